@@ -45,7 +45,7 @@ class Controller:
         mansd: M − 1; more consecutive losses violate the assumption.
         x0: x(0), if sensor and controller start from it; else None.
         acknowledges: whether it acknowledges each update, as the acknowledgement baseline does.
-        start: the step of the run at which this process starts.
+        start: the beginning of the run, or a restart during the run.
         safe_input: the input before the first update, shape (m,); by default 0.
         predictive: whether an actuation also carries x_c, for the plant's watchdog.
         setpoint: x_r and u_r, shapes (n,) and (m,): u = K(x_c − x_r) + u_r; None is 0.

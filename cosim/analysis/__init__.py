@@ -1,1 +1,1 @@
-"""What a run shows: summary, claims, fidelity, replay, adversary."""
+"""Analysis of runs: summary, claims, fidelity, replay, adversary."""

@@ -1,16 +1,19 @@
-"""Fidelity: how a live run differs from the ideal loop, and why.
+"""Fidelity: the difference between a live run and the ideal loop, split by cause.
 
-The run's own packet fates, by event number, in a chain of simulations, each exact, each with one
-effect more: the ideal loop in continuous time; + sampling: the trigger is tested on the
-measurement grid; + delay: an update acts from the plant step on that really was the first to hold
-an input computed with it; + held actuation: the input of each step is K x_c at the model time of
-the actuation that really was latched there, zero before the first. The last has everything that the
-live run has, and must be the live run to rounding. Records are in simulated time, and the plant
-lives on its nominal grid, whenever its steps were really taken; so delays and model times are
-compared with that grid.
+A chain of exact simulations uses the run's packet fates by event number. Each adds one effect:
 
-For events that the run did not have, the network emulator's own word is taken (its decisions
-depend on its seed alone), and the median of the recorded delays.
+* the ideal loop in continuous time;
+* sampling: the trigger is tested on the measurement grid;
+* delay: an update acts from the plant step that first applied an input computed with it;
+* held actuation: the input of each step is K x_c at the model time of the actuation that was
+  applied there, and zero before the first actuation.
+
+The last simulation has all effects of the live run and must equal it up to rounding. Records are in
+simulated time, and the plant's state is defined on its nominal grid, whatever the actual times of
+its steps. So delays and model times refer to that grid.
+
+Events that the live run did not have use the network emulator's decisions (which depend only on its
+seed) and the median of the recorded delays.
 """
 
 from dataclasses import asdict, dataclass, replace
@@ -38,20 +41,21 @@ from noack.protocol.record_tables import PLANT_STEP
 EXPLAINED = 0.1
 """Largest residual, as a share of the difference, that counts as explained."""
 _ROUNDING = 1e-9
-"""Relative to x: a difference below is rounding, and there is nothing to explain."""
+"""A difference below this share of x is rounding and needs no explanation."""
 _NUDGE = 1e-13
-"""Relative to x(0): about what rounding amounts to. If this changes a run, so does rounding."""
+"""Perturbation of x(0), relative, about the size of rounding. If it changes the events of a run,
+rounding does so too."""
 _PARTED_PERIODS = 10
-"""The event sequences differ from the first event that is further apart, in measurements."""
+"""Two event sequences differ from the first event that is further apart, in measurements."""
 _LARGEST = 1e100
 _STEPS_AT_THE_END, _EVENTS_AT_THE_END = 500_000, 10_000
-"""A longer run is compared on request only, so that the end of a run takes seconds."""
+"""Longer runs are compared only on request, so that the end of a run takes seconds."""
 _STAGES = ("sampling", "delay", "held actuation", "residual")
 
 
 @dataclass(frozen=True)
 class SignalDifference:
-    """A difference of two runs in x over all measurements."""
+    """The difference of x between two runs, over all measurements."""
 
     rms: float
     """Root mean square of its norm."""
@@ -63,19 +67,20 @@ class SignalDifference:
 
 @dataclass(frozen=True)
 class FidelityStage:
-    """What one effect adds to the difference between the ideal loop and the live run."""
+    """The contribution of one effect to the difference between the ideal loop and the live run."""
 
     name: str
     difference: SignalDifference
-    """To the stage before."""
+    """Difference to the stage before."""
     share: float
-    """Of the whole difference D, ⟨d, D⟩/⟨D, D⟩; the shares add up to 1, one may be negative."""
+    """Share of the whole difference D, ⟨d, D⟩/⟨D, D⟩. Shares add up to 1; some may be negative."""
     events: int
-    """Events with this effect, and all before it, in place."""
+    """Number of events with this effect and all effects before it."""
     max_event_difference_s: float | None
-    """Largest difference in time to the same event in the stage before."""
+    """Largest time difference to the same event in the stage before."""
     first_different_event: int | None
-    """First event more than ten measurements from the stage before's, or that one of them lacks."""
+    """First event that is more than ten measurements from that of the stage before, or that only
+    one of the two stages has."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +90,7 @@ class Fidelity:
     scenario: str
     mode: str
     compared_s: float
-    """Simulated time that was compared."""
+    """Length of the comparison in simulated time."""
     samples: int
     state_names: tuple[str, ...]
     rms_live: float
@@ -98,18 +103,18 @@ class Fidelity:
     events_ideal: int
     events_live: int
     max_event_difference_s: float | None
-    """Between the ideal loop and the live run, over the events that both have."""
+    """Largest time difference between ideal loop and live run, over the events that both have."""
     first_different_event: int | None
-    """First event that is more than ten measurements apart, or that one of the two lacks: from
-    there on the same packet fates meet different events."""
+    """First event that is more than ten measurements apart, or that only one of the two has. From
+    there on the same packet fates apply to different events."""
     t_s: Vector
     """(samples,) times of the measurements."""
     stage_norms: Matrix
-    """(stages, samples) Euclidean norm of what each stage adds to x."""
+    """(stages, samples) Euclidean norm of the change of x by each stage."""
 
     @property
     def explained(self) -> bool:
-        """Whether the effects account for the difference to within a tenth."""
+        """Whether the residual is at most a tenth of the difference."""
         return self.explained_relative <= EXPLAINED or self._nothing_to_explain
 
     @property
@@ -118,7 +123,7 @@ class Fidelity:
 
     @property
     def verdict(self) -> str:
-        """One line for people."""
+        """The result in one line of text."""
         if self._nothing_to_explain:
             return "x equals that of the ideal loop, to rounding"
         of_x = 100 * self.total.rms / self.rms_live
@@ -158,7 +163,7 @@ def fidelity_for_summary(record: RunRecord) -> FidelityPart | NoFidelityPart:
         return compute_fidelity(record, _EVENTS_AT_THE_END).summary()
     except NoackError as error:
         return NoFidelityPart(reason=str(error))
-    except Exception as error:  # the run itself did not fail
+    except Exception as error:  # a failed comparison is no failure of the run
         return NoFidelityPart(reason=repr(error))
 
 
@@ -167,11 +172,11 @@ def compute_fidelity(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelit
 
     Args:
         record: the run's record.
-        max_events: events of the ideal loop; it has no end of them if it is unstable.
+        max_events: largest number of events of the ideal loop; an unstable loop may exceed it.
 
     Raises:
-        IncomparableError: the run diverged, its record is too short or incomplete, or its loop
-            turns rounding into another run.
+        IncomparableError: the run diverged, its record is too short or incomplete, or rounding
+            changes its events.
     """
     live = live_run(record)
     schedule, scenario = live.schedule, record.scenario
@@ -253,7 +258,7 @@ def _ideal(
 
 
 def is_against(share: float) -> bool:
-    """Whether a share partly cancels the others, at the precision that is shown."""
+    """Return whether a share is negative (it partly cancels the others) at the shown precision."""
     return round(100 * share, 1) < 0
 
 
@@ -273,7 +278,7 @@ def _share(part: Matrix, whole: Matrix) -> float:
 
 
 def _apart(first_s: Vector, second_s: Vector) -> Vector:
-    """How far apart the events of the same number are, over those that both have."""
+    """Return the time differences between events of equal number, over those that both have."""
     both = min(len(first_s), len(second_s))
     apart_s: Vector = np.abs(first_s[:both] - second_s[:both])
     return apart_s

@@ -1,4 +1,4 @@
-"""What a run lost: updates in the network, datagrams elsewhere, rows of its record."""
+"""Losses of a run: updates in the network, datagrams elsewhere, rows of the record."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -27,11 +27,11 @@ from noack.protocol.wire_format import Flow
 from noack.runtime.life_cycle import HORIZON
 
 VIOLATION = "violation"
-"""Level of a notice: a process saw that an assumption was violated."""
+"""Level of a notice: a process detected that an assumption was violated."""
 
 
 def drops_by_cause(outcomes: PacketOutcome) -> dict[str, int]:
-    """How many updates were lost, by cause; causes without losses are left out."""
+    """Return the number of lost updates by cause, without causes of no losses."""
     fates = outcomes.rows["fate"]
     causes = {
         fate.name.lower(): int((fates == fate).sum()) for fate in Fate if not fate.effective
@@ -51,7 +51,7 @@ def acknowledgements(record: RunRecord) -> AcknowledgementsPart:
 
 
 def unintended_losses(record: RunRecord) -> dict[str, int]:
-    """Datagrams that were lost without a decision of the emulator, by leg."""
+    """Return the number of datagrams lost without a decision of the emulator, by hop."""
     sensor, outcomes = record[SENSOR_MEASUREMENT], packet_outcomes(record)
     every = record.scenario.plant.measure_every
     sent = record[PLANT_STEP]["sequence"]
@@ -77,7 +77,7 @@ def unintended_losses(record: RunRecord) -> dict[str, int]:
 
 
 def missing_rows(record: RunRecord) -> Counter[str]:
-    """Rows that a process wrote and the record lacks, by table.
+    """Return the number of rows that a process wrote and the record does not contain, by table.
 
     For a process that died without a report: by process, from the gaps in its input numbers.
     """
@@ -96,7 +96,10 @@ def missing_rows(record: RunRecord) -> Counter[str]:
 
 
 def reported_violations(record: RunRecord) -> list[ViolationPart]:
-    """Violations that the processes reported, and a loss burst at the end, which none can see."""
+    """Return the violations that the processes reported, and a loss burst at the end of the run.
+
+    The burst at the end is computed here, because no process can detect it.
+    """
     found = [
         ViolationPart(
             t_s=notice["t_ns"] * 1e-9,
@@ -122,7 +125,7 @@ def reported_violations(record: RunRecord) -> list[ViolationPart]:
 def list_violations(
     reported: Sequence[ViolationPart], observed: Sequence[AssumptionViolation]
 ) -> list[ViolationPart]:
-    """All violations of a run: those that processes reported, then those seen in its record.
+    """Return all violations of a run: those reported by processes, then those found in the record.
 
     A violation of M − 1 that a process reported is not repeated.
     """

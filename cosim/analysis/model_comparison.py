@@ -1,4 +1,4 @@
-"""What a plant that is not linear is near its operating point, beside what its loop believes."""
+"""Compares the linearisation of a non-linear plant with the model that its loop uses."""
 
 from typing import Any
 
@@ -17,11 +17,12 @@ Linearisation = dict[str, Any]
 
 
 def linearisation(resolved: Scenario) -> Linearisation | None:
-    """Return the linearisation of a resolved scenario's plant; None of a linear plant.
+    """Return the linearisation of a resolved scenario's plant; None for a linear plant.
 
-    ``A``, ``B`` by rows, ``eigenvalues`` of A + BK as pairs of real and imaginary part, ``off_A``
-    and ``off_B`` = A − Â and B − B̂, and ``in_box``, whether these are within the half-widths of the
-    scenario's uncertainty box; None without one. Only ``A``, as None, if x is not the whole state.
+    Its fields: ``A`` and ``B`` by rows; ``eigenvalues`` of A + BK as pairs of real and imaginary
+    part; ``off_A`` and ``off_B``, A − Â and B − B̂; ``in_box``, whether these are within the
+    half-widths of the scenario's uncertainty box, None without a box. If x is not the whole state,
+    the only field is ``A``, with the value None.
     """
     if resolved.coverage.is_linear:
         return None
@@ -37,7 +38,7 @@ def linearisation(resolved: Scenario) -> Linearisation | None:
             A, B = plant.system.linearisation() or linearise(
                 system_at, n, m, settling_s=plant.system.settling_s
             )
-    except NoackError:  # of the user's own: it fails, or begins only where it wants
+    except NoackError:  # a user's plant: its code fails, or it does not accept this x(0)
         A, B = np.full((n, n), np.nan), np.full((n, m), np.nan)
     if not (np.isfinite(A).all() and np.isfinite(B).all()):
         return {"A": None}
@@ -57,7 +58,7 @@ def linearisation(resolved: Scenario) -> Linearisation | None:
 
 
 _EXACT = 1e-3
-"""What an entry may be off that no half-width allows to be: it was found by differences."""
+"""Tolerance for an entry with a half-width of 0, as the linearisation uses finite differences."""
 
 
 def _within(off: Matrix, halfwidth: ArrayLike | None) -> bool:
@@ -66,7 +67,7 @@ def _within(off: Matrix, halfwidth: ArrayLike | None) -> bool:
 
 
 def said(found: Linearisation) -> tuple[tuple[str, str], ...]:
-    """A linearisation as a person reads it: quantities and their values."""
+    """Return a linearisation as text: quantities and their values."""
     if found["A"] is None:
         return (("the plant, linearised", "none: x does not tell what follows, or not smoothly"),)
     slowest = max(real for real, _ in found["eigenvalues"])

@@ -1,4 +1,4 @@
-"""What became of a run, for tables and programs."""
+"""The outcome of a run, for tables and programs."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +9,7 @@ from noack.core.errors import ExitStatus
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a run."""
+    """The outcome of a run."""
 
     run_dir: Path
     status: ExitStatus

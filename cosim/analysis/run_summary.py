@@ -54,7 +54,7 @@ Summary = dict[str, Any]
 """The content of ``summary.json``: :class:`~cosim.analysis.summary_model.RunSummary` as JSON."""
 
 
-@np.errstate(all="ignore")  # a run that diverged has a summary, too
+@np.errstate(all="ignore")  # a diverging run overflows and has a summary all the same
 def summarise(
     record: RunRecord, exit_status: int, reason: str, startup_s: float | None = None
 ) -> RunSummary:
@@ -64,7 +64,7 @@ def summarise(
         record: the run's record.
         exit_status: the run's exit status.
         reason: why the run ended.
-        startup_s: wall time from the launch to simulated time 0; None if it is not known.
+        startup_s: wall time from the launch to simulated time 0; None if unknown.
     """
     scenario, live = record.scenario, record.kind == "live"
     missing, lost, diverged = missing_rows(record), unintended_losses(record), _divergence(record)
@@ -151,7 +151,7 @@ def _signals(record: RunRecord, joined: AlignedRun) -> dict[str, Any]:
 
 
 def _true_e_c(record: RunRecord, joined: AlignedRun) -> NDArray[np.float64]:
-    """‖x_c − x‖_W with the plant's own x, from the controller's first update on."""
+    """Return ‖x_c − x‖_W with the plant's own x, from the controller's first update on."""
     e_c = joined.x_c - true_states(record[PLANT_STEP], joined.t_ns)
     if record.loop.weight is not None:
         e_c = e_c @ record.loop.weight.T
@@ -165,14 +165,14 @@ def _estimation(record: RunRecord, joined: AlignedRun) -> EstimationPart | None:
 
 
 def _watchdog(record: RunRecord) -> WatchdogPart:
-    """When the newest actuation was too old for the plant's watchdog, from the recorded steps."""
+    """Return the watchdog's actions (the newest actuation was too old) from the recorded steps."""
     scenario, steps, received = record.scenario, record[PLANT_STEP], record[PLANT_ACTUATION]
     found = np.searchsorted(received["sequence"], steps["actuation"])
     there = np.append(received["sequence"], NO_SEQUENCE)[found] == steps["actuation"]
     newest_ns = np.where(
         steps["actuation"] != NO_SEQUENCE, np.append(received["t_ns"], 0)[found], 0
     )
-    # The age of an actuation that is not on record is unknown.
+    # If an actuation is not recorded, its age is unknown.
     old = there & too_old(steps["t_ns"], newest_ns, scenario.timing.actuation_timeout_ns)
     trips = np.flatnonzero(old & ~np.append(False, old[:-1]))
     return WatchdogPart(
@@ -193,14 +193,14 @@ def _rejected(channel: Mapping[str, Any]) -> dict[str, int]:
 def _why_failed(
     record: RunRecord, missing: Mapping[str, int], diverged: Divergence | None
 ) -> str | None:
-    """Why a run that ended at its horizon failed; None if it did not fail."""
+    """Return why a run that ended at its horizon failed; None if it did not fail."""
     if diverged is not None:
         return diverged.text
     for notice in record.notices:
         if notice["level"] == FAILED:
             at_s = notice["t_ns"] * 1e-9
             return f"the {notice['process']} failed at {at_s:g} s: {notice['text']}"
-    # The last rows of a killed process do not count: a restarted process took its place.
+    # Missing last rows of a killed process are no failure: a restarted process replaced it.
     lacking = [f"{missing[table]:,} of {table}" for table in record.tables if missing[table] > 0]
     return f"rows are missing from the record: {', '.join(lacking)}" if lacking else None
 
@@ -231,11 +231,11 @@ def _changes(record: RunRecord) -> list[ChangePart]:
 
 
 def _restarts(record: RunRecord) -> list[RestartPart]:
-    """The processes that were restarted during the run, in the order of time."""
+    """Return the processes that were restarted during the run, in order of time."""
     found: list[RestartPart] = []
     for role in (*LOOP_ROLES, RECORDER):
         notices = [n for n in record.notices if (n["process"], n["level"]) == (role, RESTART)]
-        if role == RECORDER:  # it has no rows of its own
+        if role == RECORDER:  # the recorder has no rows
             found += [
                 RestartPart(process=role, generation=number, last_s=None,
                             first_s=notice["t_ns"] * 1e-9, what=notice["text"])
@@ -243,7 +243,8 @@ def _restarts(record: RunRecord) -> list[RestartPart]:
             ]  # fmt: skip
             continue
         active_s = {life.generation: _active_s(life) for life in record.lives(role)}
-        # Each restart has one notice; a lost notice is that of a process that ended soon.
+        # Each restart has one notice. It is lost only if the process ended soon after, so the
+        # notices belong to the last generations.
         reported = dict(enumerate(notices, max(max(active_s) - len(notices), 0) + 1))
         last_s = active_s.pop(0)[-1]
         for number in sorted(active_s.keys() | reported.keys()):
@@ -259,7 +260,7 @@ def _restarts(record: RunRecord) -> list[RestartPart]:
 
 
 def _active_s(life: Life) -> tuple[float | None, float | None]:
-    """When a process left its first and its last row; None for a process without rows."""
+    """Return the times of a process's first and last row; None for a process without rows."""
     now_ns = np.concatenate([rows["now_ns"] for rows in life.rows.values()])
     if not len(now_ns):
         return None, None

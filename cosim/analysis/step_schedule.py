@@ -1,4 +1,4 @@
-"""What happened when in a live run, counted in steps of the plant: from the record."""
+"""Reads from a live run's record, in steps of the plant, when updates and inputs took effect."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -41,13 +41,13 @@ class LiveRun(NamedTuple):
 
 
 def live_run(record: RunRecord) -> LiveRun:
-    """Read what happened in a run.
+    """Read the schedule of a run.
 
     Raises:
         IncomparableError: the run diverged, a process was restarted, settings were changed, the
-            record is too short or has gaps, or the input was not that of the controller's model
-            throughout.
-        CallerError: it is of a scenario that exact simulation cannot take.
+            record is too short or has gaps, or some inputs were not those of the controller's
+            model.
+        CallerError: exact simulation does not support the scenario.
     """
     record.scenario.coverage.require_unacknowledged()
     if changes_of(record):
@@ -73,7 +73,7 @@ def live_run(record: RunRecord) -> LiveRun:
     if (np.diff(sensor["input"], prepend=-1) != 1).any():
         raise IncomparableError("measurements are missing from the sensor's record")
     _require_times(record)
-    if not np.abs(steps["x"]).max() < _LARGEST:  # nor with NaN
+    if not np.abs(steps["x"]).max() < _LARGEST:  # also true for NaN
         raise IncomparableError("the run diverged")
     measured = np.zeros(last + 1, dtype=np.bool_)
     measured[sensor["t_ns"] // period_ns] = True
@@ -101,10 +101,10 @@ def live_run(record: RunRecord) -> LiveRun:
 
 
 def _require_times(record: RunRecord) -> None:
-    """Require times that a run has; a simulation would follow others for ever.
+    """Require possible times: with others, as in a damaged record, a simulation would not end.
 
     Raises:
-        IncomparableError: some are not.
+        IncomparableError: a time is impossible.
     """
     horizon_ns = record.scenario.timing.horizon_ns
     for table, column in (
@@ -118,15 +118,15 @@ def _require_times(record: RunRecord) -> None:
 
 
 class _Ticks(NamedTuple):
-    """What the controller's actuations, by sequence number, or the plant's steps rest on."""
+    """The origin of the controller's actuations (by sequence number) or of the plant's steps."""
 
     model_ns: NDArray[np.int64]
     newest: NDArray[np.int64]
-    """Sequence number of the newest update in them, −1 for none."""
+    """Sequence number of the newest update that they use, −1 for none."""
 
 
 def _ticks(ticks: Rows, deliveries: Rows) -> tuple[_Ticks, set[int]]:
-    """What each actuation rests on, and the updates that the controller took."""
+    """Return the origin of each actuation, and the updates that the controller accepted."""
     inputs = np.sort(np.concatenate([ticks["input"], deliveries["input"]]))
     whole = np.array_equal(inputs, np.arange(len(inputs)))
     if not whole or (ticks["sequence"] != np.arange(len(ticks))).any():
@@ -137,7 +137,7 @@ def _ticks(ticks: Rows, deliveries: Rows) -> tuple[_Ticks, set[int]]:
 
 
 def _latched(actuations: NDArray[np.int64], ticks: _Ticks) -> _Ticks:
-    """What the input held from each step on rests on; −1 before the first."""
+    """Return the origin of the input held from each step on; −1 before the first."""
     if actuations.max(initial=NO_SEQUENCE) >= len(ticks.newest):
         raise IncomparableError("the controller's record ends before the plant's")
     by_sequence = _Ticks(
@@ -147,14 +147,14 @@ def _latched(actuations: NDArray[np.int64], ticks: _Ticks) -> _Ticks:
 
 
 def _fates(taken: set[int], known: int, network: Callable[[int], bool]) -> Callable[[int], bool]:
-    """What the controller took; for events that the run did not have, the network's own word."""
+    """Return whether the controller accepted each update; for other events, ask ``network``."""
     return lambda event: event in taken if event < known else network(event)
 
 
 def _delays(
     taken: set[int], delays: NDArray[np.int64], acted: NDArray[np.bool_]
 ) -> Callable[[int], int]:
-    """Recorded delays; for events that the run did not have, their median."""
+    """Return the recorded delays; for events that the run did not have, their median."""
     usable = [int(delays[event]) for event in taken if event < len(delays) and acted[event]]
     usual = int(np.median(usable)) if usable else 0
     return lambda event: int(delays[event]) if event < len(delays) else usual

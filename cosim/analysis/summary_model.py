@@ -10,12 +10,12 @@ from cosim.analysis.claims.claim import ClaimVerdict
 
 
 def _or_none(value: Any) -> Any:
-    """JSON has no infinity and no NaN: null instead."""
+    """Return None for infinity and NaN, which JSON does not have."""
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 Text = Annotated[str, Field(pattern=r"^[^\[]*$")]
-"""Text that a table prints as it is: without a bracket, which would begin markup."""
+"""Text without an opening bracket, which would start markup in a printed table."""
 Count = Annotated[int, Field(ge=-(2**63), lt=2**63)]
 Real = Annotated[float | None, BeforeValidator(_or_none)]
 Counts = dict[Text, Count]
@@ -23,7 +23,7 @@ Matrix = Annotated[list[Annotated[list[float], Field(min_length=1)]], Field(min_
 
 
 class SummaryPart(BaseModel):
-    """A part of a summary, checked when it is made and when it is read."""
+    """A part of a summary, validated when it is created and when it is read."""
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
 
@@ -56,7 +56,7 @@ class Quantiles(SummaryPart):
 
 
 class LatenessPart(Quantiles):
-    """How late a process was."""
+    """The lateness of a process."""
 
     steps: Count
     late_steps: Count
@@ -78,7 +78,7 @@ class AcknowledgementsPart(SummaryPart):
 
 
 class WatchdogPart(SummaryPart):
-    """How often the plant's watchdog acted."""
+    """The number of times that the plant's watchdog acted."""
 
     policy: Text
     timeout_s: float
@@ -302,7 +302,7 @@ class RunSummary(SummaryPart):
 
 
 def can_be_shown(summary: Mapping[str, Any]) -> bool:
-    """Whether a file holds a whole summary of this version."""
+    """Return whether a file contains a complete summary of this version."""
     try:
         RunSummary.model_validate(summary)
     except ValidationError:

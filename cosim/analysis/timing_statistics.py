@@ -1,4 +1,4 @@
-"""How late the processes of a live run were, in wall time."""
+"""Lateness of the processes of a live run, in wall time."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,8 @@ from noack.protocol.record_tables import (
 def lateness_us(record: RunRecord, role: str) -> NDArray[np.float64]:
     """Wall time between a process's actions and their nominal times, (k,).
 
-    Plant and controller have deadlines of their own; the nominal time is that of the measurement
-    for the sensor, and that of the event for the network.
+    The nominal time is the deadline for plant and controller, the time of the measurement for the
+    sensor, and the time of the event for the network.
     """
     if role == "netem":
         outcomes = packet_outcomes(record)
@@ -33,7 +33,7 @@ def lateness_us(record: RunRecord, role: str) -> NDArray[np.float64]:
 
 
 def lateness(record: RunRecord, role: str) -> LatenessPart:
-    """Quantiles of a process's lateness, and its late steps: those late by more than a period."""
+    """Return quantiles of a process's lateness, and its number of steps late by over a period."""
     timing = record.scenario.timing
     period_ns = {
         "plant": timing.plant_period_ns,
@@ -47,7 +47,7 @@ def lateness(record: RunRecord, role: str) -> LatenessPart:
 
 
 def latency_us(record: RunRecord) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Wall time from the sensor's event to the controller's update, one way.
+    """Return the wall time from the sensor's event to the controller's update, one way.
 
     Returns:
         Event times in ns (d,) and latencies in µs (d,), of the delivered updates.

@@ -62,7 +62,7 @@ class Certificates:
 
     @property
     def theorem_2(self) -> "Theorem2 | None":
-        """The paper's Theorem 2, the paper's formula; None if it cannot be evaluated."""
+        """Theorem 2 by the paper's formula; None if it cannot be evaluated."""
         return self._study.theorem_2
 
     @property

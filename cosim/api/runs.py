@@ -93,8 +93,8 @@ class Run:
 
         Returns:
             The table with the columns of ``docs/record.md``: times in nanoseconds of simulated
-                time, and one column per entry of a vector (``x_1``, ``x_2``, …). The first column
-                is ``t_s``, the time ``t_ns`` in seconds.
+            time, and one column per entry of a vector (``x_1``, ``x_2``, …). The first column is
+            ``t_s``, the time ``t_ns`` in seconds.
 
         Raises:
             NoackError: there is no such table, or its file is damaged.
@@ -113,11 +113,10 @@ class Run:
 
         Returns:
             ``t_s`` and ``t_ns``; x, x_s and x_c, one column per state (``x_1``, ``x_s_1``,
-                ``x_c_1``, …); ``e_s_norm`` before a reset, its ``threshold``, and ``e_c_norm``, all
-                in the trigger's norm; ``event``, the number of the transmitted update, or −1. x_s
-                is the value after a reset. x_c is NaN at times without controller records. x is the
-                state that the sensor uses; with noise or an observer it differs from the plant's
-                state.
+            ``x_c_1``, …); ``e_s_norm`` before a reset, its ``threshold``, and ``e_c_norm``, all in
+            the trigger's norm; ``event``, the number of the transmitted update, or −1. x_s is the
+            value after a reset. x_c is NaN at times without controller records. x is the state that
+            the sensor uses; with noise or an observer it differs from the plant's state.
         """
         from cosim.api.data_frames import samples
 
@@ -128,10 +127,10 @@ class Run:
 
         Returns:
             ``event``, its number; ``t_s`` and ``t_ns``; ``interval_s``, the inter-event time, NaN
-                for the first event; ``fate`` in the network: delivered, forced (delivered because M
-                − 1 was reached), dropped, corrupted, overflowed, blacked_out, overtaken (delivered
-                out of order), in_flight at the end, or none, if it did not reach the network;
-                ``received``, whether the controller processed it.
+            for the first event; ``fate`` in the network: delivered, forced (delivered because M − 1
+            was reached), dropped, corrupted, overflowed, blacked_out, overtaken (delivered out of
+            order), in_flight at the end, or none, if it did not reach the network; ``received``,
+            whether the controller processed it.
         """
         from cosim.api.data_frames import events
 
@@ -310,7 +309,7 @@ def compare(*runs: Run | Folder) -> "RunComparison":
 
     Returns:
         The comparison: ``numbers`` with their differences to the first run, ``settings`` that
-            differ, ``plot()`` for the overlay, ``save(path)``, ``to_json()``.
+        differ, ``plot()`` for the overlay, ``save(path)``, ``to_json()``.
 
     Raises:
         NoackError: there are fewer than two or more than seven runs, or their plants have different

@@ -1,1 +1,1 @@
-"""The record of a run: its directory, its tables, aligned on a common time grid."""
+"""The record of a run: its directory, its tables, and their alignment on a common time grid."""

@@ -2,12 +2,13 @@
 
 At each measurement time t:
 
-* x(t) and x_s(t) are the sensor's own; at an event x_s is the value after its reset. x is measured
-  or estimated by the sensor. With noise or an observer it is not the plant's state, and e_c is the
-  controller's error against x (:mod:`cosim.record.estimation_error` has the other part);
-* x_c(t) is the controller's last state whose model time is at most t, propagated by e^{H(t−t')}.
+* x(t) and x_s(t) are the sensor's values; at an event x_s is the value after its reset. x is
+  measured or estimated by the sensor. With noise or an observer it is not the plant's state, and
+  e_c is the controller's error relative to this x. :mod:`cosim.record.estimation_error` computes
+  the difference between this x and the plant's state;
+* x_c(t) is the controller's last state with a model time t' ≤ t, propagated by e^{H(t−t')}.
 
-After a controller's death there is no x_c until the restarted one has its first update.
+If a controller dies, there is no x_c until the restarted controller has its first update.
 """
 
 from typing import NamedTuple
@@ -44,11 +45,11 @@ class AlignedRun(NamedTuple):
     x_s: Reals
     """(k, n), after a reset."""
     x_c: Reals
-    """(k, n); NaN where the controller's record does not reach."""
+    """(k, n); NaN at times without a recorded controller state."""
     e_s_norm: Reals
-    """(k,) ‖e_s‖_W before a reset: what the trigger tested."""
+    """(k,) ‖e_s‖_W before a reset, as tested by the trigger."""
     threshold: Reals
-    """(k,) What ‖e_s‖_W would have to exceed for an event."""
+    """(k,) The value of ‖e_s‖_W above which there is an event."""
     e_c_norm: Reals
     """(k,) ‖e_c‖_W."""
     received: NDArray[np.int64]
@@ -57,32 +58,32 @@ class AlignedRun(NamedTuple):
     """(k,) generation of the sensor."""
 
     def since_delivery(self, scenario: Scenario) -> NDArray[np.bool_]:
-        """Where the controller's error is on record, from its first update on, (k,)."""
+        """Return where the controller's error is recorded, from its first update on, (k,)."""
         known = scenario.network.initial_sync == "known_state"
         delivered = known | (self.received != NO_SEQUENCE)
         return np.asarray(np.isfinite(self.e_c_norm) & delivered)
 
 
 class ControllerTrack(NamedTuple):
-    """The controller's states in the order in which it went through them."""
+    """The controller's states in order."""
 
     model_ns: Times
     x_c: Reals
     received: NDArray[np.int64]
     generation: int = 0
-    """Of the controller that was in the last of them."""
+    """Generation of the controller in the last state."""
 
     def since(self, index: int) -> "ControllerTrack":
-        """The track from its ``index``-th state on."""
+        """Return the track from its ``index``-th state on."""
         return self._replace(
             model_ns=self.model_ns[index:], x_c=self.x_c[index:], received=self.received[index:]
         )
 
 
 def in_common(scenario: Scenario, joined: AlignedRun) -> NDArray[np.bool_]:
-    """Where x_c is on record, and sensor and controller share an update, (k,).
+    """Return where x_c is recorded, and sensor and controller share an update, (k,).
 
-    After a restart of the sensor they share none until an update of the new sensor is delivered.
+    After a restart of the sensor they share none until an update of the restarted one is delivered.
     """
     known = scenario.network.initial_sync == "known_state"
     first = np.where(known & (joined.sensor == 0), NO_SEQUENCE, joined.sensor * GENERATION)
@@ -98,7 +99,7 @@ def initial_track(scenario: Scenario) -> ControllerTrack:
 
 
 def controller_track(before: ControllerTrack, steps: Rows, deliveries: Rows) -> ControllerTrack:
-    """Continue a track by ticks and deliveries."""
+    """Append ticks and deliveries to a track."""
     inputs = np.concatenate([steps["input"], deliveries["input"]])
     order = np.argsort(inputs, kind="stable")
     newest = np.concatenate([np.full(len(steps), NO_SEQUENCE), deliveries["sequence"]])[order]
@@ -115,8 +116,8 @@ def controller_track(before: ControllerTrack, steps: Rows, deliveries: Rows) -> 
 def _continued(
     track: ControllerTrack, life: int, model_ns: Times, x_c: Reals, newest: NDArray[np.int64]
 ) -> ControllerTrack:
-    """Continue a track by states of one controller."""
-    if life != track.generation:  # between two controllers there is no state
+    """Append the states of one generation of the controller to a track."""
+    if life != track.generation:  # no state between two generations of the controller
         track = ControllerTrack(
             np.append(track.model_ns, track.model_ns[-1] + 1),
             np.vstack([track.x_c, np.full_like(track.x_c[-1:], np.nan)]),
@@ -143,16 +144,16 @@ def join(
     flow: ModelFlow | None = None,
     acknowledged: bool = False,
 ) -> AlignedRun:
-    """Join measurements with the controller's track.
+    """Align measurements with the controller's track.
 
     Args:
         loop: matrices of the run.
         measurements: rows of ``sensor_measurement``, ordered.
         track: the controller's states, at least from the first measurement on.
-        until_ns: x_c is known up to here.
-        flow: what x_c follows; by default what it does in a run in which nothing is changed.
-        acknowledged: an event does not reset x_s; it shows in the next sample if one did that was
-            acknowledged.
+        until_ns: end of the controller's track.
+        flow: the flow of x_c; by default that of a run without changes of settings.
+        acknowledged: updates are acknowledged: an event itself does not reset x_s. The reset by an
+            acknowledged event appears in the next sample.
     """
     t_ns = measurements["t_ns"]
     reset = (measurements["event"] != NO_SEQUENCE) & (not acknowledged)
@@ -176,9 +177,10 @@ def join(
 
 
 def _threshold(measurements: Rows) -> Reals:
-    """Where ‖e_s‖_W would be an event, if the sides of the comparison grew with it alike.
+    """Return the value of ‖e_s‖_W at which both sides of the comparison would be equal.
 
-    For a trigger that compares ‖e_s‖_W itself, as the paper's does, this is its threshold.
+    It assumes that the left side is proportional to ‖e_s‖_W. For a trigger that compares ‖e_s‖_W
+    itself, like the paper's, this is its threshold.
     """
     left, right = measurements["compared"], measurements["threshold"]
     norms = measurements["e_s_norm"]
@@ -209,7 +211,7 @@ def _at(
 
 
 def join_all(record: RunRecord) -> AlignedRun:
-    """Join a whole run."""
+    """Align a whole run."""
     steps = record[CONTROLLER_STEP]
     track = controller_track(initial_track(record.scenario), steps, record[CONTROLLER_DELIVERY])
     reach_ns = int(track.model_ns[-1]) + record.scenario.timing.controller_period_ns
@@ -221,7 +223,7 @@ def join_all(record: RunRecord) -> AlignedRun:
 
 
 class IdentityResidual:
-    """Evaluates (I1) along a run, batch after batch of its measurements.
+    """Evaluates (I1) along a run, by batches of measurements.
 
     Args:
         scenario: the resolved scenario, without acknowledgements: (I1) assumes that x_s is
@@ -233,11 +235,11 @@ class IdentityResidual:
         self._missed = ModelDifference(loop_of(scenario).H)
 
     def of(self, measurements: Rows, joined: AlignedRun) -> Reals:
-        """Largest entry of |x_c − x_s − Σ e^{H(t−t_k)} e_s(t_k⁻)| at each measurement, (k,).
+        """Return the largest entry of |x_c − x_s − Σ e^{H(t−t_k)} e_s(t_k⁻)| by measurement, (k,).
 
         Args:
-            measurements: rows of ``sensor_measurement``, which follow those given before.
-            joined: the same, joined.
+            measurements: the next rows of ``sensor_measurement``.
+            joined: the same rows, aligned.
         """
         missed = self._missed
         residual = np.full(len(measurements), np.nan)
@@ -253,11 +255,10 @@ class IdentityResidual:
 
 
 def identity_residual(record: RunRecord, joined: AlignedRun) -> Reals:
-    """(I1)'s residual over a whole run, (k,); see :class:`IdentityResidual`.
+    """Return (I1)'s residual over a whole run, (k,); see :class:`IdentityResidual`.
 
-    Zero to rounding on every run, whatever was lost. NaN where x_c is not recorded, and as long as
-    sensor and controller have nothing in common: before the first delivery, unless x(0) is known.
-    NaN throughout where updates are acknowledged.
+    It is zero up to rounding on every run, for all losses. It is NaN if x_c is not recorded, and
+    before the first delivery unless x(0) is known. In a run with acknowledgements all are NaN.
     """
     if record.scenario.protocol.acknowledges:
         return np.full(len(joined.t_ns), np.nan)

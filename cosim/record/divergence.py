@@ -1,16 +1,18 @@
-"""Whether a run diverged: its state is not finite, or it outgrew its scale and still grew.
+"""Detects a diverged run: its state is not finite, or far above the run's scale and still growing.
 
-The scale of a run is the largest, in units of ‖x‖, of
+The scale of a run is the largest of these values, in units of ‖x‖:
 
 * ‖x‖ in the first tenth of the run,
 * the set-points x_r,
-* the threshold that the trigger begins with or has as its floor, and
-* how far a step disturbance that begins later could carry x: its integral over the rest of the run.
+* the trigger's initial threshold and its floor, and
+* the integral of each later step disturbance over the rest of the run, the largest possible change
+  of x.
 
-A run whose state stays finite diverged if the largest ‖x‖ of its last tenth is more than
-``GROWTH`` times that scale and more than twice the largest of its first seven tenths. An unstable
-loop e^{λt} meets this from λT ≈ 7.7 on, T the length of the run. In a shorter run its growth is not
-told from a transient; a run that is disturbed, saturated or in a limit cycle does not meet it.
+A run with a finite state diverged if the largest ‖x‖ of its last tenth is more than ``GROWTH``
+times that scale and more than twice the largest ‖x‖ of its first seven tenths. An unstable loop
+e^{λt} meets this from λT ≈ 7.7 on, where T is the length of the run. In a shorter run, divergence
+cannot be distinguished from a transient. A run that is disturbed, saturated or in a limit cycle
+does not meet the criterion.
 """
 
 from collections.abc import Iterable
@@ -29,22 +31,22 @@ _LEAST_SAMPLES = 20
 
 
 class Divergence(NamedTuple):
-    """That a run diverged."""
+    """The divergence of a run."""
 
     at_s: float
-    """When its state ceased to be finite, or passed ``GROWTH`` times its scale."""
+    """First time at which the state was not finite or exceeded ``GROWTH`` times the scale."""
     text: str
-    """In words, one line."""
+    """Description in one line."""
 
 
 @np.errstate(all="ignore")
 def divergence(t_s: Vector, x: Matrix, scenarios: Iterable[Scenario]) -> Divergence | None:
-    """Return that a run diverged; None if it did not.
+    """Return the divergence of a run; None if the run did not diverge.
 
     Args:
         t_s: times of the samples, (k,), ascending.
         x: the plant's state, (k, n).
-        scenarios: the resolved scenario, and those that changes of settings made of it.
+        scenarios: the resolved scenario, and the scenarios after each change of settings.
     """
     lost = np.flatnonzero(~np.isfinite(x).all(axis=1))
     if len(lost):
@@ -67,7 +69,7 @@ def divergence(t_s: Vector, x: Matrix, scenarios: Iterable[Scenario]) -> Diverge
 
 
 def _scale(scenario: Scenario) -> float:
-    """Return the size of ‖x‖ that a scenario lets expect from its disturbances and set-point."""
+    """Return the magnitude of ‖x‖ to expect from a scenario's disturbances and set-point."""
     loop = loop_of(scenario)
     carried = 0.0
     for one in scenario.plant.disturbances:

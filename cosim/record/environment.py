@@ -1,4 +1,4 @@
-"""Where a run was made: versions, machine, command; kept with the run."""
+"""The environment of a run, stored with it: versions, computer, command."""
 
 import json
 import os
@@ -12,7 +12,7 @@ from typing import Any, Literal
 from cosim.record.run_directory import ENVIRONMENT_FILE, read_object
 
 Kind = Literal["live", "simulated"]
-"""Whether a run took place between processes, or in virtual time."""
+"""Whether a run used processes (live) or virtual time (simulated)."""
 
 _PACKAGES = ("noack", "numpy", "scipy", "eclipse-zenoh", "rerun-sdk", "pyarrow", "pydantic")
 _ARITHMETIC = ("noack", "numpy", "scipy")
@@ -40,13 +40,13 @@ def write_environment(run_dir: Path, kind: Kind) -> None:
 
 
 def kind_of(run_dir: Path) -> Kind:
-    """Return of which kind a run is: what its environment says, which in old runs is nothing."""
+    """Return the kind of a run from its environment file; old runs have no entry for it."""
     said = read_object(run_dir / ENVIRONMENT_FILE)
     return "simulated" if said.get("kind") == "simulated" else "live"
 
 
 def changed_since(run_dir: Path) -> list[str]:
-    """Return what the arithmetic of a run may depend on and is not what it was, in words."""
+    """Return the changes since the run that may affect its arithmetic, in words."""
     then, now = read_object(run_dir / ENVIRONMENT_FILE), environment("live")
     said = then.get("packages")
     packages = said if isinstance(said, dict) else {}

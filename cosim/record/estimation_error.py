@@ -15,7 +15,7 @@ Reals = NDArray[np.float64]
 
 
 def true_states(steps: Rows, t_ns: NDArray[np.int64]) -> Reals:
-    """The plant's own state at some times, (k, n); NaN where its row is missing.
+    """Return the plant's own state at some times, (k, n); NaN if its row is missing.
 
     Args:
         steps: rows of ``plant_step``, ordered.
@@ -36,7 +36,7 @@ def estimation_error(record: RunRecord) -> Reals:
 
 
 def estimation_summary(record: RunRecord, e_c_sup: float | None) -> dict[str, Any] | None:
-    """The estimation error of a run for its summary; None where the sensor measures x itself.
+    """Return the estimation error for a run's summary; None if the sensor measures x itself.
 
     Args:
         record: the run's record.
@@ -60,7 +60,7 @@ def estimation_summary(record: RunRecord, e_c_sup: float | None) -> dict[str, An
 
 
 def expected_rms(resolved: Scenario) -> float:
-    """RMS of ‖x̂ − x‖ in the steady state, by noise and random disturbances, for an exact model."""
+    """Return the steady-state RMS of ‖x̂ − x‖ from noise and disturbances, for an exact model."""
     return float(np.sqrt(np.trace(steady_state(resolved).covariance)))
 
 

@@ -26,15 +26,15 @@ class PacketOutcome(NamedTuple):
     lost: NDArray[np.bool_]
     """Dropped, corrupted, or delivered out of order (stale)."""
     in_flight: NDArray[np.bool_]
-    """Had not left when the run ended."""
+    """Not yet forwarded when the run ended."""
 
     @property
     def left(self) -> NDArray[np.bool_]:
-        """Left intact, and before every newer one."""
+        """Forwarded intact, and before every newer update."""
         return ~self.lost & ~self.in_flight
 
     def longest_loss_burst(self) -> int:
-        """Largest number of consecutive updates that were lost."""
+        """Largest number of consecutive losses."""
         longest = count = 0
         for lost in self.lost.tolist():
             count = count + 1 if lost else 0
@@ -43,13 +43,13 @@ class PacketOutcome(NamedTuple):
 
 
 def packet_outcomes(record: RunRecord, flow: Flow = Flow.UPDATE) -> PacketOutcome:
-    """The outcomes of the updates, or acknowledgements, that reached the network emulator."""
+    """Return the outcomes of the updates or acknowledgements that reached the network emulator."""
     rows, sequence, event_ns = updates_in(record[NETEM_PACKET], flow)
     releases = record[NETEM_RELEASE]
     if "flow" in (releases.dtype.names or ()):
         way = ACKNOWLEDGEMENTS if flow is Flow.ACKNOWLEDGEMENT else UPDATES
         releases = releases[releases["flow"] == way]
-    # The first intact one of a datagram and its copy is what counts: the copy, if that is it.
+    # Of a datagram and its copy, the first intact one counts; it may be the copy.
     which = (rows["bit"] >= 0).astype(np.int64)
     numbers = 2 * rows["sequence"] + which
     left = 2 * releases["sequence"] + releases["copy"]

@@ -20,11 +20,11 @@ NEVER_NS = 2**63 - 1
 
 
 class RecordedChange(NamedTuple):
-    """A change of settings, and when each process applied it."""
+    """A change of settings, and the times at which the processes applied it."""
 
     change: ParameterChange
     since_ns: Mapping[str, int]
-    """From when on it was in force, by process; a process that never received it is missing."""
+    """Time from which it was in force, by process, without processes that never received it."""
     scenario: Scenario
     """The scenario from then on."""
 
@@ -35,12 +35,12 @@ class RecordedChange(NamedTuple):
 
     @property
     def everywhere_ns(self) -> int:
-        """From when on it was in force everywhere."""
+        """The time from which it was in force in every process."""
         return max(self.since_ns.get(role, NEVER_NS) for role in CHANGEABLE)
 
     @property
     def late(self) -> dict[str, int]:
-        """Processes that applied it after its time, and when."""
+        """Processes that applied it after its time, with their times."""
         return {role: ns for role, ns in self.since_ns.items() if ns > self.change.t_ns}
 
     @property
@@ -50,9 +50,9 @@ class RecordedChange(NamedTuple):
 
 
 def changes_of(record: RunRecord) -> list[RecordedChange]:
-    """The changes of a run, in the order in which they came into force.
+    """Return the changes of a run, in the order in which they came into force.
 
-    Changes that the scenario does not allow, from a damaged record, are left out.
+    Invalid changes, from a damaged record, are omitted.
     """
     since: dict[int, dict[str, int]] = {}
     found: dict[int, ParameterChange] = {}
@@ -90,7 +90,7 @@ def model_flow(scenario: Scenario, received: Rows) -> ModelFlow:
 
 
 def claimed_until_s(received: Rows) -> float:
-    """When the claims at the start of a run end at a change; infinite if never.
+    """Return the time of the change that ends the claims at the start of a run; infinite if none.
 
     Args:
         received: rows of one of the tables of changes.

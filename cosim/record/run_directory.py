@@ -1,4 +1,4 @@
-"""The run directory: the names of what it holds, and where the newest one is."""
+"""The run directory: the names of its files, and the search for the newest one."""
 
 import contextlib
 import json
@@ -19,7 +19,7 @@ from noack.core.regular_file import read_regular
 from noack.settings.user_files import file_tables, unchanged, with_tables
 
 DEFAULT_RUNS = Path("runs")
-"""Where run directories are made, in the folder where a person stands."""
+"""Folder for run directories, relative to the current folder."""
 SCENARIO_FILE = "scenario.toml"
 ENVIRONMENT_FILE = "environment.json"
 REPORTS_FILE = "reports.json"
@@ -63,7 +63,7 @@ def new_run_dir(runs: Path, name: str) -> Path:
 def write_scenario(resolved: Scenario, run_dir: Path) -> Scenario:
     """Write the scenario of a run into its directory, with the files that the run executes.
 
-    So the run can be replayed when a file has changed, and the directory can be moved. The file of
+    The copies allow a replay after a file has changed, and the directory can be moved. The file of
     a plant is copied to ``plant/``, that of a trigger to ``trigger/``, and so on.
 
     Returns:
@@ -87,7 +87,7 @@ def write_scenario(resolved: Scenario, run_dir: Path) -> Scenario:
 
 
 def read_object(path: Path) -> dict[str, Any]:
-    """Return the object of a JSON file of a run; empty if there is none, or a damaged one."""
+    """Return the object of a JSON file of a run; empty if the file is missing or damaged."""
     try:
         found = json.loads(read_regular(path, _MOST_JSON_BYTES))
     except (OSError, ValueError, RecursionError):
@@ -96,10 +96,10 @@ def read_object(path: Path) -> dict[str, Any]:
 
 
 def point_to_latest(run_dir: Path) -> None:
-    """Let ``latest`` beside the run directory lead to it; if it cannot, warn."""
+    """Link ``latest``, beside the run directory, to it; warn if this fails."""
     latest = run_dir.parent / LATEST
     scratch = run_dir.parent / f".{LATEST}.{os.getpid()}"
-    try:  # a convenience, not worth a run
+    try:  # the link is optional, so its failure does not end the run
         scratch.unlink(missing_ok=True)
         scratch.symlink_to(run_dir.name)
         scratch.replace(latest)
@@ -116,8 +116,8 @@ def latest_run(runs: Path) -> Path:
     """Return the newest run directory below ``runs``.
 
     Raises:
-        CallerError: there is none, or the link or the directory is another user's: to open a run
-            may execute the code of its plant.
+        CallerError: there is none, or the link or the directory belongs to another user: opening a
+            run may execute the code of its plant.
     """
     link = runs / LATEST
     if not link.is_symlink() or not link.is_dir():
@@ -132,10 +132,10 @@ def latest_run(runs: Path) -> Path:
 
 
 def chosen_run(run_dir: Path | None, runs: Path) -> Path:
-    """Return the run directory that was named, or the newest below ``runs`` if none was.
+    """Return the given run directory, or the newest below ``runs`` if none is given.
 
     Raises:
-        CallerError: as :func:`latest_run`, which follows a ``latest`` that was named, too.
+        CallerError: as :func:`latest_run`, which also resolves a given ``latest``.
     """
     if run_dir is None:
         return latest_run(runs)
@@ -146,7 +146,7 @@ def chosen_run(run_dir: Path | None, runs: Path) -> Path:
 
 @contextmanager
 def active_run(run_dir: Path) -> Iterator[None]:
-    """Mark a run as active; its launcher and its recorder do so while they live.
+    """Mark a run as active, for its launcher and its recorder.
 
     Raises:
         MachineError: the directory cannot be written.
@@ -160,7 +160,7 @@ def finished_run(run_dir: Path) -> Iterator[None]:
     """Lock the directory of a run that has ended.
 
     Raises:
-        CallerError: the run is still under way.
+        CallerError: the run is still active.
         MachineError: the directory cannot be written.
     """
     with _locked(run_dir) as alone:

@@ -1,7 +1,7 @@
-"""How a run ended, stored in its directory as soon as it is known.
+"""How a run ended, stored in its directory as soon as the run ends.
 
-The file is made when the run begins and is blank until the end is known. Its space on the disk is
-thus reserved, and the reason can be stored when the disk is full or no longer writable.
+The file is created blank when the run begins. This reserves its space on the disk, so the reason
+can be stored even if the disk is full or no longer writable.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ class RunEnding:
     status: ExitStatus
     reason: str
     startup_s: float | None = None
-    """Wall time from the launch to simulated time 0; None if it is not known."""
+    """Wall time from the launch to simulated time 0; None if unknown."""
 
 
 class EndingFile:
@@ -67,7 +67,7 @@ class EndingFile:
         self._is_blank = False
         found = {"exit": {"status": int(status), "reason": reason}, "startup_s": startup_s}
         text = json.dumps(found).encode().ljust(_RESERVED_BYTES)
-        with contextlib.suppress(OSError):  # the terminal shows it, too
+        with contextlib.suppress(OSError):  # the terminal also shows the ending
             self._file.seek(0)
             self._file.write(text)
             self._file.truncate()

@@ -1,7 +1,8 @@
 """The numeric record of a run: spool in, Parquet out, structured arrays back.
 
-``RUN/record/TABLE.parquet`` is the run's truth; ``docs/record.md`` documents the columns. Vectors
-are stored one column per entry (``x_1``, ``x_2``, …) so that any reader of Parquet takes them.
+``RUN/record/TABLE.parquet`` is the authoritative record; ``docs/record.md`` documents the columns.
+Vectors are stored as one column per entry (``x_1``, ``x_2``, …), so every Parquet reader can read
+them.
 """
 
 import contextlib
@@ -75,7 +76,7 @@ class RunRecord:
         return self._rows[table]
 
     def owned_by(self, role: str) -> dict[str, Rows]:
-        """The tables that a process fills."""
+        """Return the tables that a process writes."""
         return {table: self[table] for table in self.tables if OWNER[table] == role}
 
     def lives(self, role: str) -> list["Life"]:
@@ -85,7 +86,7 @@ class RunRecord:
         reports |= {one.get("generation", 0): one for one in self.earlier if one["process"] == role}
         again = any((one["process"], one["level"]) == (role, RESTART) for one in self.notices)
         begun = generations(owned) if again else [0]
-        which = {  # an unexpected number belongs to the generation before
+        which = {  # a row with an unexpected number belongs to the generation before
             table: np.searchsorted(begun, rows["input"] // GENERATION, side="right") - 1
             for table, rows in owned.items()
         }
@@ -104,7 +105,7 @@ class RunRecord:
 
 
 class Life(NamedTuple):
-    """The rows and report of one generation of a process."""
+    """The rows and the report of one generation of a process."""
 
     generation: int
     rows: Mapping[str, Rows]
@@ -125,9 +126,9 @@ class Life(NamedTuple):
 
 
 def generations(owned: Mapping[str, Rows]) -> list[int]:
-    """The generations of a role that left rows: the first input of each has a number of its own.
+    """Return the generations of a role that wrote rows, from the number of each one's first input.
 
-    If that row is missing, the rows of a later generation show that there were earlier ones.
+    If that row is missing, the rows of a later generation prove that there were earlier ones.
 
     Args:
         owned: the rows of the role's tables.
@@ -142,7 +143,7 @@ def load_record(run_dir: Path) -> RunRecord:
     """Read the record of a run directory.
 
     Raises:
-        CallerError: it is not a run directory, or its record was never finished or is damaged.
+        CallerError: the path is no run directory, or the record is unfinished or damaged.
     """
     folder = run_dir / RECORD
     if not (run_dir / SCENARIO_FILE).is_file():
@@ -175,9 +176,9 @@ def write_record(record: RunRecord, run_dir: Path) -> None:
 
 
 def finish_record(run_dir: Path) -> RunRecord:
-    """Turn a run's spool into its record, and remove the spool.
+    """Convert a run's spool to its record, and remove the spool.
 
-    It merges all spools; rows that were spooled twice count once.
+    It merges all spools and removes duplicate rows.
 
     Raises:
         MachineError: the record cannot be written; the spool is kept.
@@ -192,7 +193,7 @@ def finish_record(run_dir: Path) -> RunRecord:
     record = RunRecord(scenario, rows, notices, reports, kind_of(run_dir), earlier)
     try:
         write_record(record, run_dir)
-        if spool.is_dir():  # moved in one step, so that half a spool is never read as a whole
+        if spool.is_dir():  # moved in one step, so that an incomplete spool is never read
             shutil.rmtree(spool.rename(spool.with_name(f"{SPOOL}.done")), ignore_errors=True)
     except OSError as error:
         raise MachineError(
@@ -203,7 +204,7 @@ def finish_record(run_dir: Path) -> RunRecord:
 
 
 def merge_rows(parts: Sequence[Rows], dtype: np.dtype[np.void]) -> Rows:
-    """Put the rows of a table in the order of the machine's inputs, each of them once.
+    """Return the rows of a table in the order of the machine's inputs, without duplicates.
 
     Args:
         parts: batches, in any order.
@@ -217,11 +218,13 @@ def merge_rows(parts: Sequence[Rows], dtype: np.dtype[np.void]) -> Rows:
 def updates_in(
     packets: Rows, flow: Flow = Flow.UPDATE
 ) -> tuple[Rows, NDArray[np.int64], NDArray[np.int64]]:
-    """Pick the loop's updates from what reached the network emulator, which reads no payload.
+    """Select the loop's updates from the packets that reached the network emulator.
+
+    The emulator reads no payload, so the packets' headers are read here.
 
     Args:
         packets: rows of ``netem_packet``.
-        flow: the updates, or what else.
+        flow: the flow to select.
 
     Returns:
         Their rows of ``netem_packet``, sequence numbers and event times.
@@ -231,7 +234,7 @@ def updates_in(
         header = read_header(head.tobytes())
         if header is None or (header.version, header.flow) != (VERSION, flow):
             continue
-        if header.sequence < 2**63 and header.t_ns >= 0:  # what else has no place in the record
+        if header.sequence < 2**63 and header.t_ns >= 0:  # others do not fit the record's columns
             kept.append(i)
             sequences.append(header.sequence)
             events_ns.append(header.t_ns)
@@ -280,11 +283,11 @@ def report_of(role: str, said: bytes | str, tables: Iterable[str]) -> dict[str, 
 
     Args:
         role: the process.
-        said: what it said.
-        tables: the run's.
+        said: the JSON text.
+        tables: the run's tables.
 
     Raises:
-        PeerError: it is no report, or does not account for every table of the process.
+        PeerError: the text is no report, or has no entry for a table of the process.
     """
     report = parse_message(ProcessReport, said)
     if not report["rows"].keys() >= {table for table in tables if OWNER[table] == role}:
@@ -312,12 +315,12 @@ def write_reports(run_dir: Path, reports: Iterable[Mapping[str, Any]]) -> None:
 def _reports(
     run_dir: Path, rows: Mapping[str, Rows]
 ) -> tuple[dict[str, dict[str, Any]], list[dict[str, Any]]]:
-    """Return the reports of the last process of each role, and those of the ones before."""
+    """Return the reports of the last process of each role, and those of earlier processes."""
     try:
         said = read_object(run_dir / REPORTS_FILE)
         entries = [(role, said[role]) for role in LOOP_ROLES if role in said]
         entries += [(one["process"], one) for one in said.get(_EARLIER, ())]
-    # A killed recorder wrote none, or part of one.
+    # A killed recorder wrote no report or an incomplete one.
     except (LookupError, TypeError):
         return {}, []
     reports: dict[str, dict[str, Any]] = {}
@@ -377,11 +380,11 @@ def read_table(path: Path, dtype: np.dtype[np.void]) -> pa.Table:
     """Read a table's file as it is.
 
     Args:
-        path: of the Parquet file.
+        path: path of the Parquet file.
         dtype: the table's row type.
 
     Raises:
-        CallerError: it cannot be read, or lacks what rows of that type have.
+        CallerError: the file cannot be read, or does not have all columns of that type.
     """
     try:
         table = pq.read_table(path)

@@ -56,7 +56,7 @@ SINGLE_TRACK_LANE_DEFAULTS: Mapping[str, float] = {
     "front_n_per_rad": 129_697.0, "rear_n_per_rad": 105_400.0,
     "speed_m_per_s": 15.0, "look_ahead_m": 20.0, "gain": 0.5,
 }  # fmt: skip
-"""The BMW 320i of CommonRoad's vehicle models; its tyres carry its weight at rest."""
+"""The BMW 320i of CommonRoad's vehicle models, with its tyres under the static load."""
 
 
 def single_track_lane(parameters: Mapping[str, float]) -> NamedModel:

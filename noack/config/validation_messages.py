@@ -195,7 +195,7 @@ def _choices(kind: Any) -> tuple[Mapping[str, type[BaseModel]], str]:
 
 
 def _own_check(key: str, value: Any, message: str) -> str:
-    """Split the message of a section's own check, ``inner key: what is wrong``."""
+    """Add key and value to the message of a section's check, ``inner key: what is wrong``."""
     inner, colon, rest = message.partition(": ")
     if not colon or not isinstance(value, Mapping):
         shown = f" = {_show(value)}" if isinstance(value, str) else ""

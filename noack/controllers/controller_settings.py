@@ -60,7 +60,7 @@ class ControllerSettings(ScenarioSection):
     """Whether u = K(x_c − x_r) + u_r, as the theory assumes."""
 
     kind: str
-    """What the controller is."""
+    """The kind of controller."""
     rate_hz: RateHz = 500.0
     """Control inputs per second of simulated time."""
     phase: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.5

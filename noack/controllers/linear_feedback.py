@@ -12,7 +12,7 @@ class LinearFeedbackSettings(ControllerSettings):
     is_linear: ClassVar = True
 
     kind: Literal["linear"] = "linear"
-    """What the controller is."""
+    """The kind of controller."""
 
     def law(self, model: ControlModel) -> "LinearFeedback":
         """Return the law with the scenario's gain."""

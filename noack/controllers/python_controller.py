@@ -35,7 +35,7 @@ class PythonControllerSettings(ClassSettings, ControllerSettings):
     group: ClassVar = "noack.controllers"
 
     kind: Literal["python"]
-    """What the controller is."""
+    """The kind of controller."""
 
     def law(self, model: ControlModel) -> "PythonLaw":
         """Return an object of the class."""

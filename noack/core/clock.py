@@ -15,7 +15,7 @@ class RunClock:
     Args:
         epoch_ns: monotonic clock reading at simulated time 0, common to all processes of a run.
         speed: simulated seconds per wall second, positive.
-        monotonic_ns: the wall clock; the system's monotonic clock unless a test says otherwise.
+        monotonic_ns: the wall clock; the system's monotonic clock by default, another one in tests.
     """
 
     def __init__(
@@ -36,6 +36,6 @@ class RunClock:
         return wall_ns if self.speed == 1.0 else int(wall_ns * self.speed)
 
     def wall_s_until(self, t_ns: int) -> float:
-        """Wall seconds from now until simulated time ``t_ns``; negative once it has passed."""
+        """Return the wall seconds until simulated time ``t_ns``; negative if it is in the past."""
         wall_ns = self._monotonic_ns() - self.epoch_ns
         return (t_ns / self.speed - wall_ns) * 1e-9

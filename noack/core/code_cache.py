@@ -1,7 +1,7 @@
 """The cache of compiled code, in the user's cache folder.
 
-numba unpickles cached files, so that another user who can write there could run code as this user.
-A folder that another user can change is neither read nor written.
+numba unpickles cached files. So another user who can write to the cache could run code as this
+user. For this reason a folder that another user can change is neither read nor written.
 """
 
 import hashlib
@@ -26,10 +26,10 @@ _KEPT_S = 30 * 24 * 3600
 
 
 def cache_folder(name: str, sources: Iterable[Path]) -> Path | None:
-    """Return the cache folder for code of these sources; None if there can be none.
+    """Return the cache folder for code of these sources; None if there is no safe, writable one.
 
-    The folder's name depends on the content of all sources: numba itself checks the file of the
-    outermost function only. Only the user and root can change it and the folders above it.
+    The folder's name depends on the content of all sources, because numba checks only the file of
+    the outermost function. Only the user and root can change the folder and the folders above it.
     """
     digest = hashlib.blake2b(version("numba").encode(), digest_size=8)
     for source in sources:
@@ -44,16 +44,16 @@ def cache_folder(name: str, sources: Iterable[Path]) -> Path | None:
         with tempfile.TemporaryFile(dir=folder) as probe:
             if next(folder.rglob("*.nbi"), None) is None:
                 os.posix_fallocate(probe.fileno(), 0, _ROOM_BYTES)
-    except (OSError, RuntimeError):  # not writable, another user's, full, or no home
+    except (OSError, RuntimeError):  # not writable, another user's folder, disk full, or no home
         return None
     return folder
 
 
 def _make_own(folder: Path) -> None:
-    """Make a folder, and those above it that do not exist, for the user alone.
+    """Create a folder, and missing folders above it, with access for the user only.
 
     Raises:
-        PermissionError: another user may change it, or one above it.
+        PermissionError: another user may change the folder or a folder above it.
     """
     for level in (*reversed(folder.parents), folder):
         with suppress(FileExistsError):
@@ -61,7 +61,7 @@ def _make_own(folder: Path) -> None:
         status = level.stat(follow_symlinks=False)
         if level == folder.parent:
             _require_own(level, status)
-            level.chmod(0o700)  # whatever the umask was
+            level.chmod(0o700)  # independent of the umask
         elif status.st_uid not in (0, os.getuid()) or _others_may_write(status):
             raise PermissionError(f"{level} can be changed by another user")
     _require_own(folder, status)
@@ -69,16 +69,16 @@ def _make_own(folder: Path) -> None:
 
 
 def _examine(file: Path) -> None:
-    """Require that a file is the user's; remove it if it is empty."""
-    with suppress(FileNotFoundError):  # another process renames what it has written
+    """Require that a file belongs to the user; remove it if it is empty."""
+    with suppress(FileNotFoundError):  # another process may have renamed it
         status = file.lstat()
         _require_own(file, status)
         if file.suffix in (".nbi", ".nbc") and status.st_size == 0:
-            file.unlink()  # left by a power failure; numba would fail on it
+            file.unlink()  # from a power failure; numba fails on an empty file
 
 
 def _others_may_write(status: os.stat_result) -> bool:
-    """Whether others may replace the user's files; in a sticky folder they may not."""
+    """Return whether others may replace the user's files; in a sticky folder they may not."""
     return bool(status.st_mode & 0o022) and not status.st_mode & stat.S_ISVTX
 
 
@@ -88,19 +88,19 @@ def _require_own(path: Path, status: os.stat_result) -> None:
 
 
 def is_kept(folder: Path | None, function: Callable[..., Any]) -> bool:
-    """Whether a function has been compiled before, for this machine, and is in a folder."""
+    """Return whether a folder has the compiled code of a function for this computer."""
     return folder is not None and any(folder.rglob(f"*.{function.__name__}-*.nbi"))
 
 
 def while_compiling(what: str, kept: bool, about_s: float | None = None) -> str:
-    """Line that explains the wait for a compilation."""
+    """Return the line that explains the wait for a compilation."""
     once = "once" if kept else "as the user's cache (XDG_CACHE_HOME) cannot be used"
     time = " ..." if about_s is None else f"; this takes about {about_s:.0f} s"
     return f"compiling {what} for this machine, {once}{time}"
 
 
 def _forget_old(folder: Path, name: str) -> None:
-    """Delete code of other sources that has not been used for 30 days."""
+    """Delete the code of other sources if it has not been used for 30 days."""
     os.utime(folder)
     for other in folder.parent.glob(f"{name}-*"):
         if other.stat().st_mtime < time.time() - _KEPT_S:
@@ -110,7 +110,7 @@ def _forget_old(folder: Path, name: str) -> None:
 def compiler(folder: Path | None, **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return a compiler of functions that caches in a folder, if there is one.
 
-    Without a folder numba must not cache at all: it could find code of other sources elsewhere.
+    Without a folder numba must not cache at all: it could load code of other sources elsewhere.
     """
     if folder is None:
         compiling: Callable[[Callable[..., Any]], Any] = _numba().njit(**options)
@@ -126,11 +126,11 @@ def compiler(folder: Path | None, **options: Any) -> Callable[[Callable[..., Any
 
 
 def _one_at_a_time(compiling: Callable[[Any], Any], lock: Path) -> Callable[[Any], Any]:
-    """Let one process compile at a time; the others then read the cache."""
+    """Allow one process to compile at a time; the others then read the cache."""
 
     def compile_alone(signature: Any) -> Any:
         with ExitStack() as stack:
-            with suppress(OSError):  # without file locks all of them compile
+            with suppress(OSError):  # without file locks every process compiles
                 stack.enter_context(locked(lock, wait=True))
             with _to_the_end():
                 return compiling(signature)
@@ -140,7 +140,7 @@ def _one_at_a_time(compiling: Callable[[Any], Any], lock: Path) -> Callable[[Any
 
 @contextmanager
 def _to_the_end() -> Iterator[None]:
-    """Delay Ctrl-C: LLVM calls Python back, and does not survive an exception there."""
+    """Delay Ctrl-C: an exception in a Python callback of LLVM would crash the process."""
     before = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(before):
         yield

@@ -1,4 +1,4 @@
-"""Errors that say who erred: the caller, a peer, or the machine the process runs on."""
+"""Errors by cause: the caller, a peer process, or the computer that the process runs on."""
 
 import os
 from enum import IntEnum
@@ -17,9 +17,9 @@ class ExitStatus(IntEnum):
 
 
 class NoackError(Exception):
-    """An error that is reported as one line, without a traceback; one line for each mistake.
+    """An error that is reported without a traceback, in one line for each mistake.
 
-    Quoted input may contain anything: unprintable characters are escaped.
+    Quoted input may contain any character: unprintable characters are escaped.
     """
 
     exit_status = ExitStatus.FAILED
@@ -29,7 +29,7 @@ class NoackError(Exception):
 
 
 class CallerError(NoackError):
-    """The caller asked for something wrong: a scenario key, a path, an argument."""
+    """The caller's input is wrong: a scenario key, a path, an argument."""
 
     exit_status = ExitStatus.CALLER
 
@@ -43,11 +43,11 @@ class NoAnswerError(PeerError):
 
 
 class MachineError(NoackError):
-    """The operating system refused: a port is taken, the disk is full, a file cannot be read."""
+    """The operating system reported an error: port in use, disk full, file not readable."""
 
 
 class NeverStartedError(NoackError):
-    """A run ended before its start; the exit status says who erred."""
+    """A run ended before its start; the exit status shows the cause."""
 
     def __init__(self, message: str, exit_status: ExitStatus) -> None:
         super().__init__(message)
@@ -60,12 +60,12 @@ def one_line(error: BaseException) -> str:
 
 
 def why(error: OSError) -> str:
-    """Return the system's reason for an error, without additions of libraries."""
+    """Return the operating system's text of an error, without additions by libraries."""
     return os.strerror(error.errno) if error.errno else one_line(error)
 
 
 def shortened(text: str, longest: int = 80) -> str:
-    """Return a text, or its beginning and ``...`` if it has more than so many characters."""
+    """Return a text, or its beginning and ``...`` if it has more than ``longest`` characters."""
     return text if len(text) <= longest else f"{text[: longest - 3]}..."
 
 

@@ -1,4 +1,4 @@
-"""Advisory locks on files and folders; the system releases them when their holder ends."""
+"""Advisory locks on files and folders; the system releases them when their process ends."""
 
 import fcntl
 from collections.abc import Iterator
@@ -16,14 +16,14 @@ def lock(file: int | _Descriptor, *, shared: bool = False, wait: bool = False) -
 
     Args:
         file: the file, or its descriptor.
-        shared: others may hold shared locks at the same time.
-        wait: wait for other holders.
+        shared: other processes may have shared locks at the same time.
+        wait: wait until other processes release their locks.
 
     Returns:
-        False if another holds a lock, and ``wait`` is false.
+        False if another process has the lock and ``wait`` is false.
 
     Raises:
-        OSError: the file system has no locks.
+        OSError: the file system does not support locks.
     """
     kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
     try:

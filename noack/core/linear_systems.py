@@ -20,15 +20,15 @@ _SAFE = 1e-140
 
 
 def transition(generator: Matrix, dt_ns: int) -> Matrix:
-    """The transition matrix e^{G dt}, shape (n, n), of ``dz/dt = G z`` over ``dt_ns``."""
-    # A slow import, only for programs that propagate states.
+    """Return the transition matrix e^{G dt}, shape (n, n), of ``dz/dt = G z`` over ``dt_ns``."""
+    # Imported here because the import is slow and not every program propagates states.
     from scipy.linalg import expm
 
     return np.ascontiguousarray(expm(generator * (dt_ns * 1e-9)))
 
 
 def discretise(A: Matrix, B: Matrix, dt_ns: int) -> tuple[Matrix, Matrix]:
-    """Exact zero-order-hold discretisation of ``dx/dt = A x + B u`` with u held over ``dt_ns``.
+    """Return the exact discretisation of ``dx/dt = A x + B u`` with u held over ``dt_ns``.
 
     Both blocks come from one exponential, e^{[[A, B], [0, 0]] dt} (Van Loan, 1978), so A may be
     singular.
@@ -47,7 +47,7 @@ def discretise(A: Matrix, B: Matrix, dt_ns: int) -> tuple[Matrix, Matrix]:
 class Propagator:
     """Advances states of the autonomous system ``dz/dt = G z`` exactly.
 
-    Transition matrices are cached by step; a loop on a time grid sees few distinct steps.
+    Transition matrices are cached by step; a loop on a time grid has few distinct steps.
 
     Args:
         generator: G, shape (n, n), per second.
@@ -87,16 +87,16 @@ class HeldInputPropagator:
 
 
 def norm(vector: Vector) -> float:
-    """Euclidean norm ‖v‖₂ of a vector of shape (n,); avoids overflow of squares."""
+    """Return the Euclidean norm ‖v‖₂ of a vector of shape (n,) without overflow of squares."""
     return math.hypot(*vector.tolist())
 
 
 def row_norms(rows: Matrix) -> Vector:
-    """Euclidean norms of k vectors, (k, n) → (k,); avoids overflow of squares.
+    """Return the Euclidean norms of k vectors, (k, n) → (k,), without overflow of squares.
 
-    Where squares are safe, these are numpy's, bit for bit.
+    If the squares are safe, the results equal numpy's bit-exactly.
     """
-    with np.errstate(over="ignore", under="ignore"):  # recomputed below
+    with np.errstate(over="ignore", under="ignore"):  # affected norms are recomputed below
         norms = np.asarray(np.linalg.norm(rows, axis=1))
     doubtful = (norms < _SAFE) | ~(norms < 1 / _SAFE)
     if doubtful.any():
@@ -107,5 +107,5 @@ def row_norms(rows: Matrix) -> Vector:
 
 
 def spectral_abscissa(matrix: Matrix) -> float:
-    """Largest real part of the eigenvalues, per second."""
+    """Return the largest real part of the eigenvalues, per second."""
     return float(np.linalg.eigvals(matrix).real.max())

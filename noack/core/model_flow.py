@@ -1,6 +1,6 @@
 """The model of sensor and controller between updates: dx/dt = H(x − x_r), solved exactly.
 
-The set-point x_r changes at times known to both, so that both models change alike.
+The set-point x_r changes at the same times in sensor and controller, so both models stay equal.
 """
 
 from bisect import bisect_right
@@ -29,14 +29,14 @@ class ModelFlow:
         self._moved = setpoint is not None
 
     def change(self, since_ns: int, setpoint: Vector | None) -> None:
-        """Set another set-point from a time on; times must not decrease."""
+        """Change the set-point from ``since_ns`` on; times must not decrease."""
         if not _same(self._setpoints[-1], setpoint):
             self._since_ns.append(since_ns)
             self._setpoints.append(setpoint)
             self._moved = True
 
     def setpoint(self, t_ns: int) -> Vector | None:
-        """x_r at a time; None is 0."""
+        """Return x_r at a time; None is 0."""
         return self._setpoints[bisect_right(self._since_ns, t_ns)]
 
     @property

@@ -1,22 +1,22 @@
-"""Numbers as people read them: with units, with the digits that matter, with an interval."""
+"""Formats numbers for tables and messages: with units, significant digits, and intervals."""
 
 import math
 from decimal import Decimal
 
 NONE = "-"
-"""In the place of a number that is missing."""
+"""Text for a missing number."""
 
 _DIGITS = 2
-"""Digits of the half-width."""
+"""Significant digits of the half-width."""
 _ALONE = 4
-"""Digits of a mean without an interval, or with one that is not written out."""
+"""Significant digits of a mean without an interval, or with an interval in exponent notation."""
 _FIXED = range(-5, 7)
-"""Powers of ten that are written out."""
+"""Powers of ten that are written without exponent notation."""
 _SIZES = (1e9, 1e6, 1e3)
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """Write a number with so many significant digits."""
+    """Write a number with ``digits`` significant digits."""
     return NONE if value is None or math.isnan(value) else f"{value:.{digits}g}"
 
 
@@ -26,7 +26,7 @@ def whole(value: float | None) -> str:
 
 
 def seconds(value_s: float | None, decimals: int = 3) -> str:
-    """Write a time in seconds with so many decimals."""
+    """Write a time in seconds with ``decimals`` decimals."""
     return NONE if value_s is None else f"{value_s:.{decimals}f} s"
 
 
@@ -58,9 +58,10 @@ def _with_unit(value: float, units: tuple[str, str, str, str]) -> str:
 
 
 def plus_minus(mean: float, halfwidth: float) -> str:
-    """Write ``mean ± halfwidth``; the mean alone where there is no interval.
+    """Write ``mean ± halfwidth``; only the mean if there is no interval.
 
-    The half-width has two digits, the mean as many places: ``0.1594 ± 0.016`` is ``0.159 ± 0.016``.
+    The half-width has two significant digits. The mean has as many decimals as the half-width:
+    ``0.1594 ± 0.016`` is ``0.159 ± 0.016``.
     """
     if not (math.isfinite(mean) and math.isfinite(halfwidth) and halfwidth > 0):
         return f"{mean:.{_ALONE}g}".replace("-", "−")
@@ -75,6 +76,6 @@ def _power(number: float) -> int:
 
 
 def _rounded(number: float, last: int) -> str:
-    """Round to a multiple of 10^last, which is the last digit that is written."""
+    """Round to a multiple of 10^last; this is the last written digit."""
     rounded = Decimal(repr(number)).quantize(Decimal(1).scaleb(last)) + 0  # no −0
     return f"{rounded:.{max(-last, 0)}f}"

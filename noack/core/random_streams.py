@@ -1,7 +1,7 @@
 """Named random streams: every random choice of a run comes from one of them.
 
-A stream depends on its seed and its name only, so that (for example) the loss sequence of a link is
-the same whatever the plant, the timing or the other links draw.
+A stream depends on its seed and its name only. So the loss sequence of a link, for example, does
+not depend on the random numbers of the plant, the timing or other links.
 """
 
 import hashlib
@@ -24,7 +24,7 @@ def stream(seed: int, *name: str) -> "np.random.Generator":
 
 
 def words(seed: int, *name: str, rows: range, width: int) -> NDArray[np.uint64]:
-    """Return rows of a random table; each depends on its number only.
+    """Return rows of a random table; each row depends on its number only.
 
     Philox4x64 is counter-based: any row is computed directly.
 
@@ -55,9 +55,9 @@ def uniforms(seed: int, *name: str, rows: range, width: int) -> NDArray[np.float
 def normals(seed: int, *name: str, rows: range, width: int) -> NDArray[np.float64]:
     """Return rows of a table of standard normal numbers; see :func:`words`.
 
-    By inversion of the distribution function, so that each takes exactly one word.
+    They are computed by inversion of the distribution function, so each uses exactly one word.
     """
-    # A slow import, only for programs that draw normals.
+    # Imported here because the import is slow and few programs need normal numbers.
     from scipy.special import ndtri
 
     centred = uniforms(seed, *name, rows=rows, width=width) + 2.0**-54
@@ -85,7 +85,7 @@ def stream_keys(seeds: NDArray[np.uint64], *name: str) -> NDArray[np.int64]:
         seeds: (k,), below 2⁶⁴.
         name: the stream's path.
     """
-    # numpy's SeedSequence, many at once. A seed below 2¹²⁸ is four words of entropy.
+    # numpy's SeedSequence for many seeds at once. A seed below 2¹²⁸ is four words of entropy.
     words = np.zeros((8, len(seeds)), np.uint32)
     words[0] = seeds & np.uint64(0xFFFFFFFF)
     words[1] = seeds >> np.uint64(32)
@@ -104,7 +104,7 @@ def stream_keys(seeds: NDArray[np.uint64], *name: str) -> NDArray[np.int64]:
 
 
 class _Hash:
-    """SeedSequence's hash of words of 32 bits, whose constant changes with each use."""
+    """SeedSequence's hash of words of 32 bits; its constant changes with each use."""
 
     def __init__(self, constant: int, factor: int) -> None:
         self._constant, self._factor = constant, factor

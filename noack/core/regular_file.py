@@ -1,4 +1,4 @@
-"""Reading regular files of limited size; devices are endless, and a FIFO may block."""
+"""Reads regular files of limited size; devices are refused as endless, and FIFOs as they block."""
 
 import os
 import stat
@@ -9,12 +9,12 @@ def read_regular(path: Path, most_bytes: int) -> bytes:
     """Return the bytes of a regular file.
 
     Args:
-        path: of the file.
+        path: path of the file.
         most_bytes: its maximum size.
 
     Raises:
-        OSError: it cannot be opened or read.
-        ValueError: it is a device, a FIFO or a directory; or it is larger.
+        OSError: the file cannot be opened or read.
+        ValueError: the file is a device, a FIFO or a directory, or it is too large.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # so that a FIFO does not block
     try:

@@ -1,4 +1,4 @@
-"""Files that are either written in full or not at all."""
+"""Writes files atomically: completely or not at all."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -10,9 +10,9 @@ def write_whole(path: Path, content: str | bytes, remedy: str = "") -> Path:
     """Write a file, or replace it, in one step; return its path.
 
     Args:
-        path: of the file; missing folders are created.
+        path: path of the file; missing folders are created.
         content: text, written as UTF-8, or bytes.
-        remedy: ends the message if the file cannot be written.
+        remedy: end of the error message if the file cannot be written.
 
     Raises:
         MachineError: the file cannot be written.

@@ -35,7 +35,7 @@ class DisturbanceSettings(ScenarioSection):
     """Settings of this kind with one entry, for property tests and benchmarks."""
 
     kind: str
-    """What the disturbance is."""
+    """The kind of disturbance."""
     at: Place = "input"
     """Where it enters: added to the input, or to ẋ (of a linear plant)."""
 

@@ -18,7 +18,7 @@ class GaussianDisturbance(DisturbanceSettings):
     example: ClassVar = {"kind": "gaussian", "std": [0.2]}
 
     kind: Literal["gaussian"]
-    """What the disturbance is."""
+    """The kind of disturbance."""
     std: Row
     """Standard deviation of the value of a step, entry by entry."""
 

@@ -18,7 +18,7 @@ class UniformDisturbance(DisturbanceSettings):
     example: ClassVar = {"kind": "uniform", "bound": [0.3]}
 
     kind: Literal["uniform"]
-    """What the disturbance is."""
+    """The kind of disturbance."""
     bound: Row
     """Largest absolute value, entry by entry."""
 

@@ -24,7 +24,7 @@ class KalmanSettings(ObserverSettings):
     }  # fmt: skip
 
     kind: Literal["kalman"]
-    """What the observer is."""
+    """The kind of observer."""
     process_std: Row | None = None
     """Standard deviation of w in ẋ = Âx + B̂u + w, constant over a step of the plant, n entries; by
     default that of the random disturbances at = "state"."""

@@ -25,7 +25,7 @@ class LuenbergerSettings(ObserverSettings):
     example: ClassVar = {"kind": "luenberger", "poles_per_s": [-20.0, -25.0]}
 
     kind: Literal["luenberger"]
-    """What the observer is."""
+    """The kind of observer."""
     gain: Rows | None = None
     """L by rows, n x p."""
     poles_per_s: tuple[Pole, ...] | None = None

@@ -30,7 +30,7 @@ class ObserverSettings(ScenarioSection):
     """Settings of this kind for two states, one input and one output, for property tests."""
 
     kind: str
-    """What the observer is."""
+    """The kind of observer."""
     initial_estimate: Row | None = None
     """x̂ before the first measurement, n entries; by default x(0) if the sensor starts from it,
     else 0."""

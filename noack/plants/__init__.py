@@ -1,1 +1,1 @@
-"""Kinds of plants, one per file: settings, equations and what x and u are."""
+"""Kinds of plants, one per file: settings, equations and the meaning of x and u."""

@@ -12,7 +12,7 @@ class CartPoleSettings(EquationSettings):
     """A pole on a cart; a force moves the cart on a straight rail.
 
     The default parameters are those of the Control Tutorials for MATLAB and Simulink (University of
-    Michigan, "Inverted Pendulum"), whose angle has the opposite sign.
+    Michigan, "Inverted Pendulum"), where the angle has the opposite sign.
     """
 
     states: ClassVar = ("position, m", "velocity, m/s", "angle from upright, rad", "rate, rad/s")
@@ -20,7 +20,7 @@ class CartPoleSettings(EquationSettings):
     scenario: ClassVar = "cart_pole"
 
     kind: Literal["cart_pole"]
-    """What the plant is."""
+    """The kind of plant."""
     cart_kg: Positive = 0.5
     """Mass of the cart."""
     pole_kg: Positive = 0.2

@@ -39,7 +39,7 @@ class DcMotorSettings(PlantSettings):
     scenario: ClassVar = "dc_motor"
 
     kind: Literal["dc_motor"]
-    """What the plant is."""
+    """The kind of plant."""
     resistance_ohm: Positive = 4.0
     """R of the armature."""
     inductance_h: Positive = 2.75e-6

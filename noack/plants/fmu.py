@@ -11,7 +11,7 @@ from noack.settings.user_files import FileSettings
 
 
 class FmuSettings(FileSettings, PlantSettings):
-    """A Functional Mock-up Unit for co-simulation, FMI 2 or 3: a model exported by another tool.
+    """A Functional Mock-up Unit for co-simulation, FMI 2 or 3: an exported model of another tool.
 
     It is native code that runs in the plant's process; see docs/plants.md.
     """
@@ -19,7 +19,7 @@ class FmuSettings(FileSettings, PlantSettings):
     needs: ClassVar = ("fmpy", "fmi")
 
     kind: Literal["fmu"]
-    """What the plant is."""
+    """The kind of plant."""
     file: str
     """The FMU; a relative name is relative to the scenario file."""
     state_variables: Annotated[Names, Field(min_length=1)]

@@ -11,12 +11,12 @@ _EMPTY = np.zeros(0)
 
 
 class LinearSettings(PlantSettings):
-    """ẋ = A x + B u; plant.draw and the related keys set A and B."""
+    """ẋ = A x + B u, with A and B as the plant's other keys draw them."""
 
     scenario: ClassVar = "lane_following"
 
     kind: Literal["linear"] = "linear"
-    """What the plant is."""
+    """The kind of plant."""
 
     def system(self, start: PlantStart) -> "LinearSystem":
         """Return the system at x(0)."""

@@ -51,7 +51,7 @@ class PlantSettings(ScenarioSection):
     """Settings that tests and benchmarks use one after the other."""
 
     kind: str
-    """What the plant is."""
+    """The kind of plant."""
 
     @property
     def settling_s(self) -> float:

@@ -27,7 +27,7 @@ _START_TOLERANCE = 1e-6
 
 
 class PythonPlantSettings(ClassSettings, PlantSettings):
-    """A class of the user, from an installed package or from a file.
+    """A class of the user's own, from an installed package or from a file.
 
     Its code runs in the plant's process; docs/plants.md lists the methods that it must have.
     """
@@ -35,7 +35,7 @@ class PythonPlantSettings(ClassSettings, PlantSettings):
     group: ClassVar = "noack.plants"
 
     kind: Literal["python"]
-    """What the plant is."""
+    """The kind of plant."""
     on_record: Names = ()
     """Names of the entries of the class's own state z; if they are given, z is recorded."""
 

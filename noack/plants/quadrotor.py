@@ -25,7 +25,7 @@ class QuadrotorSettings(EquationSettings):
     scenario: ClassVar = "quadrotor_hover"
 
     kind: Literal["quadrotor"]
-    """What the plant is."""
+    """The kind of plant."""
     mass_kg: Positive = 0.468
     """Mass."""
     inertia_kg_m2: tuple[Positive, Positive, Positive] = (4.856e-3, 4.856e-3, 8.801e-3)

@@ -38,7 +38,7 @@ _PARAMETERS = {"ford_escort": 1, "bmw_320i": 2, "vw_vanagon": 3, "truck": 4}
 
 
 class VehicleSettings(EquationSettings):
-    """A road vehicle of CommonRoad's vehicle models, on a lane along the x-axis.
+    """A road vehicle of CommonRoad's vehicle models, beside the lane that the x-axis is.
 
     Althoff and Würsching, "CommonRoad: Vehicle Models", 2020. x is the state of the lane models: V
     and Y_g have the opposite sign of the library's coordinates. u is the requested steering angle.
@@ -56,7 +56,7 @@ class VehicleSettings(EquationSettings):
     )  # fmt: skip
 
     kind: Literal["vehicle"]
-    """What the plant is."""
+    """The kind of plant."""
     model: Literal["kinematic", "single_track", "drift", "multi_body"] = "single_track"
     """The library's model: ks (kst for the truck), st, std or mb, in order of their number of
     states."""

@@ -1,1 +1,1 @@
-"""What settings are made of: tables, vectors and matrices, files that a table names."""
+"""The parts of settings: tables, vectors and matrices, files that a table names."""

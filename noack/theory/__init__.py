@@ -1,1 +1,1 @@
-"""Identities and bounds of the theory."""
+"""Identities, bounds and certificates of the theory."""

@@ -1,7 +1,7 @@
-"""Assumptions, the paper's and a certificate's, checked for one scenario before it runs.
+"""Assumptions of the paper and of a certificate, checked for one scenario before it runs.
 
-A claim is worth its assumptions. Each gets a verdict with its reason; what only the run can show
-(delays, the longest loss burst) is checked against the run's record.
+A claim holds only under its assumptions. Each assumption gets a verdict with its reason.
+Assumptions about the run itself (delays, the longest loss burst) are checked against its record.
 """
 
 import math
@@ -19,16 +19,16 @@ from noack.theory.certificate import Constants, NetworkConditions
 
 
 class AssumptionStatus(StrEnum):
-    """What is known of an assumption."""
+    """The status of an assumption."""
 
     HOLDS = "holds"
     VIOLATED = "violated"
     IDEALISED = "idealised"
     """No sampled loop meets it; certificates allow for the difference."""
     NOT_NEEDED = "not needed"
-    """It does not hold, or is not checked, and no bound that is computed here rests on it."""
+    """It does not hold, or is not checked; no computed bound depends on it."""
     ASSUMED = "assumed"
-    """Depends on the run, and is checked in each run."""
+    """It depends on the run and is checked in each run."""
 
 
 class Assumption(NamedTuple):
@@ -36,7 +36,7 @@ class Assumption(NamedTuple):
 
     what: str
     source: str
-    """Where the paper makes it."""
+    """The place in the paper."""
     verdict: AssumptionStatus
     why: str
 
@@ -85,7 +85,7 @@ def _disturbed(resolved: Scenario) -> list[Assumption]:
 
 
 def _estimated(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:
-    """What an observer, or noise, makes of "the sensor measures x"."""
+    """Return the assumptions that replace "the sensor measures x" with an observer or noise."""
     if resolved.coverage.knows_state:
         return []
     found = steady_state(resolved)
@@ -120,11 +120,12 @@ def _estimated(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:
 
 
 def _above_noise(loop: LoopMatrices, resolved: Scenario, found: SteadyState) -> list[Assumption]:
-    """Whether the trigger's least threshold is above what errors of the estimate make of e_s.
+    """Return whether the trigger's smallest threshold is above the e_s from estimation errors.
 
-    That is the difference of two errors, at the last event and now: √2 times their RMS if nothing
-    is left of the one in the other, and three times that to be rarely beyond. With time the first
-    one grows as the plant does, and every threshold is reached.
+    This e_s is the difference between the estimation error now and at the last event. Its RMS is
+    √2 times that of the error if the two are uncorrelated; three times this value is rarely
+    exceeded. For an unstable plant the error from the last event grows until every threshold is
+    reached.
     """
     least = resolved.trigger.least_threshold
     if least is None:
@@ -194,7 +195,7 @@ def _closed_loop(loop: LoopMatrices) -> Assumption:
 
 
 def _other_sign(loop: LoopMatrices) -> str:
-    """A hint where K is the gain of u = −Kx, as most programs give it."""
+    """Return a hint if K seems to be the gain of u = −Kx, the convention of most programs."""
     given, other = (
         spectral_abscissa(loop.A_model + sign * loop.B_model @ loop.K) for sign in (1.0, -1.0)
     )
@@ -277,15 +278,15 @@ def certificate_assumptions(
     constants: Constants | None,
     void: str | None,
 ) -> list[Assumption]:
-    """What a certificate rests on, with verdicts.
+    """Return the assumptions of a certificate, with verdicts.
 
     Args:
         resolved: the scenario.
         conditions: the assumptions about network and schedule.
         decay: decay rates per second, of "the models" and of "A + BK".
         held: whether the models hold instead of decaying.
-        constants: of the certificate; None if there is none.
-        void: why there is none.
+        constants: constants of the certificate; None if there is no certificate.
+        void: reason for having no certificate.
     """
     alpha, network = resolved.decaying.alpha_per_s, resolved.network
     rate = 0.0 if constants is None else constants.rate_per_s
@@ -350,5 +351,5 @@ def _rate(of: str, source: str, alpha: float, decay: float, rate: float) -> Assu
 
 
 def below(alpha_per_s: float, decay_per_s: float) -> bool:
-    """Whether α is clearly below the decay rate: beyond rounding."""
+    """Return whether α is below the decay rate by more than rounding."""
     return alpha_per_s < (1 - 1e-9) * decay_per_s

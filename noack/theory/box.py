@@ -1,14 +1,14 @@
 """Robust certificates: bounds that hold for every plant of an uncertainty box around the model.
 
-With A = Â + Ã, B = B̂ + B̃ and |Ã|, |B̃| below the box's half-widths entry by entry, the plant is
-the model under its own mistakes w = Ã x + B̃ u, u = K x + p:
+Let A = Â + Ã and B = B̂ + B̃, with each entry of |Ã| and |B̃| at most the box's half-width. With
+u = K x + p, the plant is the model with the model error w = Ã x + B̃ u as an additional input:
 
     x' = (Â + B̂K) x + B̂ p + w
 
-Each |w_i| is bounded by the half-widths and the suprema of single coordinates, each coordinate by
-the peak gains (∫ of impulse responses) of the model's closed loop. That is a linear inequality
-between non-negative numbers; where its matrix has a spectral radius below 1 it can be solved, for
-all plants of the box at once, time-varying ones included.
+Each |w_i| is bounded by the half-widths and the suprema of the coordinates. Each coordinate is
+bounded by the peak gains (∫ of impulse responses) of the model's closed loop. The result is a
+linear inequality between non-negative numbers. If the spectral radius of its matrix is below 1, its
+solution holds for all plants of the box, including time-varying ones.
 """
 
 import math
@@ -27,13 +27,13 @@ from noack.theory.gains import Coefficients, ErrorGains, Growth, Output
 
 @dataclass(frozen=True)
 class BoxGains:
-    """All plants of a box, as :func:`noack.theory.certificate.solve` wants a plant.
+    """All plants of a box, in the form of a plant for :func:`noack.theory.certificate.solve`.
 
     Args:
-        error: the models' side.
+        error: gains of the models.
         A_model, B_model: the box's centre, (n, n) and (n, m).
         halfwidth_A, halfwidth_B: the box, (n, n) and (n, m).
-        start: x(0) as a column, (n, 1); or a matrix whose image of the unit ball holds x(0).
+        start: x(0) as a column, (n, 1); or a matrix that maps the unit ball to a set with x(0).
         alpha_per_s: α of the scaling.
     """
 
@@ -47,7 +47,7 @@ class BoxGains:
 
     @cached_property
     def outputs(self) -> Mapping[Output, Matrix]:
-        """C by which x is looked at; the mistakes w come on top of ``MISMATCH``."""
+        """C of each output C x; the model error w is added to ``MISMATCH``."""
         return {
             Output.STATE: np.eye(len(self.A_model)),
             Output.WEIGHTED: self.error.weight,
@@ -78,14 +78,14 @@ class BoxGains:
         return found
 
     def start_up(self, start_s: float) -> tuple[float, Mapping[Output, float]]:
-        """What no input before ``start_s`` adds: p = −K x there, with x' = A x for every A.
+        """Return the effect of zero input before ``start_s``: p = −K x, x' = A x for every A.
 
-        No input makes no mistakes: w = Ã x then, which the bound of w covers.
+        With zero input w = Ã x, which the bound of w covers.
         """
         if start_s == 0:
             return 0.0, dict.fromkeys(self.outputs, 0.0)
         R, box = self.error.split_K[1], float(np.linalg.norm(self.halfwidth_A, 2))
-        # ‖e^{As}‖ ≤ e^{μs}, and the logarithmic norm μ of a sum is at most the sum's.
+        # ‖e^{As}‖ ≤ e^{μs}; the logarithmic norm μ of a sum is at most the sum of both norms.
         mu = max(logarithmic_norm(self.A_model) + box, 0.0) + self.alpha_per_s
         size = float(np.linalg.norm(self.start, 2)) * math.exp(mu * start_s)
         turn = float(np.linalg.norm(R @ self.A_model, 2)) + float(np.linalg.norm(R, 2)) * box
@@ -101,9 +101,9 @@ class BoxGains:
         return error, found
 
     def growth(self, until_s: float, cells: int) -> Growth:
-        """How ‖e_s‖_W grows over ``until_s``, on a grid."""
+        """Return the growth of ‖e_s‖_W over ``until_s``, on a grid."""
         known, mistaken = self._split_nominal[0], self._mistaken_rows
-        # Models that run the box's centre make no mistake that is known.
+        # If H is the closed loop of the box's centre, there is no nominal mismatch.
         apart = self._split_nominal[1].any() or not self._rows
         forced = np.concatenate([known, mistaken], axis=1) if apart else mistaken
         return self.error.growth(forced, self._input_matrix, until_s, cells)
@@ -133,7 +133,7 @@ class BoxGains:
 
     @cached_property
     def _responses(self) -> tuple[ResponseBounds, ResponseBounds, list[ResponseBounds]]:
-        """Of the model's closed loop to x(0), to p, and to each w_i."""
+        """Responses of the model's closed loop to x(0), to p, and to each w_i."""
         return (
             response(self._closed_loop, self.start),
             response(self._closed_loop, self._input_matrix),
@@ -156,17 +156,17 @@ class BoxGains:
 
     @cached_property
     def _coordinates(self) -> list["_PeakGains"]:
-        """Of each coordinate of x and of K x."""
+        """Peak gains of each coordinate of x and of K x."""
         rows = np.concatenate([np.eye(len(self.A_model)), self.error.K])
         return [self._peaks_at(row[None]) for row in rows]
 
     @cached_property
     def _halfwidths(self) -> Matrix:
-        """|w| ≤ these · |(x, u)|."""
+        """Half-widths Δ with |w| ≤ Δ |(x, u)|."""
         return np.concatenate([self.halfwidth_A, self.halfwidth_B], axis=1)[self._rows]
 
     def _mistakes_of(self, coordinates: Vector) -> Vector:
-        """sup|w| that follows from bounds of |(x, K x)| in which w was left out."""
+        """Return sup|w| from bounds of |(x, K x)| that were computed without w."""
         from_w = np.array([gains.from_mistakes for gains in self._coordinates])
         loop = self._halfwidths @ from_w
         if len(loop) and np.abs(np.linalg.eigvals(loop)).max() >= 1:

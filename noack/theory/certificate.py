@@ -1,17 +1,17 @@
-"""Tight certificates: what is guaranteed of a loop, under which conditions, with which constants.
+"""Tight certificates: guaranteed bounds of a loop, their conditions and their constants.
 
-For a trigger ‖e_s‖_W > βe^{−αt} that is tested every h seconds at the latest, a network that drops
-at most M − 1 consecutive updates, and an input that is held, all signals scaled by e^{αt}:
+Assumptions: the trigger ‖e_s‖_W > βe^{−αt} is tested at least every h seconds, the network drops at
+most M − 1 consecutive updates, and the input is held. With all signals scaled by e^{αt}:
 
     sup‖C x‖    ≤ free_C + gain_C π                                     (plant, input error p)
     sup‖C e_c‖  ≤ (‖C W⁻¹‖ + Σ_{j<N} sup_{τ≥jδ} ‖C e^{(H+αI)τ} W⁻¹‖) β̃ = D_C β̃          (I1)
     π = sup‖p‖  ≤ D_K β̃ + σ (sup‖KH x‖ + D_KH β̃) + r(σ) (sup‖x‖_W + D_W β̃) (input of age ≤ σ)
     β̃ = sup‖e_s‖_W ≤ ḡβ + I_E sup‖R_E x‖ + I_B π                         (between two tests)
 
-with N = M − 1 + ⌈d/δ⌉ events missing at most. These are linear in π and β̃ and hold on every [0, T],
-so their solution bounds the run if the loop gain is below 1. The minimum inter-event time δ is the
-time that ‖e_s‖_W needs from 0 to β under these bounds; a δ for which it comes out no smaller than δ
-holds by induction over the events, so that the largest such δ is taken.
+with at most N = M − 1 + ⌈d/δ⌉ missing events. These inequalities are linear in π and β̃ and hold on
+every [0, T]. So their solution bounds the run if the loop gain is below 1. The minimum inter-event
+time δ is the time that ‖e_s‖_W needs from 0 to β under these bounds. If an assumed δ gives a time
+of at least δ, it holds by induction over the events; the largest such δ is used.
 """
 
 import math
@@ -33,42 +33,42 @@ class NetworkConditions(NamedTuple):
     """The assumptions of a certificate about network and schedule, in the plant's time."""
 
     dropouts: int
-    """M − 1, the longest run of successive dropouts."""
+    """M − 1, the largest number of consecutive losses."""
     sampling_s: float = 0.0
     """h, the longest time between two tests of the trigger; 0 is a continuous trigger."""
     spacing_s: float = 0.0
-    """The shortest time between two tests; all others are its multiples."""
+    """The shortest time between two tests; all other times between tests are multiples of it."""
     delay_s: float = 0.0
-    """d, the longest time from an event until the plant feels its update, if it is delivered."""
+    """d, the longest time from an event until a delivered update affects the plant's input."""
     hold_s: float = 0.0
-    """σ, how far the model's time behind the input that the plant feels is from now, at most."""
+    """σ, the largest difference between the time and the model time of the applied input."""
     start_s: float = 0.0
-    """From here on the plant feels the controller's input; before, it feels none."""
+    """Time from which the plant applies the controller's input; before, its input is 0."""
 
 
 class Constants(NamedTuple):
     """The constants of a certificate; ‖·‖_W is the trigger's norm, ‖·‖ the Euclidean."""
 
     rate_per_s: float
-    """Every bound falls like e^{−rate·t}."""
+    """Every bound decays like e^{−rate·t}."""
     missing_events: int
-    """N, events that the controller lacks at most."""
+    """N, the largest number of events whose updates the controller does not have."""
     delta: float
     """Δ: ‖e_c‖_W ≤ Δβe^{−αt}."""
     overshoot: float
     """β̃/β: ‖e_s‖_W ≤ β̃e^{−αt}."""
     input_error: float
-    """π: ‖u − Kx‖ ≤ πe^{−αt}, once the plant feels the controller."""
+    """π: ‖u − Kx‖ ≤ πe^{−αt}, from the first applied input of the controller on."""
     start_error: float
-    """The same before that, when u = 0."""
+    """The same before the first applied input, when u = 0."""
     state: float
     """X: ‖x‖ ≤ Xe^{−αt}."""
     state_weighted: float
     """X_W: ‖x‖_W ≤ X_W e^{−αt}."""
     mismatch: float
-    """‖E x‖ ≤ this · e^{−αt}: how fast the model parts from the plant."""
+    """‖E x‖ ≤ mismatch · e^{−αt}: the rate at which the model deviates from the plant."""
     inter_event_s: float | None
-    """δ: no two events are closer; None if there is no such bound."""
+    """δ, lower bound of the inter-event time; None if there is no such bound."""
     loop_gain: float
     """Loop gain of the errors (small-gain condition); below 1."""
 
@@ -82,15 +82,15 @@ class PlantConstants(Protocol):
 
     @property
     def states(self) -> Mapping[Output, Coefficients]:
-        """sup‖C x‖ from the start and from the input error."""
+        """Return bounds of sup‖C x‖ from the start and from the input error."""
         ...
 
     def start_up(self, start_s: float) -> tuple[float, Mapping[Output, float]]:
-        """What no input before ``start_s`` adds: sup‖p‖ there, and to every sup‖C x‖."""
+        """Return the effect of zero input before ``start_s``: sup‖p‖, and additions to sup‖C x‖."""
         ...
 
     def growth(self, until_s: float, cells: int) -> Growth:
-        """How ‖e_s‖_W grows, on a grid."""
+        """Return the growth of ‖e_s‖_W, on a grid."""
         ...
 
 
@@ -98,26 +98,26 @@ class Level(NamedTuple):
     """The trigger's threshold, scaled."""
 
     beta: float
-    """β: a test leaves ‖e_s‖_W ≤ β."""
+    """β: after a test, ‖e_s‖_W ≤ β."""
     reached: float | None
-    """The least ‖e_s‖_W of an event; None if it comes arbitrarily close to 0."""
+    """The smallest ‖e_s‖_W at an event; None if it may be arbitrarily small."""
 
 
 class Background(NamedTuple):
-    """What an earlier phase of the run leaves: its bounds, which reach into this one.
+    """Bounds from an earlier phase of the run, which still have effects in this phase.
 
-    An event of the earlier phase may still be missing in this one, and so may two tests or two
-    events lie on either side of where they meet.
+    An event of the earlier phase may still be missing in this phase. Two successive tests or events
+    may be in different phases.
     """
 
     sensor_error: float = 0.0
-    """Of β̃."""
+    """Bound of β̃."""
     mismatch: float = 0.0
-    """Of sup‖R_E x‖."""
+    """Bound of sup‖R_E x‖."""
     input_error: float = 0.0
-    """Of sup‖p‖."""
+    """Bound of sup‖p‖."""
     inter_event_s: float = _LONGEST_S
-    """Of the time between two events."""
+    """Bound of the inter-event time."""
 
 
 _CLEAN = Background()
@@ -146,13 +146,13 @@ def solve(
         found_s = step.inter_event_s(spacing_s)
         if found_s >= spacing_s:
             return step.constants(spacing_s, spacing_s)
-        # Down to the largest spacing that reproduces itself, from above.
+        # Iterate from above to the largest spacing that is consistent with itself.
         spacing_s = found_s if found_s < (1 - _SETTLED) * spacing_s else (1 - _SETTLED) * found_s
     return step.constants(conditions.spacing_s, conditions.spacing_s or None)
 
 
 class _Step:
-    """One round: from an assumed spacing of events to everything else."""
+    """One iteration: all constants for an assumed spacing of events."""
 
     def __init__(
         self,
@@ -178,7 +178,7 @@ class _Step:
             self._input_growth = growth.input_error.integral_on_grid()
 
     def constants(self, spacing_s: float, inter_event_s: float | None) -> Constants:
-        """Everything, given that no two events are closer than ``spacing_s``."""
+        """Return all constants, given inter-event times of at least ``spacing_s``."""
         events = self._missing(spacing_s)
         shares = {
             output: self._error.now(output) + self._error.missing(output, events, spacing_s)
@@ -223,7 +223,7 @@ class _Step:
         )
 
     def inter_event_s(self, spacing_s: float) -> float:
-        """The time that ‖e_s‖_W needs to the next event, given that spacing of those before."""
+        """Return the time that ‖e_s‖_W needs to the next event, given the spacing before it."""
         found = self.constants(spacing_s, None)
         mismatch = self._states[Output.MISMATCH]
         own = self._error.now(Output.GAIN)
@@ -251,19 +251,19 @@ class _Step:
 def first_passage_s(
     plant: PlantConstants, level: float, mismatch: float, input_error: float, own: float
 ) -> float:
-    """A time before which ‖e_s‖_W, from 0, cannot reach ``level``.
+    """Return a time before which ‖e_s‖_W, starting at 0, cannot reach ``level``.
 
-    With ρ(r) = sup_{s≤r} ‖e_s‖_W and e_c's own share of e_s counted as it grows,
+    Let ρ(r) = sup_{s≤r} ‖e_s‖_W. The part of e_c that equals the present e_s is bounded by ρ:
 
         ρ(r) ≤ ∫₀^r ‖W e^{Hs} L_E‖ sup‖R_E x‖ + ‖W e^{Hs} B U‖ (π' + own · ρ(r−s)) ds
 
-    which is iterated from ρ = ``level``; every iterate is a bound until the level is reached.
+    This is iterated from ρ = ``level``; every iterate is a bound until the level is reached.
 
     Args:
-        plant: gives the kernels.
-        level: of an event.
+        plant: provides the kernels.
+        level: ‖e_s‖_W at an event.
         mismatch: sup‖R_E x‖.
-        input_error: π', the input error but for what the present e_s causes.
+        input_error: π', the input error without the effect of the present e_s.
         own: ‖K W^{−1}‖.
     """
     window_s, cells = _first_window_s(plant, level, mismatch, input_error + own * level), _COARSE
@@ -283,14 +283,14 @@ def first_passage_s(
             window_s, cells = float(growth.mismatch.edges_s[crossed[0] + 1]), _FINE
         elif window_s >= _LONGEST_S:
             return window_s
-        else:  # a coarse grid may have seen a level reached that is not
+        else:  # not reached, also after a coarse grid's overestimate: extend the window
             known_s, window_s = window_s, 2 * window_s
 
 
 def _first_window_s(
     plant: PlantConstants, level: float, mismatch: float, input_error: float
 ) -> float:
-    """Where to look: twice the time at the speed of the start, but not nearer than can matter."""
+    """Return the first search window: twice the time to ``level`` at the initial speed, limited."""
     start = plant.growth(_SHORTEST_S, 1)
     speed = start.mismatch.sup_on_grid() * mismatch + start.input_error.sup_on_grid() * input_error
     if not speed > 0:

@@ -1,7 +1,7 @@
 """Coordinates in which a linear system contracts: ‖L e^{Gs} Y‖ ≤ ‖L Y‖ e^{−νs}.
 
-Any invertible L will do for which ν, minus the logarithmic norm of L G L^{−1}, is positive: LᵀL is
-a Lyapunov function then. Whatever rounding did to an L that was found, ν is computed after.
+−ν is the logarithmic norm of L G L^{−1}. Any invertible L with ν > 0 is suitable; LᵀL is then a
+Lyapunov function. ν is computed from the final L, so rounding in the computation of L is harmless.
 """
 
 import math
@@ -15,7 +15,7 @@ from noack.core.linear_systems import Matrix, spectral_abscissa
 Stack = NDArray[np.float64]
 
 EPSILON = 8 * float(np.finfo(float).eps)
-"""Times n and the product of the factors' magnitudes: more than the rounding of a product."""
+"""Times n and the product of the factors' magnitudes, this exceeds the rounding of a product."""
 
 
 class Decay(NamedTuple):
@@ -30,24 +30,24 @@ class Decay(NamedTuple):
 
     @property
     def stretch(self) -> float:
-        """‖e^{Gs}‖ ≤ this."""
+        """Upper bound of ‖e^{Gs}‖ for s ≥ 0."""
         return float(np.linalg.norm(self.factor, 2) * np.linalg.norm(self.inverse, 2))
 
     def bounds(self, C: Matrix, states: Stack) -> Stack:
-        """Of ‖C e^{Gs} Y‖ at all s ≥ 0, for a stack of Y, (k, n, r) → (k,)."""
+        """Return bounds of ‖C e^{Gs} Y‖ over all s ≥ 0, for a stack of Y, (k, n, r) → (k,)."""
         return self.seen(C) * self.sizes(states)
 
     def seen(self, C: Matrix) -> float:
-        """‖C L^{−1}‖."""
+        """Return ‖C L^{−1}‖."""
         return float(np.linalg.norm(C @ self.inverse, 2))
 
     def sizes(self, states: Stack) -> Stack:
-        """‖L Y‖ for a stack of Y, (k, n, r) → (k,), in the Frobenius norm."""
+        """Return ‖L Y‖ for a stack of Y, (k, n, r) → (k,), in the Frobenius norm."""
         return frobenius_norms(product(self.factor, states))
 
 
 def decay_of(generator: Matrix) -> Decay | None:
-    """The better one of two that are tried; None if none stands its check to working precision.
+    """Return the better of two candidates for L; None if neither passes its check numerically.
 
     Args:
         generator: G, (n, n), per second.
@@ -62,13 +62,13 @@ def decay_of(generator: Matrix) -> Decay | None:
 
 
 def _checked(generator: Matrix, factor: Matrix) -> Decay | None:
-    """L with its ν, rounding taken off; None if ν is not positive."""
+    """Return L with ν, reduced by a bound of the rounding error; None if ν is not positive."""
     try:
         inverse = np.asarray(np.linalg.inv(factor))
     except np.linalg.LinAlgError:
         return None
     turned = factor @ generator @ inverse
-    # Of the products; and L times its inverse is the identity to the rounding of that product.
+    # Rounding of the products, and the deviation of L times its computed inverse from identity.
     product = np.abs(factor) @ np.abs(generator) @ np.abs(inverse)
     identity = np.linalg.norm(np.abs(factor) @ np.abs(inverse)) * np.linalg.norm(turned)
     rounding = EPSILON * len(generator) * float(np.linalg.norm(product) + identity)
@@ -79,7 +79,7 @@ def _checked(generator: Matrix, factor: Matrix) -> Decay | None:
 
 
 def _lyapunov_factor(generator: Matrix) -> Matrix | None:
-    """Of (G+νI)ᵀP + P(G+νI) = −I, ν half of G's decay rate; it depends smoothly on G."""
+    """Return the factor of P, (G+νI)ᵀP + P(G+νI) = −I, ν half of G's decay rate; smooth in G."""
     from scipy.linalg import cholesky, solve_continuous_lyapunov
 
     n = len(generator)
@@ -92,7 +92,7 @@ def _lyapunov_factor(generator: Matrix) -> Matrix | None:
 
 
 def _modal_factor(generator: Matrix) -> Matrix | None:
-    """The inverse of G's real eigenvectors: best for modes of very different speed."""
+    """Return the inverse of G's real eigenvectors, the best L for modes of very different speed."""
     values, vectors = np.linalg.eig(generator)
     columns = np.where(values.imag < 0, vectors.imag, vectors.real)
     try:
@@ -107,12 +107,12 @@ def logarithmic_norm(generator: Matrix) -> float:
 
 
 def product(matrix: Matrix, stack: Stack) -> Stack:
-    """M Y for a stack of Y, (k, n, r) → (k, q, r): one product of M with all columns."""
+    """Return M Y for a stack of Y, (k, n, r) → (k, q, r), by one product of M with all columns."""
     k, n, r = stack.shape
     columns = stack.transpose(1, 0, 2).reshape(n, k * r)
     return np.asarray((matrix @ columns).reshape(len(matrix), k, r).transpose(1, 0, 2))
 
 
 def frobenius_norms(stack: Stack) -> Stack:
-    """Of a stack of matrices, (k, q, r) → (k,)."""
+    """Return the Frobenius norms of a stack of matrices, (k, q, r) → (k,)."""
     return np.asarray(np.sqrt(np.einsum("kij,kij->k", stack, stack)))

@@ -1,16 +1,17 @@
-"""Rigorous upper bounds of ‖C e^{Gτ} D‖ over time: suprema and integrals that sampling cannot miss.
+"""Rigorous upper bounds of ‖C e^{Gτ} D‖ over time: suprema and integrals, enclosed between samples.
 
-A response e^{Gτ}D is computed at the nodes of a grid. Between two nodes, a step s apart,
+A response e^{Gτ}D is computed at the nodes of a grid. Between two nodes at a distance s,
 F(τ) = C e^{Gτ} D differs from the chord by at most s²/8 · sup‖F''‖ (its integral by s³/12 ·
-sup‖F''‖), and a norm is convex along a chord. sup‖F''‖ over the cell is bounded by Taylor's formula
-from the node, F'' = C G² e^{Gτ} D and its derivatives, the remainder by e^{μ s} with μ the
-logarithmic norm of G, or in coordinates L in which it is −ν < 0 (:mod:`noack.theory.contraction`),
-as it
-suits: ‖C e^{Gs} Y‖ ≤ ‖C L^{−1}‖ ‖L Y‖ e^{−νs}. The same bounds what is beyond the grid. Steps grow
-as fast modes die out, so that a stiff system takes hardly more of them than another.
+sup‖F''‖), and a norm is convex along a chord. sup‖F''‖ over the cell, with F'' = C G² e^{Gτ} D, is
+bounded by Taylor's formula from the left node. The remainder is bounded by the smaller of two
+bounds: e^{μ s} with the logarithmic norm μ of G; or, in coordinates L with logarithmic norm −ν < 0
+(:mod:`noack.theory.contraction`), ‖C e^{Gs} Y‖ ≤ ‖C L^{−1}‖ ‖L Y‖ e^{−νs}. The second one also
+bounds the response beyond the grid. Steps become longer when fast modes have decayed, so a stiff
+system needs hardly more steps than others.
 
-Rounding: of the products C Y by n ε |C| |Y|, which counts where C and D are ill-conditioned; all
-the rest, some 1e-12 of a value, by a relative inflation of 1e-9.
+Rounding: the error of the products C Y is bounded by n ε |C| |Y|, which matters if C and D are
+ill-conditioned. All other rounding errors, about 1e-12 of a value, are covered by a relative
+inflation of 1e-9.
 """
 
 import math
@@ -37,19 +38,19 @@ _TAYLOR_TERMS = 4
 _LARGEST_EXPONENT = 100.0
 _BLOCK = 64
 _FIRST_STEP, _STEP = 0.05, 0.2
-"""Of the fastest mode's time constant."""
+"""Step lengths as shares of the fastest mode's time constant."""
 _SAG = 0.005
-"""By how much of ‖e^{Gτ}D‖ a chord may lie below it for a step to be longer than that."""
+"""A step may become longer if the chord deviates from e^{Gτ}D by at most this share of its norm."""
 _CELLS_PER_BLOCK = 256
 _MOST_CELLS = 60_000
 _MOST_ENTRIES = 4_000_000
-"""Of all matrices of a response: many states have fewer cells, and what is beyond them counts by
-its bound, which is looser."""
+"""Largest number of entries of all matrices of a response. With many states there are fewer cells,
+and the looser bound beyond the grid applies earlier."""
 _TAIL_SHARE = 1e-5
 
 
 class NotDecayingError(ArithmeticError):
-    """The generator is not Hurwitz: over all times, the bounds would be infinite."""
+    """The generator is not Hurwitz: bounds over all times would be infinite."""
 
 
 class KernelBounds(NamedTuple):
@@ -62,11 +63,11 @@ class KernelBounds(NamedTuple):
     area: NDArray[np.float64]
     """(cells,) bound of ∫k over each cell."""
     tail_highest: float
-    """Bound of k beyond the grid; infinite if it was not asked for."""
+    """Bound of k beyond the grid; infinite if it was not requested."""
     tail_area: float
     """Bound of ∫k beyond the grid."""
     tail_rate_per_s: float
-    """Beyond the grid, the bound of k falls at this rate."""
+    """Decay rate of the bound of k beyond the grid."""
 
     def sup(self, after_s: float = 0.0) -> float:
         """Sup of k(τ) over τ ≥ ``after_s``."""
@@ -94,7 +95,7 @@ class KernelBounds(NamedTuple):
 
 @dataclass(frozen=True)
 class ResponseBounds:
-    """e^{Gτ} D at the nodes of a grid; :meth:`through` looks at it through an output matrix C."""
+    """e^{Gτ} D at the nodes of a grid; :meth:`through` applies an output matrix C."""
 
     generator: Matrix
     """G, (n, n), per second."""
@@ -103,16 +104,16 @@ class ResponseBounds:
     states: Stack
     """(cells + 1, n, r), e^{Gτ} D."""
     decay: Decay | None
-    """None if it is not needed, or if G does not decay."""
+    """L and ν; None if they are not needed, or if G does not decay."""
     endless: bool
-    """Whether bounds beyond the grid are asked for."""
+    """Whether bounds beyond the grid are requested."""
 
     @cached_property
     def _bends(self) -> "_Bends":
         return _bends(self.generator, self.states[:-1], np.diff(self.edges_s), self.decay)
 
     def through(self, C: Matrix) -> KernelBounds:
-        """Bounds of ‖C e^{Gτ} D‖, with C of shape (q, n)."""
+        """Return bounds of ‖C e^{Gτ} D‖, with C of shape (q, n)."""
         steps_s = np.diff(self.edges_s)
         norms = norm_bounds(C, self.states)
         bend = self._bends.over(C)
@@ -133,7 +134,7 @@ class ResponseBounds:
 
 
 def norm_bounds(C: Matrix, states: Stack) -> Stack:
-    """Upper bounds of ‖C Y‖ for a stack of Y, (k, n, r) → (k,), the product's rounding included."""
+    """Return upper bounds of ‖C Y‖ for a stack of Y, (k, n, r) → (k,), including rounding."""
     exact = product(C, states)
     # Of a vector, the Euclidean norm is the spectral one.
     norms = (
@@ -147,20 +148,20 @@ def norm_bounds(C: Matrix, states: Stack) -> Stack:
 
 @dataclass(frozen=True)
 class _Bends:
-    """What bounds ‖C G² e^{Gτ} D‖ over each of k cells, but for C."""
+    """The factors, apart from C, of the bounds of ‖C G² e^{Gτ} D‖ over k cells."""
 
     terms: Stack
     """(4k, n, r), Taylor's terms G^j e^{Gτ} D s^{j−2}/(j−2)! at the left nodes, by order."""
     rest: Stack
-    """(k,), of the remainder, to be multiplied by ‖C‖."""
+    """(k,), factor of ‖C‖ in a bound of the remainder."""
     decay: Decay | None
     rest_decaying: Stack
-    """(k,), of the remainder as the decay bounds it, to be multiplied by ‖C L^{−1}‖."""
+    """(k,), factor of ‖C L^{−1}‖ in a bound of the remainder from the decay."""
     least: Stack
-    """(k,), of the whole, likewise."""
+    """(k,), factor of ‖C L^{−1}‖ in a bound of the whole value."""
 
     def over(self, C: Matrix) -> Stack:
-        """Bounds for an output matrix C, (k,)."""
+        """Return the bounds for an output matrix C, (k,)."""
         bound = frobenius_norms(product(C, self.terms)).reshape(_TAYLOR_TERMS, -1).sum(axis=0)
         rest = float(np.linalg.norm(C, 2)) * self.rest
         if self.decay is None:
@@ -171,7 +172,7 @@ class _Bends:
 
 
 def _bends(generator: Matrix, nodes: Stack, steps_s: Stack, decay: Decay | None) -> _Bends:
-    """Of the cells that begin at the nodes, (k, n, r), by Taylor's formula."""
+    """Return the factors for the cells that start at the nodes, (k, n, r), by Taylor's formula."""
     exponents = max(logarithmic_norm(generator), 0.0) * steps_s
     growth = np.where(
         exponents < _LARGEST_EXPONENT, np.exp(exponents.clip(max=_LARGEST_EXPONENT)), np.inf
@@ -190,7 +191,7 @@ def _bends(generator: Matrix, nodes: Stack, steps_s: Stack, decay: Decay | None)
 
 
 def response(generator: Matrix, D: Matrix) -> ResponseBounds:
-    """Follow e^{Gτ} D over all times, shapes (n, n) and (n, r).
+    """Compute e^{Gτ} D over all times, shapes (n, n) and (n, r).
 
     Raises:
         NotDecayingError: G is not Hurwitz.
@@ -227,7 +228,7 @@ def response(generator: Matrix, D: Matrix) -> ResponseBounds:
 
 
 def _straight(generator: Matrix, state: Matrix, step_s: float, decay: Decay) -> bool:
-    """Whether e^{Gτ} Y hardly differs from its chord over a step from here."""
+    """Return whether e^{Gτ} Y is close to its chord over a step."""
     size = float(np.linalg.norm(state))
     everything, steps_s = np.eye(len(generator)), np.array([step_s])
     bend = _bends(generator, state[None], steps_s, decay).over(everything)
@@ -235,7 +236,7 @@ def _straight(generator: Matrix, state: Matrix, step_s: float, decay: Decay) -> 
 
 
 def response_until(generator: Matrix, D: Matrix, until_s: float, cells: int = 64) -> ResponseBounds:
-    """Follow e^{Gτ} D over 0 ≤ τ ≤ ``until_s`` on a grid of ``cells`` equal cells."""
+    """Compute e^{Gτ} D over 0 ≤ τ ≤ ``until_s`` on a grid of ``cells`` equal cells."""
     step_s = until_s / cells
     return ResponseBounds(
         generator,
@@ -247,25 +248,25 @@ def response_until(generator: Matrix, D: Matrix, until_s: float, cells: int = 64
 
 
 def constant_kernel(value: float) -> KernelBounds:
-    """The kernel of a response that neither decays nor grows."""
+    """Return the kernel of a constant response."""
     edges_s = np.array([0.0, 1.0])
     return KernelBounds(edges_s, np.full(1, value), np.full(1, value), value, math.inf, 0.0)
 
 
 def factors(matrix: Matrix) -> tuple[Matrix, Matrix]:
-    """Write a matrix as L R with orthonormal columns in L and as many of them as its rank.
+    """Factorise a matrix as L R; L has orthonormal columns, their number is the matrix's rank.
 
-    ‖L R v‖ = ‖R v‖, so that a signal that acts through few directions is measured in these only.
+    ‖L R v‖ = ‖R v‖, so a signal that acts in few directions is bounded in these directions only.
     """
     U, singular, Vt = np.linalg.svd(matrix, full_matrices=False)
     cut = singular.max(initial=0.0) * max(matrix.shape) * np.finfo(float).eps
-    # What is cut off is as small as the matrix's own rounding; a zero matrix keeps a column.
+    # The omitted part is below the matrix's rounding error; a zero matrix keeps one column.
     rank = max(int((singular > cut).sum()), 1)
     return U[:, :rank], singular[:rank, None] * Vt[:rank]
 
 
 def _propagate(generator: Matrix, state: Matrix, step_s: float, cells: int) -> Stack:
-    """e^{G k s} state for k = 0 … cells, (cells + 1, n, r); each block starts anew."""
+    """Return e^{G k s} state for k = 0 … cells, (cells + 1, n, r), block by block."""
     from scipy.linalg import expm
 
     powers, size = np.eye(len(generator))[None], min(_BLOCK, cells)
@@ -281,6 +282,6 @@ def _propagate(generator: Matrix, state: Matrix, step_s: float, cells: int) -> S
 
 
 def _fastest(generator: Matrix) -> float:
-    """The rate in 1/s that sets the step."""
+    """Return the rate in 1/s that determines the step."""
     magnitude = float(np.abs(np.linalg.eigvals(generator)).max())
     return max(magnitude, 0.2 * logarithmic_norm(generator), np.finfo(float).tiny)

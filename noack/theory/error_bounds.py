@@ -25,17 +25,17 @@ class ErrorBounds(NamedTuple):
 
     identity: float
     printed: float
-    """NaN of another trigger than the paper's."""
+    """The paper's formula; NaN for other triggers than the paper's."""
 
 
 class ErrorMonitor:
-    """Follows a run, measurement by measurement.
+    """Computes the bounds along a run, measurement by measurement.
 
-    The work of a measurement is a few array operations over the missing events, however many: a
-    network without a bound may lose thousands of consecutive updates.
+    A measurement needs a few array operations over the missing events: a network without a bound
+    may lose thousands of consecutive updates.
 
     Args:
-        H: what both models integrate between updates, (n, n), per second.
+        H: matrix of both models between updates, (n, n), per second.
         trigger: the event-triggering policy.
     """
 
@@ -46,21 +46,21 @@ class ErrorMonitor:
         self._weight = np.eye(n) if trigger.weight is None else trigger.weight
         self._inverse = np.linalg.inv(self._weight)
         self._t_ns = 0
-        # Of the missing events, in their order:
+        # One entry per missing event, in order of the events:
         self._sequences = np.zeros(0, dtype=np.int64)
         self._thens_ns = np.zeros(0, dtype=np.int64)
         self._thresholds = np.zeros(0)
         self._jumps = np.zeros((0, n))  # e^{H(t−t_k)} e_s(t_k⁻)
-        # Measurements lie on a grid, so that few ages occur.
+        # Measurements lie on a grid, so there are few different ages.
         self._grown = lru_cache(_CACHED_AGES)(self._growth)
 
     def sample(self, t_ns: int, e_s: Vector, event: int, received: int) -> ErrorBounds:
-        """Take a measurement.
+        """Add a measurement; return the bounds at its time.
 
         Args:
-            t_ns: its time.
+            t_ns: time of the measurement.
             e_s: the sensor's error before any reset, (n,).
-            event: sequence number of the event that it caused, negative for none.
+            event: sequence number of the event at this measurement, negative for none.
             received: sequence number of the newest update that the controller has, negative for
                 none.
         """
@@ -93,6 +93,6 @@ class ErrorMonitor:
             self._thresholds, self._jumps = self._thresholds[kept], self._jumps[kept]
 
     def _growth(self, age_ns: int) -> float:
-        """‖e^{Hτ}‖_W."""
+        """Return ‖e^{Hτ}‖_W."""
         moved = self._weight @ self._propagate.transition(age_ns) @ self._inverse
         return float(np.linalg.norm(moved, 2))

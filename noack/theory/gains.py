@@ -1,12 +1,12 @@
-"""The gains of a loop that a certificate needs: from each signal to each other one.
+"""The gains of a loop that a certificate needs, between all pairs of signals.
 
 All signals are scaled by e^{αt}, so that a decaying bound becomes a constant one. With K = U R (U
 has orthonormal columns), the input error is p = u − K x, which acts on the plant through B U:
 
     x' = (A + BK) x + B p,      e_s' = H e_s − E x − B p,      E = A + BK − H
 
-and, by identity (I1), e_c is e_s and what the missing events left behind. The outputs of interest
-are the weighted norm W, the state itself, E x, and K H x (which a held input is wrong by).
+and, by identity (I1), e_c is e_s plus the contributions of the missing events. The outputs of
+interest are the weighted norm W, the state itself, E x, and K H x (the error rate of a held input).
 """
 
 from collections.abc import Mapping
@@ -31,7 +31,7 @@ from noack.theory.enclosure import (
 
 
 class Output(StrEnum):
-    """Through which output matrix C a state or error is looked at."""
+    """The output matrix C of a state or error."""
 
     STATE = "I"
     WEIGHTED = "W"
@@ -48,7 +48,7 @@ class Coefficients(NamedTuple):
 
 
 class Growth(NamedTuple):
-    """How ‖e_s‖_W grows after a reset."""
+    """The growth of ‖e_s‖_W after a reset."""
 
     mismatch: KernelBounds
     """‖W e^{Hτ} L_E‖, E = L_E R_E"""
@@ -58,10 +58,10 @@ class Growth(NamedTuple):
 
 @dataclass(frozen=True)
 class ErrorGains:
-    """The models' side: depends on H, K and W only, not on the plant.
+    """Gains of the models: they depend on H, K and W only, not on the plant.
 
     Args:
-        H: what the models integrate, (n, n).
+        H: matrix of the models, (n, n).
         K: gain, (m, n).
         weight: W, (n, n).
         alpha_per_s: α of the scaling.
@@ -89,7 +89,7 @@ class ErrorGains:
 
     @cached_property
     def outputs(self) -> Mapping[Output, Matrix]:
-        """C by which e_c is looked at."""
+        """C of each output C e_c."""
         R = self.split_K[1]
         return {Output.WEIGHTED: self.weight, Output.GAIN: R, Output.GAIN_RATE: R @ self.H}
 
@@ -100,7 +100,7 @@ class ErrorGains:
         Raises:
             NotDecayingError: α is not below the decay rate of e^{Hτ}.
         """
-        if not self.scaled_H.any():  # a hold: what was missed stays missed
+        if not self.scaled_H.any():  # a hold: a missed update's contribution does not decay
             return {output: constant_kernel(self.now(output)) for output in self.outputs}
         followed = response(self.scaled_H, self.inverse_weight)
         found = {output: followed.through(C) for output, C in self.outputs.items()}
@@ -117,19 +117,19 @@ class ErrorGains:
         return float(np.linalg.eigvalsh(turned + turned.T).max()) <= 1e-12 * size
 
     def now(self, output: Output) -> float:
-        """‖C W^{−1}‖: the share of the present e_s."""
+        """Return ‖C W^{−1}‖, the gain of the present e_s."""
         if output is Output.WEIGHTED:
             return 1.0
         return float(norm_bounds(self.outputs[output], self.inverse_weight[None])[0])
 
     def missing(self, output: Output, events: int, spacing_s: float) -> float:
-        """Σ_{j<N} sup_{τ ≥ jδ} ‖C e^{(H+αI)τ} W^{−1}‖: the share of N missing events, δ apart."""
+        """Return Σ_{j<N} sup_{τ ≥ jδ} ‖C e^{(H+αI)τ} W^{−1}‖, the gain of N missing events."""
         return float(
             self.kernels[output].sups(spacing_s * np.arange(events, dtype=np.float64)).sum()
         )
 
     def growth(self, mismatch: Matrix, pushed: Matrix, until_s: float, cells: int) -> Growth:
-        """How ‖e_s‖_W grows if E x and B p act through these columns."""
+        """Return the growth of ‖e_s‖_W if E x and B p act through these columns."""
         return Growth(
             *(
                 response_until(self.scaled_H, D, until_s, cells).through(self.weight)
@@ -138,14 +138,14 @@ class ErrorGains:
         )
 
     def stretch(self, until_s: float) -> float:
-        """sup‖e^{(H+αI)τ}‖_W over τ ≤ ``until_s``: how a sampled error grows."""
+        """Return sup‖e^{(H+αI)τ}‖_W over τ ≤ ``until_s``, the growth of a sampled error."""
         if until_s == 0:
             return 1.0
         followed = response_until(self.scaled_H, self.inverse_weight, until_s)
         return followed.through(self.weight).sup_on_grid()
 
     def hold_remainder(self, hold_s: float) -> float:
-        """Bound of ‖K(e^{−Hσ} − I + Hσ) W^{−1}‖, |σ| ≤ ``hold_s``: ½σ² sup‖K H² e^{−Hs} W^{−1}‖."""
+        """Bound ‖K(e^{−Hσ} − I + Hσ) W^{−1}‖, |σ| ≤ ``hold_s``, by ½σ² sup‖K H² e^{−Hs} W^{−1}‖."""
         if hold_s == 0:
             return 0.0
         curvature = self.split_K[1] @ self.H @ self.H
@@ -160,13 +160,13 @@ class ErrorGains:
 
 @dataclass(frozen=True)
 class PlantGains:
-    """The plant's side, for one known plant.
+    """Gains of one known plant.
 
     Args:
-        error: the models' side.
+        error: gains of the models.
         A, B: the plant, (n, n) and (n, m).
-        start: x(0) as a column, (n, 1); or a matrix whose image of the unit ball holds x(0).
-        alpha_per_s: α of the scaling; may differ from the models' side's.
+        start: x(0) as a column, (n, 1); or a matrix that maps the unit ball to a set with x(0).
+        alpha_per_s: α of the scaling; may differ from that of ``error``.
     """
 
     error: ErrorGains
@@ -192,7 +192,7 @@ class PlantGains:
 
     @cached_property
     def outputs(self) -> Mapping[Output, Matrix]:
-        """C by which x is looked at."""
+        """C of each output C x."""
         return {
             Output.STATE: np.eye(len(self.A)),
             Output.WEIGHTED: self.error.weight,
@@ -218,7 +218,7 @@ class PlantGains:
         return response(self.closed_loop, self.input_matrix)
 
     def start_up(self, start_s: float) -> tuple[float, Mapping[Output, float]]:
-        """What no input at all before ``start_s`` adds: p = −K x there.
+        """Return the effect of zero input before ``start_s``: p = −K x there.
 
         Returns:
             sup‖p‖ over the start, and its contribution to every sup‖C x‖.
@@ -234,11 +234,11 @@ class PlantGains:
         }
 
     def growth(self, until_s: float, cells: int) -> Growth:
-        """How ‖e_s‖_W grows over ``until_s``, on a grid."""
+        """Return the growth of ‖e_s‖_W over ``until_s``, on a grid."""
         return self.error.growth(self.split_mismatch[0], self.input_matrix, until_s, cells)
 
 
 def error_gains(loop: LoopMatrices, alpha_per_s: float) -> ErrorGains:
-    """The models' side of a resolved loop."""
+    """Return the gains of a resolved loop's models."""
     weight = np.eye(loop.n) if loop.weight is None else loop.weight
     return ErrorGains(loop.H, loop.K, weight, alpha_per_s)

@@ -1,9 +1,10 @@
-"""Exact identities that follow from the update laws alone, whatever the plant.
+"""Exact identities that follow from the update laws alone, for every plant.
 
 (I1)  x_c(t) − x_s(t) = Σ_{k=r+1..q} e^{H(t−t_k)} e_s(t_k⁻)
 
-with r the last event whose packet the controller has, q the last event. It extends the paper's
-eq:LossEv2 to every drop pattern: x_s jumped by −e_s(t_k⁻) at each event; x_c missed those jumps.
+where q is the last event and r the last event with a packet that the controller received. It
+extends the paper's eq:LossEv2 to every loss pattern: x_s jumps by −e_s(t_k⁻) at each event, and x_c
+misses the jumps of events r + 1 to q.
 """
 
 import numpy as np
@@ -15,7 +16,7 @@ class ModelDifference:
     """Evaluates the right-hand side of (I1) along a run.
 
     Args:
-        H: what both models integrate between updates, shape (n, n), per second.
+        H: matrix of both models between updates, shape (n, n), per second.
     """
 
     def __init__(self, H: Matrix) -> None:
@@ -30,18 +31,18 @@ class ModelDifference:
         self._t_ns = t_ns
 
     def event(self, sequence: int, e_s: Vector) -> None:
-        """Event ``sequence`` happens now with sensor error e_s(t_k⁻), shape (n,)."""
+        """Add event ``sequence`` at the present time with sensor error e_s(t_k⁻), shape (n,)."""
         self._jumps[sequence] = (self._t_ns, e_s)
         self._total = self._total + e_s
 
     def received(self, sequence: int) -> None:
-        """The controller now has event ``sequence``; it and all before it are missed no more."""
-        if self._jumps and next(iter(self._jumps)) <= sequence:  # numbered in order
+        """Remove the missed events up to ``sequence``: the controller received this update."""
+        if self._jumps and next(iter(self._jumps)) <= sequence:  # events are in order
             self._jumps = {k: jump for k, jump in self._jumps.items() if k > sequence}
-            # Anew rather than by subtraction, so that no rounding outlives a delivery.
+            # Sum again instead of subtracting, so that rounding errors end at a delivery.
             terms = [self.propagate(e_s, self._t_ns - t_ns) for t_ns, e_s in self._jumps.values()]
             self._total = np.sum([np.zeros_like(self._total), *terms], axis=0)
 
     def total(self) -> Vector:
-        """Σ of the missed jumps at the present time, shape (n,)."""
+        """Return the sum of the missed jumps at the present time, shape (n,)."""
         return self._total

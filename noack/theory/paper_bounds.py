@@ -1,10 +1,10 @@
-"""The paper's bounds as they are printed: Theorems 1 and 2, and the line that can be run.
+"""The paper's formulas for its bounds: Theorems 1 and 2.
 
-Theorem 1's Δ (eq:Normec) depends on the trajectory and on the true plant, so that it exists after a
-run only: :func:`theorem_1`. Theorem 2's minimum inter-event time (eq:tau, eq:Htil) needs some Δ and
-constants c, ᾱ with ‖e^{(A+BK)t}‖ ≤ c e^{−ᾱt}, which are free: the best are taken. Its F̄ may be
-negative, and F depends on t_i: a bound for all t_i takes the larger of its values at t_i = 0 and
-t_i → ∞. Norms are Euclidean, as in the paper.
+Theorem 1's Δ (eq:Normec) depends on the trajectory and on the true plant, so it can be computed
+only after a run: :func:`theorem_1`. Theorem 2's minimum inter-event time (eq:tau, eq:Htil) needs
+some Δ and constants c, ᾱ with ‖e^{(A+BK)t}‖ ≤ c e^{−ᾱt}. c and ᾱ are free, and the best values are
+used. F̄ may be negative, and F depends on t_i: a bound for all t_i uses the larger of F's values at
+t_i = 0 and t_i → ∞. Norms are Euclidean, as in the paper.
 """
 
 import math
@@ -29,7 +29,7 @@ class Theorem2(NamedTuple):
     alpha_bar_per_s: float
     """ᾱ."""
     delta: float
-    """The Δ that was put in."""
+    """The given Δ."""
     a_hat: float
     """‖Â + B̂K‖."""
     a_tilde: float
@@ -42,15 +42,15 @@ class Theorem2(NamedTuple):
     """g = βcΔ‖BK‖ / (ᾱ − α)."""
 
     def state(self, t_s: Vector, alpha_per_s: float) -> Vector:
-        """Right-hand side of eq:normXt at times (k,)."""
+        """Return the right-hand side of eq:normXt at times (k,)."""
         fast = np.exp(-self.alpha_bar_per_s * t_s)
         return self.state_start * fast + self.state_forced * (np.exp(-alpha_per_s * t_s) - fast)
 
 
 def theorem_2(loop: LoopMatrices, beta: float, alpha_per_s: float, delta: float) -> Theorem2 | None:
-    """Theorem 2 for a given Δ, with the c and ᾱ that give the longest inter-event time.
+    """Return Theorem 2 for a given Δ, with the c and ᾱ that give the longest inter-event time.
 
-    None if 0 < α < ᾱ cannot be met, or if the numbers leave floating point.
+    None if no ᾱ meets 0 < α < ᾱ, or if a number overflows or underflows.
     """
     closed = loop.A + loop.B @ loop.K
     fastest = -spectral_abscissa(closed)
@@ -62,7 +62,7 @@ def theorem_2(loop: LoopMatrices, beta: float, alpha_per_s: float, delta: float)
         rate = alpha_per_s + share * (fastest - alpha_per_s)
         return _theorem_2(loop, beta, alpha_per_s, delta, rate)
 
-    # c grows without bound towards the one end, 1/(ᾱ − α) towards the other.
+    # At one end of the range c tends to infinity, at the other end 1/(ᾱ − α) does.
     try:
         best = minimize_scalar(
             lambda share: -at(share).inter_event_s,
@@ -71,7 +71,7 @@ def theorem_2(loop: LoopMatrices, beta: float, alpha_per_s: float, delta: float)
             options={"xatol": _SHARE},
         )
         found = at(float(best.x))
-    except NotDecayingError:  # to working precision, which c would need
+    except NotDecayingError:  # the decay is too slow to compute c in floating point
         return None
     sizes = (found.c, found.state_start, found.state_forced)
     return None if math.isnan(found.inter_event_s) or not all(map(math.isfinite, sizes)) else found
@@ -87,7 +87,7 @@ def _theorem_2(
     a_tilde = float(np.linalg.norm(closed - loop.H, 2))
     start = a_tilde * c * (x0 - beta * delta * BK / gap)
     forced = (1 + a_tilde * c / gap) * beta * delta * BK
-    # eq:Htil falls or rises monotonically with t_i, as the sign of F̄ says.
+    # eq:Htil is monotonic in t_i; the sign of F̄ determines the direction.
     F = max(start, 0.0) / (a_hat + alpha_bar_per_s) + forced / (a_hat + alpha_per_s)
     inter_event_s = math.log1p(beta / F) / (a_hat + alpha_bar_per_s) if F > 0 else math.inf
     return Theorem2(
@@ -100,7 +100,7 @@ class Interval(NamedTuple):
     """A trajectory between two events: k samples."""
 
     t_s: Vector
-    """(k,), the first at the event."""
+    """(k,), the first is the time of the event."""
     x_norm: Vector
     """(k,) ‖x‖."""
     model_norm: Vector
@@ -108,11 +108,11 @@ class Interval(NamedTuple):
 
 
 def longest_interval_s(interval: Interval, beta: float, alpha_per_s: float, kappa: float) -> float:
-    """Theorem 1's δ̄_j, from the trajectory: the least over the free constant γ > 0.
+    """Return Theorem 1's δ̄_j from the trajectory: the minimum over the free constant γ > 0.
 
     η_j e^{γ(t−t_j)} ≤ ‖x(t)‖ and ‖e^{H(t−t_j)}x(t_j)‖ ≤ ζ_j e^{−κ(t−t_j)} give (eq:deltaa, deltak)
-    δ̄_j = ln((ζ_j + βe^{−αt_j})/η_j) / (γ + min(κ, α)). γ and η_j exist for every trajectory that is
-    not 0 in between, growing or not; without Proposition 1's growth, δ̄_j is long.
+    δ̄_j = ln((ζ_j + βe^{−αt_j})/η_j) / (γ + min(κ, α)). γ and η_j exist for every trajectory without
+    zeros in the interval, growing or not. Without the growth of Proposition 1, δ̄_j is long.
     """
     passed_s = interval.t_s - interval.t_s[0]
     zeta = float((interval.model_norm * np.exp(kappa * passed_s)).max())
@@ -128,10 +128,10 @@ def longest_interval_s(interval: Interval, beta: float, alpha_per_s: float, kapp
 
 
 def theorem_1(H: Matrix, alpha_per_s: float, longest_s: Sequence[float]) -> float:
-    """Theorem 1's Δ (eq:Normec) for one stretch between two deliveries, or Theorem 3's if H = 0.
+    """Return Theorem 1's Δ (eq:Normec) between two deliveries, or Theorem 3's if H = 0.
 
     Args:
-        H: what the models integrate, (n, n).
+        H: matrix of the models, (n, n).
         alpha_per_s: α.
         longest_s: δ̄_j for the intervals between the missed events and after them, j = 1 … M−1.
 

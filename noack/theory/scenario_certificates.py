@@ -37,15 +37,15 @@ Change = Callable[[NetworkConditions, float], NetworkConditions]
 """Sets a time of the conditions."""
 
 PlantAt = Callable[[ErrorGains, Matrix, float], PlantConstants]
-"""A plant, given the models' side, where x starts, and α."""
+"""Returns the plant's constants from the gains of the models, the start of x, and α."""
 
 
 @dataclass(frozen=True)
 class ScenarioCertificate:
-    """What is guaranteed of a loop."""
+    """The guaranteed bounds of a loop."""
 
     scope: str
-    """Of which plants."""
+    """The plants that it covers."""
     beta: float
     alpha_per_s: float
     floor: float
@@ -56,30 +56,30 @@ class ScenarioCertificate:
     constants: Constants | None
     """None if there is no certificate."""
     floor_constants: Constants | None
-    """From ``floor_from_s`` on, with ε in the place of βe^{−αt} and no decay."""
+    """The constants from ``floor_from_s`` on, with ε in place of βe^{−αt} and without decay."""
     void: str | None
-    """Why there is no certificate."""
+    """Reason for having no certificate; None if there is one."""
 
     @property
     def source(self) -> str:
-        """What to call it beside a claim."""
+        """Name of the certificate as the source of a claim."""
         return "certificate" if self.scope == OWN_PLANT else "box certificate"
 
     @property
     def floor_from_s(self) -> float:
-        """When βe^{−αt} falls below the floor ε; infinite without a floor."""
+        """Time at which βe^{−αt} falls below the floor ε; infinite without a floor."""
         return _floor_from_s(self.beta, self.alpha_per_s, self.floor)
 
     @property
     def inter_event_s(self) -> float | None:
-        """No two events are closer than this."""
+        """Lower bound of the inter-event time; None if there is none."""
         found = [c.inter_event_s for c in (self.constants, self.floor_constants) if c is not None]
         known = [value for value in found if value is not None]
         return min(known) if known and len(known) == len(found) else None
 
     @property
     def level(self) -> str:
-        """What bounds of errors are multiples of: βe^{−αt}, or without decay β or the floor ε."""
+        """The unit of the error bounds: βe^{−αt}, or without decay β or the floor ε."""
         rate = 0.0 if self.constants is None else self.constants.rate_per_s
         if rate:
             return f"βe^(−{rate:.3g}t)"
@@ -98,7 +98,7 @@ class ScenarioCertificate:
         return self._envelope(t_s, lambda c, level: c.state)
 
     def to_json(self) -> dict[str, Any]:
-        """All fields for JSON."""
+        """Return all fields for JSON."""
         found = asdict(self)
         for key, value in (
             ("constants", self.constants),
@@ -167,7 +167,7 @@ def box(resolved: Scenario, start_error: float = 0.0) -> "CertificateScope | Non
 
 
 def outside_box(resolved: Scenario) -> str | None:
-    """Where the scenario's plant lies outside its own uncertainty box; None if it does not."""
+    """Return, as text, an entry of the plant outside its uncertainty box; None if there is none."""
     loop, plant = loop_of(resolved), resolved.plant
     for name, true, model, halfwidth in (
         ("A", loop.A, loop.A_model, plant.uncertainty_A),
@@ -187,13 +187,13 @@ def outside_box(resolved: Scenario) -> str | None:
 
 
 class CertificateScope:
-    """Plants for which certificates are made; what depends on no condition is computed once.
+    """Plants for which certificates are computed; values without conditions are computed once.
 
     Args:
-        name: of which plants.
+        name: name of the plants.
         resolved: the scenario.
-        closed_loop: A + BK, the box's centre for a box, (n, n).
-        plant_at: gives their gains.
+        closed_loop: A + BK, for a box that of its centre, (n, n).
+        plant_at: returns the plants' constants.
         start_error: sup‖u − Kx‖, scaled, while the plant still applies inputs of an earlier run
             at the start. The certificate exists only if its own π is at least that large, so that
             it covers these inputs.
@@ -221,7 +221,7 @@ class CertificateScope:
         self._plants: dict[tuple[float, float, bytes], PlantConstants] = {}
 
     def certificate(self, conditions: NetworkConditions) -> ScenarioCertificate:
-        """The certificate under some conditions; a void one has the reason."""
+        """Return the certificate under some conditions; a void certificate has the reason."""
         trigger = self._resolved.decaying
         first: Constants | None = None
         late: Constants | None = None
@@ -252,9 +252,9 @@ class CertificateScope:
         )  # fmt: skip
 
     def largest(self, conditions: NetworkConditions, change: Change, most_s: float = 10.0) -> float:
-        """The largest time for which ``change`` of the conditions leaves a certificate.
+        """Return the largest time for which the changed conditions still have a certificate.
 
-        ``most_s`` if there always is one, 0 if there never is.
+        It is ``most_s`` if all times have one, and 0 if none has.
         """
 
         def stands(value_s: float) -> bool:
@@ -279,7 +279,7 @@ class CertificateScope:
                 if floor > 0:
                     raise
                 return self._slower(conditions, alpha, start)
-        # A slower decay, or none, is certified instead; then no threshold is there to be reached.
+        # Certify a slower decay or none; the smallest event level is then the floor, if any.
         slower = 0.0 if self._held or floor > 0 else max(_SLOWER * decay, 0.0)
         level = Level(max(beta, floor), floor or None)
         return self._solve(conditions, slower, slower, start, level)
@@ -287,10 +287,10 @@ class CertificateScope:
     def _slower(
         self, conditions: NetworkConditions, alpha_per_s: float, start: Matrix
     ) -> Constants:
-        """Bounds that fall more slowly than the threshold: of a box too large for α.
+        """Return bounds that decay more slowly than the threshold, for a box too large for α.
 
         Raises:
-            NotDecayingError: there are none, either.
+            NotDecayingError: there are no such bounds.
         """
         for share in _SHARES_OF_ALPHA:
             rate = share * alpha_per_s
@@ -300,11 +300,12 @@ class CertificateScope:
         raise NotDecayingError("the uncertainty box is too large for the loop's gains")
 
     def _after_floor(self, conditions: NetworkConditions, first: Constants) -> Constants:
-        """Once the threshold is the floor: from any state the first phase leaves, without decay.
+        """Return the constants without decay from t_ε on, when the threshold is the floor.
 
-        What the first phase leaves falls like e^{−αt}: what was there τ before t_ε is greater than
-        at t_ε by e^{ατ}. The models' side keeps α, so that its kernels, e^{(H+αI)τ}, bring that
-        factor along wherever something of the first phase reaches into this one.
+        They hold for every state at the end of the first phase. The bounds of the first phase decay
+        like e^{−αt}: at t_ε − τ they are larger than at t_ε by the factor e^{ατ}. The gains of the
+        models keep α, so their kernels e^{(H+αI)τ} contain this factor for all effects of the first
+        phase on this one.
         """
         trigger = self._resolved.decaying
         beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
@@ -347,7 +348,7 @@ class CertificateScope:
 
 
 def _finite(constants: Constants | None) -> bool:
-    """Whether every constant is a number; only the inter-event time may be without end."""
+    """Return whether every constant is finite; only the inter-event time may be infinite."""
     if constants is None:
         return True
     numbers = constants._replace(inter_event_s=None)

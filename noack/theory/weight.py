@@ -1,9 +1,9 @@
 """Chooses the weight W of the trigger's norm for the tightest certificate.
 
-A factor W of P = WᵀW with (H+αI)ᵀP + P(H+αI) ⪯ 0 makes ‖·‖_W contract along the models, hence
-Δ ≤ M on an instant network. Among these factors, the one with the longest certified inter-event
-time is searched for (P solves the Lyapunov equation for some Q ⪰ 0; Q is varied). Its scale is such
-that ‖W e‖ ≤ β encloses the same volume as ‖e‖ ≤ β: |det W| = 1.
+If P = WᵀW and (H+αI)ᵀP + P(H+αI) ⪯ 0, ‖·‖_W contracts along the models. Then Δ ≤ M on a network
+without delay. Among these factors W, the search finds the one with the longest certified
+inter-event time: P solves the Lyapunov equation for some Q ⪰ 0, and Q is varied. W is scaled to
+|det W| = 1, so that ‖W e‖ ≤ β encloses the same volume as ‖e‖ ≤ β.
 """
 
 from collections.abc import Callable
@@ -33,11 +33,11 @@ def choose_weight(
     """Return W, upper triangular, (n, n).
 
     Args:
-        loop: a resolved loop; its own weight plays no part.
+        loop: a resolved loop; its own weight is not used.
         beta: β.
         alpha_per_s: α.
         mansd: M − 1.
-        progress: receives the share of the work that is done.
+        progress: receives the completed share of the work.
 
     Raises:
         NotDecayingError: α is not below the decay rate of e^{Ht} and e^{(A+BK)t}.
@@ -48,7 +48,7 @@ def choose_weight(
     for name, matrix in (("the models", loop.H), ("A + BK", loop.A + loop.B @ loop.K)):
         if spectral_abscissa(matrix) + alpha_per_s >= 0:
             raise NotDecayingError(f"α = {alpha_per_s:g} /s is not below the decay rate of {name}")
-    # Off-diagonal entries of Q are worth their cost for few states only.
+    # Off-diagonal entries of Q are varied only for few states; for more they cost too much time.
     free = np.tril_indices(n) if n <= _MOST_FREE else np.diag_indices(n)
     rounds = 0
 
@@ -82,7 +82,7 @@ def choose_weight(
 def _weight(
     H: Matrix, alpha_per_s: float, free: tuple[Indices, ...], entries: Matrix
 ) -> Matrix | None:
-    """The factor for Q = L Lᵀ, with L's free entries; None where it is not one to rounding."""
+    """Return W for Q = L Lᵀ from L's free entries; None if it fails the inequality by rounding."""
     from scipy.linalg import solve_continuous_lyapunov
 
     n = len(H)

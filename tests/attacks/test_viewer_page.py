@@ -121,7 +121,7 @@ def test_the_secret_is_on_no_command_line(server: RecordingServer) -> None:
 
 
 @pytest.mark.parametrize("path", ["\xe9", "\x01", "\x7f", "?\xe9"])
-def test_an_invalid_path_gives_one_line(
+def test_an_invalid_path_gets_status_400(
     server: RecordingServer, path: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     server.start_page()

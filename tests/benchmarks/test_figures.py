@@ -70,11 +70,13 @@ def test_lateness_is_judged_against_cyclictest(
     assert note in judged.as_json().get("note", "")
 
 
-def test_the_first_step_is_bounded_by_the_promptest_progress_line() -> None:
+def test_the_earliest_progress_line_bounds_the_time_of_the_first_step() -> None:
     lines = [
         Line(100.9, "noack: something else"),
         Line(102.0, progress_text(ACCOUNT | {"t_s": 0.25}, 20.0)),
-        Line(102.2, progress_text(ACCOUNT | {"t_s": 0.5}, 20.0)),  # an epoch at 101.75 or before
+        Line(
+            102.2, progress_text(ACCOUNT | {"t_s": 0.5}, 20.0)
+        ),  # the epoch is at 101.75 or earlier
         Line(103.0, progress_text(ACCOUNT | {"t_s": 1.0}, 20.0)),
     ]
     assert first_step_s(100.0, lines) == pytest.approx(1.75)
@@ -92,12 +94,12 @@ def test_startup_has_a_row_for_the_goal_and_one_for_the_peer() -> None:
     assert len(startup.rows_of([1.0], [], [0.2])) == 2
 
 
-def test_a_program_that_fails_is_reported_with_its_last_words() -> None:
+def test_a_failed_program_is_reported_with_its_last_output() -> None:
     with pytest.raises(MeasurementError, match=r"ended with 3, said 'sorry'"):
         execute([sys.executable, "-c", "import sys; print('sorry', file=sys.stderr); sys.exit(3)"])
 
 
-def test_a_programs_output_and_lines_are_kept_apart() -> None:
+def test_standard_output_and_error_lines_are_separate() -> None:
     finished = execute([sys.executable, "-c", "import sys; print(1); print(2, file=sys.stderr)"])
     assert finished.stdout == "1\n"
     assert [line.text for line in finished.lines] == ["2"]
@@ -128,7 +130,7 @@ def test_each_case_gives_a_row_with_its_alternative() -> None:
         assert row.goal is None
 
 
-def test_a_plants_step_is_held_against_its_period_and_a_linear_plants() -> None:
+def test_a_plant_step_is_compared_with_its_period_and_a_linear_plant() -> None:
     for case in plants.CASES:
         ours, linear = plants.timed(case, count=20, pace_ns=0, asked=False)
         assert len(ours.us) == len(linear.us) == 19
@@ -137,11 +139,11 @@ def test_a_plants_step_is_held_against_its_period_and_a_linear_plants() -> None:
         assert p50.value is not None
         assert p99.value is not None
         assert p50.value <= p99.value
-        assert share.value == pytest.approx(p99.value / 20)  # per cent of 2 ms of wall time
+        assert share.value == pytest.approx(p99.value / 20)  # per cent of a period of 2 ms
 
 
 @pytest.mark.skipif(not (ROOT / ".git").exists(), reason="not a git repository")
-def test_the_repositorys_files_are_copied_without_what_was_made_from_them(tmp_path: Path) -> None:
+def test_the_repository_is_copied_without_generated_files(tmp_path: Path) -> None:
     startup.copy_repository(tmp_path)
     assert (tmp_path / "Makefile").is_file()
     assert (tmp_path / "noack" / "protocol" / "wire_format.py").is_file()

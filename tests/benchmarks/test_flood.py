@@ -1,4 +1,4 @@
-"""The flood's process, and the figures of a flooded run."""
+"""The process that sends the flood, and the figures of a flooded run."""
 
 import socket
 import subprocess
@@ -24,7 +24,7 @@ PERIOD_NS = 2_000_000
 
 
 def taken(ear: socket.socket) -> list[bytes]:
-    """All that has come, and close it."""
+    """Return all received datagrams and close the socket."""
     found = []
     with ear, suppress(BlockingIOError):
         while True:
@@ -33,7 +33,7 @@ def taken(ear: socket.socket) -> list[bytes]:
 
 
 @pytest.mark.parametrize("at_once", [True, False])
-def test_a_flood_is_shared_out_evenly_and_counted(
+def test_a_flood_is_distributed_evenly_over_the_ports_and_counted(
     monkeypatch: pytest.MonkeyPatch, at_once: bool
 ) -> None:
     if at_once and sys.platform != "linux":
@@ -51,7 +51,7 @@ def test_a_flood_is_shared_out_evenly_and_counted(
     assert decoder.rejected[Rejection.RUN] == sent  # it looks like an update of another run
 
 
-def test_the_floods_process_says_what_it_sent() -> None:
+def test_the_flood_process_prints_the_number_sent() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "benchmarks._flood", "--ports", "9", "--seconds", "0.05"],
         capture_output=True, text=True, check=True,

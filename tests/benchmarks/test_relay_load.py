@@ -1,4 +1,4 @@
-"""The load and the relays themselves: counts only, no rates."""
+"""The load generator and the relays: counts only, no rates."""
 
 import shutil
 import socket
@@ -47,20 +47,22 @@ def ends(tools: Built) -> Iterator[Ends]:
 
 @pytest.fixture
 def stopped() -> Iterator[int]:
-    """A child process that a burst can stop and let go on, and that forwards nothing."""
+    """A child process that a burst can stop and continue; it forwards nothing."""
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
         yield process.pid
         process.kill()
 
 
-def test_a_burst_straight_to_the_sink_arrives_whole(ends: Ends, stopped: int) -> None:
+def test_a_burst_directly_to_the_sink_arrives_completely(ends: Ends, stopped: int) -> None:
     for _ in range(2):
         found = ends.burst(stopped, 100)
         assert (found.decided, found.received) == (100, 100)
     assert ends.sent == 200
 
 
-def test_a_burst_comes_from_all_addresses_in_turn_numbered(ends: Ends, stopped: int) -> None:
+def test_a_burst_is_numbered_and_uses_all_source_addresses_in_turn(
+    ends: Ends, stopped: int
+) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mine:
         mine.bind(("127.0.0.1", 0))
         mine.setblocking(False)
@@ -74,7 +76,7 @@ def test_a_burst_comes_from_all_addresses_in_turn_numbered(ends: Ends, stopped: 
     assert hosts == [f"127.1.0.{k % 100}" for k in range(130)]
 
 
-def test_each_way_to_send_is_numbered_on_and_arrives(ends: Ends) -> None:
+def test_all_send_methods_continue_the_numbering(ends: Ends) -> None:
     found, cpu_s = ends.direct(150)
     assert (found.decided, found.received) == (150, 150)
     assert cpu_s > 0
@@ -83,7 +85,7 @@ def test_each_way_to_send_is_numbered_on_and_arrives(ends: Ends) -> None:
     assert ends.sent == 190
 
 
-def test_what_nobody_returns_is_marked(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_datagrams_without_a_reply_are_marked(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_relay_load, "_PATIENCE_NS", 1_000_000)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mine:
         mine.bind(("127.0.0.1", 0))
@@ -94,7 +96,7 @@ def test_what_nobody_returns_is_marked(ends: Ends, monkeypatch: pytest.MonkeyPat
 
 def test_gaps_and_disorder_of_a_steady_load_are_counted(tools: Built) -> None:
     ends, state = Ends(tools.load), Soak()
-    numbers = [0, 1, 5, 6, 4, 9]  # 2 and 3 missing at first, then 4, late, then 7 and 8
+    numbers = [0, 1, 5, 6, 4, 9]  # 2 and 3 are missing, 4 is late, 7 and 8 are missing
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mine:
         for number in numbers:
             mine.sendto(number.to_bytes(8, sys.byteorder), ("127.0.0.1", ends.sink_port))
@@ -107,7 +109,7 @@ def test_gaps_and_disorder_of_a_steady_load_are_counted(tools: Built) -> None:
     assert (state.next, state.sent) == (10, 0)
 
 
-def test_a_steady_load_goes_on_where_it_was(ends: Ends) -> None:
+def test_a_steady_load_continues_its_numbering(ends: Ends) -> None:
     state = Soak()
     for _ in range(3):
         ends.soak(state, 5, 70, 1000)
@@ -131,7 +133,7 @@ def test_a_peer_forwards_everything_in_order(name: str, tools: Built) -> None:
         pytest.skip(kind)
     assert kind.name == name
     with running(kind, tools) as relay:
-        assert relay.burst()["cpu_us"] > 0  # a burst of which anything is missing raises
+        assert relay.burst()["cpu_us"] > 0  # an incomplete burst raises
         state = Soak()
         relay.ends.soak(state, 1, 0, 1000)
         assert state.received == 0
@@ -140,11 +142,11 @@ def test_a_peer_forwards_everything_in_order(name: str, tools: Built) -> None:
 
 def test_the_asyncio_relay_delays(tools: Built) -> None:
     with running(asyncio_relay(delay_ms=5.0), tools) as relay:
-        # asyncio takes what is due within the clock's resolution for due
+        # asyncio runs timers early by up to the clock's resolution
         assert (relay.ends.pace(20, 100_000) > 4_900_000).all()
 
 
-def test_our_relays_counts_are_what_sender_and_sink_saw(tools: Built) -> None:
+def test_the_relays_counters_agree_with_sender_and_sink(tools: Built) -> None:
     with running(our_relay("ours", Ours("loss 30% mansd 2 seed 3")), tools) as relay:
         found = relay.ends.burst(relay.pid, 200, slack=2)
         totals = relay.totals()

@@ -15,7 +15,7 @@ from benchmarks._report import MeasurementError, Rounds, Row
 from noack.protocol.record_tables import Fate
 
 
-def test_what_a_relay_decided_counts_and_not_what_it_forwarded() -> None:
+def test_the_rate_counts_decided_and_not_forwarded_packets() -> None:
     figures = figures_of("ours", Burst(wall_s=0.01, decided=998, received=950), 1000, 16, 0.003)
     assert figures == pytest.approx({"per_s": 99_800, "cpu_us": 3.0})
 
@@ -23,7 +23,7 @@ def test_what_a_relay_decided_counts_and_not_what_it_forwarded() -> None:
 @pytest.mark.parametrize(
     ("burst", "slack"), [(Burst(0.01, 983, 930), 16), (Burst(0.01, 1000, 999), 0)]
 )
-def test_a_burst_that_did_not_come_through_is_no_figure(burst: Burst, slack: int) -> None:
+def test_an_incomplete_burst_gives_no_figure(burst: Burst, slack: int) -> None:
     with pytest.raises(MeasurementError, match=f"only {burst.received} arrived"):
         figures_of("relay", burst, 1000, slack, 0.003)
 
@@ -45,7 +45,7 @@ def test_the_goals_of_the_rates() -> None:
     ]
 
 
-def test_delays_are_counted_beyond_the_base() -> None:
+def test_the_base_delay_is_subtracted() -> None:
     delays_ns = np.arange(1, 102) * 1000  # 1, 2, ..., 101 µs
     assert relay_delay.quantiles_of("relay", delays_ns, 3.0) == {"p50": 48.0, "p99": 97.0}
 
@@ -83,7 +83,7 @@ def test_only_the_99th_percentile_of_the_lateness_is_judged(refused: str | None)
     assert judged.holds is (None if refused else True)
 
 
-def test_the_cost_of_many_flows_is_compared_with_that_of_one() -> None:
+def test_the_cost_of_many_flows_is_compared_with_one_flow() -> None:
     rounds = Rounds()
     for one, many in ((3.0, 4.2), (6.0, 7.2)):
         rounds.add("ours, one flow", {"cpu_us": one})
@@ -97,7 +97,7 @@ def test_the_cost_of_many_flows_is_compared_with_that_of_one() -> None:
 
 
 @pytest.mark.parametrize("batch", [1, 3, 7, 50])
-def test_runs_of_losses_are_those_of_the_fates_whatever_the_batches(batch: int) -> None:
+def test_consecutive_losses_do_not_depend_on_the_batches(batch: int) -> None:
     delivered = (Fate.DELIVERED, Fate.FORCED)
     fates = np.random.default_rng(batch).integers(0, 4, (50, 3)).astype(np.uint8)
     runs = LossRuns(3)
@@ -115,10 +115,10 @@ def test_runs_of_losses_are_those_of_the_fates_whatever_the_batches(batch: int) 
 
 
 @pytest.mark.parametrize(("probability", "mansd"), [(0.5, 4), (0.05, 4), (0.9, 1), (0.3, 0)])
-def test_the_predicted_loss_is_the_stationary_one_of_the_chain_of_runs(
+def test_the_predicted_loss_is_that_of_the_stationary_markov_chain(
     probability: float, mansd: int
 ) -> None:
-    chain = np.zeros((mansd + 1, mansd + 1))  # from a run of k losses to the next
+    chain = np.zeros((mansd + 1, mansd + 1))  # transitions of the number of consecutive losses
     for run in range(mansd):
         chain[run, run + 1] = probability
         chain[run, 0] = 1 - probability
@@ -135,20 +135,20 @@ def test_the_pure_link_keeps_its_guarantee_and_the_predicted_loss(
     found = relay_flows.decide_all(way(200), 100_000, 200)
     assert found.runs.longest == 4
     assert found.runs.decisions >= 100_000
-    # 5 standard errors of independent draws; the cap makes the losses less variable than those.
+    # 5 standard errors of independent draws; the cap reduces the variance.
     share = found.runs.lost / found.runs.decisions
     assert share == pytest.approx(predicted_loss(0.5, 4), abs=0.008)
 
 
-def test_both_ways_to_run_the_link_decide_alike() -> None:
+def test_plain_and_compiled_links_make_the_same_decisions() -> None:
     assert (plain(20)(30) == compiled(20)(30)).all()
 
 
-def test_a_run_of_losses_beyond_the_cap_misses_the_goal() -> None:
+def test_a_loss_burst_beyond_the_cap_misses_the_goal() -> None:
     def decide(count: int) -> np.ndarray[tuple[int, int], np.dtype[np.uint8]]:
         fates = np.zeros((count, relay_flows.FLOWS), np.uint8)
-        fates[-3:, 7] = Fate.DROPPED  # with the two before, across the batches, five
-        fates[:2, 7] = 99  # whatever is neither delivered nor forced
+        fates[-3:, 7] = Fate.DROPPED  # with the two of the next batch: five consecutive losses
+        fates[:2, 7] = 99  # any fate except delivered and forced
         return fates
 
     found = relay_flows.decide_all(decide, 3_000_000, relay_flows.FLOWS)
@@ -157,7 +157,7 @@ def test_a_run_of_losses_beyond_the_cap_misses_the_goal() -> None:
     assert verdicts == [False]
 
 
-def test_decisions_that_cannot_be_had_say_why() -> None:
+def test_unavailable_decisions_state_the_reason() -> None:
     (row,) = relay_flows.decision_rows("compiled", "not built")
     assert row.as_json()["note"] == "not built"
 
@@ -175,7 +175,7 @@ def soaked(**changes: int) -> list[Row]:
     )
 
 
-def test_a_load_that_came_through_reaches_all_goals() -> None:
+def test_a_load_without_unintended_losses_reaches_all_goals() -> None:
     rows = soaked()
     assert [row.holds for row in rows if row.goal is not None] == [True] * 6
     assert rows[0].ratio == 0.5
@@ -195,21 +195,21 @@ def test_each_unintended_loss_misses_its_goal(changes: dict[str, int], row: str)
     assert [found.name for found in soaked(**changes) if found.holds is False] == [row]
 
 
-def test_memory_grows_between_the_second_quarter_and_the_last() -> None:
+def test_memory_growth_is_measured_from_the_second_to_the_last_quarter() -> None:
     start, flat, leak = [100.0, 900.0], [1000.0] * 6, [1000.0 + 7 * k for k in range(8)]
     assert relay_soak.growth_kib([*start, *flat]) == 0
-    assert relay_soak.growth_kib(leak) == 7 * 4  # from the middle of 2, 3 to that of 6, 7
+    assert relay_soak.growth_kib(leak) == 7 * 4  # from the mean of samples 2, 3 to that of 6, 7
     assert relay_soak.growth_kib([5.0] * 4) == 0
 
 
 @pytest.mark.parametrize("per_s", [900.0, 57_321.0, 372_500.0])
-def test_groups_make_the_rate(per_s: float) -> None:
+def test_group_size_and_period_give_the_rate(per_s: float) -> None:
     size, period_ns = relay_soak.groups(per_s)
     assert size * 1e9 / period_ns == pytest.approx(per_s, rel=1e-4)
     assert size >= 1
 
 
-def test_our_command_line() -> None:
+def test_the_command_line_of_our_relay() -> None:
     ours = Ours("loss 5% mansd 4", realtime=True, segment=True, engine="plain")
     command = command_of(ours, 9001)
     assert Path(command[0]).name.startswith("python")
@@ -220,7 +220,7 @@ def test_our_command_line() -> None:
     assert "--one-way" not in command_of(Ours("delay 10ms", reverse=True), 9001)
 
 
-def test_totals_that_are_not_there_are_an_error() -> None:
+def test_missing_totals_are_an_error() -> None:
     forward = {
         "arrived": 9, "forwarded": 8, "longest_loss_burst": 1, "unintended": {"lost_in_kernel": 0},
     }  # fmt: skip

@@ -29,19 +29,17 @@ KEYS = {"name", "value", "unit", "peer", "ratio", "goal", "holds"}
         (Goal("==", 0), 1, False),
     ],
 )
-def test_a_goal_compares_what_was_found_with_its_limit(
-    goal: Goal, found: float, holds: bool
-) -> None:
+def test_a_goal_compares_a_value_with_its_limit(goal: Goal, found: float, holds: bool) -> None:
     assert goal.holds(found) is holds
 
 
-def test_a_goal_is_about_the_ratio_if_there_is_a_peer() -> None:
+def test_with_a_peer_the_goal_applies_to_the_ratio() -> None:
     row = Row("latency", 30.0, "µs", Peer("ping", 12.0), Goal("<=", 3))
     assert row.ratio == 2.5
     assert row.holds is True
 
 
-def test_a_goal_is_about_the_value_if_there_is_no_peer() -> None:
+def test_without_a_peer_the_goal_applies_to_the_value() -> None:
     assert Row("missing", 1, "samples", goal=Goal("==", 0)).holds is False
 
 
@@ -54,11 +52,11 @@ def test_a_goal_is_about_the_value_if_there_is_no_peer() -> None:
         Row("not comparable", 1.0, "s", Peer("p", 1.0), Goal("<", 3), unjudged="no SCHED_FIFO"),
     ],
 )
-def test_what_cannot_be_judged_neither_holds_nor_fails(row: Row) -> None:
+def test_a_row_that_cannot_be_judged_neither_holds_nor_fails(row: Row) -> None:
     assert row.holds is None
 
 
-def test_a_row_as_json_has_the_agreed_keys_and_says_why_it_was_not_judged() -> None:
+def test_a_row_as_json_has_all_keys_and_the_reason_if_not_judged() -> None:
     plain = Row("p50", 3.0, "µs", Peer("ping", 1.5), Goal("<=", 3)).as_json()
     assert plain == {
         "name": "p50",
@@ -81,7 +79,9 @@ def test_cpu_times_are_read_from_the_line_of_all_cores() -> None:
     times = cpu_times("cpu  " + " ".join(map(str, ticks)) + "\ncpu0 1 1 1 1 1 1 1 1 1 1\n")
     assert times.busy_s == 10 + 1 + 5 + 0 + 1
     assert times.steal_s == 4
-    assert times.total_s == 17 + 80 + 2 + 4  # guest time, the last two, is part of user time
+    assert (
+        times.total_s == 17 + 80 + 2 + 4
+    )  # user time already includes guest time, the last two values
 
 
 def benchmark(rows: list[Row]) -> Benchmark:
@@ -98,7 +98,7 @@ def test_the_rows_are_written_as_json(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "An example" in capsys.readouterr().out
 
 
-def test_a_benchmark_that_cannot_be_carried_out_says_why_and_the_next_one_goes_on(
+def test_a_benchmark_that_cannot_run_states_the_reason_and_the_next_one_runs(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fail(options: argparse.Namespace) -> list[Row]:
@@ -117,7 +117,7 @@ def test_a_benchmark_that_cannot_be_carried_out_says_why_and_the_next_one_goes_o
     assert "no such program" in capsys.readouterr().out
 
 
-def test_options_of_a_benchmark_reach_it(capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_are_passed_to_their_benchmark(capsys: pytest.CaptureFixture[str]) -> None:
     seen: list[bool] = []
 
     def measure(options: argparse.Namespace) -> list[Row]:
@@ -168,16 +168,16 @@ def test_a_row_has_the_medians_of_the_rounds() -> None:
     assert (row.value, row.peer, row.ratio, row.holds) == (12.0, Peer("theirs", 6.0), 2.0, False)
 
 
-def test_a_paired_ratio_is_that_within_a_round() -> None:
+def test_a_paired_ratio_is_the_median_of_the_ratios_per_round() -> None:
     rounds = rounds_of([1.0, 30.0, 3.0], [2.0, 60.0, 8.0])
     row = rounds.row("cost", "µs", "us", "ours", "theirs", HALF, paired=True)
     assert (row.value, row.peer) == (3.0, Peer("theirs", 8.0))
-    assert row.ratio == 0.5  # and not 3 / 8
+    assert row.ratio == 0.5  # not 3 / 8
     assert row.holds is True
 
 
 @pytest.mark.parametrize("side", ["ours", "theirs"])
-def test_a_side_that_was_not_measured_is_named_and_nothing_is_judged(side: str) -> None:
+def test_a_side_without_measurements_is_named_and_not_judged(side: str) -> None:
     rounds = rounds_of([1.0, 2.0], [1.0])
     rounds.add(side, "lost a datagram")
     row = rounds.row("cost", "µs", "us", "ours", "theirs", HALF, paired=True)

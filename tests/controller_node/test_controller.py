@@ -260,9 +260,7 @@ def test_no_safe_input_is_sent_with_a_known_start() -> None:
 
 
 def test_an_actuation_carries_the_state_that_it_was_computed_from() -> None:
-    """An actuation also carries the state's time, although a newer update advanced the model past a
-    late tick.
-    """
+    """The state's time is sent, too; a newer update had advanced the model past a late tick."""
     controller = new_controller(predictive=True, safe_input=np.full(3, 0.5))
     message, _ = tick(controller)
     assert message.vector.tolist() == [0.5, 0.5, 0.5, 0.0, 0.0]

@@ -1,7 +1,7 @@
-"""Every shipped scenario, in virtual time; and the classic plants beside their literature.
+"""Every shipped scenario in virtual time, and the classic plants against their literature.
 
-What is of the reactor, and of Tabuada's example, stands in ``exact/test_published.py``, what is of
-the cart and its pole in ``tests/plant_server/test_systems.py``.
+The reactor and Tabuada's example are in ``simulation/continuous/test_published.py``, the cart-pole
+in ``tests/noack/plants/test_cart_pole.py``.
 """
 
 import math
@@ -32,8 +32,9 @@ from noack.protocol.record_tables import PLANT_STEP
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 NAMES = sorted(path.stem for path in SCENARIOS.glob("*.toml"))
 ENDS_BELOW = {"f16_lateral": 0.5, "pendulum_observed": 0.5}
-"""‖x(T)‖ / ‖x(0)‖; the F-16 starts aslip, in rad, and ends with its rudder a little off, in °; the
-pendulum is balanced from noisy angles."""
+"""‖x(T)‖ / ‖x(0)‖. The F-16 starts with sideslip in rad and ends with a small rudder angle in °;
+the pendulum is balanced from noisy angles.
+"""
 
 
 def shipped(name: str, *settings: str) -> Scenario:
@@ -46,7 +47,7 @@ def run_of(name: str) -> RunRecord:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_shipped_scenario_keeps_what_it_assumes_and_settles(name: str) -> None:
+def test_a_shipped_scenario_meets_its_assumptions_and_settles(name: str) -> None:
     record = run_of(name)
     summary = summarise(record, 0, "horizon").to_json()
     assert summary["exit"]["status"] == 0
@@ -81,7 +82,7 @@ def linear_tanks(**given: Any) -> tuple[Matrix, Matrix]:
 
 
 def zeros(A: Matrix, B: Matrix) -> list[float]:
-    """Of the levels 1 and 2, by the generalised eigenvalues of Rosenbrock's matrix."""
+    """From levels 1 and 2, by the generalised eigenvalues of Rosenbrock's matrix."""
     C = np.eye(2, 4)
     pencil = np.block([[A, B], [C, np.zeros((2, 2))]])
     weight = np.diag([1.0, 1, 1, 1, 0, 0])
@@ -89,8 +90,8 @@ def zeros(A: Matrix, B: Matrix) -> list[float]:
     return sorted(found[np.isfinite(found)].real.tolist())
 
 
-def test_the_tanks_time_constants_gains_and_zeros_are_those_that_johansson_prints() -> None:
-    """Of P₋: 62, 90, 23 and 30 s; gains 2.6, 1.5, 1.4 and 2.8; zeros −0.060 and −0.018 /s."""
+def test_the_tanks_time_constants_gains_and_zeros_are_johanssons() -> None:
+    """For P₋: 62, 90, 23 and 30 s; gains 2.6, 1.5, 1.4 and 2.8; zeros −0.060 and −0.018 /s."""
     A, B = linear_tanks()
     np.testing.assert_allclose(-1 / np.diag(A), [62, 90, 23, 30], atol=0.7)
     gains = 0.5 * np.linalg.solve(-A, B)[:2]  # 0.5 V per cm
@@ -98,12 +99,12 @@ def test_the_tanks_time_constants_gains_and_zeros_are_those_that_johansson_print
     np.testing.assert_allclose(zeros(A, B), [-0.060, -0.018], atol=6e-4)
 
 
-def test_the_other_valves_put_a_zero_into_the_right_half_plane_where_johansson_has_it() -> None:
-    """Of P₊: time constants 63, 91, 39 and 56 s; zeros −0.057 and 0.013 /s."""
+def test_the_other_valve_settings_give_johanssons_right_half_plane_zero() -> None:
+    """For P₊: time constants 63, 91, 39 and 56 s; zeros −0.057 and 0.013 /s."""
     A, B = linear_tanks(
         valves=(0.43, 0.34), voltages_v=(3.15, 3.15), pumps_cm3_per_v_s=(3.14, 3.29)
     )
-    # The levels that he prints and computes with are not quite those that the voltages hold.
+    # The published levels differ slightly from the equilibrium of the published voltages.
     np.testing.assert_allclose(-1 / np.diag(A), [63, 91, 39, 56], rtol=0.015)
     np.testing.assert_allclose(zeros(A, B), [-0.057, 0.013], atol=1e-3)
 
@@ -119,7 +120,7 @@ def test_a_tank_that_runs_dry_stays_empty() -> None:
     settings = FourTankSettings(kind="four_tank")
     system = OdeSystem(settings.equations(), np.array([0.0, 0.0, -1.0, -1.0]))
     for step in range(600):
-        system.advance(np.array([-5.0, -5.0]), step * 10**9, 10**9)  # a pump does not draw
+        system.advance(np.array([-5.0, -5.0]), step * 10**9, 10**9)  # a pump does not draw water
     assert (system.z < 1e-3).all()
     assert (system.z > -1e-6).all()
 
@@ -127,7 +128,7 @@ def test_a_tank_that_runs_dry_stays_empty() -> None:
 # The F-16: Stevens and Lewis, Aircraft Control and Simulation, Example 5.3-1.
 
 
-def test_the_f16s_modes_are_those_of_the_aircraft() -> None:
+def test_the_f16s_modes_are_the_published_ones() -> None:
     """Dutch roll −0.42 ± 3.06j, roll −3.615, spiral −0.0163 /s, and servos of 20.2 /s."""
     found = np.linalg.eigvals(loop("f16_lateral").A_model)
     expected = [-20.2, -20.2, -3.615, -1.0, -0.4224 - 3.0635j, -0.4224 + 3.0635j, -0.0163]
@@ -135,8 +136,8 @@ def test_the_f16s_modes_are_those_of_the_aircraft() -> None:
     np.testing.assert_allclose(ordered, expected, atol=5e-4)
 
 
-def test_the_f16s_regulator_moves_them_to_where_the_book_has_them() -> None:
-    """−0.82 ± 0.11j, −3.13 ± 0.83j, −11.47 ± 17.18j, −15.02 /s, of a gain of two decimals."""
+def test_the_f16s_closed_loop_modes_are_the_published_ones() -> None:
+    """−0.82 ± 0.11j, −3.13 ± 0.83j, −11.47 ± 17.18j, −15.02 /s, for a gain of two decimals."""
     expected = [-15.02, -11.47 - 17.18j, -11.47 + 17.18j, -3.13 - 0.83j, -3.13 + 0.83j,
                 -0.82 - 0.11j, -0.82 + 0.11j]  # fmt: skip
     found = sorted(closed(loop("f16_lateral")), key=lambda pole: (pole.real, pole.imag))
@@ -157,7 +158,7 @@ def test_the_double_integrators_regulator_is_the_textbooks() -> None:
                             "trigger.floor=1e-6", "network.loss={model='lossless'}"))  # fmt: skip
     steps = fine[PLANT_STEP]
     cost = np.sum(steps["x"][:, 0] ** 2 + steps["u"][:, 0] ** 2) * 2e-3
-    assert cost == pytest.approx(math.sqrt(2), rel=4e-3)  # sampled every 1/700 of its time
+    assert cost == pytest.approx(math.sqrt(2), rel=4e-3)  # sampled every 1/700 of its time constant
 
 
 # A quadrotor: Luukkonen, Modelling and Control of Quadcopter, Aalto University, 2011.
@@ -175,15 +176,15 @@ def test_the_quadrotor_scenarios_model_is_the_linearisation_of_its_plant() -> No
     np.testing.assert_allclose(found.B_model, B, atol=1e-5)
 
 
-def test_the_quadrotors_gain_is_the_regulator_that_its_scenario_names() -> None:
+def test_the_quadrotors_gain_is_the_regulator_named_in_its_scenario() -> None:
     found = loop("quadrotor_hover")
     Q, R = np.diag([1.0] * 6 + [0.5] * 3 + [0.1] * 3), np.diag([1.0, 100.0, 100.0, 100.0])
     P = solve_continuous_are(found.A_model, found.B_model, Q, R)
     np.testing.assert_allclose(found.K, -np.linalg.solve(R, found.B_model.T @ P), atol=1e-5)
 
 
-def test_luukkonens_gains_level_the_quadrotor_within_the_five_seconds_that_he_reports() -> None:
-    """From 1 m and 10° of each angle, by his PD gains (2.5, 1.5 of height; 1.75, 6 of angles)."""
+def test_luukkonens_gains_level_the_quadrotor_within_his_five_seconds() -> None:
+    """From 1 m and 10° of each angle, by his PD gains (2.5, 1.5 for height; 1.75, 6 for angles)."""
     settings = QuadrotorSettings(kind="quadrotor")
     K = np.zeros((4, 12))
     K[0, [2, 8]] = np.array([-1.5, -2.5]) * settings.mass_kg
@@ -198,7 +199,8 @@ def test_luukkonens_gains_level_the_quadrotor_within_the_five_seconds_that_he_re
         system.advance(K @ system.x, step * h_ns, h_ns)
     assert np.abs(system.x[3:6]).max() < 0.02 * aslant  # the usual 2 %
     assert abs(system.x[2]) < 0.07  # of 1 m: its slower pole, −0.62 /s with drag, leaves 6 %
-    assert np.abs(system.x[:2]).max() > 0.3  # nothing brings it back, as he remarks
+    # the horizontal position is not controlled, as he remarks
+    assert np.abs(system.x[:2]).max() > 0.3
 
 
 def test_a_quadrotor_in_free_fall_without_drag_keeps_its_energy_and_its_angular_momentum() -> None:
@@ -227,10 +229,10 @@ def test_a_quadrotor_in_free_fall_without_drag_keeps_its_energy_and_its_angular_
     assert np.abs(system.x[3:6] - start[3:6]).max() > 0.3
 
 
-# What every summary says of a plant that is not linear.
+# The linearisation in the summary of a run with a nonlinear plant.
 
 
-def test_a_summary_holds_the_car_against_what_its_loop_believes() -> None:
+def test_a_summary_compares_the_cars_linearisation_with_the_model() -> None:
     found = linearisation(shipped("lane_vehicle"))
     assert found is not None
     assert found["in_box"] is True
@@ -241,7 +243,7 @@ def test_a_summary_holds_the_car_against_what_its_loop_believes() -> None:
     assert said(found)[1][1].endswith("inside the box")
 
 
-def test_another_car_is_outside_the_box_and_says_where() -> None:
+def test_another_car_is_reported_outside_the_box_with_its_entries() -> None:
     found = linearisation(shipped("lane_vehicle", "plant.system.parameters=vw_vanagon"))
     assert found is not None
     assert found["in_box"] is False
@@ -249,14 +251,14 @@ def test_another_car_is_outside_the_box_and_says_where() -> None:
     assert said(found)[1][1] == f"B[2, 1], by {worst:.3g}, outside the box"
 
 
-def test_without_a_box_nothing_is_inside_and_of_a_linear_plant_nothing_is_said() -> None:
+def test_a_plant_without_a_box_and_a_linear_plant_have_no_box_check() -> None:
     found = linearisation(shipped("cart_pole"))
     assert found is not None
     assert found["in_box"] is None
     assert linearisation(shipped("lane_following")) is None
 
 
-def test_of_a_plant_whose_x_is_no_state_the_summary_says_so() -> None:
+def test_the_summary_reports_a_plant_without_a_linearisation() -> None:
     found = linearisation(shipped("lane_vehicle", "plant.system.model=kinematic"))
     assert found is not None
     assert set(found.values()) == {None}
@@ -265,8 +267,8 @@ def test_of_a_plant_whose_x_is_no_state_the_summary_says_so() -> None:
     )
 
 
-def test_the_f16s_file_says_truly_what_is_not_certified_of_it() -> None:
-    """A certificate at its own schedule would make the file's words untrue."""
+def test_the_f16_scenarios_comment_on_its_certificates_is_correct() -> None:
+    """A certificate at its own schedule would contradict the file's comment."""
     words = (SCENARIOS / "f16_lateral.toml").read_text().partition("name =")[0]
     own, box = scheduled_certificates(shipped("f16_lateral"))
     degree = math.degrees(1)

@@ -1,4 +1,4 @@
-"""``python -m tests.fuzz run|show``: the long run; one input again, as a line of a corpus."""
+"""``python -m tests.fuzz run|show``: run the long run; show one input as a corpus line."""
 
 import argparse
 import importlib.util
@@ -11,7 +11,7 @@ from tests.fuzz.long import fuzz_all
 
 
 def main() -> int:
-    """Return 0, or 1 if something is wrong with a parser."""
+    """Return 0, or 1 if a parser fails."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     commands = parser.add_subparsers(required=True, dest="command")
     run = commands.add_parser("run", help="fuzz; exit status 1 if something was found")

@@ -1,7 +1,7 @@
 """One parser under the coverage-guided fuzzer: ``python -m tests.fuzz.child NAME OUT FLAGS…``.
 
-What goes wrong is kept with the smallest input that shows it, and the fuzzer goes on; only what
-ends the process (a crash of compiled code, a hang in it, too much memory) ends it.
+For each failure, the smallest input that causes it is kept, and the fuzzer continues. Fuzzing stops
+only if the process ends: a crash or hang of compiled code, or too much memory.
 """
 
 import hashlib
@@ -11,14 +11,14 @@ from pathlib import Path
 from types import ModuleType
 
 PACKAGES = ("noack", "netem", "cosim", "tests", "tomllib", "shlex")
-"""Of which coverage is taken."""
+"""Packages with coverage instrumentation."""
 
 
 class Findings:
-    """What went wrong, one for each place.
+    """Failures, one for each place in the code.
 
     Args:
-        folder: takes the inputs, and beside each what it led to.
+        folder: the folder for the inputs and their tracebacks.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -26,7 +26,7 @@ class Findings:
         self._smallest: dict[str, int] = {}
 
     def add(self, data: bytes, error: BaseException) -> None:
-        """Keep an input, unless a smaller one shows the same."""
+        """Keep an input unless a smaller one causes the same failure."""
         place = signature(error)
         if len(data) >= self._smallest.get(place, 2**63):
             return
@@ -38,7 +38,7 @@ class Findings:
 
 
 def signature(error: BaseException) -> str:
-    """Where something went wrong: the kind of error, and the innermost frames of our own."""
+    """Return the place of a failure: the exception's type and the innermost project frames."""
     frames = [
         f"{frame.filename}:{frame.lineno}"
         for frame in traceback.extract_tb(error.__traceback__)
@@ -49,7 +49,7 @@ def signature(error: BaseException) -> str:
 
 
 def main(atheris: ModuleType) -> None:
-    """Fuzz until the fuzzer's flags say that it is enough."""
+    """Fuzz until the limit in the fuzzer's flags."""
     name, out, *flags = sys.argv[1:]
     with atheris.instrument_imports(include=list(PACKAGES)):
         from tests.fuzz.harness import harness

@@ -1,7 +1,7 @@
-"""Bytes as choices: what a structured input is made of, however long the bytes are.
+"""Build structured inputs from bytes of any length: the bytes determine each choice.
 
-Beyond their end every choice is the first one, so that all bytes make an input, and fewer bytes a
-simpler one. It needs no fuzzer, so that a kept input means the same to all who run it.
+Beyond the end of the bytes, every choice is the first option. So all bytes give an input, and fewer
+bytes give a simpler one. No fuzzer is needed, so a kept input has the same meaning everywhere.
 """
 
 import struct
@@ -20,13 +20,13 @@ FLOATS = (
 )  # fmt: skip
 
 SEEDS = (b"", bytes(range(256)), bytes(range(255, -1, -1)) * 2)
-"""Few choices and many."""
+"""Seeds with few choices and with many."""
 EDITS = tuple(b"\0" + seed for seed in SEEDS)
-"""The same for parsers of text, of which a zero byte begins edits of valid text."""
+"""The same seeds for parsers of text, where a zero byte selects edits of valid text."""
 
 
 class Choices:
-    """Takes choices from bytes, first to last."""
+    """Reads choices from bytes, first to last."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
@@ -34,34 +34,34 @@ class Choices:
 
     @property
     def left(self) -> int:
-        """Bytes that no choice has taken."""
+        """Number of unused bytes."""
         return len(self._data) - self._at
 
     def take(self, count: int) -> bytes:
-        """So many bytes."""
+        """Return the next ``count`` bytes."""
         taken = self._data[self._at : self._at + count]
         self._at += len(taken)
         return taken.ljust(count, b"\0")
 
     def rest(self) -> bytes:
-        """All that is left."""
+        """Return all unused bytes."""
         return self.take(self.left)
 
     def below(self, limit: int) -> int:
-        """A number from 0 to below ``limit``."""
+        """Return a number from 0 to ``limit`` − 1."""
         size = 1 if limit <= 256 else 2
         return int.from_bytes(self.take(size), "little") % limit
 
     def one(self, of: Sequence[T]) -> T:
-        """One of these."""
+        """Return one of these options."""
         return of[self.below(len(of))]
 
     def flag(self) -> bool:
-        """Yes or no."""
+        """Return True or False."""
         return bool(self.below(2))
 
     def integer(self) -> int:
-        """An integer: one where something is apt to go wrong, a small one, or any of 64 bits."""
+        """Return an integer: a boundary value, a small one, or any of 64 bits."""
         match self.below(3):
             case 0:
                 return self.one(INTEGERS)
@@ -71,11 +71,11 @@ class Choices:
                 return int(struct.unpack("<q", self.take(8))[0])
 
     def real(self) -> float:
-        """A real number: one where something is apt to go wrong, or of any bits."""
+        """Return a float: a boundary value, or any 64 bits."""
         if self.flag():
             return float(struct.unpack("<d", self.take(8))[0])
         return self.one(FLOATS)
 
     def text(self) -> str:
-        """A short text, of any characters that UTF-8 can say."""
+        """Return a short text of any UTF-8 characters."""
         return self.take(self.below(16)).decode("utf-8", errors="replace")

@@ -1,4 +1,4 @@
-"""Valid content, edited: the parser's own keys and values, where they do not belong."""
+"""Edit valid content: put the parser's own keys and values in wrong places."""
 
 import copy
 import datetime
@@ -9,16 +9,16 @@ from tests.fuzz.choices import Choices
 
 
 class Vocabulary(NamedTuple):
-    """What edits put in."""
+    """Keys and values that edits insert."""
 
     keys: Sequence[str]
     words: Sequence[str]
     dates: bool = False
-    """Whether the format has dates, and no null, as TOML."""
+    """Whether the format has dates and no null, as TOML does."""
 
 
 def vocabulary(schema: Mapping[str, Any], *, dates: bool = False) -> Vocabulary:
-    """The keys and the constant strings of a JSON Schema, in order."""
+    """Return the keys and constant strings of a JSON Schema, in order."""
     keys, words = dict[str, None](), dict[str, None]()
     parts: list[Any] = [schema]
     while parts:
@@ -34,7 +34,7 @@ def vocabulary(schema: Mapping[str, Any], *, dates: bool = False) -> Vocabulary:
 
 
 def edited(choices: Choices, tree: Any, known: Vocabulary, most: int = 6) -> Any:
-    """A copy of a tree of dicts and lists with some edits."""
+    """Return a copy of a tree of dicts and lists with some edits."""
     root = {"": copy.deepcopy(tree)}
     for _ in range(choices.below(most)):
         _edit(choices, root[""], known)
@@ -42,7 +42,7 @@ def edited(choices: Choices, tree: Any, known: Vocabulary, most: int = 6) -> Any
 
 
 def value(choices: Choices, known: Vocabulary, depth: int = 0) -> Any:
-    """Any value."""
+    """Return a value of any type."""
     match choices.below(9 if depth < 3 else 6):
         case 0:
             return choices.integer()
@@ -71,7 +71,7 @@ def value(choices: Choices, known: Vocabulary, depth: int = 0) -> Any:
 
 
 def key(choices: Choices, known: Vocabulary) -> str:
-    """A key that the format has, or any."""
+    """Return a key of the format or any other key."""
     return choices.one(known.keys) if known.keys and choices.below(8) else choices.text()
 
 
@@ -102,7 +102,7 @@ def _edit(choices: Choices, tree: Any, known: Vocabulary) -> None:
 
 
 def _containers(tree: Any) -> Any:
-    """Tables and lists of a tree; of a long list the first entries only."""
+    """Return the tables and lists of a tree; of a long list, only the first entries."""
     if isinstance(tree, dict):
         yield tree
         for one in tree.values():

@@ -1,4 +1,4 @@
-"""Files that parsers read, and what they may say."""
+"""Files that parsers read, and dictionary words for the fuzzer."""
 
 import json
 import tomllib
@@ -15,11 +15,11 @@ NAMED: Mapping[str, bytes] = {
     "delays.txt": b"# delays\n0.01\n12.5ms\n",
     "table.dist": b"-8192 0 8192\n",
 }
-"""Files that lie beside what is read."""
+"""Files in the same folder as the input file."""
 
 
 def write_named(folder: Path, name: str, data: bytes) -> Path:
-    """Write a file into a folder, and beside it those that it may name."""
+    """Write a file into a folder, together with the files that it may name."""
     _named(folder)
     path = folder / name
     path.write_bytes(data)
@@ -33,12 +33,12 @@ def _named(folder: Path) -> None:
 
 
 def bases(folder: str, *more: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
-    """The content of the shipped TOML files of a folder, and more."""
+    """Return the content of the shipped TOML files of a folder, and ``more``."""
     paths = sorted((FOLDER.parents[1] / folder).glob("*.toml"))
     return [*(tomllib.loads(path.read_text(encoding="utf-8")) for path in paths), *more]
 
 
 def quoted(known: Vocabulary) -> Sequence[bytes]:
-    """Keys as they stand, words in quotes, and some numbers, for a fuzzer that makes text."""
+    """Return plain keys, quoted words and some numbers, for a fuzzer that makes text."""
     words: Iterable[str] = (*known.keys, *(json.dumps(word) for word in known.words))
     return [word.encode() for word in (*words, "1e400", "nan", "-inf", "[[", "]]", "{", "}", "=")]

@@ -1,12 +1,12 @@
-"""What every parser must do with any input: return, or say in one line what is wrong with it.
+"""With any input, every parser must return or report the mistake in one line.
 
-A parser has a module below ``parsers`` with
+Each parser has a module below ``parsers`` with
 
-* ``one_input(data)``, which feeds it one input, and raises if something is wrong with the parser;
-* optionally ``SEEDS``, inputs to begin with beside the kept ones, where they are no choices
-  (:mod:`tests.fuzz.choices`), and ``WORDS``, of which the fuzzer makes inputs.
+* ``one_input(data)``, which passes one input to the parser and raises if the parser fails;
+* optionally ``SEEDS``, initial inputs in addition to the kept ones (the default is that of
+  :mod:`tests.fuzz.choices`), and ``WORDS``, from which the fuzzer builds inputs.
 
-``corpus/NAME.txt`` keeps its inputs, one a line, as Python escapes bytes.
+``corpus/NAME.txt`` contains the kept inputs, one per line, escaped as Python escapes bytes.
 """
 
 import importlib
@@ -29,7 +29,7 @@ FOLDER = Path(__file__).parent
 NAMES = tuple(sorted(path.stem for path in (FOLDER / "parsers").glob("[a-z]*.py")))
 CORPUS = FOLDER / "corpus"
 LONGEST_CPU_S = 10.0
-"""For one input; what is allowed takes milliseconds, a hundred times as many if it is large."""
+"""CPU time limit for one input; valid inputs take milliseconds, large ones up to 100 times that."""
 _MOST_MEMORY_KIB = 1024 * 1024
 
 
@@ -44,26 +44,26 @@ class Harness:
     name: str
     one_input: Callable[[bytes], None]
     seeds: Sequence[bytes]
-    """To begin with, beside what is kept."""
+    """Initial inputs in addition to the kept ones."""
     words: Sequence[bytes]
-    """Of which inputs are made."""
+    """Words from which the fuzzer builds inputs."""
 
     def run(self, data: bytes) -> None:
-        """Feed it one input.
+        """Pass one input to the parser.
 
         Raises:
-            Exception: the parser does not do what it must; whatever it is.
+            Exception: the parser fails; any type.
         """
         before_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         with _time_limit(), warnings.catch_warnings():
-            warnings.simplefilter("error")  # one more line on standard error is not one line
+            warnings.simplefilter("error")  # a warning would be a second line on standard error
             self.one_input(data)
         grown_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kib
         assert grown_kib < _MOST_MEMORY_KIB, f"one input took {grown_kib} KiB"
 
 
 def harness(name: str) -> Harness:
-    """The harness of a parser."""
+    """Return the harness of a parser."""
     module = importlib.import_module(f"tests.fuzz.parsers.{name}")
     return Harness(
         name, module.one_input, getattr(module, "SEEDS", SEEDS), getattr(module, "WORDS", ())
@@ -71,25 +71,25 @@ def harness(name: str) -> Harness:
 
 
 def kept(name: str) -> list[bytes]:
-    """The kept inputs of a parser."""
+    """Return the kept inputs of a parser."""
     path = CORPUS / f"{name}.txt"
     lines = path.read_text(encoding="ascii").splitlines() if path.is_file() else []
     return [from_line(line) for line in lines if not line.startswith("#")]
 
 
 def from_line(line: str) -> bytes:
-    """The input of a line of a corpus."""
+    """Return the input of a corpus line."""
     return line.encode("ascii").decode("unicode_escape").encode("latin-1")
 
 
 def to_line(data: bytes) -> str:
-    """The line of a corpus that keeps an input; a ``#`` begins comments."""
+    """Return the corpus line for an input; ``#`` begins a comment."""
     line = data.decode("latin-1").encode("unicode_escape").decode("ascii")
     return re.sub("^#", r"\\x23", line)
 
 
 def workspace() -> Path:
-    """A folder of this process for files that parsers read; it is removed at the end."""
+    """Return this process's folder for input files; it is removed at exit."""
     return Path(_workspace().name)
 
 
@@ -100,11 +100,11 @@ def _workspace() -> "tempfile.TemporaryDirectory[str]":
 
 @contextmanager
 def refusal(begin: str | tuple[str, ...] = "", *, lines: bool = False) -> Iterator[None]:
-    """Allow the errors that the project reports to a person, and look at how they read.
+    """Allow the project's own errors and check the form of their messages.
 
     Args:
-        begin: what each line begins with.
-        lines: whether there may be several, one for each mistake.
+        begin: the required beginning of each line.
+        lines: whether several lines are allowed, one for each mistake.
     """
     try:
         yield
@@ -118,7 +118,7 @@ def refusal(begin: str | tuple[str, ...] = "", *, lines: bool = False) -> Iterat
 
 @contextmanager
 def _time_limit() -> Iterator[None]:
-    """Raise in what takes too much time of the processor, which no load of the machine changes."""
+    """Raise after too much CPU time; other load on the machine does not count."""
 
     def over(signum: int, frame: FrameType | None) -> None:
         raise HangError(f"one input took {LONGEST_CPU_S:g} s of the processor")

@@ -1,4 +1,4 @@
-"""The long run: every parser in a process of its own under the fuzzer, and a report at the end."""
+"""The long run: fuzz each parser in a separate process and print a report at the end."""
 
 import os
 import re
@@ -14,7 +14,7 @@ from tests.fuzz.harness import FOLDER, Harness, harness, kept
 
 ROOT = FOLDER.parents[1]
 OUT = ROOT / ".cache" / "fuzz"
-"""What runs find, and what they have learned, for the next one."""
+"""Findings of runs, and their corpora for the next run."""
 BIN = ".venv/bin"
 _STATUS = re.compile(rb"#(\d+)\s+\w+\s+cov: (\d+) ft: (\d+)")
 _INPUT_TIMEOUT_S = 60
@@ -22,22 +22,22 @@ _MEMORY_MIB = 3000
 _LONGEST_INPUT = 8192
 _ARTIFACTS = ("crash-", "oom-", "timeout-")
 FINDINGS = ("finding-", *_ARTIFACTS)
-"""How the files begin that hold an input that shows something wrong."""
+"""Prefixes of the files with an input that causes a failure."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """What became of a parser."""
+    """The result of fuzzing a parser."""
 
     name: str
     executions: int
     features: int
-    """What the fuzzer tells apart in how often which branch is taken."""
+    """The fuzzer's coverage features: branches and how often they are taken."""
     wall_s: float
     findings: Sequence[Path]
-    """Inputs that show something wrong."""
+    """Files with inputs that cause a failure."""
     failed: str | None
-    """Why the fuzzer itself did not run to its end."""
+    """Why the fuzzer itself ended early, or None."""
 
 
 def fuzz(name: str, until: str, out: Path = OUT) -> Result:
@@ -45,15 +45,15 @@ def fuzz(name: str, until: str, out: Path = OUT) -> Result:
 
     Args:
         name: the parser.
-        until: the fuzzer's flag that says when it is enough.
-        out: in a folder below it lies what is learned and found.
+        until: the fuzzer's flag that limits the run.
+        out: the parent folder of the corpus and the findings.
     """
     under_test = harness(name)
     folder, corpus = out / name, out / name / "corpus"
     corpus.mkdir(parents=True, exist_ok=True)
     for old in (path for path in folder.iterdir() if path.is_file()):
         if old.name.startswith(FINDINGS) and not old.suffix:
-            old.replace(corpus / old.name)  # whether it is mended is seen first
+            old.replace(corpus / old.name)  # try old findings first
         else:
             old.unlink()
     for number, data in enumerate([*under_test.seeds, *kept(name)]):
@@ -88,7 +88,7 @@ def fuzz(name: str, until: str, out: Path = OUT) -> Result:
 
 
 def fuzz_all(names: Sequence[str], minutes: float, jobs: int) -> int:
-    """Fuzz parsers, some at a time, within a budget; print what is found; return how many erred."""
+    """Fuzz ``jobs`` parsers at a time; print the findings; return the number of failed parsers."""
     seconds = max(round(60 * minutes * jobs / len(names)), 1)
     print(f"{len(names)} parsers, {seconds} s each, {jobs} at a time", flush=True)
     results: list[Result] = []

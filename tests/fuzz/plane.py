@@ -1,4 +1,4 @@
-"""A control plane without zenoh: messages are put there by the test."""
+"""A control plane without zenoh; the test supplies the messages."""
 
 import json
 from collections import deque
@@ -7,7 +7,7 @@ from typing import Any
 
 
 class Payload:
-    """Bytes, as zenoh hands them over."""
+    """Bytes with zenoh's interface."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
@@ -31,7 +31,7 @@ class Sample:
 
 @dataclass
 class Query:
-    """A request and its answers."""
+    """A request and its replies."""
 
     key_expr: str
     data: bytes | None
@@ -39,7 +39,7 @@ class Query:
     error: str | None = None
     answered: int = 0
     dismissed: bool = False
-    """Whether it was dropped unanswered, so that the process sends it again."""
+    """Whether the request was dropped without a reply, so that the process sends it again."""
 
     @property
     def payload(self) -> Payload | None:
@@ -63,7 +63,7 @@ class _Channel(deque[Any]):
 
 
 class FakePlane:
-    """What recorder and coordinator use of the control plane and its session."""
+    """The part of the control plane and its session that recorder and coordinator use."""
 
     def __init__(self) -> None:
         self.is_closed = False
@@ -72,7 +72,7 @@ class FakePlane:
         self.answers: list[Any] = []
         self.announced: list[Any] = []
         self.acknowledged: dict[str, Any] = {}
-        """The newest confirmation to each process."""
+        """The newest acknowledgement to each process."""
         self._channels: dict[str, _Channel] = {}
 
     def __enter__(self) -> "FakePlane":

@@ -1,4 +1,4 @@
-"""Tables of Parquet with something wrong: other types, holes, odd numbers, damaged bytes."""
+"""Faulty Parquet tables: wrong types, missing values, unusual numbers, damaged bytes."""
 
 import io
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ _IN_64_BITS = [number for number in INTEGERS if -(2**63) <= number < 2**63]
 
 
 def edited_table(choices: Choices, table: pa.Table) -> pa.Table:
-    """A copy of a table with some edits."""
+    """Return a copy of a table with some edits."""
     for _ in range(choices.below(4)):
         name = choices.one(table.column_names) if table.num_columns else ""
         at = table.schema.get_field_index(name)
@@ -39,21 +39,21 @@ def edited_table(choices: Choices, table: pa.Table) -> pa.Table:
 
 
 def written(choices: Choices, table: pa.Table, metadata: Mapping[str, str]) -> bytes:
-    """The bytes of a file, some of them changed."""
+    """Return the bytes of a Parquet file, some of them changed."""
     buffer = io.BytesIO()
     pq.write_table(table.replace_schema_metadata(dict(metadata)), buffer, compression="none")
     return damaged(choices, buffer.getvalue())
 
 
 def damaged(choices: Choices, data: bytes) -> bytes:
-    """Bytes of which some are changed, or the end is missing."""
+    """Return the bytes with some of them changed, or truncated."""
     changed = bytearray(data)
     match choices.below(8):
         case 0:
             return bytes(changed[: choices.below(len(changed) + 1)])
         case 1:
             for _ in range(1 + choices.below(8)):
-                # Counted from the end, where a file of Parquet says what is in it.
+                # Counted from the end, where Parquet stores its metadata.
                 changed[-1 - choices.below(min(len(changed), 2**16))] = choices.below(256)
     return bytes(changed)
 

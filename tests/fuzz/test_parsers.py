@@ -1,4 +1,4 @@
-"""Each parser on its corpus, and on inputs near it; the long run is ``make fuzz``."""
+"""Test each parser on its corpus and on similar inputs; the long run is ``make fuzz``."""
 
 import pytest
 from hypothesis import given, settings
@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from tests.fuzz.harness import NAMES, from_line, harness, kept, to_line
 
 EXAMPLES = {"record": 10, "telemetry": 15, "campaign": 20}
-"""Of slow parsers; 50 of the others. The long run is `make fuzz`."""
+"""Number of examples for slow parsers; 50 for the others. The long run is `make fuzz`."""
 
 places = st.integers(0, 2**16)
 changes = st.lists(
@@ -39,7 +39,7 @@ def test_inputs_near_the_corpus_are_read_or_refused_in_one_line(name: str) -> No
 
 
 def changed(data: bytes, other: bytes, these: list[tuple[str, int, bytes]]) -> bytes:
-    """An input with some changes; one joins a piece of another to it."""
+    """Return an input with some changes; one change appends a piece of another input."""
     for what, place, new in these:
         at = place % (len(data) + 1)
         match what:

@@ -1,4 +1,4 @@
-"""Runs real processes on ephemeral loopback ports, faster than real time."""
+"""Run real processes on ephemeral loopback ports, faster than real time."""
 
 import json
 import os
@@ -40,7 +40,7 @@ class Finished:
 
 
 def settings(**values: object) -> list[str]:
-    """``--set`` options; a double underscore stands for the dot of a key."""
+    """Return ``--set`` options; a double underscore means the dot of a key."""
     pairs = []
     for key, value in values.items():
         pairs += ["--set", f"{key.replace('__', '.')}={json.dumps(value)}"]
@@ -48,10 +48,10 @@ def settings(**values: object) -> list[str]:
 
 
 def command_of(process: psutil.Process) -> list[str]:
-    """Command line of a process; empty if it has ended or was just forked."""
+    """Return the command line of a process; empty if it has ended or was just forked."""
     try:
         return process.cmdline()
-    except psutil.NoSuchProcess:  # a zombie, too
+    except psutil.NoSuchProcess:  # also for a zombie
         return []
 
 
@@ -64,7 +64,7 @@ def is_over(process: psutil.Process) -> bool:
 
 
 def child_of(parent: subprocess.Popen[str], role: str) -> psutil.Process | None:
-    """The launched process of a role; None if there is none at the moment."""
+    """Return the running process of a role, or None."""
     for child in psutil.Process(parent.pid).children():
         if ROLE_MODULES[role] in command_of(child):
             return child
@@ -77,7 +77,7 @@ AT_RATE = settings(plant__rate_hz=RATE_HZ, controller__rate_hz=RATE_HZ)
 
 
 def private_files(folder: Path) -> list[Path]:
-    """The private files below a runtime directory."""
+    """Return the private files below a runtime directory."""
     return [path for path in (folder / f"noack-{os.getuid()}").rglob("*") if path.is_file()]
 
 
@@ -94,7 +94,7 @@ def run_scenario(runs: Path, *arguments: str) -> Finished:
 
 
 class Running:
-    """A running run."""
+    """An active run."""
 
     def __init__(self, runs: Path, process: subprocess.Popen[str]) -> None:
         self.runs = runs
@@ -113,7 +113,7 @@ class Running:
         raise AssertionError(f"no process of {role}")
 
     def udp_port(self, role: str) -> int:
-        """The receiving port of a process of the loop."""
+        """Return the receiving port of a process of the loop."""
         connections = self.child(role).net_connections("udp4")
         (port,) = {one.laddr.port for one in connections if not one.raddr}
         return int(port)
@@ -124,7 +124,7 @@ class Running:
         return Finished(self.process.returncode, summary, stderr, (self.runs / "latest").resolve())
 
     def finish_unstarted(self) -> str:
-        """The error of a run that never started."""
+        """Return the error of a run that never started."""
         stdout, _ = self.process.communicate(timeout=PATIENCE_S)
         assert self.process.returncode == 1
         error: str = json.loads(stdout)["error"]
@@ -144,14 +144,14 @@ def wait_for(condition: Callable[[], bool]) -> None:
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Callable[..., Running]]:
-    """Start ``noack run`` in the background; remaining processes are killed at the end."""
+    """Start ``noack run`` in the background; kill remaining processes at the end."""
     with begun(tmp_path) as begin:
         yield begin
 
 
 @contextmanager
 def begun(folder: Path) -> Iterator[Callable[..., Running]]:
-    """As ``start``, for fixtures of a module."""
+    """Do the same as ``start``, for fixtures of a module."""
     started: list[Running] = []
 
     def begin(*arguments: str, command: tuple[str, ...] = ("run", "lane_following")) -> Running:
@@ -179,7 +179,7 @@ def begun(folder: Path) -> Iterator[Callable[..., Running]]:
 
 @pytest.fixture
 def by_hand(tmp_path: Path) -> Iterator[Callable[[str], subprocess.Popen[str]]]:
-    """Start one process by hand; remaining processes are killed at the end."""
+    """Start one process by hand; kill remaining processes at the end."""
     started: list[subprocess.Popen[str]] = []
 
     def begin(role: str) -> subprocess.Popen[str]:

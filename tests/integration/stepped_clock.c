@@ -1,6 +1,7 @@
-/* Preloaded: the wall clock is off by as many seconds as the file STEPPED_CLOCK says, a number of
-   eight bytes that may change at any time. All other clocks are the machine's. (libfaketime breaks
-   clock_nanosleep and locks with a timeout when the monotonic clock is not faked, too.) */
+/* A preloaded library that adds an offset in seconds to the wall clock. The offset is an 8-byte
+   integer in the file STEPPED_CLOCK and may change at any time. Other clocks are unchanged.
+   (libfaketime breaks clock_nanosleep and locks with a timeout if it does not fake the monotonic
+   clock, too.) */
 
 #define _GNU_SOURCE
 #include <dlfcn.h>

@@ -78,7 +78,7 @@ def test_only_an_acknowledgement_resets_the_sensors_model(record: RunRecord) -> 
         assert event["t_ns"] == answer["t_ns"]
         if answer["model_t_ns"] == answer["t_ns"]:
             assert answer["x_s"].tobytes() == event["x"].tobytes()
-    # Between two measurements without an acknowledgement x_s only goes on as the model does.
+    # Between two measurements without an acknowledgement, x_s follows the model only.
     step = record.loop.H * 0.01
     resets = np.searchsorted(rows["input"], answers["input"])
     jumps = rows["x_s"][1:] - rows["x_s"][:-1]
@@ -87,7 +87,7 @@ def test_only_an_acknowledgement_resets_the_sensors_model(record: RunRecord) -> 
     bound = np.expm1(np.linalg.norm(step, 2)) * size[free - 1] * 1.001 + 1e-12
     assert (np.linalg.norm(jumps[free - 1], axis=1) <= bound).all()
     at_once = (rows["event"] != NO_SEQUENCE).sum() - len(answers)
-    assert at_once > 3  # events whose update or acknowledgement was lost, which reset nothing
+    assert at_once > 3  # if the update or its acknowledgement is lost, an event does not reset x_s
 
 
 def test_each_process_receives_from_its_senders_only(finished: Finished) -> None:

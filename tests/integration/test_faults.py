@@ -36,7 +36,7 @@ def wait_recording(running: Running) -> None:
         wait_for(lambda spooled=spooled: spooled.exists() and spooled.stat().st_size > 10_000)
 
 
-def test_a_killed_recorder_is_named_and_nothing_recorded_is_lost(start: Start) -> None:
+def test_a_killed_recorder_is_named_and_no_recorded_row_is_lost(start: Start) -> None:
     role = "recorder"
     running = start(*LONG, "--report")
     wait_recording(running)
@@ -58,7 +58,9 @@ def test_a_killed_recorder_is_named_and_nothing_recorded_is_lost(start: Start) -
     assert running.left_behind() == []
 
 
-def test_a_signal_ends_a_run_cleanly_and_a_summary_does_not_touch_it(start: Start) -> None:
+def test_a_signal_ends_a_run_cleanly_and_summary_does_not_change_an_active_run(
+    start: Start,
+) -> None:
     running = start(*LONG)
     wait_recording(running)
     done = subprocess.run(
@@ -94,7 +96,7 @@ def test_a_killed_launcher_leaves_no_process_behind(start: Start) -> None:
 
 
 @pytest.mark.parametrize("role", ["plant", "control"])
-def test_a_taken_port_is_one_clear_line(tmp_path: Path, role: str) -> None:
+def test_a_taken_port_gives_one_clear_line(tmp_path: Path, role: str) -> None:
     kind = socket.SOCK_STREAM if role == "control" else socket.SOCK_DGRAM
     with socket.socket(socket.AF_INET, kind) as squatter:
         squatter.bind(("127.0.0.1", 0))
@@ -121,7 +123,7 @@ def test_an_overloaded_run_does_not_claim_its_horizon(tmp_path: Path) -> None:
         *settings(speed=1000.0, horizon_s=2000.0, plant__rate_hz=500.0, plant__measure_every=100),
     )
     assert finished.status == 1
-    # Its other threads may starve, too, so that it seems to be lost.
+    # Its other threads may starve, too; the process then seems to be lost.
     reason = finished.summary["exit"]["reason"]
     assert "overrun" in reason or "stopped responding" in reason
     assert finished.summary["reached_s"] < 2000.0
@@ -135,7 +137,7 @@ def test_a_process_that_is_not_ready_in_time_is_named(start: Start) -> None:
     assert sensor is not None
     sensor.send_signal(signal.SIGSTOP)
     error = running.finish_unstarted()
-    # On a busy machine the others may not be ready, either.
+    # On a busy machine, other processes may not be ready, either.
     reason = re.search(r"sensor\b.* not ready in time: waited \d+ s.* cores", error)
     assert reason is not None, error
     assert not sensor.is_running()

@@ -1,4 +1,4 @@
-"""A run whose processes people start: one never comes, or the one that opened the run is killed."""
+"""Processes started by hand: one is missing, or the coordinator is killed."""
 
 import json
 import os
@@ -61,7 +61,7 @@ def test_a_wait_for_a_missing_process_can_be_interrupted(
 
 
 def test_the_loop_outlives_the_coordinator(start: Start, by_hand: ByHand, tmp_path: Path) -> None:
-    """It goes on to its horizon, and each process writes down all of its rows by itself."""
+    """The loop reaches its horizon, and each process stores all of its rows itself."""
     recording = start(*AT_RATE, *settings(speed=4.0, horizon_s=12.0), command=RECORD)
     processes = {role: by_hand(role) for role in LOOP_ROLES}
     wait_recording(recording)
@@ -84,7 +84,7 @@ def test_the_loop_outlives_the_coordinator(start: Start, by_hand: ByHand, tmp_pa
     assert replay["bit_exact"]
     steps = load_record(run_dir)["plant_step"]
     assert np.array_equal(steps["sequence"], np.arange(12 * RATE_HZ + 1))
-    # The next run of the session takes the place of what was left there.
+    # The next run of the session replaces the files that are left.
     again = start(*settings(speed=4.0), command=RECORD)
     ticket = tmp_path / f"noack-{os.getuid()}" / "default.json"
     wait_for(lambda: json.loads(ticket.read_text())["run_dir"] != str(run_dir))

@@ -1,4 +1,4 @@
-"""A disk that is full, or is taken away: said in a line, and all that reached it stays readable."""
+"""A full or removed disk gives one error line, and all stored rows stay readable."""
 
 import json
 import os
@@ -28,18 +28,18 @@ Start = Callable[..., Running]
 
 
 class Disk:
-    """A small disk of its own."""
+    """A separate small disk."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._filler = path / "filler"
 
     def fill(self, *, but_bytes: int = 0) -> None:
-        """Leave no more than so much room."""
+        """Fill the disk; leave at most ``but_bytes`` free."""
         self.empty()
         room = shutil.disk_usage(self.path).free - but_bytes
         with self._filler.open("wb") as file:
-            while room > 0:  # others may write meanwhile
+            while room > 0:  # other processes may write at the same time
                 try:
                     room -= file.write(bytes(min(room, 1 << 16)))
                     file.flush()
@@ -47,7 +47,7 @@ class Disk:
                     break
 
     def empty(self) -> None:
-        """Make room again."""
+        """Free the space again."""
         self._filler.unlink(missing_ok=True)
 
 
@@ -63,7 +63,7 @@ def mounted(path: Path, *options: str) -> None:
 
 @pytest.fixture
 def small(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Disk]:
-    """A disk of so many MiB, where the runs of ``start`` lie."""
+    """A disk of the given size in MiB that contains the runs of ``start``."""
     path = tmp_path / "runs"
     path.mkdir()
     mounted(path, "-t", "tmpfs", "-o", f"size={request.param}m", "noack-test")
@@ -85,7 +85,7 @@ def one_line(done: subprocess.CompletedProcess[str]) -> str:
 
 
 @pytest.mark.parametrize("small", [64], indirect=True)
-def test_a_disk_that_fills_up(
+def test_a_run_on_a_disk_that_fills_up_can_be_finalised_later(
     start: Start, small: Disk, capsys: pytest.CaptureFixture[str]
 ) -> None:
     running = start(*AT_RATE, *settings(speed=4.0, horizon_s=60.0))
@@ -125,7 +125,7 @@ def test_a_disk_that_fills_up(
     assert summary["exit"] == {"status": 1, "reason": reason}
     assert reason in (run_dir / "report.html").read_text()
     missing = summary["missing_samples"]
-    # Full again, before the summary is written; and before the report is.
+    # Fill the disk before the summary is written, then before the report is written.
     for path in (run_dir / "summary.json", run_dir / "report.html"):
         path.unlink()
     small.fill()
@@ -150,8 +150,8 @@ def test_a_run_does_not_begin_on_a_full_disk(small: Disk) -> None:
 
 
 @pytest.mark.parametrize("small", [64], indirect=True)
-def test_a_folder_that_becomes_read_only(start: Start, small: Disk) -> None:
-    """What is open may still be written; nothing new may be made."""
+def test_a_folder_that_becomes_read_only_gives_clear_errors(start: Start, small: Disk) -> None:
+    """Open files can still be written; new files cannot be created."""
     running = start(*AT_RATE, *settings(speed=4.0, horizon_s=16.0))
     wait_recording(running)
     run_dir = (running.runs / "latest").resolve()
@@ -189,7 +189,7 @@ def test_a_deleted_spool_file_ends_the_run(start: Start) -> None:
     assert running.left_behind() == []
 
 
-def test_a_folder_that_is_removed(start: Start) -> None:
+def test_a_removed_folder_gives_clear_errors(start: Start) -> None:
     running = start(*AT_RATE, *settings(speed=4.0, horizon_s=16.0))
     wait_recording(running)
     run_dir = (running.runs / "latest").resolve()

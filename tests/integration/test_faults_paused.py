@@ -1,4 +1,4 @@
-"""Processes that stand still for a while: for less than the plane's patience, or for more."""
+"""Processes that are paused for less or more than zenoh's lease."""
 
 import signal
 import time
@@ -20,9 +20,9 @@ from tests.integration.test_faults import LONG, wait_recording
 
 Start = Callable[..., Running]
 PAUSE_S = 0.7
-"""Well below zenoh's lease, and far beyond every delay that a certificate allows."""
+"""Well below zenoh's lease, and far above every delay that a certificate allows."""
 UNCONFIRMED_S = 1.2
-"""Below the lease, too, and so long that what was not confirmed is sent again."""
+"""Also below the lease, but long enough that unacknowledged rows are sent again."""
 
 
 def pause(process: psutil.Process, pause_s: float) -> None:
@@ -37,14 +37,14 @@ def test_a_run_catches_up_after_each_process_was_paused(start: Start) -> None:
     for role in ROLE_MODULES:
         pause(running.child(role), PAUSE_S)
         time.sleep(0.1)
-    # The launcher's process routes all telemetry; what it holds up is sent again.
+    # The launcher's process routes all telemetry; delayed batches are sent again.
     pause(psutil.Process(running.process.pid), UNCONFIRMED_S)
     finished = running.finish()
     summary = finished.summary
     assert finished.status == 0, finished.stderr
     assert summary["exit"]["reason"] == "horizon"
     assert summary["reached_s"] == 28.0
-    # Nothing is skipped: what was due meanwhile was done late, and in order.
+    # No step is skipped: the steps due during the pause are executed late and in order.
     record = load_record(finished.run_dir)
     for table in ("plant_step", "sensor_measurement", "controller_step"):
         rows = record[table]
@@ -55,9 +55,9 @@ def test_a_run_catches_up_after_each_process_was_paused(start: Start) -> None:
     assert summary["replay"]["complete"]
     assert summary["identity_residual_relative"] < 1e-11
     assert summary["longest_loss_burst"] <= summary["mansd"]
-    for role in ("plant", "sensor", "controller"):  # netem may have had nothing to do
+    for role in ("plant", "sensor", "controller"):  # netem may have had no packet
         assert summary["lateness_us"][role]["max"] > 0.9e6 * PAUSE_S
-    # No certificate allows inputs of that age: void, since when and for what.
+    # No certificate allows inputs of this age: the claims are void, with time and cause.
     certified = [claim for claim in summary["claims"] if "certificate" in claim["source"]]
     assert certified
     for claim in certified:
@@ -71,7 +71,7 @@ def test_a_run_catches_up_after_each_process_was_paused(start: Start) -> None:
 
 
 def test_a_frozen_recorder_is_named_and_no_row_is_lost(start: Start) -> None:
-    """The run is ended, as nobody would show it any more; everyone else writes down its rows."""
+    """The run ends because it has no recorder; the other processes store their rows themselves."""
     running = start(*LONG)
     wait_recording(running)
     running.child("recorder").send_signal(signal.SIGSTOP)
@@ -82,7 +82,7 @@ def test_a_frozen_recorder_is_named_and_no_row_is_lost(start: Start) -> None:
     assert finished.summary["unintended_losses"] == 0
     assert finished.summary["replay"]["bit_exact"]
     steps = load_record(finished.run_dir)["plant_step"]
-    # All of the time that the plane was patient for, two seconds but for the last sign of life.
+    # Rows exist up to the end of the lease: two seconds since the last keep-alive.
     assert len(steps) > 1.5 * 4 * RATE_HZ
     assert np.array_equal(steps["sequence"], np.arange(len(steps)))
     assert not (finished.run_dir / "spool").exists()

@@ -1,4 +1,4 @@
-"""Nobody listens to the launcher: its streams are closed, or full, or its reader leaves."""
+"""The launcher's streams are closed or full, or their reader ends."""
 
 import fcntl
 import os
@@ -32,7 +32,7 @@ HORIZON_S = 8.0
 SHORT = [*AT_RATE, *settings(speed=4.0, horizon_s=HORIZON_S)]
 F_SETPIPE_SZ = 1031
 AS_A_TERMINAL = os.environ | {"FORCE_COLOR": "1", "TERM": "dumb"}
-"""That cannot redraw a line: progress comes in lines, through a pipe, too."""
+"""A terminal that cannot redraw a line: progress is printed line by line, also to a pipe."""
 EVENTS, VOID = " s  events ", "void (assumption violated) from "
 
 
@@ -45,8 +45,8 @@ def is_whole(run_dir: Path) -> bool:
     return np.array_equal(steps["sequence"], np.arange(HORIZON_S * RATE_HZ + 1))
 
 
-def test_closed_streams(tmp_path: Path) -> None:
-    """As a shell's ``<&- >&- 2>&-`` leaves them: what a program opens next takes their numbers."""
+def test_a_run_with_closed_streams_is_complete(tmp_path: Path) -> None:
+    """Closed by a shell's ``<&- >&- 2>&-``: files opened next get the descriptors 0 to 2."""
     shell = ["/bin/sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", *run(tmp_path), "--report"]
     assert subprocess.run(shell, timeout=PATIENCE_S, check=False).returncode == 0
     run_dir = (tmp_path / "latest").resolve()
@@ -56,7 +56,7 @@ def test_closed_streams(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="sets the size of a pipe")
-def test_a_full_pipe_holds_up_the_launcher_and_not_the_loop(tmp_path: Path) -> None:
+def test_a_full_pipe_blocks_the_launcher_but_not_the_loop(tmp_path: Path) -> None:
     reading, writing = os.pipe()
     room = fcntl.fcntl(writing, F_SETPIPE_SZ, 4096)
     os.write(writing, b"x" * (room - 10))
@@ -68,16 +68,16 @@ def test_a_full_pipe_holds_up_the_launcher_and_not_the_loop(tmp_path: Path) -> N
         latest = tmp_path / "latest"
         wait_for(lambda: latest.exists() or process.poll() is not None)
         loop = psutil.Process(process.pid).children()
-        # The loop ends, with nobody to read of it; the recorder with it.
+        # The loop and the recorder end although the pipe is not read.
         wait_for(lambda: all(is_over(child) for child in loop))
         assert process.poll() is None
-        assert any(child.is_running() for child in loop)  # nobody has noticed
+        assert any(child.is_running() for child in loop)  # not reaped yet
     finally:
         with os.fdopen(reading, "rb") as pipe:
             said = pipe.read()[room - 10 :].decode()
     assert process.wait(PATIENCE_S) == 0
-    # What it was held up with is all there. On a slow machine claims are void before there is
-    # any progress, and afterwards there is none to tell.
+    # The blocked output is complete. On a slow machine, claims can be void before the first
+    # progress line, and no progress line follows.
     assert said.endswith("\n")
     assert all(EVENTS in line or VOID in line for line in said.splitlines())
     assert said
@@ -86,7 +86,7 @@ def test_a_full_pipe_holds_up_the_launcher_and_not_the_loop(tmp_path: Path) -> N
 
 @pytest.fixture(scope="module")
 def unheard(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run; who read its progress left at the first line."""
+    """A finished run; the reader of its progress closed the pipe after the first line."""
     runs = tmp_path_factory.mktemp("runs")
     with subprocess.Popen(
         run(runs), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=AS_A_TERMINAL

@@ -1,4 +1,4 @@
-"""The wall clock is stepped by an hour during a run."""
+"""A step of the wall clock by an hour during a run."""
 
 import mmap
 import os
@@ -22,10 +22,10 @@ WITNESS = "import sys, time\nfor _ in sys.stdin: print(time.time(), time.monoton
 
 
 class WallClock:
-    """A wall clock that can be stepped, for processes that have its environment.
+    """A wall clock that can be stepped, for processes with its environment.
 
     Args:
-        folder: where its files lie.
+        folder: the folder for its files.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -42,12 +42,12 @@ class WallClock:
         self.environment = {"LD_PRELOAD": str(library), "STEPPED_CLOCK": str(offset)}
 
     def step_to(self, offset_s: int) -> None:
-        """Let the clock be so far from the true one."""
+        """Set the clock's offset from the true time."""
         self._offset_s[:] = offset_s.to_bytes(8, sys.byteorder, signed=True)
 
 
 class Witness:
-    """A process that says what the clocks are in this environment."""
+    """A process that prints the clocks in this environment."""
 
     def __init__(self, environment: dict[str, str]) -> None:
         self._process = subprocess.Popen(
@@ -57,7 +57,7 @@ class Witness:
         )  # fmt: skip
 
     def offsets_s(self) -> tuple[float, float]:
-        """By how much its wall clock and its monotonic clock differ from ours."""
+        """Return the offsets of its wall clock and its monotonic clock from this process's."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write("\n")
@@ -69,7 +69,7 @@ class Witness:
         self._process.communicate()
 
 
-def test_a_run_does_not_notice_a_stepped_wall_clock(
+def test_a_stepped_wall_clock_does_not_affect_a_run(
     start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = WallClock(tmp_path)

@@ -1,4 +1,4 @@
-"""A viewer that stalls during the run that it shows."""
+"""A live viewer that stalls during the run."""
 
 import os
 import signal
@@ -27,7 +27,7 @@ Start = Callable[..., Running]
 def is_rerun(process: psutil.Process) -> bool:
     try:
         return "rerun" in Path(process.exe()).name
-    except psutil.Error:  # it has ended
+    except psutil.Error:  # the process has ended
         return False
 
 
@@ -47,7 +47,7 @@ def test_a_stalled_viewer_does_not_disturb_the_run(start: Start) -> None:
         if "cosim.output.viewer.live_viewer" in command_of(child) or is_rerun(child)
     ]
     (group,) = {os.getpgid(viewer.pid) for viewer in viewers}
-    assert len(viewers) == 2  # who serves the recording, and who serves rerun's page
+    assert len(viewers) == 2  # the server of the recording and the server of rerun's page
     os.killpg(group, signal.SIGSTOP)
     finished = running.finish()
     assert finished.status == 0, finished.stderr

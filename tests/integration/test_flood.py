@@ -1,4 +1,4 @@
-"""As many datagrams as the machine sends, at every port of a run: the loop goes on."""
+"""Send as many datagrams as possible to every port of a run: the loop continues."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""A whole run whose network does everything to its updates, live and simulated."""
+"""A whole run with all impairments of the updates, live and simulated."""
 
 import subprocess
 from typing import Any
@@ -33,7 +33,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     values = {
         "horizon_s": 3.0,
         "speed": 2.0,
-        "trigger__beta": 0.0003,  # an update every 15 ms or so
+        "trigger__beta": 0.0003,  # an update about every 15 ms
         "network__mansd": MANSD,
         "network__loss__probability": 0.1,
     }
@@ -65,7 +65,7 @@ def sequences(rows: NDArray[Any]) -> list[int]:
     return [read_header(head.tobytes()).sequence for head in rows["head"]]
 
 
-def test_the_run_ends_well_and_replays_to_the_bit(finished: Finished) -> None:
+def test_the_run_completes_and_is_replayed_bit_for_bit(finished: Finished) -> None:
     summary = finished.summary
     assert finished.status == 0, finished.stderr
     assert summary["exit"] == {"status": 0, "reason": "horizon"}
@@ -93,10 +93,10 @@ def test_claims_are_judged(finished: Finished) -> None:
     for claim in finished.summary["claims"]:
         verdicts.setdefault(claim["source"], set()).add(claim["verdict"])
     assert verdicts["(I1)"] == {"held"}
-    assert "violated" not in verdicts["certificate"]  # void, if the machine stalled too long
+    assert "violated" not in verdicts["certificate"]  # void if the machine stalled too long
 
 
-def test_every_impairment_happened(live: RunRecord) -> None:
+def test_every_impairment_occurs(live: RunRecord) -> None:
     packets, released = live[NETEM_PACKET], live[NETEM_RELEASE]
     assert len(packets) > 100
     assert {Fate.DELIVERED, Fate.DROPPED, Fate.FORCED, Fate.CORRUPTED} <= set(packets["fate"])
@@ -124,7 +124,7 @@ def test_the_controller_never_misses_more_than_mansd(live: RunRecord) -> None:
 def test_the_simulated_run_has_the_same_fates(live: RunRecord, simulated: RunRecord) -> None:
     count = min(len(live[NETEM_PACKET]), len(simulated[NETEM_PACKET]))
     assert count > 100
-    # Live, updates come a little later: when they leave differs, and so who overtakes whom.
+    # In the live run, updates are slightly later, so departures and reordering differ.
     for column in ("sequence", "flow", "fate", "consecutive_losses", "bit"):
         here, there = (record[NETEM_PACKET][column][:count] for record in (live, simulated))
         np.testing.assert_array_equal(here, there, column)

@@ -1,4 +1,4 @@
-"""Somebody else on the same machine, at the control plane's port, while a run goes on."""
+"""Another user on the same machine attacks the control plane's port during a run."""
 
 import contextlib
 import json
@@ -29,7 +29,7 @@ ATTACKS = ("flood", "half_open", "garbage", "guess")
 
 
 class Intruder:
-    """Knocks at a port in every way that needs no secret, until told to stop."""
+    """Attacks a port in every way that needs no secret, until it is stopped."""
 
     def __init__(self, ticket: Ticket) -> None:
         self._ticket = ticket
@@ -55,7 +55,7 @@ class Intruder:
 
     def _again_and_again(self, attack: Callable[[], None]) -> None:
         while not self._stop.wait(0.1):
-            with contextlib.suppress(OSError):  # the run is over, or its queue is full
+            with contextlib.suppress(OSError):  # the run has ended or its queue is full
                 attack()
                 self.done[attack.__name__] += 1
 
@@ -73,7 +73,7 @@ class Intruder:
             self._stop.wait(0.5)
 
     def garbage(self) -> None:
-        """Behind a length that zenoh believes, and without; it hangs up soon."""
+        """Send random bytes with and without a valid length; zenoh soon closes the connection."""
         left = GARBAGE_BYTES
         while left > 0 and not self._stop.is_set():
             with self._connect() as connection, contextlib.suppress(OSError):
@@ -93,7 +93,7 @@ class Intruder:
 
 
 class Attacked:
-    """A run by hand that was attacked until it had been in every way, and what was seen of it."""
+    """A run started by hand, attacked at least once in each way, and all data visible of it."""
 
     def __init__(
         self,
@@ -118,7 +118,7 @@ class Attacked:
                 "the private folder": {
                     name: content
                     for name, content in _files(private).items()
-                    if name != path.name  # which is for it
+                    if name != path.name  # the ticket file contains the key
                 },
             }
             wait_for(lambda: all(self.intruder.done[attack] > 0 for attack in ATTACKS))
@@ -145,7 +145,7 @@ def _files(folder: Path) -> dict[str, bytes]:
 def _told_by_processes(
     recording: Running, processes: list[subprocess.Popen[str]]
 ) -> dict[str, bytes]:
-    """What any user of the machine, or who may look into an environment, sees of the processes."""
+    """Return command lines, environments and names of the processes."""
     launcher = psutil.Process(recording.process.pid)
     pids = [launcher.pid, *(child.pid for child in launcher.children(recursive=True))]
     pids += [process.pid for process in processes]
@@ -156,7 +156,7 @@ def _told_by_processes(
     return told
 
 
-def test_a_run_goes_on_untouched(
+def test_attacks_on_the_control_plane_do_not_affect_a_run(
     start: Callable[..., Running],
     by_hand: Callable[[str], subprocess.Popen[str]],
     tmp_path: Path,
@@ -184,7 +184,7 @@ def test_a_run_goes_on_untouched(
         for name, content in contents.items():
             for what, secret in secrets.items():
                 if what == "password" and name == own:
-                    continue  # which is for `noack set`, and for the user alone
+                    continue  # this user's private file for `noack set`
                 assert secret not in content, f"{what} in {where}: {name}"
     assert len(attacked.seen["command lines and environments"]) == 3 * 6
     assert attacked.left == {}

@@ -1,4 +1,4 @@
-"""The network emulator on its own, as a person runs it."""
+"""The network emulator as a standalone program."""
 
 import json
 import os
@@ -22,7 +22,7 @@ COMMAND = [sys.executable, "-m", "netem"]
 
 @contextmanager
 def emulator(*arguments: str, links: int = 1) -> Iterator[tuple[subprocess.Popen[str], list[int]]]:
-    """An emulator that has said where it listens."""
+    """Start an emulator; yield its process and its ports."""
     with subprocess.Popen(
         [*COMMAND, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
@@ -70,7 +70,7 @@ def forward_of(stdout: str) -> Any:
 
 
 def totals_of(stdout: str) -> Any:
-    """What is printed with ``--json`` after the line that says that it is ready."""
+    """Return the JSON that follows the line with ``ready``."""
     ready, _, totals = stdout.partition("\n")
     assert json.loads(ready).keys() == {"ready"}
     return json.loads(totals)
@@ -78,7 +78,7 @@ def totals_of(stdout: str) -> Any:
 
 @pytest.mark.parametrize("engine", ["batched", "plain"])
 @pytest.mark.parametrize(("words", "run"), [("loss worst mansd 3 first", 3), ("loss none", 0)])
-def test_it_serves_any_udp_program(words: str, run: int, engine: str) -> None:
+def test_the_emulator_relays_any_udp_program(words: str, run: int, engine: str) -> None:
     with server() as (there, to), client() as here:
         arguments = ["--listen", ":0", "--to", to, "--engine", engine, "--json", *words.split()]
         with emulator(*arguments) as (process, [port]):
@@ -111,10 +111,10 @@ def test_the_reverse_direction_has_its_own_impairments(family: int) -> None:
             _, stderr = ended(process)
     assert question == b"ask"
     assert answers == [b"1", b"3", b"5"]
-    assert re.search(r"dropped by loss +0 +3 *\n", stderr)
+    assert re.search(r"dropped by a loss model +0 +3 *\n", stderr)
 
 
-def test_several_links_come_from_a_file(tmp_path: Path) -> None:
+def test_several_links_are_read_from_a_file(tmp_path: Path) -> None:
     path = tmp_path / "links.toml"
     with server() as (there, to), client() as here:
         path.write_text(
@@ -141,7 +141,7 @@ def test_several_links_come_from_a_file(tmp_path: Path) -> None:
 
 
 def test_recorded_fates_are_replayed(tmp_path: Path) -> None:
-    """With another seed and other words, but the same fates."""
+    """Another seed and other words give the recorded fates."""
     arrived = []
     record, again = tmp_path / "fates.parquet", tmp_path / "again.parquet"
     for arguments in (
@@ -204,8 +204,8 @@ def waiting(*arguments: str, **more: Any) -> subprocess.Popen[str]:
 
 
 @pytest.mark.parametrize("engine", ["batched", "plain"])
-def test_a_script_can_wait_for_it(engine: str) -> None:
-    """For a line through a pipe, after which what it sends is not lost."""
+def test_a_script_can_wait_until_the_emulator_is_ready(engine: str) -> None:
+    """After the line ``ready`` on the pipe, datagrams are not lost."""
     with (
         server() as (there, to),
         client() as here,
@@ -225,7 +225,7 @@ def test_a_script_can_wait_for_it(engine: str) -> None:
 
 
 def test_show_names_the_compilation_and_its_duration(tmp_path: Path) -> None:
-    """An empty cache; show names the state, and the next start knows how long this one took."""
+    """With an empty cache, ``show`` names the state; the duration is stored for the next start."""
     environment = os.environ | {
         "XDG_CACHE_HOME": str(tmp_path / "cache"), "XDG_RUNTIME_DIR": str(tmp_path),
     }  # fmt: skip
@@ -256,7 +256,7 @@ def test_show_names_the_compilation_and_its_duration(tmp_path: Path) -> None:
 
 
 def test_unintended_losses_have_their_own_exit_status() -> None:
-    """The kernel's buffer overflows while it stands still."""
+    """The kernel's buffer overflows while the emulator is stopped."""
     with (
         client() as here,
         emulator("--listen", ":0", "--to", ":9", "mansd", "2") as (process, [port]),

@@ -1,4 +1,4 @@
-"""The controller stands still for a while: what the plant does about it, and what is said of it."""
+"""The controller is paused: the plant applies its watchdog policy, and the log states it."""
 
 import signal
 import time
@@ -16,7 +16,7 @@ FROZEN_S = 0.4
 
 
 def outage(start: Start) -> Finished:
-    """A run whose controller is stopped once it has begun, and goes on later."""
+    """Return a run in which the controller is paused and later continued."""
     running = start(
         *settings(speed=2.0, horizon_s=400.0),
         *settings(plant__watchdog__policy="model", plant__watchdog__timeout_s=0.1),
@@ -48,12 +48,12 @@ def test_the_plant_applies_its_watchdog_policy_and_logs_it(start: Start) -> None
     trips = [one for one in record.notices if one["level"] == "watchdog"]
     assert trips[0]["t_ns"] == acted["t_ns"][0]
     said = [one for one in record.notices if one["level"] == "void"]
-    (watchdog,) = [one for one in said if "the watchdog's" in one["text"]]
+    (watchdog,) = [one for one in said if "the watchdog replaced" in one["text"]]
     assert watchdog["t_ns"] == acted["t_ns"][0]
     assert watchdog["text"].startswith(
-        f"void (assumption violated) from {first_s:.3f} s on: the input was "
+        f"void (assumption violated) from {first_s:.3f} s on: the watchdog replaced the input: "
     )
-    # An input is too old for a certificate before it is too old for the watchdog.
+    # The age limit of a certificate is below the watchdog's timeout.
     void = [one for one in summary["claims"] if one["source"] == "certificate"]
     assert {(one["verdict"], round(one["since_s"] * 1e9)) for one in void} == {
         ("void", min(one["t_ns"] for one in said))
@@ -64,7 +64,7 @@ def test_the_plant_applies_its_watchdog_policy_and_logs_it(start: Start) -> None
 
 
 def inputs_of_the_watchdog(record: RunRecord) -> np.ndarray:
-    """The steps at which the newest actuation was too old; their inputs are the model's."""
+    """Return the steps with a timed-out actuation; check that the model gives their inputs."""
     steps, taken = record[PLANT_STEP], record[PLANT_ACTUATION]
     newest = taken[np.searchsorted(taken["sequence"], steps["actuation"])]
     has = steps["actuation"] >= 0

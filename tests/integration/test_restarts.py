@@ -1,4 +1,4 @@
-"""Processes that die while the run goes on, and others that take their place."""
+"""Processes that are killed during a run and restarted."""
 
 import signal
 import socket
@@ -37,7 +37,7 @@ RESTARTED = ("recorder", "controller", "sensor", "netem")
 
 
 def spooled(running: Running, table: str) -> Rows:
-    """What is on disk of a table."""
+    """Return the rows of a table that are on disk."""
     spool = running.runs / "latest" / "spool"
     dtype = tables_of(load(running.runs / "latest" / "scenario.toml"))[table]
     found = [np.frombuffer(data, dtype) for _, data in read_chunks(spool, table)]
@@ -45,13 +45,13 @@ def spooled(running: Running, table: str) -> Rows:
 
 
 def is_whole(running: Running, table: str) -> bool:
-    """Whether there are no gaps in a table."""
+    """Whether a table has no gaps."""
     inputs = spooled(running, table)["sequence"] % GENERATION
     return bool((np.diff(np.unique(inputs)) == 1).all())
 
 
 def goes_on(running: Running, role: str) -> bool:
-    """Whether the second process of a role does its work, or died in vain."""
+    """Whether the restarted process of a role has recorded rows; fail if the run has ended."""
     assert running.process.poll() is None, running.process.communicate()
     if role == "recorder":
         written = (running.runs / "latest" / "spool").glob("plant_step.*")
@@ -77,7 +77,7 @@ def taken(squatter: socket.socket, port: int) -> bool:
 
 @pytest.fixture(scope="module")
 def restarted(tmp_path_factory: pytest.TempPathFactory) -> Finished:
-    """A run in which one process after the other was killed."""
+    """A run in which the processes were killed one after the other."""
     folder = tmp_path_factory.mktemp("restarted")
     with begun(folder) as start:
         running = start(
@@ -93,8 +93,8 @@ def restarted(tmp_path_factory: pytest.TempPathFactory) -> Finished:
             before.kill()
             wait_for(lambda role=role: goes_on(running, role))
             if role == "recorder":
-                # What it had not taken is sent again: only then is everything on disk that was
-                # recorded before the next one dies.
+                # Unacknowledged rows are sent again. Wait until all of them are on disk before
+                # the next process is killed.
                 let_run(running, 9)
                 wait_for(lambda: all(is_whole(running, table) for table in LOOP))
         let_run(running, 12)
@@ -104,7 +104,7 @@ def restarted(tmp_path_factory: pytest.TempPathFactory) -> Finished:
         return finished
 
 
-def test_the_run_goes_on_and_lists_its_restarts(restarted: Finished) -> None:
+def test_the_run_continues_and_lists_its_restarts(restarted: Finished) -> None:
     assert restarted.status == 130, restarted.stderr
     assert restarted.summary["exit"]["reason"] == "stopped by the user (SIGINT)"
     restarts = {one["process"]: one for one in restarted.summary["restarts"]}
@@ -118,13 +118,13 @@ def test_the_run_goes_on_and_lists_its_restarts(restarted: Finished) -> None:
         assert f"{role} runs again at " in restarted.stderr
 
 
-def test_nothing_recorded_is_lost_and_everything_is_replayed(restarted: Finished) -> None:
+def test_no_recorded_row_is_lost_and_all_rows_are_replayed(restarted: Finished) -> None:
     assert restarted.summary["missing_samples"] == 0
     verdict = restarted.summary["replay"]
     assert verdict["bit_exact"], verdict
     record = load_record(restarted.run_dir)
     assert verdict["inputs"] == sum(len(record[table]) for table in record.tables)
-    steps = record["plant_step"]["sequence"]  # although its recorder died
+    steps = record["plant_step"]["sequence"]  # although its recorder was killed
     assert np.array_equal(steps, np.arange(len(steps)))
 
 
@@ -182,7 +182,7 @@ def test_claims_are_void_from_the_first_outage_on(restarted: Finished) -> None:
 
 
 def test_a_restarted_process_accepts_no_old_message(restarted: Finished) -> None:
-    """Whoever takes over knows nothing of what was accepted before; its own number tells it."""
+    """A restarted process has lost the accepted numbers; the generation identifies old messages."""
     record = load_record(restarted.run_dir)
     for role, table in (("sensor", "sensor_measurement"), ("controller", "controller_delivery")):
         before, again = record.lives(role)

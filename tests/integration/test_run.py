@@ -1,4 +1,4 @@
-"""A whole run of real processes, checked from its record against independent computations."""
+"""Compare the record of a whole run of real processes with independent computations."""
 
 import json
 from collections import Counter
@@ -67,14 +67,14 @@ def record(request: pytest.FixtureRequest) -> RunRecord:
     return simulate(resolve(load(path, ["horizon_s=20", *CASES[request.param]])))
 
 
-def test_a_run_ends_well_and_its_summary_is_complete(finished: Finished) -> None:
+def test_a_run_completes_with_a_complete_summary(finished: Finished) -> None:
     assert finished.status == 0, finished.stderr
     assert finished.summary.keys() >= SUMMARY_KEYS
     assert finished.summary["exit"] == {"status": 0, "reason": "horizon"}
     assert finished.summary["missing_samples"] == 0
     assert finished.summary["unintended_losses"] == 0
     violations = finished.summary["assumption_violations"]
-    assert "dropouts" not in {one["cause"] for one in violations}  # the machine may be late
+    assert "dropouts" not in {one["cause"] for one in violations}  # deadlines may be missed
     assert finished.summary["rejected_datagrams"] == {}
     for role in ("plant", "sensor", "controller", "netem"):
         assert finished.summary["lateness_us"][role].keys() == {
@@ -97,13 +97,15 @@ def test_the_run_directory_holds_everything(finished: Finished) -> None:
     assert "warning" not in finished.stderr
 
 
-def test_the_resolved_scenario_repeats_itself(live: RunRecord, finished: Finished) -> None:
+def test_resolving_the_resolved_scenario_changes_nothing(
+    live: RunRecord, finished: Finished
+) -> None:
     again = load(finished.run_dir / "scenario.toml")
     assert again == live.scenario
     assert resolve(again) == again
 
 
-def test_every_sample_is_there(record: RunRecord) -> None:
+def test_every_sample_is_recorded(record: RunRecord) -> None:
     scenario = record.scenario
     steps = scenario.timing.horizon_ns // scenario.timing.plant_period_ns + 1
     plant, sensor = record["plant_step"], record["sensor_measurement"]
@@ -174,8 +176,8 @@ def test_x_c_is_reset_only_at_deliveries(record: RunRecord) -> None:
         assert late_s >= 0
         assert np.allclose(delivery["x_c"], expm(loop.H * late_s) @ delivery["x"], atol=1e-12)
     period_ns = record.scenario.timing.controller_period_ns
-    untouched = np.diff(steps["input"]) == 1  # no delivery between two ticks
-    # One before a late tick may have taken the model's time further than that.
+    untouched = np.diff(steps["input"]) == 1  # no delivery between the two ticks
+    # A delivery before a late tick may have advanced the model's time further.
     untouched &= np.diff(steps["model_t_ns"]) == period_ns
     assert untouched.mean() > 0.5
     transition = expm(loop.H * period_ns * 1e-9)
@@ -229,7 +231,7 @@ def test_identity_i1_holds_to_rounding_at_every_sample(record: RunRecord) -> Non
     if record.scenario.network.initial_sync == "first_packet":
         in_common = joined.t_ns >= record["controller_delivery"]["model_t_ns"][0]
     assert np.array_equal(np.isnan(residual), ~in_common)
-    # States of a few units, propagated some thousand times: far below any physical difference.
+    # States of a few units and some thousand steps: rounding is far below any physical difference.
     assert residual[in_common].max() < 1e-11
 
 
@@ -248,7 +250,7 @@ def test_fidelity_explains_the_difference_to_the_ideal_loop(
 ) -> None:
     fidelity = finished.summary["fidelity"]
     assert fidelity["reason"] is None
-    # All effects together give the run but for rounding: 1e-14 of x, over some per cent of it.
+    # All effects together explain the run up to rounding: 1e-14 of x, relative to a few per cent.
     assert fidelity["explained_relative"] < 1e-6
     assert 0 < fidelity["rms_x"] < 0.5 * fidelity["rms_x_live"]
 
@@ -285,7 +287,7 @@ def test_the_recording_shows_the_record(finished: Finished, live: RunRecord) -> 
 
 
 def test_no_claim_with_checked_assumptions_is_violated(finished: Finished) -> None:
-    """On a late machine, certificates are void and say since when and why."""
+    """After missed deadlines, certificates are void and state time and cause."""
     claims = [c for c in finished.summary["claims"] if c["source"] in OWN_CLAIMS]
     assert {c["source"] for c in claims} >= {"(I1)", "certificate", "box certificate"}
     for claim in claims:
@@ -299,7 +301,7 @@ def test_no_claim_with_checked_assumptions_is_violated(finished: Finished) -> No
 
 
 def test_the_recording_shows_the_bounds(finished: Finished, live: RunRecord) -> None:
-    """The curves drawn during the run are those evaluated at its end."""
+    """The curves drawn during the run equal those evaluated at its end."""
     envelopes = ClaimEvaluation(live).envelopes()
     (identity,) = [e.values for e in envelopes if e.label == "bound from (I1)"]
     certified = {e.quantity: e.values for e in envelopes if e.label == CERTIFIED}["x"]

@@ -1,4 +1,4 @@
-"""A run that is changed from other terminals while it goes on."""
+"""Change runtime parameters of a run from other processes."""
 
 import json
 import os
@@ -55,7 +55,7 @@ def test_a_run_is_changed_twice_from_another_process(
     changes = [one["text"] for one in record.notices if one["level"] == "change"]
     assert len(changes) == 2
     assert all("; requested at " in text for text in changes)
-    if not any(one.late for one in changes_of(record)):  # else the machine was, and that is said
+    if not any(one.late for one in changes_of(record)):  # a late change is a recorded violation
         causes = {one["cause"] for one in summary["assumption_violations"]}
         assert not causes & {"dropouts", "change"}
     assert not (tmp_path / f"noack-{os.getuid()}" / "runs" / f"{run.run_id}.json").exists()

@@ -1,8 +1,7 @@
-"""A live run and the simulated run of the same scenario: the same events, fates and states.
+"""A live run and a simulated run of the same scenario have the same events, fates and states.
 
-The steps are 50 ms long, so that only a machine that stalls for 25 ms does anything later than its
-turn. What such a machine does from then on is another run: runs are compared up to there, and a
-live run that went wrong early is made anew.
+The steps are 50 ms long, so only a stall of 25 ms changes the order of events. After such a stall
+the runs differ. The test compares them up to the stall and repeats a live run with an early stall.
 """
 
 from pathlib import Path
@@ -43,10 +42,10 @@ CLOSE = {
 
 
 def in_turn_until_ns(live: RunRecord, simulated: RunRecord) -> int:
-    """Time of the first thing that happened live in another turn than in the simulation.
+    """Return the time in ns of the first live event in a different order than in the simulation.
 
-    The plant and the controller have two kinds of input each, and only their order is a race; it
-    shows in the ``input`` numbers. The plant's held actuation shows what got through in time.
+    Only the order of the two kinds of input of the plant and of the controller can differ; the
+    ``input`` numbers show it. The plant's applied actuation shows which actuation came in time.
     """
     first_ns = simulated.scenario.timing.horizon_ns + 1
     for table, columns in (
@@ -62,7 +61,7 @@ def in_turn_until_ns(live: RunRecord, simulated: RunRecord) -> int:
     return first_ns
 
 
-def test_a_live_run_does_what_the_simulated_run_does(tmp_path: Path) -> None:
+def test_a_live_run_agrees_with_the_simulated_run(tmp_path: Path) -> None:
     values = {
         "horizon_s": HORIZON_S,
         "plant__rate_hz": 20.0,
@@ -89,13 +88,13 @@ def test_a_live_run_does_what_the_simulated_run_does(tmp_path: Path) -> None:
 def compare(live: RunRecord, simulated: RunRecord, until_ns: int) -> None:
     compared = 0
     for table, columns in SAME.items():
-        # A row's time in the simulation is its turn; live it may be late, but not out of turn.
+        # A live row may be later than in the simulation, but the order is the same.
         rows = simulated[table][simulated[table]["now_ns"] < until_ns]
         others = live[table][: len(rows)]
         for column in columns:
             np.testing.assert_array_equal(others[column], rows[column], f"{table}.{column}")
         for column in CLOSE.get(table, ()):
-            # The same arithmetic in the same order, but perhaps another kernel of the BLAS.
+            # The same arithmetic in the same order, but BLAS may use another kernel.
             np.testing.assert_allclose(
                 others[column], rows[column], rtol=1e-9, atol=1e-12, err_msg=f"{table}.{column}"
             )

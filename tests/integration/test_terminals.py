@@ -1,4 +1,4 @@
-"""One process each, started by hand."""
+"""Runs with each process started by hand in its own terminal."""
 
 import json
 import os
@@ -20,7 +20,7 @@ from tests.integration.conftest import (
 )
 
 
-def test_five_terminals_in_any_order(
+def test_five_processes_may_be_started_by_hand_in_any_order(
     start: Callable[..., Running],
     by_hand: Callable[[str], subprocess.Popen[str]],
     tmp_path: Path,
@@ -69,7 +69,7 @@ def test_a_process_may_be_restarted_by_hand(
     assert again.stderr is not None
     said = "replaces a process (sensor ended early: SIGINT)"
     assert any(said in line for line in iter(again.stderr.readline, ""))
-    processes["plant"].send_signal(signal.SIGINT)  # without it there is no run
+    processes["plant"].send_signal(signal.SIGINT)  # the run ends without the plant
     finished = recording.finish()
     assert finished.status == 1
     assert finished.summary["exit"]["reason"] == "plant ended early: SIGINT"
@@ -78,7 +78,7 @@ def test_a_process_may_be_restarted_by_hand(
     (restart,) = finished.summary["restarts"]
     assert restart["what"] == "restarted: sensor ended early: SIGINT"
     assert finished.summary["replay"]["bit_exact"]
-    assert finished.summary["replay"]["complete"]  # who is asked to end hands everything over
+    assert finished.summary["replay"]["complete"]  # on SIGINT, a process delivers all rows
     assert finished.summary["missing_samples"] == 0
     for process in (*processes.values(), again):
         process.communicate(timeout=PATIENCE_S)

@@ -1,4 +1,4 @@
-"""What is built and installed works where there is no repository."""
+"""The built and installed package works without the repository."""
 
 import json
 import os
@@ -37,7 +37,7 @@ def uv(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 
 
 def built(*arguments: str | Path) -> Path:
-    """Build with what is installed here: nothing is fetched."""
+    """Build with the installed packages and without downloads; return the wheel."""
     out = Path(arguments[-1])
     done = uv("build", "--no-build-isolation", "--python", sys.executable, *arguments)
     assert done.returncode == 0, done.stderr
@@ -47,7 +47,7 @@ def built(*arguments: str | Path) -> Path:
 
 @pytest.fixture(scope="module")
 def dist(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the sdist, and the wheel that was built from it."""
+    """A folder with the sdist and the wheel built from it."""
     out = tmp_path_factory.mktemp("dist")
     built(ROOT, "--out-dir", out)
     return out
@@ -55,7 +55,7 @@ def dist(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @dataclass(frozen=True)
 class Installed:
-    """An environment with noack in it, and a folder to work in."""
+    """An environment with noack installed, and a working folder."""
 
     program: Path
     folder: Path

@@ -110,8 +110,8 @@ def test_a_flows_fates_depend_on_nothing_but_its_own_order(
     st.none() | st.integers(0, 4),
 )
 def test_nor_do_bits_copies_and_delays(arrivals: list[tuple[int, int]], mansd: int | None) -> None:
-    """For all impairments except rates, blackouts and the limit. Delays are measured from the
-    arrival, without the time that the guarantee adds."""
+    """Other flows do not change bits, copies and delays either, except with rates, blackouts and
+    the limit. Delays are measured from the arrival, without the time that the guarantee adds."""
     link = new_link(*TIMELESS, mansd=mansd)
     found: dict[int, list[tuple[int, ...]]] = {flow: [] for flow in range(4)}
 

@@ -183,7 +183,7 @@ def test_never_more_than_mansd_in_a_row_are_not_delivered(
 def test_nor_when_the_shell_is_late(
     settings: LinkSettings, steps: list[tuple[int, int]], seed: int, share: float
 ) -> None:
-    """Datagrams arrive while timers are overdue; timers are served at random times."""
+    """The guarantee holds if datagrams arrive before overdue timers are served."""
     link = Link(settings, 1, "a")
     rng = np.random.default_rng(seed)
     observer, sent = send_all(link, steps, lambda: rng.random() < share)
@@ -193,7 +193,7 @@ def test_nor_when_the_shell_is_late(
 @settings(max_examples=100)
 @given(links, st.integers(0, 2**32), st.integers(1, 80))
 def test_nor_when_its_clock_goes_astray(settings: LinkSettings, seed: int, count: int) -> None:
-    """Arrival times in any order, timers served too early: the guarantee needs no clock."""
+    """The guarantee needs no clock: arrival times in any order, timers served too early."""
     link = Link(settings, 1, "a")
     rng = np.random.default_rng(seed)
     observer, sent = Observer(), [0, 0]
@@ -215,7 +215,7 @@ def test_nor_when_its_clock_goes_astray(settings: LinkSettings, seed: int, count
 def test_nor_when_the_impairments_change(
     stages: list[LinkSettings], steps: list[tuple[int, int]], seed: int
 ) -> None:
-    """With the same cap and any datagrams in flight."""
+    """The guarantee holds across changes of the impairments that keep the cap."""
     first, rng = stages[0], np.random.default_rng(seed)
     same = {"mansd": first.mansd, "first_delivered": first.first_delivered}
     link = Link(first, 1, "a")
@@ -275,7 +275,7 @@ decisions = st.builds(
 def test_nor_when_anything_is_repeated(
     recorded: list[RecordedDecision], gaps: list[int], mansd: int, first: bool
 ) -> None:
-    """A record may contain decisions that no link makes, and its times may differ."""
+    """The guarantee holds in any replay, also of decisions that no link makes, at other times."""
     settings = LinkSettings(
         impairments=(LossOf(loss=WorstCaseLoss()),), mansd=mansd, first_delivered=first
     )

@@ -27,12 +27,12 @@ def ns(text: str) -> int:
 
 
 @pytest.mark.parametrize(("words", "column"), [("mansd 1", 3), ("mansd 1 first", 5)])
-def test_the_example_is_what_the_link_decides(words: str, column: int) -> None:
+def test_the_link_decides_the_example_as_documented(words: str, column: int) -> None:
     rows = table()
     assert [int(row[0]) for row in rows] == list(range(6))
     decisions = []
     for k, comes, wish, *_ in rows:
-        lost = k in ("3", "4")  # as the text says
+        lost = k in ("3", "4")  # as the text states
         delay_ns = NEVER_NS if wish == NEVER else ns(wish) - ns(comes)
         decisions.append(
             RecordedDecision(Fate.DROPPED if lost else Fate.DELIVERED, delay_ns, -1, -1, -1)

@@ -107,7 +107,7 @@ def test_the_prediction_of_a_reducible_chain_depends_on_its_start() -> None:
         "delay 1ms 1ms loss 30% reorder 20% mansd 2 limit 1000000",
     ],
 )
-def test_a_million_decisions_lose_what_is_predicted(words: str) -> None:
+def test_a_million_decisions_have_the_predicted_loss(words: str) -> None:
     """Standard error of batch means: correlation over 5,000 datagrams is negligible."""
     settings = settings_of(words)
     predicted = predicted_loss(settings)

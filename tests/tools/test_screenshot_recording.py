@@ -1,4 +1,4 @@
-"""The recording is looked at, in a browser, as a person would."""
+"""Check the recording on a screenshot of the viewer in a browser."""
 
 import shutil
 import subprocess
@@ -24,7 +24,7 @@ CAR, SENSOR, CONTROLLER = palette.PLANT, palette.SENSOR, palette.CONTROLLER
 @pytest.mark.skipif(
     not any(map(shutil.which, BROWSERS)), reason="there is no Chromium or Chrome on the PATH"
 )
-def test_a_runs_recording_shows_its_car_and_where_the_models_believe_it(tmp_path: Path) -> None:
+def test_a_recording_shows_the_car_and_the_position_in_each_model(tmp_path: Path) -> None:
     finished = run_scenario(tmp_path, *settings(speed=5.0, horizon_s=8.0))
     picture = tmp_path / "run.png"
     done = subprocess.run(
@@ -38,13 +38,13 @@ def test_a_runs_recording_shows_its_car_and_where_the_models_believe_it(tmp_path
     assert done.returncode == 0, done.stderr
     image = Image.open(picture).convert("RGB")
     assert image.size == (1200, 800)
-    # The left half of the window: the car on its lane above, packets and words below.
-    lane = image.crop((0, 60, 440, 330))  # without the words on the right
+    # The left half of the window: the car on its lane at the top, packets and text below.
+    lane = image.crop((0, 60, 440, 330))  # without the text on the right
     car, sensor, controller = (near(lane, colour) for colour in (CAR, SENSOR, CONTROLLER))
-    assert len(car) > 2000  # a body
-    assert len(sensor) > 150  # outlines
+    assert len(car) > 2000  # the car's body
+    assert len(sensor) > 150  # outline only
     assert len(controller) > 150
-    # It opens where losses have led the controller's model away; in the end all are together.
+    # The view opens at a time when losses make the controller's model differ.
     middles = {name: np.median(found, axis=0) for name, found in
                (("car", car), ("sensor", sensor), ("controller", controller))}  # fmt: skip
     assert np.linalg.norm(middles["sensor"] - middles["car"]) < 10
@@ -55,6 +55,6 @@ def test_a_runs_recording_shows_its_car_and_where_the_models_believe_it(tmp_path
 
 
 def near(image: Image.Image, colour: palette.Colour) -> Any:
-    """Places (k, 2) of the pixels that have this colour, but for what smoothing does to edges."""
+    """Return the positions (k, 2) of pixels of this colour, with a tolerance for smoothed edges."""
     pixels = np.asarray(image, dtype=int)
     return np.argwhere(np.abs(pixels - colour).max(axis=2) < 20)

@@ -21,7 +21,7 @@ START = -1
 
 
 class Nodes(NamedTuple):
-    """N runs, each just after an event whose update was delivered or dropped."""
+    """N runs, each just after an event and the delivery or loss of its update."""
 
     t_s: Vector
     """(N,)"""

@@ -1,1 +1,1 @@
-"""What a run shows of what was claimed for it: held, violated, or void since when and why."""
+"""Claims checked against a run: held, violated or void, with time and reason."""

@@ -1,8 +1,8 @@
 """Checks the assumptions of a run's claims during the run.
 
-It reports what :class:`cosim.analysis.claims.claim_evaluation.ClaimEvaluation` reports after the
-run, from the same limits and the same
-:class:`~cosim.analysis.claims.condition_reader.ConditionReader`, as soon as the rows are in.
+It reports the same violations as :class:`cosim.analysis.claims.claim_evaluation.ClaimEvaluation`,
+which runs after the run, from the same limits and the same
+:class:`~cosim.analysis.claims.condition_reader.ConditionReader`, as soon as the rows arrive.
 """
 
 import math
@@ -22,7 +22,8 @@ from noack.config.scenario import Scenario
 from noack.theory.run_conditions import allowed_conditions
 
 _MOST_WAITING = 100_000
-"""Rows that wait for a silent process: some minutes of a run. The monitor stops then."""
+"""Largest number of rows that wait for a process without output (some minutes of a run). If there
+are more, the monitor stops."""
 
 
 class AssumptionMonitor:
@@ -40,7 +41,7 @@ class AssumptionMonitor:
         self._found: dict[str, AssumptionViolation] = {}
         self._until_s = math.inf
         self.stopped: str | None = None
-        """Why it reports nothing more; None while it works."""
+        """Reason why the monitor stopped; None while it is active."""
 
     def take(self, table: str, rows: Rows) -> None:
         """Add rows of a table, in their order."""
@@ -48,18 +49,18 @@ class AssumptionMonitor:
             self._reader.take(table, rows)
 
     def stop(self, why: str) -> None:
-        """Report nothing more: rows are missing, so that conditions cannot be determined."""
+        """Stop reporting: rows are missing, so the conditions cannot be determined."""
         self.stopped = self.stopped or why
 
     def end_at(self, t_s: float) -> None:
-        """Ignore violations from a change of settings on.
+        """Ignore violations after a change of settings.
 
         The claims after a change depend on the state at that time; they are checked after the run.
         """
         self._until_s = min(self._until_s, t_s)
 
     def advance(self) -> list[AssumptionViolation]:
-        """Assumptions that the run has violated since the last call, each for the first time."""
+        """Return the assumptions that were violated for the first time since the last call."""
         if self.stopped is not None:
             return []
         found = self._new_violations(self._reader.observed())
@@ -68,17 +69,17 @@ class AssumptionMonitor:
         return found
 
     def end(self) -> list[AssumptionViolation]:
-        """The same for rows that were still waiting; no more rows come."""
+        """Return the violations from the rows that were still waiting; no more rows follow."""
         return [] if self.stopped is not None else self._new_violations(self._reader.end())
 
     @property
     def void_from(self) -> VoidFrom | None:
-        """When the run first violated an assumption, as far as known."""
+        """The time at which the run first violated an assumption, as far as determined."""
         return earliest(VoidFrom(one.t_s, one.text) for one in self._found.values())
 
     @property
     def waiting(self) -> int:
-        """How many rows wait for others."""
+        """The number of rows that wait for others."""
         return self._reader.waiting
 
     @np.errstate(all="ignore")  # a run may diverge

@@ -33,12 +33,12 @@ class Claim(NamedTuple):
     certified: float | None
     """The claimed constant."""
     observed: float | None
-    """The constant that would have been enough for this run."""
+    """The smallest constant with which the claim holds for this run."""
     ratio: float | None
     """Largest share of the bound that was reached; at most 1 if the claim held."""
     verdict: ClaimVerdict
     since_s: float | None
-    """From when on the claim was violated, void or not applicable."""
+    """Time from which the claim was violated, void or not applicable."""
     why: str
     from_s: float = 0.0
     """The claim begins here: at the start of the run, or after a change of settings."""

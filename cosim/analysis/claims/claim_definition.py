@@ -36,7 +36,7 @@ class Bound(NamedTuple):
     shares: Reals
     """Observed value over bound; for lower bounds, bound over observed value. (k,)"""
     void: VoidFrom | None
-    """From when on an assumption was violated."""
+    """The time from which an assumption was violated."""
     constant: float | None = None
     is_lower: bool = False
 
@@ -49,7 +49,7 @@ class ClaimDefinition:
     source: str
     assumes: str
     bound: Callable[[RunEvidence], Bound | None]
-    """None: nothing is claimed of this run."""
+    """Returns the bound; None if there is no claim about this run."""
     envelope: Callable[[RunEvidence], Envelope | None] = lambda run: None
     needs_ideal_loop: bool = False
     """A run that exceeds the bound does not refute it."""
@@ -66,7 +66,7 @@ class CertifiedClaim:
 
 
 def upper_shares(observed: Reals, bound: Reals) -> Reals:
-    """Share of an upper bound that was reached, (k,); 0 of a bound of 0 is a share of 0."""
+    """Return the share of an upper bound that was reached, (k,); 0 if both values are 0."""
     shares = np.zeros(len(observed))
     return np.divide(observed, bound, out=shares, where=(observed != 0) | ~(bound >= 0))
 
@@ -78,9 +78,9 @@ def check(
 
     Args:
         bound: the bound.
-        statement: what is claimed.
-        source: where the claim comes from.
-        until_s: the claim ends here.
+        statement: the claim in words.
+        source: the claim's source.
+        until_s: end of the claim.
         unmet: the assumption that this run cannot meet; empty if there is none.
     """
     void = bound.void if bound.void is not None and bound.void.t_s < until_s else None

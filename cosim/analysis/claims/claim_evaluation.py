@@ -22,7 +22,7 @@ class ClaimEvaluation(RunEvidence):
     """The claims about one run, or about one part of it."""
 
     def judge(self) -> list[Claim]:
-        """Every claim with its verdict."""
+        """Return every claim with its verdict."""
         if not len(self.joined.t_ns) or not self.in_common.any():
             return []
         if self.record.scenario.protocol.acknowledges:

@@ -1,12 +1,12 @@
-"""The claims about a run whose settings change during the run.
+"""The claims about a run with changes of settings.
 
-The claims at the start end at the first change. What follows is checked as a run of its own, in
-deviations from the set-point. Its time begins with the first event after the change whose update
-the controller received: there x_s = x, and x_c is reset to it. Nothing is claimed in between.
+The claims at the start end at the first change. The part after a change is checked as a separate
+run, in deviations from the set-point. Its time 0 is the first event after the change whose update
+the controller received: there x_s = x, and x_c is reset to x. There are no claims in between.
 
-Such a run begins with an input of the run before: until the plant applies the first input of this
-part, u was computed from older updates. ‖u − Kx‖ is on record, and the certificate holds if it
-covers input errors of that size (:class:`noack.theory.scenario_certificates.CertificateScope`).
+Such a part starts with an input of the part before: until the plant applies the first input of the
+new part, u was computed from older updates. ‖u − Kx‖ is recorded, and the certificate holds if it
+covers input errors of this size (:class:`noack.theory.scenario_certificates.CertificateScope`).
 """
 
 import math
@@ -43,7 +43,7 @@ _TIMES = ("t_ns", "now_ns", "model_t_ns", "release_ns", "copy_ns")
 _STATES = ("x", "x_s", "x_c", "x_c_before", "x_s_before")
 _LEAST_BETA = 1e-300
 _AT_REST = 1e-9
-"""A plant rests at the set-point if |A x_r + B u_r| is at most this share of its larger term."""
+"""The set-point is an equilibrium if |A x_r + B u_r| is at most this share of its larger term."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class RunClaims:
 
     @property
     def judged_until_s(self) -> float | None:
-        """The claims about a stopped run end here; None: they are checked to its end."""
+        """End of the claims about a stopped run; None if they are checked to the end of the run."""
         end_ns = common_end_ns(self.record)
         return None if end_ns is None else end_ns / NS_PER_S
 
@@ -92,7 +92,7 @@ class RunClaims:
         return ClaimEvaluation(self._judged).conditions
 
     def violations(self) -> list[AssumptionViolation]:
-        """The assumptions that the run violated: each at the first time, in each of its parts."""
+        """The assumptions that the run violated: in each part, the first violation of each."""
         found = []
         for one in self.parts:
             if not isinstance(one, Claim):
@@ -127,7 +127,7 @@ class RunClaims:
             if one.part is None:
                 return one.envelopes()
             if setpoint_of(self._judged.scenario) is not None or one.part.from_s > 0:
-                # Its bounds are of deviations from another set-point, or begin later.
+                # These bounds hold for deviations from another set-point, or start later.
                 continue
             found += [_until(envelope, one.part.until_s) for envelope in one.envelopes()]
         return found
@@ -156,7 +156,7 @@ class RunClaims:
 
 
 def _nothing_after(made: RecordedChange, until_ns: int, why: str) -> Claim:
-    """A void claim for the part after a change, which says why there are no claims."""
+    """Return a void claim for the part after a change, with the reason for having no claims."""
     at_s, text = made.first_ns / NS_PER_S, text_of(made.change.settings)
     until_s = None if until_ns == NEVER_NS else until_ns / NS_PER_S
     why = f"changed at {at_s:.3f} s: {text}; {why}"
@@ -178,7 +178,7 @@ def _until(envelope: Envelope, until_s: float) -> Envelope:
 def _part_of(
     record: RunRecord, scenario: Scenario, origin_ns: int, sequence: int | None
 ) -> RunRecord:
-    """Return the part of a run that follows an event, as the record of a run of its own.
+    """Return the part of a run after an event, in the form of the record of a separate run.
 
     Args:
         record: the run's record.
@@ -202,7 +202,7 @@ def _part_of(
             kept = kept[kept["sequence"] >= sequence]
         rows[table] = _shifted(kept, origin_ns, x_r, u_r)
     sensor = rows[SENSOR_MEASUREMENT]
-    if sequence is not None and len(sensor):  # before the reset it was of the part before
+    if sequence is not None and len(sensor):  # the state before the reset belongs to the last part
         sensor["x_s"][0] = sensor["x"][0]
         sensor["e_s_norm"][0] = sensor["compared"][0] = 0.0
         rows[CONTROLLER_DELIVERY]["dropouts"][:1] = 0
@@ -238,8 +238,8 @@ def _shifted(rows: Rows, origin_ns: int, x_r: Vector, u_r: Vector) -> Rows:
 def _start_error(own: RunRecord, started_s: float) -> float:
     """sup‖u − Kx‖ e^{αt} over the steps until the plant applied the first input of the part.
 
-    u is held within a step, so ‖u − Kx‖ is at most its larger value at both ends plus the curvature
-    of x in between: Δt²/8 sup‖K A ẋ‖, with ẋ = e^{As}(Ax + Bu).
+    u is constant within a step. So ‖u − Kx‖ is at most the larger of its values at both ends, plus
+    a term for the curvature of x: Δt²/8 sup‖K A ẋ‖, with ẋ = e^{As}(Ax + Bu).
     """
     loop, steps = own.loop, own[PLANT_STEP]
     steps = steps[: int(np.searchsorted(steps["t_ns"] * 1e-9, started_s)) + 1]
@@ -256,7 +256,7 @@ def _start_error(own: RunRecord, started_s: float) -> float:
 
 
 def _void(record: RunRecord, scenario: Scenario) -> Mapping[str, str]:
-    """By scope: why there is no certificate at a set-point, where the plant may not rest."""
+    """Return by scope why there is no certificate: the set-point may not be an equilibrium."""
     setpoint = setpoint_of(scenario)
     if setpoint is None or not scenario.coverage.is_linear:
         return {}

@@ -27,7 +27,7 @@ _PACES = {
 
 
 def common_end_ns(record: RunRecord) -> int | None:
-    """The time that every process of a stopped run had reached.
+    """Return the latest time that every process of a stopped run reached.
 
     None if the run was not stopped, or if a process did not report its time.
     """
@@ -39,7 +39,7 @@ def common_end_ns(record: RunRecord) -> int | None:
     measured_ns = record[SENSOR_MEASUREMENT]["t_ns"]
     if len(known_ns) < len(reports) or not len(measured_ns):
         return None
-    # A sensor has no deadlines of its own: its time is that of its last measurement.
+    # A sensor has no deadlines, so its time is that of its last measurement.
     return int(min(*known_ns, measured_ns[-1]))
 
 

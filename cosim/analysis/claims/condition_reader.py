@@ -36,7 +36,7 @@ from plant_server.watchdog import too_old
 
 Times = NDArray[np.int64]
 _Batches = list[tuple[NDArray[Any], ...]]
-"""Columns of rows that wait, batch by batch."""
+"""Columns of the waiting rows, batch by batch."""
 
 _KEPT_TICKS = 512
 """A process sends its tables one after the other, up to 256 rows of each."""
@@ -45,7 +45,7 @@ _NO_TIMES: Times = np.zeros(0, np.int64)
 
 
 def read_conditions(record: RunRecord) -> ObservedConditions:
-    """Read the conditions from the record of a run; what an incomplete record lacks is late."""
+    """Read the conditions from the record of a run; missing updates and inputs count as late."""
     observer = ConditionReader(record.scenario)
     for table in record.tables:
         observer.take(table, record[table])
@@ -81,20 +81,20 @@ class ConditionReader:
             self._takes[table](rows)
 
     def observed(self) -> ObservedConditions:
-        """What became known since the last call.
+        """Return the conditions that were determined since the last call.
 
-        Until the plant has applied an input of the controller, ``start_s`` is the time up to which
-        it is known that it has not.
+        Until the plant applies the first input of the controller, ``start_s`` is the latest time
+        at which it is certain that there was no such input.
         """
         return self._observed(None)
 
     def end(self) -> ObservedConditions:
-        """What was still waiting; no more rows come."""
+        """Return the conditions from the rows that were still waiting; no more rows follow."""
         return self._observed(max(self._inputs.newest_ns, self._gaps.newest_ns))
 
     @property
     def waiting(self) -> int:
-        """How many rows wait for others."""
+        """The number of rows that wait for others."""
         return self._inputs.waiting + self._ticks.waiting + self._updates.waiting
 
     def _measured(self, rows: Rows) -> None:
@@ -142,7 +142,7 @@ class _Gaps:
 
 
 class _Sensors:
-    """When a sensor was restarted."""
+    """The times at which a sensor was restarted."""
 
     def __init__(self) -> None:
         self._newest = 0
@@ -190,7 +190,7 @@ class _Ticks:
         return sum(len(inputs) for inputs, *_ in self._taken)
 
     def receipts(self, *, ended: bool) -> _Receipts:
-        """Updates whose tick became known; at the end, also those without a tick."""
+        """Return the updates whose tick was determined; at the end, also those without a tick."""
         inputs, ticks = _columns(self._ticks, 2)
         taken, sequence, model_ns = _columns(self._taken, 3)
         first = np.searchsorted(inputs, taken, "right")
@@ -198,7 +198,7 @@ class _Ticks:
         self._taken = [(taken[known:], sequence[known:], model_ns[known:])]
         self._ticks = [(inputs[-_KEPT_TICKS:], ticks[-_KEPT_TICKS:])]
         tick = np.append(ticks, _NEVER)[first[:known]]
-        # A controller that died before its next tick: a restarted one does not have the update.
+        # If the controller died before its next tick, the restarted one does not have the update.
         of = taken[:known] // GENERATION
         kept = (tick == _NEVER) | (tick // GENERATION == of)
         return _Receipts(sequence[:known][kept], model_ns[:known][kept], tick[kept])
@@ -250,7 +250,7 @@ class _Inputs:
         self._ticked = _NEVER if ended else ticked
 
     def classified(self, *, ended: bool) -> tuple[SampledSeries, SampledSeries, SampledSeries]:
-        """Classify the steps whose input is known.
+        """Classify the steps with a known input.
 
         Returns:
             Ages of inputs; ages of actuations that the watchdog replaced; sizes of safe inputs.
@@ -273,7 +273,7 @@ class _Inputs:
             self._latched = int(highest[-1])
         if not self.started and controlled.any():
             self.started, self.start_ns = True, int(t_ns[np.argmax(controlled)])
-        # A late plant may latch an input whose model time is ahead of the step.
+        # A late plant step may apply an input with a model time after the step's nominal time.
         age_ns = np.maximum(t_ns + self._period_ns - model_ns, model_ns - t_ns)
         replaced = controlled & self._replaces & too_old(t_ns, model_ns, self._timeout_ns)
         # Until the first input with a state, the certificates assume that the input is 0.
@@ -292,7 +292,7 @@ class _Inputs:
         return np.array(first, dtype=np.int64)[which]
 
     def _model_ns(self, newest: Times) -> Times:
-        """Model time of each actuation; 0 for one that is not on record."""
+        """Return the model time of each actuation; 0 if the actuation is not recorded."""
         sequence, t_ns = _columns(self._actuations, 2)
         found = np.searchsorted(sequence, newest)
         there = np.append(sequence, NO_SEQUENCE)[found] == newest
@@ -315,7 +315,7 @@ class _Inputs:
         known = len(tick) if ended else int((first < len(latched)).sum())
         applied_ns = [int(t_ns[i]) if i < len(latched) else None for i in first[:known]]
         self._receipts = [(sequence[known:], model_ns[known:], tick[known:])]
-        needed = latched > self._ticked  # later ticks are beyond these
+        needed = latched > self._ticked  # steps with a later actuation than these ticks
         self._latches = [(latched[needed], t_ns[needed])]
         numbers = zip(sequence[:known].tolist(), model_ns[:known].tolist(), applied_ns, strict=True)
         return list(numbers)
@@ -374,9 +374,9 @@ class _Updates:
     def _fate(
         self, sequence: int, event_ns: int, end_ns: int | None
     ) -> tuple[float, int | None] | None:
-        """When a newer update replaced a lost one, in s, and when the update took effect, in ns.
+        """Return when a newer update replaced a lost one, in s, and when the update acted, in ns.
 
-        None if that is not known yet. An update in flight at the end is not lost; it counts as
+        None if this is not determined yet. An update in flight at the end is not lost; it counts as
         delivered at the end.
         """
         while self._taken and self._taken[0][0] < sequence:
@@ -391,7 +391,7 @@ class _Updates:
         if taken == sequence:
             return None if applied_ns is None else (0.0, max(applied_ns, model_ns))
         if passed is None and end_ns is None and self._newest_packet < sequence:
-            return None  # its row of netem_packet is still to come
+            return None  # its row of netem_packet has not arrived yet
         if not passed:
             return np.inf, None
         # It was delivered out of order: a newer update replaced it.
@@ -399,7 +399,7 @@ class _Updates:
 
 
 def _columns(batches: _Batches, count: int) -> tuple[NDArray[Any], ...]:
-    """Put batches of columns one after the other."""
+    """Concatenate batches of columns."""
     if not batches:
         return (_NO_TIMES,) * count
     if len(batches) == 1:

@@ -15,7 +15,7 @@ Reals = NDArray[np.float64]
 
 
 class VoidFrom(NamedTuple):
-    """From when on claims are void, because an assumption was violated or data is missing."""
+    """The time from which claims are void: an assumption was violated, or data is missing."""
 
     t_s: float
     why: str
@@ -36,7 +36,7 @@ CAUSES = {
 
 
 class SampledSeries(NamedTuple):
-    """A condition's value over time: k values, each known from its time on."""
+    """A condition's value over time: k values, each determined at its time."""
 
     t_s: Reals
     value: Reals
@@ -47,7 +47,7 @@ class SampledSeries(NamedTuple):
 
 
 class PacketLosses(NamedTuple):
-    """The events, and which of their updates were lost."""
+    """The events, and the losses among their updates."""
 
     t_s: Reals
     """(k,)"""
@@ -71,7 +71,7 @@ class PacketLosses(NamedTuple):
 
 
 class AssumptionViolation(NamedTuple):
-    """The first time at which a run violated one assumption, and by how much in all."""
+    """A run's first violation of one assumption, with the largest excess over the run."""
 
     t_s: float
     cause: str
@@ -93,11 +93,11 @@ class ObservedConditions(NamedTuple):
     sampling: SampledSeries
     """Time since the measurement before, in seconds, at every measurement."""
     delay: SampledSeries
-    """From an event until the plant applied an input computed with its update, at the event."""
+    """Time from each event until the plant applied an input computed with its update."""
     hold: SampledSeries
     """Largest difference between the time and the model time of the applied input, per step."""
     start_s: float
-    """When the plant applied the first input of a controller with a state; infinite if never."""
+    """Time at which the plant applied the first input of a controller with a state, or infinity."""
     watchdog: SampledSeries
     """Age of the newest actuation at every step at which the watchdog replaced the input."""
     safe_input: SampledSeries
@@ -126,7 +126,7 @@ class ObservedConditions(NamedTuple):
             "hold": (self.hold, conditions.hold_s),
             "start": (start, conditions.start_s),
             "watchdog": (self.watchdog, self.timeout_s),
-            "safe input": (self.safe_input, -1.0),  # any at all
+            "safe input": (self.safe_input, -1.0),  # every value is a violation
             "restart": (self.restarts, 0.0),
         }
         found = []
@@ -140,7 +140,7 @@ class ObservedConditions(NamedTuple):
     def first_violation(
         self, conditions: NetworkConditions, causes: Collection[str] = tuple(CAUSES)
     ) -> VoidFrom | None:
-        """When the run first violated one of the conditions; None if never."""
+        """Return the time at which the run first violated a condition; None if never."""
         return earliest(VoidFrom(one.t_s, one.text) for one in self.violations(conditions, causes))
 
     def summary(self) -> dict[str, float | None]:
@@ -162,7 +162,7 @@ def earliest(found: Iterable[VoidFrom | None]) -> VoidFrom | None:
 def causes_of(scenario: Scenario) -> Collection[str]:
     """The assumptions that claims about a resolved scenario need.
 
-    Certificates need all; (I1) needs the measurements only; nothing is claimed of the
+    Certificates need all of them. (I1) needs the measurements only. There are no claims about the
     acknowledgement baseline.
     """
     if scenario.protocol.acknowledges:

@@ -32,7 +32,7 @@ from noack.theory.paper_bounds import Theorem2, theorem_2
 from noack.theory.run_conditions import allowed_conditions, ideal_conditions, nominal_conditions
 from noack.theory.scenario_certificates import ScenarioCertificate, certify, certify_box
 
-_LONG_S = 1e300  # finite, because an input that never came took an infinite time
+_LONG_S = 1e300  # finite: the delay of an input that never arrived is infinite
 _ANY = NetworkConditions(sys.maxsize, *[_LONG_S] * 5)
 
 
@@ -53,10 +53,10 @@ class RunPart(NamedTuple):
 
 @dataclass(frozen=True)
 class RunEvidence:
-    """What is known of a run; each property is computed once, when it is first used.
+    """The data of a run for checking claims; each property is computed once, when first used.
 
     Args:
-        record: the record of the run, or of a part of it, as of a run of its own.
+        record: the record of the run, or of a part of it in the form of a separate run.
         part: the part; None: the whole run.
     """
 
@@ -86,7 +86,7 @@ class RunEvidence:
 
     @cached_property
     def certificates(self) -> list[ScenarioCertificate]:
-        """The certificates of the run's scenario under its schedule."""
+        """The certificates of the run's scenario under the scenario's schedule."""
         if self.part is None:
             return scheduled_certificates(self.record.scenario)
         found = scheduled_certificates(self.record.scenario, self.part.start_error)
@@ -103,7 +103,7 @@ class RunEvidence:
         found = read_conditions(self.record)
         if self.part is None or self.part.start_error is None:
             return found
-        # The certificate covers the inputs before the part's first one by its start error.
+        # The certificate's start error covers the inputs before the part's first one.
         safe, restarts = found.safe_input, found.restarts
         kept, again = safe.t_s >= found.start_s, restarts.t_s > 0
         return found._replace(
@@ -133,7 +133,7 @@ class RunEvidence:
 
     @cached_property
     def first_gap(self) -> VoidFrom | None:
-        """From when on the record is incomplete, so that no claim can be checked."""
+        """The time from which the record is incomplete and no claim can be checked."""
         limit = _ANY._replace(sampling_s=self._schedule.sampling_s)
         found = [self.observed.first_violation(limit, ("sampling",))]
         whole, from_s = self.record, 0.0
@@ -152,13 +152,13 @@ class RunEvidence:
 
     @cached_property
     def paper_violation(self) -> VoidFrom | None:
-        """When M − 1 was exceeded, or u was not K x_c: the paper's theorems assume both."""
+        """First violation of M − 1 or of u = K x_c, which the paper's theorems assume."""
         limit = _ANY._replace(dropouts=self._schedule.dropouts)
         causes = ("dropouts", "watchdog", "safe input", "restart")
         return earliest([self.observed.first_violation(limit, causes), self.first_gap])
 
     def violation_of(self, certificate: ScenarioCertificate) -> VoidFrom | None:
-        """When the run first violated the conditions of a certificate."""
+        """Return the time at which the run first violated the conditions of a certificate."""
         return self.observed.first_violation(certificate.conditions)
 
     @cached_property
@@ -184,7 +184,7 @@ class RunEvidence:
 
     @cached_property
     def theorem_2(self) -> Theorem2 | None:
-        """Theorem 2 with the uniform Δ of (I1) for the paper's conditions; None if it has none."""
+        """Theorem 2 with (I1)'s uniform Δ under the paper's conditions; None if there is no Δ."""
         scenario, loop = self.record.scenario, self.record.loop
         if (
             not scenario.coverage.is_certifiable
@@ -208,11 +208,11 @@ class RunEvidence:
 def scheduled_certificates(
     scenario: Scenario, start_error: float | None = None
 ) -> list[ScenarioCertificate]:
-    """The certificates of a resolved scenario under its schedule; none beyond the theory.
+    """Return the certificates of a resolved scenario under its schedule, if it can have any.
 
     Args:
         scenario: the scenario.
-        start_error: for a run that begins with an input of an earlier run; see
+        start_error: for a part that starts with an input of the part before; see
             :class:`noack.theory.scenario_certificates.CertificateScope`.
     """
     if not scenario.coverage.is_certifiable:

@@ -1,4 +1,4 @@
-"""A run of the paper's loop in continuous time, for a given pattern of dropouts."""
+"""A run of the paper's loop in continuous time, for a given loss pattern."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -67,7 +67,7 @@ class SampledLoop:
     Args:
         system: matrices and trigger, of any policy.
         schedule: times of measurements, deliveries and actuations.
-        known_start: sensor and controller know x(0); otherwise the first measured step is event 0.
+        known_start: sensor and controller start from x(0); else the first measured step is event 0.
     """
 
     def __init__(

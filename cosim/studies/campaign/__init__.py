@@ -1,1 +1,1 @@
-"""Campaigns: many runs over a grid of settings, what they have in common and where they differ."""
+"""Campaigns: many runs over a grid of settings, with their means and differences."""

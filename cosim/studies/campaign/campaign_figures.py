@@ -1,4 +1,4 @@
-"""The figures of a campaign; intervals are the means' 95 % confidence intervals."""
+"""The figures of a campaign; intervals are 95 % confidence intervals of the means."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -34,9 +34,9 @@ _HEIGHT_IN = 3.4
 _MAP_HEIGHT_IN, _MAPS_IN_A_ROW, _BAR_IN = 2.4, 3, 0.16
 _QUANTILES = 400
 _NARROWEST_IN = 0.42
-"""Cells of a map have their numbers written in them unless they are narrower."""
+"""Narrowest cell of a map in which its number is written, in inches."""
 _FAR = 10.0
-"""A metric that spans this factor gets a logarithmic axis."""
+"""A metric with values further apart than this factor gets a logarithmic axis."""
 _LONGEST_LABEL = 28
 _MARKERS = "os^Dv<>PXph*"
 _DASHES: tuple[Any, ...] = ("-", (0, (6, 1.5)), (0, (2, 1.2)), (0, (6, 1.5, 1.5, 1.5)))
@@ -46,7 +46,7 @@ class Drawn(NamedTuple):
     """A figure of the page."""
 
     name: str
-    """A word."""
+    """Name of the figure, one word."""
     figure: Figure
     caption: str
 
@@ -75,7 +75,7 @@ def figures(summary: CampaignSummary, store: Store) -> Iterator[Drawn]:
 def pareto_figure(
     series: Mapping[str, tuple[Sequence[Estimate], Sequence[Estimate]]], x: Metric, y: Metric
 ) -> Figure:
-    """Means against each other with their intervals; the points that none dominates are joined."""
+    """Draw means of y against means of x, with intervals; a line joins the non-dominated points."""
     figure, (axes,) = single(_HEIGHT_IN, list(series))
     shown: list[Shown] = []
     for i, (label, pair) in enumerate(series.items()):
@@ -106,7 +106,7 @@ def pareto_figure(
 
 
 def undominated(x: Vector, y: Vector) -> Any:
-    """Indices, by ascending x, of the points than which no other is as small in both, (k,)."""
+    """Return the indices, by ascending x, of the points that no other point dominates, (k,)."""
     front: list[int] = []
     for i in np.lexsort((y, x)):
         if not front or y[i] < y[front[-1]]:
@@ -122,13 +122,13 @@ def curve_figure(
     axis: str,
     metric: Metric,
 ) -> Figure:
-    """Means of a metric over an axis, with their intervals.
+    """Draw the means of a metric over an axis, with their intervals.
 
     Args:
-        x: the axis' values, (k,); None if they are no numbers.
-        labels: k of them.
-        series: by name k estimates; None where there is none.
-        axis: its title.
+        x: values of the axis, (k,); None if they are not numbers.
+        labels: k labels of these values.
+        series: k estimates by name of the series; None if there is no estimate.
+        axis: title of the axis.
         metric: the metric.
     """
     figure, (axes,) = single(_HEIGHT_IN, list(series))
@@ -163,12 +163,12 @@ def heat_map_figure(
     y: tuple[str, Sequence[str]],
     metric: Metric,
 ) -> Figure:
-    """Maps of a metric with a common scale.
+    """Draw maps of a metric with a common scale.
 
     Args:
-        maps: by title, (values of y, values of x); NaN is no value.
+        maps: by title, (values of y, values of x); NaN is a missing value.
         x: title and labels of the horizontal axis.
-        y: of the vertical one.
+        y: title and labels of the vertical axis.
         metric: the metric.
     """
     columns = min(len(maps), _MAPS_IN_A_ROW)
@@ -207,10 +207,10 @@ def heat_map_figure(
 
 @styled
 def distribution_figure(series: Mapping[str, Vector], metric: Metric) -> Figure:
-    """Shares of the runs in which a metric is at most so much; what is infinite is never reached.
+    """Draw the cumulative distribution of a metric; infinite values keep a curve below 1.
 
     Args:
-        series: by name the values of all runs, (k,), without NaN.
+        series: values of all runs by name of the series, (k,), without NaN.
         metric: the metric.
     """
     figure, (axes,) = single(_HEIGHT_IN, list(series))
@@ -311,7 +311,7 @@ def _distribution(
 def _series(
     summary: CampaignSummary, found: Sequence[GridPointResult], spanned: tuple[str, ...]
 ) -> Iterator[tuple[str, list[GridPointResult]]]:
-    """Grid points by the values of the axes that have no place of their own."""
+    """Group grid points by the values of the axes that the figure does not show as coordinates."""
     rest = [axis for axis in summary.campaign.axes if axis.name not in spanned]
     groups: dict[str, list[GridPointResult]] = {}
     for one in found:
@@ -338,7 +338,7 @@ def _title(metric: Metric) -> str:
 
 
 def _scale(axes: Axes, which: Any, estimates: Sequence[Estimate], metric: Metric) -> None:
-    """Logarithmic where values are far apart and above 0, else from 0 if that is near."""
+    """Use a logarithmic axis if the values are positive and far apart."""
     means = np.array([e.mean for e in estimates if np.isfinite(e.mean)])
     if METRICS[metric].logarithmic and _far(means):
         logarithmic(axes, which)

@@ -1,7 +1,7 @@
 """The campaign file: axes of the grid, draws, metrics and figures.
 
-Settings are those of a scenario, as after ``--set``: a key with dots, in quotes, sets one value
-(``"trigger.beta" = 0.3``), a key without them a whole table (``trigger = { policy = … }``).
+Settings have the keys of a scenario, as in ``--set``. A key with dots, in quotes, sets one value
+(``"trigger.beta" = 0.3``). A key without dots sets a whole table (``trigger = { policy = … }``).
 """
 
 import itertools
@@ -21,17 +21,17 @@ from noack.settings.section import ScenarioSection, Seed
 
 MOST_POINTS = 10_000
 MOST_SERIES = 12
-"""Curves of one figure."""
+"""Largest number of curves in a figure."""
 
 Identifier = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
 Settings = Annotated[dict[str, JsonValue], Field(min_length=1)]
 
 
 def _require_scalars(given: Any) -> Any:
-    """Check that a value, or each of a list, is a number, a text, true or false.
+    """Check that a value, or each value of a list, is a number, a text, true or false.
 
     Raises:
-        ValueError: one is a list or a table.
+        ValueError: a value is a list or a table.
     """
     values = given if isinstance(given, list | tuple) else (given,)
     if any(isinstance(one, list | tuple | dict) for one in values):
@@ -81,11 +81,11 @@ class Axis(ScenarioSection):
     name: Identifier
     """Name of the column of the results: small letters, digits and _."""
     title: str = ""
-    """Name in figures and tables; the name unless given."""
+    """Name in figures and tables; by default the name of the axis."""
     key: str | None = None
     """A key of the scenario, e.g. network.mansd; needs values."""
     values: Values | None = None
-    """Its values."""
+    """Values of the key."""
     variants: Annotated[dict[str, Settings], Field(min_length=1)] | None = None
     """Instead of key and values: names, each with its settings."""
 
@@ -108,7 +108,7 @@ class Axis(ScenarioSection):
 
     @property
     def called(self) -> str:
-        """Its title, or its name."""
+        """The axis's title, or its name if it has no title."""
         return self.title or self.name.replace("_", " ")
 
     @property
@@ -130,7 +130,7 @@ class Axis(ScenarioSection):
 
     @property
     def numbers(self) -> list[float] | None:
-        """The values as numbers, if they all are."""
+        """The values as numbers, if all are numbers."""
         values = self.values or ()
         if not values or any(isinstance(v, str | bool) for v in values):
             return None
@@ -150,9 +150,9 @@ class Metrics(ScenarioSection):
     )
     """Columns of the tables."""
     Q: Rows | None = None
-    """Weight of the state in the cost ∫ xᵀQx + uᵀRu dt, by rows; the identity unless given."""
+    """Weight of the state in the cost ∫ xᵀQx + uᵀRu dt, by rows; by default the identity."""
     R: Rows | None = None
-    """Weight of the input in the cost, by rows; the identity unless given."""
+    """Weight of the input in the cost, by rows; by default the identity."""
     settle: Annotated[FiniteFloat, Field(gt=0, lt=1)] = 0.02
     """A run has settled when ‖x‖ stays below this share of ‖x(0)‖."""
     most_events: Annotated[int, Field(ge=1, le=10_000_000)] = 100_000
@@ -165,7 +165,7 @@ class PairedComparison(ScenarioSection):
     axis: Identifier
     """The axis."""
     reference: Value
-    """The value or variant to which the others are compared."""
+    """The value or variant from which the differences are computed."""
 
 
 class _Figure(ScenarioSection):
@@ -177,7 +177,7 @@ class Pareto(_Figure):
     """Means of two metrics against each other, with the non-dominated points of each series."""
 
     kind: Literal["pareto"] = "pareto"
-    """One metric against another; both should be small."""
+    """One metric against another; smaller is better for both."""
     series: Identifier
     """The axis with one front per value."""
     x: Metric = "transmissions"
@@ -243,13 +243,14 @@ class Campaign(ScenarioSection):
     description: str = ""
     """The question that the campaign answers."""
     scenario: Annotated[str, Field(min_length=1)]
-    """The scenario of all runs: a file beside this one, or the name of a shipped scenario."""
+    """The scenario of all runs: a file in the folder of this file, or the name of a shipped
+    scenario."""
     settings: dict[str, JsonValue] = Field({})
-    """Settings of all runs, replacing the scenario's."""
+    """Settings of all runs, which replace the scenario's."""
     time: Literal["continuous", "sampled"] = "continuous"
     """continuous: continuous trigger, network without delay; exact and compiled. sampled: the
     machines of a live run in virtual time, with the schedule's sampling, delays and
-    acknowledgements; a thousand times slower."""
+    acknowledgements; about a thousand times slower."""
     draws: Annotated[int, Field(ge=1, le=100_000_000)]
     """Runs at each grid point, with different plants from the box, initial states and losses."""
     seed: Seed = 0
@@ -265,7 +266,7 @@ class Campaign(ScenarioSection):
 
     @cached_property
     def by_name(self) -> Mapping[str, Axis]:
-        """The axes."""
+        """The axes by name."""
         return {axis.name: axis for axis in self.axes}
 
     @model_validator(mode="after")
@@ -324,7 +325,7 @@ class Campaign(ScenarioSection):
             raise ValueError(f"{place}: no such value; {axis} has {', '.join(labels)}")
 
     def selected(self, where: Mapping[str, Value]) -> Iterator[tuple[int, ...]]:
-        """Places in the grid, one number per axis, with these values."""
+        """Return the places in the grid, one index per axis, of the points with these values."""
         ranges = [
             [i for i, label in enumerate(axis.labels) if axis.name not in where
              or label == label_of(where[axis.name])]

@@ -36,17 +36,17 @@ class Point:
 
     number: int
     place: tuple[int, ...]
-    """Which value of each axis."""
+    """Index of the point's value on each axis."""
     labels: Mapping[str, str]
-    """By axis."""
+    """Labels by axis."""
     values: Mapping[str, Value]
-    """By axis: numbers if all values of the axis are numbers, otherwise labels."""
+    """Values by axis: numbers if all values of the axis are numbers, otherwise labels."""
     scenario: Scenario
     """The scenario; its plant and initial state are not yet drawn."""
     certified_error: float | None
-    """Δβ, or None."""
+    """Certified bound Δβ, or None."""
     work: Work
-    """Computes its draws."""
+    """Computes the draws of the point."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class ContinuousWork:
     seed: int
 
     def run(self, draws: range) -> NDArray[np.void]:
-        """Compute successive draws; one row each."""
+        """Compute consecutive draws; one row each."""
         return run_batch(self.setting, self.box.population(self.seed, draws))
 
 

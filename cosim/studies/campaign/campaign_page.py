@@ -26,12 +26,12 @@ class SummaryRow(NamedTuple):
 
 
 def page(summary: CampaignSummary, drawn: Sequence[Drawn], base: Mapping[str, Any]) -> str:
-    """Return the page as HTML; all text but the figures is escaped.
+    """Return the page as HTML; all text except the figures is escaped.
 
     Args:
         summary: the results.
         drawn: the figures in order.
-        base: content of the scenario that all runs start from.
+        base: content of the scenario of all runs.
     """
     campaign = summary.campaign
     content = campaign.model_dump(mode="json", exclude_none=True)
@@ -74,20 +74,20 @@ def verdict(summary: CampaignSummary) -> str:
 
 
 def found_row(found: GridPointResult, metrics: Sequence[Metric]) -> SummaryRow:
-    """A grid point's means with their intervals."""
+    """Return a grid point's means with their intervals."""
     cells = [written(found.estimates[m]) if m in found.estimates else NONE for m in metrics]
     return SummaryRow(list(found.point.labels.values()), cells)
 
 
 def compared_row(compared: ComparedResult, metrics: Sequence[Metric]) -> SummaryRow:
-    """Mean differences with their intervals."""
+    """Return mean differences with their intervals."""
     found = [compared.differences.get(metric) for metric in metrics]
     cells = [written(d.estimate) if d and d.estimate.finite else NONE for d in found]
     return SummaryRow(list(compared.point.labels.values()), cells)
 
 
 def _compared_row(compared: ComparedResult, metrics: Sequence[Metric]) -> SummaryRow:
-    """The same, with the share of draws in which the metric is smaller."""
+    """Return mean differences, with the share of draws in which the metric is smaller."""
     labels, cells = compared_row(compared, metrics)
     shares = [
         compared.differences[m].smaller if m in compared.differences else None for m in metrics
@@ -102,7 +102,7 @@ def _compared_row(compared: ComparedResult, metrics: Sequence[Metric]) -> Summar
 
 
 def written(estimate: Estimate) -> str:
-    """Mean ± half-width, and the share of finite runs if not all are."""
+    """Return mean ± half-width, with the share of finite runs if it is below 100 %."""
     if not estimate.finite:
         return "never"
     text = plus_minus(estimate.mean, estimate.halfwidth)
@@ -112,7 +112,7 @@ def written(estimate: Estimate) -> str:
 
 
 def unfinished(summary: CampaignSummary) -> Iterator[str]:
-    """Return a remark for each grid point where not all runs reached the horizon."""
+    """Return a note for each grid point at which a run did not reach the horizon."""
     for found in summary.found:
         others = {how: count for how, count in found.ended.items() if how != "finished"}
         if others:

@@ -33,7 +33,7 @@ _MOST_REMARKS = 5
 
 
 def write_report(summary: CampaignSummary, store: Store, base: Mapping[str, Any]) -> list[Path]:
-    """Write page and summary; return their paths and that of the runs.
+    """Write page and summary; return their paths and the path of the runs.
 
     Raises:
         MachineError: they cannot be written.
@@ -84,13 +84,13 @@ def print_summary(console: Console, summary: CampaignSummary) -> None:
 def tables_of(
     title: str, axes: Sequence[str], headings: Sequence[str], rows: Sequence[SummaryRow], width: int
 ) -> Iterator[Table]:
-    """Split a table into as many as a terminal of this width needs; nothing is truncated.
+    """Split a table into as many tables as a terminal of this width needs; nothing is truncated.
 
     Args:
-        title: of the first.
-        axes: headings of the labels, which each table repeats.
-        headings: of the cells.
-        rows: of all tables.
+        title: of the first table.
+        axes: headings of the label columns, which each table repeats.
+        headings: headings of the other columns.
+        rows: rows of all tables.
         width: in characters.
     """
     labels = sum(_width(axis, [row.labels[i] for row in rows]) for i, axis in enumerate(axes))
@@ -120,7 +120,7 @@ def _width(heading: str, cells: Iterable[str]) -> int:
 
 
 def _known(value: Any) -> Any:
-    """The value for JSON: null for a number that is not finite."""
+    """Return the value for JSON: null for a number that is not finite."""
     if isinstance(value, dict):
         return {key: _known(entry) for key, entry in value.items()}
     if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""Runs a campaign: computes the runs that are missing in its folder."""
+"""Runs a campaign: computes the runs that its folder does not have yet."""
 
 import signal
 from collections.abc import Callable, Iterator
@@ -10,7 +10,7 @@ from cosim.studies.campaign.chunk_store import Store
 from noack.core.errors import ExitStatus, MachineError, NoackError
 
 Progress = Callable[[int, int], None]
-"""Called with the number of finished runs and of all runs."""
+"""Called with the number of finished runs and the number of all runs."""
 
 
 class InterruptedCampaignError(NoackError):
@@ -56,8 +56,8 @@ def run_campaign(store: Store, runner: Runner, progress: Progress | None = None)
         progress: called after each chunk.
 
     Raises:
-        InterruptedCampaignError: by Ctrl-C.
-        TerminatedCampaignError: by a signal, within :func:`terminations_raised`.
+        InterruptedCampaignError: the user pressed Ctrl-C.
+        TerminatedCampaignError: a signal was received within :func:`terminations_raised`.
         LostWorkersError: workers have died.
         MachineError: the results cannot be written.
     """

@@ -32,10 +32,11 @@ class GridPointResult(NamedTuple):
 
     point: Point
     ended: Mapping[str, int]
-    """Number of runs by how they ended."""
+    """Number of runs by reason of their end."""
     estimates: Mapping[Metric, Estimate]
     breaches: int
-    """Runs in which ‖e_c‖ exceeds its certified bound: an error in the theory or in the code."""
+    """Number of runs in which ‖e_c‖ exceeds its certified bound: an error in the theory or the
+    code."""
 
 
 class ComparedResult(NamedTuple):
@@ -56,7 +57,7 @@ class CampaignSummary(NamedTuple):
 
     @property
     def breaches(self) -> int:
-        """Runs in which a certified bound is exceeded."""
+        """Number of runs in which a certified bound is exceeded."""
         return sum(found.breaches for found in self.found)
 
     def document(self) -> dict[str, Any]:
@@ -90,7 +91,7 @@ class CampaignSummary(NamedTuple):
 
 
 def summarise(campaign: Campaign, store: Store) -> CampaignSummary:
-    """Estimate all metrics; reads the runs of one or two grid points at a time."""
+    """Estimate all metrics; the runs of at most two grid points are read at a time."""
     found = [_found(point, store) for point in store.points]
     return CampaignSummary(campaign, store.draws, found, list(_compared(campaign, store)))
 

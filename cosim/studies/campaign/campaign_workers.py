@@ -1,6 +1,6 @@
 """Computes the chunks of a campaign: in processes of this machine or on a Dask cluster.
 
-Chunks are independent. This process receives and writes all results.
+Chunks are independent of each other. Only this process writes results.
 """
 
 import logging
@@ -26,12 +26,12 @@ class Work(Protocol):
     """Computes the draws of a grid point; sent to another process with each chunk."""
 
     def run(self, draws: range) -> NDArray[Any]:
-        """Compute successive draws; one row each."""
+        """Compute consecutive draws; one row each."""
         ...
 
 
 class Chunk(NamedTuple):
-    """Successive draws at a grid point."""
+    """Consecutive draws at a grid point."""
 
     point: int
     start: int
@@ -39,7 +39,7 @@ class Chunk(NamedTuple):
 
     @property
     def draws(self) -> range:
-        """Their numbers."""
+        """Numbers of the draws."""
         return range(self.start, self.stop)
 
 
@@ -48,7 +48,7 @@ Runner = Callable[[Sequence[Work], Iterable[Chunk]], Iterator[Finished]]
 """Computes chunks, given the work of each grid point; yields results in any order."""
 
 _AHEAD = 2
-"""Chunks in flight per worker: one that runs and one that waits."""
+"""Chunks in flight per worker: one is computed and one waits."""
 _LOOK_EVERY_S = 1.0
 _PATIENCE_S = 30.0
 _CONNECT_S = 10.0
@@ -56,7 +56,7 @@ _CONNECT_TRIES = 3
 
 
 class OtherArithmeticError(PeerError):
-    """A worker's results would differ."""
+    """A worker's arithmetic differs: it would compute other results."""
 
 
 class LostWorkersError(PeerError):
@@ -70,7 +70,7 @@ def alone(works: Sequence[Work], chunks: Iterable[Chunk]) -> Iterator[Finished]:
 
 
 def run_draws(work: Work, draws: range) -> NDArray[Any]:
-    """Compute successive draws in another process of this machine."""
+    """Compute consecutive draws in another process of this machine."""
     return work.run(draws)
 
 
@@ -103,7 +103,7 @@ def _require_address(address: str) -> None:
 
 
 def _client(connect: Any, address: str) -> Any:
-    """Connect; on a busy machine Dask's thread may not start within its ten seconds."""
+    """Connect, with retries: on a busy machine Dask's thread may not start within ten seconds."""
     for _ in range(_CONNECT_TRIES - 1):
         with suppress(AssertionError):
             return connect(address, timeout=_CONNECT_S, set_as_default=False)
@@ -116,7 +116,7 @@ def _client(connect: Any, address: str) -> Any:
 
 
 def run_alike(work: Work, draws: range, wanted: Mapping[str, str]) -> NDArray[Any]:
-    """Compute successive draws on another machine.
+    """Compute consecutive draws on another machine.
 
     Raises:
         OtherArithmeticError: its results would differ from those of the caller.
@@ -130,11 +130,11 @@ def run_alike(work: Work, draws: range, wanted: Mapping[str, str]) -> NDArray[An
 
 @contextmanager
 def cluster(address: str, say: Callable[[str], None] = lambda line: None) -> Iterator[Runner]:
-    """Compute chunks on the Dask cluster of a scheduler; its workers need the same noack.
+    """Compute chunks on a Dask cluster; its workers need the same version of noack.
 
     Args:
-        address: of the scheduler.
-        say: called with a line when the campaign waits for the cluster.
+        address: of the cluster's scheduler.
+        say: called with a message when the campaign waits for the cluster.
 
     Raises:
         CallerError: Dask is not installed, or the address is not valid.
@@ -148,7 +148,7 @@ def cluster(address: str, say: Callable[[str], None] = lambda line: None) -> Ite
         ) from None
     _require_address(address)
     for name in list(logging.root.manager.loggerDict):
-        if name.startswith("distributed"):  # its errors are reported below
+        if name.startswith("distributed"):  # Dask's errors are reported below
             logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         client = _client(distributed.Client, address)
@@ -180,12 +180,12 @@ def cluster(address: str, say: Callable[[str], None] = lambda line: None) -> Ite
 
 
 class _Watch:
-    """How many chunks may be in flight on a cluster with a varying number of workers.
+    """The number of chunks that may be in flight on a cluster with a varying number of workers.
 
     Args:
         client: of the cluster.
         address: of its scheduler.
-        say: called with a line when there is no worker.
+        say: called with a message when there is no worker.
     """
 
     def __init__(self, client: Any, address: str, say: Callable[[str], None]) -> None:
@@ -194,7 +194,7 @@ class _Watch:
         self._cores, self._looked_s, self._seen_s = 0, -math.inf, time.monotonic()
 
     def __call__(self) -> int:
-        """Return the number of chunks; asks the cluster at most once per second.
+        """Return the number of chunks; queries the cluster at most once per second.
 
         Raises:
             LostWorkersError: the scheduler has ended, or there has been no worker for 30 s.

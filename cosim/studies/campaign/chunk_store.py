@@ -1,7 +1,8 @@
-"""A campaign's folder: the runs in Parquet files, each written in full or not at all.
+"""A campaign's folder: the runs in Parquet files, each written completely or not at all.
 
-``FOLDER/runs/point-00003/draws-000004000.parquet`` holds runs 4,000 … of grid point 3, one row
-each: the values of the axes and the metrics. A chunk that exists is not computed again.
+``FOLDER/runs/point-00003/draws-000004000.parquet`` holds the runs from number 4,000 on of grid
+point 3. Each row has the values of the axes and the metrics of one run. A chunk with a file is not
+computed again.
 """
 
 import contextlib
@@ -37,9 +38,9 @@ class Store:
 
     Args:
         folder: the campaign's folder.
-        points: of its grid.
-        draws: runs at each point.
-        size: draws in a chunk.
+        points: all points of the grid.
+        draws: number of runs at each point.
+        size: number of draws in a chunk.
 
     Raises:
         CallerError: there would be too many files.
@@ -66,20 +67,20 @@ class Store:
         )
 
     def chunks(self, point: int) -> Iterator[Chunk]:
-        """All chunks of a point."""
+        """Return all chunks of a point."""
         for start in range(0, self.draws, self._size):
             yield Chunk(point, start, min(start + self._size, self.draws))
 
     def missing(self) -> Iterator[Chunk]:
-        """Chunks without a file: the first draws of all points first."""
+        """Return the chunks without a file, ordered by draw and then by point."""
         for chunks in zip(*(self.chunks(point.number) for point in self.points), strict=True):
             yield from (chunk for chunk in chunks if not self._is_there(chunk))
 
     def write(self, chunk: Chunk, rows: NDArray[np.void]) -> None:
-        """Write a chunk in full or not at all.
+        """Write a chunk completely or not at all.
 
         Raises:
-            OSError: it cannot be written.
+            OSError: the file cannot be written.
         """
         values = self.points[chunk.point].values
         columns: dict[str, Any] = {
@@ -103,7 +104,7 @@ class Store:
             raise
 
     def columns(self, point: int, names: Sequence[str]) -> dict[str, NDArray[Any]]:
-        """Columns of all runs at a point, by draw, (draws,) each.
+        """Return columns of all runs at a point, by draw, (draws,) each.
 
         Raises:
             MachineError: a file cannot be read.
@@ -123,7 +124,7 @@ class Store:
         return {name: np.concatenate(part) for name, part in parts.items()}
 
     def _is_there(self, chunk: Chunk) -> bool:
-        """Whether its file is valid; it may hold more draws, of a campaign with more draws."""
+        """Whether the chunk's file is valid; it may have more rows, if draws was larger before."""
         try:
             found = pq.read_metadata(self._path(chunk))
         except (OSError, pa.ArrowException):
@@ -139,26 +140,27 @@ class Store:
 
 @contextmanager
 def opened(campaign: Campaign, base: Mapping[str, Any], store: Store) -> Iterator[None]:
-    """Lock a campaign's folder: a new one, or one of the same campaign.
+    """Lock a campaign's folder: a new folder, or one of the same campaign.
 
-    The number of draws and the figures may differ; also code and libraries, if no run is missing.
+    The number of draws and the figures may differ from earlier. If no run is missing, code and
+    libraries may differ, too.
 
     Args:
         campaign: the campaign.
         base: content of the scenario of all runs.
-        store: its folder.
+        store: the campaign's folder.
 
     Raises:
-        CallerError: it holds another campaign, or runs of other code or libraries, or another
-            noack uses it.
-        MachineError: it cannot be created.
+        CallerError: the folder has another campaign, or runs of other code or libraries, or another
+            noack process uses it.
+        MachineError: the folder cannot be created.
     """
     folder = store.folder
     manifest = {
         "format": _FORMAT,
         "campaign": _identity(campaign),
         "scenario": base,
-        # Files that the scenario names, and defaults, are not in the entries above.
+        # The entries above do not contain defaults, or the files that the scenario names.
         "scenario_resolved": blake2b(
             "".join(point.scenario.model_dump_json() for point in store.points).encode(),
             digest_size=16,
@@ -214,7 +216,7 @@ def _claim(folder: Path, manifest: Mapping[str, Any]) -> Mapping[str, str]:
 
 
 def _identity(campaign: Campaign) -> dict[str, Any]:
-    """The settings on which results depend."""
+    """Return the settings on which the results depend."""
     content = campaign.model_dump(
         mode="json", exclude={"draws", "description", "figures", "compare"}
     )
@@ -225,7 +227,7 @@ def _identity(campaign: Campaign) -> dict[str, Any]:
 
 
 def _difference(there: Any, here: Any, key: str = "") -> str | None:
-    """Return the first difference, in words; None if there is none."""
+    """Return the first difference as text; None if there is none."""
     if isinstance(there, dict) and isinstance(here, dict):
         for name in sorted(there.keys() | here.keys()):
             place = f"{key}.{name}" if key else name

@@ -1,8 +1,8 @@
 """Estimates of a metric from the draws of a grid point, with confidence intervals.
 
-Means have Student's confidence intervals, ± t s/√k. Mean and interval are of the finite values.
-The median's interval is that of order statistics (binomial, for any distribution). It counts
-infinite values: a run that never settles is later than all others.
+Means have Student's confidence intervals, ± t s/√k. Mean and interval use the finite values only.
+The median's interval uses order statistics (binomial, for any distribution). It includes infinite
+values: a run that never settles counts as later than all others.
 """
 
 import math
@@ -16,7 +16,7 @@ from noack.core.linear_systems import Vector
 
 CONFIDENCE = 0.95
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
-"""Each is the smallest value that at least this share of the draws does not exceed."""
+"""A quantile is the smallest value that at least this share of the draws does not exceed."""
 
 
 class Estimate(NamedTuple):
@@ -24,17 +24,17 @@ class Estimate(NamedTuple):
 
     draws: int
     finite: int
-    """Draws in which the metric is finite; mean and interval are of these."""
+    """Number of draws with a finite metric; mean and interval use only these."""
     mean: float
     halfwidth: float
-    """Of the mean's 95 % confidence interval."""
+    """Half-width of the mean's 95 % confidence interval."""
     q05: float
     q25: float
     median: float
     q75: float
     q95: float
     median_low: float
-    """The median's 95 % confidence interval."""
+    """Lower end of the median's 95 % confidence interval."""
     median_high: float
     largest: float
 
@@ -44,7 +44,7 @@ def estimate(values: Vector, finite: Vector | None = None) -> Estimate:
 
     Args:
         values: (k,), without NaN.
-        finite: the values that count for the mean; all finite ones unless given.
+        finite: the values for the mean; by default all finite values.
     """
     finite = values[np.isfinite(values)] if finite is None else finite
     mean, halfwidth = float(finite.mean()) if len(finite) else math.inf, math.inf
@@ -80,12 +80,12 @@ class Quartiles(NamedTuple):
 
 
 def quartiles(values: Vector) -> Quartiles:
-    """Lower quartile, median and upper quartile of k ≥ 1 draws, (k,)."""
+    """Return lower quartile, median and upper quartile of k ≥ 1 draws, (k,)."""
     return Quartiles(*_quantiles(values, (0.25, 0.5, 0.75)))
 
 
 def paired(values: Vector, reference: Vector) -> Vector:
-    """``values`` − ``reference`` draw by draw; 0 where both are infinite."""
+    """Return ``values`` − ``reference`` draw by draw; 0 if both are infinite."""
     with np.errstate(invalid="ignore"):
         return np.where(values == reference, 0.0, values - reference)
 
@@ -95,15 +95,15 @@ class PairedDifference(NamedTuple):
 
     estimate: Estimate
     larger: float
-    """Share of the draws in which it is larger."""
+    """Share of the draws in which the metric is larger than at the reference."""
     smaller: float
-    """Share of the draws in which it is smaller."""
+    """Share of the draws in which the metric is smaller than at the reference."""
 
 
 def difference(values: Vector, reference: Vector) -> PairedDifference:
     """Estimate ``values`` − ``reference``, (k,) each.
 
-    Where both are infinite, the difference is 0 for quantiles and does not count for the mean.
+    If both are infinite, the quantiles use a difference of 0, and the mean omits the draw.
     """
     differences = paired(values, reference)
     both = np.isfinite(values) & np.isfinite(reference)
@@ -116,7 +116,7 @@ def difference(values: Vector, reference: Vector) -> PairedDifference:
 
 @cache
 def _student(count: int) -> float:
-    """Student's factor t of the standard error of a mean of this many values."""
+    """Return Student's factor t for the mean of this number of values."""
     from scipy.special import stdtrit
 
     return float(stdtrit(count - 1, (1 + CONFIDENCE) / 2))
@@ -127,18 +127,18 @@ def _quantiles(values: Vector, shares: Sequence[float]) -> list[float]:
 
 
 def interval_ranks(count: int, share: float) -> tuple[int, int]:
-    """Ranks, from 0, of the ends of a quantile's 95 % confidence interval (order statistics).
+    """Return the ranks, from 0, of the ends of a quantile's 95 % confidence interval.
 
     Args:
-        count: draws.
+        count: number of draws.
         share: of the quantile, in (0, 1).
 
     Returns:
-        Lower and upper rank; −1 and ``count`` where no draw bounds the quantile.
+        Lower and upper rank; −1 and ``count`` if no draw bounds the quantile.
     """
     from scipy.stats import binom
 
-    # At least the j-th of all draws, from 1, exceeds the quantile if fewer than j lie below it.
+    # The j-th smallest draw, from 1, exceeds the quantile if fewer than j draws lie below it.
     tail = (1.0 - CONFIDENCE) / 2
     low, high = (int(binom.ppf(level, count, share)) for level in (tail, 1.0 - tail))
     return low - 1, min(high, count)

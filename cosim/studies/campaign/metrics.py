@@ -33,7 +33,7 @@ class Description(NamedTuple):
     title: str
     unit: str = ""
     meaning: str = ""
-    """Formula, where the title needs one."""
+    """Formula, if the title needs one."""
     logarithmic: bool = False
     """Whether the axis of a figure may be logarithmic."""
 
@@ -65,11 +65,11 @@ METRICS: Mapping[Metric, Description] = {
 def measured(columns: Mapping[str, NDArray[Any]], certified: float | None) -> dict[Metric, Vector]:
     """Return all metrics of k runs.
 
-    A time is infinite if its event does not happen; all metrics of a failed run are infinite.
+    A time is infinite if its event does not happen. All metrics of a failed run are infinite.
 
     Args:
         columns: of the batch engine, (k,) each.
-        certified: Δβ; without it ``certificate_used`` is left out.
+        certified: Δβ; without it, the result has no ``certificate_used``.
     """
     found: dict[Metric, Vector] = {}
     failed = columns["status"] != OK
@@ -85,11 +85,12 @@ def measured(columns: Mapping[str, NDArray[Any]], certified: float | None) -> di
 
 
 def certified_error(resolved: Scenario) -> float | None:
-    """Δβ with ‖e_c‖_W ≤ Δβe^{−αt} for every plant and every x(0); None if there is none.
+    """Return Δβ with ‖e_c‖_W ≤ Δβe^{−αt} for every plant and every x(0); None if there is none.
 
-    By identity (I1), Δ is the sum of the gains of the present error and of M − 1 missed ones, at
-    any distance in time; it depends on the models alone. It needs models that decay faster than the
-    threshold (a hold does not), a threshold without a floor, and a network that enforces the cap.
+    By identity (I1), Δ is the sum of the gains of the present error and of M − 1 lost ones, for any
+    inter-event times. It depends on the models only. It exists if the models decay faster than the
+    threshold (a zero-order hold does not), the threshold has no floor, and the network enforces the
+    cap.
     """
     network = resolved.network
     if not resolved.coverage.is_decaying or not network.enforce_mansd:

@@ -1,6 +1,6 @@
 """The draws of a campaign: plants from the box, initial states, losses, disturbances and noise.
 
-Each quantity has a random stream of its own. Draw i depends on the campaign's seed and on i only,
+Each quantity has its own random stream. Draw i depends only on the campaign's seed and on i, and
 not on the grid point, the chunk or the worker.
 """
 
@@ -23,22 +23,22 @@ class Box(NamedTuple):
     """The box of plants and initial states."""
 
     A: Matrix
-    """Centre, (n, n)."""
+    """Centre of A, (n, n)."""
     B: Matrix
-    """Centre, (n, m)."""
+    """Centre of B, (n, m)."""
     x0: Vector
-    """Centre, (n,)."""
+    """Centre of x(0), (n,)."""
     half_A: Matrix
-    """Half-widths, (n, n)."""
+    """Half-widths of A, (n, n)."""
     half_B: Matrix
-    """Half-widths, (n, m)."""
+    """Half-widths of B, (n, m)."""
     half_x0: Vector
-    """Half-widths, (n,)."""
+    """Half-widths of x(0), (n,)."""
     vertex: bool
     """Whether plants are drawn from the corners of the box only."""
 
     def population(self, seed: int, draws: range) -> Population:
-        """Successive draws."""
+        """Return consecutive draws."""
         signs = partial(np.copysign, 1.0) if self.vertex else np.asarray
         A, B = (
             centre + half * signs(_units(seed, name, draws, centre.size)).reshape(-1, *centre.shape)
@@ -51,7 +51,7 @@ class Box(NamedTuple):
 
 
 def box_of(scenario: Scenario) -> Box:
-    """The box of a scenario; a plant that is given or nominal has a box of width 0.
+    """Return the box of a scenario; a given or nominal plant has a box of width 0.
 
     The box of a nonlinear plant is around the model.
     """
@@ -87,7 +87,7 @@ def box_of(scenario: Scenario) -> Box:
 
 
 def drawn_scenario(scenario: Scenario, seed: int, draw: int) -> Scenario:
-    """One run of a campaign as a scenario of its own, resolved."""
+    """Return one run of a campaign as a resolved scenario."""
     A, B, x0, loss_seeds = (
         drawn[0].tolist() for drawn in box_of(scenario).population(seed, range(draw, draw + 1))
     )
@@ -115,5 +115,5 @@ def _rows(matrix: list[list[float]]) -> tuple[tuple[float, ...], ...]:
 
 
 def _units(seed: int, name: str, draws: range, width: int) -> Matrix:
-    """Uniform in [−1, 1), (k, width)."""
+    """Return uniform numbers in [−1, 1), (k, width)."""
     return 2.0 * uniforms(seed, _STREAM, name, rows=draws, width=width) - 1.0

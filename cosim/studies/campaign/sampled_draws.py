@@ -2,11 +2,11 @@
 
 They have the schedule's sampling, delays and acknowledgements.
 
-The plant holds its input from step to step, so the cost is exact: over a step of length h, with
+The input is constant over a step of the plant, so the cost is exact. Over a step of length h, with
 z = (x, u) and ż = G z, it is zᵀMz with M = ∫₀ʰ e^{Gᵀs} diag(Q, R) e^{Gs} ds (Van Loan 1978).
-Disturbances are held in the same way and are part of z, with weight 0. The cost of a nonlinear
+Disturbances are constant over a step, too, and part of z with weight 0. The cost of a nonlinear
 plant is computed by the trapezoidal rule over the plant's steps. All other metrics are computed
-from the samples: x at the plant's steps, e_c at the measurements.
+from samples: x at the plant's steps, e_c at the measurements.
 """
 
 from dataclasses import dataclass
@@ -59,7 +59,7 @@ class SampledWork:
         return box_of(self.scenario)
 
     def run(self, draws: range) -> NDArray[np.void]:
-        """Compute successive draws; one row of ``batch_interface.ROW`` each."""
+        """Compute consecutive draws; one row of ``batch_interface.ROW`` each."""
         rows = np.zeros(len(draws), ROW)
         for row, draw in zip(rows, draws, strict=True):
             record = simulate(drawn_scenario(self.scenario, self.seed, draw))
@@ -129,7 +129,7 @@ class SampledWork:
 
 
 def in_virtual_time(scenario: Scenario) -> Scenario:
-    """The scenario without the settings that do not affect its simulation."""
+    """Return the scenario without the settings that do not affect its simulation."""
     return scenario.model_copy(
         update={
             "name": "campaign",

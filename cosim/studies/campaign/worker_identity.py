@@ -1,4 +1,4 @@
-"""Code, libraries and arithmetic, on which the bits of results depend besides the campaign."""
+"""The code, libraries and arithmetic on which a campaign's results depend, bit by bit."""
 
 import platform
 from collections.abc import Mapping
@@ -21,10 +21,10 @@ _NO_CODE_OF_RUNS = ("cli", "output", "studies")
 
 @cache
 def arithmetic() -> Mapping[str, str]:
-    """Names and values; if all are equal, so are the bits of the results.
+    """Return names with values; if all values are equal, the results are equal bit by bit.
 
-    ``rounding`` is a digest of computations on fixed matrices: libraries choose their instructions
-    by the processor.
+    ``rounding`` is a digest of computations on fixed matrices, because libraries select their
+    instructions by the processor.
     """
     return {
         **{name: metadata.version(name) for name in _PACKAGES},
@@ -36,7 +36,7 @@ def arithmetic() -> Mapping[str, str]:
 
 
 def difference(there: Mapping[str, str], here: Mapping[str, str]) -> str | None:
-    """Return the first difference, in words; None if there is none."""
+    """Return the first difference as text; None if there is none."""
     for name in here:
         if there.get(name) != here[name]:
             return f"{name} is {there.get(name, 'unknown')} there, {here[name]} here"
@@ -60,7 +60,7 @@ def _rounding() -> str:
     entries = np.arange(1, 50) * 7919 % 101 - 50
     matrix = (
         entries.reshape(7, 7) / 64
-    )  # exact; of rank 6, as some processors find and others do not
+    )  # exact entries, rank 6; the computed rank depends on the processor
     regular = matrix + 8 * np.eye(7)  # diagonally dominant
     parts = (
         expm(matrix),

@@ -1,1 +1,1 @@
-"""Two or more runs beside each other: numbers, settings, curves."""
+"""Comparison of two or more runs: numbers, settings, curves."""

@@ -1,4 +1,4 @@
-"""Runs overlaid: their states, errors and transmissions in one figure, and a page with it."""
+"""The overlay of runs: their states, errors and transmissions in one figure, and a page with it."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -49,10 +49,10 @@ _DESCRIPTION = "States, error norms and transmissions of the runs over time, ove
 
 @styled
 def overlay_figure(runs: Sequence[ComparedRun]) -> Figure:
-    """States, ‖e_s‖ with thresholds, ‖e_c‖ and transmissions of runs, one colour per run.
+    """Draw states, ‖e_s‖ with thresholds, ‖e_c‖ and transmissions of runs, one colour per run.
 
     Args:
-        runs: of plants with equally many states; the first 6 states are drawn.
+        runs: runs with the same number of states; the first 6 states are drawn.
     """
     with np.errstate(all="ignore"):  # a run may diverge
         joined = [join_all(run.record) for run in runs]
@@ -90,7 +90,7 @@ def overlay_figure(runs: Sequence[ComparedRun]) -> Figure:
 
 
 def _style(number: int) -> dict[str, Any]:
-    """The colour of a run, and a line thinner than that of the run before, which stays visible."""
+    """Return a run's colour and line width; each line is thinner than the line below it."""
     width = max(_WIDEST * _NARROWER**number, 0.8)
     return {"color": printed(palette.SERIES[number % len(palette.SERIES)]), "linewidth": width}
 
@@ -107,7 +107,7 @@ def _state(axes: Axes, entry: int, joined: Sequence[AlignedRun]) -> list[Shown]:
 
 
 def _norms(axes: Axes, title: str, curves: Sequence[tuple[Reals, Reals, Reals | None]]) -> None:
-    """Draw norms on a logarithmic axis, the first run on top; a reset goes down to rounding."""
+    """Draw norms on a logarithmic axis, the first run on top; a reset reduces them to rounding."""
     logarithmic(axes, "y")
     for number, (t_s, values, threshold) in enumerate(curves):
         style = _style(number) | {"linewidth": _NORM_WIDTH, "zorder": 3 - 0.1 * number}
@@ -142,7 +142,7 @@ def _events(axes: Axes, runs: Sequence[ComparedRun]) -> None:
 
 
 def write_overlay(comparison: RunComparison, path: Path) -> None:
-    """Write the overlay of runs, as ``save`` has it."""
+    """Write the overlay of runs to a page or a figure; see :meth:`RunComparison.save`."""
     if path.suffix not in (".html", ".svg", ".png"):
         raise CallerError(f"{path}: a comparison is written as .html, .svg or .png")
     figure = overlay_figure(comparison.runs)

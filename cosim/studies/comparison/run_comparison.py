@@ -1,4 +1,4 @@
-"""Two or more runs beside each other: key numbers, settings that differ, how far apart x is."""
+"""A comparison of runs: key numbers, settings that differ, and the distance between states."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 LABELS = "ABCDEFG"
-"""What the runs are called; there are as many colours."""
+"""Names of the runs; there is one colour for each."""
 _LONGEST_VALUE = 40
 _NAMES_ONLY = ("name", "description", "ports.", "realtime.")
-"""Settings that do not change what a run computes."""
+"""Settings that do not affect the results of a run."""
 
 
 class ComparedRun(NamedTuple):
-    """One of the runs."""
+    """A run of the comparison."""
 
     label: str
     directory: Path
@@ -34,22 +34,22 @@ class ComparedRun(NamedTuple):
 
     @property
     def title(self) -> str:
-        """What was run, in words."""
+        """The scenario and its kind of run, as text."""
         mode = "model-based" if self.summary["mode"] == "model" else "zero-order hold"
         kind = self.summary.get("kind", "live")
         return f"{self.summary['scenario']}, {mode}, {kind}, M − 1 = {self.summary['mansd']}"
 
 
 class KeyNumber(NamedTuple):
-    """A number of each run."""
+    """A key number, with its value in each run."""
 
     name: str
     values: tuple[float | None, ...]
-    """One per run, in order; None where a run has none."""
+    """One value per run, in order; None if a run has no value."""
 
     @property
     def differences(self) -> tuple[float | None, ...]:
-        """Each minus the first run's; None where either is missing."""
+        """Each value minus the first run's; None if one of them is missing."""
         first = self.values[0]
         return tuple(
             None if first is None or value is None else value - first for value in self.values
@@ -57,7 +57,7 @@ class KeyNumber(NamedTuple):
 
     @property
     def cells(self) -> list[str]:
-        """The numbers as a person reads them, each with its difference to the first."""
+        """The values as text, each with its difference to the first run's."""
         return [
             "-" if value is None else f"{value:.4g}" + (f" ({apart:+.3g})" if apart else "")
             for value, apart in zip(self.values, self.differences, strict=True)
@@ -66,10 +66,10 @@ class KeyNumber(NamedTuple):
 
 @dataclass(frozen=True)
 class RunComparison:
-    """Runs of plants with the same number of states, beside each other.
+    """A comparison of runs with the same number of states.
 
     Args:
-        runs: two or more; differences are to the first.
+        runs: two or more; differences are relative to the first.
     """
 
     runs: tuple[ComparedRun, ...]
@@ -89,7 +89,7 @@ class RunComparison:
 
     @cached_property
     def settings(self) -> dict[str, tuple[str, ...]]:
-        """The settings that differ, by key, each with its value in every run."""
+        """The settings that differ, by key, with the value in every run."""
         flat = [dict(_flat(run.record.scenario.model_dump(mode="json"))) for run in self.runs]
         keys = dict.fromkeys(key for one in flat for key in one)
         found = {key: tuple(one.get(key, "-") for one in flat) for key in keys}
@@ -106,10 +106,10 @@ class RunComparison:
         return overlay_figure(self.runs)
 
     def save(self, path: Path) -> None:
-        """Write the overlay: as a page (``.html``), or the figure alone (``.svg``, ``.png``).
+        """Write the overlay as a page (``.html``), or the figure alone (``.svg``, ``.png``).
 
         Raises:
-            CallerError: the name ends otherwise.
+            CallerError: the name has another ending.
             MachineError: the file cannot be written.
         """
         from cosim.studies.comparison.overlay_figure import write_overlay
@@ -117,7 +117,7 @@ class RunComparison:
         write_overlay(self, path)
 
     def to_json(self) -> dict[str, Any]:
-        """Everything but the figure, for programs."""
+        """Return the comparison without the figure, for programs."""
         return {
             "runs": [
                 {"label": run.label, "directory": str(run.directory), "title": run.title}
@@ -130,12 +130,12 @@ class RunComparison:
 
     @property
     def rows(self) -> list[tuple[str, ...]]:
-        """The key numbers as a table of words: name, then a cell per run."""
+        """Return the key numbers as a table of text: name, then a cell per run."""
         return [(one.name, *one.cells) for one in self.numbers]
 
     @property
     def setting_rows(self) -> list[tuple[str, ...]]:
-        """The settings that differ as a table of words: key, then a cell per run."""
+        """Return the settings that differ as a table of text: key, then a cell per run."""
         return [(key, *values) for key, values in self.settings.items()]
 
     def __repr__(self) -> str:
@@ -146,14 +146,14 @@ class RunComparison:
 
 
 def compare_runs(directories: Sequence[Path]) -> RunComparison:
-    """Open runs and put them beside each other.
+    """Open runs and compare them.
 
     Args:
         directories: two to seven run directories, live or simulated.
 
     Raises:
-        CallerError: they are too few or too many, one is no run directory, or their plants have
-            different numbers of states.
+        CallerError: there are fewer than two or more than seven, one is not a run directory, or the
+            plants have different numbers of states.
     """
     if not 2 <= len(directories) <= len(LABELS):
         raise CallerError(
@@ -213,7 +213,7 @@ _NUMBERS: dict[str, Callable[[Summary], float | None]] = {
 
 @np.errstate(all="ignore")  # a run may diverge
 def _distance(first: RunRecord, other: RunRecord) -> tuple[float | None, float | None]:
-    """RMS and maximum of ‖x − x'‖ over the times that both records have; None if not finite."""
+    """RMS and maximum of ‖x − x'‖ over the common times of two records; None if not finite."""
     a, b = first[PLANT_STEP], other[PLANT_STEP]
     _, at_a, at_b = np.intersect1d(a["t_ns"], b["t_ns"], return_indices=True)
     if first is other or not len(at_a):

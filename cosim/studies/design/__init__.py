@@ -1,1 +1,1 @@
-"""Chooses a trigger for the fewest transmissions, subject to limits; see docs/design.md."""
+"""Minimises transmissions by the choice of a trigger, subject to limits; see docs/design.md."""

@@ -22,7 +22,7 @@ from noack.theory.scenario_certificates import (
 
 Bounded = Literal["state", "error"]
 Bounds = Mapping[Bounded, float]
-"""sup‖x‖ and sup‖e_c‖, Euclidean; infinite if none is certified."""
+"""Certified sup‖x‖ and sup‖e_c‖, Euclidean; infinite if there is no bound."""
 
 
 @dataclass(frozen=True)
@@ -31,10 +31,11 @@ class DesignLimits:
 
     Args:
         settling_s: upper limit of the quantile of the settling times.
-        quantile: the share of draws that must settle within it.
+        quantile: the share of draws that must settle within this limit.
         settle: a run has settled when ‖x‖ stays at or below this share of ‖x(0)‖.
         bounds: upper limits of the certified bounds.
-        schedule: bounds are certified under the scenario's schedule, not the paper's conditions.
+        schedule: whether bounds are certified under the scenario's schedule; else under the paper's
+            conditions.
     """
 
     settling_s: float
@@ -55,23 +56,23 @@ class CandidateMeasures(NamedTuple):
 
     draws: int
     transmissions: float
-    """Mean."""
+    """Mean number of transmissions."""
     halfwidth: float
-    """Of the mean's confidence interval."""
+    """Half-width of the mean's confidence interval."""
     settling_s: float
     """Quantile of the settling times; infinite if too many runs do not settle."""
     settling_low_s: float
     settling_high_s: float
-    """Ends of its interval, of order statistics."""
+    """Upper end of the quantile's interval, by order statistics."""
     settled: float
     """The share of runs that settle within the limit."""
 
 
 def measure(scenario: Scenario, limits: DesignLimits, population: Population) -> CandidateMeasures:
-    """Run a scenario over draws; a run that fails never settles.
+    """Run a scenario over draws; the settling time of a failed run is infinite.
 
     Raises:
-        CallerError: the engine cannot run it.
+        CallerError: the engine cannot run the scenario.
     """
     setting = replace(setting_of(resolve(scenario)), settle=limits.settle)
     rows = run_batch(setting, population)
@@ -94,7 +95,7 @@ def require_draws(draws: int, quantile: float) -> None:
     """Require enough draws for an interval of the quantile.
 
     Raises:
-        CallerError: they are too few.
+        CallerError: there are too few draws.
     """
     if interval_ranks(draws, quantile)[1] < draws:
         return
@@ -110,7 +111,7 @@ def require_certifiable(scenario: Scenario) -> None:
     """Require that a certificate covers all plants and initial states that are drawn.
 
     Raises:
-        CallerError: it would not.
+        CallerError: it does not cover them.
     """
     if scenario.plant.initial_state_halfwidth is not None:
         raise CallerError("--bound: needs one x(0); leave out plant.initial_state_halfwidth")
@@ -120,7 +121,7 @@ def require_certifiable(scenario: Scenario) -> None:
 
 
 def certificate_of(scenario: Scenario, limits: DesignLimits) -> ScenarioCertificate:
-    """The certificate of all plants in the box, or of the plant if there is no box."""
+    """Return the certificate of all plants in the box, or of the plant if there is no box."""
     resolved = resolve(scenario)
     late = resolved.certificate.late_periods
     conditions = (
@@ -130,7 +131,7 @@ def certificate_of(scenario: Scenario, limits: DesignLimits) -> ScenarioCertific
 
 
 def bounds_of(scenario: Scenario, limits: DesignLimits) -> Bounds:
-    """Certified sup‖x‖ and sup‖e_c‖ over all times; ‖e_c‖ ≤ ‖W⁻¹‖ ‖e_c‖_W."""
+    """Return certified sup‖x‖ and sup‖e_c‖ over all times; ‖e_c‖ ≤ ‖W⁻¹‖ ‖e_c‖_W."""
     found = certificate_of(scenario, limits)
     if found.constants is None:
         return {"state": math.inf, "error": math.inf}

@@ -15,7 +15,7 @@ _MARKERS = "os^Dv<>PX"
 
 @styled
 def trade_off(found: DesignResult) -> Figure:
-    """Draw all that was tried, the trade-off curve, the limit and the chosen one."""
+    """Draw all tried candidates, the trade-off curve, the limit and the chosen candidate."""
     names = [f"W {family.name}" for family in found.space.families]
     star_name = "the choice" if found.feasible else "the closest"
     labels = [*names, "trade-off", "limit", star_name]

@@ -1,4 +1,4 @@
-"""The page of a design: one file of HTML with figure and tables, and the table of a terminal."""
+"""The page of a design: one HTML file with figure and tables, and the table for a terminal."""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ HEADINGS = ("transmissions", "settling time", "α [1/s]", "β", "weight", "gain"
 
 
 def page(found: DesignResult) -> str:
-    """Return the page as HTML; all text but the figure is escaped."""
+    """Return the page as HTML; all text except the figure is escaped."""
     limits, bounds = found.limits, found.bounds or {}
     lines = [
         f"{100 * limits.quantile:g} % of draws settle to {limits.settle:g} ‖x(0)‖ "
@@ -49,7 +49,7 @@ def page(found: DesignResult) -> str:
 
 
 def rows(found: DesignResult) -> list[tuple[str, ...]]:
-    """The trade-off curve."""
+    """Return the rows of the trade-off curve."""
     found_rows: list[tuple[str, ...]] = []
     for trial in found.front:
         family = found.space.families[trial.candidate.family]
@@ -69,7 +69,7 @@ def rows(found: DesignResult) -> list[tuple[str, ...]]:
 def print_found(console: Console, found: DesignResult) -> None:
     """Print the trade-off curve, thinned if it is long, and the verdict."""
     title = f"{found.space.families[0].scenario.name}: trade-off of transmissions and settling time"
-    # It must fit into 80 columns.
+    # The table must fit into 80 columns.
     table = Table(
         title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False
     )

@@ -1,4 +1,4 @@
-"""What was found, in words and numbers."""
+"""The result of a design, as text and as numbers."""
 
 import math
 from collections.abc import Sequence
@@ -20,13 +20,14 @@ class DesignResult:
     """The result of a design.
 
     Args:
-        space: what was chosen from.
-        limits: what had to be met.
-        trials: all that were tried.
+        space: the candidates that were available.
+        limits: the limits that the design must meet.
+        trials: all candidates that were tried.
         front: the trade-off curve, by ascending transmissions.
-        best: of those that meet the limits the one with the fewest transmissions, or the closest.
-        fresh: the best, measured on draws that no choice depended on.
-        bounds: of the best, certified; None if that cannot be.
+        best: the candidate with the fewest transmissions among those that meet the limits; if none
+            does, the closest to the limits.
+        fresh: measures of the best candidate on new draws, which the search did not use.
+        bounds: certified bounds of the best candidate; None if there are none.
         seed: of the draws.
     """
 
@@ -41,17 +42,17 @@ class DesignResult:
 
     @property
     def feasible(self) -> bool:
-        """Whether the best meets the limits, with the confidence of its interval."""
+        """Whether the best candidate meets the limits with the upper end of its interval."""
         return self.best.excess(self.limits) == 0
 
     @property
     def confirmed(self) -> bool:
-        """Whether it also does on the fresh draws: the quantile itself."""
+        """Whether the quantile itself also meets the limit on the new draws."""
         return self.feasible and self.fresh.settling_s <= self.limits.settling_s
 
     @property
     def scenario(self) -> Scenario:
-        """With what was chosen, under a name of its own."""
+        """The scenario of the best candidate, under a new name."""
         family = self.space.families[self.best.candidate.family]
         chosen = family.with_trigger(self.best.candidate)
         limits = self.limits
@@ -65,12 +66,12 @@ class DesignResult:
 
     @property
     def conditions(self) -> str:
-        """What certified bounds hold for."""
+        """The conditions of the certified bounds."""
         kind = "the scenario's schedule" if self.limits.schedule else "the paper's conditions"
         return f"under {kind}, for the whole box"
 
     def verdict(self) -> str:
-        """One line."""
+        """The verdict in one line."""
         if self.confirmed:
             sent = plus_minus(self.fresh.transmissions, self.fresh.halfwidth)
             return f"{sent} transmissions, settled after {self._settling(self.fresh)}: {self._at()}"
@@ -82,7 +83,7 @@ class DesignResult:
         return f"no design meets the limits; the closest has {self._missed()}, at {self._at()}"
 
     def document(self) -> dict[str, Any]:
-        """As JSON."""
+        """Return the result as JSON."""
         limits, fresh = self.limits, self.fresh
         chosen = self.scenario
         return {
@@ -128,7 +129,7 @@ class DesignResult:
         return f"{seconds(measured)} in {100 * self.limits.quantile:g} % of draws"
 
     def _missed(self) -> str:
-        """What exceeds its limit, and by how much."""
+        """Return the limits that are exceeded, with the amounts."""
         measured, missed = self.best.measured, []
         if measured.settling_high_s > self.limits.settling_s:
             missed.append(
@@ -143,14 +144,14 @@ class DesignResult:
 
 
 def certified(name: Bounded, value: float) -> str:
-    """A certified bound in words."""
+    """Return a certified bound as text."""
     if not math.isfinite(value):
         return f"no certified bound of {WORDS[name]}"
     return f"{WORDS[name]} ≤ {value:.4g}"
 
 
 def seconds(measured: CandidateMeasures) -> str:
-    """The quantile of the settling times with its interval."""
+    """Return the quantile of the settling times with its interval, as text."""
     low, at, high = (
         f"{value:.4g}" if math.isfinite(value) else "∞"
         for value in (measured.settling_low_s, measured.settling_s, measured.settling_high_s)

@@ -1,4 +1,4 @@
-"""A design from its scenario to what was found."""
+"""A design, from the scenario to the result."""
 
 from collections.abc import Callable, Mapping
 
@@ -16,7 +16,7 @@ from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 
 _SCREENING = 4
-"""Screening takes this part of the draws."""
+"""Screening uses the number of draws divided by this."""
 
 
 def design(
@@ -27,17 +27,17 @@ def design(
     seed: int,
     progress: Callable[[float], None] = lambda share: None,
 ) -> DesignResult:
-    """Choose among families; deterministic.
+    """Choose among families; the result is deterministic.
 
     Args:
         families: scenarios, not resolved, by the names of gain and norm.
-        limits: what must be met.
-        draws: to choose by; as many others confirm the choice.
+        limits: the limits that the design must meet.
+        draws: number of draws for the choice; the same number of new draws confirms it.
         seed: of all draws.
-        progress: told which share of the work is done, roughly.
+        progress: called with the approximate share of the work that is done.
 
     Raises:
-        CallerError: the limits or the scenario do not allow it.
+        CallerError: the limits or the scenario do not permit a design.
     """
     first = next(iter(families.values()))
     first.coverage.require_exact()
@@ -58,7 +58,7 @@ def design(
     try:
         require_certifiable(scenario)
         bounds = best.bounds or bounds_of(scenario, limits)
-    except CallerError:  # nobody asked for a bound
+    except CallerError:  # a bound is not required here
         bounds = None
     return DesignResult(
         space, limits, search.trials, search.front(), best, search.confirm(best), bounds, seed

@@ -1,9 +1,9 @@
-"""The search: few draws for all candidates, more for those that may win, all on the same draws.
+"""The search: few draws for all candidates, more for the best ones; all use the same draws.
 
-A candidate is screened with few draws. Whatever seems the best is measured with all draws, and
-certified, before it is believed; then it may no longer be the best. So no candidate that was tried
-and meets the limits has fewer transmissions than what is chosen. With few draws the quantile itself
-must meet its limit, with all draws the upper end of its interval.
+A candidate is screened with few draws. If it then ranks first, it is measured with all draws and
+certified; after this another candidate may rank first. So no tried candidate that meets the limits
+has fewer transmissions than the chosen one. With few draws the quantile itself must meet its limit,
+with all draws the upper end of its interval.
 """
 
 from collections.abc import Callable, Iterable
@@ -24,26 +24,26 @@ from cosim.studies.design.candidate_measures import (
 from cosim.studies.design.design_space import Candidate, DesignSpace
 
 _SMALLEST_STEP = 0.04
-"""Of the grid's steps."""
+"""Smallest step of the refinement, as a share of the grid's steps."""
 _MOST_ROUNDS = 24
 
 Progress = Callable[[float], None]
-"""Told which share of the work is done, roughly."""
+"""Called with the approximate share of the work that is done."""
 
 
 @dataclass
 class Trial:
-    """A candidate, and what is known of it so far."""
+    """A candidate with its measures and bounds."""
 
     candidate: Candidate
     measured: CandidateMeasures
     full: bool = False
-    """Measured with all draws."""
+    """Whether it was measured with all draws."""
     bounds: Bounds = field(default_factory=dict)
-    """Certified, once it was asked for."""
+    """Certified bounds; empty until they are computed."""
 
     def excess(self, limits: DesignLimits) -> float:
-        """How far it misses the limits, as far as is known."""
+        """Return by how much the candidate misses the limits, from the measures so far."""
         settling_s = self.measured.settling_high_s if self.full else self.measured.settling_s
         return limits.excess(settling_s, self.bounds)
 
@@ -52,13 +52,14 @@ class Search:
     """All trials of a space on common draws.
 
     Args:
-        space: what is chosen from.
-        limits: what must be met.
-        box: what is drawn from.
+        space: the available candidates.
+        limits: the limits that the design must meet.
+        box: the box from which plants and initial states are drawn.
         seed: of the draws.
-        screening: draws for all candidates.
-        draws: for those that may win; these and the next as many.
-        progress: told how far the work is.
+        screening: number of draws for all candidates.
+        draws: number of draws for the best candidates; the same number of new draws confirms the
+            choice.
+        progress: called with the approximate share of the work that is done.
     """
 
     def __init__(
@@ -81,11 +82,11 @@ class Search:
 
     @property
     def trials(self) -> list[Trial]:
-        """What was tried, in order."""
+        """All trials, in the order in which they were made."""
         return list(self._trials.values())
 
     def run(self) -> Trial:
-        """Search; return the one of the fewest transmissions within the limits, or the closest."""
+        """Return the trial with the fewest transmissions within the limits, or the closest."""
         grid, families = list(self.space.grid()), len(self.space.families)
         for i, candidate in enumerate(grid):
             self._try([candidate])
@@ -99,9 +100,9 @@ class Search:
         return best
 
     def front(self) -> list[Trial]:
-        """The trade-off: no other trial has both fewer transmissions and a shorter settling time.
+        """Return the trade-off: no other trial has fewer transmissions and also settles earlier.
 
-        All are within the bounds and measured with all draws.
+        All its trials are within the bounds and measured with all draws.
         """
         while True:
             known = [t for t in self.trials if self._within_bounds(t)]
@@ -116,11 +117,11 @@ class Search:
                 self._settle(trial)
 
     def confirm(self, trial: Trial) -> CandidateMeasures:
-        """Measure a trial on draws that no choice depended on."""
+        """Measure a trial on new draws, which the search did not use."""
         return self._measure(trial.candidate, self._fresh)
 
     def _refine(self, family: int) -> None:
-        """Look around a family's best, ever nearer."""
+        """Try the neighbours of a family's best trial, in steps that become smaller."""
         share, rounds = 0.5, 0
         best = self._best(self._of(family))
         while share > _SMALLEST_STEP and rounds < _MOST_ROUNDS:
@@ -154,7 +155,7 @@ class Search:
         return trial.full and (not self.limits.bounds or bool(trial.bounds))
 
     def _settle(self, trial: Trial) -> None:
-        """Learn all there is to know of a trial; the cheaper first, lest it be enough."""
+        """Measure a trial with all draws; if this is already done, certify its bounds."""
         if not trial.full:
             trial.measured, trial.full = self._measure(trial.candidate, self._all), True
         elif not trial.bounds:

@@ -1,4 +1,4 @@
-"""What is chosen from: families of loops, each with a gain and a norm, and in each α and β."""
+"""The candidates of a design: families of loops with a gain and a norm, each with α and β."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -13,12 +13,12 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, spectral_abscissa
 
 RATE_STEP, RATE_STEPS, MOST_RATE = 1.5, 6, 0.95
-"""The grid's α: MOST_RATE of the decay rate, and so often RATE_STEP times less."""
+"""α of the grid: MOST_RATE of the decay rate, divided by powers of RATE_STEP; RATE_STEPS values."""
 LEVELS = np.geomspace(0.01, 3.0, 8)
-"""The grid's β, as shares of ‖x(0)‖."""
+"""β of the grid, as shares of ‖x(0)‖."""
 LEVEL_STEP = float(LEVELS[1] / LEVELS[0])
 _WIDEST = 3.0
-"""The search may leave the grid's β by this factor."""
+"""Factor by which the search may exceed the grid's range of β."""
 
 
 class Candidate(NamedTuple):
@@ -34,9 +34,9 @@ class Family:
     """Candidates that differ in α and β only.
 
     Args:
-        gain: what its gain is called.
-        weight: what its norm is called.
-        scenario: with this gain and norm, not resolved.
+        gain: name of the gain.
+        weight: name of the norm.
+        scenario: the scenario with this gain and norm, not resolved.
     """
 
     gain: str
@@ -45,11 +45,11 @@ class Family:
 
     @property
     def name(self) -> str:
-        """Norm and gain."""
+        """The names of norm and gain."""
         return self.weight if self.gain == "given" else f"{self.weight}, {self.gain}"
 
     def with_trigger(self, candidate: Candidate) -> Scenario:
-        """The scenario of a candidate."""
+        """Return the scenario of a candidate."""
         trigger = self.scenario.decaying.model_copy(
             update={"alpha_per_s": candidate.alpha_per_s, "beta": candidate.beta}
         )
@@ -62,9 +62,9 @@ class DesignSpace:
 
     Args:
         families: at least one.
-        decay_per_s: of each, the decay rate that α must stay below.
+        decay_per_s: the decay rate of each family; α must be below it.
         initial_norm: ‖x(0)‖.
-        floor: of the trigger, which β must exceed.
+        floor: floor of the trigger; β must be above it.
     """
 
     families: tuple[Family, ...]
@@ -73,7 +73,7 @@ class DesignSpace:
     floor: float
 
     def grid(self) -> Iterator[Candidate]:
-        """Where the search begins."""
+        """Return the first candidates of the search."""
         for family, decay_per_s in enumerate(self.decay_per_s):
             for step in range(RATE_STEPS):
                 for level in LEVELS:
@@ -83,7 +83,7 @@ class DesignSpace:
                         yield one
 
     def around(self, centre: Candidate, share: float) -> Iterator[Candidate]:
-        """A candidate's neighbours, a share of the grid's steps away."""
+        """Return a candidate's neighbours, at a distance of this share of the grid's steps."""
         for i in (-1, 0, 1):
             for j in (-1, 0, 1):
                 one = Candidate(
@@ -95,28 +95,28 @@ class DesignSpace:
                     yield one
 
     def holds(self, one: Candidate) -> bool:
-        """Whether a candidate may be tried."""
+        """Whether a candidate is within the ranges."""
         low = max(LEVELS[0] * self.initial_norm / _WIDEST, self.floor)
         high = LEVELS[-1] * self.initial_norm * _WIDEST
         return one.alpha_per_s < self.decay_per_s[one.family] and low < one.beta < high
 
 
 def with_gain(scenario: Scenario, K: Matrix) -> Scenario:
-    """The scenario with another gain, (m, n)."""
+    """Return the scenario with another gain, (m, n)."""
     rows = tuple(tuple(row) for row in K.tolist())
     model = scenario.model.model_copy(update={"gain": rows})
     return scenario.model_copy(update={"model": model})
 
 
 def with_norm(scenario: Scenario, weight: Matrix | None) -> Scenario:
-    """The scenario with another norm in the trigger, W or the identity."""
+    """Return the scenario with another norm in the trigger, W or the identity."""
     rows = None if weight is None else tuple(tuple(row) for row in weight.tolist())
     trigger = scenario.decaying.model_copy(update={"weight": rows})
     return scenario.model_copy(update={"trigger": trigger})
 
 
 def decay_rate(scenario: Scenario) -> float:
-    """What α must stay below, per second: the decay rate of the nominal loop, and of the models.
+    """Return the limit of α, per second: the decay rate of the nominal loop and the models.
 
     Raises:
         CallerError: the nominal loop does not decay.
@@ -129,7 +129,7 @@ def decay_rate(scenario: Scenario) -> float:
 
 
 def space_of(families: Mapping[tuple[str, str], Scenario]) -> DesignSpace:
-    """The space of scenarios by the names of gain and norm.
+    """Return the space of scenarios, which are given by the names of gain and norm.
 
     Raises:
         CallerError: ‖x(0)‖ = 0, the floor is above all β, or a nominal loop does not decay.

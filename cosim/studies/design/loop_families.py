@@ -1,4 +1,4 @@
-"""Which gains and norms there are to choose from."""
+"""The gains and norms among which a design chooses."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -16,7 +16,7 @@ from noack.theory.weight import choose_weight
 
 NORMS = ("identity", "given", "chosen")
 COSTS_OF_INPUT = (0.1, 1.0, 10.0)
-"""R is multiplied by these: three regulators, from eager to sparing."""
+"""Factors of R: three regulators, from large to small inputs."""
 _LEVEL = 0.1
 
 
@@ -26,17 +26,17 @@ def families_of(
     lqr: tuple[Matrix, Matrix] | None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> dict[tuple[str, str], Scenario]:
-    """Scenarios by the names of gain and norm.
+    """Return scenarios by the names of gain and norm.
 
     Args:
         scenario: as loaded.
         norms: of :data:`NORMS`.
-        lqr: Q and R, for gains of regulators instead of the scenario's; R times each of
-            :data:`COSTS_OF_INPUT`.
-        progress: told which share of the work is done; norms that are chosen take long.
+        lqr: Q and R, for the gains of regulators instead of the scenario's gain; R is multiplied by
+            each of :data:`COSTS_OF_INPUT`.
+        progress: called with the share of the work that is done; computing a norm takes long.
 
     Raises:
-        CallerError: a norm or a gain cannot be had.
+        CallerError: a norm or a gain cannot be computed.
     """
     if not norms:
         raise CallerError(f"--weights: name one at least of {', '.join(NORMS)}")
@@ -81,7 +81,7 @@ def _normed(scenario: Scenario, norm: str, progress: Callable[[float], None]) ->
         )
     loop = loop_of(resolve(scenario))
     nominal = replace(loop, A=loop.A_model, B=loop.B_model)
-    # In the middle of the grid: a norm that contracts at this rate does so at all lower ones.
+    # α in the middle of the grid: a norm that contracts at this rate does so at all lower rates.
     alpha_per_s = MOST_RATE * decay_rate(scenario) / RATE_STEP
     beta = _LEVEL * float(np.linalg.norm(loop.x0))
     try:

@@ -1,4 +1,4 @@
-"""The linear-quadratic regulator of the nominal model: K for the least ∫ xᵀQx + uᵀRu dt."""
+"""The linear-quadratic regulator of the nominal model: K that minimises ∫ xᵀQx + uᵀRu dt."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ def lqr_gain(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
     """Return K of u = K x, (m, n): K = −R⁻¹BᵀP, AᵀP + PA − PBR⁻¹BᵀP + Q = 0.
 
     Raises:
-        CallerError: Q or R is not what it must be, or no P makes the loop stable.
+        CallerError: Q or R is not a valid weight, or no P makes the loop stable.
     """
     from scipy.linalg import solve_continuous_are
 

@@ -1,1 +1,1 @@
-"""Section V of the paper, reproduced: an ensemble of draws, its figures, its claims, its slips."""
+"""Section V of the paper, reproduced: an ensemble of draws, its figures, claims and errors."""

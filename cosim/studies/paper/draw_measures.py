@@ -1,4 +1,4 @@
-"""What is measured of one draw: both loops, exact in continuous time, on the same plant."""
+"""The measures of one draw: both loops, exact in continuous time, on the same plant."""
 
 import math
 from collections.abc import Mapping
@@ -31,10 +31,10 @@ _NEVER = math.inf
 
 
 class Measures(NamedTuple):
-    """One loop of one draw. Infinite is what does not happen within the horizon."""
+    """One loop of one draw. A time is infinite if its event does not happen within the horizon."""
 
     events: float
-    """Transmissions, the first at t = 0."""
+    """Number of transmissions; the first is at t = 0."""
     deliveries: float
     settled_5_s: float
     """The last time at which ‖x‖ > 0.05 ‖x(0)‖."""
@@ -47,7 +47,7 @@ class Measures(NamedTuple):
     reception_median_s: float
     """Median time between deliveries: the paper's receiving intervals."""
     controller_error: float
-    """sup ‖e_c‖ e^{αt}/β: how many thresholds the controller is wrong by."""
+    """sup ‖e_c‖ e^{αt}/β: the controller's largest error, in thresholds."""
     final_norm: float
     """‖x‖ at the horizon."""
     peak: float
@@ -55,11 +55,11 @@ class Measures(NamedTuple):
     envelope: float
     """sup ‖x‖ e^{αt}."""
     growing: float
-    """Deliveries at which ‖x‖ is larger than at the one before."""
+    """Number of deliveries at which ‖x‖ is larger than at the delivery before."""
 
 
 class Draw(NamedTuple):
-    """Both loops of one draw, and what they have in common."""
+    """Both loops of one draw, and their common quantities."""
 
     start_norm: float
     """‖x(0)‖."""
@@ -75,7 +75,7 @@ class Draw(NamedTuple):
 
 
 def resolved_draw(scenario: Scenario, draw: int, mode: Mode) -> Scenario:
-    """A draw of a scenario, resolved: its number is the seed of every random stream."""
+    """Return a resolved draw of a scenario; its number is the seed of every random stream."""
     seeds = SeedsSection(plant=draw, initial_state=draw, loss=draw)
     return resolve(scenario.model_copy(update={"mode": mode, "seeds": seeds}))
 
@@ -85,7 +85,7 @@ def measure_draw(scenario: Scenario, draw: int) -> Draw:
 
     Args:
         scenario: of a variation; its seeds and mode are replaced.
-        draw: the draw's number.
+        draw: number of the draw.
     """
     resolved = {mode: resolved_draw(scenario, draw, mode) for mode in MODES}
     loop = loop_of(resolved["model"])
@@ -104,7 +104,7 @@ def measure_draw(scenario: Scenario, draw: int) -> Draw:
 
 
 def open_loop_eigenvalues(loop: LoopMatrices) -> Vector:
-    """Eigenvalues of A, those within rounding of 0 set to 0, (n,).
+    """Return the eigenvalues of A, (n,); eigenvalues that are 0 up to rounding are set to 0.
 
     A defective double eigenvalue splits by about the square root of the rounding error.
     """
@@ -138,7 +138,8 @@ def _measure(resolved: Scenario) -> Measures:
     samples = run.at(t_s)
     norms = np.linalg.norm(samples.x, axis=1)
     growth = np.exp(trigger.alpha_per_s * t_s)
-    # e_c jumps at a delivery: the largest may come just before one. Before event 0 it has no x_c.
+    # e_c jumps at a delivery, so its largest value may come just before. Before event 0 there is no
+    # x_c.
     before = np.array([state.e_c for state in run.before[1:]]).reshape(-1, loop.n)
     at_events = run.system.norms(before) * np.exp(trigger.alpha_per_s * run.event_s[1:])
     between = run.e_c_norm(samples) * growth
@@ -169,21 +170,21 @@ def _grid(until_s: float) -> Vector:
 
 
 def _ideal_norms(closed: Matrix, x0: Vector, horizon_s: float) -> tuple[Vector, Vector]:
-    """Times and ‖x‖ of dx/dt = (A + BK) x."""
+    """Return times and ‖x‖ of dx/dt = (A + BK) x."""
     t_s = _grid(horizon_s)
     flow = ExactFlow(closed, 1.0 / growth_rate(closed))
     return t_s, np.asarray(np.linalg.norm(flow.sample(x0, t_s), axis=1))
 
 
 def _settling_s(t_s: Vector, norms: Vector, level: float) -> float:
-    """When ``norms`` is above ``level`` for the last time; infinite if it is so at the end."""
+    """Return the last time with ``norms`` above ``level``; infinite if it is above at the end."""
     above = np.flatnonzero(norms > level)
     if not len(above):
         return 0.0
     last = int(above[-1])
     if last == len(norms) - 1:
         return _NEVER
-    # Between two samples the norm is taken to fall exponentially.
+    # Assumption: between two samples the norm falls exponentially.
     share = math.log(norms[last] / level) / math.log(norms[last] / norms[last + 1])
     return float(t_s[last] + share * (t_s[last + 1] - t_s[last]))
 

@@ -1,4 +1,4 @@
-"""The bounds that a draw's measures are held against: certified, and as the paper prints them."""
+"""The bounds for the measures of a draw: certified bounds, and the paper's formulas."""
 
 import math
 from typing import NamedTuple
@@ -13,10 +13,10 @@ from noack.theory.scenario_certificates import certify
 
 
 class Certified(NamedTuple):
-    """What is certified of a draw's MB-ET loop, in the paper's setting."""
+    """Certified constants of a draw's MB-ET loop, in the paper's setting."""
 
     inter_event_s: float
-    """δ: no two events are closer."""
+    """δ: a lower bound of the inter-event times."""
     delta: float
     """Δ: ‖e_c‖ ≤ Δβe^{−αt}."""
     state: float
@@ -24,7 +24,7 @@ class Certified(NamedTuple):
 
 
 class Printed(NamedTuple):
-    """Theorem 2 for a draw's MB-ET loop, with the certified Δ in the place of Theorem 1's."""
+    """Theorem 2 for a draw's MB-ET loop, with the certified Δ in place of Theorem 1's."""
 
     inter_event_s: float
     """δ̲ of eq:tau for every t_i."""
@@ -37,7 +37,7 @@ class Printed(NamedTuple):
 
 
 def certified(scenario: Scenario, draw: int) -> Certified:
-    """The certificate of a draw; zeros and infinities if there is none."""
+    """Return the certificate of a draw; zeros and infinities if there is none."""
     constants = _constants(scenario, draw)
     if constants is None:
         return Certified(0.0, math.inf, math.inf)
@@ -45,7 +45,7 @@ def certified(scenario: Scenario, draw: int) -> Certified:
 
 
 def printed(scenario: Scenario, draw: int) -> Printed:
-    """Theorem 2 for a draw; zeros if it does not apply."""
+    """Return Theorem 2 for a draw; zeros if it does not apply."""
     resolved, constants = resolved_draw(scenario, draw, "model"), _constants(scenario, draw)
     trigger, nothing = resolved.decaying, Printed(0.0, 0.0, 0.0, 0.0)
     if constants is None:

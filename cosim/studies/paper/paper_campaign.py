@@ -1,7 +1,7 @@
-"""The draws behind the page: the campaign ``paper``, its variations simulated with both loops.
+"""The draws of the page: the variations of the campaign ``paper``, simulated with both loops.
 
-Draw i has all random streams seeded with i, so that ``noack simulate --set seeds...`` repeats it.
-MB-ET and ZOH-ET have the same plant, the same initial state and the same stream of losses.
+All random streams of draw i have the seed i, so ``noack simulate --set seeds...`` repeats it. MB-ET
+and ZOH-ET have the same plant, the same initial state and the same stream of losses.
 """
 
 import json
@@ -23,16 +23,16 @@ from noack.core.linear_systems import Matrix
 
 BASE, EXACT_MODEL, WIDE_BOX = "base: Bernoulli 0.8", "box × 0: exact model", "box × 5"
 OTHER_EXAMPLES = ("nothing lost", WIDE_BOX, EXACT_MODEL)
-"""Variations that change the paper's example. The others vary only what the paper leaves open."""
+"""Variations that change the paper's example. The others vary only unspecified settings."""
 
 Progress = Callable[[int, int], None]
-"""Called with the number of finished draws and of all draws."""
+"""Called with the number of finished draws and the number of all draws."""
 Table = Literal["printed", "certified", "draws"]
 
 _CHUNK = 10
 _VARIED, _PRINTED = 10, 40
-"""A variation has one draw for every 10 of the base; table ``printed``, the slowest, for every 40.
-"""
+"""A variation has one draw per 10 draws of the base. Table ``printed``, the slowest, has one per
+40."""
 
 
 _COMMON = tuple(name for name in Draw._fields if name not in MODES)
@@ -73,12 +73,12 @@ class PaperWork:
     scenario: Scenario
 
     def run(self, draws: range) -> Matrix:
-        """Compute the rows of some draws, (draws, columns)."""
+        """Compute the rows of the given draws, (draws, columns)."""
         return np.array([_ROWS[self.table](self.scenario, draw) for draw in draws])
 
 
 def load_campaign() -> tuple[Campaign, dict[str, Scenario]]:
-    """The shipped campaign ``paper``, and the scenario of each of its variations.
+    """Return the shipped campaign ``paper``, and the scenario of each of its variations.
 
     Raises:
         CallerError: the file has mistakes.
@@ -90,18 +90,18 @@ def load_campaign() -> tuple[Campaign, dict[str, Scenario]]:
 
 
 def base_scenario() -> Scenario:
-    """The scenario of the base ensemble, its seeds not set."""
+    """Return the scenario of the base ensemble, without seeds."""
     return load_campaign()[1][BASE]
 
 
 def settings_of(draw: int) -> list[str]:
-    """The settings of a draw of the base, as after ``--set`` on the command line."""
+    """Return the settings of a draw of the base, as after ``--set`` on the command line."""
     settings = [f"{key}={json.dumps(value)}" for key, value in load_campaign()[0].settings.items()]
     return [*settings, *(f"seeds.{name}={draw}" for name in ("plant", "initial_state", "loss"))]
 
 
 def parts(draws: int, variations: tuple[str, ...]) -> list[EnsemblePart]:
-    """What to compute for a base ensemble of this many draws."""
+    """Return the tables to compute for a base ensemble of this number of draws."""
     varied, few = max(draws // _VARIED, 1), max(draws // _PRINTED, 1)
     return [
         EnsemblePart("printed", BASE, few),
@@ -113,7 +113,7 @@ def parts(draws: int, variations: tuple[str, ...]) -> list[EnsemblePart]:
 def run_parts(
     scenarios: Mapping[str, Scenario], draws: int, runner: Runner, progress: Progress | None = None
 ) -> list[tuple[EnsemblePart, Matrix]]:
-    """Compute every part.
+    """Compute every table.
 
     Args:
         scenarios: by variation.

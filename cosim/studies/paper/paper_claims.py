@@ -1,8 +1,8 @@
-"""The claims of the paper's text, each judged by the draws.
+"""The claims of the paper's text, each with a verdict from the draws.
 
-A claim is confirmed if it holds in at least 95 % of the draws, of the base ensemble and of every
-variation of what the paper leaves open; partly, if it holds in at least half of the base's; else it
-is not confirmed.
+A claim is confirmed if it holds in at least 95 % of the draws, both in the base ensemble and in
+every variation of a setting that the paper does not specify. It is partly confirmed if it holds in
+at least half of the draws of the base ensemble. Otherwise it is not confirmed.
 """
 
 from collections.abc import Callable, Iterator
@@ -22,7 +22,7 @@ CONFIRMED_FROM, PARTLY_FROM = 0.95, 0.5
 
 
 class PaperVerdict(StrEnum):
-    """What the draws say of a claim."""
+    """The verdict on a claim."""
 
     CONFIRMED = "confirmed"
     PARTLY = "partly"
@@ -33,29 +33,29 @@ class PaperClaim(NamedTuple):
     """A claim with its verdict."""
 
     where: str
-    """In the paper."""
+    """Place in the paper."""
     gist: str
     verdict: PaperVerdict
     why: str
-    """The numbers."""
+    """The numbers that support the verdict."""
 
 
 Flags = NDArray[np.bool_]
 Column = Callable[[str], Vector]
-"""Returns a column of a variation by its name."""
+"""Returns a column of a variation by the column's name."""
 
 
 class Judgement(NamedTuple):
-    """In how many draws something holds."""
+    """The share of draws in which a statement holds."""
 
     base: float
     least: float
-    """The smallest share among the variations of what the paper leaves open."""
+    """The smallest share among the variations of settings that the paper does not specify."""
     least_in: str
 
     @property
     def verdict(self) -> PaperVerdict:
-        """By the rule above."""
+        """The verdict by the rule in the module's docstring."""
         if min(self.base, self.least) >= CONFIRMED_FROM:
             return PaperVerdict.CONFIRMED
         return PaperVerdict.PARTLY if self.base >= PARTLY_FROM else PaperVerdict.NOT_CONFIRMED
@@ -68,16 +68,16 @@ class Judgement(NamedTuple):
 
     @property
     def sentence(self) -> str:
-        """The same at the beginning of a sentence."""
+        """The text of the judgement, with a capital letter."""
         return str(self)[0].upper() + str(self)[1:]
 
 
 def judge(results: Results, holds: Callable[[Column], Flags]) -> Judgement:
-    """In which share of the draws a statement holds: of the base and, at least, of the variations.
+    """Return the shares of draws in which a statement holds: base, and smallest variation.
 
     Args:
         results: the draws.
-        holds: from a variation's columns to one truth value per draw.
+        holds: returns one truth value per draw from a variation's columns.
     """
 
     def share(variation: str) -> float:
@@ -89,7 +89,7 @@ def judge(results: Results, holds: Callable[[Column], Flags]) -> Judgement:
 
 
 def claims(results: Results) -> Iterator[PaperClaim]:
-    """All claims of the paper's text about its example, in the order of the text."""
+    """Return all claims of the paper's text about its example, in the order of the text."""
     yield from _mb_et(results)
     yield from _zoh_et(results)
     yield from _inter_event(results)

@@ -1,6 +1,6 @@
-"""What the page says about the paper's assumptions and slips, computed: examples, counterexamples.
+"""The page's evidence on the paper's assumptions and errors: computed examples, counterexamples.
 
-Each function returns numbers for the page, each from the exact simulator or from linear algebra.
+Each function returns numbers for the page, from the exact simulator or from linear algebra.
 """
 
 import math
@@ -37,17 +37,17 @@ _LONG_S = 300.0
 _SAMPLED_S = 20.0
 _SAMPLES = 101
 _ROUNDING = 1e-12
-"""What is smaller is a matter of rounding, and of the machine."""
+"""Smaller numbers are rounding errors, which depend on the machine."""
 _ZERO = 1e-6
-"""Eigenvalues below it in magnitude are 0: the lane's double eigenvalue 0 is defective."""
+"""An eigenvalue of smaller magnitude is taken as 0: the lane's double eigenvalue 0 is defective."""
 
 
 def evidence(scenario: Scenario, representative: int) -> Numbers:
-    """All numbers of the page's sections on assumptions and slips, as JSON.
+    """Return all numbers of the page's sections on assumptions and errors, as JSON.
 
     Args:
         scenario: of the base ensemble; its seeds and mode are replaced.
-        representative: the draw that serves as an example.
+        representative: the draw that is used as an example.
     """
     M, trigger = scenario.network.mansd + 1, scenario.decaying
     return {
@@ -66,7 +66,7 @@ def evidence(scenario: Scenario, representative: int) -> Numbers:
 
 
 def _eigenvalues() -> Numbers:
-    """The example's numbers as printed, and with the other sign of U."""
+    """Return the numbers of the example as printed, and with the other sign of U."""
     found: Numbers = {}
     for name, speed in (("printed", -12.0), ("flipped", 12.0)):
         model = lane_following({"speed": speed})
@@ -80,9 +80,9 @@ def _eigenvalues() -> Numbers:
 
 
 def _loss(M: int) -> Numbers:
-    """What a bound of M − 1 successive dropouts leaves of a loss probability p.
+    """Return loss rates for a loss probability p if at most M − 1 dropouts are successive.
 
-    A delivery follows after 1 + p + … + p^(M−1) transmissions on average.
+    On average a delivery needs 1 + p + … + p^(M−1) transmissions.
     """
     polynomial = np.ones(M)
     polynomial[-1] -= 2.0
@@ -122,7 +122,7 @@ def _exact_model(scenario: Scenario) -> Numbers:
 
 
 def _trapped(scenario: Scenario) -> Numbers:
-    """The dimensions of the x whose pair (x, x) lies in the span of Γ's stable modes.
+    """Return the dimensions of the set of x with (x, x) in the span of Γ's stable modes.
 
     "model" and "zoh" count eigenvalues 0 as stable (no exponential growth), "strictly" does not.
     """
@@ -143,9 +143,10 @@ def _trapped(scenario: Scenario) -> Numbers:
 
 
 def _stable_pairs(loop: LoopMatrices, H: Matrix, least_real: float) -> int:
-    """Dimensions of {x: (x, x) has no share in modes of Γ = [[A, BK], [0, H]] beyond a real part.
+    """Return the dimension of the x for which (x, x) excites no mode of Γ with a larger real part.
 
-    The rows of the left invariant subspace of these modes vanish on such a pair.
+    Γ = [[A, BK], [0, H]]. The rows of the left invariant subspace of these modes vanish on such a
+    pair.
     """
     gamma = np.block([[loop.A, loop.B @ loop.K], [np.zeros_like(H), H]])
 
@@ -158,11 +159,11 @@ def _stable_pairs(loop: LoopMatrices, H: Matrix, least_real: float) -> int:
 
 
 def _slow_model(M: int) -> Numbers:
-    """No Δ for all times: a model that decays more slowly than the threshold, M − 1 of M lost.
+    """No Δ holds for all times: a model decays more slowly than the threshold, M − 1 of M are lost.
 
-    The first state has an exact model, so that it causes no events. In the second the model's pole
-    is −0.1, the plant's −1; α = 0.5 is below A + BK's decay rate 1. A has the distinct eigenvalues
-    1 and −1, as the paper asks.
+    The first state has an exact model, so it causes no events. In the second state the model's pole
+    is −0.1 and the plant's pole is −1. α = 0.5 is below A + BK's decay rate 1. A has the distinct
+    eigenvalues 1 and −1, as the paper requires.
     """
     A, model, B, K = np.diag([1.0, -1.0]), np.diag([1.0, -0.1]), np.eye(2)[:, :1], [[-3.0, 0.0]]
     trigger = DecayingTrigger(1.0, 0.5, 0.0, None)
@@ -190,9 +191,9 @@ def _slow_model(M: int) -> Numbers:
 
 
 def _standstill(scenario: Scenario) -> Numbers:
-    """A hold without growth: the nominal lane comes to rest beside the lane, and stays there.
+    """A hold without growth: the nominal lane comes to rest away from the lane, and stays there.
 
-    K x(0) = 0, and (V, r) decays along A's stable direction until ψ = 0: nothing moves any more.
+    K x(0) = 0, and (V, r) decays along A's stable direction until ψ = 0. Then nothing moves.
     """
     resolved = resolved_draw(_nominal(scenario, scenario.horizon_s), 0, "zoh")
     loop, trigger = loop_of(resolved), resolved.decaying
@@ -224,7 +225,7 @@ def _standstill(scenario: Scenario) -> Numbers:
 
 
 def _overshoot(scenario: Scenario, representative: int) -> Numbers:
-    """Sup ‖x‖ / ‖x(0)‖ for ever smaller x(0)."""
+    """Return sup ‖x‖ / ‖x(0)‖ for a sequence of decreasing x(0)."""
     scales = (1.0, 1e-2, 1e-4)
     scenario = scenario.model_copy(update={"horizon_s": 100.0})
     found: Numbers = {"scales": list(scales)}
@@ -247,7 +248,7 @@ def _overshoot(scenario: Scenario, representative: int) -> Numbers:
 
 
 def _theorem_1(scenario: Scenario, representative: int) -> Numbers:
-    """Theorem 1's Δ of every stretch between deliveries, from the trajectory; the best γ, η_j."""
+    """Return Theorem 1's Δ of each interval between deliveries, with the best γ and η_j."""
     run = simulate_draw(resolved_draw(scenario, representative, "model"))
     trigger, H = run.system.decaying, run.system.loop.H
     arrived = np.flatnonzero(run.delivered)
@@ -268,9 +269,9 @@ def _longest_s(run: ContinuousRun, event: int) -> float:
 
 
 def _theorem_3(scenario: Scenario, representative: int) -> Numbers:
-    """eq:zohnume as printed, and with the factor that its derivation gives, along a run.
+    """Compare eq:zohnume as printed with the factor from its derivation, along a run.
 
-    With γ of the nominal plant and the largest η_j that the theorem allows, ‖x(t_j)‖.
+    It uses γ of the nominal plant and η_j = ‖x(t_j)‖, the largest that the theorem permits.
     """
     from scipy.optimize import brentq
 
@@ -300,7 +301,7 @@ def _theorem_3(scenario: Scenario, representative: int) -> Numbers:
 
 
 def _sampled(scenario: Scenario, representative: int) -> Numbers:
-    """The same draw with a trigger that looks at the scenario's sampling rate only."""
+    """Return the same draw with a trigger that is evaluated at sampling times only."""
     scenario = scenario.model_copy(update={"horizon_s": _SAMPLED_S})
     resolved = resolved_draw(scenario, representative, "model")
     continuous = simulate_draw(resolved)
@@ -320,7 +321,7 @@ def _sampled(scenario: Scenario, representative: int) -> Numbers:
 
 
 def _nominal(scenario: Scenario, horizon_s: float) -> Scenario:
-    """The scenario with the nominal plant and its nominal initial state."""
+    """Return the scenario with the nominal plant and its nominal initial state."""
     plant = scenario.plant.model_copy(update={"draw": "nominal", "initial_state_halfwidth": None})
     return scenario.model_copy(update={"plant": plant, "horizon_s": horizon_s})
 

@@ -24,7 +24,7 @@ from noack.protocol.machine_interface import Record
 from noack.protocol.record_tables import NETEM_PACKET, Fate, effective, tables
 
 SHOWN_S = 20.0
-"""The representative draw is shown up to here; later everything is too small to be seen."""
+"""The representative draw is shown up to this time; later values are too small to be visible."""
 _STEP_S = 0.01
 _BINS = 30
 _PANELS = (
@@ -42,7 +42,7 @@ _DOT = printed(palette.PLANT)
 
 
 def draw_figure(run: ContinuousRun, resolved: Scenario, draw: int) -> Figure:
-    """States, broadcasting and receiving intervals of one loop of a draw."""
+    """Draw states, broadcasting and receiving intervals of one loop of a draw."""
     shown = run.event_s <= SHOWN_S
     samples = run.at(np.linspace(0.0, SHOWN_S, round(SHOWN_S / _STEP_S) + 1))
     fates = _fates(resolved, int(shown.sum()))
@@ -63,7 +63,7 @@ def draw_figure(run: ContinuousRun, resolved: Scenario, draw: int) -> Figure:
 
 
 def _fates(resolved: Scenario, events: int) -> NDArray[np.int64]:
-    """The network's word on each of the first updates, (events,)."""
+    """Return the network's decision for each of the first updates, (events,)."""
     link, fate = update_link_of(resolved), (tables(1, 1)[NETEM_PACKET].names or ()).index("fate")
     return np.array(
         [
@@ -78,7 +78,7 @@ def _fates(resolved: Scenario, events: int) -> NDArray[np.int64]:
 
 @styled
 def ensemble_figure(results: Results) -> Figure:
-    """Above, how the draws are distributed; below, both loops of each draw against each other."""
+    """Draw the distributions over the draws, and below them both loops of each draw as points."""
     figure = Figure(figsize=(WIDTH_IN, _HEAD_IN + _ABOVE_IN + _GAP_IN + _BELOW_IN + BELOW_IN))
     width_in = (WIDTH_IN - RIGHT_IN) / len(_PANELS) - _LEFT_IN
     shown: list[Shown] = []
@@ -116,7 +116,7 @@ def _histogram(axes: Axes, both: Mapping[Mode, Vector], *, logarithm: bool) -> l
 
 
 def _against(axes: Axes, model: Vector, zoh: Vector, *, logarithm: bool) -> None:
-    """One dot per draw; on the line both are equal."""
+    """Draw one dot per draw; both loops are equal on the diagonal line."""
     finite = np.isfinite(model) & np.isfinite(zoh)
     model, zoh = model[finite], zoh[finite]
     low, high = min(model.min(), zoh.min()), max(model.max(), zoh.max())
@@ -129,7 +129,7 @@ def _against(axes: Axes, model: Vector, zoh: Vector, *, logarithm: bool) -> None
 
 
 def _few_decades(axes: Axes, which: Literal["x", "y"]) -> None:
-    """A logarithmic axis so short that only 1 and 3 of each decade have room for a number."""
+    """Label a short logarithmic axis at 1 and 3 of each decade only."""
     axes.set(**{f"{which}scale": "log"})
     axis = axes.xaxis if which == "x" else axes.yaxis
     axis.set_major_locator(LogLocator(subs=(1.0, 3.0)))

@@ -1,4 +1,4 @@
-"""How the page writes numbers, shares and quartiles."""
+"""The format of numbers, shares and quartiles on the page."""
 
 import math
 
@@ -6,15 +6,15 @@ from cosim.studies.campaign.draw_statistics import quartiles
 from noack.core.linear_systems import Vector
 
 HORIZON_S = 40.0
-"""Horizon of the campaign ``paper``; a time that is not reached is written as "> 40"."""
+"""Horizon of the campaign ``paper``; a time beyond it is written as "> 40"."""
 
 
 _SMALL, _LARGE = 1e-3, 1e6
-"""Beyond these, numbers are written with a power of ten."""
+"""Numbers outside these limits are written with a power of ten."""
 
 
 def number(value: float, digits: int = 3) -> str:
-    """A number as a person reads it: 0.0123, 517, 2.8 · 10³³."""
+    """Return a number as text: 0.0123, 517, 2.8 · 10³³."""
     if not math.isfinite(value):
         return f"> {HORIZON_S:g}"
     if value == round(value) and abs(value) < _LARGE:
@@ -30,7 +30,7 @@ def number(value: float, digits: int = 3) -> str:
 
 
 def percent(value: float) -> str:
-    """A share in percent; only what is all or nothing is written as 100 % or 0 %."""
+    """Return a share in percent; only exactly all or none is written as 100 % or 0 %."""
     if value in (0.0, 1.0):
         return f"{100 * value:.0f} %"
     text = f"{100 * value:.0f}"
@@ -38,7 +38,7 @@ def percent(value: float) -> str:
 
 
 def spread(values: Vector, digits: int = 3) -> str:
-    """Median and quartiles: 517 (493 … 547)."""
+    """Return median and quartiles: 517 (493 … 547)."""
     low, middle, high = quartiles(values)
     return f"{number(middle, digits)} ({number(low, digits)} … {number(high, digits)})"
 

@@ -1,4 +1,4 @@
-"""The page ``paper.md``: the template's words, the results' numbers."""
+"""The page ``paper.md``: the text of a template with the numbers of the results."""
 
 import re
 import textwrap
@@ -108,7 +108,7 @@ def _filled(paragraph: str) -> list[str]:
     start = paragraph.lstrip()
     item = _ITEM.match(start)
     begin = len(paragraph) - len(start) + (item.end() if item else 0)
-    # No line may begin with an operator, which is a mark of Markdown.
+    # No line may begin with an operator that Markdown reads as a list mark.
     glued = paragraph[:begin] + re.sub(r" (?=[-+>=*] )", _GLUE, paragraph[begin:])
     lines = textwrap.wrap(
         glued,
@@ -167,7 +167,7 @@ def _varied(results: Results) -> Iterator[_Varied]:
 
 
 def _both(results: Results, name: str, variation: str = BASE) -> list[Vector]:
-    """A measure of MB-ET and of ZOH-ET."""
+    """Return a measure of MB-ET and of ZOH-ET."""
     if name == _LOST:
         return [results.lost(mode, variation) for mode in MODES]
     return [results.column(f"{mode}.{name}", variation) for mode in MODES]

@@ -15,14 +15,14 @@ from cosim.studies.paper.paper_campaign import BASE, COLUMNS, EnsemblePart
 from noack.core.linear_systems import Matrix, Vector
 
 DIGITS = 5
-"""Significant digits that are kept."""
+"""Number of significant digits in the file."""
 
 REPRESENTED = tuple(
     f"{mode}.{name}"
     for mode in MODES
     for name in ("events", "deliveries", "settled_5_s", "settled_1_s", "gap_min_s")
 )
-"""The measures that choose the representative draw."""
+"""The measures by which the representative draw is chosen."""
 
 
 @dataclass(frozen=True)
@@ -30,16 +30,16 @@ class Results:
     """All numbers of the page."""
 
     tables: Mapping[tuple[str, str], Matrix]
-    """By table and variation: rows are draws, columns those of ``COLUMNS``. An event that does not
-    happen within the horizon has the time infinity; there is no NaN."""
+    """By table and variation: rows are draws, columns those of ``COLUMNS``. If an event does not
+    happen within the horizon, its time is infinite; there is no NaN."""
     evidence: Mapping[str, Any]
 
     def column(self, name: str, variation: str = BASE, table: str = "draws") -> Vector:
-        """A column, one entry per draw."""
+        """Return a column, one entry per draw."""
         return np.asarray(self.tables[table, variation][:, COLUMNS[table].index(name)])
 
     def lost(self, mode: str, variation: str = BASE) -> Vector:
-        """Share of the transmissions that the network lost."""
+        """Return the share of the transmissions that the network lost, one entry per draw."""
         deliveries, events = (
             self.column(f"{mode}.{name}", variation) for name in ("deliveries", "events")
         )
@@ -51,7 +51,7 @@ class Results:
         return [variation for table, variation in self.tables if table == "draws"]
 
     def count(self, variation: str = BASE, table: str = "draws") -> int:
-        """Number of draws."""
+        """Return the number of draws."""
         return len(self.tables[table, variation])
 
     @property
@@ -72,7 +72,7 @@ class Results:
 def results_of(
     parts: Iterable[tuple[EnsemblePart, Matrix]], evidence: Mapping[str, Any]
 ) -> Results:
-    """Results, with as many digits as the file keeps."""
+    """Return the results, rounded to the digits of the file."""
     document = {
         "tables": [
             {"table": part.table, "variation": part.variation, "rows": rows.tolist()}
@@ -89,7 +89,7 @@ def load_results(path: Path) -> Results:
 
 
 def dumps(results: Results) -> str:
-    """The content of ``paper.json``: one draw per line, null for infinity."""
+    """Return the content of ``paper.json``: one draw per line, null for infinity."""
     tables = []
     for (table, variation), rows in results.tables.items():
         head = {"table": table, "variation": variation, "columns": COLUMNS[table]}
@@ -111,7 +111,7 @@ def _read(document: Mapping[str, Any]) -> Results:
 
 
 def _rounded(value: Any) -> Any:
-    """Values as JSON holds them: few digits, whole numbers without a point, null for infinite."""
+    """Return values as in the JSON file: rounded, integers without a point, null for infinity."""
     if isinstance(value, Mapping):
         return {key: _rounded(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):

@@ -27,15 +27,15 @@ FEWEST_DRAWS = 4
 
 
 def reproduce(draws: int, workers: int, progress: Progress | None = None) -> Results:
-    """Compute everything that the page shows.
+    """Compute all results of the page.
 
     Args:
         draws: of the base ensemble.
-        workers: processes.
+        workers: number of processes.
         progress: called after each chunk of draws.
 
     Raises:
-        CallerError: too few draws.
+        CallerError: there are too few draws.
     """
     if draws < FEWEST_DRAWS:
         raise CallerError(f"--draws {draws}: quartiles need at least {FEWEST_DRAWS} draws")
@@ -83,7 +83,7 @@ def write_page(results: Results, folder: Path) -> list[Path]:
 
 
 def document(results: Results, written: list[Path]) -> dict[str, Any]:
-    """The results as JSON: quartiles of the base ensemble, claims, files."""
+    """Return the results as JSON: quartiles of the base ensemble, claims, files."""
     found = {
         name: {
             key: value if math.isfinite(value) else None

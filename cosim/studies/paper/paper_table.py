@@ -1,4 +1,4 @@
-"""What ``noack paper`` prints: the claims, and where the page is."""
+"""The output of ``noack paper``: the claims, and the path of the page."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ _STYLES = {
 
 
 def print_claims(console: Console, found: dict[str, Any]) -> None:
-    """Print what :func:`cosim.studies.paper.paper_run.document` found."""
+    """Print the result of :func:`cosim.studies.paper.paper_run.document`."""
     table = Table(title=f"Section V over {found['draws']:,} draws", show_lines=True)
     for heading in ("the paper says", "verdict", "numbers"):
         table.add_column(heading)

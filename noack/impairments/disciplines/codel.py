@@ -173,7 +173,8 @@ class Codel(QueueDiscipline):
 
     words: ClassVar = (
         Word("codel", _EXAMPLE, _read),
-        *(Word(name, _EXAMPLE, after="rate RATE codel") for name in ("target", "interval", "mtu")),
+        *(Word(name, _EXAMPLE, after="rate RATE codel") for name in ("target", "interval")),
+        Word("mtu", f"{_EXAMPLE} mtu 1200", after="rate RATE codel"),
     )
     behaviour: ClassVar = Behaviour(CodelStage, apply, CodelQueue)
 

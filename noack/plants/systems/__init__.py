@@ -1,1 +1,1 @@
-"""What moves a plant: equations that are integrated, an FMU; and what they need."""
+"""The systems behind the plants: integrated equations, an FMU; and their support code."""

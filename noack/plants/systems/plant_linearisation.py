@@ -42,8 +42,8 @@ def linearise(
 
     Returns:
         A and B, shapes (n, n) and (n, m), per second. They are NaN if the motion is not finite, or
-            if x is not a state: its entries depend on each other, or do not determine the further
-            motion.
+        if x is not a state: its entries depend on each other, or do not determine the further
+        motion.
     """
     settling = round(settling_s * 1e9 / _STEP_NS)
     ahead = _AHEAD if settling else 1

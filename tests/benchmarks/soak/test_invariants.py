@@ -1,4 +1,4 @@
-"""A simulated run, handed over as a recorder would: all is well, and every damage is seen."""
+"""The rows of a simulated run satisfy all invariants, and every damage to them is detected."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -32,7 +32,7 @@ def day() -> RunRecord:
 
 
 def followed(record: RunRecord, tables: Tables, batches: int = 40) -> Invariants:
-    """Hand the tables over in batches, advancing meanwhile."""
+    """Pass the tables in batches as a recorder does, and check the invariants after each."""
     invariants = Invariants(record.scenario)
     for i in range(batches):
         for table, rows in tables.items():
@@ -50,7 +50,7 @@ def tables_of(record: RunRecord) -> Tables:
 
 @pytest.mark.parametrize("kind", ["hour", "day"])
 @pytest.mark.parametrize("batches", [1, 7, 40])
-def test_of_a_good_run_nothing_is_broken(
+def test_a_good_run_violates_no_invariant(
     kind: str, batches: int, request: pytest.FixtureRequest
 ) -> None:
     record = request.getfixturevalue(kind)
@@ -63,7 +63,7 @@ def test_of_a_good_run_nothing_is_broken(
     assert 0 < float(str(account["identity_residual_relative"])) < 1e-12
 
 
-def test_what_is_held_does_not_grow_with_the_run() -> None:
+def test_the_stored_rows_do_not_grow_with_the_run() -> None:
     held = [
         int(str(followed(record, tables_of(record), batches).account()["most_held"]))
         for record, batches in ((simulated("day", 60.0), 20), (simulated("day", 240.0), 80))
@@ -125,20 +125,22 @@ def not_finite(tables: Tables) -> None:
         (not_finite, "controller_step: u is not as computed"),
     ],
 )
-def test_every_damage_is_told(hour: RunRecord, damage: Callable[[Tables], None], told: str) -> None:
+def test_every_damage_is_reported(
+    hour: RunRecord, damage: Callable[[Tables], None], told: str
+) -> None:
     tables = tables_of(hour)
     damage(tables)
     found = followed(hour, tables)
     assert any(what.startswith(told) or told in what for what in found.broken), found.broken
 
 
-def test_an_update_that_never_left_the_network_is_told(day: RunRecord) -> None:
+def test_an_update_that_never_left_the_network_is_reported(day: RunRecord) -> None:
     tables = tables_of(day)
     without("netem_release", 0.5)(tables)
     assert any("update to controller" in what for what in followed(day, tables).broken)
 
 
-def test_a_batch_that_was_skipped_is_told(hour: RunRecord) -> None:
+def test_a_skipped_batch_is_reported(hour: RunRecord) -> None:
     invariants = Invariants(hour.scenario)
     rows = hour["plant_step"]
     invariants.take("plant_step", 0, rows[:10].tobytes())
@@ -147,7 +149,7 @@ def test_a_batch_that_was_skipped_is_told(hour: RunRecord) -> None:
     assert "plant_step: row 10 is missing" in invariants.broken
 
 
-def test_a_batch_that_was_sent_again_is_taken_in_its_turn(hour: RunRecord) -> None:
+def test_repeated_and_reordered_batches_are_put_in_order(hour: RunRecord) -> None:
     invariants = Invariants(hour.scenario)
     rows = hour["plant_step"]
     for first, end in ((0, 10), (20, 30), (10, 20), (10, 20), (25, 40)):

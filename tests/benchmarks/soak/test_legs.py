@@ -22,14 +22,14 @@ def test_numbers_may_come_in_any_order_if_none_is_missing(
     assert (turn.next, turn.waiting) == (12, 0)
 
 
-def test_a_missing_number_is_told_at_the_end() -> None:
+def test_a_missing_number_is_reported_at_the_end() -> None:
     turn = InTurn("input")
     assert list(turn.take(numbers(0, 1, 3, 4))) == []
     assert turn.next == 2
     assert list(turn.end()) == ["input 2 never came, but 3 and others did"]
 
 
-def test_a_number_that_comes_twice_is_told() -> None:
+def test_a_repeated_number_is_reported() -> None:
     turn = InTurn("input")
     assert list(turn.take(numbers(0, 1))) == []
     assert list(turn.take(numbers(1, 2))) == ["input 1 came twice"]
@@ -49,7 +49,7 @@ def both(sent: list[int], arrived: list[int]) -> list[str]:
     return [*leg.judge(), *leg.end(0)]
 
 
-def test_what_arrives_as_it_was_sent_is_right_whoever_is_heard_first() -> None:
+def test_arrivals_may_be_reported_before_they_are_reported_as_sent() -> None:
     leg = Leg("update")
     leg.arrived(numbers(3))
     assert list(leg.judge()) == []
@@ -69,11 +69,13 @@ def test_what_arrives_as_it_was_sent_is_right_whoever_is_heard_first() -> None:
         ([1], [1, 2], "update 2 came, but was not sent"),
     ],
 )
-def test_what_is_wrong_is_told(sent: list[int], arrived: list[int], what: str) -> None:
+def test_lost_repeated_and_unsent_packets_are_reported(
+    sent: list[int], arrived: list[int], what: str
+) -> None:
     assert both(sent, arrived) == [what]
 
 
-def test_what_is_under_way_at_the_end_is_not_lost() -> None:
+def test_packets_in_flight_at_the_end_are_not_lost() -> None:
     leg = Leg("actuation")
     leg.sent(numbers(1, 2))
     assert list(leg.end(2)) == []

@@ -1,4 +1,4 @@
-"""A soak of a few seconds; whether memory is flat, only a longer one can tell."""
+"""A soak test of a few seconds; only a longer one can show whether memory is flat."""
 
 import json
 from pathlib import Path
@@ -43,7 +43,7 @@ def test_every_process_is_watched(result: Result) -> None:
         assert all(sample.uss_kib > 1000 and sample.threads >= 1 for sample in watched.samples)
 
 
-def test_a_real_run_breaks_nothing(result: Result) -> None:
+def test_a_real_run_violates_no_invariant(result: Result) -> None:
     assert result.account["broken"] == 0, result.account["first_broken"]
     assert result.account["rows"]["plant_step"] == 96 * 20 + 1
     assert result.account["events"] > 100
@@ -51,7 +51,7 @@ def test_a_real_run_breaks_nothing(result: Result) -> None:
     assert ended_badly(result.summary, 0, result.account["rows"], delivered_out_of_order) == []
 
 
-def test_it_writes_figures_and_a_picture(result: Result) -> None:
+def test_a_soak_test_writes_figures_and_a_picture(result: Result) -> None:
     assert result.run_dir is not None
     written = json.loads((result.run_dir / RESULT_FILE).read_text())
     assert set(written["processes"]) == ROLES
@@ -63,7 +63,7 @@ def test_a_good_end_has_no_faults() -> None:
     assert ended_badly(GOOD, 0, {"plant_step": 3, "sensor_measurement": 4}) == []
 
 
-def test_what_was_overtaken_is_rejected_and_nothing_else() -> None:
+def test_stale_rejections_must_equal_the_packets_delivered_out_of_order() -> None:
     rows, stale = {"plant_step": 7}, {"controller": {"stale": 3}}
     assert ended_badly(GOOD | {"rejected_datagrams": stale}, 0, rows, 3) == []
     for delivered_out_of_order in (0, 2):
@@ -88,21 +88,23 @@ def test_what_was_overtaken_is_rejected_and_nothing_else() -> None:
         ("claims", [GOOD["claims"][1] | {"verdict": "violated"}], "violated since 1.0 s"),
     ],
 )
-def test_a_bad_end_is_told(key: str, value: object, told: str) -> None:
+def test_each_fault_in_the_summary_is_reported(key: str, value: object, told: str) -> None:
     faults = ended_badly(GOOD | {key: value}, 0, {"plant_step": 7})
     assert len(faults) == 1
     assert told in faults[0]
 
 
 @pytest.mark.parametrize("arguments", [["week"], ["--minutes", "x"], ["--minutes", "nan"]])
-def test_a_mistake_is_told(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_mistake_on_the_command_line_is_reported(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit) as ended:
         main(arguments)
     assert ended.value.code == 2
     assert "error: " in capsys.readouterr().err
 
 
-def test_a_run_that_cannot_begin_is_told(
+def test_a_run_that_cannot_start_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     settings = ["--set", "network.mansd=-1"]

@@ -1,4 +1,4 @@
-"""The run that a soak watches goes on meanwhile, and may end."""
+"""Measuring a run while it changes its files or ends."""
 
 import shutil
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Numbers that age badly: every one has defined behaviour, and nobody is accused wrongly."""
+"""Numerical limits: defined behaviour at each, and no false violation."""
 
 import json
 from typing import Any
@@ -32,7 +32,7 @@ def scenario(content: dict[str, Any], rate_hz: float = 100.0, **settings: Any) -
 
 
 def plant(A: Any, B: Any, gain: Any, factor: float = 1.02) -> dict[str, Any]:
-    """A model, and a plant that is a little faster."""
+    """A model, and a slightly faster plant."""
     A, B = np.array(A, dtype=float), np.array(B, dtype=float)
     return {
         "model": {"A": A.tolist(), "B": B.tolist(), "gain": gain, "allow_unstable": True},
@@ -44,7 +44,7 @@ def plant(A: Any, B: Any, gain: Any, factor: float = 1.02) -> dict[str, Any]:
 
 
 def require_sound(record: RunRecord, status: ExitStatus = ExitStatus.OK) -> dict[str, Any]:
-    """Replay, summary and claims of a run: bit-exact, JSON, and no false accusation."""
+    """Replay, summary and claims of a run: bit-exact, valid JSON, and no false violation."""
     found = summarise(record, 0, "horizon").to_json()
     json.dumps(found, allow_nan=False)
     assert found["exit"]["status"] == status, found["exit"]
@@ -80,11 +80,11 @@ def test_a_threshold_that_underflows_makes_every_error_an_event(
     late = rows[rows["threshold"] < 1e-300]
     assert len(late) > 100
     np.testing.assert_array_equal(late["event"] >= 0, late["compared"] > late["threshold"])
-    # An error of exactly 0 is none: it never exceeds a threshold of exactly 0.
+    # An error of exactly 0 is not an event: it never exceeds a threshold of exactly 0.
     assert not (late["event"] >= 0)[late["compared"] == 0].any()
 
 
-def test_a_floor_ends_what_an_underflow_begins(content: dict[str, Any]) -> None:
+def test_a_floor_prevents_events_after_an_underflow(content: dict[str, Any]) -> None:
     trigger = {"beta": 0.5, "alpha_per_s": 400.0, "floor": 0.05}
     record = simulate(
         scenario(content, trigger=trigger, horizon_s=5.0, **plant([[-1.0]], [[1.0]], [[-1.0]], 1.1))
@@ -95,7 +95,7 @@ def test_a_floor_ends_what_an_underflow_begins(content: dict[str, Any]) -> None:
     require_sound(record)
 
 
-def test_the_longest_horizon_is_a_run(content: dict[str, Any]) -> None:
+def test_a_run_with_the_longest_horizon_is_possible(content: dict[str, Any]) -> None:
     resolved = scenario(
         content,
         rate_hz=1e-4,
@@ -108,7 +108,7 @@ def test_the_longest_horizon_is_a_run(content: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("size", [1e300, 1e160, 1e150, 1e-150, 1e-160, 1e-300, 5e-324])
-def test_states_of_any_size_are_judged_alike(content: dict[str, Any], size: float) -> None:
+def test_states_of_any_magnitude_are_judged_alike(content: dict[str, Any], size: float) -> None:
     resolved = scenario(
         content,
         **plant([[0.0, 1.0], [0.1, 0.0]], [[0], [1]], [[-1.0, -1.7]], 1.1)
@@ -133,7 +133,7 @@ PLANTS = {
 
 
 @pytest.mark.parametrize("name", PLANTS)
-def test_no_plant_is_too_odd(content: dict[str, Any], name: str) -> None:
+def test_unusual_plants_run_and_replay(content: dict[str, Any], name: str) -> None:
     trigger = {"beta": 1e-3, "alpha_per_s": 0.25}
     record = simulate(scenario(content, horizon_s=0.2, trigger=trigger, **PLANTS[name]))
     require_sound(record)
@@ -157,14 +157,14 @@ def test_signs_of_zero_and_subnormal_numbers_are_replayed(
     require_sound(record)
 
 
-def test_a_run_that_diverges_says_since_when(content: dict[str, Any]) -> None:
+def test_a_diverged_run_reports_the_time_of_divergence(content: dict[str, Any]) -> None:
     resolved = scenario(content, horizon_s=20.0, **plant([[50.0]], [[1.0]], [[-0.1]]))
     found = require_sound(simulate(resolved), ExitStatus.FAILED)
     assert 10 < found["diverged_at_s"] < 20
     assert found["exit"]["reason"].startswith("diverged: x is not finite at")
 
 
-def test_an_input_beyond_all_numbers_is_not_applied(content: dict[str, Any]) -> None:
+def test_a_non_finite_input_is_not_applied(content: dict[str, Any]) -> None:
     resolved = scenario(
         content,
         **plant([[-1.0]], [[0.0]], [[-1e300]]) | {"plant__initial_state": [1e10]},
@@ -173,14 +173,14 @@ def test_an_input_beyond_all_numbers_is_not_applied(content: dict[str, Any]) -> 
     record = simulate(resolved)
     sent = ~np.isfinite(record["controller_step"]["u"]).all(axis=1)
     assert sent.sum() > 50
-    # The plant rejects what is not finite, and goes on holding what it has: here, nothing.
+    # The plant rejects non-finite inputs and holds the applied one; here there is none.
     assert np.isfinite(record["plant_step"]["u"]).all()
     assert np.isfinite(record["plant_step"]["x"]).all()
     found = summarise(record, 0, "horizon").to_json()
     assert found["rejected_datagrams"]["plant"]["not_finite"] == sent.sum()
 
 
-def test_a_model_that_leaves_floating_point_in_one_step_is_refused(
+def test_a_model_that_overflows_in_one_step_is_refused(
     content: dict[str, Any],
 ) -> None:
     with pytest.raises(CallerError, match="take one step to infinity"):
@@ -201,7 +201,7 @@ def test_a_model_that_leaves_floating_point_in_one_step_is_refused(
         ("netem_packet", "release_ns", -(2**63)),
     ],
 )
-def test_a_damaged_number_in_a_record_is_named(
+def test_a_damaged_value_in_a_record_is_located(
     content: dict[str, Any], table: str, column: str, value: float
 ) -> None:
     record = simulate(

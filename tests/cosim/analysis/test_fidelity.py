@@ -1,4 +1,4 @@
-"""Fidelity: explained where the record is the scenario's, and not where it is not."""
+"""Fidelity: the difference to the ideal loop is explained if the record is the scenario's."""
 
 import itertools
 import json
@@ -54,8 +54,8 @@ def with_rows(record: RunRecord, **changed: Rows) -> RunRecord:
     return RunRecord(record.scenario, rows, record.notices, record.reports)
 
 
-def test_all_is_explained(fidelity: Fidelity) -> None:
-    # What remains is rounding, some 1e-15 of x, over a difference of some per cent of x.
+def test_the_difference_to_the_ideal_loop_is_explained(fidelity: Fidelity) -> None:
+    # The residual is rounding, about 1e-15 of x; the difference is a few per cent of x.
     assert fidelity.explained_relative < 1e-9
     assert fidelity.explained
     assert 1e-4 < fidelity.total.rms / fidelity.rms_live < 0.5
@@ -65,7 +65,7 @@ def test_all_is_explained(fidelity: Fidelity) -> None:
     assert fidelity.stages[3].first_different_event is None
 
 
-def test_the_figures_fit_together(fidelity: Fidelity) -> None:
+def test_the_effects_add_up_to_the_difference(fidelity: Fidelity) -> None:
     for difference in (fidelity.total, *(stage.difference for stage in fidelity.stages)):
         assert math.hypot(*difference.rms_by_state) == pytest.approx(difference.rms)
         assert max(difference.max_by_state) <= difference.max * (1 + 1e-12)
@@ -98,13 +98,13 @@ def test_losses_and_delays_are_explained_in_every_mode(mode: str, start: str) ->
         '{ policy = "deadline", interval_s = 0.3, rule = { policy = "absolute", delta = 0.2 } }',
     ],
 )
-def test_any_policy_is_explained(policy: str) -> None:
+def test_the_difference_is_explained_for_any_policy(policy: str) -> None:
     fidelity = compute_fidelity(lane(None, f"trigger={policy}", 'mode="zoh"'))
     assert fidelity.explained_relative < 1e-9
     assert fidelity.events_live > 3
 
 
-def test_a_rule_without_a_run_in_continuous_time_is_told_in_a_line() -> None:
+def test_a_rule_without_a_continuous_time_run_gives_one_line() -> None:
     record = lane(lambda data, now_ns: None, 'trigger={ policy = "lyapunov", rate_per_s = 0.1 }')
     summary = fidelity_for_summary(record)
     assert "accumulate" in summary["reason"]
@@ -112,7 +112,7 @@ def test_a_rule_without_a_run_in_continuous_time_is_told_in_a_line() -> None:
     assert told == f"not compared: {summary['reason']}"
 
 
-def test_a_share_that_counts_against_the_others_is_called_so() -> None:
+def test_a_negative_share_is_said_to_cancel_other_effects() -> None:
     shares = {"sampling": 1.42, "delay": -0.42, "held_actuation": -1e-9, "residual": 0.0}
     numbers = {"rms_x": 0.1, "rms_x_live": 1.0, "explained_relative": 0.0, "shares": shares}
     told = dict(summary_rows(numbers | {"reason": None}))
@@ -121,23 +121,24 @@ def test_a_share_that_counts_against_the_others_is_called_so() -> None:
     assert told["  held actuation"] == "0.0 %"
 
 
-def test_a_loop_that_amplifies_rounding_is_told_and_not_blamed_on_the_run() -> None:
-    """This rule does not stand the losses; a deviation grows freely between the same events."""
+def test_amplified_rounding_is_reported_and_not_attributed_to_the_run() -> None:
+    """This rule does not tolerate the losses; a deviation grows between equal events."""
     policy = '{ policy = "dynamic", sigma = 0.2, theta_s = 0.1, decay_per_s = 0.5 }'
     record = lane(None, f"trigger={policy}", 'mode="zoh"', "horizon_s=100")
     with pytest.raises(IncomparableError, match="turns rounding into another run"):
         compute_fidelity(record)
 
 
-def test_delay_shows_as_delay() -> None:
+def test_delay_is_attributed_to_delay() -> None:
     prompt, late = (compute_fidelity(lane(lambda data, now_ns, d=d: d)) for d in (0, 30_000_000))  # type: ignore[misc]
     sampling, delay = (late.stages[i].difference.rms for i in (0, 1))
     assert delay > 2 * prompt.stages[1].difference.rms
-    assert sampling == pytest.approx(prompt.stages[0].difference.rms)  # the same fates, no delay
+    # the same fates without delay
+    assert sampling == pytest.approx(prompt.stages[0].difference.rms)
 
 
-def test_a_start_without_actuation_shows_as_held_actuation() -> None:
-    """Known x(0), no event at all: the plant still waits for the first tick, 8 ms late."""
+def test_a_start_without_actuation_is_attributed_to_held_actuation() -> None:
+    """Known x(0), no event: the plant still waits 8 ms for the first tick."""
     settings = ("trigger.beta=100", 'network.initial_sync="known_state"', "controller.phase=0.8")
     fidelity = compute_fidelity(lane(None, *settings))
     sampling, delay, held, _ = fidelity.stages
@@ -173,7 +174,7 @@ def test_at_rest_there_is_nothing_to_explain() -> None:
     assert "rounding" in fidelity.verdict
 
 
-def test_events_that_the_run_did_not_have_take_the_networks_fates_and_usual_delays() -> None:
+def test_additional_events_get_the_networks_fates_and_median_delays() -> None:
     waits_ns = itertools.cycle([10_000_000, 10_000_000, 30_000_000])
     late = lane(lambda data, now_ns: next(waits_ns), "trigger.beta=0.02")
     schedule = live_run(late).schedule
@@ -183,13 +184,13 @@ def test_events_that_the_run_did_not_have_take_the_networks_fates_and_usual_dela
     beyond = range(events, events + 50)
     assert [schedule.delivered(i) for i in beyond] == [fates(i) for i in beyond]
     assert {schedule.delivered(i) for i in beyond} == {True, False}
-    # 10 ms under way, then 5 to the tick that uses it, or the next step.
+    # 10 ms in flight, then 5 ms to the tick that uses it, or to the next step.
     assert {schedule.delay_ns(i) for i in beyond} == {15_000_000}
     assert {schedule.delay_steps(i) for i in beyond} == {2}
 
 
 def test_a_paper_loop_with_more_events_than_the_run_is_compared() -> None:
-    """A sampled sensor that looks four times a second has fewer events than the paper's."""
+    """A sensor that samples four times a second has fewer events than the paper's loop."""
     fidelity = compute_fidelity(lane(None, "plant.measure_every=25", 'mode="zoh"'))
     assert fidelity.events_ideal > fidelity.events_live
     assert fidelity.first_different_event is not None
@@ -208,7 +209,9 @@ def test_a_paper_loop_with_more_events_than_the_run_is_compared() -> None:
         (CONTROLLER_DELIVERY, slice(1, None), "controller's record"),
     ],
 )
-def test_a_record_with_gaps_says_so(record: RunRecord, table: str, rows: Any, why: str) -> None:
+def test_gaps_in_the_record_are_reported(
+    record: RunRecord, table: str, rows: Any, why: str
+) -> None:
     broken = with_rows(record, **{table: record[table][rows]})
     with pytest.raises(IncomparableError, match=why):
         compute_fidelity(broken)
@@ -217,7 +220,7 @@ def test_a_record_with_gaps_says_so(record: RunRecord, table: str, rows: Any, wh
     assert set(summary.values()) == {None}
 
 
-def test_a_run_that_was_cut_short_is_compared_as_far_as_it_goes(record: RunRecord) -> None:
+def test_an_interrupted_run_is_compared_up_to_its_end(record: RunRecord) -> None:
     """The sensor was the first to end."""
     short = with_rows(record, sensor_measurement=record[SENSOR_MEASUREMENT][:250])
     fidelity = compute_fidelity(short)
@@ -225,20 +228,20 @@ def test_a_run_that_was_cut_short_is_compared_as_far_as_it_goes(record: RunRecor
     assert fidelity.explained_relative < 1e-9
 
 
-def test_a_run_that_diverged_says_so(record: RunRecord) -> None:
+def test_a_diverged_run_is_reported(record: RunRecord) -> None:
     steps = record[PLANT_STEP].copy()
     steps["x"][300:] = math.nan
     with pytest.raises(IncomparableError, match="diverged"):
         compute_fidelity(with_rows(record, plant_step=steps))
 
 
-def test_a_loop_whose_events_accumulate_says_so() -> None:
+def test_an_accumulation_of_events_is_reported() -> None:
     unstable = lane(None, "model.parameters.gain=-1.0", "model.allow_unstable=true", "horizon_s=20")
     with pytest.raises(IncomparableError, match="more than 200 events, which accumulate"):
         compute_fidelity(unstable, max_events=200)
 
 
-def test_the_summary_has_the_same_keys_whatever_happens(
+def test_the_summary_always_has_the_same_keys(
     record: RunRecord, fidelity: Fidelity, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     good = fidelity_for_summary(record)
@@ -281,7 +284,7 @@ def test_the_last_run_is_compared(simulated: Path) -> None:
     ]  # fmt: skip
 
 
-def test_a_difference_that_nothing_explains_fails(simulated: Path, tmp_path: Path) -> None:
+def test_an_unexplained_difference_fails(simulated: Path, tmp_path: Path) -> None:
     run = Path(shutil.copytree(simulated / "latest", tmp_path / "run"))
     path = run / "record" / "plant_step.parquet"
     table = pq.read_table(path)
@@ -294,7 +297,7 @@ def test_a_difference_that_nothing_explains_fails(simulated: Path, tmp_path: Pat
     assert noack("fidelity", run, "--json").exit_code == 1
 
 
-def test_what_is_no_run_is_one_line(tmp_path: Path) -> None:
+def test_an_invalid_run_gives_one_line(tmp_path: Path) -> None:
     done = noack("fidelity", tmp_path)
     assert done.exit_code == 2
     assert "not a run directory" in done.stderr
@@ -309,7 +312,7 @@ def test_what_is_no_run_is_one_line(tmp_path: Path) -> None:
         (CONTROLLER_DELIVERY, "model_t_ns", -1),
     ],
 )
-def test_a_record_with_times_that_no_run_has_is_not_compared(
+def test_a_record_with_impossible_times_is_not_compared(
     table: str, column: str, value: int
 ) -> None:
     record = lane()

@@ -1,4 +1,4 @@
-"""A summary that passes for one that can be shown is shown; whatever else is written anew."""
+"""A valid summary is shown; any other is written again."""
 
 import copy
 import io
@@ -90,20 +90,18 @@ def test_full_summary_can_be_shown(record: RunRecord, summary: dict[str, Any]) -
         show(record, summary | {"replay": replayed})
 
 
-def test_damaged_summary_is_shown_or_told_from_a_whole_one(
-    record: RunRecord, summary: dict[str, Any]
-) -> None:
+def test_a_damaged_summary_is_shown_or_detected(record: RunRecord, summary: dict[str, Any]) -> None:
     shown = 0
     for place in places(summary):
-        for value in VALUES if place[0] != "exit" else ():  # which is read first (test_conclude)
+        for value in VALUES if place[0] != "exit" else ():  # which is read first (test_finalize)
             damaged = changed(summary, place, value)
             if can_be_shown(damaged):
                 show(record, damaged)
                 shown += 1
-    assert shown > 100  # numbers that may be missing, keys that nothing shows
+    assert shown > 100  # numbers that may be missing, keys that are not shown
 
 
-def test_damaged_summary_is_written_anew(tmp_path: Path) -> None:
+def test_a_damaged_summary_is_written_again(tmp_path: Path) -> None:
     source = noack.load("double_integrator", {"horizon_s": 0.2})
     run = noack.simulate(source, runs=tmp_path)
     path = run.directory / SUMMARY_FILE
@@ -113,7 +111,7 @@ def test_damaged_summary_is_written_anew(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", ["[" * 100_000, "{" * 100_000, "7", '{"kind": []}'])
-def test_damaged_environment_says_nothing(content: str, tmp_path: Path) -> None:
+def test_a_damaged_environment_is_ignored(content: str, tmp_path: Path) -> None:
     (tmp_path / ENVIRONMENT_FILE).write_text(content)
     assert kind_of(tmp_path) == "live"
     assert any(line.startswith("python was None") for line in changed_since(tmp_path))
@@ -132,7 +130,7 @@ def places(value: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
 
 
 def changed(summary: dict[str, Any], place: tuple[Any, ...], value: Any) -> dict[str, Any]:
-    """The summary with another value in a place, or without it, or with another name for it."""
+    """The summary with one key replaced, removed or renamed."""
     found = copy.deepcopy(summary)
     table: Any = found
     for key in place[:-1]:
@@ -148,7 +146,7 @@ def changed(summary: dict[str, Any], place: tuple[Any, ...], value: Any) -> dict
 
 
 def show(record: RunRecord, summary: dict[str, Any]) -> None:
-    """Whatever reads a summary."""
+    """Every function that reads a summary."""
     outcome = Outcome(Path("run"), ExitStatus.OK, "horizon", summary)
     print_outcome(Console(file=io.StringIO()), outcome)
     page(record.scenario, summary, [], "", {})

@@ -1,4 +1,4 @@
-"""That claims are void is said while the run goes on: by the recorder, and in the terminal."""
+"""The recorder and the terminal report void claims during the run."""
 
 import io
 import json
@@ -33,7 +33,7 @@ def run() -> RunRecord:
 
 
 class Told(FakePlane):
-    """A plane that remembers the recorder's accounts."""
+    """A control plane that stores the recorder's reports."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -61,7 +61,9 @@ def send(plane: FakePlane, record: RunRecord, until_ns: int, sent: dict[str, int
             plane.put("telemetry", Sample(key, rows.tobytes(), header))
 
 
-def test_the_recorder_says_it_once_and_it_stays_on_record(run: RunRecord, tmp_path: Path) -> None:
+def test_the_recorder_reports_a_violation_once_and_records_it(
+    run: RunRecord, tmp_path: Path
+) -> None:
     plane, sent = Told(), {}  # type: ignore[var-annotated]
     recorder = recorder_of(run.scenario, tmp_path, plane)
     for until_ns in range(100_000_000, 1_200_000_000, 100_000_000):
@@ -79,7 +81,7 @@ def test_the_recorder_says_it_once_and_it_stays_on_record(run: RunRecord, tmp_pa
 
 def test_the_summary_lists_every_violated_assumption(run: RunRecord) -> None:
     reported = summarise(run, 0, "horizon").assumption_violations
-    assert reported == []  # no process sees that an input is old
+    assert reported == []  # no process detects that an input is old
     found = {one.cause: one for one in list_violations(reported, RunClaims(run).violations())}
     assert found.keys() == {"hold"}
     assert found["hold"].t_s == pytest.approx(0.506)
@@ -87,7 +89,7 @@ def test_the_summary_lists_every_violated_assumption(run: RunRecord) -> None:
     assert found["hold"].process == "recorder"
 
 
-def test_what_is_found_out_at_the_end_is_said_too(run: RunRecord, tmp_path: Path) -> None:
+def test_a_violation_found_at_the_end_is_reported(run: RunRecord, tmp_path: Path) -> None:
     plane = Told()
     recorder = recorder_of(run.scenario, tmp_path, plane)
     send(plane, run, 1_200_000_000, {})
@@ -96,13 +98,11 @@ def test_what_is_found_out_at_the_end_is_said_too(run: RunRecord, tmp_path: Path
     assert [account["void"] for account in plane.accounts] == [[notice["text"]]]
 
 
-def test_a_recorder_that_lacks_rows_says_that_it_cannot_tell(
-    run: RunRecord, tmp_path: Path
-) -> None:
+def test_missing_rows_are_reported_as_an_unknown_result(run: RunRecord, tmp_path: Path) -> None:
     plane, sent = Told(), {}  # type: ignore[var-annotated]
     recorder = recorder_of(run.scenario, tmp_path, plane)
     send(plane, run, 300_000_000, sent)
-    sent["sensor_measurement"] += 10  # a batch that is lost, and sent again at the end
+    sent["sensor_measurement"] += 10  # a batch is lost and sent again at the end
     send(plane, run, 1_200_000_000, sent)
     recorder.poll()
     recorder.show()
@@ -114,7 +114,7 @@ def test_a_recorder_that_lacks_rows_says_that_it_cannot_tell(
 
 
 @pytest.mark.parametrize("terminal", [True, False])
-def test_the_terminal_says_each_cause_once(run: RunRecord, terminal: bool) -> None:
+def test_the_terminal_reports_each_cause_once(run: RunRecord, terminal: bool) -> None:
     shown = io.StringIO()
     account: dict[str, Any] = {
         "t_s": 0.5, "events": 3, "deliveries": 2, "longest_loss_burst": 1, "x_norm": 1.0,
@@ -139,13 +139,13 @@ def test_rows_whose_file_is_deleted_are_not_confirmed(run: RunRecord, tmp_path: 
     (tmp_path / "spool" / "plant_step.recorder").unlink()
     with pytest.raises(MachineError, match=r"plant_step\.recorder: was deleted or moved"):
         recorder.acknowledge()
-    record = recorder.finish()  # what is left of it is kept
+    record = recorder.finish()  # the rest of it is stored
     assert not len(record["plant_step"])
     assert len(record["sensor_measurement"]) == len(run["sensor_measurement"])
     assert "plant_step.recorder: was deleted or moved" in str(recorder.lost)
 
 
-def test_after_the_stop_nothing_more_is_said(run: RunRecord, tmp_path: Path) -> None:
+def test_nothing_is_reported_after_the_stop(run: RunRecord, tmp_path: Path) -> None:
     plane = Told()
     recorder = recorder_of(run.scenario, tmp_path, plane)
     recorder.end_monitoring()

@@ -1,4 +1,4 @@
-"""One short run, made once."""
+"""One short run, shared by the tests."""
 
 import pytest
 
@@ -11,7 +11,7 @@ TRUE = ([[0.0, 1.0], [9.6, -0.15]], [[0.0], [1.0]])
 
 @pytest.fixture(scope="session")
 def scenario() -> noack.Scenario:
-    """A pendulum that is not quite the model, over a network that loses most of the updates."""
+    """A pendulum that differs slightly from the model, with a network that loses most updates."""
     settings = {"horizon_s": 4.0, "network.loss.probability": 0.8}
     return noack.from_system(SYSTEM, GAIN, [0.2, 0.0], plant=TRUE, settings=settings)
 

@@ -1,4 +1,4 @@
-"""Certificates as a program has them."""
+"""Certificates in the Python API."""
 
 import json
 
@@ -8,7 +8,7 @@ import pytest
 import noack
 
 
-def test_a_system_is_certified_in_few_lines(scenario: noack.Scenario) -> None:
+def test_a_system_is_certified(scenario: noack.Scenario) -> None:
     found = noack.certify(scenario)
     for certificate in (found.paper, found.schedule):
         assert certificate.void is None
@@ -60,6 +60,6 @@ def test_what_cannot_be_asked_is_one_line(options: dict[str, object], said: str)
     assert str(caught.value) == said
 
 
-def test_what_has_no_certificate_is_one_line() -> None:
+def test_a_missing_certificate_gives_one_line() -> None:
     with pytest.raises(noack.NoackError, match="linear plant"):
         noack.certify("cart_pole")

@@ -1,4 +1,4 @@
-"""A run's tables against its record and its summary, and in data frames."""
+"""A run's tables against its record and its summary, and as data frames."""
 
 import re
 from collections import Counter
@@ -15,7 +15,7 @@ from cosim.record.packet_outcomes import packet_outcomes
 from cosim.record.run_record import load_record
 
 
-def test_a_table_is_the_file_with_seconds_before_it(simulated: noack.Run) -> None:
+def test_a_table_is_the_file_with_a_column_of_seconds_first(simulated: noack.Run) -> None:
     assert "plant_step" in simulated.tables
     for name in simulated.tables:
         table = simulated.table(name)
@@ -25,7 +25,7 @@ def test_a_table_is_the_file_with_seconds_before_it(simulated: noack.Run) -> Non
         np.testing.assert_allclose(table["t_s"].to_numpy(), file["t_ns"].to_numpy() * 1e-9)
 
 
-def test_samples_are_the_joined_record(simulated: noack.Run) -> None:
+def test_samples_are_the_aligned_record(simulated: noack.Run) -> None:
     joined = join_all(load_record(simulated.directory))
     samples = simulated.samples()
     for name, states in (("x", joined.x), ("x_s", joined.x_s), ("x_c", joined.x_c)):
@@ -36,7 +36,7 @@ def test_samples_are_the_joined_record(simulated: noack.Run) -> None:
     assert (samples["event"].to_numpy() >= 0).sum() == simulated.summary["events"]
 
 
-def test_events_add_up_to_the_summary(simulated: noack.Run) -> None:
+def test_event_counts_agree_with_the_summary(simulated: noack.Run) -> None:
     events, summary = simulated.events(), simulated.summary
     assert events.num_rows == summary["events"]
     assert sum(events["received"].to_pylist()) == summary["deliveries"]
@@ -51,7 +51,7 @@ def test_events_add_up_to_the_summary(simulated: noack.Run) -> None:
     assert intervals_s[1:].min() == pytest.approx(summary["inter_event_min_s"])
 
 
-def test_what_overtakes_and_what_is_under_way_is_said(scenario: noack.Scenario) -> None:
+def test_stale_and_in_flight_updates_are_marked(scenario: noack.Scenario) -> None:
     """Delays of up to half a second: some updates arrive out of order, some after the end."""
     jitter = {"kind": "delay", "delay_s": 0.3, "jitter_s": 0.25}
     run = noack.simulate(noack.with_settings(scenario, {"network.impairments": [jitter]}))
@@ -65,7 +65,7 @@ def test_what_overtakes_and_what_is_under_way_is_said(scenario: noack.Scenario) 
     assert fates["in_flight"] == crossed.in_flight.sum()
 
 
-def test_a_damaged_table_is_one_line(tmp_path: Path, scenario: noack.Scenario) -> None:
+def test_a_damaged_table_gives_one_line(tmp_path: Path, scenario: noack.Scenario) -> None:
     run = noack.simulate(noack.with_settings(scenario, {"horizon_s": 0.1}), runs=tmp_path)
     assert run.tables
     (run.directory / "record/plant_step.parquet").write_bytes(b"PAR1")
@@ -88,8 +88,8 @@ def test_polars_takes_every_table(simulated: noack.Run) -> None:
     assert frame.columns[0] == "t_s"
 
 
-def test_states_have_one_name_everywhere(simulated: noack.Run) -> None:
-    """Figures, samples, columns of the record and what a replay says count from 1."""
+def test_states_have_the_same_name_everywhere(simulated: noack.Run) -> None:
+    """Figures, samples, columns of the record and replay reports count from 1."""
     names = ("x_1", "x_2")
     assert simulated.scenario.model.state_names == names
     assert [axes.get_ylabel().split("\n")[0] for axes in simulated.plot().axes[:2]] == [*names]

@@ -1,4 +1,4 @@
-"""What ``import noack`` is: documented, typed, and light until it is used."""
+"""The interface of ``import noack``: documented, typed, and without heavy imports until used."""
 
 import inspect
 import json
@@ -23,7 +23,7 @@ def loaded_by(program: str) -> set[str]:
 
 
 def documented(heading: str) -> set[str]:
-    """Names at the left of the table under a heading."""
+    """Names in the first column of the table below a heading."""
     text = PAGE.partition(f"\n## {heading}\n")[2].partition("\n## ")[0]
     rows = [line.split("|")[1] for line in text.splitlines() if line.startswith("| `")]
     return {re.match(r"[\w.]+", name)[0] for row in rows for name in re.findall("`(.+?)`", row)}  # type: ignore[index]
@@ -34,17 +34,17 @@ def members(kind: type) -> set[str]:
     return own | {name for name in kind.__annotations__ if not name.startswith("_")}
 
 
-def test_the_names_are_those_of_the_page() -> None:
+def test_the_public_names_are_the_documented_ones() -> None:
     assert {name.removeprefix("noack.") for name in documented("Names")} == set(noack.__all__)
 
 
-def test_a_runs_and_certificates_members_are_those_of_the_page() -> None:
+def test_the_members_of_runs_and_certificates_are_the_documented_ones() -> None:
     assert documented("Runs") == members(noack.Run)
     assert documented("Certificates") == members(noack.Certificates)
 
 
 @pytest.mark.parametrize("name", sorted(set(noack.__all__) - {"__version__"}))
-def test_every_name_is_explained(name: str) -> None:
+def test_every_public_name_has_a_docstring(name: str) -> None:
     found = getattr(noack, name)
     text = inspect.getdoc(found)
     assert text
@@ -60,25 +60,25 @@ def test_every_name_is_explained(name: str) -> None:
                 assert inspect.signature(target).return_annotation is not inspect.Signature.empty
 
 
-def test_importing_it_loads_nothing_heavy() -> None:
+def test_importing_noack_loads_no_heavy_modules() -> None:
     assert not loaded_by("import noack; dir(noack)") & set(HEAVY)
 
 
-def test_loading_a_scenario_needs_no_viewer_plane_or_plots() -> None:
+def test_loading_a_scenario_imports_no_viewer_zenoh_or_plots() -> None:
     loaded = loaded_by("import noack; noack.load('lane_following')")
     assert not loaded & {"matplotlib", "numba", "rerun", "zenoh"}
 
 
-def test_a_process_of_a_run_loads_no_library() -> None:
+def test_a_process_of_a_run_does_not_import_cosim() -> None:
     assert "cosim" not in loaded_by("import controller_node.__main__, plant_server.__main__")
 
 
-def test_what_it_has_not_is_said() -> None:
+def test_an_unknown_name_is_refused_with_a_message() -> None:
     with pytest.raises(AttributeError, match="module 'noack' has no attribute 'simulates'"):
         noack.simulates  # type: ignore[attr-defined]  # noqa: B018
     assert set(noack.__all__) <= set(dir(noack))
 
 
-def test_users_type_checkers_are_told() -> None:
+def test_the_package_is_marked_as_typed() -> None:
     assert (ROOT / "noack/py.typed").is_file()
     assert (ROOT / "cosim/py.typed").is_file()

@@ -1,4 +1,4 @@
-"""Runs that a program makes, opens, and looks at."""
+"""Runs that a program starts, opens and evaluates."""
 
 import gc
 import json
@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 import noack
 
 
-def test_a_run_says_what_became_of_it(simulated: noack.Run) -> None:
+def test_a_run_gives_its_results(simulated: noack.Run) -> None:
     assert simulated.ok
     assert simulated.reason == "horizon"
     assert simulated.summary == json.loads((simulated.directory / "summary.json").read_text())
@@ -28,12 +28,12 @@ def test_a_run_says_what_became_of_it(simulated: noack.Run) -> None:
     assert len(repr(simulated).splitlines()) < 10
 
 
-def test_its_machines_repeat_it(simulated: noack.Run) -> None:
+def test_a_run_is_replayed(simulated: noack.Run) -> None:
     assert simulated.replay().bit_exact
     assert simulated.fidelity().explained
 
 
-def test_a_temporary_run_is_there_as_long_as_its_object() -> None:
+def test_a_temporary_run_exists_as_long_as_its_object() -> None:
     run = noack.simulate("double_integrator")
     folder = run.directory
     assert folder.is_dir()
@@ -43,7 +43,7 @@ def test_a_temporary_run_is_there_as_long_as_its_object() -> None:
     assert not folder.parent.exists()
 
 
-def test_a_run_directory_is_like_any_other(
+def test_a_run_of_the_api_has_an_ordinary_run_directory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scenario: noack.Scenario
 ) -> None:
     run = noack.simulate(scenario, runs=tmp_path / "runs")
@@ -55,7 +55,7 @@ def test_a_run_directory_is_like_any_other(
     assert again.report() == again.directory / "report.html"
 
 
-def test_a_live_run_is_a_run(scenario: noack.Scenario) -> None:
+def test_a_live_run_gives_its_results(scenario: noack.Scenario) -> None:
     run = noack.run(noack.with_settings(scenario, {"horizon_s": 0.5}))
     assert run.ok
     assert run.summary["kind"] == "live"
@@ -63,7 +63,7 @@ def test_a_live_run_is_a_run(scenario: noack.Scenario) -> None:
     assert run.table("plant_step").num_rows == 250 + 1
 
 
-def test_a_live_run_that_is_interrupted_is_returned() -> None:
+def test_an_interrupted_live_run_is_returned() -> None:
     program = (
         "import noack\n"
         "scenario = noack.load('double_integrator', {'horizon_s': 10.0})\n"
@@ -72,7 +72,7 @@ def test_a_live_run_that_is_interrupted_is_returned() -> None:
     )
     with subprocess.Popen(
         [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env=os.environ | {"FORCE_COLOR": "1", "TERM": "dumb"},  # a pipe is told no progress
+        env=os.environ | {"FORCE_COLOR": "1", "TERM": "dumb"},  # no progress is printed to a pipe
     ) as process:  # fmt: skip
         assert process.stderr is not None
         assert any("/10 s" in line for line in process.stderr)
@@ -82,7 +82,7 @@ def test_a_live_run_that_is_interrupted_is_returned() -> None:
     assert process.returncode == 0
 
 
-def test_a_live_run_is_the_main_threads(scenario: noack.Scenario) -> None:
+def test_a_live_run_needs_the_main_thread(scenario: noack.Scenario) -> None:
     caught: list[noack.NoackError] = []
 
     def start() -> None:
@@ -96,7 +96,7 @@ def test_a_live_run_is_the_main_threads(scenario: noack.Scenario) -> None:
     assert caught
 
 
-def test_what_is_no_run_is_one_line(tmp_path: Path) -> None:
+def test_an_invalid_run_gives_one_line(tmp_path: Path) -> None:
     with pytest.raises(noack.NoackError, match="not a run directory"):
         noack.open_run(tmp_path)
 
@@ -108,7 +108,7 @@ def test_a_figure_is_shown_by_a_notebook(simulated: noack.Run, name: str) -> Non
     assert figure._repr_png_().startswith(b"\x89PNG")  # type: ignore[attr-defined]
 
 
-def test_certified_bounds_are_drawn_with_what_they_bound(simulated: noack.Run) -> None:
+def test_certified_bounds_are_drawn_with_the_bounded_signals(simulated: noack.Run) -> None:
     (axes,) = simulated.plot("errors").axes
     assert any(line.get_linestyle() != "-" for line in axes.lines)
     legend = axes.get_legend()
@@ -116,14 +116,14 @@ def test_certified_bounds_are_drawn_with_what_they_bound(simulated: noack.Run) -
     assert any("certified for" in text.get_text() for text in legend.get_texts())
 
 
-def test_a_figure_or_table_that_there_is_not_is_one_line(simulated: noack.Run) -> None:
+def test_an_unknown_figure_or_table_gives_one_line(simulated: noack.Run) -> None:
     with pytest.raises(noack.NoackError, match=r'"lateness": no such figure .* it has states, '):
         simulated.plot("lateness")
     with pytest.raises(noack.NoackError, match='"plant": the record has no such table; it has'):
         simulated.table("plant")
 
 
-def test_a_diverging_run_is_a_run() -> None:
+def test_a_diverging_run_gives_its_results() -> None:
     run = noack.simulate(
         noack.from_system(
             ([[100.0]], [[1.0]]), [[-150.0]], [1.0],

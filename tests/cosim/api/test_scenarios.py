@@ -1,4 +1,4 @@
-"""Scenarios of files, tables and matrices, and what is said of mistakes."""
+"""Scenarios from files, tables and matrices, and the messages for mistakes."""
 
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from noack.config.scenario_file import dumps
 from tests.cosim.api.conftest import GAIN, SYSTEM, TRUE
 
 
-def test_a_shipped_scenario_a_file_and_a_table_are_the_same(tmp_path: Path) -> None:
+def test_a_scenario_loads_equally_by_name_file_and_table(tmp_path: Path) -> None:
     shipped = noack.load("double_integrator")
     path = tmp_path / "own.toml"
     path.write_text(dumps(shipped))
@@ -21,7 +21,7 @@ def test_a_shipped_scenario_a_file_and_a_table_are_the_same(tmp_path: Path) -> N
     assert noack.load(shipped) is shipped
 
 
-def test_files_that_a_scenario_names_lie_beside_it(
+def test_files_are_found_relative_to_the_scenario(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: dict[str, Any]
 ) -> None:
     np.savez(tmp_path / "model.npz", A=SYSTEM[0], B=SYSTEM[1], K=GAIN)
@@ -30,7 +30,7 @@ def test_files_that_a_scenario_names_lie_beside_it(
     assert noack.load(content).model.matrices[0].tolist() == SYSTEM[0]
 
 
-def test_settings_replace_values_and_leave_the_scenario_as_it_is() -> None:
+def test_settings_replace_values_in_a_copy_of_the_scenario() -> None:
     scenario = noack.load("lane_following")
     other = noack.with_settings(
         scenario,
@@ -59,14 +59,14 @@ def test_settings_replace_values_and_leave_the_scenario_as_it_is() -> None:
         ({"horizon_s": object()}, "is no value of a setting"),
     ],
 )
-def test_a_wrong_setting_is_one_line(settings: dict[str, Any], said: str) -> None:
+def test_a_wrong_setting_gives_one_line(settings: dict[str, Any], said: str) -> None:
     with pytest.raises(noack.NoackError) as caught:
         noack.with_settings(noack.load("lane_following"), settings)
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_a_name_that_is_not_shipped_is_one_line() -> None:
+def test_an_unknown_scenario_name_gives_one_line() -> None:
     with pytest.raises(noack.NoackError, match="lane_folowing") as caught:
         noack.load("lane_folowing")
     assert "lane_following" in str(caught.value)
@@ -85,7 +85,7 @@ def test_a_system_becomes_a_scenario_with_the_documented_choices() -> None:
     assert noack.from_system(SYSTEM, GAIN, [0, 0]).decaying.beta == 0.1
 
 
-def test_python_controls_system_brings_its_names_and_the_plant_is_another() -> None:
+def test_a_python_control_system_keeps_its_names_and_may_have_another_plant() -> None:
     system = control.ss(
         *SYSTEM, np.eye(2), np.zeros((2, 1)), states=["angle", "rate"], inputs=["torque"]
     )
@@ -106,14 +106,14 @@ def test_python_controls_system_brings_its_names_and_the_plant_is_another() -> N
         (GAIN, "upright", "plant.initial_state"),
     ],
 )
-def test_a_system_that_is_none_is_one_line(gain: Any, initial_state: Any, said: str) -> None:
+def test_an_invalid_system_gives_one_line(gain: Any, initial_state: Any, said: str) -> None:
     with pytest.raises(noack.NoackError) as caught:
         noack.from_system(SYSTEM, gain, initial_state)
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_a_notebook_shows_what_matters() -> None:
+def test_a_notebook_shows_a_short_form_of_a_scenario() -> None:
     shown = str(noack.load("lane_following"))
     for word in ("lane_following", "beta = 0.5", "bernoulli", "M − 1 = 4", "20 s"):
         assert word in shown

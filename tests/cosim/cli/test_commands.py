@@ -1,4 +1,4 @@
-"""What all commands share."""
+"""Behaviour that all commands share."""
 
 import subprocess
 import sys
@@ -14,7 +14,7 @@ from cosim.cli import app
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a POSIX shell's redirection")
-def test_a_program_without_standard_output_ends_as_any_other() -> None:
+def test_a_command_without_standard_output_ends_normally() -> None:
     command = f"'{sys.executable}' -m cosim.cli schema --json >&-"
     done = subprocess.run(["sh", "-c", command], check=False, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
@@ -24,7 +24,7 @@ def test_a_program_without_standard_output_ends_as_any_other() -> None:
     {"policy": "lyapunov", "rate_per_s": 1.0},
     {"policy": "dynamic", "sigma": 0.5, "theta_s": 0.5, "decay_per_s": 0.5},
 ])  # fmt: skip
-def test_check_refuses_a_policy_that_needs_a_stable_loop_where_there_is_none(
+def test_check_refuses_a_policy_that_needs_a_stable_loop_if_it_is_unstable(
     tmp_path: Path, content: dict[str, Any], keys: dict[str, Any]
 ) -> None:
     content["trigger"] = keys

@@ -1,4 +1,4 @@
-"""Completion, as a shell asks for it."""
+"""Completion, called as by a shell."""
 
 import os
 import subprocess
@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[3]
 
 
 def completed(line: str, cwd: Path) -> list[str]:
-    """What bash is offered for the last word of a line."""
+    """The completions that bash offers for the last word of a line."""
     words = line.split(" ")
     asked = {"_NOACK_COMPLETE": "complete_bash", "COMP_WORDS": line, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(
@@ -47,7 +47,7 @@ def test_words_are_completed(line: str, offered: list[str], tmp_path: Path) -> N
     assert completed(line, tmp_path) == offered
 
 
-def test_the_script_of_a_shell_is_shown() -> None:
+def test_the_completion_script_of_a_shell_is_printed() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "cosim.cli", "--show-completion", "bash"],
         capture_output=True, text=True, check=True,
@@ -56,13 +56,13 @@ def test_the_script_of_a_shell_is_shown() -> None:
     assert "_NOACK_COMPLETE=complete_bash" in done.stdout
 
 
-def test_every_key_is_offered_once_with_those_of_tables_that_may_be_chosen() -> None:
+def test_every_key_is_offered_once_including_those_of_optional_tables() -> None:
     found = keys(Scenario)
     assert len(found) == len(set(found))
     assert {"speed", "trigger.policy", "trigger.sigma", "network.loss.probability",
             "plant.watchdog.policy", "seeds.loss"} <= set(found)  # fmt: skip
 
 
-def test_without_runs_nothing_is_offered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_completed_without_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert run_directories("") == []

@@ -1,4 +1,4 @@
-"""What the help promises: a story, examples that work, one word for one thing."""
+"""The help: an introduction, examples that work, and one word for each concept."""
 
 import json
 import re
@@ -21,7 +21,7 @@ from noack.core.errors import NoackError
 PROGRAM: Any = get_command(app)
 COMMANDS: dict[str, Any] = dict(PROGRAM.commands)
 OURS = sorted(COMMANDS.keys() - {"netem"})
-"""netem's words are its own; its help is of argparse."""
+"""netem has its own vocabulary; its help is by argparse."""
 
 
 def help_of(*command: str) -> str:
@@ -35,11 +35,11 @@ def examples() -> list[tuple[str, str]]:
 
 
 def words_of(example: str) -> list[str]:
-    """An example's words after the program's name, without where a shell puts its output."""
+    """An example's arguments, without the redirection of its output."""
     return shlex.split(example.partition(">")[0])[1:]
 
 
-def test_the_help_begins_with_a_story() -> None:
+def test_the_help_begins_with_an_introduction() -> None:
     text = help_of()
     story, _, panels = text.partition("Options")
     told = re.findall(r"^ +noack (\w+)", story, re.MULTILINE)
@@ -73,7 +73,7 @@ def test_the_emulators_help_ends_with_examples(command: str) -> None:
 
 
 @pytest.mark.parametrize(("command", "example"), examples())
-def test_every_example_is_understood(
+def test_every_example_has_valid_arguments(
     command: str, example: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -83,7 +83,7 @@ def test_every_example_is_understood(
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where there is a run, if one in virtual time."""
+    """A folder, with a run in virtual time if needed."""
     folder = tmp_path_factory.mktemp("examples")
     words = ["simulate", "lane_following", "--set", "horizon_s=2", "--no-report"]
     done = CliRunner().invoke(app, [*words, "--runs", str(folder / "runs")])
@@ -105,7 +105,7 @@ MORE = {
     "doctor": ("--seconds", "0.1", "--set", "ports={}"),
     "demo": ("--set", "horizon_s=0.5", "--set", "ports={}", "--no-report"),
 }
-"""Commands whose first and last examples are run (of the slow ones the first), made short."""
+"""Commands of which the first and last example (for slow ones the first) are run, shortened."""
 
 
 def run_examples() -> list[str]:
@@ -127,14 +127,14 @@ def test_examples_work(example: str, folder: Path, monkeypatch: pytest.MonkeyPat
         json.loads(done.stdout)
 
 
-def test_commands_without_a_short_example_are_the_long_and_the_live_ones() -> None:
+def test_only_long_and_live_commands_have_no_short_example() -> None:
     assert set(OURS) - MORE.keys() == {
         "campaign", "compare", "controller", "design", "paper", "plant", "record", "run", "sensor",
         "set", "view",
     }  # fmt: skip
 
 
-def test_the_emulators_examples_are_understood() -> None:
+def test_the_emulators_examples_have_valid_arguments() -> None:
     text = emulator.parser().format_help().replace(" \\\n", " ")
     told = re.findall(r"^  noack netem (--.*)", text.partition("examples:")[2], re.MULTILINE)
     assert len(told) >= 5
@@ -149,7 +149,7 @@ def test_the_emulators_examples_are_understood() -> None:
 
 
 @pytest.mark.parametrize("command", OURS)
-def test_every_command_speaks_json(command: str) -> None:
+def test_every_command_has_a_json_option(command: str) -> None:
     assert "--json" in {name for one in COMMANDS[command].params for name in one.opts}
 
 
@@ -158,7 +158,7 @@ OF_THEIR_OWN = {
     "--out": "a folder of results, or a scenario file",
     "--runs": "where they are made, or the last one is looked for",
 }
-"""Options that mean what fits the command, and say so."""
+"""Options with a different meaning in each command, which their help states."""
 
 
 def test_options_of_the_same_name_mean_the_same_everywhere() -> None:

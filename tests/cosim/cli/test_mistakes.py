@@ -1,4 +1,4 @@
-"""A mistake in how a command is called is one line, with what would be right."""
+"""A mistake in a command's arguments gives one line with the remedy."""
 
 import json
 import socket
@@ -50,7 +50,7 @@ def noack(line: str) -> Result:
 
 
 @pytest.mark.parametrize(("line", "said"), MISTAKES.items())
-def test_a_mistake_is_one_line_and_with_json_a_document(line: str, said: str) -> None:
+def test_a_mistake_gives_one_line_and_with_json_a_document(line: str, said: str) -> None:
     done = noack(line)
     assert (done.exit_code, done.stdout, done.stderr) == (2, "", f"{said}\n")
     done = noack(f"{line} --json" if line != "demo --set" else "demo --json --set")
@@ -62,9 +62,7 @@ def test_a_mistake_is_one_line_and_with_json_a_document(line: str, said: str) ->
 
 @pytest.mark.parametrize(("name", "said"), NOT_FOUND.items())
 @pytest.mark.parametrize("command", ["check", "certify", "simulate", "run", "doctor"])
-def test_a_scenario_that_is_not_there_suggests_the_nearest(
-    command: str, name: str, said: str
-) -> None:
+def test_an_unknown_scenario_suggests_the_nearest_name(command: str, name: str, said: str) -> None:
     done = noack(f"{command} {name} --json")
     assert done.exit_code == 2
     assert said in done.stderr
@@ -79,7 +77,7 @@ def test_a_long_key_is_shortened() -> None:
     assert len(done.stderr) < 400
 
 
-def test_without_a_command_the_help_is_shown() -> None:
+def test_the_help_is_shown_without_a_command() -> None:
     done = noack("")
     assert done.exit_code == 2
     assert "noack doctor" in done.stdout
@@ -87,7 +85,7 @@ def test_without_a_command_the_help_is_shown() -> None:
 
 
 def test_a_process_that_fails_is_named_once(tmp_path: Path) -> None:
-    """The process names itself in its log, and the launcher names it; neither does so twice."""
+    """Both the process's log and the launcher name the process; the message contains it once."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
         port = other.getsockname()[1]

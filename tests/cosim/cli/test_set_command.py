@@ -1,4 +1,4 @@
-"""`noack set`: its words, and how it finds a run."""
+"""`noack set`: its arguments, and the run that it applies to."""
 
 import os
 import stat
@@ -37,7 +37,7 @@ def coordinator(ticket: Ticket) -> Iterator[Coordinator]:
         found.close()
 
 
-def test_words_are_keys_and_values() -> None:
+def test_arguments_are_keys_and_values() -> None:
     words = ["loss.p", "0.9", "mansd=2", "setpoint", "[1.0, 0.0]", "loss.model", "bernoulli"]
     assert parsed(words) == {
         "network.loss.probability": 0.9,
@@ -61,7 +61,7 @@ def test_mistaken_words_are_told(words: list[str], why: str) -> None:
         parsed(words)
 
 
-def test_without_a_run_that_is_said(ticket: Ticket) -> None:
+def test_a_missing_run_is_reported(ticket: Ticket) -> None:
     done = CliRunner().invoke(app, ["set", "loss.p", "0.5"])
     assert done.exit_code == 2
     assert "no run is active" in done.stderr
@@ -85,7 +85,7 @@ def test_a_run_is_found_by_its_session_its_directory_or_as_the_newest(ticket: Ti
     assert list(path.parent.iterdir()) == []
 
 
-def test_only_what_runs_can_be_changed(ticket: Ticket, coordinator: Coordinator) -> None:
+def test_only_active_runs_can_be_changed(ticket: Ticket, coordinator: Coordinator) -> None:
     asked = {"settings": {"network.mansd": 1}}
     with pytest.raises(CallerError, match="the run has not begun"):
         coordinator._answer_to(asked)

@@ -1,4 +1,4 @@
-"""``noack scenarios``: what comes with noack, and a file to start one's own from."""
+"""``noack scenarios``: the shipped scenarios, and a file to start one's own from."""
 
 import json
 import tomllib
@@ -19,17 +19,17 @@ def scenarios(*words: str) -> Result:
     return CliRunner().invoke(app, ["scenarios", *words], prog_name="noack")
 
 
-def test_all_are_listed_with_what_they_say_of_themselves() -> None:
+def test_all_shipped_scenarios_are_listed_with_their_description() -> None:
     done = scenarios()
     assert done.exit_code == 0
-    listed = [" ".join(line.split()) for line in done.stdout.splitlines()]  # a line each
+    listed = [" ".join(line.split()) for line in done.stdout.splitlines()]  # one line each
     for folder, names in (("scenarios", SCENARIOS), ("campaigns", CAMPAIGNS)):
         for name in names:
             content = tomllib.loads((ROOT / folder / f"{name}.toml").read_text("utf-8"))
             assert f"{name} {content['description']}" in listed
 
 
-def test_a_folder_of_the_same_name_is_not_taken_for_it(
+def test_a_folder_with_a_scenarios_name_is_ignored(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -39,7 +39,7 @@ def test_a_folder_of_the_same_name_is_not_taken_for_it(
     assert load(Path(found["path"])).name == "cart_pole"
 
 
-def test_the_list_as_a_document_names_files_that_can_be_read() -> None:
+def test_the_json_list_contains_readable_files() -> None:
     document = json.loads(scenarios("--json").stdout)
     assert [one["name"] for one in document["scenarios"]] == SCENARIOS
     assert [one["name"] for one in document["campaigns"]] == CAMPAIGNS
@@ -48,19 +48,17 @@ def test_the_list_as_a_document_names_files_that_can_be_read() -> None:
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
-def test_a_printed_scenario_is_the_shipped_one_wherever_it_is_put(
-    name: str, tmp_path: Path
-) -> None:
+def test_a_printed_scenario_loads_from_any_folder(name: str, tmp_path: Path) -> None:
     done = scenarios(name)
     assert done.exit_code == 0
     copy = tmp_path / "mine.toml"
     copy.write_text(done.stdout, encoding="utf-8")
     assert load(copy) == load(ROOT / "scenarios" / f"{name}.toml")
-    assert "schema" not in done.stdout  # which lies elsewhere
+    assert "schema" not in done.stdout  # which is in another folder
 
 
 @pytest.mark.parametrize("words", [["lane_folowing"], ["lane_folowing", "--json"]])
-def test_a_name_that_is_not_shipped_is_one_line(words: list[str]) -> None:
+def test_an_unknown_scenario_name_gives_one_line(words: list[str]) -> None:
     done = scenarios(*words)
     assert done.exit_code == 2
     assert "lane_folowing: not a shipped file; did you mean lane_following?" in (done.stderr)

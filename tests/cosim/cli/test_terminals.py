@@ -1,4 +1,4 @@
-"""Pipes, terminals, and readers who leave."""
+"""Pipes, terminals, and readers that close the pipe early."""
 
 import os
 import pty
@@ -19,7 +19,7 @@ COLOUR = re.compile(r"\x1b\[[0-9;]*\b(3[0-8]|4[0-8]|9[0-7]|10[0-7])[0-9;]*m")
 
 
 def environment(**more: str) -> dict[str, str]:
-    """The tests', without what speaks of terminals and colours."""
+    """The tests' environment without variables that concern terminals and colours."""
     said = ("NO_COLOR", "FORCE_COLOR", "PY_COLORS", "TTY_COMPATIBLE", "TTY_INTERACTIVE",
             "GITHUB_ACTIONS", "COLUMNS", "TERM", "COLORTERM")  # fmt: skip
     kept = {name: value for name, value in os.environ.items() if name not in said}
@@ -27,7 +27,7 @@ def environment(**more: str) -> dict[str, str]:
 
 
 def on_a_terminal(*arguments: str, cwd: Path, **more: str) -> str:
-    """What a command writes that has a terminal for both of its outputs."""
+    """A command's output with both streams connected to a terminal."""
     reading, writing = pty.openpty()
     command = [*NOACK, *arguments]
     with subprocess.Popen(
@@ -43,7 +43,7 @@ def on_a_terminal(*arguments: str, cwd: Path, **more: str) -> str:
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
-def test_pipes_get_text_and_nothing_else(command: tuple[str, ...], tmp_path: Path) -> None:
+def test_pipes_receive_plain_text_only(command: tuple[str, ...], tmp_path: Path) -> None:
     done = subprocess.run(
         [*NOACK, *command], cwd=tmp_path, env=environment(), capture_output=True, check=True
     )
@@ -52,18 +52,18 @@ def test_pipes_get_text_and_nothing_else(command: tuple[str, ...], tmp_path: Pat
     assert b"simulated" not in done.stderr
 
 
-def test_a_terminal_gets_colours_unless_it_does_not_want_them(tmp_path: Path) -> None:
+def test_a_terminal_receives_colours_unless_they_are_disabled(tmp_path: Path) -> None:
     assert COLOUR.search(on_a_terminal("check", "lane_following", cwd=tmp_path))
     assert COLOUR.search(on_a_terminal("--help", cwd=tmp_path))
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
-def test_no_color_is_respected(command: tuple[str, ...], tmp_path: Path) -> None:
+def test_the_variable_no_color_disables_colours(command: tuple[str, ...], tmp_path: Path) -> None:
     assert not COLOUR.search(on_a_terminal(*command, cwd=tmp_path, NO_COLOR="1"))
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
-def test_a_dumb_terminal_gets_no_control_characters(
+def test_a_dumb_terminal_receives_no_control_characters(
     command: tuple[str, ...], tmp_path: Path
 ) -> None:
     said = on_a_terminal(*command, cwd=tmp_path, TERM="dumb")
@@ -73,7 +73,7 @@ def test_a_dumb_terminal_gets_no_control_characters(
 @pytest.mark.parametrize(
     "command", [("--help",), ("certify", "unstable_pendulum"), ("schema",), SIMULATE], ids=" ".join
 )
-def test_a_reader_who_leaves_is_no_mistake(command: tuple[str, ...], tmp_path: Path) -> None:
+def test_a_closed_pipe_is_not_an_error(command: tuple[str, ...], tmp_path: Path) -> None:
     reading, writing = os.pipe()
     os.close(reading)
     done = subprocess.run(
@@ -84,7 +84,7 @@ def test_a_reader_who_leaves_is_no_mistake(command: tuple[str, ...], tmp_path: P
     assert (done.returncode, done.stderr) == (0, b"")
 
 
-def test_the_exit_status_is_the_commands_whoever_reads(tmp_path: Path) -> None:
+def test_the_exit_status_does_not_depend_on_the_reader(tmp_path: Path) -> None:
     reading, writing = os.pipe()
     os.close(reading)
     command = [*NOACK, "certify", "no_such_scenario", "--json"]
@@ -96,7 +96,7 @@ def test_the_exit_status_is_the_commands_whoever_reads(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])
-def test_what_is_said_is_heard_at_once(unbuffered: str, tmp_path: Path) -> None:
+def test_output_is_flushed_at_once(unbuffered: str, tmp_path: Path) -> None:
     command = [*NOACK, "plant", "--session", "nobodys"]
     more = environment(PYTHONUNBUFFERED=unbuffered, XDG_RUNTIME_DIR=str(tmp_path))
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=more) as process:
@@ -110,7 +110,7 @@ def test_what_is_said_is_heard_at_once(unbuffered: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "words", [("scenarios",), ("scenarios", "--json"), ("scenarios", "lane_weighted")]
 )
-def test_a_full_disk_is_one_line(words: tuple[str, ...], tmp_path: Path) -> None:
+def test_a_full_disk_gives_one_line(words: tuple[str, ...], tmp_path: Path) -> None:
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
             [*NOACK, *words], cwd=tmp_path, env=environment(),
@@ -121,7 +121,7 @@ def test_a_full_disk_is_one_line(words: tuple[str, ...], tmp_path: Path) -> None
     assert done.stderr.count("\n") == 1
 
 
-def test_a_terminal_gets_the_list_wrapped(tmp_path: Path) -> None:
+def test_the_list_is_wrapped_on_a_terminal(tmp_path: Path) -> None:
     wrapped = on_a_terminal("scenarios", cwd=tmp_path, COLUMNS="60", NO_COLOR="1")
     assert max(map(len, wrapped.splitlines())) <= 60
     assert "unstable_pendulum" in wrapped

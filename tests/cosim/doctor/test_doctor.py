@@ -1,4 +1,4 @@
-"""``noack doctor``, on the machine that tests run on: that it measures, not what."""
+"""``noack doctor`` on the machine of the tests: that it measures, not the values."""
 
 import json
 import socket
@@ -19,7 +19,7 @@ def doctor(*arguments: str) -> Result:
     return CliRunner().invoke(app, ["doctor", *arguments])
 
 
-def test_everything_is_measured_and_judged(tmp_path: Path) -> None:
+def test_every_check_gives_a_finding(tmp_path: Path) -> None:
     done = doctor(*SHORT, "--json", "--runs", str(tmp_path))
     said = json.loads(done.stdout)
     assert done.exit_code == (1 if said["verdict"] == "bad" else 0)
@@ -46,7 +46,7 @@ def test_a_taken_port_makes_a_run_impossible() -> None:
     assert "already taken" in " ".join(done.stdout.split())
 
 
-def test_a_scenario_wants_wall_time() -> None:
+def test_the_requirements_of_a_scenario_are_in_wall_time() -> None:
     wanted = requirements_of(resolve(load(Path("scenarios/lane_following.toml"), ["speed=4"])))
     assert (wanted.duration_s, wanted.period_ns, wanted.allowance_ns) == (5.0, 500_000, 1_000_000)
     assert wanted.rate_hz == 2000
@@ -54,7 +54,7 @@ def test_a_scenario_wants_wall_time() -> None:
 
 
 @pytest.mark.parametrize("arguments", [("--seconds", "0"), ("no_such_scenario",)])
-def test_what_cannot_be_meant_is_refused(arguments: tuple[str, ...]) -> None:
+def test_invalid_arguments_are_refused(arguments: tuple[str, ...]) -> None:
     done = doctor(*arguments)
     assert done.exit_code == 2
     assert len(done.stderr.splitlines()) == 1

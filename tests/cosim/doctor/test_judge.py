@@ -1,4 +1,4 @@
-"""From numbers to verdicts, without a machine."""
+"""From measured values to findings, independent of the machine."""
 
 import re
 from dataclasses import replace
@@ -36,7 +36,7 @@ IDEAL = MachineFacts(
 
 
 def about(what: str, wanted: RunRequirements = WANTED, **changed: Any) -> MachineFinding:
-    """The first finding of a kind that is not good; the first of all if every one is."""
+    """The first finding of a kind that is not good, or the first one if all are good."""
     found = [one for one in judge(replace(IDEAL, **changed), wanted) if one.what.startswith(what)]
     return next((one for one in found if one.verdict is not FindingStatus.GOOD), found[0])
 
@@ -97,7 +97,7 @@ def test_lateness_is_compared_with_the_allowance_of_the_certificates() -> None:
     assert "certificate.late_periods" in found.remedy
 
 
-def test_settings_that_a_run_does_not_use_limit_nothing() -> None:
+def test_unused_settings_do_not_affect_the_findings() -> None:
     late = Lateness(1000, 50.0, 3000.0, 9000.0, 4)
     assert about("wake-ups", plain=late).verdict is FindingStatus.GOOD
     without = WANTED._replace(realtime=False)
@@ -107,7 +107,7 @@ def test_settings_that_a_run_does_not_use_limit_nothing() -> None:
     assert about("real-time", without, granted=refused).verdict is FindingStatus.GOOD
 
 
-def test_wake_ups_that_could_not_be_measured_are_not_good() -> None:
+def test_missing_wake_up_measurements_are_not_good() -> None:
     assert about(
         "wake-ups with the real-time settings applied", realtime="it timed out"
     ).verdict is (FindingStatus.LIMITED)

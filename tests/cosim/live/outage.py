@@ -1,4 +1,4 @@
-"""A run in virtual time whose controller stands still for a while, as under SIGSTOP.
+"""A run in virtual time with a controller that stands still for a while, as under SIGSTOP.
 
 ``python -m tests.cosim.live.outage`` prints the table of docs/scenarios.md.
 """
@@ -31,11 +31,11 @@ CASES = (
 
 
 class Frozen:
-    """A machine that does nothing from one time to another, and then catches up.
+    """A machine that does nothing during an interval, and then catches up.
 
     Args:
-        machine: the machine.
-        from_ns, until_ns: when it stands still.
+        machine: the wrapped machine.
+        from_ns, until_ns: the interval in which it stands still.
     """
 
     def __init__(self, machine: Machine[Any], from_ns: int, until_ns: int) -> None:
@@ -61,11 +61,11 @@ class Frozen:
 
 
 class Deaf:
-    """A machine to which some messages never come: lost in a socket, say.
+    """A machine that does not receive some messages, as if they were lost in a socket.
 
     Args:
-        machine: the machine.
-        hears: whether a message, by its number among those sent, comes.
+        machine: the wrapped machine.
+        hears: maps the number of a sent message to whether it arrives.
     """
 
     def __init__(self, machine: Machine[Any], hears: Callable[[int], bool]) -> None:
@@ -80,12 +80,12 @@ class Deaf:
 
 
 class Reborn:
-    """A machine that another takes the place of.
+    """A machine that is replaced by a restarted one.
 
     Args:
-        machine: the one that dies.
-        successor: the one that follows.
-        at_ns: when.
+        machine: the machine that ends.
+        successor: the restarted machine.
+        at_ns: time of the restart.
     """
 
     def __init__(self, machine: Machine[Any], successor: Machine[Any], at_ns: int) -> None:
@@ -112,7 +112,7 @@ def simulate_with(
     wrap: Callable[[Machine[Any]], Machine[Any]],
     network: Network | None = None,
 ) -> RunRecord:
-    """Simulate a scenario in which something befalls the machine of a role."""
+    """Simulate a scenario with the machine of one role replaced."""
     name = f"{role}_of"
     build = getattr(cosim.simulation.virtual_time, name)
     with patch.object(
@@ -122,13 +122,13 @@ def simulate_with(
 
 
 def with_outage(resolved: Scenario, from_s: float, until_s: float) -> RunRecord:
-    """Simulate a scenario whose controller stands still from ``from_s`` to ``until_s``."""
+    """Simulate a scenario; its controller stands still from ``from_s`` to ``until_s``."""
     from_ns, until_ns = round(from_s * 1e9), round(until_s * 1e9)
     return simulate_with(resolved, "controller", lambda one: Frozen(one, from_ns, until_ns))
 
 
 def at_the_end(name: str, mode: str, policy: str, lasts_s: float) -> float:
-    """‖x‖ at the end of an outage, root mean square over the times at which it begins."""
+    """‖x‖ at the end of an outage, root mean square over the start times of the outage."""
     squares = []
     for from_s in STARTS_S:
         chosen = "hold" if policy == NO_OUTAGE else policy

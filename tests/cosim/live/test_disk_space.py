@@ -25,7 +25,7 @@ def with_free(monkeypatch: pytest.MonkeyPatch, free: int) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: Usage(free))
 
 
-def test_the_size_is_that_of_the_rows_but_for_events(content: dict[str, Any]) -> None:
+def test_the_estimated_size_is_that_of_all_rows_except_events(content: dict[str, Any]) -> None:
     resolved = resolve(scenario_of(content))
     record = simulate(resolved)
     events = ("controller_delivery", "netem_packet", "netem_release")

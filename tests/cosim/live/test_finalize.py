@@ -32,7 +32,7 @@ SHORT = ["horizon_s=1", "plant.rate_hz=200", "controller.rate_hz=200"]
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run without a summary that is marked as live; its record is a simulated one's."""
+    """A run that is marked as live, with the record of a simulated one and without a summary."""
     folder = tmp_path_factory.mktemp("recorded")
     record = simulate(resolve(load(find_shipped("lane_following", "scenarios"), SHORT)))
     (folder / SCENARIO_FILE).write_text(dumps(record.scenario))
@@ -48,7 +48,7 @@ def finalized(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same run with its summary and report."""
     folder = tmp_path_factory.mktemp("finalized") / "run"
     shutil.copytree(recorded, folder)
-    assert reopen(folder).status == ExitStatus.FAILED  # it has no ending of its own
+    assert reopen(folder).status == ExitStatus.FAILED  # it has no stored ending
     assert (folder / REPORT_FILE).stat().st_size > 10_000
     return folder
 
@@ -112,7 +112,7 @@ def test_a_run_whose_record_is_lost_fails(run_dir: Path) -> None:
     record = cosim.live.finalize.load_record(run_dir)
     no_rows = {table: record[table][:0] for table in record.tables}
     write_record(RunRecord(record.scenario, no_rows, [], {}), run_dir)
-    (run_dir / REPORTS_FILE).unlink()  # of how much there was, nobody knows
+    (run_dir / REPORTS_FILE).unlink()  # the total number of rows is unknown
     outcome = finalize(ended_well(run_dir), report=False)
     assert outcome.status == ExitStatus.FAILED
     assert outcome.reason == "the run cannot be replayed: the record has no inputs"
@@ -157,7 +157,7 @@ def test_a_damaged_summary_is_written_again(whole: Path, end: Any) -> None:
 
 
 def test_the_stored_ending_is_used_without_a_summary(run_dir: Path) -> None:
-    """A blank file is of a launcher that ended before the run."""
+    """An empty file comes from a launcher that ended before the run."""
     with EndingFile(run_dir) as file:
         assert (reopen(run_dir).status, reopen(run_dir).reason) == (1, "the launcher ended early")
         (run_dir / SUMMARY_FILE).unlink()

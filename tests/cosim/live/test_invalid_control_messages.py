@@ -1,4 +1,4 @@
-"""What is no message of the run ends nobody: it is refused or ignored, and the rest goes on."""
+"""An invalid control message is refused or ignored, and all processes continue."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Which processes a launcher restarts, when it ends the run instead, and with which reason."""
+"""Which processes the launcher restarts, when it ends the run, and the reason it reports."""
 
 import time
 from pathlib import Path
@@ -19,7 +19,7 @@ KILLED = "sensor died: killed by SIGKILL"
 
 
 class Child:
-    """A process that has exited with a status, or runs."""
+    """A process that has exited with a status, or is running."""
 
     stdin = None
 
@@ -33,7 +33,7 @@ class Child:
 
 
 class FakeCoordinator:
-    """What the launcher asks the coordinator."""
+    """The part of the coordinator that the launcher uses."""
 
     epoch_ns = 0
 
@@ -65,7 +65,7 @@ class FakeCoordinator:
 
 
 class FakeChildren(ChildProcesses):
-    """All processes run, but for the sensor, which has exited."""
+    """All processes run except the sensor, which has exited."""
 
     def __init__(self, ticket: Any, run_dir: Path, code: int | None) -> None:
         super().__init__(ticket, run_dir, ROLES)
@@ -129,7 +129,7 @@ def test_a_process_that_reported_an_error_is_not_restarted(case: Case, code: int
         (None, "the disk is full"),
     ],
 )
-def test_the_reason_is_from_the_log_or_else_from_the_report(
+def test_the_reason_is_taken_from_the_log_or_else_from_the_report(
     case: Case, log: str | None, why: str
 ) -> None:
     case.log.unlink()
@@ -138,7 +138,7 @@ def test_the_reason_is_from_the_log_or_else_from_the_report(
     assert case.result(1) == (ExitStatus.FAILED, f"sensor: {why}")
 
 
-def test_the_exit_status_of_a_process_counts_more_than_its_report(case: Case) -> None:
+def test_the_exit_status_of_a_process_takes_precedence_over_its_report(case: Case) -> None:
     children = case.children(None)
     coordinator = FakeCoordinator(0.5, "sensor", sensor="sensor ended early: no room")
     policy = case.run(children, coordinator)._policy
@@ -158,7 +158,7 @@ def test_a_restart_that_fails_ends_the_run(case: Case) -> None:
     assert case.run(children, FakeCoordinator(0.5))._policy.check() == (ExitStatus.FAILED, reason)
 
 
-def test_a_process_that_nobody_restarts_ends_the_run(
+def test_a_process_that_is_not_restarted_ends_the_run(
     case: Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     policy = case.run(case.children(-9), FakeCoordinator(0.5))._policy
@@ -203,9 +203,9 @@ def test_a_recorder_that_sorts_a_long_record_need_not_respond(case: Case) -> Non
     assert policy.check() == (ExitStatus.FAILED, "recorder died: killed by SIGKILL")
 
 
-def test_a_progress_report_that_arrives_with_the_end_is_shown(case: Case) -> None:
+def test_a_progress_report_that_arrives_at_the_end_is_shown(case: Case) -> None:
     class Ending(FakeCoordinator):
-        """All processes exit after the first look; the last report arrives after it."""
+        """All processes exit after the first check; the last report arrives after it."""
 
         looks = 0
 

@@ -24,7 +24,7 @@ def test_merged_rows_are_unique_and_ordered(ranges: list[tuple[int, int]]) -> No
     assert rows.dtype == ROW
 
 
-def test_nothing_merges_to_an_empty_table() -> None:
+def test_merging_no_batches_gives_an_empty_table() -> None:
     rows = merge_rows([], ROW)
     assert rows.shape == (0,)
     assert rows.dtype == ROW

@@ -1,4 +1,4 @@
-"""Numbers of a run that are shown beside the settings."""
+"""Figures of a run that are shown next to the settings."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ def simulated(scenario: str, **settings: Any) -> noack.Run:
 
 
 def test_the_expected_loss_rate_is_shown_beside_the_measured_one() -> None:
-    """Of a chance p under a cap N: Σ_{k=1…N} p^k drops for each delivery."""
+    """With loss probability p and cap N, Σ_{k=1…N} p^k drops are expected for each delivery."""
     summary = simulated("lane_following", horizon_s=2.0).summary
     drops = sum(0.8**k for k in range(1, 5))
     assert summary["loss_expected"] == pytest.approx(drops / (1 + drops))

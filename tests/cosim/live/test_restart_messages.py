@@ -1,4 +1,4 @@
-"""What the summary says of processes that took another's place."""
+"""The summary's messages about restarted processes."""
 
 from typing import Any
 
@@ -34,7 +34,7 @@ def test_a_restart_without_rows_is_listed(content: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("newest", [1, 2])
 def test_missing_first_rows_of_a_restart_are_counted(content: dict[str, Any], newest: int) -> None:
-    """It died before a recorder was back to which it could have sent them again."""
+    """The process died before a recorder was back to which it could have sent them again."""
     record = simulate(resolve(validate(content, "")))
     rows = record[SENSOR_MEASUREMENT].copy()
     rows["input"][50:80] = GENERATION + 7 + np.arange(30)

@@ -1,4 +1,4 @@
-"""A recorder that takes another's place knows what that one knew."""
+"""A restarted recorder continues from the state of the one before it."""
 
 import errno
 import json
@@ -26,7 +26,7 @@ from tests.fuzz.plane import FakePlane, Query, Sample
 
 
 class Run:
-    """A run directory, and the recorders that follow each other in it."""
+    """A run directory and its successive recorders."""
 
     def __init__(self, content: dict[str, Any], run_dir: Path) -> None:
         self.scenario, self.run_dir = resolve(validate(content, "")), run_dir
@@ -124,8 +124,10 @@ def test_a_restarted_recorder_does_not_wait_for_ended_processes(
     assert run.recorder.finished
 
 
-def test_a_log_on_a_full_disk_costs_no_record(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What fails first then is the view; to say so must not fail, too."""
+def test_a_log_on_a_full_disk_does_not_stop_the_record(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The view fails first; reporting the failure must not raise another error."""
 
     class Full(StringIO):
         def write(self, text: str) -> int:

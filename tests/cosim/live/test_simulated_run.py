@@ -1,4 +1,4 @@
-"""A simulated run leaves a run directory that everything which reads runs takes."""
+"""A simulated run gives a run directory that all readers of run directories accept."""
 
 import json
 from pathlib import Path
@@ -41,7 +41,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_directory_is_a_live_runs_directory(runs: Path) -> None:
+def test_a_simulated_run_has_the_files_of_a_live_run(runs: Path) -> None:
     run_dir = runs / "latest"
     assert {path.name for path in run_dir.iterdir()} == {
         "scenario.toml", "environment.json", "record", "recording.rrd", "reports.json",
@@ -65,7 +65,7 @@ def test_a_report_can_be_omitted_and_written_later(tmp_path: Path) -> None:
     assert report.exists()
 
 
-def test_the_record_on_disk_is_the_simulators(runs: Path) -> None:
+def test_the_record_on_disk_equals_the_simulators(runs: Path) -> None:
     again, loaded = simulate(resolve(load(PATH, SHORT))), load_record(runs / "latest")
     assert all(again[table].tobytes() == loaded[table].tobytes() for table in again.tables)
     assert loaded.scenario == again.scenario
@@ -96,7 +96,7 @@ def test_a_lost_summary_is_written_again_from_the_record(runs: Path, tmp_path: P
     assert anew | {"exit": None} == content | {"exit": None}
 
 
-def test_the_recording_shows_the_run_without_lateness(runs: Path) -> None:
+def test_the_recording_of_a_simulated_run_has_no_lateness(runs: Path) -> None:
     reader = rerun.chunk.RrdReader(runs / "latest" / "recording.rrd")
     (store,) = reader.recordings()
     paths = {chunk.entity_path.removeprefix("/") for chunk in reader.stream(store=store)}
@@ -118,8 +118,8 @@ def test_an_interrupted_simulation_leaves_no_run_directory(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_older_run_directory_is_a_live_runs(runs: Path, tmp_path: Path) -> None:
-    """Run directories that were made before simulation was do not say what they are."""
+def test_a_run_directory_without_a_kind_is_a_live_run(runs: Path, tmp_path: Path) -> None:
+    """Run directories made before simulations existed do not state their kind."""
     folder = tmp_path / "old"
     folder.mkdir()
     for path in (runs / "latest").iterdir():
@@ -130,7 +130,7 @@ def test_an_older_run_directory_is_a_live_runs(runs: Path, tmp_path: Path) -> No
     assert load_record(folder).kind == "simulated"
 
 
-def test_the_view_opens_where_the_controller_errs_most(runs: Path) -> None:
+def test_the_view_opens_at_the_largest_controller_error(runs: Path) -> None:
     run_dir = runs / "latest"
     record = load_record(run_dir)
     joined = join_all(record)

@@ -67,7 +67,7 @@ def test_a_process_may_not_join_again_once_another_has_its_role(
     )
 
 
-def test_the_reason_of_an_end_is_the_reported_one(plane: FakePlane, barrier: Coordinator) -> None:
+def test_the_reason_for_an_end_is_the_reported_one(plane: FakePlane, barrier: Coordinator) -> None:
     assert barrier.reported_failure("sensor") is None
     plane.put("ended", Sample("noack/0/ended/sensor/one", b"the disk is full"))
     barrier.poll()

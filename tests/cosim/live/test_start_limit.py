@@ -20,7 +20,7 @@ def test_the_start_limit_grows_with_the_load(load: float, times: int) -> None:
     assert reached_after_s(StartLimit(30.0, 2), load) == pytest.approx(30.0 * times, abs=0.25)
 
 
-def test_only_the_present_load_extends_the_limit() -> None:
+def test_only_the_current_load_extends_the_limit() -> None:
     limit = StartLimit(30.0, 2)
     limit.wait(60.0, 6.0)
     assert not limit.is_reached

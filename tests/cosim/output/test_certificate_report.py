@@ -1,4 +1,4 @@
-"""``noack certify``: what it says, to a person and to a program; what the documentation quotes."""
+"""``noack certify``: its text and JSON output, and the figures quoted in the documentation."""
 
 import json
 import re
@@ -45,8 +45,8 @@ def weighted() -> Study:
     return study(scenario("lane_weighted"), 2)
 
 
-def test_the_lane_example_reaches_its_figures(lane: Study, weighted: Study) -> None:
-    """A hundred times the printed inter-event time; Δ = M = 5 in a chosen weight."""
+def test_the_lane_example_has_its_documented_figures(lane: Study, weighted: Study) -> None:
+    """A hundred times the paper's inter-event time; Δ = M = 5 in a chosen weight."""
     assert lane.theorem_2 is not None
     printed_s = lane.theorem_2.inter_event_s
     assert found(lane, IDEAL, "certificate")["inter_event_s"] >= 100 * printed_s
@@ -55,7 +55,7 @@ def test_the_lane_example_reaches_its_figures(lane: Study, weighted: Study) -> N
     assert found(weighted, IDEAL, "box certificate")["delta"] == pytest.approx(5.0, abs=1e-9)
 
 
-def test_the_documentation_quotes_what_is_computed(lane: Study, weighted: Study) -> None:
+def test_the_documentation_quotes_computed_figures(lane: Study, weighted: Study) -> None:
     assert lane.theorem_2 is not None
     text = (ROOT / "docs/theory.md").read_text().partition("## The adversary")[0]
     rows = {
@@ -81,7 +81,7 @@ def test_the_documentation_quotes_what_is_computed(lane: Study, weighted: Study)
 
 
 def test_beyond_the_largest_certified_schedule_there_is_no_certificate(lane: Study) -> None:
-    """The limits are limits: a little less stands, a little more does not."""
+    """The limits are tight: slightly less is certified, slightly more is not."""
     from noack.theory.run_conditions import nominal_conditions
     from noack.theory.scenario_certificates import own_plant
 
@@ -98,7 +98,7 @@ def test_beyond_the_largest_certified_schedule_there_is_no_certificate(lane: Stu
             assert (scope.certificate(changed).constants is not None) == stands
 
 
-def test_a_weight_is_chosen_that_contracts_and_keeps_the_volume() -> None:
+def test_the_chosen_weight_makes_the_model_contract_and_keeps_the_volume() -> None:
     resolved = scenario(
         "lane_following", 'model={name="double_integrator"}', "plant={initial_state=[1.0,0.0]}"
     )
@@ -117,14 +117,14 @@ def test_a_weight_is_chosen_that_contracts_and_keeps_the_volume() -> None:
     assert better["inter_event_s"] >= plain["inter_event_s"]
 
 
-def test_no_weight_helps_a_hold() -> None:
+def test_no_weight_improves_a_hold() -> None:
     with pytest.raises(CallerError, match=r"weight chosen: α = 0\.25 /s is not below"):
         with_weight(scenario("lane_following", 'mode="zoh"'), "chosen")
     with pytest.raises(CallerError, match='given, identity or chosen, not "best"'):
         with_weight(scenario("lane_following"), "best")
 
 
-def test_identity_takes_the_weight_away() -> None:
+def test_identity_removes_the_weight() -> None:
     plain, W = with_weight(scenario("lane_weighted"), "identity")
     assert W is None
     assert plain.trigger.weight is None
@@ -143,8 +143,8 @@ def test_the_command_prints_one_document() -> None:
     assert document["limits"]["the scenario's plant"]["sampling_s"] > 0.002
 
 
-def test_nothing_certified_is_a_failure_that_says_why() -> None:
-    """The gain does not stabilise this plant at all."""
+def test_a_missing_certificate_fails_with_the_reason() -> None:
+    """The gain does not stabilise this plant."""
     settings = ["--set", "model.gain=[[1.0, 1.0]]", "--set", "model.allow_unstable=true"]
     result = CliRunner().invoke(app, ["certify", "unstable_pendulum", *settings])
     assert result.exit_code == 1
@@ -152,7 +152,7 @@ def test_nothing_certified_is_a_failure_that_says_why() -> None:
     assert "grows at" in result.stdout
 
 
-def test_what_is_certified_is_said_in_words_with_its_conditions() -> None:
+def test_the_text_states_the_bounds_and_their_conditions() -> None:
     result = CliRunner().invoke(app, ["certify", "unstable_pendulum"])
     said = " ".join(result.stdout.split())
     sentences = said.split("In words: ")[1:]
@@ -170,7 +170,7 @@ def test_what_is_certified_is_said_in_words_with_its_conditions() -> None:
         assert f"on, ‖x‖ ≤ {one['floor_constants']['state']:.4g}." in sentence
 
 
-def test_a_gain_of_the_other_sign_is_recognised() -> None:
+def test_a_gain_of_the_opposite_sign_is_recognised() -> None:
     settings = ["--set", "model.gain=[[15.0, 5.0]]", "--set", "model.allow_unstable=true"]
     arguments = ["certify", "unstable_pendulum", *settings]
     said = " ".join(CliRunner().invoke(app, arguments).stdout.split())
@@ -188,8 +188,8 @@ def test_a_gain_of_the_other_sign_is_recognised() -> None:
     ],
 )
 @pytest.mark.filterwarnings("error::RuntimeWarning")
-def test_numbers_beyond_floating_point_are_no_certificate(settings: list[str]) -> None:
-    """Neither a traceback nor a certificate with a constant that is no number."""
+def test_numbers_that_overflow_give_no_certificate(settings: list[str]) -> None:
+    """Neither a traceback nor a certificate with a non-finite constant."""
     arguments = [part for setting in settings for part in ("--set", setting)]
     result = CliRunner().invoke(app, ["certify", "unstable_pendulum", "--json", *arguments])
     assert result.exit_code in (0, 1), result.output
@@ -226,7 +226,7 @@ def test_a_plant_outside_its_box_is_named() -> None:
 
 
 def test_a_box_too_large_for_alpha_is_certified_at_a_slower_rate() -> None:
-    """Bounds that fall like e^(−rate·t), and no inter-event time; a larger box has none at all."""
+    """Bounds decay like e^(−rate·t), without an inter-event time; a larger box has no bounds."""
     certified = {}
     for wide in (0.2, 0.5, 5.0):
         settings = [

@@ -1,8 +1,8 @@
-"""The palette's colours can be told from their backgrounds, and from each other by everyone.
+"""The palette's colours differ from their backgrounds, and from each other for everyone.
 
 Colour-blindness is simulated after Machado, Oliveira and Fernandes, "A Physiologically-based Model
 for Simulation of Color Vision Deficiency", 2009, at full severity; colours are compared in Oklab
-(Ottosson, 2020), in which a hundredth or two is what an eye can just tell.
+(Ottosson, 2020), in which a distance of 0.01 to 0.02 is just noticeable.
 """
 
 from itertools import combinations
@@ -53,7 +53,7 @@ TO_OKLAB = np.array(
     ]
 )
 BODIES = (palette.PLANT, palette.SENSOR, palette.CONTROLLER)
-"""What is drawn one on the other in every picture and plot of states."""
+"""Colours that are drawn on each other in every picture and plot of states."""
 PANELS: dict[str, tuple[palette.Colour, ...]] = {
     "states": BODIES,
     "errors": (
@@ -87,8 +87,8 @@ def distance(one: palette.Colour, other: palette.Colour, vision: NDArray[np.floa
 
 
 @pytest.mark.parametrize("background", BACKGROUNDS)
-def test_every_colour_stands_out_from_its_background(background: str) -> None:
-    """3 to 1, what WCAG asks of graphics."""
+def test_every_colour_has_enough_contrast_to_its_background(background: str) -> None:
+    """3 to 1, WCAG's minimum for graphics."""
     behind = luminance(BACKGROUNDS[background])
     for colour in CONCEPTS:
         low, high = sorted((luminance(colour), behind))
@@ -103,7 +103,7 @@ def test_colours_of_one_panel_can_be_told_apart(panel: str, vision: str) -> None
         assert distance(one, other, VISIONS[vision]) > least, (one, other)
 
 
-def test_no_two_concepts_look_the_same_to_anybody() -> None:
+def test_all_concepts_can_be_told_apart_with_colour_blindness() -> None:
     for vision in VISIONS.values():
         for one, other in combinations(CONCEPTS, 2):
             assert distance(one, other, vision) > 0.05, (one, other)

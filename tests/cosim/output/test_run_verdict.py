@@ -1,4 +1,4 @@
-"""The end of a run: three lines, one table that fits, and nothing alarming without a cause."""
+"""The end of a run: three lines, one table that fits, and no warning without a cause."""
 
 import io
 import json
@@ -24,13 +24,13 @@ RED = "\x1b[1;31m"
 
 @pytest.fixture(scope="module")
 def outcome(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
-    """Of the paper's example, which goes well."""
+    """The paper's example, completed without problems."""
     run = noack.simulate("lane_following", runs=tmp_path_factory.mktemp("runs"))
     return reopen(run.directory)
 
 
 def printed(outcome: Outcome, *, verbose: bool = False, **changed: Any) -> str:
-    """What a terminal of 80 columns gets, colours included."""
+    """The output on a terminal of 80 columns, colours included."""
     file = io.StringIO()
     console = Console(file=file, width=80, force_terminal=True, color_system="standard")
     print_outcome(console, replace(outcome, summary=outcome.summary | changed), verbose=verbose)
@@ -80,7 +80,7 @@ def test_verbose_prints_all_tables_without_warnings(outcome: Outcome) -> None:
         (0, "horizon; rows are missing", "completed 20 s: horizon; rows are missing"),
     ],
 )  # fmt: skip
-def test_the_first_line_says_how_a_run_ended(
+def test_the_first_line_states_how_the_run_ended(
     outcome: Outcome, status: int, reason: str, said: str
 ) -> None:
     first, *_ = verdict(outcome.summary | {"exit": {"status": status, "reason": reason}})
@@ -98,7 +98,7 @@ def test_claims_that_did_not_hold_are_counted_with_a_reason(outcome: Outcome) ->
     assert verdict(outcome.summary | {"claims": []})[2].text == "claims: none"
 
 
-def test_what_breaks_the_guarantee_is_unmistakable(outcome: Outcome) -> None:
+def test_a_broken_guarantee_is_shown_as_an_error(outcome: Outcome) -> None:
     broken = {
         "t_s": 2.5,
         "process": "controller",
@@ -111,7 +111,7 @@ def test_what_breaks_the_guarantee_is_unmistakable(outcome: Outcome) -> None:
     assert RED in text
 
 
-def test_an_assumption_that_a_scenario_breaks_is_a_warning(tmp_path: Path) -> None:
+def test_an_assumption_that_a_scenario_violates_is_a_warning(tmp_path: Path) -> None:
     trigger = {"policy": "absolute", "delta": 0.02}
     run = noack.simulate(noack.load("double_integrator", {"trigger": trigger}), runs=tmp_path)
     assert "warning:" in (text := printed(reopen(run.directory)))
@@ -123,10 +123,11 @@ def test_the_table_fits_eighty_columns(scenario: str, tmp_path: Path) -> None:
     run = noack.simulate(noack.load(scenario, {"horizon_s": 1.0}), runs=tmp_path)
     rows = short_numbers(run.summary)
     assert max(len(name) for name, _ in rows) + max(len(value) for _, value in rows) <= 73
-    assert "ideal loop" not in verdict(run.summary)[1].text  # there is none to compare with
+    # there is no other value to compare with
+    assert "ideal loop" not in verdict(run.summary)[1].text
 
 
-def test_summary_prints_the_same_short_form_and_all_of_it_on_request(outcome: Outcome) -> None:
+def test_summary_prints_the_short_form_and_all_tables_on_request(outcome: Outcome) -> None:
     def noack_summary(*more: str) -> str:
         command = [sys.executable, "-m", "cosim.cli", "summary", str(outcome.run_dir), *more]
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout
@@ -149,7 +150,7 @@ def test_a_live_run_has_latency_and_deadlines_in_its_table(outcome: Outcome) -> 
     assert rows["sensor-to-controller latency p50 / p99"] == "600 / 900 µs"
 
 
-def test_a_run_that_is_not_of_the_present_version_is_printed_all_the_same(
+def test_a_run_of_another_version_is_printed(
     outcome: Outcome, capsys: pytest.CaptureFixture[str]
 ) -> None:
     earlier = {key: value for key, value in outcome.summary.items()

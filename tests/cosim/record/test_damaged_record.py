@@ -1,4 +1,4 @@
-"""A damaged run directory: what is readable is read, what is not is said in a line."""
+"""A damaged run directory: the readable part is read, the rest is reported in one line."""
 
 import json
 from collections.abc import Callable
@@ -41,7 +41,7 @@ def change(run_dir: Path, do: Callable[[pa.Table], pa.Table]) -> None:
         (lambda n: pa.array([None] + [0] * (n - 1), pa.int64()), "column t_ns has holes"),
     ],
 )
-def test_a_column_is_of_its_type_and_whole(
+def test_a_column_of_another_type_or_with_missing_values_is_refused(
     run_dir: Path, values: Callable[[int], Any], expected: str
 ) -> None:
     change(
@@ -54,7 +54,7 @@ def test_a_column_is_of_its_type_and_whole(
         load_record(run_dir)
 
 
-def test_a_column_is_there_once(run_dir: Path) -> None:
+def test_a_repeated_column_is_refused(run_dir: Path) -> None:
     change(run_dir, lambda table: table.append_column("t_ns", table["t_ns"]))
     with pytest.raises(CallerError, match=r"plant_step\.parquet: .*t_ns"):
         load_record(run_dir)
@@ -67,7 +67,7 @@ def test_a_column_is_there_once(run_dir: Path) -> None:
         {"ended": "horizon", "channel": {}, "rows": {"plant_step": "1", "plant_actuation": 1}},
     ],
 )  # fmt: skip
-def test_what_is_no_report_counts_as_none(run_dir: Path, report: object) -> None:
+def test_an_invalid_report_is_ignored(run_dir: Path, report: object) -> None:
     path = run_dir / REPORTS_FILE
     path.write_text(json.dumps(json.loads(path.read_text()) | {"plant": report}))
     record = load_record(run_dir)
@@ -75,7 +75,7 @@ def test_what_is_no_report_counts_as_none(run_dir: Path, report: object) -> None
     assert json.loads(summarise(record, 0, "").model_dump_json())["missing_samples"] == 0
 
 
-def test_of_a_damaged_spool_the_rest_is_kept(run_dir: Path) -> None:
+def test_the_readable_part_of_a_damaged_spool_is_read(run_dir: Path) -> None:
     record = load_record(run_dir)
     rows, steps = record[PLANT_STEP], len(record[PLANT_STEP])
     (run_dir / RECORD / f"{PLANT_STEP}.parquet").unlink()

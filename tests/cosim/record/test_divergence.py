@@ -1,4 +1,4 @@
-"""A run that diverges is told from one that is disturbed, saturated, short or in a limit cycle."""
+"""A diverging run is distinguished from a disturbed, saturated, short or oscillating one."""
 
 from typing import Any
 
@@ -64,15 +64,16 @@ def shapes() -> dict[str, Matrix]:
 
 
 @pytest.mark.parametrize("name", shapes())
-def test_what_does_not_diverge_is_not_accused(content: dict[str, Any], name: str) -> None:
+def test_a_bounded_run_is_not_reported_as_diverged(content: dict[str, Any], name: str) -> None:
     assert divergence(T_S, shapes()[name], [scenario(content)]) is None
 
 
-def test_a_late_disturbance_or_set_point_gives_the_run_its_scale(content: dict[str, Any]) -> None:
+def test_a_disturbance_or_set_point_sets_the_scale_of_the_state(content: dict[str, Any]) -> None:
     content["trigger"]["beta"] = 1e-9
     late = at_0_unless(T_S >= 9.5) + 1e-12
     plain = scenario(content)
-    assert divergence(T_S, late, [plain]) is not None  # nothing in it explains such a state
+    # nothing in the run explains a state of this size
+    assert divergence(T_S, late, [plain]) is not None
     step = {"kind": "step", "amplitude": [1.0], "from_s": 0.0}
     assert divergence(T_S, late, [scenario(content, disturbances=[step])]) is None
     moved = plain.controller.model_copy(update={"setpoint": (1.0, 0.0)})
@@ -80,7 +81,7 @@ def test_a_late_disturbance_or_set_point_gives_the_run_its_scale(content: dict[s
 
 
 def unstable(content: dict[str, Any], horizon_s: float) -> Scenario:
-    """The sign convention of Matlab, wanted: A + BK has an eigenvalue 4.64."""
+    """The sign convention of Matlab, on purpose: A + BK has the eigenvalue 4.64."""
     content["model"] = {
         "A": [[0.0, 1.0], [3.0, -0.5]], "B": [[0.0], [1.0]], "gain": [[6.16, 3.17]],
         "allow_unstable": True,
@@ -102,7 +103,7 @@ def test_a_simulated_run_that_diverges_fails(content: dict[str, Any]) -> None:
     assert stopped["diverged_at_s"] == sampled["diverged_at_s"]
 
 
-def test_a_run_too_short_to_tell_does_not_fail(content: dict[str, Any]) -> None:
+def test_a_run_too_short_to_show_divergence_does_not_fail(content: dict[str, Any]) -> None:
     found = summarise(simulate(unstable(content, 0.5)), 0, "horizon").to_json()
     assert found["final_state_norm"] < GROWTH * found["initial_state_norm"]
     assert (found["exit"]["status"], found["diverged_at_s"]) == (0, None)

@@ -1,4 +1,4 @@
-"""``latest`` is followed if link and run are the user's own, and said to be another's if not."""
+"""``latest`` is followed if link and run belong to the user; otherwise the owner is reported."""
 
 import os
 import subprocess
@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[3]
 
 @pytest.fixture
 def runs(tmp_path: Path) -> Path:
-    """A folder in which everybody may write, and remove what is their own, as in /tmp."""
+    """A folder that everybody may write to, where users remove only their own files, as in /tmp."""
     folder = tmp_path / "runs"
     for name in ("first", "second"):
         (folder / name).mkdir(parents=True)
@@ -37,7 +37,7 @@ def require_root() -> None:
         pytest.skip("only root may give a file to another user")
 
 
-def test_the_newest_is_where_the_link_leads(runs: Path) -> None:
+def test_latest_is_the_target_of_the_link(runs: Path) -> None:
     with pytest.raises(CallerError, match="no run yet"):
         latest_run(runs)
     for name in ("first", "second"):
@@ -47,7 +47,7 @@ def test_the_newest_is_where_the_link_leads(runs: Path) -> None:
 
 
 @pytest.mark.parametrize("whose", ["link", "run"])
-def test_what_is_another_user_s_is_not_opened(runs: Path, whose: str) -> None:
+def test_a_run_of_another_user_is_not_opened(runs: Path, whose: str) -> None:
     require_root()
     point_to_latest(runs / "first")
     os.chown(
@@ -60,13 +60,13 @@ def test_what_is_another_user_s_is_not_opened(runs: Path, whose: str) -> None:
     ):
         with pytest.raises(CallerError, match=rf"^{runs / LATEST}: .* is another user's; name the"):
             opened()
-    assert chosen_run(runs / "first", runs) == runs / "first"  # whose name says which it is
+    assert chosen_run(runs / "first", runs) == runs / "first"  # the link's name identifies the run
 
 
-def test_a_link_that_cannot_be_replaced_is_said(runs: Path) -> None:
+def test_a_link_that_cannot_be_replaced_is_reported(runs: Path) -> None:
     require_root()
     point_to_latest(runs / "first")
-    # Relative: another user need not be let into the folders above.
+    # A relative path: the other user may lack access to the parent folders.
     script = (
         "import os, pathlib, sys, cosim.record.run_directory;"
         "os.chdir(sys.argv[1]); os.setuid(int(sys.argv[2]));"

@@ -1,4 +1,4 @@
-"""The tables and columns of the record: docs/record.md describes them as the code declares them."""
+"""The tables and columns of the record agree with docs/record.md."""
 
 from pathlib import Path
 

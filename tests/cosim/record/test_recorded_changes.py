@@ -1,4 +1,4 @@
-"""Runs whose settings change: replay, the identity (I1), and the cap, whatever changes when."""
+"""Runs with changes of runtime parameters: replay, the identity (I1), and the cap."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -91,7 +91,7 @@ def test_whatever_changes_the_run_is_replayed_and_the_identity_holds(
     residual = identity_residual(record, joined)
     scale = float(np.abs(joined.x_s).max())
     assert np.nanmax(residual) <= 1e-12 * max(scale, 1.0)
-    # A run of losses is no longer than the larger of the caps that were in force during it.
+    # The number of consecutive losses never exceeds the largest cap in force meanwhile.
     caps = [(-1, 3), *((one.change.t_ns, one.scenario.network.mansd) for one in changes_of(record))]
     began_ns = 0
     for row in record[NETEM_PACKET]:
@@ -109,7 +109,7 @@ def test_whatever_changes_the_run_is_replayed_and_the_identity_holds(
     assert summarise(record, 0, "horizon").to_json()["assumption_violations"] == []
 
 
-def test_each_machine_applies_a_change_at_its_own_first_time_not_before_it() -> None:
+def test_each_machine_applies_a_change_at_its_first_time_not_before_it() -> None:
     at_ns = 1_003 * MS
     record = run_with([(at_ns, {"trigger.beta": 0.5, "network.loss.probability": 0.0})])
     assert [len(record[table]) for table in (SENSOR_SETTING, NETEM_SETTING, CONTROLLER_SETTING)]
@@ -124,7 +124,7 @@ def test_each_machine_applies_a_change_at_its_own_first_time_not_before_it() -> 
     assert (packets["fate"][packets["now_ns"] >= at_ns] == Fate.DELIVERED).all()
 
 
-def test_the_plant_goes_to_the_set_point_and_both_models_know_it() -> None:
+def test_the_plant_and_both_models_converge_to_the_set_point() -> None:
     record = run_with(
         [(1_003 * MS, {"controller.setpoint": [2.0, 0.0]})], horizon_s=12.0, plant={
             "initial_state": [1.0, 0.0], "rate_hz": 100.0,
@@ -136,12 +136,12 @@ def test_the_plant_goes_to_the_set_point_and_both_models_know_it() -> None:
     assert steps["u"] == pytest.approx((steps["x_c"] - x_r) @ loop.K.T)
 
 
-def test_a_cap_that_shrinks_in_the_middle_of_a_burst_lets_the_next_datagram_pass() -> None:
+def test_a_cap_lowered_during_a_burst_delivers_the_next_datagram() -> None:
     content = CONTENT | {"network": {"mansd": 5, "loss": {"model": "worst_case"}}}
     link = update_link_of(resolve(validate(content, "here")))
     runs = []
     for number in range(12):
-        if number == 5:  # one passed, and four have been lost
+        if number == 5:  # one datagram was delivered, then four were lost
             link.announce(ParameterChange(0, 50 * MS, {"network.mansd": 2}), 45 * MS)
         (row,) = [one.row for one in link.handle(Datagram(0, b"x"), number * 10 * MS)
                   if isinstance(one, Record)]  # fmt: skip
@@ -151,7 +151,7 @@ def test_a_cap_that_shrinks_in_the_middle_of_a_burst_lets_the_next_datagram_pass
     assert max(lost) == 4
 
 
-def test_dropouts_are_held_against_the_caps_of_their_time() -> None:
+def test_dropouts_are_compared_with_the_cap_of_their_time() -> None:
     content = CONTENT | {"network": {"mansd": 5, "loss": {"model": "lossless"}}}
     controller = controller_of(resolve(validate(content, "here")))
 
@@ -161,19 +161,19 @@ def test_dropouts_are_held_against_the_caps_of_their_time() -> None:
 
     assert delivered(0, 0) == []
     controller.announce(ParameterChange(0, 50 * MS, {"network.mansd": 1}), 0)
-    assert delivered(5, 60 * MS) == []  # four were lost while five might be
+    assert delivered(5, 60 * MS) == []  # four were lost while the cap was five
     (text,) = delivered(8, 90 * MS)
     assert "2 successive dropouts" in text
     assert "at most 1 assumed" in text
 
 
-def test_who_is_started_anew_is_told_and_applies_what_is_in_force() -> None:
+def test_a_restarted_process_applies_the_parameters_in_force() -> None:
     resolved = resolve(validate(CONTENT, "here"))
     change = ParameterChange(0, 500 * MS, {"trigger.beta": 0.5, "controller.setpoint": [2.0, 0.0]})
     sensor = sensor_of(resolved, Start(1, 2_000 * MS))
     (said,) = sensor.announce(change, 2_000 * MS)
     assert isinstance(said, Record)
-    assert said.row[4] == change.t_ns  # not late: it had no time of its own yet
+    assert said.row[4] == change.t_ns  # not late: the process had no time of its own yet
     x = np.array([1.0, 0.0])
     sensor.handle(Message(Flow.MEASUREMENT, 0, 2_000 * MS, x), 2_000 * MS)
     outputs = sensor.handle(Message(Flow.MEASUREMENT, 1, 2_010 * MS, x), 2_010 * MS)
@@ -184,7 +184,7 @@ def test_who_is_started_anew_is_told_and_applies_what_is_in_force() -> None:
     assert rate == pytest.approx(loop.H @ (x - x_r), rel=0.02, abs=0.02)
 
 
-def test_processes_that_were_told_otherwise_are_found() -> None:
+def test_differing_changes_of_two_processes_are_found() -> None:
     record = run_with([(1_003 * MS, {"trigger.beta": 0.5})])
     rows = {table: record[table].copy() for table in record.tables}
     rows[NETEM_SETTING]["t_ns"] += 1
@@ -195,8 +195,8 @@ def test_processes_that_were_told_otherwise_are_found() -> None:
     assert found.what == "another process received another change"
 
 
-def test_who_hears_of_a_change_too_late_says_so_and_voids_what_it_touches() -> None:
-    """The controller is told at 1 s of what was to be so from 0.9 s on."""
+def test_a_change_received_too_late_is_reported_and_voids_its_claims() -> None:
+    """The controller receives at 1 s a change that applies from 0.9 s on."""
     resolved = resolve(validate(CONTENT, "here"))
     change = ParameterChange(0, 900 * MS, {"controller.setpoint": [2.0, 0.0]})
     told_ns = {"sensor": 500 * MS, "netem": 500 * MS, "controller": 1_000 * MS}
@@ -224,13 +224,13 @@ def test_who_hears_of_a_change_too_late_says_so_and_voids_what_it_touches() -> N
     assert [one.verdict for one in claims] == [ClaimVerdict.HELD] * 4
     assert claims[0].until_s == 0.9
     assert claims[-1].from_s > made.everywhere_ns * 1e-9
-    # In between the models were apart by what they did not both know.
+    # In between, only one of the two models had the change.
     joined = join_all(record)
     between = (joined.t_ns > 910 * MS) & (joined.t_ns < claims[-1].from_s * 1e9)
     assert np.nanmax(identity_residual(record, joined)[between]) > 1e-3
 
 
-def test_a_sensor_with_an_observer_is_told_too() -> None:
+def test_a_sensor_with_an_observer_applies_a_change() -> None:
     changes = [
         {"at_s": 1.0, "set": {"trigger.beta": 0.01, "network.mansd": 0}},
         {"at_s": 2.0, "set": {"controller.setpoint": [0.0, 0.0]}},
@@ -245,14 +245,16 @@ def test_a_sensor_with_an_observer_is_told_too() -> None:
 
 
 @pytest.mark.parametrize("machine_of", [sensor_of, network_of, controller_of])
-def test_the_machines_of_the_baseline_refuse(machine_of: Callable[[Scenario], Any]) -> None:
+def test_the_machines_of_the_acknowledgement_baseline_refuse_changes(
+    machine_of: Callable[[Scenario], Any],
+) -> None:
     content = CONTENT | {"network": CONTENT["network"] | {"protocol": "ack"}}
     machine = machine_of(resolve(validate(content, "here")))
     with pytest.raises(CallerError, match="changed"):
         machine.announce(ParameterChange(0, MS, {"network.mansd": 1}), 0)
 
 
-def test_who_decides_every_fate_cannot_have_changes() -> None:
+def test_changes_are_refused_with_a_network_that_decides_every_fate() -> None:
     listed = [{"at_s": 1.0, "set": {"network.mansd": 1}}]
     resolved = resolve(validate(CONTENT | {"changes": listed}, "here"))
     with pytest.raises(CallerError, match="settings that stay the same"):

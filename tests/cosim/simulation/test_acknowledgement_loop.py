@@ -1,4 +1,4 @@
-"""The acknowledgement baseline on the whole loop in virtual time, and in replay."""
+"""The acknowledgement baseline in the whole loop in virtual time, and in replay."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -79,8 +79,8 @@ def fates(record: RunRecord, flow: int) -> list[int]:
 
 
 @pytest.mark.parametrize("mode", ["model", "zoh"])
-def test_without_any_loss_it_is_the_ordinary_loop(mode: str) -> None:
-    """An acknowledgement that takes no time is there before the next measurement."""
+def test_without_losses_the_baseline_equals_the_ordinary_loop(mode: str) -> None:
+    """An acknowledgement without delay arrives before the next measurement."""
     start = (f"mode={mode}", "network.initial_sync=known_state", LOSSLESS, "trigger.beta=0.05")
     one = simulate(acknowledged(*start, "network.acknowledgements={}"))
     other = simulate(plain(*start))
@@ -103,7 +103,7 @@ POLICIES = [
 
 
 @pytest.mark.parametrize("policy", POLICIES)
-def test_every_policy_goes_on_from_what_was_acknowledged(policy: str) -> None:
+def test_every_policy_continues_from_the_last_acknowledged_state(policy: str) -> None:
     start = (f"trigger={policy}", "network.initial_sync=known_state", LOSSLESS)
     one = simulate(acknowledged(*start, "network.acknowledgements={}"))
     other = simulate(plain(*start))
@@ -124,7 +124,7 @@ def test_the_models_agree_whenever_all_acknowledgements_have_arrived(record: Run
     before = np.searchsorted(answers["input"], rows["input"])
     known = np.append(NO_SEQUENCE, answers["sequence"])[before]
     arrived = known == joined.received
-    # An event's own update is taken at the time of its sample, after the sample.
+    # The update of an event is applied at the time of its sample, after the sample.
     arrived &= rows["event"] == NO_SEQUENCE
     assert 10 < arrived.sum() < len(rows)
     scale = np.abs(joined.x).max()
@@ -147,12 +147,12 @@ def test_the_sensor_waits_for_an_acknowledgement_or_the_timeout(overrides: tuple
         if one["event"] not in answers["sequence"][between]:
             too_soon += following["t_ns"] - one["t_ns"] < timeout_ns
             waited += following["t_ns"] - one["t_ns"] == timeout_ns
-        assert following["x"].tobytes() != one["x"].tobytes()  # the then current state
+        assert following["x"].tobytes() != one["x"].tobytes()  # the current state at that time
     assert too_soon == 0
     assert waited > 3
 
 
-def test_by_default_the_timeout_allows_for_the_delays_there_and_back() -> None:
+def test_the_default_timeout_covers_the_delays_of_both_directions() -> None:
     assert (
         acknowledged("network.acknowledgements={}").timing.acknowledgement_timeout_ns == 50_000_000
     )
@@ -163,7 +163,7 @@ def test_by_default_the_timeout_allows_for_the_delays_there_and_back() -> None:
     assert acknowledged(*late).timing.acknowledgement_timeout_ns == 120_000_000
 
 
-def test_lost_acknowledgements_cost_transmissions_and_none_has_none_to_lose() -> None:
+def test_lost_acknowledgements_cause_transmissions_only_in_the_baseline() -> None:
     """The paper's motivation; docs/scenarios.md has the numbers over 20 seeds and 20 s."""
 
     def mean(make: Any, *overrides: str) -> float:
@@ -197,7 +197,7 @@ def test_each_direction_has_its_own_random_stream() -> None:
     assert {Fate.DELIVERED, Fate.DROPPED} == set(answers)
 
 
-def test_the_cap_of_the_way_back_holds() -> None:
+def test_the_cap_of_the_reverse_direction_holds() -> None:
     back = 'network.acknowledgements={mansd=2, loss={model="worst_case"}}'
     found = fates(simulate(acknowledged(back)), ACKNOWLEDGEMENTS)
     assert len(found) > 6
@@ -211,7 +211,7 @@ def test_the_summary_counts_acknowledgements() -> None:
         assert found["sent"] == summary["deliveries"] == len(record[CONTROLLER_DELIVERY])
         assert found["received"] == len(record[SENSOR_ACKNOWLEDGEMENT])
         assert found["lost"] > 0
-        assert 0 <= found["sent"] - found["lost"] - found["received"] <= 2  # under way at the end
+        assert 0 <= found["sent"] - found["lost"] - found["received"] <= 2  # in flight at the end
         assert summary["unintended_losses"] == summary["missing_samples"] == 0
         assert summary["identity_residual_max"] is None
     assert summarise(MESS, 0, "horizon").to_json()["rejected_datagrams"]["sensor"].keys() <= {
@@ -259,7 +259,7 @@ def test_a_flipped_bit_of_an_acknowledgement_is_found(column: str, bit: int) -> 
 @pytest.mark.parametrize("column", ["head", "fate", "flow", "size_bytes", "sequence"])
 def test_a_flipped_bit_of_a_packet_is_found_in_its_row(flow: int, column: str) -> None:
     row = int(np.flatnonzero(MESS[NETEM_PACKET]["flow"] == flow)[5])
-    # Of the flow the bit that makes the one direction the other, and one that makes it neither.
+    # Two bits of the flow: one changes the direction, the other makes it invalid.
     for bit in (0, 5):
         first = replay(altered(NETEM_PACKET, row, column, bit)).first_difference
         assert first is not None
@@ -267,7 +267,7 @@ def test_a_flipped_bit_of_a_packet_is_found_in_its_row(flow: int, column: str) -
         assert column == "flow" or first.row == row
 
 
-def test_a_record_survives_its_files(tmp_path: Path) -> None:
+def test_a_record_is_unchanged_by_writing_and_reading(tmp_path: Path) -> None:
     ending = simulate_run(load(SCENARIOS / "lane_acknowledged.toml", [*COARSE, *MESSY]), tmp_path)
     loaded = load_record(ending.run_dir)
     assert loaded.tables.keys() == MESS.tables.keys()
@@ -278,7 +278,7 @@ def test_a_record_survives_its_files(tmp_path: Path) -> None:
     assert 'protocol = "ack"' in dumps(scenario)
 
 
-def test_nothing_is_claimed_of_it() -> None:
+def test_the_baseline_has_no_claims() -> None:
     record = simulate(acknowledged())
     (claim,) = ClaimEvaluation(record).judge()
     assert claim.verdict is ClaimVerdict.VOID
@@ -291,7 +291,7 @@ def test_nothing_is_claimed_of_it() -> None:
             refuse(record.scenario)
 
 
-def test_without_acknowledgements_there_is_no_trace_of_them() -> None:
+def test_a_run_without_acknowledgements_does_not_mention_them() -> None:
     scenario = plain()
     record = simulate(scenario)
     assert SENSOR_ACKNOWLEDGEMENT not in record.tables
@@ -315,13 +315,13 @@ def test_the_network_numbers_the_inputs_of_both_directions() -> None:
         network.handle(Datagram(2, bytes(48)), 20)
 
 
-def test_settings_of_a_way_back_that_there_is_not_are_a_mistake() -> None:
+def test_settings_of_the_reverse_direction_need_acknowledgements() -> None:
     with pytest.raises(
         CallerError, match=r"network\.acknowledgements.*there are none unless protocol"
     ):
         plain("network.acknowledgements.timeout_s=0.1")
 
 
-def test_a_way_back_is_of_no_effect_where_there_is_said_to_be_none() -> None:
+def test_settings_of_the_reverse_direction_have_no_effect_with_protocol_none() -> None:
     back = ("network.protocol=none", "network.acknowledgements.timeout_s=0.1")
     assert not plain(*back).protocol.acknowledges

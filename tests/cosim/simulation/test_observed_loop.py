@@ -1,4 +1,4 @@
-"""The whole loop with disturbances, noise and observers: what is estimated, and claimed."""
+"""The whole loop with disturbances, noise and observers: its estimates and its claims."""
 
 from typing import Any
 
@@ -39,7 +39,7 @@ CHANGE = {"at_s": 0.4, "set": {"trigger.floor": 0.02}}
 
 @pytest.fixture
 def observed(content: dict[str, Any]) -> dict[str, Any]:
-    """The double integrator under gusts, its position measured with noise, half of all lost."""
+    """The double integrator with gusts, a noisy position measurement and a loss rate of ½."""
     content["plant"] |= {"rate_hz": 100.0, "measurement": NOISE, "disturbances": [GUSTS]}
     content["controller"] = {"rate_hz": 100.0}
     content["trigger"] |= {"beta": 0.1, "floor": 0.1}
@@ -55,7 +55,7 @@ def run(content: dict[str, Any], **seeds: int) -> RunRecord:
     return simulate(resolved(content, **seeds))
 
 
-def test_the_estimation_error_is_as_large_as_the_filter_thinks(observed: dict[str, Any]) -> None:
+def test_the_estimation_error_agrees_with_the_filters_covariance(observed: dict[str, Any]) -> None:
     """Over N runs Σ eᵀP⁻¹e is χ² with 2N degrees of freedom (Bar-Shalom, Li, Kirubarajan 2001)."""
     N, covariance = 80, steady_state(resolved(observed)).covariance
     ends = np.array(
@@ -64,7 +64,8 @@ def test_the_estimation_error_is_as_large_as_the_filter_thinks(observed: dict[st
     distance = float(np.einsum("ki,ij,kj->", ends, np.linalg.inv(covariance), ends))
     low, high = chi2.ppf([5e-4, 1 - 5e-4], 2 * N)
     assert low < distance < high
-    assert 2 * N / 1.3**2 < low < high < 2 * N * 1.3**2  # so it would tell an error 30 % off
+    # so an error that is 30 % off would be detected
+    assert 2 * N / 1.3**2 < low < high < 2 * N * 1.3**2
 
 
 @pytest.mark.parametrize(
@@ -106,7 +107,7 @@ def _content(scenario: Scenario) -> dict[str, Any]:
     return tomllib.loads(dumps(scenario))
 
 
-def test_a_replay_finds_an_output_that_was_never_measured(observed: dict[str, Any]) -> None:
+def test_a_replay_finds_an_output_that_the_plant_did_not_measure(observed: dict[str, Any]) -> None:
     record = run(observed)
     rows = record[SENSOR_MEASUREMENT].copy()
     rows["y"][7] += 1e-12
@@ -121,7 +122,7 @@ def test_a_replay_finds_an_output_that_was_never_measured(observed: dict[str, An
     assert (found.first_difference.row, found.first_difference.column[0]) == (7, "y")
 
 
-def test_a_sensor_in_anothers_place_estimates_anew_and_is_replayed(
+def test_a_restarted_sensor_restarts_its_estimate_and_is_replayed(
     observed: dict[str, Any],
 ) -> None:
     observed["horizon_s"] = 2.0
@@ -135,7 +136,7 @@ def test_a_sensor_in_anothers_place_estimates_anew_and_is_replayed(
     again = np.flatnonzero(rows["input"] >= GENERATION)[0]
     assert rows["t_ns"][again] == at_ns
     assert rows["event"][again] == GENERATION
-    weight = 0.4**2 / (0.4**2 + 0.02**2)  # of the first estimate against the first output
+    weight = 0.4**2 / (0.4**2 + 0.02**2)  # of the first estimate relative to the first output
     expected = 0.5 + weight * (rows["y"][again, 0] - 0.5)
     np.testing.assert_allclose(rows["x"][again], [expected, 0.0], rtol=1e-12)
     notice = {"process": "sensor", "level": RESTART, "t_ns": at_ns, "text": "started anew"}
@@ -156,14 +157,14 @@ def test_measurements_that_are_lost_are_bridged_and_replayed(observed: dict[str,
     record = simulate_with(scenario, "sensor", lambda one: Deaf(one, lambda k: k not in lost))
     assert len(record[SENSOR_MEASUREMENT]) == 101 - len(lost)
     assert replay(record).bit_exact
-    # What the input was in the gap is not known: it was changing, by what the model decays in it.
+    # The input during the gap is unknown: it changes as the model decays.
     error = row_norms(estimation_error(record))
     moved = np.abs(np.diff(record[PLANT_STEP]["u"][:, 0])).max() * 4 * 0.04
     assert error[60:].max() < moved
     assert error[20:30].max() < 1e-6
 
 
-def test_what_follows_from_i1_is_judged_against_the_estimate_and_nothing_else_is_claimed(
+def test_only_i1_and_its_consequences_are_claimed_of_the_estimate(
     observed: dict[str, Any],
 ) -> None:
     observed["horizon_s"] = 4.0
@@ -175,14 +176,14 @@ def test_what_follows_from_i1_is_judged_against_the_estimate_and_nothing_else_is
     assert "what the sensor takes for x" in found[1].what
     assert claims.certificates == []
     assert [one.label for one in claims.envelopes()] == ["bound from (I1)"]
-    # Against the plant's own state the second would not hold: it is not claimed.
+    # Relative to the plant's own state the second claim would not hold, so it is not claimed.
     joined = join_all(record)
     e_c = row_norms(joined.x_c - true_states(record[PLANT_STEP], joined.t_ns))
     assert (e_c > joined.e_c_norm + 1e-6).any()
     assert (e_c <= joined.e_c_norm + row_norms(estimation_error(record)) + 1e-12).all()
 
 
-def test_with_noise_but_no_observer_what_is_measured_is_taken_for_x(
+def test_noisy_measurements_are_used_as_x_without_an_observer(
     observed: dict[str, Any],
 ) -> None:
     del observed["observer"]
@@ -196,7 +197,7 @@ def test_with_noise_but_no_observer_what_is_measured_is_taken_for_x(
     assert summarise(record, 0, "horizon").to_json()["estimation"]["observer"] is None
 
 
-def test_a_disturbed_plant_that_is_measured_keeps_the_paper_s_bound_line_by_line(
+def test_a_disturbed_plant_with_exact_measurements_keeps_the_papers_error_bound(
     observed: dict[str, Any],
 ) -> None:
     del observed["observer"]
@@ -212,7 +213,7 @@ def test_a_disturbed_plant_that_is_measured_keeps_the_paper_s_bound_line_by_line
     assert pushed["rms"] == pytest.approx(np.sqrt((record[PLANT_STEP]["d"] ** 2).mean()))
 
 
-def test_the_summary_says_how_good_the_estimate_was(observed: dict[str, Any]) -> None:
+def test_the_summary_contains_the_estimation_error(observed: dict[str, Any]) -> None:
     record = run(observed, disturbance=1, noise=2)
     found = summarise(record, 0, "horizon").to_json()["estimation"]
     norms = np.linalg.norm(estimation_error(record), axis=1)
@@ -225,7 +226,9 @@ def test_the_summary_says_how_good_the_estimate_was(observed: dict[str, Any]) ->
     assert found["sup_e_c_norm"] > 0
 
 
-def test_what_is_exact_or_certified_is_refused_in_one_line(observed: dict[str, Any]) -> None:
+def test_exact_simulation_and_certificates_are_refused_in_one_line(
+    observed: dict[str, Any],
+) -> None:
     scenario = resolved(observed)
     record = simulate(scenario)
     del observed["plant"]["disturbances"]
@@ -257,8 +260,10 @@ def verdict_on_noise(content: dict[str, Any]) -> str:
     return found.verdict
 
 
-def test_a_threshold_within_the_noise_is_told_beforehand(observed: dict[str, Any]) -> None:
-    """And it matters: the noise transmits then."""
+def test_a_threshold_within_the_noise_gives_a_warning_before_the_run(
+    observed: dict[str, Any],
+) -> None:
+    """The warning is justified: the noise alone triggers."""
     observed["horizon_s"] = 6.0
     observed["plant"] |= {"disturbances": [], "initial_state": [0.0, 0.0]}
     observed["plant"]["measurement"] = {"noise_std": [0.02, 0.02]}
@@ -274,7 +279,7 @@ def test_a_threshold_within_the_noise_is_told_beforehand(observed: dict[str, Any
     assert events[1.0] > 20 * max(events[3.1], 1)
 
 
-def test_numbers_that_no_riccati_equation_bears_are_told(observed: dict[str, Any]) -> None:
+def test_numbers_without_a_riccati_solution_are_refused(observed: dict[str, Any]) -> None:
     observed["model"] = {
         "A": [[0.0, 1.0], [1e9, 0.0]], "B": [[0.0], [1.0]], "gain": [[1.0, 1.0]],
         "allow_unstable": True,
@@ -286,7 +291,9 @@ def test_numbers_that_no_riccati_equation_bears_are_told(observed: dict[str, Any
     assert expected_rms(scenario) == np.inf
 
 
-def test_an_observer_that_does_not_converge_is_told_beforehand(observed: dict[str, Any]) -> None:
+def test_an_observer_that_does_not_converge_gives_a_warning_before_the_run(
+    observed: dict[str, Any],
+) -> None:
     observed["observer"] = {"kind": "luenberger", "gain": [[-0.1], [0.0]]}
     (found,) = [one for one in assumptions(resolved(observed)) if "observer's error" in one.what]
     assert found.verdict == "violated"

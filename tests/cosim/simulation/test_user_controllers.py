@@ -1,4 +1,4 @@
-"""Controllers of the user's own: the shipped examples, whole runs, refusals and mistakes."""
+"""User controllers: the shipped examples, whole runs, refusals and mistakes."""
 
 import importlib.util
 from pathlib import Path
@@ -30,7 +30,7 @@ LIMIT = 0.5
 
 
 def example(name: str, class_name: str, period_s: float, **parameters: Any) -> Any:
-    """An object of a shipped class, started on the double integrator."""
+    """An object of a shipped class, started for the double integrator."""
     spec = importlib.util.spec_from_file_location(name, SCENARIOS / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
@@ -52,7 +52,7 @@ def discrete_gain(period_s: float) -> np.ndarray:
     return gain
 
 
-def test_the_saturated_regulator_is_another_packages_between_its_limits() -> None:
+def test_the_saturated_regulator_has_another_packages_gain_within_its_limits() -> None:
     law = example("saturated_lqr", "SaturatedLqr", 0.01, limit=[LIMIT])
     x = np.array([0.1, 0.05])
     assert law.on_tick(0.0, x) == pytest.approx(-discrete_gain(0.01) @ x, rel=1e-9)
@@ -65,7 +65,7 @@ def test_the_predictive_controller_without_active_limits_is_the_regulator() -> N
 
 
 @pytest.mark.parametrize("x", [(2.0, 0.0), (1.0, -0.5), (-1.0, 0.3), (0.5, 0.45)])
-def test_the_predictive_controller_solves_its_programme(x: tuple[float, float]) -> None:
+def test_the_predictive_controller_solves_its_quadratic_programme(x: tuple[float, float]) -> None:
     law, x0 = predictive(), np.array(x)
     bound = {
         "type": "ineq",
@@ -80,8 +80,8 @@ def test_the_predictive_controller_solves_its_programme(x: tuple[float, float]) 
     np.testing.assert_allclose(law.solve(x0), found.x, atol=1e-4)
 
 
-def test_limits_of_states_that_cannot_be_met_leave_those_of_the_inputs() -> None:
-    z = predictive().solve(np.array([0.0, 5.0]))  # ten times the velocity's limit
+def test_input_limits_hold_if_state_limits_are_infeasible() -> None:
+    z = predictive().solve(np.array([0.0, 5.0]))  # ten times the velocity limit
     assert z[0] == pytest.approx(-LIMIT)
     assert (np.abs(z) <= LIMIT * (1 + 1e-9)).all()
 
@@ -98,7 +98,8 @@ def test_the_examples_settle_within_their_limits(name: str) -> None:
     assert (np.abs(u) == LIMIT).sum() > 5
     assert np.linalg.norm(x[-1]) < 0.1
     if name == "model_predictive":
-        # Predictions err by what is lost on the way: the trigger's threshold, for some updates.
+        # Lost updates cause prediction errors: the trigger's threshold times the number of lost
+        # updates.
         assert 0.4 < np.abs(x[:, 1]).max() < 1.2 * LIMIT
 
 
@@ -116,7 +117,7 @@ def test_a_run_keeps_the_class_and_is_replayed_bit_for_bit(name: str, tmp_path: 
     assert replay(record).bit_exact
 
 
-def test_a_sampled_campaign_draws_runs_of_it() -> None:
+def test_a_sampled_campaign_accepts_a_user_controller() -> None:
     work = SampledWork(
         in_virtual_time(load(SCENARIOS / "saturated_lqr.toml", ["horizon_s=2.0"])),
         7, None, None, 0.5, 1000,
@@ -126,7 +127,7 @@ def test_a_sampled_campaign_draws_runs_of_it() -> None:
     assert all(row["transmissions"] > 1 for row in first)
 
 
-def test_what_is_not_covered_is_named_in_one_line() -> None:
+def test_uncovered_theory_is_named_in_one_line() -> None:
     coverage = resolve(load(SCENARIOS / "saturated_lqr.toml")).coverage
     assert coverage.beyond_theory == 'controller.kind = "python": u is not K x_c'
     with pytest.raises(CallerError, match=r"^controller\.kind: needs the controller u = K x_c"):
@@ -144,7 +145,7 @@ def test_what_is_not_covered_is_named_in_one_line() -> None:
         ("controller.parameters={}", "SaturatedLqr.: TypeError: .*missing 3 required positional"),
     ],
 )
-def test_mistakes_in_the_settings(setting: str, message: str) -> None:
+def test_mistakes_in_the_settings_give_one_line(setting: str, message: str) -> None:
     with pytest.raises(CallerError, match=message) as refused:
         simulate(resolve(load(SCENARIOS / "saturated_lqr.toml", [setting])))
     assert "\n" not in str(refused.value)
@@ -184,7 +185,7 @@ def run_of(tmp_path: Path, **methods: str) -> RunRecord:
         ({"on_tick": "raise SystemExit(3)"}, "SystemExit: 3 (law.py, line 10)"),
     ],
 )
-def test_a_law_that_fails_sends_the_safe_input_from_then_on(
+def test_the_safe_input_is_sent_after_a_control_law_fails(
     methods: dict[str, str], message: str, tmp_path: Path
 ) -> None:
     record = run_of(tmp_path, **methods)
@@ -198,7 +199,7 @@ def test_a_law_that_fails_sends_the_safe_input_from_then_on(
     assert message in end.reason
 
 
-def test_the_law_receives_each_update_at_its_own_time(tmp_path: Path) -> None:
+def test_the_control_law_receives_each_update_with_its_own_time(tmp_path: Path) -> None:
     methods = {
         "on_update": "self.updates.append((t_s, *x))",
         "on_tick": "return [self.updates[-1][0]]",  # the time of the newest update, as the input

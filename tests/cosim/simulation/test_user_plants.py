@@ -1,4 +1,4 @@
-"""Whole runs of plants of the user's own, in virtual time: kept with the run, repeatable."""
+"""Whole runs of user plants in virtual time: stored with the run, and repeatable."""
 
 import json
 import re
@@ -70,7 +70,9 @@ def simulated(path: Path, horizon_s: float = 1.0) -> Path:
 
 
 @pytest.mark.parametrize("version", [2, 3])
-def test_an_fmu_moves_like_the_class_of_the_same_equations(version: int, tmp_path: Path) -> None:
+def test_an_fmu_moves_like_a_python_class_with_the_same_equations(
+    version: int, tmp_path: Path
+) -> None:
     path = prepared(tmp_path, FMU, "{ mu = 1.0 }")
     build(tmp_path, version).rename(tmp_path / "models" / "oscillator.fmu")
     of_fmu = load_record(simulated(path, 3.0))
@@ -86,7 +88,7 @@ def test_an_fmu_moves_like_the_class_of_the_same_equations(version: int, tmp_pat
 
 
 @pytest.mark.parametrize("kind", ["fmu", "python"])
-def test_a_run_keeps_its_plant_and_is_replayed_elsewhere_when_the_original_is_gone(
+def test_a_run_stores_its_plant_and_is_replayed_without_the_original(
     kind: str, tmp_path: Path
 ) -> None:
     path = prepared(tmp_path, FMU if kind == "fmu" else PYTHON, "{ mu = 2.0 }")
@@ -98,7 +100,7 @@ def test_a_run_keeps_its_plant_and_is_replayed_elsewhere_when_the_original_is_go
     assert replay(load_record(elsewhere)).bit_exact
     (kept,) = (elsewhere / "plant").iterdir()
     kept.write_bytes(kept.read_bytes() + b"\n")
-    record = load_record(elsewhere)  # what was recorded can be read all the same
+    record = load_record(elsewhere)  # the record is still readable
     with pytest.raises(CallerError, match="has changed: its SHA-256 is") as refused:
         replay(record)
     assert "\n" not in str(refused.value)
@@ -115,7 +117,7 @@ def test_a_run_keeps_its_plant_and_is_replayed_elsewhere_when_the_original_is_go
          "grease (mine.py, line 8)"),
     ],
 )  # fmt: skip
-def test_a_plant_that_fails_ends_the_motion_and_not_the_run(
+def test_a_failed_plant_stops_moving_and_the_run_is_recorded(
     kind: str, parameters: str, expected: str, tmp_path: Path
 ) -> None:
     path = prepared(tmp_path, FMU if kind == "fmu" else PYTHON, parameters)
@@ -134,7 +136,7 @@ def test_a_plant_that_fails_ends_the_motion_and_not_the_run(
     assert replay(record).bit_exact
 
 
-def test_replay_tells_of_a_plant_that_is_not_the_same_twice(tmp_path: Path) -> None:
+def test_replay_reports_a_plant_that_is_not_repeatable(tmp_path: Path) -> None:
     path = prepared(tmp_path, PYTHON, "{}")
     code = CODE.replace("= mu,", "= random.random(),")
     (tmp_path / "models" / "mine.py").write_text("import random\n" + code)
@@ -148,9 +150,7 @@ def test_replay_tells_of_a_plant_that_is_not_the_same_twice(tmp_path: Path) -> N
         ("python", "the plant: class VanDerPol of mine.py"),
     ],
 )
-def test_check_makes_the_plant_and_says_what_it_is(
-    kind: str, expected: str, tmp_path: Path
-) -> None:
+def test_check_creates_the_plant_and_describes_it(kind: str, expected: str, tmp_path: Path) -> None:
     path = prepared(tmp_path, FMU if kind == "fmu" else PYTHON, "{}")
     build(tmp_path, 3).rename(tmp_path / "models" / "oscillator.fmu")
     done = CliRunner().invoke(app, ["check", str(path)])
@@ -174,7 +174,7 @@ def test_check_makes_the_plant_and_says_what_it_is(
         ('{ kind = "python", file = ".", name = "a" }', '".": cannot be read: not a regular file'),
     ],
 )  # fmt: skip
-def test_settings_that_cannot_be_are_refused_when_they_are_loaded(
+def test_invalid_plant_settings_are_refused_on_loading(
     system: str, expected: str, tmp_path: Path
 ) -> None:
     path = prepared(tmp_path, system, "{}")
@@ -183,7 +183,7 @@ def test_settings_that_cannot_be_are_refused_when_they_are_loaded(
     assert expected in str(refused.value)
 
 
-def test_the_documented_fmu_is_one_that_runs(tmp_path: Path) -> None:
+def test_the_documented_fmu_runs(tmp_path: Path) -> None:
     text = (Path(__file__).parents[3] / "docs" / "plants.md").read_text()
     (block,) = re.findall(r"^```toml\n(# oscillator.*?)^```", text, re.DOTALL | re.MULTILINE)
     path = tmp_path / "oscillator.toml"
@@ -193,7 +193,7 @@ def test_the_documented_fmu_is_one_that_runs(tmp_path: Path) -> None:
     assert np.linalg.norm(x[-1]) < 0.2
 
 
-def test_an_fmu_that_begins_only_where_it_wants_has_no_linearisation(tmp_path: Path) -> None:
+def test_an_fmu_without_initial_variables_has_no_linearisation(tmp_path: Path) -> None:
     path = prepared(tmp_path, FMU.replace("PARAMETERS", "{}, initial_variables = []"), "{}")
     build(tmp_path, 2).rename(tmp_path / "models" / "oscillator.fmu")
     resolved = resolve(load(path, ["plant.initial_state=[0.0, 0.0]"]))

@@ -1,4 +1,4 @@
-"""Simulated runs against the link alone, arithmetic by hand, and each other."""
+"""Simulated runs against the link alone, hand calculation, and each other."""
 
 import itertools
 from typing import Any
@@ -31,7 +31,7 @@ MS = 1_000_000
 
 @pytest.fixture
 def busy_content(content: dict[str, Any]) -> dict[str, Any]:
-    """Some dozens of events, half of them lost, a plant that is not the model."""
+    """Dozens of events, half of them lost, and a plant that differs from the model."""
     mismatch = {"draw": "uniform", "uncertainty_A": [[0.0, 0.0], [0.5, 0.5]]}
     content["horizon_s"] = 4.0
     content["plant"] |= {"rate_hz": 100.0} | mismatch
@@ -53,12 +53,12 @@ def test_the_same_scenario_gives_the_same_record_bit_for_bit(busy: Scenario) -> 
     assert equal(simulate(busy), simulate(busy))
 
 
-def test_speed_plays_no_part(busy: Scenario) -> None:
+def test_the_speed_does_not_change_the_record(busy: Scenario) -> None:
     other = busy.model_copy(update={"speed": 50.0})
     assert equal(simulate(busy), simulate(other))
 
 
-def test_everything_happens_and_everything_is_on_time(busy: Scenario) -> None:
+def test_every_step_occurs_and_is_on_time(busy: Scenario) -> None:
     record = simulate(busy)
     for table, period_ns, phase_ns in (
         (PLANT_STEP, 10 * MS, 0),
@@ -69,7 +69,7 @@ def test_everything_happens_and_everything_is_on_time(busy: Scenario) -> None:
         np.testing.assert_array_equal(record[table]["t_ns"], due)
         np.testing.assert_array_equal(record[table]["now_ns"], due)
     assert len(record[PLANT_ACTUATION]) == len(record[CONTROLLER_STEP])
-    # The input of the tick half a period after a step acts from the next step on.
+    # The input of a tick half a period after a step applies from the next step on.
     np.testing.assert_array_equal(
         record[PLANT_STEP]["actuation"], np.arange(len(record[PLANT_STEP])) - 1
     )
@@ -80,16 +80,16 @@ def test_everything_happens_and_everything_is_on_time(busy: Scenario) -> None:
     assert summary["identity_residual_relative"] < 1e-12
 
 
-def test_the_plant_moves_as_its_held_input_says(busy: Scenario) -> None:
+def test_the_plant_moves_under_its_held_input(busy: Scenario) -> None:
     record = simulate(busy)
     loop, (n, m) = record.loop, (2, 1)
     both = expm(np.block([[loop.A, loop.B], [np.zeros((m, n + m))]]) * 0.01)
     x, u = record[PLANT_STEP]["x"], record[PLANT_STEP]["u"]
     expected = x[:-1] @ both[:n, :n].T + u[:-1] @ both[:n, n:].T
-    np.testing.assert_allclose(x[1:], expected, rtol=1e-13, atol=1e-13)  # one product's rounding
+    np.testing.assert_allclose(x[1:], expected, rtol=1e-13, atol=1e-13)  # rounding of one product
 
 
-def test_the_fates_are_those_of_the_scenarios_own_link(busy: Scenario) -> None:
+def test_the_fates_are_those_of_the_scenarios_link(busy: Scenario) -> None:
     packets = simulate(busy)[NETEM_PACKET]
     link = update_link_of(busy)
     fates = [
@@ -102,8 +102,8 @@ def test_the_fates_are_those_of_the_scenarios_own_link(busy: Scenario) -> None:
     assert {Fate.DELIVERED, Fate.DROPPED} <= set(fates)
 
 
-def test_another_network_decides_losses_and_delays(busy: Scenario) -> None:
-    """Every third update is lost, the others take 0, 7, 14, … ms in turn, and overtake."""
+def test_a_given_network_decides_losses_and_delays(busy: Scenario) -> None:
+    """Every third update is lost; the others take 0, 7, 14, … ms in turn, some out of order."""
     delays_ms = [None if i % 3 == 2 else 7 * (i % 5) for i in range(1000)]
     asked: list[int] = []
 
@@ -126,7 +126,7 @@ def test_another_network_decides_losses_and_delays(busy: Scenario) -> None:
     sequence = deliveries["sequence"]
     late_ms = (deliveries["now_ns"] - deliveries["t_ns"]) // MS
     np.testing.assert_array_equal(late_ms, [delays_ms[i] for i in sequence])
-    # Whoever was overtaken is stale; all the others were taken.
+    # Updates delivered out of order are stale; all others are used.
     arrival_ms = {
         i: packets["t_ns"][i] // MS + delay for i in asked if (delay := delays_ms[i]) is not None
     }
@@ -145,7 +145,7 @@ def test_a_perfect_network_is_the_lossless_one(busy_content: dict[str, Any]) -> 
     assert equal(simulate(lossless), simulate(lossless, lambda data, now_ns: 0))
 
 
-def test_a_violated_assumption_is_noticed_by_the_controller(busy_content: dict[str, Any]) -> None:
+def test_the_controller_reports_a_violated_assumption(busy_content: dict[str, Any]) -> None:
     busy_content["network"] |= {"mansd": 0, "enforce_mansd": False}
     record = simulate(resolve(validate(busy_content, "test")))
     assert record.notices
@@ -161,7 +161,7 @@ def test_a_violated_assumption_is_noticed_by_the_controller(busy_content: dict[s
         assert f"{gap['dropouts']} successive dropouts" in violation["what"]
 
 
-def test_a_violation_that_no_delivery_follows_is_reported(busy_content: dict[str, Any]) -> None:
+def test_a_violation_without_a_later_delivery_is_reported(busy_content: dict[str, Any]) -> None:
     loss = {"model": "worst_case"}
     busy_content["network"] = {"mansd": 2, "enforce_mansd": False, "loss": loss}
     record = simulate(resolve(validate(busy_content, "test")))
@@ -169,12 +169,13 @@ def test_a_violation_that_no_delivery_follows_is_reported(busy_content: dict[str
     (violation,) = summary["assumption_violations"]
     events = record[SENSOR_MEASUREMENT]
     event_ns = events["t_ns"][events["event"] >= 0]
-    assert violation["t_s"] == pytest.approx(event_ns[3] * 1e-9)  # t_0 passes, two may be lost
+    # t_0 is delivered; two losses are allowed
+    assert violation["t_s"] == pytest.approx(event_ns[3] * 1e-9)
     assert summary["longest_loss_burst"] == len(event_ns) - 1 > 2
 
 
-def test_a_loop_that_diverges_has_a_record(content: dict[str, Any]) -> None:
-    """ẋ = 2000 x: no number holds e^(2000 t) for long; what is no number is not received."""
+def test_a_diverging_loop_is_recorded(content: dict[str, Any]) -> None:
+    """ẋ = 2000 x: e^(2000 t) soon overflows; non-finite values are not received."""
     content["model"] = {"A": [[2000.0]], "B": [[1.0]], "gain": [[-1.0]], "allow_unstable": True}
     content["plant"] = {"initial_state": [1.0]}
     record = simulate(resolve(validate(content, "test")))
@@ -182,10 +183,10 @@ def test_a_loop_that_diverges_has_a_record(content: dict[str, Any]) -> None:
     assert record.reports["sensor"]["channel"]["rejected"]["not_finite"] > 0
     summary = summarise(record, 0, "horizon").to_json()
     assert summary["exit"]["status"] == 1
-    assert 0.3 < summary["diverged_at_s"] < 0.4  # 709.8 / 2000: where e^x leaves the numbers
+    assert 0.3 < summary["diverged_at_s"] < 0.4  # 709.8 / 2000: e^x overflows there
 
 
-def test_progress_is_told_as_time_goes_on(busy: Scenario) -> None:
+def test_progress_is_reported_during_a_run(busy: Scenario) -> None:
     longer = busy.model_copy(update={"horizon_s": 40.0})
     told: list[int] = []
     simulate(longer, progress=told.append)
@@ -194,7 +195,7 @@ def test_progress_is_told_as_time_goes_on(busy: Scenario) -> None:
     assert 0 <= told[0] < told[-1] <= longer.timing.horizon_ns
 
 
-def test_the_summary_knows_a_simulated_run_and_claims_no_timing(busy: Scenario) -> None:
+def test_the_summary_of_a_simulated_run_has_no_timing(busy: Scenario) -> None:
     summary = summarise(simulate(busy), 0, "horizon").to_json()
     assert summary["kind"] == "simulated"
     assert summary["lateness_us"] == summary["realtime"] == {}

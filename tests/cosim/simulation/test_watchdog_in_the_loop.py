@@ -1,4 +1,4 @@
-"""A controller that stands still in virtual time, and what the plant does about it."""
+"""A controller that stands still in virtual time, and the plant's input meanwhile."""
 
 from pathlib import Path
 
@@ -21,12 +21,12 @@ DOCS = Path(__file__).parents[3] / "docs"
 
 @pytest.fixture(scope="module", params=["hold", "zero", "model"])
 def run(request: pytest.FixtureRequest) -> RunRecord:
-    """The controller stands still from 1 s to 1.4 s; its tick at 0.999 s is the last before."""
+    """The controller stands still from 1 s to 1.4 s; its last tick before that is at 0.999 s."""
     changes = [f"plant.watchdog.policy={request.param}", "horizon_s=2"]
     return with_outage(resolve(load(SCENARIOS / "lane_following.toml", changes)), 1.0, 1.4)
 
 
-def test_the_input_is_what_the_policy_says(run: RunRecord) -> None:
+def test_the_applied_input_is_that_of_the_watchdog_policy(run: RunRecord) -> None:
     steps, policy = run[PLANT_STEP], run.scenario.plant.watchdog.policy
     old = steps[(steps["t_ns"] > 1_099_000_000) & (steps["t_ns"] <= 1_400_000_000)]
     tick = run[CONTROLLER_STEP][run[CONTROLLER_STEP]["t_ns"] == 999_000_000][0]
@@ -38,7 +38,7 @@ def test_the_input_is_what_the_policy_says(run: RunRecord) -> None:
             "zero": np.zeros(2),
             "model": run.loop.K @ expm(run.loop.H * age_s) @ tick["x_c"],
         }[policy]
-        # K x̂ is a difference of terms that are larger than it.
+        # K x̂ is a difference of larger terms.
         np.testing.assert_allclose(step["u"], expected, rtol=1e-12, atol=1e-14)
     before = steps[(steps["t_ns"] >= 1_000_000_000) & (steps["t_ns"] <= 1_099_000_000)]
     assert (before["u"] == tick["u"]).all()
@@ -47,13 +47,13 @@ def test_the_input_is_what_the_policy_says(run: RunRecord) -> None:
         assert taken["x_c"].tobytes() == tick["x_c"].tobytes()
 
 
-def test_it_is_replayed_bit_for_bit(run: RunRecord) -> None:
+def test_a_run_with_an_outage_is_replayed_bit_for_bit(run: RunRecord) -> None:
     found = replay(run)
     assert found.bit_exact, found.first_difference
     assert found.gaps == []
 
 
-def test_its_end_and_its_beginning_are_told(run: RunRecord) -> None:
+def test_the_beginning_and_end_of_a_trip_are_reported(run: RunRecord) -> None:
     told = [(one["t_ns"], one["process"]) for one in run.notices if one["level"] == "watchdog"]
     assert told == [(1_100_000_000, "plant"), (1_402_000_000, "plant")]
     summary = summarise(run, 0, "horizon").to_json()
@@ -65,7 +65,7 @@ def test_its_end_and_its_beginning_are_told(run: RunRecord) -> None:
     assert shown["actuations too old (watchdog)"] == "once, first at 1.100 s, 0.302 s in all"
 
 
-def test_no_ideal_loop_has_the_watchdog_s_input(run: RunRecord) -> None:
+def test_the_watchdogs_input_is_not_compared_with_the_ideal_loop(run: RunRecord) -> None:
     if run.scenario.plant.watchdog.policy == "hold":
         live_run(run)
         return
@@ -73,8 +73,8 @@ def test_no_ideal_loop_has_the_watchdog_s_input(run: RunRecord) -> None:
         live_run(run)
 
 
-def test_the_table_of_the_documentation_is_what_is_simulated() -> None:
-    """One row of it anew; `python -m tests.cosim.live.outage` makes all."""
+def test_the_table_in_the_documentation_is_the_simulated_one() -> None:
+    """One row is simulated again; `python -m tests.cosim.live.outage` prints all rows."""
     text = (DOCS / "scenarios.md").read_text()
     assert row(*CASES[4]) in text.splitlines()
     for name, mode, lasts_s in CASES:

@@ -1,4 +1,4 @@
-"""What the coordinator takes: joins, words of leave and progress, from anybody on the plane."""
+"""Messages to the coordinator: joins, farewells and progress from any sender on the plane."""
 
 import json
 from typing import Any
@@ -44,7 +44,7 @@ def one_input(data: bytes) -> None:
         barrier.poll()
     for role, asked in queries.items():
         if barrier.epoch_ns is not None or role not in ROLES:
-            # Who asks again has given up the question before.
+            # A new join request replaces the sender's previous one.
             assert _is_over(asked[-1]), "who asks to join waits for an answer"
     assert all(query.answered == 1 for query in admissions), "who knocks waits for an answer"
     for answer in plane.answers:

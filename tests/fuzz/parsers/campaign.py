@@ -1,4 +1,4 @@
-"""Campaign files: text as it stands, or, after a zero byte, valid ones edited."""
+"""Campaign files: plain text or, after a zero byte, an edited valid file."""
 
 from unittest.mock import patch
 
@@ -25,7 +25,7 @@ SEEDS = [
 WORDS = quoted(KNOWN)
 BASES = bases("campaigns")
 _MOST_POINTS = 8
-"""Of which scenarios are made; more of them would be more of the same."""
+"""Grid points for which scenarios are made; more points would add no coverage."""
 
 
 def one_input(data: bytes) -> None:
@@ -37,7 +37,7 @@ def one_input(data: bytes) -> None:
         campaign = load(path)
         chosen = list(campaign.selected({}))[:_MOST_POINTS]
         shorter = campaign.model_copy()
-        # The guarantee of a point is a computation, not part of reading the file.
+        # Skip the computation of each point's guarantee: it is not part of parsing.
         with (
             patch("cosim.studies.campaign.campaign_grid.certified_error", return_value=None),
             patch.object(type(campaign), "selected", lambda *_: iter(chosen)),
@@ -45,7 +45,7 @@ def one_input(data: bytes) -> None:
             try:
                 grid(shorter, path)
             except NoackError as error:
-                # What the scenario itself says stands in another file.
+                # Mistakes in the scenario itself are in another file.
                 if not str(error).startswith(str(path)):
                     with refusal(lines=True):
                         raise

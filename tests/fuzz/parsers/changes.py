@@ -1,4 +1,4 @@
-"""Changes of settings: what is asked, what the coordinator says; and files of open runs."""
+"""Changes of settings: requests, the coordinator's announcements, and files of open runs."""
 
 import fcntl
 import json
@@ -73,7 +73,7 @@ def one_input(data: bytes) -> None:
 
 
 def _asked(question: bytes) -> None:
-    """The coordinator answers, and what it announces is a change that every process can take."""
+    """The coordinator replies, and every process can apply the announced changes."""
     plane = FakePlane()
     with patch.object(coordinator, "ControlPlane", lambda *_, **__: plane):
         centre = coordinator.Coordinator(_TICKET)
@@ -97,7 +97,7 @@ def _asked(question: bytes) -> None:
 
 
 def _announced(said: bytes) -> None:
-    """A process takes it, or refuses it in one line and is as it was."""
+    """A process applies the change, or refuses it in one line and stays unchanged."""
     with refusal("not a valid change announcement"):
         one = parse_message(ChangeAnnouncement, said)
         schedule = ChangeSchedule(_TICKET.scenario)
@@ -114,7 +114,7 @@ def _found(data: bytes) -> None:
         with open_private("runs", create=True) as folder:
             path = folder.path / "up.json"
         path.write_bytes(data)
-        with path.open() as lock:  # as the launcher has it
+        with path.open() as lock:  # locked as by the launcher
             fcntl.flock(lock, fcntl.LOCK_EX)
             with refusal(str(path)):
                 run = run_registry.find()

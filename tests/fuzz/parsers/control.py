@@ -1,4 +1,4 @@
-"""What a running emulator is asked over zenoh, by who knows the secret and who does not."""
+"""Requests to a running emulator over zenoh, with and without the secret."""
 
 import json
 from typing import Any
@@ -37,7 +37,7 @@ WORDS = [json.dumps(word).encode() for word in (*KNOWN.keys, *KNOWN.words)]
 
 
 class _AtOnce:
-    """Errands that are done at once, in this thread."""
+    """A command queue that runs commands at once, in this thread."""
 
     def __init__(self) -> None:
         self.relay = FakeRelay("up", "down")

@@ -1,4 +1,4 @@
-"""Fate traces: a valid one with its table, its document or its bytes edited."""
+"""Fate traces: a valid trace with edits of its table, its document or its bytes."""
 
 import json
 from pathlib import Path
@@ -18,7 +18,7 @@ from tests.fuzz.harness import refusal, workspace
 from tests.fuzz.tables import edited_table, written
 
 _LATEST_NS = 2**62
-"""Beyond every arrival: a century of Unix time."""
+"""Later than every arrival: a century of Unix time."""
 SPECS = [
     LinkSpec("up", ("127.0.0.1", 9000), ("127.0.0.1", 9001), settings_of("loss 5% mansd 2"),
              LinkSettings()),
@@ -31,9 +31,10 @@ KNOWN = Vocabulary(
 
 
 def _rows() -> pa.Table:
-    """What a relay may have recorded: lost, delivered, late, duplicated, corrupted, overflowed."""
+    """Rows of a relay: lost, delivered, late, duplicated, corrupted, overflowed."""
     rows = [
-        # link, direction, flow, packet, arrival, size, fate, run, delay, copy, bit, bit, held
+        # link, direction, flow, packet, arrival, size, fate, consecutive losses, delay, copy delay,
+        # bit, copy bit, hold-back
         ("up", "forward", 0, 0, 10, 100, 0, 0, 5, -1, -1, -1, 0),
         ("up", "forward", 0, 1, 20, 100, 1, 1, -1, -1, -1, -1, 0),
         ("up", "forward", 1, 0, 21, 100, 4, 1, -1, -1, -1, -1, 0),
@@ -63,12 +64,12 @@ def one_input(data: bytes) -> None:
 
 
 def _replay(path: Path, links: list[str] | None) -> None:
-    """Take the decisions of what was read again, which must be possible."""
+    """Replay the decisions of a trace; every accepted trace must be replayable."""
     fates = read_fates(path, links)
     for place, flows in fates.decisions.items():
         link = Link(LinkSettings(mansd=fates.caps[place]), 0, *place, decisions=flows)
         for flow, decisions in enumerate(flows):
             for decision in decisions:
-                # In 64 bits with a sign, as the compiled relay adds.
+                # The compiled relay adds in signed 64 bits.
                 assert _LATEST_NS + max(decision.delay_ns, decision.copy_delay_ns) < 2**63
                 link.decide(flow, 100, 0)

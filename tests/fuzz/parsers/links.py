@@ -1,4 +1,4 @@
-"""Files of links: text as it stands, or, after a zero byte, valid ones edited."""
+"""Files of links: plain text or, after a zero byte, an edited valid file."""
 
 import json
 import socket
@@ -52,7 +52,7 @@ _LOOK_UP: Callable[..., Any] = socket.getaddrinfo
 
 
 def numeric(host: str, port: int, family: int, kind: int) -> Any:
-    """Look an address up without asking the network."""
+    """Resolve an address without network access."""
     flags = socket.AI_NUMERICHOST
     return _LOOK_UP(host, port, family=family, type=kind, flags=flags)
 

@@ -1,4 +1,4 @@
-"""Files of matrices that scenarios name; ``.mat`` is read elsewhere, and comes as ``.npz``."""
+"""Matrix files that scenarios name; ``.mat`` has another reader, so ``.npz`` stands in."""
 
 import io
 

@@ -1,4 +1,4 @@
-"""Run directories: a short run's files, some of them edited, damaged or gone."""
+"""Run directories: the files of a short run, some of them edited, damaged or missing."""
 
 import io
 import json
@@ -65,7 +65,7 @@ KNOWN = Vocabulary(
 
 @cache
 def files(acknowledged: bool, live: bool) -> Mapping[str, bytes]:
-    """The files of a run that was recorded, by their names."""
+    """Return the files of a recorded run, by name."""
     content: dict[str, Any] = json.loads(json.dumps(SCENARIO))
     if acknowledged:
         content["network"]["protocol"] = "ack"
@@ -102,7 +102,7 @@ def files(acknowledged: bool, live: bool) -> Mapping[str, bytes]:
 def one_input(data: bytes) -> None:
     choices = Choices(data)
     content = dict(files(choices.flag(), choices.flag()))
-    spooled = choices.below(3)  # recorded, cut short, or recorded with some more in the spool
+    spooled = choices.below(3)  # 0 recorded, 1 interrupted, 2 recorded with rows left in the spool
     for name in list(content):
         if (name.startswith(RECORD) and spooled == 1) or (name.startswith(SPOOL) and spooled == 0):
             del content[name]
@@ -125,7 +125,7 @@ def one_input(data: bytes) -> None:
 
 
 def _changed(choices: Choices, name: str, data: bytes) -> bytes | None:
-    """The content of a file, changed; None to remove it."""
+    """Return the changed content of a file; None removes it."""
     kind = choices.below(4)
     if kind == 0 and name != SCENARIO_FILE:
         return None if choices.flag() else damaged(choices, data)
@@ -147,7 +147,7 @@ def _table(data: bytes) -> Any:
 
 
 def _spool(choices: Choices, name: str, data: bytes) -> bytes:
-    """A file of the spool with numbers of its rows changed, or a chunk more."""
+    """Return a spool file with changed row numbers or an additional chunk."""
     if "notices" in name:
         payload = json.dumps(edited(choices, NOTICE, KNOWN)).encode()
     else:
@@ -161,7 +161,7 @@ def _spool(choices: Choices, name: str, data: bytes) -> bytes:
 
 
 def _show(run_dir: Path) -> None:
-    """What `noack summary` does with a summary that is there."""
+    """Process an existing summary as `noack summary` does."""
 
     def finalize(ending: RunEnding) -> Outcome:
         assert isinstance(ending.reason, str)
@@ -175,7 +175,7 @@ def _show(run_dir: Path) -> None:
 
 
 def _read(run_dir: Path) -> None:
-    """What the commands on runs do with a run directory."""
+    """Read a run directory as the commands on runs do."""
     cut_short = (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir()
     record = finish_record(run_dir) if cut_short else load_record(run_dir)
     json.loads(summarise(record, 0, "finished").model_dump_json())
@@ -183,6 +183,6 @@ def _read(run_dir: Path) -> None:
     json.dumps(found.verdict())
     json.dumps(found.document())
     if cut_short:
-        again = load_record(run_dir)  # what was finished can be read
+        again = load_record(run_dir)  # a finalised record can be read
         assert all(record[table].tobytes() == again[table].tobytes() for table in record.tables)
         assert record.notices == again.notices

@@ -1,4 +1,4 @@
-"""Scenario files and ``--set``: text as it stands, or, after a zero byte, valid ones edited."""
+"""Scenario files and ``--set``: plain text or, after a zero byte, edited valid content."""
 
 import tomllib
 from typing import Any
@@ -64,7 +64,7 @@ def one_input(data: bytes) -> None:
 
 
 def _written(choices: Choices) -> str:
-    """A value of ``--set``, as TOML or as anything."""
+    """Return a value of ``--set``, as TOML or as any text."""
     if choices.below(4) == 0:
         return choices.text()
     content: dict[str, Any] = {"x": value(choices, KNOWN)}

@@ -1,4 +1,4 @@
-"""What the recorder takes: batches, notices and goodbyes, from anybody who reaches the plane."""
+"""Messages to the recorder: batches, notices and farewells from any sender on the plane."""
 
 import io
 import json
@@ -62,7 +62,7 @@ def one_input(data: bytes) -> None:
     recorder.acknowledge()
     assert isinstance(recorder.finished, bool)
     assert all(query.answered == 1 for query in queries), "who says goodbye waits for an answer"
-    # Whatever came, what was good of it is on record.
+    # The record contains the valid part of the messages.
     record = recorder.finish()
     assert set(record.tables) >= {"plant_step"}
 

@@ -1,4 +1,4 @@
-"""Tickets, and the session files of emulators: text as it stands, or valid ones edited."""
+"""Tickets and session files of emulators: plain text or an edited valid file."""
 
 import fcntl
 import json
@@ -48,7 +48,7 @@ def one_input(data: bytes) -> None:
         with open_private("netem", create=True) as folder:
             path = folder.path / "up.json"
         path.write_bytes(data)
-        with path.open() as lock:  # as the emulator has it
+        with path.open() as lock:  # locked as by the emulator
             fcntl.flock(lock, fcntl.LOCK_EX)
             with refusal("emulator 'up'"):
                 one = emulator_session.find("up")

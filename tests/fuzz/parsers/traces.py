@@ -1,4 +1,4 @@
-"""Files that settings name: loss traces, observed delays, tables of ``tc``."""
+"""Files that settings name: loss traces, observed delays, ``tc`` tables."""
 
 import json
 
@@ -25,5 +25,5 @@ def one_input(data: bytes) -> None:
     settings = LinkSettings(impairments=(impairment,))
     with refusal("links.toml: forward.impairments.0"):
         read = read_files(settings, workspace(), "links.toml: forward")
-        # What was read is held to all that settings are held to.
+        # The loaded settings satisfy the validation of settings.
         assert LinkSettings.model_validate_json(json.dumps(read.model_dump(mode="json"))) == read

@@ -1,4 +1,4 @@
-"""Datagrams: junk, authentic ones, authentic but odd ones, and what an attacker makes of them."""
+"""Datagrams: random, authentic, authentic but malformed, and modified by an attacker."""
 
 import hashlib
 import math
@@ -42,13 +42,13 @@ def one_input(data: bytes) -> None:
         if message is not None:
             assert message.sequence > newest
             newest, seen = message.sequence, datagram
-            # Reserved bytes say nothing, and are not kept.
+            # Reserved bytes have no meaning and are not stored.
             assert encoder.encode(message)[:6] == datagram[:6]
             assert encoder.encode(message)[8:-16] == datagram[8:-16]
 
 
 def _junk(data: bytes) -> None:
-    """Whoever does not know the key is not heard, whatever the datagram."""
+    """Without the key, no datagram is accepted."""
     flow_of(data)
     header = read_header(data)
     assert (header is None) == (len(data) < 32 or data[:2] != b"NA")
@@ -57,7 +57,7 @@ def _junk(data: bytes) -> None:
 
 
 def _sound(choices: Choices, encoder: Encoder, flow: Flow, dimension: int) -> bytes:
-    """What a process of the run may send, or nearly."""
+    """Return a datagram that a process of the run may send, or nearly so."""
     sequence, t_ns = choices.integer() % 2**64, choices.integer()
     t_ns = (t_ns + 2**63) % 2**64 - 2**63
     vector = np.array([choices.real() for _ in range(dimension)])
@@ -65,7 +65,7 @@ def _sound(choices: Choices, encoder: Encoder, flow: Flow, dimension: int) -> by
 
 
 def _odd(choices: Choices, dimension: int) -> bytes:
-    """A header with anything in it, or content of any length, under the right key."""
+    """Return a datagram with the correct key but any header or any content length."""
     magic, version = choices.one([b"NA", b"NB", b"\0\0"]), choices.one([1, 0, 2, 255])
     flow, n = choices.one([1, 2, 3, 4, 0, 5, 255]), choices.one([dimension, 0, 1, 64, 65, 65_535])
     reserved, run = choices.one([0, 1, 65_535]), choices.one([RUN, RUN ^ 1, 0])
@@ -78,7 +78,7 @@ def _odd(choices: Choices, dimension: int) -> bytes:
 
 
 def _changed(choices: Choices, datagram: bytes) -> bytes:
-    """A datagram with a bit flipped, cut, or made longer."""
+    """Return the datagram with a bit flipped, truncated or extended."""
     match choices.below(3):
         case 0:
             bit = choices.below(8 * len(datagram))
@@ -95,7 +95,7 @@ def _tag(content: bytes) -> bytes:
 
 
 def _is_sound(datagram: bytes, flow: Flow, dimension: int, newest: int) -> bool:
-    """Whether a datagram must be accepted: by ``docs/wire.md``, not by the code."""
+    """Whether a datagram must be accepted according to ``docs/wire.md``."""
     if len(datagram) != 48 + 8 * dimension or _tag(datagram[:-16]) != datagram[-16:]:
         return False
     magic, version, kind, n, _, run, sequence, t_ns = struct.unpack_from("<2sBBHHQQq", datagram)

@@ -1,4 +1,4 @@
-"""Words of ``tc netem``: text as it stands, or, after a zero byte, a sentence of its words."""
+"""Words of ``tc netem``: plain text or, after a zero byte, a sequence of valid words."""
 
 from netem.words.tc_command import tc_command
 from netem.words.words_to_settings import EXAMPLES as ANY_WORD
@@ -24,7 +24,7 @@ WORDS = [token.encode() for token in TOKENS if token]
 
 
 def sentence(choices: Choices) -> str:
-    """Some examples, in which some words are others."""
+    """Return some examples with some words replaced."""
     words = [word for _ in range(1 + choices.below(4)) for word in choices.one(EXAMPLES).split()]
     for _ in range(choices.below(4)):
         at = choices.below(len(words))

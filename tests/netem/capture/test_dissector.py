@@ -182,7 +182,9 @@ def test_other_protocols_are_not_dissected(dissect: Dissect, payload: bytes) -> 
     assert not any(name.startswith("noack") for name in fields)
 
 
-def test_a_truncated_datagram_is_shown_as_far_as_it_goes(tshark: Tshark, tmp_path: Path) -> None:
+def test_the_available_fields_of_a_truncated_datagram_are_shown(
+    tshark: Tshark, tmp_path: Path
+) -> None:
     (packet,) = read(capture_of(tmp_path, WHOLE).read_bytes()).packets
     frame = packet.frame[: 28 + HEADER_BYTES + 8 + 7]
     head = struct.pack("<IHHIIII", 0xA1B2C3D4, 2, 4, 0, 0, 262_144, 101)  # a pcap file of raw IP

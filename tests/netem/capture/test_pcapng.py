@@ -59,7 +59,7 @@ def test_the_file_does_not_depend_on_batching_or_old_memory(
     assert parts + section.statistics() == whole
 
 
-def test_a_file_says_who_wrote_it_and_describes_the_interfaces() -> None:
+def test_a_file_names_its_program_and_describes_the_interfaces() -> None:
     interfaces = (
         PcapngInterface("link0 client", "[::]:5000 → here"),
         PcapngInterface("link0 server"),

@@ -143,7 +143,7 @@ def test_the_explanation_fits_into_a_terminal(
         assert max(map(len, out.splitlines())) <= columns
 
 
-def test_commands_to_copy_are_never_wrapped(
+def test_commands_to_copy_are_complete_at_any_width(
     explain: Explain, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     commands = set()

@@ -176,7 +176,7 @@ def test_a_client_without_the_secret_cannot_connect(
         zenoh.open(session_config(session.endpoint, listen=False, more=more))
 
 
-def test_it_listens_on_loopback_only(server: ControlServer) -> None:
+def test_the_control_server_listens_on_loopback_only(server: ControlServer) -> None:
     port = int(find("lab").endpoint.rpartition(":")[2])
     own = psutil.Process().net_connections()
     listening = [c.laddr for c in own if c.status == psutil.CONN_LISTEN and c.laddr.port == port]

@@ -113,7 +113,7 @@ def test_loss_is_counted_since_the_settings_came_into_force(relay: FakeRelay) ->
 
 
 def test_the_prediction_uses_the_settings_in_force(relay: FakeRelay) -> None:
-    """Bernoulli p, at most m in a row: p(1 − p^m)/(1 − p^(m+1))."""
+    """Bernoulli p, at most m consecutive losses: p(1 − p^m)/(1 − p^(m+1))."""
     found = forward(statistics(look(relay, 1)))
     assert found["loss"]["predicted"] == pytest.approx(0.1 * (1 - 0.1**2) / (1 - 0.1**3))
 
@@ -132,7 +132,7 @@ def test_values_without_data_are_null(relay: FakeRelay) -> None:
     assert set(found["delay_ns"].values()) == {None}
 
 
-def test_quantiles_are_those_of_the_times(relay: FakeRelay) -> None:
+def test_delay_quantiles_match_the_delays(relay: FakeRelay) -> None:
     drawn_ns = np.random.default_rng(4).lognormal(13, 2, 20_000).astype(np.int64)
     relay.delays = times(*drawn_ns.tolist())
     found = forward(statistics(look(relay, 1)))["delay_ns"]

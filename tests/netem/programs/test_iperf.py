@@ -57,7 +57,7 @@ def run(emulate: Emulate, words: Sequence[str], *options: str) -> Ran:
 
 
 @pytest.mark.parametrize("reverse", [False, True], ids=["forward", "reverse"])
-def test_iperf3_counts_as_lost_what_the_emulator_dropped(emulate: Emulate, reverse: bool) -> None:
+def test_iperf3_counts_the_emulators_drops_as_lost(emulate: Emulate, reverse: bool) -> None:
     # The first datagram of a stream opens it, and iperf3 does not repeat it.
     words = ("--both", "loss 10% mansd 3 first")
     options = (*SIZE, "--bitrate", "1M", "--time", "1", "--parallel", str(STREAMS))

@@ -10,7 +10,7 @@ from noack.impairments.loss_models.bernoulli import BernoulliLoss
 
 
 @pytest.mark.parametrize("p", [0.02, 0.3, 0.8])
-def test_it_loses_at_its_rate_and_without_memory(
+def test_losses_are_independent_and_have_the_given_rate(
     decide: Any, share_is: Callable[..., None], p: float
 ) -> None:
     lost = decide([LossOf(loss=BernoulliLoss(probability=p))], 400_000).fates == 1

@@ -23,7 +23,7 @@ def test_reordered_packets_leave_at_once(
     share_is(at_once[turns], 0.3)
 
 
-def test_with_probability_1_every_packet_after_a_gap_is_reordered(decide: Any) -> None:
+def test_with_probability_1_one_packet_per_gap_is_reordered(decide: Any) -> None:
     decided = decide([FIXED, Reorder(gap=4)], 100)
     assert np.flatnonzero(decided.delays_ns == 0).tolist() == list(range(3, 100, 4))
 

@@ -121,7 +121,7 @@ def test_words_of_tc_have_the_same_meaning_here(tc: Tc, words: str) -> None:
         "duplicate 5%%", "corrupt", "limit", "delay 10ms distribution", "help",
     ],
 )  # fmt: skip
-def test_what_tc_refuses_is_refused_here(tc: Tc, words: str) -> None:
+def test_words_that_tc_refuses_are_refused_here(tc: Tc, words: str) -> None:
     assert tc.request(words) is None
     with pytest.raises(CallerError):
         settings_of(words)

@@ -150,7 +150,7 @@ def test_a_mistake_among_links_gets_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_the_published_schema_is_the_codes() -> None:
+def test_the_published_schema_matches_the_code() -> None:
     """``noack schema --netem > docs/netem.schema.json`` updates the published schema."""
     published = json.loads((ROOT / "docs/netem.schema.json").read_text(encoding="utf-8"))
     assert published == json_schema()

@@ -287,7 +287,7 @@ def test_a_mistake_gets_one_line_that_names_the_word(words: str, says: str) -> N
     assert "\n" not in line
 
 
-def test_a_direction_has_no_seed_of_its_own() -> None:
+def test_a_seed_for_one_direction_is_refused() -> None:
     with pytest.raises(CallerError, match="seed 7: belongs to the link"):
         settings_of("loss 5% seed 7")
 

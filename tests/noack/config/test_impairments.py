@@ -146,9 +146,7 @@ def test_a_delay_that_depends_on_the_loss_state_needs_a_loss_with_states(before:
 
 @given(st.floats(0, 0.99), st.floats(1, 1000))
 def test_means_determine_the_chain(loss: float, burst: float) -> None:
-    """Bursts last 1/r on average and the loss rate is p/(p + r); refused exactly if p would exceed
-    1.
-    """
+    """Bursts last 1/r on average, the loss rate is p/(p + r); refused exactly if p exceeds 1."""
     if loss / (1 - loss) > burst:
         with pytest.raises(ValidationError, match="needs longer bursts"):
             GilbertElliottLoss(mean_loss=loss, mean_burst=burst)

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[3]
 SHIPPED = sorted((ROOT / "scenarios").glob("*.toml"))
 
 
-def test_the_published_schema_is_the_codes() -> None:
+def test_the_published_scenario_schema_is_up_to_date() -> None:
     """``noack schema > docs/scenario.schema.json`` updates it."""
     published = (ROOT / "docs" / "scenario.schema.json").read_text(encoding="utf-8")
     assert json.loads(published) == json_schema()

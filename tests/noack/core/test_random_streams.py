@@ -56,9 +56,7 @@ def test_an_empty_stream_name_or_a_negative_seed_is_refused() -> None:
 
 
 def test_a_streams_key_is_the_seed_sequences_state() -> None:
-    """Two words of the state that seeds the stream of the same name; the expected values are
-    constants.
-    """
+    """Two words of the state that seeds the stream of that name; the expected values are fixed."""
     digest = hashlib.blake2b(b"netem\0a\0loss", digest_size=16).digest()
     key = [int.from_bytes(digest[i : i + 4], "little") for i in range(0, 16, 4)]
     words = np.random.SeedSequence(2, spawn_key=key).generate_state(2)

@@ -54,9 +54,7 @@ def test_energy_changes_by_the_work_of_force_and_friction() -> None:
 
 
 def test_its_linearisation_has_the_poles_of_the_literature() -> None:
-    """Open-loop poles by the Control Tutorials for MATLAB and Simulink: 0, -0.1428, -5.6041,
-    5.5651.
-    """
+    """Open-loop poles by the Control Tutorials (MATLAB): 0, -0.1428, -5.6041, 5.5651."""
     A, B = linearise(lambda x0: OdeSystem(CartPoleSettings(kind="cart_pole").equations(), x0), 4, 1)
     poles = np.sort(np.linalg.eigvals(A).real)
     np.testing.assert_allclose(poles, [-5.6041, -0.1428, 0.0, 5.5651], atol=1e-4)

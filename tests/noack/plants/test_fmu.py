@@ -80,7 +80,7 @@ def test_van_der_pol_agrees_with_another_integrator(version: int, tmp_path: Path
 
 
 @VERSIONS
-def test_the_same_steps_give_the_same_bits(version: int, tmp_path: Path) -> None:
+def test_the_same_steps_give_bit_identical_states(version: int, tmp_path: Path) -> None:
     loaded = settings(build(tmp_path, version))
     assert (
         run(FmuSystem(loaded, X0), INPUTS).tobytes() == run(FmuSystem(loaded, X0), INPUTS).tobytes()

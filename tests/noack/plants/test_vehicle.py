@@ -161,7 +161,7 @@ def test_a_truck_is_simulated_with_its_trailer() -> None:
     assert system.z[-1] < -0.01  # the trailer follows on the inside of the curve
 
 
-def test_the_same_steps_give_the_same_bits() -> None:
+def test_the_same_steps_give_bit_identical_states() -> None:
     runs = [
         steered(OdeSystem(settings(model="multi_body").equations(), X0), [0.01, -0.02] * 20)
         for _ in "ab"

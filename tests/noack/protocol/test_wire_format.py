@@ -73,9 +73,7 @@ def new_decoder(flow: int = 2, dimension: int = 3, run_id: int = RUN) -> Decoder
 def assert_rejected(
     decoder: Decoder, data: bytes, reason: Rejection, *, from_peer: bool = True
 ) -> None:
-    """The datagram is rejected for that reason and counted once; the decoder is otherwise
-    unchanged.
-    """
+    """The datagram is rejected for that reason and counted once; nothing else changes."""
     accepted, rejected = decoder.accepted, dict(decoder.rejected)
     assert decoder.decode(data, from_peer=from_peer) is None
     counted = {key: n - rejected[key] for key, n in decoder.rejected.items() if n != rejected[key]}

@@ -272,9 +272,7 @@ def test_a_request_is_sent_again_when_its_answer_was_lost(
 def test_a_launched_process_connects_again_until_it_is_admitted(
     ticket: Ticket, monkeypatch: pytest.MonkeyPatch, launched: bool
 ) -> None:
-    """A connection without answers does not recover; a process started by a person reports it
-    instead.
-    """
+    """A connection without answers does not recover; started by a person, a process reports it."""
     tries: list[FakePlane] = []
 
     class Silent(FakePlane):

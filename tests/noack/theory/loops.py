@@ -225,9 +225,7 @@ class _Propagators:
 
 
 def networks(rng: np.random.Generator, system: System) -> tuple[Flags, NDArray[np.int64]]:
-    """Loss patterns with at most M − 1 consecutive losses: worst cases, and random ones of every
-    rate.
-    """
+    """Loss patterns with at most M − 1 consecutive losses: worst cases, and random ones."""
     events = STEPS // system.sample_steps + 2
     lost = rng.uniform(size=(RUNS, events)) < rng.uniform(size=(RUNS, 1)) ** 0.5
     lost[0] = True

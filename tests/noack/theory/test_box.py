@@ -1,6 +1,6 @@
 """Tries to break box certificates with plants anywhere in the box, at its corners, and switching.
 
-Broken copies of the bounds have to be caught by the same check.
+The same check must detect broken copies of the bounds.
 """
 
 from collections.abc import Mapping

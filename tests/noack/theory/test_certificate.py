@@ -1,7 +1,6 @@
-"""Tries to break the certificates: random loops, random and worst-case networks; no bound is
-exceeded.
+"""Tries to break the certificates: no bound is exceeded by random loops and worst-case networks.
 
-The same check is then given broken copies of the certificates, and has to catch each of them.
+The same check must detect each broken copy of the certificates.
 """
 
 from collections.abc import Callable

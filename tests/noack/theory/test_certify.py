@@ -1,6 +1,6 @@
 """Certificates of scenarios: across the floor, where α is too large, in zero-order hold, as JSON.
 
-What ``nominal_conditions`` says is held against the machines in tests/cosim/claims.
+tests/cosim/analysis/claims compares ``nominal_conditions`` with the machines.
 """
 
 import json
@@ -98,9 +98,7 @@ def test_a_run_across_the_floor_exceeds_no_bound(system: System, share: float, s
 
 
 def late_start(mansd: int = 0) -> System:
-    """ẋ = u, u = −x_c, from a large x(0): until the plant applies its first input, x_s diverges
-    from x.
-    """
+    """ẋ = u, u = −x_c, from a large x(0): x_s diverges from x until the first input is applied."""
     one = np.ones((1, 1))
     return System(
         A=0 * one, B=one, K=-one, H=-one, weight=one, x0=np.array([1000.0]), alpha=0.25, beta=1.0,
@@ -120,9 +118,7 @@ def test_a_floor_may_begin_before_the_plant_feels_its_input(
 
 
 def test_an_event_of_the_start_may_be_missing_long_after() -> None:
-    """The error at the first event comes from the start, exceeds the threshold many times, and is
-    never delivered.
-    """
+    """The error at the first event, from the start, is far above the threshold; it is lost."""
     system = late_start(mansd=3)
     for floor in (0.999, 0.99, 0.9, 0.5):
         certificate = certify(scenario(system, trigger={"floor": floor}), system.conditions)
@@ -245,10 +241,9 @@ HARDER = ("dropouts", "sampling_s", "delay_s", "hold_s", "start_s")
 def test_harder_conditions_never_have_better_bounds(
     system: System, harder: str, share: float
 ) -> None:
-    """More dropouts, a lower test rate, longer delay, older input, later start; the same grid of
-    tests.
+    """More dropouts, fewer tests, longer delay, older input, later start; the same grid of tests.
 
-    δ is searched for to a thousandth and enclosed to a hundredth.
+    δ is searched with a relative accuracy of 0.1 % and enclosed with 1 %.
     """
     easy = system.conditions
     more = {name: getattr(easy, name) + share * system.step_s for name in HARDER[1:]}

@@ -205,9 +205,7 @@ def test_over_a_finite_time_growing_systems_are_enclosed_too(
 
 
 def test_a_fast_decaying_mode_hardly_loosens_a_coarse_grid() -> None:
-    """10 cells for 1000 time constants of the fast mode, for which Taylor's formula does not
-    converge.
-    """
+    """10 cells for 1000 time constants of the fast mode, beyond the range of Taylor's formula."""
     G = np.array([[-1.0, 1.0], [0.0, -1e4]])
     kernel = response_until(G, np.eye(2), 0.1, 10).through(np.eye(2))
     assert kernel.sup_on_grid() < 20_000

@@ -1,6 +1,4 @@
-"""Gains of a loop against dense sampling: never below, not far above; and the inequalities they
-solve.
-"""
+"""Gains of a loop against dense sampling: never below, not far above; and their inequalities."""
 
 import math
 
@@ -78,9 +76,7 @@ def test_missing_events_count_what_they_may_have_grown_to(
 @settings(SEARCH)
 @given(systems(), st.floats(0.01, 3.0))
 def test_an_input_that_is_not_of_now_is_wrong_by_no_more(system: System, reach: float) -> None:
-    """‖K(e^{−Hσ} − I + Hσ) W⁻¹‖ for |σ| ≤ hold: the input is older or, for a late plant, newer than
-    x_c.
-    """
+    """‖K(e^{−Hσ} − I + Hσ) W⁻¹‖ for |σ| ≤ hold: inputs older or, if the plant is late, newer."""
     error, _ = gains(system)
     hold_s = reach / float(np.linalg.norm(system.H, 2))
     ages_s = np.linspace(-hold_s, hold_s, 81)

@@ -45,7 +45,7 @@ class History(NamedTuple):
 def histories(draw: st.DrawFn) -> History:
     """Random motion of x, random events, updates that arrive late, out of order or never.
 
-    The models are moved here by their own update laws; (I1) is not used.
+    The models follow their own update laws here; (I1) is not used.
     """
     n, rng = draw(st.integers(1, 4)), np.random.default_rng(draw(seeds))
     H = rng.normal(size=(n, n)) if draw(st.booleans()) else np.zeros((n, n))

@@ -113,9 +113,7 @@ def test_dynamic_waits_longer_than_static_from_the_same_state() -> None:
 
 
 def events_ms(policy: Policy, error: Callable[[int, int], float]) -> Iterator[int]:
-    """Events in the first second, tested every ms, for an error given by the time since the last
-    event.
-    """
+    """Events in the first second, tested every ms; the error depends on the last event's age."""
     trigger, last = Trigger(policy), 0
     trigger.start(0, np.ones(2))
     for t_ms in range(1, 1001):
@@ -133,7 +131,7 @@ def silent(t_ms: int, since_ms: int) -> float:
     return 0.0
 
 
-def test_periodic_is_a_clock() -> None:
+def test_periodic_transmits_at_a_fixed_period() -> None:
     assert list(events_ms(PeriodicTrigger(70 * MS), growing)) == list(range(70, 1001, 70))
 
 

@@ -1,4 +1,4 @@
-"""A certificate's lower bound of the time between two events."""
+"""A certificate's lower bound of the inter-event time."""
 
 from cosim.analysis.claims.claim import Envelope
 from cosim.analysis.claims.claim_definition import Bound, CertifiedClaim

@@ -1,4 +1,4 @@
-"""A certificate's bound of ‖e_s‖: a multiple of the threshold, for a trigger tested in samples."""
+"""A certificate's bound of ‖e_s‖ with a sampled trigger: a multiple of the threshold."""
 
 from cosim.analysis.claims.claim_definition import Bound, CertifiedClaim
 from cosim.analysis.claims.run_evidence import RunEvidence

@@ -1,4 +1,4 @@
-"""A certificate's bound of ‖x‖: X e^{−rt}, and a constant once the threshold is the floor."""
+"""A certificate's bound of ‖x‖: X e^{−rt}, and a constant from the time of the floor on."""
 
 from cosim.analysis.claims.claim import Envelope
 from cosim.analysis.claims.claim_definition import Bound, CertifiedClaim, upper_shares

@@ -1,6 +1,6 @@
 """(I1) with the triangle inequality: ‖e_c‖ ≤ ‖e_s‖ + Σ ‖e^{H(t−t_k)} e_s(t_k⁻)‖.
 
-For every plant, trigger and network. Where the sensor estimates x, the error is x_c − x̂.
+It holds for every plant, trigger and network. If the sensor estimates x, the error is x_c − x̂.
 """
 
 from cosim.analysis.claims.claim import Envelope

@@ -1,8 +1,8 @@
 """(I1): x_c − x_s = Σ e^{H(t−t_k)} e_s(t_k⁻) over the events that the controller missed.
 
-An identity of the update laws, for every plant, trigger and network. The run is compared with it up
-to rounding: the residual is divided by the larger of both models' states and by the margin that
-rounding explains.
+This identity follows from the update laws, for every plant, trigger and network. The run must meet
+it up to rounding: the residual is divided by the larger of both models' states and by the relative
+rounding error.
 """
 
 import numpy as np
@@ -18,7 +18,7 @@ _LEAST_MARGIN, _LARGEST_MARGIN = 1e-9, 1e-6
 def _bound(run: RunEvidence) -> Bound:
     here, margin = run.in_common, _margin(run)
     residual = identity_residual(run.record, run.joined)[here]
-    # Both models were rounded: a missed update may have carried x_c far from x_s.
+    # Use the larger model state, since a missed update may have moved x_c far from x_s.
     before_end = run.t_s < run.until_s
     both = np.concatenate([run.joined.x_s[before_end], run.joined.x_c[here & before_end]])
     scale = max(float(np.abs(both).max(initial=0.0)), np.finfo(float).tiny)
@@ -27,9 +27,9 @@ def _bound(run: RunEvidence) -> Bound:
 
 
 def _margin(run: RunEvidence) -> float:
-    """Relative rounding error that the models may accumulate between two deliveries.
+    """Return the relative rounding error that the models may accumulate between two deliveries.
 
-    n ε sup‖e^{Hτ}‖ over the time τ between deliveries, at most 1e-6.
+    It is n ε sup‖e^{Hτ}‖ over the time τ between deliveries, at most 1e-6.
     """
     loop, period_ns = run.record.loop, run.record.scenario.timing.measurement_period_ns
     fresh_ns = run.joined.t_ns[np.flatnonzero(np.diff(run.joined.received, prepend=-1))]

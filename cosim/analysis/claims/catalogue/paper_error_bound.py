@@ -9,7 +9,7 @@ from cosim.analysis.claims.shared_bounds import controller_error_bound
 
 
 def _bound(run: RunEvidence) -> Bound | None:
-    # An estimate, or noise, jumps at every measurement: no trigger keeps e_s below a threshold.
+    # Estimates and noise jump at every measurement, so no trigger keeps e_s below a threshold.
     if not run.record.scenario.coverage.is_decaying or not run.record.scenario.coverage.knows_state:
         return None
     formula = "‖e_c‖ ≤ βe^(−αt) + Σ βe^(−αt_k) ‖e^(H(t−t_k))‖"

@@ -1,7 +1,7 @@
 """Theorem 1 of the paper, and Theorem 3 for a hold: ‖e_c‖ ≤ Δ βe^{−αt} (eq:Normec).
 
-Its Δ depends on the trajectory and on the true plant, so it exists after a run only. It is the
-largest over all stretches between two deliveries.
+Its Δ depends on the trajectory and on the true plant, so it can be computed only after a run. It is
+the largest one over all intervals between two deliveries.
 """
 
 import math
@@ -25,12 +25,12 @@ Indices = NDArray[np.int64]
 def trajectory_delta(
     record: RunRecord, joined: AlignedRun, until_s: float = math.inf
 ) -> float | None:
-    """Theorem 1's Δ from a recorded trajectory; None if it has none, or if W ≠ I.
+    """Return Theorem 1's Δ from a recorded trajectory; None if there is none, or if W ≠ I.
 
     Args:
         record: the run's record.
         joined: its samples.
-        until_s: an assumption of the theorem was violated from here on.
+        until_s: time from which an assumption of the theorem was violated.
     """
     loop, trigger = record.loop, record.scenario.decaying
     if loop.weight is not None:
@@ -46,9 +46,9 @@ def trajectory_delta(
         longest_interval_s(interval, trigger.beta, trigger.alpha_per_s, kappa)
         for interval in _intervals(record, joined, starts, ends)
     ]
-    # Δ grows with the stretch: of the stretches that begin with an event, the longest is enough.
+    # Δ increases with the interval: only the longest interval from each event is needed.
     stretches: dict[int, int] = {}
-    first = 0  # of the missed events
+    first = 0  # index of the first missed event
     for index, start in enumerate(starts):
         while first <= index and event[starts[first]] <= joined.received[start]:
             first += 1
@@ -63,9 +63,9 @@ def trajectory_delta(
 
 
 def undominated(stretches: Sequence[Sequence[float]]) -> list[Sequence[float]]:
-    """The stretches that no other one exceeds throughout: only they can have the largest Δ.
+    """Return the sequences that no other one dominates: only they can have the largest Δ.
 
-    Δ grows with every δ̃_k, the sum of a stretch from its interval k on.
+    Δ increases with every δ̃_k, the sum of a sequence from its interval k on.
     """
     most = max(map(len, stretches), default=0)
     reaches = np.zeros((len(stretches), most))
@@ -79,7 +79,7 @@ def undominated(stretches: Sequence[Sequence[float]]) -> list[Sequence[float]]:
 
 
 def _model_decay(record: RunRecord) -> float:
-    """κ, a rate at which the model decays: α if the model decays that fast."""
+    """Return κ, a decay rate of the model: α if the model decays at least that fast."""
     H = record.loop.H
     if not H.any():
         return 0.0
@@ -89,7 +89,7 @@ def _model_decay(record: RunRecord) -> float:
 def _intervals(
     record: RunRecord, joined: AlignedRun, starts: Indices, ends: Sequence[int]
 ) -> list[Interval]:
-    """The trajectory from every event of ``starts`` to the next event."""
+    """Return the trajectory from every event of ``starts`` to the next event."""
     propagate = Propagator(record.loop.H)
     found = []
     for first, end in zip(starts, ends, strict=True):

@@ -1,4 +1,4 @@
-"""Theorem 2, eq:tau of the paper: a lower bound of the time between two events."""
+"""Theorem 2, eq:tau of the paper: a lower bound of the inter-event time."""
 
 from cosim.analysis.claims.claim import Envelope
 from cosim.analysis.claims.claim_definition import Bound, ClaimDefinition

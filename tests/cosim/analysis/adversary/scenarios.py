@@ -1,4 +1,4 @@
-"""Random scenarios, small enough that every pattern of dropouts can be tried one by one."""
+"""Random scenarios with few events, so that every pattern of dropouts can be tried."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -27,7 +27,7 @@ _PROBES = (ALL_LOST, (), (False, True) * 500)
 def scenario_of(
     system: System, horizon_s: float, mode: str = "model", floor: float = 0.0
 ) -> Scenario:
-    """The scenario of a random loop, whose models follow its H."""
+    """The scenario of a random loop with the loop's H in its models."""
     return resolve(
         validate(
             {
@@ -69,7 +69,7 @@ def rows(matrix: Matrix) -> list[list[float]]:
 
 @st.composite
 def scenarios(draw: st.DrawFn, most_events: int, **fixed: Any) -> Scenario:
-    """Loops with at most about so many events, and with a threshold low enough for half of that."""
+    """Loops with at most the given number of events and a threshold low enough for half of it."""
     system = draw(systems(**{"mismatch": 0.5} | fixed))
     horizon_s = 20.0 / float(np.abs(np.linalg.eigvals(system.H)).max())
     mode = draw(st.sampled_from(["model", "model", "model", "zoh"]))
@@ -87,7 +87,7 @@ def scenarios(draw: st.DrawFn, most_events: int, **fixed: Any) -> Scenario:
 
 
 def simulate(resolved: Scenario, wanted: Pattern) -> ContinuousRun:
-    """Run one pattern with the reference simulator, delivering where the cap asks for it."""
+    """Simulate one pattern with the reference simulator; the cap forces deliveries."""
     mansd, known_start = resolved.network.mansd, resolved.network.initial_sync == "known_state"
     dropped = 0
 
@@ -107,10 +107,10 @@ def simulate(resolved: Scenario, wanted: Pattern) -> ContinuousRun:
 
 
 def every_run(resolved: Scenario) -> Iterator[ContinuousRun]:
-    """All admissible patterns, one after the other, each from the start: nothing is left out.
+    """All admissible patterns, each simulated from the start.
 
-    Counts like an odometer: the last update that was lost is delivered in the next pattern, and
-    everything after it that may be lost is lost.
+    Counts like an odometer: the next pattern delivers the last lost update and loses all later
+    updates that may be lost.
     """
     first = int(resolved.network.initial_sync == "first_packet")
     prefix: Pattern = ()

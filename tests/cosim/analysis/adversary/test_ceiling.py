@@ -1,4 +1,4 @@
-"""The bound on what a run can still cost, against what it does cost."""
+"""The upper bound on the cost of the rest of a run, against the actual cost."""
 
 import numpy as np
 from hypothesis import given, settings
@@ -39,7 +39,7 @@ def test_what_the_ceiling_leaves_out_is_not_missed(resolved: Scenario) -> None:
 
 
 def test_the_ceiling_leaves_something_out() -> None:
-    """Otherwise the test above says nothing."""
+    """Without an excluded pattern, the test above would check nothing."""
     saved = []
 
     @given(resolved=scenarios(12, mansd=2, beta=0.01, mismatch=0.1))

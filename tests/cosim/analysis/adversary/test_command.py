@@ -1,4 +1,4 @@
-"""What ``noack adversary`` prints and how it ends."""
+"""The output and the exit status of ``noack adversary``."""
 
 import json
 from pathlib import Path
@@ -19,7 +19,7 @@ def run(*arguments: str) -> tuple[int, str, str]:
     return result.exit_code, result.stdout, result.stderr
 
 
-def test_json_tells_everything() -> None:
+def test_json_contains_all_results() -> None:
     status, stdout, stderr = run("--json", *SHORT)
     assert status == ExitStatus.OK, stderr
     document = json.loads(stdout)
@@ -36,7 +36,7 @@ def test_json_tells_everything() -> None:
     assert document["certificate"]["conditions"]["sampling_s"] == 0
 
 
-def test_a_person_sees_the_patterns_of_one_objective() -> None:
+def test_the_text_output_shows_the_patterns_of_one_objective() -> None:
     status, stdout, _ = run("--objective", "error", "--nodes", "0", "--beam", "8", *SHORT)
     assert status == ExitStatus.OK
     assert "not all patterns searched" in stdout
@@ -44,13 +44,13 @@ def test_a_person_sees_the_patterns_of_one_objective() -> None:
     assert "cost" not in stdout
 
 
-def test_values_of_the_scenario_can_be_replaced() -> None:
+def test_settings_replace_values_of_the_scenario() -> None:
     status, stdout, _ = run("--objective", "error", "--set", "network.mansd=0", "--json", *SHORT)
     assert status == ExitStatus.OK
     assert json.loads(stdout)["worst"]["error"]["value"] == pytest.approx(1.0, rel=1e-6)
 
 
-def test_a_mistake_is_one_line() -> None:
+def test_a_mistake_in_the_arguments_gives_one_line() -> None:
     status, _, stderr = run("--horizon", "-1")
     assert status == ExitStatus.CALLER
     assert stderr.startswith("noack: ")

@@ -1,4 +1,4 @@
-"""Many polynomial curves at once against one at a time, and against dense sampling."""
+"""Many polynomial curves at once, against single curves and against dense sampling."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ DEGREE = 18
 
 
 def curves(rng: np.random.Generator, count: int, size: float) -> Stack:
-    """Smooth curves that cross the unit sphere never, once, or several times."""
+    """Smooth curves that cross the unit sphere never, once or several times."""
     falling = 1.0 / np.cumprod([1.0, *(np.arange(1.0, DEGREE + 1) / 6)])
     return np.asarray(size * falling[:, None] * rng.normal(size=(count, DEGREE + 1, 2)))
 
@@ -27,8 +27,8 @@ def test_first_exits_are_those_of_single_curves(size: float) -> None:
     np.testing.assert_allclose(found[crossed], reference, rtol=0, atol=1e-9)
 
 
-def test_a_peak_is_the_highest_point_nearby() -> None:
-    """Against 10,001 points: their spacing squared is below 1e-8 of the curvature."""
+def test_a_peak_is_the_maximum_of_its_neighbourhood() -> None:
+    """Against 10,001 points; their squared spacing times the curvature is below 1e-8."""
     taylor = curves(np.random.default_rng(1), 100, 1.0)
     grid = np.linspace(0.0, 1.0, 10_001)
     squares = ((powers(grid, DEGREE) @ taylor) ** 2).sum(axis=2)

@@ -1,4 +1,4 @@
-"""Values of runs against dense sampling, against scipy's quadrature, and in closed form."""
+"""Objective values of runs against dense sampling, scipy's quadrature and closed forms."""
 
 import math
 from itertools import pairwise
@@ -20,7 +20,7 @@ POINTS = 4001
 @given(resolved=scenarios(12))
 @settings(max_examples=40)
 def test_a_supremum_is_just_above_all_samples(objective: Objective, resolved: Scenario) -> None:
-    """Between samples a norm can only rise by their spacing squared times its curvature."""
+    """Between samples, a norm exceeds them by at most the squared spacing times its curvature."""
     run = simulate(resolved, (False,) * 20)
     measure = measure_of(run.system, objective)
     found = evaluate(run, measure)

@@ -1,4 +1,4 @@
-"""The adversary against all patterns tried one by one, and against certificates."""
+"""The adversary's search against all patterns tried one by one, and against certificates."""
 
 import math
 from dataclasses import replace
@@ -46,7 +46,7 @@ def test_the_exact_search_finds_what_trying_all_finds(
 @given(resolved=scenarios(7, mansd=3), objective=st.sampled_from(Objective))
 @settings(max_examples=6)
 def test_the_tree_alone_finds_it_too(resolved: Scenario, objective: Objective) -> None:
-    """Without guesses to start with, so that nothing but its own branches can find it."""
+    """Without initial guesses, so that only the tree's own branches can find the pattern."""
     _, measure, flow = flow_of(resolved, objective)
     found = search_tree(flow, resolved.network.mansd, 10**6)
     expected = max(evaluate(run, measure).value for run in every_run(resolved))
@@ -113,7 +113,7 @@ def test_no_certificate_is_exceeded(resolved: Scenario, objective: Objective) ->
 
 
 def test_a_certificate_that_forgets_a_dropout_is_caught() -> None:
-    """M = 2: without its one dropout, Δ would be 1, and nearly any loss refutes that."""
+    """M = 2: for no dropout, Δ would be 1, and almost any loss refutes that."""
     caught = []
 
     @given(resolved=scenarios(16, mansd=1, n=2, alpha_share=0.2))
@@ -126,7 +126,7 @@ def test_a_certificate_that_forgets_a_dropout_is_caught() -> None:
     assert sum(caught) >= 0.8 * len(caught)
 
 
-def test_a_loop_that_diverges_is_as_bad_as_can_be(content: dict[str, Any]) -> None:
+def test_a_diverging_loop_has_an_infinite_objective(content: dict[str, Any]) -> None:
     content |= {"model": {"A": [[3.0]], "B": [[1.0]], "gain": [[1.0]]}, "horizon_s": 80.0}
     content["model"]["allow_unstable"] = True
     content["plant"] = {"initial_state": [1.0]}

@@ -1,4 +1,4 @@
-"""Many segments at once against the reference simulator, one at a time."""
+"""Many segments at once, against the reference simulator with one run at a time."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def parts(z: Matrix) -> list[Matrix]:
 @given(resolved=scenarios(12))
 @settings(max_examples=60)
 def test_events_are_those_of_the_reference(resolved: Scenario) -> None:
-    """Both are exact to rounding; a nearly tangent crossing amplifies it."""
+    """Both are exact up to rounding; an almost tangential crossing amplifies the rounding error."""
     system, _, flow = flow_of(resolved, Objective.INTER_EVENT)
     rng, n = np.random.default_rng(0), system.loop.n
     t_s = rng.uniform(0, resolved.horizon_s, STATES)
@@ -46,7 +46,7 @@ def test_events_are_those_of_the_reference(resolved: Scenario) -> None:
 @given(resolved=scenarios(12))
 @settings(max_examples=30)
 def test_a_pattern_is_worth_what_its_run_is(objective: Objective, resolved: Scenario) -> None:
-    """Rounding of event times, amplified by the loop; the supremum's own resolution is 1e-6."""
+    """The loop amplifies the rounding of event times; the supremum's own resolution is 1e-6."""
     _, measure, flow = flow_of(resolved, objective)
     rng = np.random.default_rng(0)
     wanted = [tuple(row) for row in (rng.uniform(size=(8, 15)) < 0.5).tolist()]

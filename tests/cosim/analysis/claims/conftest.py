@@ -1,4 +1,4 @@
-"""Runs whose conditions are known, and ways to spoil their records."""
+"""Runs with known conditions, and functions that damage their records."""
 
 from collections.abc import Callable
 from typing import Any
@@ -19,19 +19,19 @@ Make = Callable[..., Scenario]
 
 
 def changed(record: RunRecord, **tables: Rows) -> RunRecord:
-    """A record with some tables exchanged."""
+    """The record with some tables replaced."""
     rows = {table: tables.get(table, record[table]) for table in record.tables}
     return RunRecord(record.scenario, rows, record.notices, record.reports, record.kind)
 
 
 def of_scenario(record: RunRecord, scenario: Scenario) -> RunRecord:
-    """The same rows, said to be of another scenario."""
+    """The same rows with another scenario."""
     rows = {table: record[table] for table in record.tables}
     return RunRecord(scenario, rows, record.notices, record.reports, record.kind)
 
 
 def network_of(decide: Callable[[int], int | None]) -> Network:
-    """A network that decides by an update's number: how many ms it takes, or None."""
+    """A network that maps an update's number to a delay in ms, or to None for a loss."""
 
     def network(data: bytes, now_ns: int) -> int | None:
         header = read_header(data)
@@ -44,7 +44,7 @@ def network_of(decide: Callable[[int], int | None]) -> Network:
 
 @pytest.fixture
 def make() -> Make:
-    """A double integrator with a plant of its own, 100 Hz; ``changes`` by section."""
+    """A double integrator with a separate plant, 100 Hz; ``changes`` by section."""
 
     def scenario(**changes: Any) -> Scenario:
         content: dict[str, Any] = {
@@ -71,7 +71,7 @@ def make() -> Make:
 
 @pytest.fixture
 def run(make: Make) -> RunRecord:
-    """A run that keeps to its schedule; 50 events or so."""
+    """A run that meets its timing conditions, with about 50 events."""
     record = simulate(make())
     assert np.isfinite(record["plant_step"]["x"]).all()
     return record

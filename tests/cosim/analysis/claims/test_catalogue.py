@@ -1,4 +1,4 @@
-"""The registry of claims: every file of the catalogue is a claim, and the docs list it."""
+"""The registry of claims: every file of the catalogue is a claim and is documented."""
 
 from pathlib import Path
 

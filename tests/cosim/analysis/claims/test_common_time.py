@@ -1,4 +1,4 @@
-"""A run that is stopped is judged up to the time that all of its processes had reached."""
+"""A stopped run is judged up to the last time that all of its processes reached."""
 
 from itertools import permutations
 
@@ -20,7 +20,7 @@ APART_NS = 47 * MS
 
 
 def stopped(record: RunRecord, reached_ns: dict[str, int]) -> RunRecord:
-    """The record of the same run, whose processes were stopped at these times."""
+    """The record of the same run with its processes stopped at these times."""
     rows = {
         table: record[table][record[table]["now_ns"] <= reached_ns[OWNER[table]]]
         for table in record.tables
@@ -34,7 +34,7 @@ def stopped(record: RunRecord, reached_ns: dict[str, int]) -> RunRecord:
 
 
 @pytest.mark.parametrize("order", list(permutations(LOOP_ROLES)), ids="-".join)
-def test_processes_that_stop_one_after_the_other_void_nothing(
+def test_processes_that_stop_at_different_times_void_no_claim(
     run: RunRecord, order: tuple[str, ...]
 ) -> None:
     cut = stopped(run, {role: STOP_NS + i * APART_NS for i, role in enumerate(order)})
@@ -47,15 +47,15 @@ def test_processes_that_stop_one_after_the_other_void_nothing(
 
 
 def test_the_time_beyond_the_common_end_would_void_claims(run: RunRecord) -> None:
-    """The controller stops first: the plant goes on with its last input."""
+    """The controller stops first; the plant continues with its last input."""
     times = dict.fromkeys(LOOP_ROLES, STOP_NS + APART_NS) | {"controller": STOP_NS}
     cut = stopped(run, times)
     assert ClaimVerdict.VOID in {claim.verdict for claim in ClaimEvaluation(cut).judge()}
     assert ClaimVerdict.VOID not in {claim.verdict for claim in RunClaims(cut).judge()}
 
 
-def test_what_left_the_conditions_before_the_stop_is_void(make: Make) -> None:
-    """The certificate allows for an input that is 10 ms old, the controller ticks every 50 ms."""
+def test_a_violation_before_the_stop_voids_the_claims(make: Make) -> None:
+    """The certificate assumes an input age of at most 10 ms; the controller's period is 50 ms."""
     scenario = make(controller={"rate_hz": 20.0}, certificate={"late_periods": 0})
     slow = simulate(scenario)
     quick = scenario.model_copy(
@@ -74,13 +74,14 @@ def test_rows_of_every_table_end_with_their_process(run: RunRecord) -> None:
         rows, whole = cut[table], run[table]
         assert len(rows) < len(whole) or not len(whole)
         assert np.array_equal(rows, whole[: len(rows)])
-        if table != "plant_actuation" and len(rows):  # whose time is that of the model behind it
+        # with the time of the model state used for the input
+        if table != "plant_actuation" and len(rows):
             assert rows["now_ns"][-1] <= end_ns + 10 * MS
     for role in LOOP_ROLES:
         assert [life.hole_ns() for life in cut.lives(role)] == [None]
 
 
-def test_a_run_that_was_not_stopped_is_judged_as_it_is(run: RunRecord) -> None:
+def test_a_complete_run_is_judged_to_its_end(run: RunRecord) -> None:
     assert common_end_ns(run) is None
     assert up_to_common_end(run) is run
     unknown = stopped(run, dict.fromkeys(LOOP_ROLES, STOP_NS))

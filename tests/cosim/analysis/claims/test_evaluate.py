@@ -1,4 +1,4 @@
-"""Claims against runs: held, violated, void, each where it should be; none violated by chance."""
+"""Claims against runs: held, violated or void, as constructed; random runs violate none."""
 
 import json
 import math
@@ -51,7 +51,7 @@ def from_I1(record: RunRecord) -> list[Claim]:
 # --- held -----------------------------------------------------------------------------------------
 
 
-def test_a_run_that_keeps_to_its_schedule_holds_what_is_certified(run: RunRecord) -> None:
+def test_certified_claims_hold_in_a_run_that_meets_its_schedule(run: RunRecord) -> None:
     assert verdicts(run) == dict.fromkeys(CERTIFIED, HELD)
     for claim in ClaimEvaluation(run).judge():
         assert claim.since_s is None
@@ -61,8 +61,8 @@ def test_a_run_that_keeps_to_its_schedule_holds_what_is_certified(run: RunRecord
             assert claim.observed == pytest.approx(claim.certified * claim.ratio)
 
 
-def test_what_is_observed_is_what_would_have_been_enough(run: RunRecord) -> None:
-    """From the record itself, not from the joined one."""
+def test_the_observed_value_is_the_smallest_bound_that_would_hold(run: RunRecord) -> None:
+    """Computed from the recorded tables, not from the aligned ones."""
     claims, rows = certified(run), run[SENSOR_MEASUREMENT]
     trigger = run.scenario.trigger
     growth = np.exp(trigger.alpha_per_s * rows["t_ns"] * 1e-9)
@@ -74,16 +74,16 @@ def test_what_is_observed_is_what_would_have_been_enough(run: RunRecord) -> None
     assert claims[CERTIFIED[3]].observed == pytest.approx(np.diff(event_s).min(), rel=1e-6)
 
 
-def test_the_identity_s_claims_hold_on_every_run(make: Make) -> None:
-    """Whatever is lost, late or overtaken; even where everything else is void."""
+def test_the_claims_of_the_identity_hold_in_every_run(make: Make) -> None:
+    """With any losses, delays and reordering, even if all other claims are void."""
     network = network_of(lambda n: None if n % 7 else 13 * (n % 5))
     for mode in ("model", "zoh"):
         record = simulate(make(mode=mode), network)
         assert [claim.verdict for claim in from_I1(record)] == [HELD, HELD]
 
 
-def test_a_quiet_run_claims_what_it_can(make: Make) -> None:
-    """One event, at t = 0: there is no time between two."""
+def test_a_claim_without_data_is_held_without_an_observed_value(make: Make) -> None:
+    """One event, at t = 0, gives no inter-event time."""
     record = simulate(make(trigger={"beta": 100.0}))
     claim = certified(record)["minimum inter-event time"]
     assert (claim.verdict, claim.ratio, claim.observed) == (HELD, None, None)
@@ -92,8 +92,8 @@ def test_a_quiet_run_claims_what_it_can(make: Make) -> None:
 # --- violated -------------------------------------------------------------------------------------
 
 
-def test_a_run_of_another_plant_violates_what_is_certified_of_this_one(make: Make) -> None:
-    """The certificate is of a plant that is the model and starts a tenth as far away."""
+def test_a_run_of_another_plant_violates_the_certificate(make: Make) -> None:
+    """The certificate is for a plant equal to the model that starts at a tenth of the distance."""
     run = simulate(make())
     plant = {"A": [[0.0, 1.0], [0.0, 0.0]], "B": [[0.0], [1.0]], "initial_state": [0.1, 0.0]}
     other = of_scenario(run, make(plant=plant))
@@ -104,10 +104,11 @@ def test_a_run_of_another_plant_violates_what_is_certified_of_this_one(make: Mak
     assert state.ratio is not None
     assert state.ratio > 1
     assert claims["minimum inter-event time"].verdict is VIOLATED
-    assert [claim.verdict for claim in from_I1(other)] == [HELD, HELD]  # it asks for no plant
+    # it makes no assumption on the plant
+    assert [claim.verdict for claim in from_I1(other)] == [HELD, HELD]
 
 
-def test_a_violation_is_told_from_its_first_moment_on(run: RunRecord) -> None:
+def test_a_violation_is_reported_with_its_first_time(run: RunRecord) -> None:
     rows = run[SENSOR_MEASUREMENT].copy()
     rows["e_s_norm"][150:152] = 5.0
     claim = certified(changed(run, **{SENSOR_MEASUREMENT: rows}))[CERTIFIED[0]]
@@ -124,8 +125,8 @@ def test_a_controller_that_is_not_the_model_violates_the_identity(run: RunRecord
     assert difference.since_s == pytest.approx(2.01, abs=0.011)
 
 
-def test_a_printed_bound_that_is_exceeded_is_not_refuted(make: Make) -> None:
-    """eq:LossEv3 assumes ‖e_s‖ ≤ βe^{−αt} at all times; tested five times a second, it is not."""
+def test_exceeding_a_printed_bound_outside_its_assumptions_is_not_a_violation(make: Make) -> None:
+    """eq:LossEv3 assumes ‖e_s‖ ≤ βe^{−αt} at all times; five tests a second do not ensure it."""
     lossy = {"loss": {"model": "worst_case"}}
     seldom = make(plant={"measure_every": 20}, network=lossy, trigger={"beta": 1e-3})
     record = simulate(seldom)
@@ -141,7 +142,7 @@ def test_a_printed_bound_that_is_exceeded_is_not_refuted(make: Make) -> None:
 # --- void -----------------------------------------------------------------------------------------
 
 
-def test_more_losses_than_allowed_make_every_certified_claim_void(make: Make) -> None:
+def test_too_many_losses_void_every_certified_claim(make: Make) -> None:
     record = simulate(make(), network_of(lambda n: None if 10 <= n < 14 else 0))
     rows = record[SENSOR_MEASUREMENT]
     one_too_many_s = float(rows["t_ns"][rows["event"] == 12][0] * 1e-9)
@@ -152,14 +153,14 @@ def test_more_losses_than_allowed_make_every_certified_claim_void(make: Make) ->
     assert [claim.verdict for claim in from_I1(record)] == [HELD, HELD]
 
 
-def test_what_happens_after_a_claim_is_void_is_not_judged(run: RunRecord) -> None:
-    """And what happened before is."""
+def test_a_void_claim_is_judged_only_up_to_the_violation(run: RunRecord) -> None:
+    """The part before the violation is judged."""
     rows = run[SENSOR_MEASUREMENT].copy()
     rows["e_s_norm"][[100, 400]] = 5.0
     late = np.delete(rows, slice(300, 310))
     for spoilt, verdict, since_s in (
         (late, VIOLATED, 1.0),
-        (np.delete(late, 100), VOID, 0.99),  # that one is missing, too
+        (np.delete(late, 100), VOID, 0.99),  # that event is missing, too
     ):
         claim = certified(changed(run, **{SENSOR_MEASUREMENT: spoilt}))[CERTIFIED[0]]
         assert (claim.verdict, claim.since_s) == (verdict, pytest.approx(since_s))
@@ -172,14 +173,14 @@ def test_what_happens_after_a_claim_is_void_is_not_judged(run: RunRecord) -> Non
     assert claim.ratio < 1
 
 
-def test_without_a_certificate_the_claim_is_void_and_says_why(make: Make) -> None:
+def test_a_claim_without_a_certificate_is_void_with_the_reason(make: Make) -> None:
     record = simulate(make(model={"gain": [[0.0, 0.0]], "allow_unstable": True}, horizon_s=1.0))
     (claim,) = certified(record).values()
     assert claim.verdict is VOID
     assert "grows" in claim.why
 
 
-def test_a_run_that_diverges_is_void_where_it_was_promised_nothing(make: Make) -> None:
+def test_claims_of_a_diverging_run_without_a_certificate_are_void(make: Make) -> None:
     record = simulate(
         make(
             horizon_s=1.0,
@@ -196,7 +197,7 @@ def test_a_run_that_diverges_is_void_where_it_was_promised_nothing(make: Make) -
     assert [envelope.label for envelope in envelopes] == ["bound from (I1)"]
 
 
-# --- records that lack something ------------------------------------------------------------------
+# --- incomplete records ---------------------------------------------------------------------------
 
 
 def without(run: RunRecord, *processes: str) -> RunRecord:
@@ -204,22 +205,22 @@ def without(run: RunRecord, *processes: str) -> RunRecord:
     return changed(run, **gone)
 
 
-def test_nothing_is_claimed_of_a_run_without_measurements(run: RunRecord) -> None:
+def test_a_run_without_measurements_has_no_claims(run: RunRecord) -> None:
     assert ClaimEvaluation(without(run, "sensor")).judge() == []
     assert ClaimEvaluation(without(run, "sensor", "plant", "controller", "netem")).judge() == []
 
 
 @pytest.mark.parametrize("process", ["plant", "controller"])
-def test_without_a_process_no_certified_claim_is_judged(run: RunRecord, process: str) -> None:
-    """What the others recorded may be judged; of the conditions too little is known."""
+def test_certified_claims_need_the_rows_of_every_process(run: RunRecord, process: str) -> None:
+    """Claims on recorded signals are judged; too little is known about the conditions."""
     claims = certified(without(run, process))
     assert set(verdicts(without(run, process)).values()) <= {VOID}
     for claim in claims.values():
         assert claim.since_s == 0.0
 
 
-def test_a_controller_that_dies_makes_claims_void_rather_than_violated(make: Make) -> None:
-    """The plant diverges under its last input: nobody promised anything of that."""
+def test_a_dead_controller_makes_claims_void_not_violated(make: Make) -> None:
+    """The plant diverges under its last input, for which no bound is certified."""
     whole = simulate(make(network={"mansd": 0}), network_of(lambda n: 0))
     died_ns = 1_500_000_000
     steps, sensor = whole[PLANT_STEP].copy(), whole[SENSOR_MEASUREMENT].copy()
@@ -241,10 +242,10 @@ def test_a_controller_that_dies_makes_claims_void_rather_than_violated(make: Mak
     assert state.since_s <= died_ns * 1e-9 + 0.03
 
 
-# --- what else is said ----------------------------------------------------------------------------
+# --- further output -------------------------------------------------------------------------------
 
 
-def test_envelopes_are_at_the_measurements(run: RunRecord) -> None:
+def test_envelopes_are_evaluated_at_the_measurements(run: RunRecord) -> None:
     claims = ClaimEvaluation(run)
     k = len(run[SENSOR_MEASUREMENT])
     found = {(e.label, e.quantity): e for e in claims.envelopes()}
@@ -261,8 +262,8 @@ def test_envelopes_are_at_the_measurements(run: RunRecord) -> None:
         assert (error[known] <= bound[known] * (1 + 1e-9) + 1e-12).all()
 
 
-def test_a_long_run_s_clock_does_not_violate_the_distance_of_events(run: RunRecord) -> None:
-    """At 1e7 s, a float tells apart 2 ns: differences are taken of whole nanoseconds."""
+def test_inter_event_times_are_exact_in_a_long_run(run: RunRecord) -> None:
+    """At 1e7 s, a float resolves 2 ns only, so differences are taken in integer nanoseconds."""
     rows = run[SENSOR_MEASUREMENT].copy()
     rows["t_ns"] += 10**16
     shifted = ClaimEvaluation(changed(run, **{SENSOR_MEASUREMENT: rows}))
@@ -270,7 +271,7 @@ def test_a_long_run_s_clock_does_not_violate_the_distance_of_events(run: RunReco
     np.testing.assert_array_equal(passed_s, ClaimEvaluation(run).inter_event_s[1])
 
 
-def test_numbers_that_are_none_are_null() -> None:
+def test_values_that_are_not_finite_are_null_in_json() -> None:
     claim = Claim("w", "s", "b", math.inf, math.nan, np.float64(0.5), HELD, None, "")
     (found,) = as_json([claim])
     assert found == {
@@ -280,12 +281,12 @@ def test_numbers_that_are_none_are_null() -> None:
     assert type(found["ratio"]) is float
 
 
-# --- no certificate is violated, whatever the scenario --------------------------------------------
+# --- no certificate is violated, for any scenario -------------------------------------------------
 
 
 @st.composite
 def scenarios(draw: st.DrawFn) -> Scenario:
-    """Loops of every kind with schedules of every kind; late by up to what is allowed."""
+    """Loops of every kind with schedules of every kind, with delays up to the allowed maximum."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     n, m = int(rng.integers(1, 4)), int(rng.integers(1, 3))
     H = rng.uniform(-1, 1, (n, n)) * 2
@@ -324,7 +325,7 @@ def scenarios(draw: st.DrawFn) -> Scenario:
 
 
 def hostile(resolved: Scenario, seed: int) -> Any:
-    """Loses all it may, or some, and is as late as is allowed, or less."""
+    """Loses as many updates as allowed, or some; delays them as long as allowed, or less."""
     rng = np.random.default_rng(seed)
     late_ns = resolved.certificate.late_periods * resolved.timing.plant_period_ns
     known = resolved.network.initial_sync == "known_state"
@@ -337,14 +338,14 @@ def hostile(resolved: Scenario, seed: int) -> Any:
             run += 1
             return None
         run = 0
-        # At the tick before the one that would be too late.
+        # At the last tick that is not too late.
         return int(rng.integers(0, late_ns + 1)) if late_ns else 0
 
     return network
 
 
 def test_no_simulated_run_violates_its_certificate() -> None:
-    """Nor leaves its conditions, nor the bounds of (I1)."""
+    """The run also meets its conditions and the bounds of (I1)."""
     judged: dict[ClaimVerdict, int] = {}
 
     @settings(
@@ -364,11 +365,11 @@ def test_no_simulated_run_violates_its_certificate() -> None:
     assert judged[HELD] > 10 * judged.get(VOID, 0)
 
 
-# --- what cannot be judged ------------------------------------------------------------------------
+# --- claims that cannot be judged -----------------------------------------------------------------
 
 
-def test_too_many_dropouts_void_the_paper_s_theorems_too(make: Make) -> None:
-    """They presuppose M − 1; what follows from (I1) alone does not, and is judged to the end."""
+def test_too_many_dropouts_void_the_papers_theorems(make: Make) -> None:
+    """The theorems assume M − 1; consequences of (I1) alone do not and are judged to the end."""
     record = simulate(
         make(network={"loss": {"model": "worst_case"}, "enforce_mansd": False, "mansd": 2})
     )
@@ -379,21 +380,21 @@ def test_too_many_dropouts_void_the_paper_s_theorems_too(make: Make) -> None:
     assert {claim.verdict for claim in theorems} == {VOID}
     events = record[SENSOR_MEASUREMENT]
     event_s = events["t_ns"][events["event"] >= 0] * 1e-9
-    # t_0 arrives; of the next ones, the third is too many.
+    # t_0 arrives; of the following updates, the third loss is one too many.
     assert list(since) == pytest.approx([event_s[3]])
     assert {claim.verdict for claim in claims if claim.source == "(I1)"} == {HELD}
 
 
-def test_nothing_at_all_is_within_every_bound(make: Make) -> None:
-    """x(0) = 0: every error, and the bounds that follow from the errors, are 0 all along."""
+def test_a_run_at_rest_holds_every_bound(make: Make) -> None:
+    """x(0) = 0: all errors, and the bounds that follow from them, are 0 throughout."""
     record = simulate(make(plant={"initial_state": [0.0, 0.0]}))
     for claim in ClaimEvaluation(record).judge():
         assert claim.verdict is HELD, claim
         assert claim.ratio is None or claim.ratio <= 1
 
 
-def test_what_is_not_on_record_is_not_held(run: RunRecord) -> None:
-    """The measurements go on when the controller's record ends: from 2 s on ‖e_c‖ is unknown."""
+def test_a_claim_is_not_held_where_the_record_has_no_rows(run: RunRecord) -> None:
+    """Measurements continue after the controller's record ends: ‖e_c‖ is unknown from 2 s on."""
     ticks, taken = run[CONTROLLER_STEP], run[CONTROLLER_DELIVERY]
     cut = changed(
         run, controller_step=ticks[ticks["t_ns"] < 2_000_000_000],
@@ -407,7 +408,7 @@ def test_what_is_not_on_record_is_not_held(run: RunRecord) -> None:
         assert claim.since_s <= 2.02
 
 
-def test_a_state_beyond_floating_point_is_not_held(make: Make) -> None:
+def test_a_claim_is_not_held_if_the_state_overflows(make: Make) -> None:
     unstable = make(
         model={"A": [[400.0, 0.0], [0.0, 0.0]], "gain": [[0.0, 0.0]], "allow_unstable": True},
         plant={"A": [[400.0, 0.0], [0.0, 0.0]]}, horizon_s=2.0,

@@ -1,4 +1,4 @@
-"""What is said of a run while it goes on is what is said of it afterwards."""
+"""The live assumption monitor reports the same violations as the evaluation after the run."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -36,11 +36,11 @@ from tests.cosim.analysis.claims.conftest import Make, changed, network_of
 from tests.cosim.live.outage import Deaf, Reborn, simulate_with, with_outage
 
 Batches = Iterator[tuple[str, Rows] | None]
-"""A table and rows of it; None where somebody looks what is known."""
+"""A table and some of its rows; None where the result so far is queried."""
 
 
 def batches(record: RunRecord, seed: int) -> Batches:
-    """The record, as processes hand it over: each in its order, whoever comes first."""
+    """The record as the processes send it: each in its own order, the processes in any order."""
     rng = np.random.default_rng(seed)
     taken = dict.fromkeys(record.tables, 0)
     while waiting := [table for table in taken if taken[table] < len(record[table])]:
@@ -61,7 +61,7 @@ def batches(record: RunRecord, seed: int) -> Batches:
 def guarded(
     record: RunRecord, seed: int = 0
 ) -> tuple[AssumptionMonitor, list[AssumptionViolation]]:
-    """A guard that has seen a run as it went on, and what it said."""
+    """A monitor that received the run in batches, and its reported violations."""
     guard, said = AssumptionMonitor(record.scenario), []
     for batch in batches(record, seed):
         if batch is None:
@@ -98,7 +98,7 @@ def scenarios(draw: st.DrawFn, make: Make) -> Scenario:
 
 
 def spoilt(record: RunRecord, seed: int) -> RunRecord:
-    """A record that lacks rows, or a process that died."""
+    """A record with missing rows, or of a process that died."""
     rng = np.random.default_rng(seed)
     match int(rng.integers(0, 3)):
         case 1:
@@ -158,7 +158,7 @@ def joined(parts: list[ObservedConditions]) -> ObservedConditions:
     )
 
 
-# --- every condition, left in a run: what is said then, and afterwards ----------------------------
+# --- violation of each condition: the live report, and the evaluation after the run ---------------
 
 
 def event_s(record: RunRecord, number: int) -> float:
@@ -167,7 +167,7 @@ def event_s(record: RunRecord, number: int) -> float:
 
 
 def watched(policy: str, make: Make, **more: Any) -> Scenario:
-    """An input may be 35 ms old, and the watchdog acts after 20 ms."""
+    """An input may be 35 ms old; the watchdog acts after 20 ms."""
     plant = make().plant.model_dump(exclude_none=True)
     plant["watchdog"] = {"policy": policy, "timeout_s": 0.02}
     return make(plant=plant, certificate={"late_periods": 2}, **more)
@@ -217,7 +217,7 @@ def model_input(make: Make) -> tuple[RunRecord, float]:
 
 
 def safe_input(make: Make) -> tuple[RunRecord, float]:
-    """The start may take as long as the network's delay; but then there is to be no input."""
+    """The start may take as long as the network's delay, and there must be no input until then."""
     late = {"kind": "delay", "delay_s": 0.1}
     resolved = make(controller={"rate_hz": 100.0, "safe_input": [0.5]})
     network = resolved.network.model_dump() | {"impairments": [late]}
@@ -225,7 +225,7 @@ def safe_input(make: Make) -> tuple[RunRecord, float]:
 
 
 def started_anew(make: Make) -> tuple[RunRecord, float]:
-    """A controller that is followed at once by one that knows no state, by steps of 10 ms."""
+    """A controller that is restarted at once without a known state, in steps of 10 ms."""
     resolved, at_ns = make(network={"initial_sync": "known_state"}), 2_000_000_000
     successor = controller_of(resolved, Start(1, at_ns))
     record = simulate_with(resolved, "controller", lambda one: Reborn(one, successor, at_ns))
@@ -236,7 +236,7 @@ def started_anew(make: Make) -> tuple[RunRecord, float]:
 
 
 def sensor_anew(make: Make) -> tuple[RunRecord, float]:
-    """A sensor that is followed by another between two measurements, soon after an event."""
+    """A sensor that is restarted between two measurements, soon after an event."""
     resolved, at_ns = make(), 50_000_000
     successor = sensor_of(resolved, Start(1, at_ns))
     record = simulate_with(resolved, "sensor", lambda one: Reborn(one, successor, at_ns))
@@ -262,13 +262,13 @@ def sensor_anew(make: Make) -> tuple[RunRecord, float]:
         (sensor_anew, "the sensor was restarted"),
     ],
 )
-def test_claims_are_void_from_the_moment_on_and_for_the_reason_that_the_guard_says(
+def test_claims_are_void_from_the_time_and_for_the_reason_that_the_monitor_reports(
     leave: Callable[[Make], tuple[RunRecord, float]], why: str, make: Make
 ) -> None:
     record, when_s = leave(make)
     judged = [claim for claim in ClaimEvaluation(record).judge() if claim.source == "certificate"]
     assert {claim.verdict for claim in judged} == {ClaimVerdict.VOID}
-    # Of ‖e_c‖ nothing is on record while there is no controller.
+    # Nothing is recorded of ‖e_c‖ while there is no controller.
     claims = [claim for claim in judged if "e_c" not in claim.bound]
     assert claims
     for claim in claims:
@@ -281,8 +281,8 @@ def test_claims_are_void_from_the_moment_on_and_for_the_reason_that_the_guard_sa
     assert first.t_s == pytest.approx(when_s)
 
 
-def test_a_number_that_is_none_is_no_measurement(make: Make) -> None:
-    """At 2000 /s the state is finite for 0.36 s; its norm, and that of an error, for less."""
+def test_a_non_finite_value_is_not_a_measurement(make: Make) -> None:
+    """At 2000 /s the state is finite for 0.36 s; its norm and that of an error overflow earlier."""
     record = simulate(
         make(
             horizon_s=1.0, model={"A": [[-1.0]], "B": [[1.0]], "gain": [[0.0]]},
@@ -302,13 +302,13 @@ def test_a_number_that_is_none_is_no_measurement(make: Make) -> None:
         assert claim.since_s <= last_s
 
 
-def test_a_run_that_keeps_to_its_conditions_is_not_talked_about(run: RunRecord) -> None:
+def test_no_violation_is_reported_in_a_run_that_meets_its_conditions(run: RunRecord) -> None:
     guard, said = guarded(run)
     assert (said, guard.void_from, guard.stopped) == ([], None, None)
 
 
-def test_nothing_is_said_of_what_is_claimed_nowhere(make: Make) -> None:
-    """Of another trigger only what follows from (I1); of acknowledged updates nothing."""
+def test_only_assumptions_of_existing_claims_are_reported(make: Make) -> None:
+    """With another trigger, only (I1) and its consequences are claimed; with acks, nothing."""
     network = network_of(lambda n: None if 10 <= n < 20 else 33)
     for resolved in (make(network={"protocol": "ack"}), _absolute(make)):
         assert guarded(simulate(resolved, network))[1] == []
@@ -324,11 +324,11 @@ def _absolute(make: Make) -> Scenario:
     return make().model_copy(update={"trigger": AbsoluteSettings(policy="absolute", delta=0.02)})
 
 
-# --- it is said in time, and costs little memory --------------------------------------------------
+# --- reports are timely and cost little memory ----------------------------------------------------
 
 
-def test_an_input_that_is_too_old_is_told_while_the_controller_stands_still(make: Make) -> None:
-    """Nothing of the controller's own rows is needed for that."""
+def test_an_input_that_is_too_old_is_reported_during_the_outage(make: Make) -> None:
+    """The report does not need the controller's own rows."""
     record = with_outage(make(), 2.0, 3.0)
     guard, said = AssumptionMonitor(record.scenario), []
     for table in record.tables:
@@ -339,7 +339,7 @@ def test_an_input_that_is_too_old_is_told_while_the_controller_stands_still(make
     assert [(one.t_s, one.cause) for one in said] == [(pytest.approx(2.01), "hold")]
 
 
-def test_losses_are_told_once_the_network_has_said_so(make: Make) -> None:
+def test_losses_are_reported_once_the_networks_rows_arrive(make: Make) -> None:
     record = simulate(make(), network_of(lambda n: None if n >= 10 else 0))
     guard = AssumptionMonitor(record.scenario)
     until_ns = event_s(record, 13) * 1e9
@@ -349,8 +349,8 @@ def test_losses_are_told_once_the_network_has_said_so(make: Make) -> None:
     assert (one.cause, one.t_s) == ("dropouts", pytest.approx(event_s(record, 12)))
 
 
-def test_only_what_waits_is_kept(make: Make) -> None:
-    """In a run of any length: here every 0.5 s, all processes together."""
+def test_only_rows_that_are_still_needed_are_stored(make: Make) -> None:
+    """The memory does not grow with the run; here all processes send every 0.5 s."""
     record = simulate(make(horizon_s=30.0, trigger={"beta": 1e-9}), hostile(1))
     guard, waiting = AssumptionMonitor(record.scenario), []
     for end_ns in range(500_000_000, 30_500_000_000, 500_000_000):
@@ -362,8 +362,8 @@ def test_only_what_waits_is_kept(make: Make) -> None:
     assert max(waiting) < 150
 
 
-def test_a_guard_gives_up_rather_than_keep_everything(make: Make) -> None:
-    """The controller is not heard of for a quarter of an hour."""
+def test_the_monitor_stops_instead_of_storing_everything(make: Make) -> None:
+    """No rows of the controller arrive for a quarter of an hour."""
     record = simulate(make(trigger={"beta": 1e-9}, network={"initial_sync": "known_state"}))
     guard, sensor = AssumptionMonitor(record.scenario), record[SENSOR_MEASUREMENT].copy()
     sensor["event"] = np.arange(len(sensor))
@@ -379,7 +379,7 @@ def test_a_guard_gives_up_rather_than_keep_everything(make: Make) -> None:
     assert guard.end() == []
 
 
-def test_what_was_violated_before_stays_violated(make: Make) -> None:
+def test_a_claim_violated_before_it_is_void_stays_violated(make: Make) -> None:
     record, _ = slow_controller(make)
     rows = record[SENSOR_MEASUREMENT].copy()
     rows["e_s_norm"][100] = 5.0

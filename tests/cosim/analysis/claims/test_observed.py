@@ -1,4 +1,4 @@
-"""What a record shows of the conditions that it was made under: whole records, and spoilt ones."""
+"""The observed conditions of a run: from complete and from damaged records."""
 
 import numpy as np
 import pytest
@@ -46,7 +46,7 @@ def event_s(record: RunRecord, number: int) -> float:
 def busy(
     step_ns: int, tick_ns: int, every: int, phase: float, sync: str, horizon_s: float, make: Make
 ) -> Scenario:
-    """All but every measurement is an event."""
+    """Almost every measurement is an event."""
     return make(
         horizon_s=horizon_s,
         plant={"rate_hz": 1e9 / step_ns, "measure_every": every},
@@ -74,7 +74,7 @@ def test_a_simulated_run_keeps_to_its_own_schedule_whatever_the_rates(make: Make
 @pytest.mark.parametrize(
     ("step_ns", "tick_ns", "every", "phase"),
     [
-        (2_000_000, 2_000_000, 1, 0.5),  # the demo's
+        (2_000_000, 2_000_000, 1, 0.5),  # the demo's rates
         (2_000_000, 3_000_000, 1, 0.0),
         (5_000_000, 7_000_000, 3, 0.5),
         (4_000_000, 5_000_000, 2, 0.0168),
@@ -82,10 +82,10 @@ def test_a_simulated_run_keeps_to_its_own_schedule_whatever_the_rates(make: Make
         (2_000_000, 2_020_000, 1, 0.3),
     ],
 )
-def test_a_schedule_s_worst_case_really_happens(
+def test_the_worst_case_of_a_schedule_occurs(
     step_ns: int, tick_ns: int, every: int, phase: float, make: Make
 ) -> None:
-    """What is presupposed is what occurs, to the nanosecond: nothing is allowed for nothing."""
+    """The assumed delays and ages occur exactly, to the nanosecond."""
     resolved = busy(step_ns, tick_ns, every, phase, "first_packet", 1.5, make)
     seen, presupposed = (
         read_conditions(simulate(resolved)).summary(),
@@ -95,7 +95,7 @@ def test_a_schedule_s_worst_case_really_happens(
         assert seen[name] == pytest.approx(getattr(presupposed, name), abs=1e-12), name
 
 
-def test_late_periods_are_added() -> None:
+def test_allowed_late_periods_extend_the_conditions() -> None:
     none, two = (nominal_conditions(_plain(rate), late) for rate, late in ((100.0, 0), (100.0, 2)))
     assert two.delay_s - none.delay_s == pytest.approx(0.02)
     assert two.hold_s - none.hold_s == pytest.approx(0.02)
@@ -121,10 +121,10 @@ def _plain(rate_hz: float) -> Scenario:
     )  # fmt: skip
 
 
-# --- each condition, left at the right time -------------------------------------------------------
+# --- violation of each condition, reported with the right time ------------------------------------
 
 
-def test_too_many_losses_in_a_row_are_told_at_the_one_too_many(make: Make) -> None:
+def test_too_many_consecutive_losses_are_reported_at_the_first_excess_loss(make: Make) -> None:
     lost = {4, 5, 8, 9, 10, 11}  # two are allowed
     record = simulate(make(), network_of(lambda n: None if n in lost else 0))
     when_s, why = left(record)
@@ -133,7 +133,7 @@ def test_too_many_losses_in_a_row_are_told_at_the_one_too_many(make: Make) -> No
     assert read_conditions(record).summary()["dropouts"] == 4
 
 
-def test_losses_of_the_end_count_although_nothing_follows_them(make: Make) -> None:
+def test_losses_at_the_end_of_a_run_count(make: Make) -> None:
     record = simulate(make(), network_of(lambda n: None if n >= 20 else 0))
     assert record[SENSOR_MEASUREMENT]["event"].max() > 25
     when_s, why = left(record)
@@ -141,23 +141,23 @@ def test_losses_of_the_end_count_although_nothing_follows_them(make: Make) -> No
     assert "consecutive updates lost" in why
 
 
-def test_a_late_update_is_told_at_its_event(make: Make) -> None:
+def test_a_late_update_is_reported_at_its_event(make: Make) -> None:
     record = simulate(make(), network_of(lambda n: 33 if n == 7 else 0))
     when_s, why = left(record)
     assert when_s == pytest.approx(event_s(record, 7))
-    # 33 ms later, at the tick after that, and the plant's step after the tick.
+    # 33 ms later, at the next tick, and at the plant's step after that tick.
     assert why == "an update took effect after 0.04 s, 0.01 s allowed"
 
 
-def test_an_update_that_was_overtaken_is_lost(make: Make) -> None:
+def test_a_stale_update_counts_as_lost(make: Make) -> None:
     record = simulate(make(), network_of(lambda n: 2000 if n in (7, 8, 9) else 0))
     when_s, why = left(record)
     assert when_s == pytest.approx(event_s(record, 9))
     assert why == "3 consecutive updates lost, 2 allowed"
 
 
-def test_an_update_that_is_overtaken_in_time_is_not_lost(make: Make) -> None:
-    """Every other update is just under way long enough for the next one to pass it."""
+def test_a_stale_update_is_not_lost_if_the_newer_one_arrived_in_time(make: Make) -> None:
+    """The delay of every other update is just long enough for the next update to arrive first."""
     resolved = make()
     allowance_s = 0.4
     record = simulate(resolved, network_of(lambda n: 500 if n % 2 else 0))
@@ -169,8 +169,8 @@ def test_an_update_that_is_overtaken_in_time_is_not_lost(make: Make) -> None:
     assert observed.losses.consecutive(allowance_s).largest() == 0
 
 
-def test_an_update_that_never_came_is_late_from_its_event_on(make: Make) -> None:
-    """The network passed it, nobody took it: lost in a socket, or by a controller that died."""
+def test_an_update_that_never_arrives_is_late_from_its_event_on(make: Make) -> None:
+    """The network forwarded it; it was lost in a socket or with a dead controller."""
     whole = simulate(make(), network_of(lambda n: 0))
     deliveries = whole[CONTROLLER_DELIVERY]
     record = changed(whole, **{CONTROLLER_DELIVERY: deliveries[deliveries["sequence"] < 12]})
@@ -179,7 +179,9 @@ def test_an_update_that_never_came_is_late_from_its_event_on(make: Make) -> None
     assert "an update took effect after" in why
 
 
-def test_missing_measurements_are_told_at_the_last_before_them(run: RunRecord) -> None:
+def test_missing_measurements_are_reported_at_the_last_measurement_before_them(
+    run: RunRecord,
+) -> None:
     rows = run[SENSOR_MEASUREMENT]
     assert left(changed(run, **{SENSOR_MEASUREMENT: np.delete(rows, slice(100, 103))})) == (
         pytest.approx(0.99), "no measurement for 0.04 s, 0.01 s allowed",
@@ -193,28 +195,28 @@ def test_missing_measurements_are_told_at_the_last_before_them(run: RunRecord) -
 
 
 def held(run: RunRecord, first: int, last: int, by: int) -> RunRecord:
-    """Steps ``first`` to ``last`` − 1 hold inputs ``by`` steps older than they did."""
+    """Steps ``first`` to ``last`` − 1 apply inputs that are older by ``by`` steps."""
     steps = run[PLANT_STEP].copy()
     steps["actuation"][first:last] -= by
     return changed(run, **{PLANT_STEP: steps})
 
 
-def test_an_old_input_is_told_when_it_is_too_old(run: RunRecord) -> None:
+def test_an_old_input_is_reported_when_it_exceeds_the_maximum_age(run: RunRecord) -> None:
     assert read_conditions(run).summary()["hold_s"] == pytest.approx(0.015)
     assert left(held(run, 200, 210, 3)) == (
         pytest.approx(2.0), "an input was 0.045 s old, 0.015 s allowed",
     )  # fmt: skip
 
 
-def test_an_input_of_the_future_is_too_far_from_now_as_well(run: RunRecord) -> None:
-    """A plant that is late by 3.5 steps latches what the controller meant for later."""
+def test_an_input_from_the_future_violates_the_maximum_age(run: RunRecord) -> None:
+    """A plant that is 3.5 steps late latches an input computed for a later time."""
     assert read_conditions(held(run, 200, 203, -2)).first_violation(allowed(run)) is None
     assert left(held(run, 200, 203, -4)) == (
         pytest.approx(2.0), "an input was 0.035 s old, 0.015 s allowed",
     )  # fmt: skip
 
 
-def test_an_update_that_the_model_had_late_is_late_even_if_the_plant_was_later(
+def test_an_update_late_at_the_model_is_late_even_if_the_plant_was_later(
     run: RunRecord,
 ) -> None:
     deliveries = run[CONTROLLER_DELIVERY].copy()
@@ -224,12 +226,12 @@ def test_an_update_that_the_model_had_late_is_late_even_if_the_plant_was_later(
     assert why == "an update took effect after 0.03 s, 0.01 s allowed"
 
 
-def test_a_late_start_leaves_the_conditions_at_once(make: Make) -> None:
+def test_a_late_start_violates_the_conditions_at_once(make: Make) -> None:
     for sync in ("first_packet", "known_state"):
         resolved = make(network={"initial_sync": sync})
         record = simulate(resolved, network_of(lambda n: 500 if n < 3 else 0))
         found = read_conditions(record)
-        if sync == "known_state":  # nobody has to tell the controller where to begin
+        if sync == "known_state":  # the controller starts from the known x(0)
             assert found.start_s == pytest.approx(0.01)
             continue
         assert found.start_s > 0.01
@@ -238,8 +240,8 @@ def test_a_late_start_leaves_the_conditions_at_once(make: Make) -> None:
         assert why.startswith("the plant applied no input until")
 
 
-def test_what_the_start_brings_late_is_the_start_s(make: Make) -> None:
-    """The first update, 60 ms late, is felt with the first input of all."""
+def test_a_late_first_update_violates_only_the_start_condition(make: Make) -> None:
+    """The first update is 60 ms late and is applied with the first input."""
     record = simulate(make(trigger={"beta": 0.1}), network_of(lambda n: 0 if n else 60))
     assert event_s(record, 1) > 0.07
     found = read_conditions(record)
@@ -247,7 +249,7 @@ def test_what_the_start_brings_late_is_the_start_s(make: Make) -> None:
     assert found.delay.largest() == pytest.approx(0.01)
 
 
-# --- records that lack something ------------------------------------------------------------------
+# --- incomplete records ---------------------------------------------------------------------------
 
 
 def without(run: RunRecord, *processes: str) -> RunRecord:
@@ -256,12 +258,12 @@ def without(run: RunRecord, *processes: str) -> RunRecord:
 
 
 @pytest.mark.parametrize("process", ["plant", "sensor", "controller"])
-def test_without_a_process_nothing_is_certain(run: RunRecord, process: str) -> None:
+def test_conditions_are_unknown_without_the_rows_of_a_process(run: RunRecord, process: str) -> None:
     when_s, _ = left(without(run, process))
     assert when_s == 0.0
 
 
-def test_without_the_network_s_word_the_losses_are_known_from_the_controller(
+def test_losses_are_derived_from_the_controller_without_network_rows(
     run: RunRecord,
 ) -> None:
     whole, blind = read_conditions(run), read_conditions(without(run, "netem"))
@@ -269,7 +271,7 @@ def test_without_the_network_s_word_the_losses_are_known_from_the_controller(
     assert blind.hold.largest() == whole.hold.largest()
 
 
-def test_an_empty_record_has_conditions_too(run: RunRecord) -> None:
+def test_an_empty_record_has_conditions(run: RunRecord) -> None:
     empty = without(run, "plant", "sensor", "netem", "controller")
     found = read_conditions(empty)
     assert set(found.summary().values()) == {None}
@@ -281,8 +283,8 @@ def until(run: RunRecord, end_s: float, *names: str) -> RunRecord:
     return changed(run, **cut)
 
 
-def test_a_controller_that_died_holds_its_last_input_for_ever(make: Make) -> None:
-    """Its own last rows are lost with it; the plant's record of its inputs is not."""
+def test_the_last_input_of_a_dead_controller_grows_old(make: Make) -> None:
+    """The controller's last rows are lost; the plant's record of its inputs is not."""
     run = simulate(make(), network_of(lambda n: 0))
     died_s, known_s = 3.0, 2.96
     steps = run[PLANT_STEP].copy()
@@ -299,21 +301,20 @@ def test_a_controller_that_died_holds_its_last_input_for_ever(make: Make) -> Non
     assert late[0] == pytest.approx(died_s)
 
 
-def test_ticks_that_nobody_knows_are_as_old_as_can_be(run: RunRecord) -> None:
+def test_inputs_of_unrecorded_ticks_have_the_largest_possible_age(run: RunRecord) -> None:
     ticks, inputs = run[CONTROLLER_STEP], run[PLANT_ACTUATION]
     gap = slice(300, 310)
     record = changed(run, **{CONTROLLER_STEP: np.delete(ticks, gap)})
-    assert read_conditions(record).hold.largest() == pytest.approx(
-        0.015
-    )  # the plant knows when they were
+    # The plant's record has the times of the missing ticks.
+    assert read_conditions(record).hold.largest() == pytest.approx(0.015)
     record = changed(record, **{PLANT_ACTUATION: np.delete(inputs, gap)})
     when_s, why = left(record)
     assert when_s == pytest.approx(3.01)
     assert "an input was" in why
 
 
-def test_a_run_that_diverges_is_without_measurements_from_then_on(make: Make) -> None:
-    """What is no number is not received: at 400 Hz e^{709} is passed within 0.4 s."""
+def test_a_diverged_run_has_no_further_measurements(make: Make) -> None:
+    """Non-finite values are not received; at 400 Hz, e^{709} is exceeded within 0.4 s."""
     record = simulate(
         make(
             horizon_s=1.0,
@@ -328,7 +329,7 @@ def test_a_run_that_diverges_is_without_measurements_from_then_on(make: Make) ->
     assert found.sampling.largest() == pytest.approx(0.65, abs=0.02)
 
 
-def test_rows_of_every_table_may_be_none_at_all(make: Make) -> None:
+def test_every_table_may_be_empty(make: Make) -> None:
     resolved = make()
     n, m = 2, 1
     rows = {table: np.zeros(0, dtype) for table, dtype in tables(n, m).items()}
@@ -341,8 +342,8 @@ def test_rows_of_every_table_may_be_none_at_all(make: Make) -> None:
     assert NETEM_PACKET in rows
 
 
-def test_what_is_overtaken_as_the_run_ends_is_not_lost(make: Make) -> None:
-    """The controller has the newer update, but no step is left in which the plant could feel it."""
+def test_a_stale_update_at_the_end_of_the_run_is_not_lost(make: Make) -> None:
+    """The controller has the newer update, but no plant step is left that could apply it."""
     busy = make(trigger={"beta": 1e-6}, horizon_s=1.0)
     events = simulate(busy, network_of(lambda n: 0))[SENSOR_MEASUREMENT]["event"]
     late = int(events.max()) - 1

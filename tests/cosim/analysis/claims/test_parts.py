@@ -1,4 +1,4 @@
-"""Claims about runs whose settings change: up to the change, and of the run that follows it."""
+"""Claims about runs with changes of parameters: up to the change, and for the part after it."""
 
 from typing import Any
 
@@ -41,13 +41,13 @@ def test_without_changes_the_claims_are_those_of_the_run() -> None:
     assert RunClaims(record).judge() == ClaimEvaluation(record).judge()
 
 
-def test_a_change_of_the_loss_alone_touches_no_claim() -> None:
+def test_a_change_of_the_loss_alone_affects_no_claim() -> None:
     claims = RunClaims(run_with((2.0, {"network.loss.probability": 0.9}))).judge()
     assert {(claim.from_s, claim.until_s) for claim in claims} == {(0.0, None)}
     assert {claim.verdict for claim in claims} == {ClaimVerdict.HELD}
 
 
-def test_what_follows_a_change_is_judged_as_a_run_of_its_own() -> None:
+def test_the_part_after_a_change_is_judged_as_a_separate_run() -> None:
     record = run_with((2.005, {"trigger.beta": 0.04, "network.mansd": 2}))
     claims = RunClaims(record).judge()
     deliveries = record[CONTROLLER_DELIVERY]["t_ns"]
@@ -60,13 +60,13 @@ def test_what_follows_a_change_is_judged_as_a_run_of_its_own() -> None:
     )
     assert [one.what for one in before] == [one.what for one in after]
     delta = {one.what: one.certified for one in after}["the controller's error is bounded"]
-    # βe^{−αt} in the run's own time: what is certified of its first instant is of that threshold.
+    # βe^{−αt} in the run's own time: the part's certificate starts from the threshold at that time.
     own = next(part for part in RunClaims(record).parts[1:] if isinstance(part, ClaimEvaluation))
     beta = 0.04 * np.exp(-0.2 * first_s)
     assert own.record.scenario.decaying.beta == pytest.approx(beta)
     envelope = own.certificates[0].controller_error(np.zeros(1))
     assert envelope == pytest.approx([delta * beta])
-    # One more may be lost in a row, and is one more that may be missing.
+    # One more consecutive loss is allowed, so one more update may be missing.
     missing = [
         part.certificates[0].constants for part in RunClaims(record).parts
         if isinstance(part, ClaimEvaluation)
@@ -76,14 +76,14 @@ def test_what_follows_a_change_is_judged_as_a_run_of_its_own() -> None:
     assert missing[1].missing_events == missing[0].missing_events + 1
 
 
-def test_at_a_set_point_the_claims_are_of_the_deviations() -> None:
+def test_claims_at_a_set_point_concern_the_deviations() -> None:
     claims = RunClaims(run_with((2.005, {"controller.setpoint": [3.0, 0.0]}))).judge()
     after = [one for one in claims if one.from_s > 0]
     assert {one.verdict for one in after} == {ClaimVerdict.HELD}
     assert any(one.source == "box certificate" for one in after)
 
 
-def test_a_plant_that_does_not_rest_where_its_model_does_is_certified_nothing() -> None:
+def test_no_certificate_at_a_set_point_that_is_not_the_plants_equilibrium() -> None:
     plant = CONTENT["plant"] | {"uncertainty_A": [[0.0, 0.0], [0.3, 0.0]]}
     claims = RunClaims(run_with((2.005, {"controller.setpoint": [3.0, 0.0]}), plant=plant)).judge()
     after = [one for one in claims if one.from_s > 0]
@@ -94,8 +94,8 @@ def test_a_plant_that_does_not_rest_where_its_model_does_is_certified_nothing() 
     assert identity.verdict is ClaimVerdict.HELD
 
 
-def test_two_set_points_at_once_are_neither() -> None:
-    # Who reads the deviations from the wrong one sees a state that never decays.
+def test_nothing_is_judged_before_a_set_point_that_applies_from_the_start() -> None:
+    # Deviations from the wrong set-point never decay.
     record = run_with((0.0, {"controller.setpoint": [3.0, 0.0]}), horizon_s=12.0)
     (first, own) = RunClaims(record).parts
     assert isinstance(own, ClaimEvaluation)
@@ -105,7 +105,7 @@ def test_two_set_points_at_once_are_neither() -> None:
     assert first.judge() == [] or all(one.ratio is None for one in first.judge())
 
 
-def test_until_a_delivery_nothing_is_claimed_and_that_is_said() -> None:
+def test_a_part_without_a_delivery_is_void_with_the_reason() -> None:
     record = run_with((5.995, {"trigger.beta": 0.04}))
     (last,) = [one for one in RunClaims(record).judge() if one.from_s > 0]
     assert last.verdict is ClaimVerdict.VOID
@@ -113,7 +113,7 @@ def test_until_a_delivery_nothing_is_claimed_and_that_is_said() -> None:
     assert "no update was delivered after it" in last.why
 
 
-def test_a_process_that_never_heard_of_a_change_leaves_nothing_to_claim() -> None:
+def test_claims_are_void_if_a_process_did_not_receive_a_change() -> None:
     record = run_with((2.005, {"trigger.beta": 0.04}))
     rows = {table: record[table] for table in record.tables}
     rows[CONTROLLER_SETTING] = rows[CONTROLLER_SETTING][:0]
@@ -130,7 +130,7 @@ def test_an_input_too_far_from_kx_voids_the_certificate() -> None:
     assert all("from Kx" in one.why for one in void)
 
 
-def test_the_error_of_the_input_at_the_start_is_that_of_the_steps() -> None:
+def test_the_input_error_at_the_start_is_that_of_the_plants_steps() -> None:
     record = run_with()
     loop, steps = record.loop, record[PLANT_STEP]
     u, x = steps["u"][:20], steps["x"][:21]
@@ -142,7 +142,7 @@ def test_the_error_of_the_input_at_the_start_is_that_of_the_steps() -> None:
     assert worst <= found <= 1.01 * worst
 
 
-def test_the_guard_says_no_more_of_what_comes_after() -> None:
+def test_the_monitor_reports_nothing_after_its_end_time() -> None:
     record = run_with(network=CONTENT["network"] | {"enforce_mansd": False, "mansd": 0})
     free, ended = AssumptionMonitor(record.scenario), AssumptionMonitor(record.scenario)
     ended.end_at(0.0)

@@ -1,4 +1,4 @@
-"""Theorem 1's Δ from a recorded run: against its parts, one by one, and the error it bounds."""
+"""Theorem 1's Δ from a recorded run: against its terms, and against the error that it bounds."""
 
 import itertools
 import math
@@ -25,9 +25,9 @@ def delta_of(record: RunRecord) -> float | None:
 
 
 def by_hand(record: RunRecord, joined: AlignedRun, horizon: int = 10**9) -> float:
-    """1 + Σ_k e^{αδ̃_k} sup‖e^{Hτ}‖ over the events that are missing after each event.
+    """1 + Σ_k e^{αδ̃_k} sup‖e^{Hτ}‖ over the missing events after each event.
 
-    Here from real intervals, which the theorem's δ̄_j bound from above.
+    Computed from the real intervals; the theorem's δ̄_j bound them from above.
     """
     from scipy.linalg import expm
 
@@ -48,7 +48,7 @@ def by_hand(record: RunRecord, joined: AlignedRun, horizon: int = 10**9) -> floa
 
 @pytest.mark.parametrize("mode", ["model", "zoh"])
 @pytest.mark.parametrize("sync", ["first_packet", "known_state"])
-def test_it_bounds_the_error_and_what_the_real_intervals_give(
+def test_theorem_1_bounds_the_error_and_the_sum_over_the_real_intervals(
     mode: str, sync: str, make: Make
 ) -> None:
     fast = make(
@@ -63,30 +63,30 @@ def test_it_bounds_the_error_and_what_the_real_intervals_give(
     trigger = record.scenario.trigger
     level = trigger.beta * np.exp(-trigger.alpha_per_s * joined.t_ns * 1e-9)
     known = joined.received >= 0
-    # The theorem's trigger watches always; this one is tested once a millisecond.
+    # The theorem assumes a continuous trigger; this one is tested once a millisecond.
     overshoot = float((joined.e_s_norm / joined.threshold).max())
     assert overshoot < 1.2
     assert (joined.e_c_norm[known] <= overshoot * delta * level[known]).all()
 
 
-def test_a_late_update_is_missing_until_it_comes_and_no_longer(make: Make) -> None:
-    """Every update is 15 ms late: never two are missing, however long the run."""
+def test_a_late_update_is_missing_exactly_until_it_arrives(make: Make) -> None:
+    """Every update is 15 ms late, so two are never missing at once."""
     record = simulate(make(), network_of(lambda n: 15))
     joined = join_all(record)
     starts = np.flatnonzero(record[SENSOR_MEASUREMENT]["event"] != NO_SEQUENCE)
     assert (joined.received[starts[1:]] == np.arange(len(starts) - 1)).all()
     delta, alone = trajectory_delta(record, joined), by_hand(record, joined)
     assert delta is not None
-    # Each stretch is one event long; δ̄_j is some times the real interval.
+    # Each stretch has one event; δ̄_j is a few times the real interval.
     assert alone < 4
     assert delta < 20
 
 
-def test_without_losses_nothing_is_missing(make: Make) -> None:
+def test_no_event_is_missing_without_losses(make: Make) -> None:
     assert delta_of(simulate(make(), network_of(lambda n: 0))) == 1.0
 
 
-def test_there_is_none_without_events_or_with_a_weight(make: Make) -> None:
+def test_theorem_1_does_not_apply_without_events_or_with_a_weight(make: Make) -> None:
     quiet = make(trigger={"beta": 100.0}, network={"initial_sync": "known_state"})
     assert delta_of(simulate(quiet)) is None
     record = simulate(make())

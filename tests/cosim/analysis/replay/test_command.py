@@ -32,7 +32,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def runs(simulated: Path, tmp_path: Path) -> Path:
-    """A folder of runs of one's own."""
+    """An own folder of runs."""
     return Path(shutil.copytree(simulated, tmp_path / "runs", symlinks=True))
 
 
@@ -59,7 +59,7 @@ def test_the_last_run_is_replayed(runs: Path) -> None:
     assert document["changed_since"] == []
 
 
-def test_a_difference_is_named_and_fails(runs: Path) -> None:
+def test_a_difference_is_reported_and_fails(runs: Path) -> None:
     rewrite(
         runs / "latest/record/controller_step.parquet", lambda table: nudged(table, "x_c_3", 11)
     )
@@ -73,7 +73,7 @@ def test_a_difference_is_named_and_fails(runs: Path) -> None:
     assert json.loads(as_json.stdout)["first_difference"]["column"] == "x_c_3"
 
 
-def test_a_difference_on_another_machine_says_so(runs: Path) -> None:
+def test_a_difference_on_another_machine_lists_what_changed(runs: Path) -> None:
     rewrite(runs / "latest/record/plant_step.parquet", lambda table: nudged(table, "x_1", 3))
     path = runs / "latest/environment.json"
     environment = json.loads(path.read_text())
@@ -86,7 +86,7 @@ def test_a_difference_on_another_machine_says_so(runs: Path) -> None:
     assert len(document["changed_since"]) == 1
 
 
-def test_an_incomplete_record_is_exact_as_far_as_it_goes(runs: Path) -> None:
+def test_an_incomplete_record_is_exact_up_to_its_end(runs: Path) -> None:
     rewrite(
         runs / "latest/record/sensor_measurement.parquet",
         lambda table: pa.concat_tables([table.slice(0, 20), table.slice(22)]),
@@ -122,7 +122,7 @@ def spoil(run_dir: Path, how: str) -> None:
 
 
 @pytest.mark.parametrize("how", ["no scenario", "no record", "no table", "no Parquet", "no column"])
-def test_what_is_no_run_directory_gets_one_line(runs: Path, how: str) -> None:
+def test_an_invalid_run_directory_gives_one_line(runs: Path, how: str) -> None:
     spoil(runs / "latest", how)
     done = noack("replay", runs / "latest")
     assert done.exit_code == 2
@@ -131,7 +131,7 @@ def test_what_is_no_run_directory_gets_one_line(runs: Path, how: str) -> None:
     assert done.stderr.count("\n") == 1
 
 
-def test_no_run_at_all_gets_one_line(tmp_path: Path) -> None:
+def test_a_missing_run_gives_one_line(tmp_path: Path) -> None:
     for arguments in (("--runs", tmp_path / "none"), (tmp_path,)):
         done = noack("replay", *arguments)
         assert done.exit_code == 2

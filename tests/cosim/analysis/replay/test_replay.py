@@ -1,4 +1,4 @@
-"""Replay finds nothing in a good record, and finds every flipped bit in a damaged one.
+"""Replay finds no difference in a good record, and every flipped bit in a damaged one.
 
 The record is a simulated one; live records are replayed in tests/integration.
 """
@@ -43,9 +43,9 @@ SHORT = (
 RECORD = simulate(resolve(load(ROOT / "scenarios" / "lane_following.toml", SHORT)))
 
 FILLED = [table for table in RECORD.tables if len(RECORD[table]) or table not in SETTINGS]
-"""Nothing is changed in this run."""
+"""No parameter changes in this run."""
 FROM_OUTSIDE = ("input", "now_ns")
-"""Columns that have tests of their own: no machine gives a process its order and its clock."""
+"""Columns with separate tests: they record the process's clock and input order."""
 
 
 def changed(rows: Mapping[str, Rows], reports: Any = RECORD.reports) -> RunRecord:
@@ -86,7 +86,7 @@ def test_a_run_is_replayed_bit_for_bit() -> None:
 
 
 @pytest.mark.parametrize(("table", "column"), list(columns()))
-@settings(max_examples=40)  # for each of some forty columns
+@settings(max_examples=40)  # for each of about forty columns
 @given(st.data())
 def test_a_flipped_bit_is_found_and_named(table: str, column: str, data: st.DataObject) -> None:
     rows = RECORD[table]
@@ -99,8 +99,8 @@ def test_a_flipped_bit_is_found_and_named(table: str, column: str, data: st.Data
     assert first.table == table
     name = f"{column}_{byte // 8 + 1}" if rows.dtype[column].shape else column
     if column == "sequence":
-        # With another message's number, the rest of the message is what differs; with the next
-        # one's, the next row may be the one that repeats it.
+        # With another message's number, the rest of the row differs; with the next one's, the next
+        # row may be the repeated one.
         assert first.row - row in (0, 1)
         assert first.column in ("sequence", "t_ns")
     else:
@@ -117,20 +117,20 @@ def test_a_wrong_input_number_is_found(table: str, data: st.DataObject) -> None:
     found = replay(flipped(table, row, "input", byte, bit))
     first = found.first_difference
     assert first is not None
-    # Of two rows with one number either may be the wrong one.
+    # Either of two rows with the same number may be the wrong one.
     assert OWNER[first.table] == OWNER[table]
     assert first.column == "input"
     assert [gap.partition(":")[0] for gap in found.gaps] == [OWNER[table]]
 
 
 @pytest.mark.parametrize("table", FILLED)
-def test_time_does_not_run_backward(table: str) -> None:
+def test_a_time_that_decreases_is_found(table: str) -> None:
     found = replay(flipped(table, len(RECORD[table]) - 1, "now_ns", 7, 7))
     assert found.first_difference is not None
     assert found.first_difference.column in ("now_ns", "t_ns")  # netem's t_ns is its now_ns
 
 
-def test_no_timer_acts_before_it_is_due() -> None:
+def test_a_timer_before_its_deadline_is_found() -> None:
     rows = RECORD[PLANT_STEP].copy()
     rows["now_ns"][7] -= 1
     first = replay(changed({PLANT_STEP: rows})).first_difference
@@ -139,13 +139,13 @@ def test_no_timer_acts_before_it_is_due() -> None:
 
 
 @pytest.mark.parametrize("table", FILLED)
-def test_missing_rows_are_said(table: str) -> None:
+def test_missing_rows_are_reported(table: str) -> None:
     rows = RECORD[table]
     cut = len(rows) // 2
     found = replay(changed({table: np.delete(rows, [cut])}))
     number = int(rows["input"][cut])
     process = OWNER[table]
-    assert found.bit_exact  # as far as it goes
+    assert found.bit_exact  # up to the gap
     assert found.gaps == [f"{process}: rows are missing from input {number} on"]
     assert found.verdict()["complete"] is False
     accounts = {account.process: account for account in found.processes}
@@ -154,7 +154,7 @@ def test_missing_rows_are_said(table: str) -> None:
 
 
 @pytest.mark.parametrize("table", FILLED)
-def test_rows_missing_at_the_end_are_said(table: str) -> None:
+def test_rows_missing_at_the_end_are_reported(table: str) -> None:
     cut = int(RECORD[table]["input"][-1])
     rows = {
         other: RECORD[other][RECORD[other]["input"] < cut]
@@ -176,7 +176,7 @@ def test_a_difference_before_a_gap_is_still_found() -> None:
 
 
 @pytest.mark.parametrize("process", ["plant", "sensor", "netem", "controller"])
-def test_who_left_no_report_is_named(process: str) -> None:
+def test_a_process_without_a_report_is_named(process: str) -> None:
     reports = {role: report for role, report in RECORD.reports.items() if role != process}
     found = replay(changed({}, reports=reports))
     assert found.bit_exact
@@ -185,8 +185,8 @@ def test_who_left_no_report_is_named(process: str) -> None:
     ]
 
 
-def test_what_nobody_sent_is_found() -> None:
-    """A forged actuation that got by: the plant acts on it, so only the sender can tell."""
+def test_a_message_that_no_process_sent_is_found() -> None:
+    """The plant applies a forged actuation, so only the sender's rows reveal it."""
     rows = RECORD[PLANT_ACTUATION].copy()
     last = len(rows) - 1
     rows["sequence"][last] += 1
@@ -198,8 +198,8 @@ def test_what_nobody_sent_is_found() -> None:
     assert first.what == "was never sent"
 
 
-def test_a_delivery_of_what_the_network_dropped_is_found() -> None:
-    """As if a dropped update had arrived: it was sent so, but must not be there."""
+def test_a_delivery_of_a_dropped_update_is_found() -> None:
+    """The record shows the arrival of an update that was sent and then dropped."""
     events = RECORD[SENSOR_MEASUREMENT][RECORD[SENSOR_MEASUREMENT]["event"] >= 0]
     deliveries = RECORD[CONTROLLER_DELIVERY].copy()
     delivered = set(deliveries["sequence"].tolist())
@@ -217,8 +217,8 @@ def test_a_delivery_of_what_the_network_dropped_is_found() -> None:
     assert differences["sensor → netem"] is None
 
 
-def test_a_machine_that_changed_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The plant's arithmetic in another order: the same but for the last bits."""
+def test_a_changed_machine_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The plant's arithmetic in another order: only the last bits differ."""
 
     def reordered(self: HeldInputPropagator, x: Any, u: Any, dt_ns: int) -> Any:
         Ad, Bd = self.step(dt_ns)
@@ -233,9 +233,9 @@ def test_a_machine_that_changed_is_found(monkeypatch: pytest.MonkeyPatch) -> Non
     assert accounts["controller"].difference is None
 
 
-def test_numbers_that_no_machine_takes_are_a_difference() -> None:
+def test_values_that_a_machine_refuses_are_a_difference() -> None:
     rows = RECORD[SENSOR_MEASUREMENT].copy()
-    rows["t_ns"][20] = -(2**62)  # e^(−αt) is no number
+    rows["t_ns"][20] = -(2**62)  # e^(−αt) overflows
     found = replay(changed({SENSOR_MEASUREMENT: rows}))
     sensor = next(account for account in found.processes if account.process == "sensor")
     assert sensor.difference is not None
@@ -244,7 +244,7 @@ def test_numbers_that_no_machine_takes_are_a_difference() -> None:
     assert "sensor: replayed up to input 20" in found.gaps
 
 
-def test_an_empty_record_is_not_called_exact() -> None:
+def test_an_empty_record_is_not_reported_as_exact() -> None:
     found = replay(changed({table: RECORD[table][:0] for table in RECORD.tables}, reports={}))
     assert found.bit_exact is None
     assert found.inputs == 0

@@ -1,4 +1,4 @@
-"""Replay of a controller that took another's place, of which only its rows are on record."""
+"""Replay of a restarted controller; only the rows of the second generation are recorded."""
 
 from typing import Any
 
@@ -30,7 +30,7 @@ def test_an_update_before_its_first_tick_is_replayed(content: dict[str, Any], ti
     first = taken[taken["input"] == GENERATION]
     assert len(first) == 1
     assert first["now_ns"][0] < rows[CONTROLLER_STEP]["t_ns"][again][0]
-    if not ticks:  # it died before it had one
+    if not ticks:  # the process died before it had one
         rows[CONTROLLER_STEP] = rows[CONTROLLER_STEP][~again]
         rows[CONTROLLER_DELIVERY] = taken[taken["input"] <= GENERATION]
     found = replay(RunRecord(resolved, rows, [NOTICE], {}, "live"))

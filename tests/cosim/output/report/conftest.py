@@ -1,4 +1,4 @@
-"""Records made of whole cloth: what a report draws need not have happened."""
+"""Synthetic records: a report also draws data that no run produces."""
 
 import copy
 from typing import Any
@@ -20,7 +20,7 @@ ENCODER = Encoder(1, bytes(32))
 
 
 def scenario_of(content: dict[str, Any], n: int = 2, **names: Any) -> Scenario:
-    """The small scenario, with n states in place of its own two."""
+    """The small scenario with n states."""
     content = copy.deepcopy(content)
     if n != 2 or names:
         model = {
@@ -37,7 +37,7 @@ def make_record(scenario: Scenario, k: int = 500, largest: float = 1.0) -> RunRe
     Args:
         scenario: the resolved scenario.
         k: steps of every process.
-        largest: the last half of the states grows to this.
+        largest: final value of the second half of the states.
     """
     loop = loop_of(scenario)
     types = tables(loop.n, loop.m)
@@ -83,7 +83,7 @@ def make_record(scenario: Scenario, k: int = 500, largest: float = 1.0) -> RunRe
     )  # fmt: skip
     fill("controller_delivery", event_ns[arrived], model_t_ns=event_ns[arrived])
     rows["controller_delivery"]["sequence"] = np.flatnonzero(arrived)
-    # The controller took its deliveries and its ticks in one order.
+    # The controller processed its deliveries and its ticks in one order.
     for table, later in (("controller_delivery", 0), ("controller_step", 1)):
         rows[table]["input"] = 2 * (rows[table]["t_ns"] // STEP_NS) + later
     return RunRecord(scenario, rows, [], {})

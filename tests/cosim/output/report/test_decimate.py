@@ -16,7 +16,7 @@ VALUES = arrays(
 def test_each_column_keeps_its_extremes_and_its_ends(
     y: np.ndarray, columns: int, step: int
 ) -> None:
-    """Checked column by column, in the way that a person would draw it."""
+    """Compared column by column, as plotted on the screen."""
     t = np.cumsum(np.arange(len(y)) % (step + 1) + 0.5)
     keep = decimate(t, y, columns)
     assert np.array_equal(keep, np.unique(keep))
@@ -25,7 +25,7 @@ def test_each_column_keeps_its_extremes_and_its_ends(
         return
     assert len(keep) <= 4 * columns
     column = np.minimum((t - t[0]) / (t[-1] - t[0]) * columns, columns - 1).astype(int)
-    # An index that rounding puts into a neighbouring column is in neither comparison.
+    # Indices that rounding assigns to a neighbouring column are compared in neither.
     edge = np.abs((t - t[0]) / (t[-1] - t[0]) * columns - column) < 1e-9
     for c in np.unique(column):
         inside = (column == c) & ~edge
@@ -46,7 +46,7 @@ def test_one_sample_in_a_million_is_not_lost() -> None:
     assert len(keep) <= 2400
 
 
-def test_a_gap_stays_a_gap() -> None:
+def test_gaps_are_preserved() -> None:
     t, y = np.linspace(0, 1, 10_000), np.ones(10_000)
     y[4000:6000] = np.nan
     keep = decimate(t, y, 100)

@@ -24,7 +24,7 @@ from tests.cosim.output.report.conftest import HOSTILE
 SIZES = {"normal": 1000, "empty": 0, "one": 1, "not finite": 1000, "ten": 300, "long": 100_000}
 UNITS = re.compile(r"\[(s|wall µs)\]$")
 UNITLESS = re.compile(r"x_\d|norm|input|count|share of steps at least as late")
-"""Pure numbers, and what is in the model's own units."""
+"""Dimensionless quantities, and those in the model's own units."""
 
 
 def values(case: str, k: int, columns: int | None = None) -> np.ndarray:
@@ -93,7 +93,7 @@ def test_every_figure_can_be_saved(drawn: dict[str, Figure], tmp_path: Path) -> 
         assert (tmp_path / f"{name}.svg").stat().st_size < 1_000_000
 
 
-def test_nothing_is_cut_off_and_no_texts_meet(drawn: dict[str, Figure]) -> None:
+def test_nothing_is_cut_off_and_no_texts_overlap(drawn: dict[str, Figure]) -> None:
     for name, figure in drawn.items():
         with settings():
             figure.draw_without_rendering()
@@ -111,7 +111,7 @@ def test_nothing_is_cut_off_and_no_texts_meet(drawn: dict[str, Figure]) -> None:
                     assert not any(one.overlaps(other) for other in boxes[:i]), name
 
 
-def test_a_figure_without_data_says_so() -> None:
+def test_a_figure_without_data_states_that() -> None:
     for name, figure in drawn_for("empty").items():
         for axes in figure.axes:
             assert "no data" in [text.get_text() for text in axes.texts], name
@@ -143,7 +143,7 @@ def labels(axes: Axes) -> list[str]:
     return [] if legend is None else [text.get_text() for text in legend.get_texts()]
 
 
-def test_intervals_and_fates_are_drawn_where_they_belong() -> None:
+def test_intervals_and_fates_are_drawn_at_their_times() -> None:
     broadcast_s = np.array([0.0, 1.0, 1.5, 3.0, 3.25])
     dropped = np.array([False, True, False, True, False])
     t_s, x = np.linspace(0, 4, 10), np.zeros((10, 1))
@@ -160,8 +160,8 @@ def test_intervals_and_fates_are_drawn_where_they_belong() -> None:
         for line in axes.lines
         if line.get_marker() != "None"
     }
-    assert found["D"] == {3.25: 1.75}  # the first, at 0, has no interval
-    assert found["o"] == {1.5: 1.5}  # the one received without force
+    assert found["D"] == {3.25: 1.75}  # the first event, at 0, has no interval
+    assert found["o"] == {1.5: 1.5}  # the received update that was not forced
     sent, lost = above.lines[1], above.lines[2]
     assert sent.get_xdata().tolist() == [1.5, 3.25]
     assert lost.get_ydata().tolist() == [1.0, 1.5]
@@ -177,8 +177,8 @@ def test_the_papers_figure_is_named_as_in_the_paper(mode: Any, head: str) -> Non
     assert [text.get_text() for text in figure.texts] == [f"{head}: one draw out of 1,000"]
 
 
-def test_names_are_taken_literally() -> None:
-    """Neither as mathematics, nor hidden for a leading underscore."""
+def test_signal_names_are_drawn_literally() -> None:
+    """Not parsed as mathematics, and not hidden for a leading underscore."""
     names = [HOSTILE, "_hidden", "a$b$c", "日本", ""]
     figure = signal_figures.input_figure(np.arange(3.0), np.zeros((3, 5)), names)
     assert len(labels(figure.axes[0])) == 5
@@ -186,7 +186,7 @@ def test_names_are_taken_literally() -> None:
     assert "<script" not in text
 
 
-def test_bounds_are_dashed_and_the_measured_is_not() -> None:
+def test_bounds_are_dashed_and_measured_lines_are_solid() -> None:
     t_s = np.arange(1.0, 5.0)
     bound = [Bound(f"bound {i}", t_s, 3.0 + t_s + i) for i in range(5)]
     (axes,) = signal_figures.error_figure(t_s, t_s, t_s, t_s, bound).axes
@@ -206,7 +206,7 @@ def test_a_reset_to_zero_is_a_vertical_line_on_a_logarithmic_axis() -> None:
     assert 0 < axes.get_ylim()[0] < axes.get_ylim()[1] < 1e9
 
 
-def test_a_bound_has_the_colour_of_what_it_rests_on_in_every_figure() -> None:
+def test_a_bound_has_the_colour_of_its_assumptions_in_every_figure() -> None:
     t_s = np.arange(1.0, 5.0)
     kinds: list[BoundKind] = ["identity", "certified", "printed", "certified"]
     bound = [Bound(f"bound {i}", t_s, 3.0 + t_s + i, kind) for i, kind in enumerate(kinds)]
@@ -222,7 +222,7 @@ def test_a_bound_has_the_colour_of_what_it_rests_on_in_every_figure() -> None:
         assert len({(line.get_color(), str(line._dash_pattern)) for line in lines}) == 4
 
 
-def test_a_legend_takes_as_few_rows_as_there_is_room_for() -> None:
+def test_a_legend_has_as_few_rows_as_its_width_permits() -> None:
     t_s = np.arange(1.0, 5.0)
     names = ("for the scenario's plant", "for every plant of the uncertainty box")
     bound = [Bound(f"certified {name}", t_s, 3.0 + t_s) for name in names]
@@ -233,7 +233,7 @@ def test_a_legend_takes_as_few_rows_as_there_is_room_for() -> None:
 
 def test_no_legend_covers_data() -> None:
     for name, figure in drawn_for("ten").items():
-        figure.savefig(io.BytesIO())  # lays it out
+        figure.savefig(io.BytesIO())  # computes the layout
         for axes in figure.axes:
             if axes.get_legend() is not None:
                 assert axes.get_legend().get_window_extent().y0 >= axes.bbox.y1 - 1, name
@@ -270,12 +270,12 @@ def test_the_same_figure_gives_the_same_bytes(tmp_path: Path, ending: str) -> No
         assert trace not in content
 
 
-def test_another_ending_is_refused(tmp_path: Path) -> None:
+def test_another_file_extension_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CallerError, match=r"figure\.pdf: a figure is saved as \.svg or \.png"):
         save_figure(Figure(), tmp_path / "figure.pdf")
 
 
-def test_drawing_leaves_the_settings_alone() -> None:
+def test_drawing_does_not_change_matplotlibs_settings() -> None:
     before = dict(mpl.rcParams)
     drawn_for("one")
     assert dict(mpl.rcParams) == before
@@ -293,8 +293,8 @@ def contrast(one: Any, other: Any) -> float:
 
 
 @pytest.mark.parametrize("paper", ["#ffffff", "#14181d"])
-def test_every_colour_stands_out_on_paper_and_on_a_dark_screen(paper: str) -> None:
-    """3 to 1, what WCAG asks of graphics."""
+def test_every_colour_has_enough_contrast_on_light_and_dark_backgrounds(paper: str) -> None:
+    """3 to 1, WCAG's minimum for graphics."""
     css = Path(signal_figures.__file__).with_name("report.css").read_text()
     assert f"--paper: {paper}" in css
     for colour in {*palette.SERIES, *palette.PROCESSES.values(), palette.THRESHOLD, palette.FORCED}:
@@ -302,8 +302,8 @@ def test_every_colour_stands_out_on_paper_and_on_a_dark_screen(paper: str) -> No
 
 
 @pytest.mark.parametrize("paper", ["#ffffff", "#14181d"])
-def test_text_stands_out(paper: str) -> None:
-    """4.5 to 1, what WCAG asks of text."""
+def test_text_has_enough_contrast(paper: str) -> None:
+    """4.5 to 1, WCAG's minimum for text."""
     css = Path(signal_figures.__file__).with_name("report.css").read_text()
     (block,) = [block for block in css.split(":root") if f"--paper: {paper}" in block][:1]
     shade = re.search(r"--shade: (#\w+)", block)
@@ -313,8 +313,8 @@ def test_text_stands_out(paper: str) -> None:
         assert contrast(colour, shade[1]) >= 4.5, name
 
 
-def test_nobody_imports_matplotlib_before_it_is_needed() -> None:
-    """Not the command line, and not a process of the loop."""
+def test_matplotlib_is_not_imported_before_it_is_needed() -> None:
+    """Neither the command line nor a process of the loop imports it."""
     code = (
         "import sys, cosim.cli, cosim.live.finalize, cosim.output.run_tables, cosim.live.recorder, "
         "plant_server.__main__, sensor_node.__main__, controller_node.__main__, netem.__main__\n"

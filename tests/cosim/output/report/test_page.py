@@ -1,4 +1,4 @@
-"""The report as a browser, a screen reader and an attacker would read it."""
+"""The report in a browser, for a screen reader, and with hostile input."""
 
 import json
 import re
@@ -44,7 +44,7 @@ CLAIMS = [
 
 
 class Page(HTMLParser):
-    """Reads a page strictly: what opens must close, in order."""
+    """A strict parser: every element that opens must close, in order."""
 
     def __init__(self, html: str) -> None:
         super().__init__()
@@ -98,7 +98,7 @@ def shown(record: RunRecord, **more: Any) -> str:
 
 
 def check(parsed: Page, html: str) -> None:
-    """What holds for every report."""
+    """Properties of every report."""
     ids = parsed.ids()
     assert len(ids) == len(set(ids))
     tags = {tag for tag, _ in parsed.tags}
@@ -131,7 +131,7 @@ def figure_names(parsed: Page) -> list[str]:
     return [(a["id"] or "").removeprefix("figure-") for a in parsed.attributes("figure")]
 
 
-def test_the_report_of_a_live_run_is_whole(record: RunRecord, tmp_path: Path) -> None:
+def test_the_report_of_a_live_run_is_complete(record: RunRecord, tmp_path: Path) -> None:
     (tmp_path / "environment.json").write_text(
         json.dumps({"started": "2020-01-02", "command": ["noack", "run"], "packages": {"a": "1.2"}})
     )
@@ -154,7 +154,7 @@ def test_the_report_of_a_live_run_is_whole(record: RunRecord, tmp_path: Path) ->
     assert "plant lateness" in parsed.text
 
 
-def test_nothing_was_late_in_a_simulated_run(record: RunRecord, tmp_path: Path) -> None:
+def test_the_report_of_a_simulated_run_has_no_lateness(record: RunRecord, tmp_path: Path) -> None:
     parsed, html, _ = written(record, tmp_path, kind="simulated", lateness_us={}, latency_us=None)
     check(parsed, html)
     assert figure_names(parsed) == FIGURES
@@ -162,7 +162,7 @@ def test_nothing_was_late_in_a_simulated_run(record: RunRecord, tmp_path: Path) 
     assert "lateness" not in parsed.text
 
 
-def test_what_the_user_writes_is_text(content: dict[str, Any], tmp_path: Path) -> None:
+def test_user_text_is_escaped(content: dict[str, Any], tmp_path: Path) -> None:
     content["description"] = HOSTILE
     scenario = scenario_of(content, 3, state_names=[HOSTILE, "_x", "$y$"], input_names=[HOSTILE])
     parsed, html, _ = written(
@@ -185,7 +185,7 @@ def test_what_the_user_writes_is_text(content: dict[str, Any], tmp_path: Path) -
 
 
 def fidelity(**changed: Any) -> dict[str, Any]:
-    """A run's difference to the ideal loop, as its summary has it."""
+    """A run's difference to the ideal loop, in the form of its summary."""
     shares = {"sampling": 0.9, "delay": -0.42, "held_actuation": 0.52, "residual": 0.0}
     return {
         "explained": True, "explained_relative": 1e-9, "rms_x": 0.25, "max_x": 0.5,
@@ -248,7 +248,7 @@ def empty(content: dict[str, Any]) -> RunRecord:
 
 
 def lone(content: dict[str, Any], *present: str) -> RunRecord:
-    """A run of which only these tables came home."""
+    """A run with only these tables."""
     record = make_record(scenario_of(content))
     types = tables(2, 1)
     rows = {t: record[t] if t in present else np.zeros(0, types[t]) for t in types}
@@ -285,7 +285,7 @@ def test_the_verdict_comes_first(record: RunRecord, exit_: dict[str, Any], said:
     assert said in shown(record, exit=exit_).partition("Key numbers")[0]
 
 
-def test_envelopes_are_drawn_where_they_belong(record: RunRecord, tmp_path: Path) -> None:
+def test_envelopes_are_drawn_with_their_signals(record: RunRecord, tmp_path: Path) -> None:
     t_s = np.linspace(0, 1, 50)
     envelopes = [
         ("a", "e_c", t_s, 1 + t_s, "identity"),
@@ -302,7 +302,7 @@ def test_envelopes_are_drawn_where_they_belong(record: RunRecord, tmp_path: Path
     assert bounded == {"errors", "state-norm", "inter-event"}
 
 
-def test_a_heavy_figure_becomes_a_picture() -> None:
+def test_a_large_figure_becomes_a_bitmap() -> None:
     figure = Figure()
     axes = figure.add_axes((0, 0, 1, 1))
     noise = np.random.default_rng(1).normal(size=(2, 40_000))
@@ -313,9 +313,7 @@ def test_a_heavy_figure_becomes_a_picture() -> None:
     assert (image["src"] or "").startswith("data:image/png;base64,")
 
 
-def test_a_report_that_cannot_be_written_is_one_clear_line(
-    record: RunRecord, tmp_path: Path
-) -> None:
+def test_a_report_that_cannot_be_written_gives_one_line(record: RunRecord, tmp_path: Path) -> None:
     (tmp_path / REPORT_FILE).mkdir()
     with pytest.raises(MachineError, match=r"report\.html: cannot be written"):
         written(record, tmp_path)
@@ -323,12 +321,12 @@ def test_a_report_that_cannot_be_written_is_one_clear_line(
 
 @pytest.fixture
 def dead_run(content: dict[str, Any], tmp_path: Path) -> Path:
-    """The directory of a run whose processes all died before they recorded anything."""
+    """The directory of a run in which all processes died before they recorded anything."""
     (tmp_path / "scenario.toml").write_text(scenario_toml(scenario_of(content)), encoding="utf-8")
     return tmp_path
 
 
-def test_a_run_is_none_the_worse_for_a_report_that_fails(
+def test_a_failed_report_does_not_fail_the_run(
     dead_run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fail(*_: object) -> None:
@@ -342,8 +340,8 @@ def test_a_run_is_none_the_worse_for_a_report_that_fails(
     assert capsys.readouterr().err == "noack: warning: no report.html: no such luck\n"
 
 
-def test_the_command_writes_the_report_anew(dead_run: Path) -> None:
-    """Of a run, too, that nobody has concluded yet."""
+def test_the_command_writes_the_report_again(dead_run: Path) -> None:
+    """Also for a run that has not been finalized."""
     ran = CliRunner().invoke(app, ["report", str(dead_run), "--json"])
     assert ran.exit_code == 0, ran.output
     path = dead_run / REPORT_FILE
@@ -356,7 +354,7 @@ def test_the_command_writes_the_report_anew(dead_run: Path) -> None:
     assert path.is_file()
 
 
-def test_the_command_says_what_is_wrong(tmp_path: Path) -> None:
+def test_the_command_reports_what_is_wrong(tmp_path: Path) -> None:
     ran = CliRunner().invoke(app, ["report", str(tmp_path)])
     assert ran.exit_code == 2
     assert ran.stderr == f"noack: {tmp_path}: not a run directory (no scenario.toml)\n"

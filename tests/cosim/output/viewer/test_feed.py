@@ -1,4 +1,4 @@
-"""Batches of different processes reach the feed in any order; the view shows them joined."""
+"""The feed receives batches of the processes in any order; the view shows them aligned."""
 
 import gc
 import weakref
@@ -24,7 +24,7 @@ MS = 1_000_000
 
 
 class Drawn:
-    """A view that keeps what it is given."""
+    """A view that stores its input."""
 
     def __init__(self) -> None:
         self.forced: list[tuple[int, bool]] = []
@@ -37,7 +37,7 @@ class Drawn:
         self.forced += list(zip(t_ns.tolist(), forced.tolist(), strict=True))
 
     def __getattr__(self, name: str) -> Any:
-        return lambda *arguments: None
+        return lambda *arguments, **options: None
 
 
 def ticks(first: int, count: int) -> np.ndarray:
@@ -47,7 +47,7 @@ def ticks(first: int, count: int) -> np.ndarray:
     return rows
 
 
-def test_a_delivery_waits_for_the_networks_word_on_it() -> None:
+def test_a_delivery_is_drawn_once_the_networks_row_has_arrived() -> None:
     view = Drawn()
     feed = ViewFeed(SCENARIO, view)  # type: ignore[arg-type]
     delivery = np.zeros(1, TYPES["controller_delivery"])
@@ -69,7 +69,7 @@ def test_a_delivery_waits_for_the_networks_word_on_it() -> None:
     assert view.forced == [(100 * MS, True)]
 
 
-def test_nothing_is_kept_of_what_was_drawn_or_is_not_shown() -> None:
+def test_rows_that_are_drawn_or_not_shown_are_discarded() -> None:
     feed = ViewFeed(SCENARIO, Drawn())  # type: ignore[arg-type]
     given: list[weakref.ref[np.ndarray]] = []
     for batch in range(200):
@@ -86,7 +86,7 @@ def test_nothing_is_kept_of_what_was_drawn_or_is_not_shown() -> None:
     assert sum(kept() is not None for kept in given) < 20
 
 
-def test_what_is_known_of_deliveries_is_forgotten_when_they_are_drawn() -> None:
+def test_data_of_deliveries_is_discarded_when_they_are_drawn() -> None:
     feed = ViewFeed(SCENARIO, Drawn())  # type: ignore[arg-type]
     rows = np.zeros(50, TYPES["netem_packet"])
     rows["fate"] = Fate.FORCED
@@ -102,10 +102,10 @@ def test_what_is_known_of_deliveries_is_forgotten_when_they_are_drawn() -> None:
     assert sorted(feed._forced) == list(range(41, 50))
 
 
-def test_a_systems_own_state_is_shown_at_the_times_of_the_measurements(
+def test_the_plants_internal_state_is_shown_at_the_measurement_times(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """However the batches of plant and sensor come; where none came in time, it is not known."""
+    """For any order of plant and sensor batches; without a row in time the state is unknown."""
     types = tables(LOOP.n, LOOP.m, internal=3)
     monkeypatch.setattr(cosim.output.viewer.table_feed, "tables_of", lambda scenario: types)
     view = Drawn()

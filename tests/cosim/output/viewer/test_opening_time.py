@@ -1,4 +1,4 @@
-"""A finished run's view opens where ‖e_c‖ is largest; where no summary says so, as rerun does."""
+"""The view of a finished run opens at the largest ‖e_c‖; without a summary, at rerun's default."""
 
 import json
 import re
@@ -17,7 +17,7 @@ T_NS = 4_244_000_000
 
 
 def decoded(message: bytes) -> list[tuple[int, int | bytes]]:
-    """Numbers and values of a protobuf message's fields."""
+    """Field numbers and values of a protobuf message."""
     at = 0
 
     def varint() -> int:
@@ -39,7 +39,7 @@ def decoded(message: bytes) -> list[tuple[int, int | bytes]]:
     return found
 
 
-def test_the_page_asks_the_viewer_for_this_time_and_to_pause() -> None:
+def test_the_page_sets_the_viewers_time_and_pauses_it() -> None:
     found = re.search(rb"Uint8Array\((\[[^]]*\])\)", script_to_open_at(T_NS))
     assert found is not None
     ((set_time_cursor, content),) = decoded(bytes(json.loads(found[1])))
@@ -60,7 +60,7 @@ def test_the_page_asks_the_viewer_for_this_time_and_to_pause() -> None:
         ("[]", None), ("{", None), (None, None),
     ],
 )  # fmt: skip
-def test_the_time_is_the_summarys(
+def test_the_opening_time_is_taken_from_the_summary(
     tmp_path: Path, summary: str | None, expected: int | None
 ) -> None:
     if summary is not None:
@@ -86,7 +86,7 @@ def read(url: str) -> bytes:
         return content
 
 
-def test_a_window_is_asked_until_it_has_the_recording(
+def test_the_time_is_sent_until_the_window_has_the_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[tuple[str, Any]] = []
@@ -115,5 +115,5 @@ def test_a_window_is_asked_until_it_has_the_recording(
     wanted = ("t", {"duration": 4.244, "play_state": "paused"})
     connected = ("connect", "rerun+http://127.0.0.1:1234/proxy")
     assert asked == [connected, connected, wanted, connected, wanted]
-    move_window_to(T_NS, window, log.open("rb"))  # closed: nothing to ask
+    move_window_to(T_NS, window, log.open("rb"))  # closed: no further request
     assert len(asked) == 5

@@ -1,4 +1,4 @@
-"""The pictures of plants and of the network, as the recording gets them."""
+"""The pictures of plants and of the network in the recording."""
 
 import math
 from pathlib import Path
@@ -44,7 +44,7 @@ def frames_of(n: int, internal: int, k: int = 7, seed: int = 0) -> Frames:
 
 
 def arrays(columns: Columns) -> dict[str, list[Any]]:
-    """Columns by the last part of their names, as lists with one entry a row."""
+    """Columns by the last part of their names, as lists with one entry per row."""
     return {
         str(column.component_descriptor()).rpartition(":")[2]: column.as_arrow_array().to_pylist()
         for column in columns
@@ -52,7 +52,7 @@ def arrays(columns: Columns) -> dict[str, list[Any]]:
 
 
 def pose(columns: Columns) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Places (k, 2) with up for +y, and the angles (k,) by which a shape is turned to the left."""
+    """Positions (k, 2) with +y upwards, and counterclockwise rotation angles (k,) of a shape."""
     found = arrays(columns)
     place = np.array(found["translation"], dtype=float)[:, 0, :2] * (1, -1)
     quaternion = np.array(found.get("quaternion", [[(0, 0, 0, 1)]] * len(place)))[:, 0, :]
@@ -77,13 +77,13 @@ def test_a_plant_has_the_picture_of_its_kind(scenario: str, kind: type, title: s
 
 
 @pytest.mark.parametrize("name", PICTURES)
-def test_all_that_moves_is_to_be_seen_and_has_a_place_in_every_frame(name: str) -> None:
+def test_every_moving_shape_has_a_position_in_every_frame(name: str) -> None:
     picture, n, internal = PICTURES[name]
     shapes = picture.scenery()
     panel(picture)
     frames = frames_of(n, internal)
     frames.x_c[3:] = np.nan  # no controller
-    frames.x[5] = 1e300  # a run may diverge
+    frames.x[5] = 1e300  # a diverging run
     moved = picture.frames(frames)
     assert moved.keys() >= {entity for entity in shapes if entity in WHO}
     for entity, columns in moved.items():
@@ -91,14 +91,14 @@ def test_all_that_moves_is_to_be_seen_and_has_a_place_in_every_frame(name: str) 
         for values in arrays(columns).values():
             assert len(values) == len(frames.t_s)
             assert np.isfinite(np.array(values, dtype=float)).all()
-    # All three of plant and models move, in themselves or by what they are made of.
+    # Plant and both models move, by their position or by their parts.
     for who in WHO:
         assert any(who in entity.split("/") for entity in moved), who
     assert picture.rate_hz <= 60
 
 
-def test_the_car_is_drawn_the_way_it_goes() -> None:
-    """Without sideslip, the nose points along the path over the ground that the picture shows."""
+def test_the_car_is_drawn_in_its_direction_of_travel() -> None:
+    """Without sideslip, the nose points along the path over the ground in the picture."""
     scenario = resolve(load(ROOT / "scenarios" / "lane_following.toml"))
     loop, picture = loop_of(scenario), picture_of(scenario)
     t_s = np.arange(600) / 60
@@ -109,7 +109,7 @@ def test_the_car_is_drawn_the_way_it_goes() -> None:
     states = np.array(x)
     moved = picture.frames(Frames(t_s, states, states, states))
     place, angle = pose(moved["plant"])
-    # The markings stay where they are on the ground, up to whole periods of theirs.
+    # The markings are fixed to the ground, up to whole periods.
     passed = -np.unwrap(pose(moved["road/passing"])[0][:, 0], period=18.0)
     speed = 12.0
     np.testing.assert_allclose(np.diff(passed) * 60, speed, rtol=1e-3)
@@ -118,8 +118,8 @@ def test_the_car_is_drawn_the_way_it_goes() -> None:
     np.testing.assert_allclose(slope[1:-1], (angle + sideslip)[1:-1], atol=2e-3)
 
 
-def test_a_vehicles_own_place_says_where_it_is() -> None:
-    """In its own coordinates y and yaw are such that it goes forward along x; Y_g is −y."""
+def test_the_internal_state_of_a_vehicle_gives_its_position() -> None:
+    """With its own y and yaw, it moves forward along x; Y_g is −y."""
     picture, n, internal = PICTURES["vehicle"]
     frames = frames_of(n, internal)
     assert frames.z is not None
@@ -132,16 +132,16 @@ def test_a_vehicles_own_place_says_where_it_is() -> None:
     np.testing.assert_allclose(place[:, 1], frames.x_s[:, 3], atol=1e-6)
 
 
-def test_a_pole_falls_to_the_side_of_its_angle() -> None:
+def test_a_pole_is_drawn_at_the_side_of_its_angle() -> None:
     picture = PendulumPicture(0, 2)
     x = np.array([[0.5, 0.0, 0.1, 0.0]])
     moved = picture.frames(Frames(np.zeros(1), x, x, x))
     assert pose(moved["plant"])[0].tolist() == [[0.5, 0.0]]
     (angle,) = pose(moved["plant/pole"])[1]
-    assert -math.sin(angle) == pytest.approx(math.sin(0.1))  # where the tip of (0, 1) goes
+    assert -math.sin(angle) == pytest.approx(math.sin(0.1))  # the image of the tip (0, 1)
 
 
-def test_levels_are_as_high_as_they_are() -> None:
+def test_tank_levels_are_drawn_to_scale() -> None:
     frames = frames_of(4, 4)
     z = np.full((7, 4), 10.0)
     moved = TanksPicture(range(4), range(4)).frames(frames._replace(z=z))
@@ -151,7 +151,7 @@ def test_levels_are_as_high_as_they_are() -> None:
     np.testing.assert_allclose(-drawn, expected, rtol=1e-6)
 
 
-def test_a_trail_goes_on_from_batch_to_batch() -> None:
+def test_a_trail_continues_from_batch_to_batch() -> None:
     frames = frames_of(2, 0, k=12)
     whole = PhasePicture(["a", "b"], np.ones(2)).frames(frames)["plant/trail"]
     picture = PhasePicture(["a", "b"], np.ones(2))
@@ -165,7 +165,7 @@ def test_a_trail_goes_on_from_batch_to_batch() -> None:
     assert pieces == arrays(whole)["strips"]
 
 
-def test_what_a_picture_has_room_for_is_what_the_models_loop_goes_through() -> None:
+def test_the_range_of_a_picture_is_that_of_the_models_loop() -> None:
     scenario = resolve(load(ROOT / "scenarios" / "lane_following.toml"))
     reach = reach_of(loop_of(scenario), scenario.timing.horizon_ns)
     assert (reach >= np.abs(loop_of(scenario).x0)).all()
@@ -173,7 +173,7 @@ def test_what_a_picture_has_room_for_is_what_the_models_loop_goes_through() -> N
 
 
 def rows_of(diagram: NetworkDiagram, ends_ns: list[int]) -> dict[str, dict[int, list[Any]]]:
-    """What each entity shows at which time."""
+    """The visible rows of each entity at each time."""
     found: dict[str, dict[int, list[Any]]] = {}
     for until_ns in ends_ns:
         for entity, moving in diagram.advance(until_ns).items():
@@ -200,12 +200,12 @@ PACKETS = [
 ]  # fmt: skip
 
 
-def test_each_packet_is_seen_to_become_what_it_became() -> None:
+def test_each_packet_is_drawn_with_its_fate() -> None:
     seen = rows_of(sent(NetworkDiagram(), PACKETS), [3 * S])
     assert seen.keys() == {"broadcast", "delivered", "forced", "lost"}
     for entity, count in (("delivered", 2), ("forced", 1), ("lost", 2)):
         shown = [bool(shapes) for _, shapes in sorted(seen[entity].items())]
-        assert shown.count(False) == count, entity  # each is seen to end
+        assert shown.count(False) == count, entity  # each packet is drawn to its end
     lost_ns = [t_ns for t_ns, shapes in seen["lost"].items() if shapes]
     assert min(lost_ns) >= (0.6 + LEG_S) * S
     # The network is at 8.8, between sensor and controller at 4.4 and 13.2.
@@ -213,7 +213,7 @@ def test_each_packet_is_seen_to_become_what_it_became() -> None:
     assert max(x for shapes in seen["lost"].values() for line in shapes for x, _ in line) < 9.3
 
 
-def test_a_packet_waits_inside_the_network_as_long_as_it_did() -> None:
+def test_a_packet_is_drawn_inside_the_network_for_its_delay() -> None:
     seen = rows_of(sent(NetworkDiagram(), PACKETS[:1], delay_s=0.8), [3 * S])
     inside = [float(np.float32(8.8)), 0.0]
     waiting = [t_ns for t_ns, shapes in seen["broadcast"].items() if inside in shapes]
@@ -221,13 +221,13 @@ def test_a_packet_waits_inside_the_network_as_long_as_it_did() -> None:
     assert max(waiting) == pytest.approx(1.3 * S, abs=S / 50)
 
 
-def test_batches_leave_no_trace_in_the_diagram() -> None:
+def test_the_diagram_does_not_depend_on_the_batches() -> None:
     whole = rows_of(sent(NetworkDiagram(), PACKETS), [3 * S])
     steps = [round(t_s * S) for t_s in np.arange(0.013, 3.0, 0.037)]
     assert rows_of(sent(NetworkDiagram(), PACKETS), [*steps, 3 * S]) == whole
 
 
-def test_a_flood_of_packets_is_thinned_and_a_quiet_network_costs_nothing() -> None:
+def test_many_packets_are_thinned_and_an_idle_network_draws_nothing() -> None:
     diagram = sent(NetworkDiagram(), [(i / 1000, Fate.DELIVERED) for i in range(2000)])
     seen = rows_of(diagram, [2 * S])
     assert max(len(shapes) for shapes in seen["broadcast"].values()) <= LEG_S / 0.025 + 1
@@ -235,7 +235,7 @@ def test_a_flood_of_packets_is_thinned_and_a_quiet_network_costs_nothing() -> No
     assert diagram.advance(100 * S) == {}
 
 
-def test_acknowledgements_go_back() -> None:
+def test_acknowledgements_are_drawn_in_the_reverse_direction() -> None:
     diagram = NetworkDiagram(acknowledged=True)
     diagram.add(
         np.array([S, 2 * S]), np.array([S, 2 * S]), np.array([Fate.DELIVERED, Fate.DROPPED]),

@@ -76,7 +76,7 @@ def times(first: int, k: int = K) -> NDArray[np.int64]:
 
 
 def add_samples(view: RunView, batches: int, n: int = 4, first: int = 0) -> None:
-    """Samples whose every value says which series, coordinate and step it belongs to."""
+    """Samples with values that encode their series, coordinate and step."""
     for batch in range(first, first + batches):
         t_ns = times(batch * K)
         norm = t_ns.astype(np.float64) * 1e-9
@@ -131,13 +131,13 @@ def series(
 
 
 def until(condition: Callable[[], bool]) -> None:
-    """Wait; the test's own time limit ends a wait in vain."""
+    """Wait until the condition is true; the test's own time limit ends the wait."""
     while not condition():
         time.sleep(0.02)
 
 
 def is_left(group: int) -> bool:
-    """Whether a process of the group is alive; one that only awaits its parent's notice is not."""
+    """Whether a process of the group is alive; a zombie does not count."""
     stats = list(Path("/proc").glob("[0-9]*/stat"))
     for stat in stats:
         with contextlib.suppress(FileNotFoundError, ProcessLookupError):
@@ -200,7 +200,7 @@ def live() -> Iterator[LiveView]:
 
 
 @pytest.mark.parametrize("indexed", [True, False])
-def test_every_sample_is_in_the_file_exactly(tmp_path: Path, indexed: bool) -> None:
+def test_the_file_contains_every_sample_exactly(tmp_path: Path, indexed: bool) -> None:
     path = tmp_path / "recording.rrd"
     with new_view(path, indexed=indexed) as view:
         add_samples(view, 5)
@@ -222,7 +222,7 @@ def test_every_sample_is_in_the_file_exactly(tmp_path: Path, indexed: bool) -> N
     np.testing.assert_array_equal(values, np.stack((np.arange(K), -np.arange(K)), axis=1))
 
 
-def test_series_have_names_and_one_colour_for_one_meaning(tmp_path: Path) -> None:
+def test_series_have_names_and_one_colour_per_concept(tmp_path: Path) -> None:
     path = tmp_path / "recording.rrd"
     new_view(path).close()
     chunks = read(path)
@@ -247,7 +247,7 @@ def test_series_have_names_and_one_colour_for_one_meaning(tmp_path: Path) -> Non
         assert static(chunks, f"lateness/{process}", "SeriesLines:names") == [process]
 
 
-def test_the_file_carries_its_identity_about_text_and_layout(tmp_path: Path) -> None:
+def test_the_file_contains_its_identity_about_text_and_layout(tmp_path: Path) -> None:
     path = tmp_path / "recording.rrd"
     new_view(path).close()
     reader = rerun.chunk.RrdReader(path)
@@ -267,7 +267,7 @@ def test_the_file_carries_its_identity_about_text_and_layout(tmp_path: Path) -> 
     assert {"Broadcasting intervals [s]", "Receiving intervals [s]", "About this run"} <= titles
 
 
-def test_no_legend_covers_a_plot_and_a_key_beside_them_names_the_colours(tmp_path: Path) -> None:
+def test_colours_are_named_in_a_key_beside_the_plots_and_not_in_legends(tmp_path: Path) -> None:
     path = tmp_path / "recording.rrd"
     new_view(path).close()
     layout = read(path, "blueprint")
@@ -282,7 +282,7 @@ def test_no_legend_covers_a_plot_and_a_key_beside_them_names_the_colours(tmp_pat
         for c in chunks if "ViewBlueprint:class_identifier" in c.to_record_batch().schema.names
         for kind in column([c], "ViewBlueprint:class_identifier")
     )  # fmt: skip
-    # All but the one, never seen, that holds what the plots share.
+    # All except the hidden view with the shared properties of the plots.
     assert legends == [[False]] * (plots - 1)
     chunks = read(path)
     named = {
@@ -323,14 +323,14 @@ def test_every_coordinate_has_a_panel(tmp_path: Path, n: int) -> None:
     assert all(len(series(read(path), f"state/{name}")[0]) == K for name in states)
 
 
-def test_names_with_signs_of_their_own_keep_their_entities_apart(tmp_path: Path) -> None:
+def test_names_with_special_characters_give_different_entities(tmp_path: Path) -> None:
     path = tmp_path / "recording.rrd"
     with new_view(path, ["a/b", "a b", "ψ"]) as view:
         add_samples(view, 1, 3)
     assert sum(entity.startswith("state/") for entity in read(path)) == 3
 
 
-def test_the_logarithm_of_a_reset_error_stays_in_sight(tmp_path: Path) -> None:
+def test_the_logarithm_of_a_reset_error_stays_in_range(tmp_path: Path) -> None:
     path = tmp_path / "recording.rrd"
     with new_view(path) as view:
         x = np.zeros((3, 4))
@@ -344,7 +344,7 @@ def test_the_logarithm_of_a_reset_error_stays_in_sight(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("threshold", [0.0, np.inf, np.nan])
-def test_a_rule_without_a_threshold_still_gives_a_plot(tmp_path: Path, threshold: float) -> None:
+def test_a_rule_without_a_threshold_gives_a_plot(tmp_path: Path, threshold: float) -> None:
     path = tmp_path / "recording.rrd"
     with new_view(path) as view:
         x, e = np.zeros((2, 4)), np.array([1e-3, 0.0])
@@ -370,7 +370,7 @@ def test_every_event_is_a_mark_on_a_stem_and_the_first_stands_on_the_axis(tmp_pa
     np.testing.assert_array_equal(values.reshape(3, 3), [[0, h, np.nan] for h in (0.0, 0.3, 0.4)])
 
 
-def test_forced_deliveries_and_drops_have_marks_of_their_own(tmp_path: Path) -> None:
+def test_forced_deliveries_and_drops_have_separate_marks(tmp_path: Path) -> None:
     path = tmp_path / "recording.rrd"
     t_ns = np.array([0, 300, 700], dtype=np.int64)
     with new_view(path) as view:
@@ -412,7 +412,7 @@ def test_a_file_that_cannot_be_created_is_named(tmp_path: Path) -> None:
         new_view(tmp_path / "nowhere" / "recording.rrd")
 
 
-def test_a_disk_that_fills_during_the_run_is_told_at_the_latest_on_closing(tmp_path: Path) -> None:
+def test_a_disk_that_fills_during_the_run_is_reported_by_the_closing(tmp_path: Path) -> None:
     path = tmp_path / "recording.rrd"
     code = (
         "import resource; view = t.new_view(path);"
@@ -428,7 +428,7 @@ def test_a_disk_that_fills_during_the_run_is_told_at_the_latest_on_closing(tmp_p
     assert "the recording is incomplete" in last
 
 
-def test_a_file_whose_writer_was_killed_holds_all_it_was_given(tmp_path: Path) -> None:
+def test_the_file_of_a_killed_writer_contains_all_written_rows(tmp_path: Path) -> None:
     path = tmp_path / "recording.rrd"
     code = (
         "import time; view = t.new_view(path); t.add_samples(view, 5);"
@@ -442,7 +442,7 @@ def test_a_file_whose_writer_was_killed_holds_all_it_was_given(tmp_path: Path) -
 
 
 def holds(path: Path, rows: int) -> bool:
-    """Whether a file that may be in the middle of a write holds these rows."""
+    """Whether a file, possibly in the middle of a write, contains these rows."""
     with contextlib.suppress(RuntimeError, ValueError):
         return rows_of(path) == rows
     return False
@@ -453,9 +453,7 @@ def rows_of(path: Path) -> int:
     return sum(c.num_rows for c in chunks if not c.is_static)
 
 
-def test_a_live_viewer_gets_the_file_as_it_grows_and_to_its_end(
-    tmp_path: Path, live: LiveView
-) -> None:
+def test_a_live_viewer_receives_the_growing_file_to_its_end(tmp_path: Path, live: LiveView) -> None:
     path = tmp_path / "recording.rrd"
     view = new_view(path, live=live)
     assert live.url is not None
@@ -479,7 +477,7 @@ def test_a_live_viewer_gets_the_file_as_it_grows_and_to_its_end(
     assert received == path.read_bytes()
 
 
-def test_a_stalled_viewer_holds_up_nothing(tmp_path: Path, live: LiveView) -> None:
+def test_a_stalled_viewer_does_not_delay_the_recorder(tmp_path: Path, live: LiveView) -> None:
     path = tmp_path / "recording.rrd"
     view = new_view(path, live=live)
     assert live.url is not None
@@ -497,12 +495,12 @@ def test_a_stalled_viewer_holds_up_nothing(tmp_path: Path, live: LiveView) -> No
         with contextlib.suppress(ConnectionResetError):
             while block := viewer.recv(1 << 16):
                 received += len(block)
-    # The file is larger than all buffers in between, so the viewer did stall its download.
+    # The file is larger than all buffers in between, so the viewer's download did stall.
     assert received < path.stat().st_size
     assert rows_of(path) == 500 * K
 
 
-def test_a_viewer_that_died_holds_up_nothing(tmp_path: Path, live: LiveView) -> None:
+def test_a_dead_viewer_does_not_delay_the_recorder(tmp_path: Path, live: LiveView) -> None:
     path = tmp_path / "recording.rrd"
     view = new_view(path, live=live)
     assert live.pid is not None
@@ -513,7 +511,7 @@ def test_a_viewer_that_died_holds_up_nothing(tmp_path: Path, live: LiveView) -> 
     assert rows_of(path) == 5 * K
 
 
-def test_a_viewer_that_does_not_start_is_told_and_the_run_is_recorded(
+def test_a_viewer_that_does_not_start_is_reported_and_the_run_is_recorded(
     tmp_path: Path, live: LiveView, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("RERUN_CLI_PATH", shutil.which("false") or "false")
@@ -534,7 +532,9 @@ def test_closing_a_live_view_leaves_no_process(tmp_path: Path, live: LiveView) -
     assert not is_left(group)
 
 
-def test_a_kept_live_view_serves_until_it_is_ended(tmp_path: Path, live: LiveView) -> None:
+def test_a_live_view_that_is_kept_open_serves_until_it_is_ended(
+    tmp_path: Path, live: LiveView
+) -> None:
     path = tmp_path / "recording.rrd"
     new_view(path, live=live).close()
     live.close(keep=True)
@@ -547,7 +547,7 @@ def test_a_kept_live_view_serves_until_it_is_ended(tmp_path: Path, live: LiveVie
     assert not is_left(group)
 
 
-def test_a_live_view_ends_with_a_killed_recorder(tmp_path: Path) -> None:
+def test_a_live_view_ends_when_the_recorder_is_killed(tmp_path: Path) -> None:
     path = tmp_path / "recording.rrd"
     path.write_bytes(b"RRF2")
     code = (
@@ -573,7 +573,7 @@ sys.exit({status})
 
 
 def pretend_window(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, opens: bool) -> Path:
-    """Put a program in the place of rerun's that opens no window; its browser part is rerun's."""
+    """Replace rerun's program by one that opens no window; its web server is rerun's."""
     folder = Path(str(__import__("rerun_cli").__file__)).parent
     program, seen = tmp_path / "viewer", tmp_path / "seen.rrd"
     program.write_text(
@@ -604,7 +604,7 @@ def test_a_window_is_shown_the_whole_recording(
     until(lambda: seen.exists() and seen.read_bytes() == path.read_bytes())
 
 
-def test_where_no_window_opens_a_browser_is_served(
+def test_a_browser_is_served_if_no_window_opens(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pretend_window(tmp_path, monkeypatch, opens=False)
@@ -618,7 +618,7 @@ def test_where_no_window_opens_a_browser_is_served(
 
 @pytest.mark.skipif(sys.platform in ("darwin", "win32"), reason="there is always a display")
 @pytest.mark.parametrize("variable", ["DISPLAY", "WAYLAND_DISPLAY", None])
-def test_a_display_is_told_by_the_environment(
+def test_a_display_is_detected_from_the_environment(
     monkeypatch: pytest.MonkeyPatch, variable: str | None
 ) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
@@ -628,7 +628,7 @@ def test_a_display_is_told_by_the_environment(
     assert has_display() is (variable is not None)
 
 
-def test_other_hosts_names_and_files_are_refused(tmp_path: Path) -> None:
+def test_other_host_names_and_files_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "recording.rrd"
     path.write_bytes(b"RRF2 and more")
     with RecordingServer(path, follow=False) as server:
@@ -641,7 +641,7 @@ def test_other_hosts_names_and_files_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("asked", [b"/\xe9", b"/\xff\x80", b"/a\x01b"])
-def test_path_that_is_not_ascii_is_a_bad_request(
+def test_a_path_that_is_not_ascii_is_a_bad_request(
     asked: bytes, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with RecordingServer(tmp_path / "recording.rrd", follow=False) as server:
@@ -652,13 +652,13 @@ def test_path_that_is_not_ascii_is_a_bad_request(
     assert capfd.readouterr().err == ""
 
 
-def test_a_recording_that_is_not_there_is_the_callers_error(tmp_path: Path) -> None:
+def test_a_missing_recording_is_a_callers_error(tmp_path: Path) -> None:
     with pytest.raises(CallerError, match=r"run/recording\.rrd: no such recording"):
         view_recording(tmp_path / "run" / "recording.rrd")
 
 
 @pytest.mark.parametrize("content", [b"", b"<html>"])
-def test_what_is_no_recording_is_not_served(content: bytes, tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_recording_is_not_served(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "recording.rrd"
     path.write_bytes(content)
     with pytest.raises(CallerError, match=r"recording\.rrd: not a rerun recording"):
@@ -692,10 +692,10 @@ def test_viewing_without_a_display_serves_a_page_until_it_is_ended(
         wait_for(lambda: not is_left(child.pid))
 
 
-def test_a_browser_is_served_where_there_is_a_display_but_no_window_is_wanted(
+def test_a_browser_is_served_with_a_display_if_no_window_is_wanted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On loopback and nowhere else."""
+    """On loopback only."""
     pretend_window(tmp_path, monkeypatch, opens=True)
     monkeypatch.setenv("DISPLAY", ":0")
     path = tmp_path / "recording.rrd"
@@ -722,7 +722,7 @@ def test_a_browser_is_served_where_there_is_a_display_but_no_window_is_wanted(
             assert child.wait() == 0
 
 
-def test_a_picture_moves_at_most_so_often_and_goes_on_from_batch_to_batch(tmp_path: Path) -> None:
+def test_a_picture_has_a_maximum_frame_rate_across_batches(tmp_path: Path) -> None:
     path = tmp_path / "recording.rrd"
     picture = LanePicture(3, 2, forward_mps=-12.0)
     with new_view(path, picture=picture, diagram=NetworkDiagram()) as view:
@@ -736,7 +736,8 @@ def test_a_picture_moves_at_most_so_often_and_goes_on_from_batch_to_batch(tmp_pa
     moving = [c for c in chunks["picture/plant"] if not c.is_static]
     places = np.array(column(moving, "Transform3D:translation"))[:, 0, :]
     assert len(places) == 2 * 60  # of 2 s, out of 1000 samples
-    assert (np.diff(places[:, 1]) < 0).all()  # the lateral offset grows; down is +y in the viewer
+    # the lateral offset grows; +y points down in the viewer
+    assert (np.diff(places[:, 1]) < 0).all()
     assert static(chunks, "picture/plant/body", "LineStrips2D:colors")
     shapes = column([c for c in chunks["network/forced"] if not c.is_static], "LineStrips2D:strips")
     assert [len(strips) for strips in (shapes[0], shapes[-1])] == [1, 0]
@@ -752,7 +753,9 @@ def test_a_picture_moves_at_most_so_often_and_goes_on_from_batch_to_batch(tmp_pa
 
 
 @pytest.mark.parametrize("wanted", ["missing recording", "missing browser"])
-def test_the_picture_tool_says_in_one_line_what_is_missing(tmp_path: Path, wanted: str) -> None:
+def test_the_picture_tool_reports_a_missing_program_in_one_line(
+    tmp_path: Path, wanted: str
+) -> None:
     path = tmp_path / "recording.rrd"
     if wanted == "missing browser":
         path.write_bytes(b"RRF2")

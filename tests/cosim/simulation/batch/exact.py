@@ -1,4 +1,4 @@
-"""Random batches, and the exact simulator's word on their runs."""
+"""Random batches, and their runs by the exact simulator."""
 
 import math
 from itertools import pairwise
@@ -38,7 +38,7 @@ SIZES = ((2, 1), (4, 2))
 
 
 def random_setting(rng: np.random.Generator, n: int, m: int) -> Setting:
-    """Any mode, weight, floor, cap, loss and start; cost weights half of the time."""
+    """Any mode, weight, floor, cap, loss and start; cost weights in half of the cases."""
     known, held, floor = rng.random(3) < 0.5
     impairments: list[Any] = [LossOf(loss=LOSSES[rng.integers(len(LOSSES))])]
     if rng.random() < 0.3:
@@ -67,7 +67,7 @@ def random_setting(rng: np.random.Generator, n: int, m: int) -> Setting:
 
 
 def random_population(rng: np.random.Generator, setting: Setting, k: int) -> Population:
-    """Plants whose closed loop is anything from the model's own to another one altogether."""
+    """Plants with a closed loop that ranges from the model's own to an unrelated one."""
     n, m = len(setting.H), len(setting.K)
     B = rng.uniform(-1, 1, (k, n, m)) * 2 / math.sqrt(n)
     apart = rng.choice([0.0, 1e-6, 0.3, 1.0], (k, 1, 1)) * rng.uniform(-1, 1, (k, n, n))
@@ -106,14 +106,14 @@ def reference(setting: Setting, draw: Population, most_events: int = 2000) -> Co
 
 
 def pieces(run: ContinuousRun) -> list[tuple[Any, float, float]]:
-    """State after the last event, from when, and until when."""
+    """State after the last event, start time and end time of each piece."""
     spans_s = pairwise([0.0, *run.event_s, run.reached_s])
     found = zip((run.start, *run.after), spans_s, strict=True)
     return [(state, begin_s, end_s) for state, (begin_s, end_s) in found if end_s > begin_s]
 
 
 def cost_of(run: ContinuousRun, setting: Setting) -> float:
-    """By Gauss's rule with 24 nodes on parts of 0.1 s at most."""
+    """The cost by Gauss's rule with 24 nodes on parts of at most 0.1 s."""
     n, m = len(setting.H), len(setting.K)
     Q = np.eye(n) if setting.Q is None else setting.Q
     R = np.eye(m) if setting.R is None else setting.R

@@ -1,4 +1,4 @@
-"""Batches against the exact simulator, whose method is another one, on the same draws."""
+"""Batches against the exact simulator, which uses another method, on the same draws."""
 
 import json
 import math
@@ -84,7 +84,9 @@ def scenario(content: dict[str, Any], **changes: Any) -> Scenario:
 
 
 @pytest.mark.parametrize("mode", ["model", "zoh"])
-def test_a_setting_of_a_scenario_runs_as_the_scenario(content: dict[str, Any], mode: str) -> None:
+def test_a_batch_setting_of_a_scenario_gives_the_scenarios_run(
+    content: dict[str, Any], mode: str
+) -> None:
     content["network"]["impairments"] = [{"kind": "delay", "delay_s": 0.1}]
     resolved = scenario(content, mode=mode, horizon_s=8.0, seeds={"loss": 2**40 + 3})
     loop = loop_of(resolved)
@@ -99,7 +101,7 @@ def test_a_setting_of_a_scenario_runs_as_the_scenario(content: dict[str, Any], m
     assert found.delivered.tolist() == run.delivered.tolist()
 
 
-def test_a_row_depends_on_its_own_draw_only() -> None:
+def test_a_row_depends_only_on_its_own_draw() -> None:
     rng = np.random.default_rng(7)
     for _ in range(5):
         setting = random_setting(rng, 3, 2)
@@ -113,7 +115,7 @@ def test_a_row_depends_on_its_own_draw_only() -> None:
 
 
 def turning(depth: float, omega: float, floored: bool) -> tuple[Setting, Population, float]:
-    """‖e_s‖ over the threshold is sin(ωt/2)/(1 − depth): it pokes through around t = π/ω."""
+    """‖e_s‖ over the threshold is sin(ωt/2)/(1 − depth): it exceeds 1 briefly around t = π/ω."""
     alpha = 0.0 if floored else 0.8
     turn = np.array([[0.0, omega], [-omega, 0.0]])
     level = 2.0 * math.hypot(0.3, 0.4) * (1 - depth)
@@ -132,7 +134,7 @@ def turning(depth: float, omega: float, floored: bool) -> tuple[Setting, Populat
 @pytest.mark.parametrize("floored", [False, True])
 @pytest.mark.parametrize("omega", [0.3, 7.0, 200.0])
 @pytest.mark.parametrize("depth", [1e-2, 1e-5, 1e-7, 1e-9, 1e-12])
-def test_a_crossing_however_short_is_found(depth: float, omega: float, floored: bool) -> None:
+def test_very_short_crossings_are_found(depth: float, omega: float, floored: bool) -> None:
     setting, draw, first_s = turning(depth, omega, floored)
     found = run_events(setting, draw)
     tolerance_s = 2e-14 / math.sqrt(depth) / omega + 1e-12 * first_s
@@ -149,7 +151,7 @@ def test_the_supremum_between_events_is_certified() -> None:
         assert 1 - 1e-10 <= row["sup_e_c_scaled"] / 1.0 <= 1 + 1e-12
 
 
-def test_a_loop_that_diverges_says_so() -> None:
+def test_a_diverging_loop_is_reported() -> None:
     fast = 100 * np.eye(2)
     setting = Setting(
         H=fast, K=np.zeros((1, 2)), trigger=DecayingTrigger(0.5, 0.25), link=LinkSettings(),
@@ -167,8 +169,8 @@ def test_a_loop_that_diverges_says_so() -> None:
         assert math.isnan(row[name])
 
 
-def test_events_of_unstable_loops_are_those_of_the_exact_simulator_while_they_can_be_told() -> None:
-    """x grows and the threshold falls: after a while there are too many events."""
+def test_events_of_unstable_loops_agree_until_they_accumulate() -> None:
+    """x grows and the threshold decays: after a while there are too many events."""
     rng = np.random.default_rng(3)
     compared = 0
     for _ in range(10):
@@ -189,7 +191,7 @@ def test_events_of_unstable_loops_are_those_of_the_exact_simulator_while_they_ca
     assert compared > 100
 
 
-def test_mistakes_are_told() -> None:
+def test_invalid_settings_are_refused() -> None:
     rng = np.random.default_rng(1)
     setting = random_setting(rng, 2, 1)
     population = random_population(rng, setting, 3)

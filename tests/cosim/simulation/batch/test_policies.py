@@ -100,9 +100,9 @@ NORM_OR_TIME = (
     "absolute", "periodic", "self_triggered", "deadline of decaying", "dwell of decaying",
     "dwell of deadline of self_triggered",
 )  # fmt: skip
-"""They run in the code that the paper's policy has."""
+"""Policies that run in the same compiled code as the paper's policy."""
 SIZES = {True: (2, 1), False: (3, 2)}
-"""Of those, and of the others. Each is compiled, which takes seconds."""
+"""Number of draws for these and for the other policies, which take seconds to compile each."""
 MOST_EVENTS = 500
 
 
@@ -114,7 +114,7 @@ def settings(name: str, seeds: range) -> list[tuple[Setting, Population]]:
         n, m = SIZES[name in NORM_OR_TIME]
         setting = random_setting(rng, n, m)
         policy = POLICIES[name](rng, n, setting.trigger.weight)
-        if name == "lyapunov":  # Where an update is lost, the next event is at once.
+        if name == "lyapunov":  # After a lost update, the next event follows at once.
             setting = replace(setting, link=LinkSettings(), H=0.3 * setting.H - 0.7 * np.eye(n))
         population = random_population(rng, setting, 2)
         made.append((replace(setting, trigger=policy, most_events=MOST_EVENTS), population))
@@ -160,7 +160,7 @@ def test_events_fates_and_measures_are_those_of_the_exact_simulator(name: str) -
 
 
 @pytest.mark.parametrize("name", ["mixed", "dynamic", "quadratic", "dwell of lyapunov"])
-def test_a_row_depends_on_its_own_draw_only(name: str) -> None:
+def test_a_row_depends_only_on_its_own_draw(name: str) -> None:
     rng = np.random.default_rng(5)
     for setting, _ in settings(name, range(2)):
         population = random_population(rng, setting, 30)
@@ -173,7 +173,7 @@ def test_a_row_depends_on_its_own_draw_only(name: str) -> None:
 
 
 def turning(sigma: float, omega: float, alpha: float) -> tuple[Setting, Population]:
-    """‖x‖ = e^{−αt}, ‖e_s‖ = 2 e^{−αt} sin(ωt/2): the relative rule meets sin(ωt/2) > σ/2."""
+    """‖x‖ = e^{−αt}, ‖e_s‖ = 2 e^{−αt} sin(ωt/2): the relative rule is met when sin(ωt/2) > σ/2."""
     turn = omega * np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     setting = Setting(
         H=-alpha * np.eye(3), K=np.zeros((2, 3)), trigger=relative_trigger(sigma),
@@ -189,10 +189,10 @@ def turning(sigma: float, omega: float, alpha: float) -> tuple[Setting, Populati
 @pytest.mark.parametrize("alpha_omega", [0.1, 7.0, 70.0])
 @pytest.mark.parametrize("omega", [0.3, 200.0])
 @pytest.mark.parametrize("depth", [1e-2, 1e-5, 1e-8, 1e-11])
-def test_a_crossing_however_short_is_found(depth: float, omega: float, alpha_omega: float) -> None:
+def test_very_short_crossings_are_found(depth: float, omega: float, alpha_omega: float) -> None:
     """Also where the state has decayed to e^{−70π}, 1e-95.
 
-    On the way there a hundred polynomials lose some 1e-14 each of its relative accuracy.
+    Each of the hundred polynomials up to there adds a relative error of about 1e-14.
     """
     found = run_events(*turning(2 * (1 - depth), omega, alpha_omega * omega))
     first_s = 2 / omega * math.asin(1 - depth)
@@ -206,12 +206,12 @@ def test_a_crossing_however_short_is_found(depth: float, omega: float, alpha_ome
     "name",
     ["relative", "periodic", "dwell of decaying", "dynamic", "quadratic", "dwell of quadratic"],
 )
-def test_runs_that_diverge_do_so_at_the_time_of_the_exact_simulator(name: str) -> None:
+def test_runs_diverge_at_the_same_time_as_in_the_exact_simulator(name: str) -> None:
     quiet = name in ("relative", "dynamic", "quadratic")
     for setting, population in settings(name, range(6)):
         wild = population._replace(A=population.A + 20 * np.eye(len(setting.H)))
         forever = replace(setting, horizon_s=60.0, most_events=100_000)
-        if quiet:  # The model knows the plant, and there is nothing to send.
+        if quiet:  # The model equals the plant, so there are no events.
             forever = replace(forever, H=wild.A[0] + wild.B[0] @ setting.K, known_start=True)
         draw = one(wild, 0)
         (row,) = run_batch(forever, draw)
@@ -221,8 +221,8 @@ def test_runs_that_diverge_do_so_at_the_time_of_the_exact_simulator(name: str) -
         assert row["transmissions"] == len(run.event_s)
 
 
-def test_an_oscillation_is_no_hard_case() -> None:
-    """x turns and nothing arrives: ‖e_c‖ is 1 for ever, all but the level 1 + 1e-10."""
+def test_an_oscillation_close_to_a_level_is_decided() -> None:
+    """x rotates and no update arrives: ‖e_c‖ is constantly 1, just below the level 1 + 1e-10."""
     turn = np.array([[0.0, 100.0], [-100.0, 0.0]])
     lost = LinkSettings(impairments=(LossOf(loss=WorstCaseLoss()),), mansd=None)
     setting = Setting(
@@ -237,8 +237,8 @@ def test_an_oscillation_is_no_hard_case() -> None:
     assert row["sup_e_c_scaled"] == pytest.approx(1.0, rel=1e-9)
 
 
-def test_a_level_that_is_all_but_met_all_the_time_is_undecided() -> None:
-    """‖x‖ is 1 for ever, as x turns; whether it passes 1 + 1e-13 is looked at a million times."""
+def test_a_norm_that_stays_within_rounding_of_a_level_is_undecided() -> None:
+    """x rotates with ‖x‖ = 1; the comparison with 1 + 1e-13 takes a million evaluations."""
     turn = np.array([[0.0, 3.0], [-3.0, 0.0]])
     setting = Setting(
         H=turn, K=np.zeros((1, 2)), trigger=AbsoluteTrigger(1.0), link=LinkSettings(),
@@ -257,7 +257,7 @@ def test_a_level_that_is_all_but_met_all_the_time_is_undecided() -> None:
 
 @pytest.mark.parametrize("rate_per_s", [1e11, 1e17])
 def test_a_plant_too_fast_for_the_clock_is_undecided(rate_per_s: float) -> None:
-    """Polynomials of 1e-10 s do not come to an end, and those of 1e-16 s do not exist."""
+    """Polynomials of 1e-10 s take too many steps; a float cannot represent steps of 1e-16 s."""
     fast = -rate_per_s * np.eye(2)
     setting = Setting(
         H=fast, K=np.zeros((1, 2)), trigger=PeriodicTrigger(1000 * MS), link=LinkSettings(),

@@ -1,4 +1,4 @@
-"""First roots of polynomials, interpreted: the functions that the batch engine compiles."""
+"""First roots of polynomials, without compilation: the functions that the batch engine compiles."""
 
 import math
 
@@ -12,7 +12,7 @@ from noack.core.linear_systems import Vector
 
 
 def coefficients(zeros: Vector, leading: float) -> Vector:
-    """Of ``leading`` Π (s − zero), from the lowest."""
+    """Coefficients of ``leading`` Π (s − zero), lowest power first."""
     return np.asarray(leading * np.poly(zeros)[::-1].real)
 
 
@@ -31,14 +31,14 @@ def test_the_first_of_known_roots_is_found(seed: int) -> None:
         assert found == NONE
 
 
-def test_a_level_that_decays_is_met() -> None:
+def test_a_root_against_a_decaying_level_is_found() -> None:
     """s² = e^{−2s} at the root of s = e^{−s}, the omega constant."""
     g = np.array([0.0, 0.0, 1.0])
     assert first_root(g, 2, 1.0, 2.0, 0.0, 1.0) == pytest.approx(0.5671432904097838, rel=1e-15)
     assert first_root(g, 2, 1.0, 2.0, 0.0, 0.567) == NONE
 
 
-def test_a_start_on_the_level_is_an_event_only_if_it_goes_up() -> None:
+def test_a_start_on_the_level_is_an_event_only_if_the_value_rises() -> None:
     assert first_root(np.array([1.0, 1e-3, 0.0]), 2, 1.0, 0.0, 0.0, 1.0) == 0.0
     assert first_root(np.array([1.0, -1.0, 2.0]), 2, 1.0, 0.0, 0.0, 1.0) == pytest.approx(0.5)
     assert first_root(np.array([1.0, -1.0, 0.5]), 2, 1.0, 0.0, 0.0, 1.0) == NONE
@@ -47,8 +47,8 @@ def test_a_start_on_the_level_is_an_event_only_if_it_goes_up() -> None:
     assert first_root(np.array([-1.0, 1.0, 0.0]), 2, 0.0, 0.0, 0.0, 0.0) == NONE
 
 
-def test_too_many_steps_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    """(s − ½)² s² all but touches 0 from below."""
+def test_too_many_steps_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    """(s − ½)² s² almost touches 0 from below."""
     g = -coefficients(np.array([0.5, 0.5, -1.0, -1.0]), 1.0)
     g[0] -= 1e-12
     assert first_root(g, 4, 0.0, 0.0, 0.0, 1.0) == NONE
@@ -56,7 +56,7 @@ def test_too_many_steps_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     assert first_root(g, 4, 0.0, 0.0, 0.0, 1.0) == UNRESOLVED
 
 
-def test_newton_gives_way_to_halving(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_root_is_found_by_bisection_without_newton_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(level_crossing, "NEWTON_STEPS", 0)
     monkeypatch.setattr(norm_crossing, "NEWTON_STEPS", 0)
     g = np.array([-0.1, 0.0, 0.0, 1.0])

@@ -1,4 +1,4 @@
-"""Exact event times against an integrator, closed forms, and curves made to be missed."""
+"""Exact event times against an integrator, closed forms, and curves that are easy to miss."""
 
 import itertools
 import math
@@ -28,7 +28,7 @@ from noack.trigger.decaying import DecayingTrigger
 def loop_with(
     A: Matrix, B: Matrix, K: Matrix, H: Matrix, x0: Vector, weight: Matrix | None = None
 ) -> LoopMatrices:
-    """A loop of given matrices; what H was made of does not matter to it."""
+    """A loop of given matrices; the simulator uses only H, not its factors."""
     names = tuple(f"x_{i}" for i in range(len(A)))
     return LoopMatrices(A, B, K, H, A, B, x0, weight, names, names[: B.shape[1]])
 
@@ -112,7 +112,7 @@ def integrated(case: Case) -> Iterator[tuple[float, Vector]]:
 @given(cases())
 @settings(max_examples=40)
 def test_events_are_the_integrators(case: Case) -> None:
-    """To 1e-8 s: the integrator's error of 1e-12 over the slope of the error norm, grown by far."""
+    """To 1e-8 s: the integrator's error of 1e-12 over the slope of the error norm, amplified."""
     run = case.run()
     states = run.before
     reference = list(integrated(case))
@@ -124,7 +124,7 @@ def test_events_are_the_integrators(case: Case) -> None:
 
 
 def test_the_random_systems_have_events_and_losses() -> None:
-    """The comparison above looks at something."""
+    """Without events and losses, the comparison above would check nothing."""
     counts: list[int] = []
 
     @given(cases())
@@ -140,7 +140,7 @@ def test_the_random_systems_have_events_and_losses() -> None:
 @given(cases())
 @settings(max_examples=30)
 def test_what_holds_between_events(case: Case) -> None:
-    """The threshold is met at each event and never passed; x_c − x_s is the missed jumps (I1)."""
+    """The threshold is never exceeded, and reached at each event; (I1) gives x_c − x_s."""
     run, H = case.run(), case.loop.H
     t_s = np.linspace(0, run.reached_s, 301)
     samples = run.at(t_s)
@@ -199,9 +199,9 @@ def test_a_scalar_loop_has_closed_form_events(floored: bool, lost: tuple[bool, .
 
 
 def turning(depth: float, omega: float, floored: bool) -> Case:
-    """‖e_s‖ over the threshold is sin(ωt/2)/(1 − depth): it pokes through around t = π/ω.
+    """‖e_s‖ over the threshold is sin(ωt/2)/(1 − depth): it exceeds 1 briefly around t = π/ω.
 
-    x turns, x_s does not, and (unless floored) both decay like the threshold.
+    x rotates, x_s does not, and both decay like the threshold unless there is a floor.
     """
     alpha = 0.0 if floored else 0.8
     turn = np.array([[0.0, omega], [-omega, 0.0]])
@@ -216,19 +216,19 @@ def turning(depth: float, omega: float, floored: bool) -> Case:
 @pytest.mark.parametrize("floored", [False, True])
 @pytest.mark.parametrize("omega", [0.3, 7.0, 200.0])
 @pytest.mark.parametrize("depth", [1e-2, 1e-5, 1e-7, 1e-9, 1e-12])
-def test_a_crossing_however_short_is_found(depth: float, omega: float, floored: bool) -> None:
+def test_very_short_crossings_are_found(depth: float, omega: float, floored: bool) -> None:
     case = turning(depth, omega, floored)
     run = case.run()
     first_s = 2 / omega * math.asin(1 - depth)
     excursion_s = 2 * (math.pi / omega - first_s)
     assert excursion_s < 3 * math.sqrt(2 * depth) * 2 / omega
-    # Time is as well determined as rounding of 1e-15 over the slope √(2 depth) permits.
+    # The time is as accurate as rounding of 1e-15 over the slope √(2 depth) permits.
     tolerance_s = 5e-15 / math.sqrt(depth) / omega + 1e-12 * first_s
     assert run.event_s[0] == pytest.approx(first_s, abs=tolerance_s)
     assert turning(-depth, omega, floored).run().event_s.size == 0
 
 
-def test_a_tangency_in_floating_point_is_settled_either_way() -> None:
+def test_a_tangency_within_rounding_is_decided_either_way() -> None:
     for floored in (False, True):
         case = turning(0.0, 7.0, floored)
         assert case.run().event_s == pytest.approx([math.pi / 7.0] * len(case.run().event_s))
@@ -236,9 +236,9 @@ def test_a_tangency_in_floating_point_is_settled_either_way() -> None:
 
 @pytest.mark.parametrize("depth", [1e-4, 1e-9])
 def test_the_highest_of_many_near_misses_is_found(depth: float) -> None:
-    """e_1 = Σ a_k (1 − cos ω_k t): hundreds of local maxima, one of which passes the threshold.
+    """e_1 = Σ a_k (1 − cos ω_k t): hundreds of local maxima, one of which exceeds the threshold.
 
-    The weight all but hides the other entries of e_s; the reference is the closed form.
+    The weight of the other entries of e_s is almost 0; the reference is the closed form.
     """
     omegas, weights = np.array([1.0, 11.3, 17.7]), np.array([0.5, 0.3, 0.2])
     horizon_s = 60.0
@@ -275,7 +275,7 @@ def scalar_system(trigger: DecayingTrigger) -> ContinuousLoop:
     return ContinuousLoop(loop_with(one, one, 0 * one, 0 * one, np.ones(1)), trigger)
 
 
-def test_an_error_on_the_boundary_leaves_at_once_or_comes_back_later() -> None:
+def test_an_error_on_the_boundary_exceeds_it_at_once_or_later() -> None:
     system = scalar_system(DecayingTrigger(1e-3, 1.0, 0.5))
     out = LoopState(1.0, np.array([1.0]), np.array([-0.5]), np.zeros(1))
     event = system.next_event(out, 9.0)
@@ -291,8 +291,8 @@ def test_an_error_on_the_boundary_leaves_at_once_or_comes_back_later() -> None:
     assert event.t_s == 1.0
 
 
-def test_the_floor_takes_over_where_it_meets_the_decaying_threshold() -> None:
-    """|e_s| = x₀(e^t − 1) meets 1·e^{−t} at first, the floor later, by the size of x₀."""
+def test_the_floor_applies_from_where_it_meets_the_decaying_threshold() -> None:
+    """|e_s| = x₀(e^t − 1) reaches 1·e^{−t} first or the floor first, depending on x₀."""
     system = scalar_system(DecayingTrigger(1.0, 1.0, 0.5))
     for x0 in (2.0, 0.6, 0.5, 0.4, 1e-6):
         state = LoopState(0.0, np.array([x0]), np.zeros(1), np.zeros(1))
@@ -303,7 +303,7 @@ def test_the_floor_takes_over_where_it_meets_the_decaying_threshold() -> None:
         assert event.t_s == pytest.approx(expected, rel=1e-13)
 
 
-def test_an_event_at_the_end_counts_and_one_beyond_does_not() -> None:
+def test_an_event_at_the_horizon_counts_and_a_later_one_does_not() -> None:
     system = scalar_system(DecayingTrigger(1e-3, 1.0, 0.5))
     state = LoopState(0.0, np.ones(1), np.zeros(1), np.zeros(1))
     at_s = math.log1p(0.5)
@@ -331,14 +331,14 @@ def test_states_between_events_are_the_matrix_exponentials(case: Case, t_s: list
 
 
 def test_a_small_mismatch_keeps_its_relative_accuracy() -> None:
-    """e_s is driven by E x alone; with E = 1e-9 it is as accurate as any other number."""
+    """Only E x drives e_s; with E = 1e-9, e_s has full relative accuracy."""
     a, h, small = -1.0, -1.0 - 1e-9, 1e-9
     one = np.ones((1, 1))
     loop = loop_with(a * one, one, 0 * one, h * one, np.ones(1))
     trigger = DecayingTrigger(1e-10, 0.1)
     run = Case(loop, trigger, [False], True, 5.0).run()
     excess = lambda t: -math.expm1(-small * t) * math.exp(a * t) - 1e-10 * math.exp(-0.1 * t)  # noqa: E731
-    # E itself, −1 − (−1 − 1e-9), is known to 1e-16/1e-9 only: so is the time.
+    # E itself, −1 − (−1 − 1e-9), has a relative error of 1e-16/1e-9, and so has the time.
     assert run.event_s[0] == pytest.approx(brentq(excess, 0, 1, xtol=1e-15), rel=1e-6)
     exact = -1.0 - h
     excess = lambda t: -math.expm1(-exact * t) * math.exp(a * t) - 1e-10 * math.exp(-0.1 * t)  # noqa: E731
@@ -361,7 +361,7 @@ def test_dense_output_is_right_continuous() -> None:
         run.at([1e-3, 0.0])
 
 
-def test_who_does_not_know_the_start_sends_it() -> None:
+def test_an_unknown_start_is_sent_at_time_zero() -> None:
     case = turning(0.3, 7.0, False)._replace(known=False, lost=[True])
     run = case.run()
     assert run.event_s[0] == 0.0
@@ -370,8 +370,8 @@ def test_who_does_not_know_the_start_sends_it() -> None:
     assert run.delivered.tolist() == [True] + [False] * (len(run.before) - 1)
 
 
-def test_a_loop_without_events_that_diverges_says_when() -> None:
-    """ẋ = 100 x, and the model knows it: no event; e^{100t} = 1e100 · 0.5 e^{−0.25t} at the end."""
+def test_a_diverging_loop_without_events_reports_the_time() -> None:
+    """ẋ = 100 x, equal to the model: no event; e^{100t} = 1e100 · 0.5 e^{−0.25t} at the end."""
     one = np.ones((1, 1))
     loop = loop_with(100 * one, one, 0 * one, 100 * one, np.ones(1))
     run = Case(loop, DecayingTrigger(0.5, 0.25), [False], True, 50.0).run()
@@ -398,7 +398,7 @@ def test_a_threshold_that_vanishes_is_an_error() -> None:
     assert Case(loop, DecayingTrigger(0.5, 1.0, 1e-9), [False], True, 1e4).run().event_s.size == 0
 
 
-def test_a_reset_keeps_what_was_not_delivered() -> None:
+def test_a_reset_keeps_the_undelivered_jumps() -> None:
     state = LoopState(1.0, np.ones(2), np.ones(2), np.ones(2))
     assert reset(state, True).e_c.tolist() == [0, 0]
     assert reset(state, False).e_c.tolist() == [1, 1]

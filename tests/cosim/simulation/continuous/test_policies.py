@@ -1,4 +1,4 @@
-"""Every policy in continuous time, beside an integrator with its own account of the rules."""
+"""Every policy in continuous time, against an integrator with separately written rules."""
 
 import math
 from collections.abc import Callable
@@ -59,9 +59,9 @@ POLICIES: dict[str, Policy] = {
     "deadline": DeadlineTrigger(MixedTrigger(0.05, 0.1), 500 * MS),
     "dwell": DwellTrigger(DynamicTrigger(0.1, 0.5, 0.3, P, Q, B @ K), 70 * MS),
 }
-"""Those whose events lie where a continuous quantity passes zero, or a time is reached."""
+"""Policies with events at the zero of a continuous function or at a given time."""
 Excess = Callable[[float, Vector, float], float]
-"""Positive at an event: of the time, z = (x, e_s), and η."""
+"""Positive at an event: a function of the time, z = (x, e_s), and η."""
 
 
 def excess_of(name: str) -> Excess:
@@ -102,7 +102,7 @@ def run_of(policy: Policy, *, zoh: bool, lost: int, horizon_s: float = 6.0) -> C
     "name", ["decaying", "absolute", "relative", "mixed", "dynamic", "dynamic, at once", "deadline"]
 )
 def test_events_are_those_of_an_integrator(name: str, zoh: bool, lost: int) -> None:
-    """From each event of the run on, an integrator with events finds the next one."""
+    """From each event of the run, an integrator with event detection finds the next one."""
     policy, excess = POLICIES[name], excess_of(name)
     run = run_of(policy, zoh=zoh, lost=lost)
     loop, decay = run.system.loop, getattr(policy, "decay_per_s", 0.0)
@@ -139,8 +139,8 @@ def test_events_are_those_of_an_integrator(name: str, zoh: bool, lost: int) -> N
 
 
 @pytest.mark.parametrize("decay_per_s", [0.0, 30.0])
-def test_time_goes_on_while_the_rule_is_not_looked_at(decay_per_s: float) -> None:
-    """Even when η is used up meanwhile; and what is due before the dwell time ends is sent."""
+def test_states_evolve_while_the_rule_is_not_tested(decay_per_s: float) -> None:
+    """η may be used up meanwhile; an event that is due within the dwell time follows at its end."""
     dynamic = DynamicTrigger(0.1, 0.5, decay_per_s, P, Q, 3 * B @ K)
     for policy, times_s in (
         (DwellTrigger(dynamic, 500 * MS), None),
@@ -157,8 +157,8 @@ def test_time_goes_on_while_the_rule_is_not_looked_at(decay_per_s: float) -> Non
 
 @pytest.mark.parametrize("name", POLICIES)
 @pytest.mark.parametrize("zoh", [False, True])
-def test_no_rule_is_broken_between_events(name: str, zoh: bool) -> None:
-    """Looked at densely: at no time after the dwell do both sides say that there is an event."""
+def test_no_rule_is_met_between_events(name: str, zoh: bool) -> None:
+    """Sampled densely: the rule is never met after the dwell time and before the event."""
     policy = POLICIES[name]
     run = run_of(policy, zoh=zoh, lost=1, horizon_s=4.0)
     ends_s = [*run.event_s, run.horizon_s]
@@ -196,15 +196,15 @@ def test_tabuadas_example_keeps_the_published_bound_and_comes_close_to_it(sigma:
     assert shortest_s < 1.2 * tau_s
 
 
-def test_periodic_is_a_clock() -> None:
+def test_periodic_transmits_at_a_fixed_period() -> None:
     run = run_of(PeriodicTrigger(300 * MS), zoh=True, lost=0, horizon_s=6.1)
     np.testing.assert_allclose(run.event_s, np.arange(1, 21) * 0.3, rtol=1e-12)
 
 
-def test_periodic_event_triggering_is_that_of_the_sampled_rule() -> None:
-    """By matrix powers, sample by sample."""
+def test_periodic_event_triggering_agrees_with_the_sampled_rule() -> None:
+    """By powers of matrices, sample by sample."""
     run = run_of(QuadraticTrigger(FORM, 50 * MS, heartbeat=7), zoh=True, lost=1)
-    step = run.system.flow.sample  # of a basis vector: a column of the transition matrix
+    step = run.system.flow.sample  # for a basis vector: a column of the transition matrix
     transition = np.stack([step(column, np.array([0.05]))[0] for column in np.eye(6)], axis=1)
     z, since, expected, number = np.concatenate(run.start[1:]), 0, [], 0
     for k in range(1, 121):
@@ -219,8 +219,8 @@ def test_periodic_event_triggering_is_that_of_the_sampled_rule() -> None:
     np.testing.assert_allclose(run.event_s, expected, rtol=1e-9)
 
 
-def test_a_self_trigger_keeps_below_the_threshold_where_its_assumption_holds() -> None:
-    """ZOH, everything delivered: |ė| = |ẋ| ≤ |A| |e| + |A+BK| |x_k|, as x = x_k − e."""
+def test_a_self_trigger_stays_below_the_threshold_under_its_assumption() -> None:
+    """ZOH, no losses: |ė| = |ẋ| ≤ |A| |e| + |A+BK| |x_k|, as x = x_k − e."""
     loop = loop_of(zoh=True, mismatch=0.0)
     L, a = np.linalg.norm(loop.A, 2), np.linalg.norm(CLOSED, 2)
     policy = SelfTrigger(0.5, 0.2, 0.0, float(L), float(a), 0.0, 1000, 10**9)
@@ -232,7 +232,7 @@ def test_a_self_trigger_keeps_below_the_threshold_where_its_assumption_holds() -
         assert norm(event.e_s) <= 0.5 * math.exp(-0.2 * event.t_s) * (1 + 1e-9)
 
 
-def test_an_envelope_alone_lets_events_accumulate_when_updates_are_lost() -> None:
+def test_events_accumulate_under_a_pure_envelope_when_updates_are_lost() -> None:
     rule = LyapunovTrigger(np.linalg.cholesky(P).T, 0.2)
     with pytest.raises(TooManyEventsError):
         run_of(rule, zoh=True, lost=2)

@@ -1,5 +1,7 @@
-"""What the literature says of the policies, beside the exact simulator; each docstring says whether
-its figures are printed there, or follow from what is proved there."""
+"""Published results on the policies, against the exact simulator.
+
+Each docstring states whether its figures are printed in the source or follow from a theorem there.
+"""
 
 import math
 from pathlib import Path
@@ -45,7 +47,7 @@ P = np.array([[1.0, 0.25], [0.25, 1.0]])
 
 
 def held(system: System, policy: Policy) -> ContinuousLoop:
-    """The loop of the literature: the input is held, and the model is the plant."""
+    """The loop of the literature: held input, and a model equal to the plant."""
     A, B, K = system
     n, m = B.shape
     names = tuple(f"x_{i}" for i in range(n)), tuple(f"u_{i}" for i in range(m))
@@ -56,7 +58,7 @@ def held(system: System, policy: Policy) -> ContinuousLoop:
 def run_from(
     x0: Matrix, loop: ContinuousLoop, horizon_s: float, max_events: int = 5000
 ) -> ContinuousRun:
-    """Every update arrives."""
+    """A run in which every update arrives."""
     return simulate_continuous(
         loop, horizon_s=horizon_s, delivered=[], known_start=True, x0=x0, max_events=max_events
     )
@@ -82,7 +84,7 @@ def directions(count: int) -> Matrix:
     return np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
 
-def test_the_reactors_inter_event_times_are_those_that_etcetera_prints() -> None:
+def test_the_reactors_inter_event_times_are_those_printed_by_etcetera() -> None:
     """Printed: regions {1}, {2}, {3}, {4}, {5}, in periods, with a heartbeat of 20.
 
     ETCetera (Delimpaltadakis, de A. Gleizer, van Straalen, Mazo Jr., HSCC 2022), documentation,
@@ -95,7 +97,7 @@ def test_the_reactors_inter_event_times_are_those_that_etcetera_prints() -> None
     assert seen == {1, 2, 3, 4, 5}
 
 
-def test_the_reactor_sends_after_two_periods_where_etcetera_says() -> None:
+def test_the_reactor_transmits_after_two_periods_in_etceteras_region() -> None:
     """Printed: xᵀN(1)x ≤ 0 < xᵀN(2)x with these N, up to a positive factor each (ibid.)."""
     first = symmetric(
         0.0325014371942073, -0.758236561497541, 2.28413716988318, -1.57991935089754,
@@ -113,8 +115,8 @@ def test_the_reactor_sends_after_two_periods_where_etcetera_says() -> None:
     found = [between(run_from(x, loop, 0.05))[:1].tolist() == [0.02] for x in states]
     assert found == expected
     assert 50 < sum(found) < 350
-    # Printed: with a transmission after one period already, one to three more follow; by a
-    # relaxation, so there may be less.
+    # Printed: after an inter-event time of one period, one to three further ones follow; this is
+    # from a relaxation, so there may be fewer.
     early = step(REACTOR, 0.01)
     follow = {
         round(float(between(run_from(early @ x, loop, 0.1))[0]) / 0.01)
@@ -130,7 +132,7 @@ def symmetric(*upper: float) -> Matrix:
 
 
 def dynamic(theta_s: float) -> ContinuousLoop:
-    """Girard's rule; at θ → ∞ it is the static one, w < 0."""
+    """Girard's rule; for θ → ∞ it becomes the static rule w < 0."""
     return shipped("tabuada_dynamic", f"trigger.theta_s={theta_s}")
 
 
@@ -196,7 +198,8 @@ def test_the_lyapunov_rule_meets_its_minimum_time_and_no_earlier_one() -> None:
     loop = held(REACTOR, LyapunovTrigger(L, rate_per_s))
     worst = np.linalg.svd(L @ step(REACTOR, shortest_s) @ np.linalg.inv(L))[2][0]
     met = run_from(np.linalg.solve(L, worst), loop, 1.5 * shortest_s)
-    assert met.event_s[0] == pytest.approx(shortest_s, rel=1e-6)  # a square root of rounding
+    # the square root of the rounding error
+    assert met.event_s[0] == pytest.approx(shortest_s, rel=1e-6)
     for x0 in np.random.default_rng(2).normal(size=(20, 4)):
         assert (between(run_from(x0, loop, 2.0)) >= shortest_s * (1 - 1e-6)).all()
 
@@ -217,10 +220,10 @@ def test_send_on_delta_samples_a_first_order_response_at_its_levels(delta: float
 @pytest.mark.parametrize("amplitude", [1.0, 3.7])
 def test_send_on_delta_saves_a_sine_the_factor_of_its_slopes(amplitude: float) -> None:
     """Theorem: at most mean|ẋ|/δ reports a second, where a clock of equal resolution needs
-    max|ẋ|/δ; the ratio is the signal's own, π/2 for a sine, whatever δ.
+    max|ẋ|/δ; the ratio depends on the signal only and is π/2 for a sine, for any δ.
 
-    Miskowicz, Sensors 6(1), 2006. The rule watches the first state of an oscillator; the second
-    one's weight is next to nothing.
+    Miskowicz, Sensors 6(1), 2006. The rule measures the first state of an oscillator; the
+    weight of the second is almost 0.
     """
     system = np.array([[0.0, 1.0], [-1.0, 0.0]]), np.array([[0.0], [1.0]]), np.zeros((1, 2))
     delta, periods = 0.05, 4
@@ -229,16 +232,16 @@ def test_send_on_delta_saves_a_sine_the_factor_of_its_slopes(amplitude: float) -
     events = len(run_from(x0, held(system, rule), 2 * math.pi * periods).event_s)
     by_clock = amplitude / delta * 2 * math.pi * periods  # max|ẋ| = amplitude
     assert by_clock / events >= math.pi / 2
-    # At each of two turning points a period less than one δ is not reported, nor one back.
+    # At each of two turning points a period, less than one δ is not reported, in either direction.
     assert events >= by_clock / (math.pi / 2) - 4 * periods - 1
 
 
-def test_the_loop_stays_as_near_to_the_continuous_one_as_lunze_and_lehmann_say() -> None:
+def test_the_distance_to_the_continuous_loop_is_within_lunze_and_lehmanns_bound() -> None:
     """Theorem: ‖x − x_CT‖ ≤ ē ∫₀^∞ ‖e^{(A+BK)s} BK‖ ds for a generator with ‖e‖ ≤ ē.
 
-    Lunze, Lehmann, Automatica 46(1), 2010. Sensor and controller run the same model. What disturbs
-    it is another plant, here in both loops; without a disturbance there is no event at all, which
-    they remark.
+    Lunze, Lehmann, Automatica 46(1), 2010. Sensor and controller run the same model. The
+    disturbance is a plant mismatch, here in both loops; without a disturbance there is no event,
+    as they remark.
     """
     A, B, K = TABUADA
     closed, level = A + B @ K, 0.2
@@ -270,8 +273,8 @@ def test_the_loop_stays_as_near_to_the_continuous_one_as_lunze_and_lehmann_say()
     ],
     ids=["relative", "lyapunov", "dynamic", "quadratic"],
 )
-def test_inter_event_times_depend_on_the_direction_only(rule: Policy) -> None:
-    """Theorem: τ(λx) = τ(x) for rules that are homogeneous and plants that are linear.
+def test_inter_event_times_depend_only_on_the_direction_of_the_state(rule: Policy) -> None:
+    """Theorem: τ(λx) = τ(x) for homogeneous rules and linear plants.
 
     Anta, Tabuada, IEEE TAC 55(9), 2010, of the degree 0.
     """
@@ -282,7 +285,7 @@ def test_inter_event_times_depend_on_the_direction_only(rule: Policy) -> None:
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-9)
 
 
-def test_inter_event_times_settle_where_the_direction_is_kept() -> None:
+def test_inter_event_times_become_constant_where_the_direction_is_invariant() -> None:
     """Theorem: constant inter-event times τ in the plane mean a state that M(τ) only scales.
 
     Rajan, Tallapragada, arXiv:2201.02090: the inter-event time is a function of the state's angle,

@@ -1,4 +1,4 @@
-"""``noack simulate --trigger continuous``: what it says is what the run holds."""
+"""``noack simulate --trigger continuous``: the output agrees with the run."""
 
 import json
 from pathlib import Path
@@ -28,7 +28,7 @@ def resolved() -> Scenario:
     return resolve(load(SCENARIOS / "lane_following.toml", ["plant.rate_hz=50", "horizon_s=10"]))
 
 
-def test_the_fates_are_the_simulated_networks(resolved: Scenario) -> None:
+def test_the_fates_are_those_of_the_simulated_network(resolved: Scenario) -> None:
     packets = simulate(resolved)[NETEM_PACKET]
     fates = network_fates(resolved)
     later_first = [fates(i) for i in reversed(range(len(packets)))][::-1]
@@ -36,7 +36,7 @@ def test_the_fates_are_the_simulated_networks(resolved: Scenario) -> None:
     assert fates(0)
 
 
-def test_the_document_is_the_run(resolved: Scenario) -> None:
+def test_the_json_document_agrees_with_the_run(resolved: Scenario) -> None:
     run = run_continuous(resolved)
     found = json.loads(json.dumps(document(run, resolved), allow_nan=False))
     summary, events, samples = found["summary"], found["events"], found["samples"]
@@ -66,14 +66,14 @@ def test_the_command_prints_a_table_or_json() -> None:
     assert document["summary"]["exit"]["status"] == 0
 
 
-def test_many_events_are_shown_in_part() -> None:
+def test_long_lists_of_events_are_shortened() -> None:
     told = noack("simulate", str(SCENARIOS / "lane_following.toml"), "--trigger", "continuous",
                  "--set", 'mode="zoh"')  # fmt: skip
     assert "more events: --json" in told.stdout
 
 
 def test_a_loop_that_diverges_fails() -> None:
-    """A model that knows the unstable loop: no event, and no end of growth."""
+    """The model equals the unstable loop: no event, and unlimited growth."""
     told = noack("simulate", str(SCENARIOS / "unstable_pendulum.toml"), "--trigger", "continuous",
                  "--set", 'plant.draw="nominal"', "--set", "model.gain=[[20.0, 20.0]]",
                  "--set", "model.allow_unstable=true",

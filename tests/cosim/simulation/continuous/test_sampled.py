@@ -1,4 +1,4 @@
-"""The loop on the plant's grid against step-by-step exponentials, and against the machines."""
+"""The loop on the plant's grid, against step-by-step exponentials and against the machines."""
 
 import itertools
 from functools import lru_cache
@@ -126,12 +126,12 @@ def test_it_is_what_one_exponential_after_another_gives(delay: bool, case: Case)
     x, events = case.sampled(delay=delay)
     expected, expected_events = case.naive(delay=delay)
     assert events == expected_events
-    # 200 products on one side, each with an error of some 1e-16 of the state, which may grow.
+    # 200 products on one side, each with an error of about 1e-16 of the state, which may grow.
     np.testing.assert_allclose(x, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
-def test_ever_faster_sampling_is_the_continuous_loop() -> None:
-    """An event is at most one period late, so that halving the period halves the difference."""
+def test_fast_sampling_converges_to_the_continuous_loop() -> None:
+    """An event is at most one period late, so half the period gives half the difference."""
     content = {
         "name": "pendulum",
         "horizon_s": 4.0,
@@ -158,7 +158,7 @@ def test_ever_faster_sampling_is_the_continuous_loop() -> None:
         run = SampledLoop(system, schedule, known_start=False).run(delay=False, hold=False)
         assert len(run.event_steps) == len(ideal.event_s)
         late_s = run.event_steps * period_ns * 1e-9 - ideal.event_s
-        assert late_s[1] >= 0  # later ones follow a loop that is another one by then
+        assert late_s[1] >= 0  # the loops have diverged from each other by the later events
         x = ideal.at(np.arange(steps + 1) * (period_ns * 1e-9)).x
         differences.append(float(np.abs(run.x - x).max()))
     ratios = [after / before for before, after in itertools.pairwise(differences)]
@@ -167,7 +167,7 @@ def test_ever_faster_sampling_is_the_continuous_loop() -> None:
 
 
 def policies(n: int) -> list[dict[str, Any]]:
-    """One of each kind, whose rule is met now and then."""
+    """One policy of each kind, with a rule that is met occasionally."""
     form = np.kron(np.diag([-0.01, 1.0]), np.eye(n))
     watched: list[dict[str, Any]] = [
         {"beta": 0.01, "alpha_per_s": 0.3},
@@ -199,7 +199,7 @@ def policies(n: int) -> list[dict[str, Any]]:
 
 @st.composite
 def records(draw: st.DrawFn) -> RunRecord:
-    """Machines in virtual time: losses, delays, overtaking, rates and phases of all kinds."""
+    """Machines in virtual time: losses, delays, reordering, all kinds of rates and phases."""
     n = draw(st.integers(1, 3))
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     A, B, K = (rng.uniform(-1, 1, shape) for shape in ((n, n), (n, 1), (1, n)))

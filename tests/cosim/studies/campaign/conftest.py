@@ -43,7 +43,7 @@ def plan() -> dict[str, Any]:
 
 @pytest.fixture
 def write(tmp_path: Path, content: dict[str, Any]) -> Write:
-    """Writes a campaign file, its scenario beside it."""
+    """Writes a campaign file and its scenario into one folder."""
     scenario = tmp_path / "small.toml"
     scenario.write_text(tomli_w.dumps(content))
 

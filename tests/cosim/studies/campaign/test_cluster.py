@@ -1,4 +1,4 @@
-"""A real Dask cluster of processes on loopback, one of which is killed during the run."""
+"""A real Dask cluster of local processes, one of which is killed during the run."""
 
 import subprocess
 import sys
@@ -70,7 +70,7 @@ def some(write: Write, plan: dict[str, Any]) -> tuple[Campaign, list[Point]]:
     return loaded, grid(loaded, path)
 
 
-def test_a_cluster_gives_the_same_bytes_though_a_worker_is_killed(
+def test_a_cluster_gives_the_same_bytes_after_a_worker_is_killed(
     dask: Cluster, tmp_path: Path, some: tuple[Campaign, list[Point]]
 ) -> None:
     plan, points = some
@@ -94,7 +94,7 @@ def test_a_cluster_gives_the_same_bytes_though_a_worker_is_killed(
     assert len(contents(there.folder)) == 120
 
 
-def test_a_worker_that_computes_otherwise_is_refused_and_named(
+def test_a_worker_with_different_results_is_refused_and_named(
     dask: Cluster, tmp_path: Path, some: tuple[Campaign, list[Point]],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
@@ -113,7 +113,7 @@ def test_a_worker_that_computes_otherwise_is_refused_and_named(
     assert files(store.folder) == {}
 
 
-def test_a_cluster_without_workers_is_waited_for_with_a_word_and_not_for_ever(
+def test_waiting_for_workers_is_reported_and_limited(
     tmp_path: Path, some: tuple[Campaign, list[Point]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plan, points = some
@@ -134,7 +134,9 @@ def test_a_cluster_without_workers_is_waited_for_with_a_word_and_not_for_ever(
     assert said == [f"{empty.address}: no worker; waiting 0.5 s for one"]
 
 
-def test_nobody_there_and_no_address_are_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unreachable_or_invalid_scheduler_address_gives_one_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("cosim.studies.campaign.campaign_workers._CONNECT_S", 0.5)
     with (
         pytest.raises(PeerError, match="no Dask scheduler answers there"),
@@ -146,7 +148,7 @@ def test_nobody_there_and_no_address_are_one_line(monkeypatch: pytest.MonkeyPatc
             pass
 
 
-def test_without_dask_the_way_to_get_it_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_dask_the_message_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with (
         pytest.raises(CallerError, match=r"pip install 'noack\[cluster\]'"),
@@ -170,7 +172,7 @@ def test_a_campaign_without_a_scheduler_does_not_import_dask(
     assert done.returncode == 0, done.stderr
 
 
-def test_a_scheduler_that_dies_is_one_line_and_no_hang(
+def test_a_dead_scheduler_gives_one_line_without_a_hang(
     tmp_path: Path, some: tuple[Campaign, list[Point]]
 ) -> None:
     plan, points = some

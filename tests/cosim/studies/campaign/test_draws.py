@@ -1,4 +1,4 @@
-"""What is drawn: the same for a draw everywhere, and distributed as the scenario says."""
+"""Draws depend only on their number and have the distributions of the scenario."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def with_plant(scenario: Scenario, **changed: object) -> Scenario:
     return scenario.model_copy(update={"plant": plant})
 
 
-def test_draws_do_not_depend_on_the_chunk_they_are_in(campaign: Few) -> None:
+def test_draws_do_not_depend_on_the_chunk_size(campaign: Few) -> None:
     box = campaign[1][0].work.box
     whole = box.population(11, range(40))
     for part, ranges in ((3, (0, 17, 39)), (1, range(40))):
@@ -38,18 +38,18 @@ def test_draws_are_the_same_at_every_grid_point(campaign: Few) -> None:
             np.testing.assert_array_equal(one, another)
 
 
-def test_other_seeds_and_other_draws_differ_in_everything(campaign: Few) -> None:
+def test_other_seeds_and_draws_give_other_numbers_throughout(campaign: Few) -> None:
     box = campaign[1][0].work.box
     first, second = box.population(11, range(2)), box.population(12, range(2))
     for one, another in zip(first, second, strict=True):
-        if (one != one[0]).any():  # B has no box
+        if (one != one[0]).any():  # B has no uncertainty
             assert (one != another).any()
     assert (first.A[0] != first.A[1]).any()
     assert (first.x0[0] != first.x0[1]).all()
     assert first.loss_seeds[0] != first.loss_seeds[1]
 
 
-def test_draws_fill_the_box_evenly_and_never_leave_it(campaign: Few) -> None:
+def test_draws_are_uniform_in_the_box(campaign: Few) -> None:
     point = campaign[1][0]
     found = point.work.box.population(11, range(20_000))
     centre, half = loop_of(drawn_scenario(with_plant(point.scenario, draw="nominal"), 0, 0)), 0.2
@@ -65,7 +65,7 @@ def test_draws_fill_the_box_evenly_and_never_leave_it(campaign: Few) -> None:
     assert len(set(found.loss_seeds.tolist())) == 20_000
 
 
-def test_vertices_are_the_boxs_corners_and_nominal_and_given_plants_are_not_drawn(
+def test_vertex_draws_are_corners_and_nominal_and_given_plants_are_constant(
     campaign: Few,
 ) -> None:
     scenario = campaign[1][0].scenario
@@ -79,12 +79,12 @@ def test_vertices_are_the_boxs_corners_and_nominal_and_given_plants_are_not_draw
     assert (np.array(B) == given.B).all()
 
 
-def test_the_hundred_millionth_draw_is_there_at_once(campaign: Few) -> None:
+def test_a_draw_with_a_large_number_is_computed_directly(campaign: Few) -> None:
     found = campaign[1][0].work.box.population(11, range(10**8, 10**8 + 1))
     assert found.x0.shape == (1, 2)
 
 
-def test_a_run_of_a_campaign_is_a_scenario_that_can_be_run_on_its_own(campaign: Few) -> None:
+def test_a_draw_of_a_campaign_can_be_run_as_a_scenario(campaign: Few) -> None:
     plan, points = campaign
     for point in points:
         rows = point.work.run(range(4))
@@ -102,7 +102,7 @@ def test_a_run_of_a_campaign_is_a_scenario_that_can_be_run_on_its_own(campaign: 
             assert rows[draw]["final_norm"] == pytest.approx(np.linalg.norm(end), rel=1e-9)
 
 
-def test_chunks_do_not_change_what_is_measured(campaign: Few) -> None:
+def test_chunks_do_not_change_the_measures(campaign: Few) -> None:
     work = campaign[1][2].work
     whole = work.run(range(6))
     parts = np.concatenate([work.run(range(4, 6)), work.run(range(4))])

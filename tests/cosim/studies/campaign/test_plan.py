@@ -1,4 +1,4 @@
-"""Campaign files: what they mean, and one clear line for every mistake."""
+"""Campaign files: their grid of points, and one clear line for every mistake."""
 
 import copy
 import json
@@ -32,7 +32,7 @@ def test_the_grid_is_all_combinations_and_the_last_axis_varies_fastest(
     assert points[0].scenario.plant.initial_state_halfwidth == (0.5, 0.5)
 
 
-def test_a_key_with_dots_sets_a_value_and_one_without_a_whole_table(
+def test_a_key_with_dots_sets_a_value_and_other_keys_a_table(
     write: Write, plan: dict[str, Any]
 ) -> None:
     variants = {
@@ -45,7 +45,7 @@ def test_a_key_with_dots_sets_a_value_and_one_without_a_whole_table(
     assert (whole.beta, whole.alpha_per_s, whole.floor) == (2.0, 1.0, 0.0)
 
 
-def test_an_axis_of_tables_goes_before_one_of_their_keys(
+def test_an_axis_of_a_table_is_applied_before_an_axis_of_its_keys(
     write: Write, plan: dict[str, Any]
 ) -> None:
     variants = {"t": {"trigger": {"beta": 2.0, "alpha_per_s": 1.0}}, "f": {"trigger.floor": 0.1}}
@@ -57,14 +57,16 @@ def test_an_axis_of_tables_goes_before_one_of_their_keys(
         load(write(plan, axes=[key, tables], compare=None, figures=[]))
 
 
-def test_values_that_differ_late_are_told_apart(write: Write, plan: dict[str, Any]) -> None:
+def test_values_that_differ_in_late_digits_have_different_labels(
+    write: Write, plan: dict[str, Any]
+) -> None:
     values = [0.1, 0.1234567, 0.1234568]
     plan["axes"][1]["values"] = values
     labels = load(write(plan, figures=[])).axes[1].labels
     assert labels == ["0.1", "0.1234567", "0.1234568"]
 
 
-def test_points_do_not_see_each_others_settings(write: Write, plan: dict[str, Any]) -> None:
+def test_the_settings_of_points_are_independent(write: Write, plan: dict[str, Any]) -> None:
     variants = {"a": {"trigger.floor": 0.02}, "b": {"mode": "zoh"}}
     path = write(plan, axes=[{"name": "v", "variants": variants}], compare=None, figures=[])
     first, second = grid(load(path), path)
@@ -168,7 +170,7 @@ def test_a_mistake_is_one_line_with_file_key_and_remedy(
         ({"metrics": {"R": [[1.0, 2.0]]}}, "metrics.R: expected 1 x 1 (one row per input)"),
     ],
 )
-def test_a_scenario_that_is_wrong_at_a_point_is_named_with_the_point(
+def test_an_invalid_scenario_at_a_point_is_reported_with_the_point(
     write: Write, plan: dict[str, Any], changed: dict[str, Any], expected: str
 ) -> None:
     path = write(plan | {"compare": None, "figures": []} | changed)
@@ -178,7 +180,7 @@ def test_a_scenario_that_is_wrong_at_a_point_is_named_with_the_point(
     assert expected in str(found.value)
 
 
-def test_too_many_curves_for_one_figure_are_refused_with_the_way_out(
+def test_too_many_curves_for_one_figure_are_refused_with_a_remedy(
     write: Write, plan: dict[str, Any]
 ) -> None:
     plan["axes"][1]["values"] = [i / 10 for i in range(1, 8)]
@@ -198,7 +200,7 @@ def test_shipped_campaigns_are_valid_and_named_after_their_file(path: Path) -> N
     assert len({point.scenario.model_dump_json() for point in points}) == len(points)
 
 
-def test_the_shipped_campaigns_are_there() -> None:
+def test_the_documented_campaigns_are_shipped() -> None:
     names = ["acknowledgements", "mansd_sweep", "mb_vs_zoh", "paper", "policies_under_loss"]
     assert [path.stem for path in SHIPPED] == names
 
@@ -211,8 +213,8 @@ def test_the_weighted_policys_weight_is_the_shipped_scenarios() -> None:
     assert any(point.scenario.trigger.weight == weight for point in points)
 
 
-def test_the_published_schema_is_the_codes() -> None:
-    """``make schema`` brings it up to date."""
+def test_the_published_campaign_schema_is_up_to_date() -> None:
+    """``make schema`` updates it."""
     published = (ROOT / "docs" / "campaign.schema.json").read_text(encoding="utf-8")
     assert json.loads(published) == json_schema()
 

@@ -1,4 +1,4 @@
-"""What a campaign says: metrics, certificates, figures, the page and the command line."""
+"""The output of a campaign: metrics, certificates, figures, the page and the command line."""
 
 import json
 import math
@@ -64,7 +64,7 @@ def scalar(content: dict[str, Any], **changed: Any) -> Scenario:
 
 
 def test_a_scalar_models_certified_error_is_m_thresholds(content: dict[str, Any]) -> None:
-    # e^{(−2+α)τ} ≤ 1: each of the M − 1 = 2 missed errors counts once, the present one, too.
+    # e^{(−2+α)τ} ≤ 1: each of the M − 1 = 2 missed errors counts once, and so does the current one.
     assert certified_error(scalar(content)) == pytest.approx(3 * 0.5, rel=1e-6)
 
 
@@ -77,7 +77,7 @@ def test_a_scalar_models_certified_error_is_m_thresholds(content: dict[str, Any]
         (None, "mode", "zoh"),
     ],
 )
-def test_nothing_is_certified_where_the_theory_is_silent(
+def test_nothing_is_certified_outside_the_theorems_assumptions(
     content: dict[str, Any], table: str | None, key: str, value: Any
 ) -> None:
     (content if table is None else content[table])[key] = value
@@ -95,7 +95,7 @@ def test_the_certified_error_bounds_that_of_a_plants_own_certificate() -> None:
         assert name != "lane_weighted" or bound == pytest.approx(5 * 0.5, rel=1e-6)  # Δ = M
 
 
-def test_metrics_that_have_no_number_are_infinite_and_shares_are_derived() -> None:
+def test_metrics_without_a_value_are_infinite_and_shares_are_derived() -> None:
     columns = {
         "transmissions": np.array([10, 1]),
         "deliveries": np.array([4, 1]),
@@ -111,7 +111,7 @@ def test_metrics_that_have_no_number_are_infinite_and_shares_are_derived() -> No
 
 
 @pytest.mark.parametrize("status", [DIVERGED, TOO_MANY_EVENTS])
-def test_a_run_that_fails_is_not_taken_for_one_that_transmits_little(status: int) -> None:
+def test_a_failed_run_is_not_counted_as_one_with_few_transmissions(status: int) -> None:
     columns = {
         "transmissions": np.array([10, 1]),
         "deliveries": np.array([5, 0]),
@@ -123,10 +123,10 @@ def test_a_run_that_fails_is_not_taken_for_one_that_transmits_little(status: int
     assert estimate(found["transmissions"]).mean == 10.0
 
 
-def test_a_curve_has_gaps_where_a_metric_is_not_known(
+def test_a_curve_has_gaps_where_a_metric_is_unknown(
     write: Write, plan: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Here the two models have a certificate for other values of α."""
+    """Each of the two models has a certificate for other values of α."""
     plan["axes"] = [
         {"name": "gain", "variants": {"weak": {"model.gain": [[-1.0, -2.0]]},
                                       "strong": {"model.gain": [[-9.0, -6.0]]}}},
@@ -150,7 +150,7 @@ def test_a_curve_has_gaps_where_a_metric_is_not_known(
     assert [np.isfinite(line[:, 1]).tolist() for line in lines] == [[True, False], [True, True]]
 
 
-def test_a_summary_is_of_all_draws_and_pairs_them(full: Store, campaign: Few) -> None:
+def test_a_summary_covers_all_draws_and_pairs_them(full: Store, campaign: Few) -> None:
     summary = summarise(campaign[0], full)
     rows = [point.work.run(range(7)) for point in campaign[1]]
     for found, row in zip(summary.found, rows, strict=True):
@@ -166,7 +166,7 @@ def test_a_summary_is_of_all_draws_and_pairs_them(full: Store, campaign: Few) ->
     assert differences.std() < rows[2]["transmissions"].std() or differences.mean() < 0
 
 
-def test_an_exceeded_certificate_is_said_everywhere(
+def test_an_exceeded_certificate_is_reported_in_every_output(
     write: Write, plan: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
@@ -180,7 +180,7 @@ def test_an_exceeded_certificate_is_said_everywhere(
     assert 'class="verdict bad"' in (out / "campaign.html").read_text()
 
 
-def test_the_command_writes_what_it_says_and_keeps_whole_chunks(
+def test_the_command_writes_the_reported_files_and_keeps_complete_chunks(
     write: Write, plan: dict[str, Any], tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
@@ -195,7 +195,7 @@ def test_the_command_writes_what_it_says_and_keeps_whole_chunks(
     assert json.loads(CliRunner().invoke(app, arguments).stdout)["made"] == 4 * (7 - 3)
 
 
-def test_a_campaign_that_is_not_there_is_one_line() -> None:
+def test_a_missing_campaign_gives_one_line() -> None:
     done = CliRunner().invoke(app, ["campaign", "mb_vs_zho"])
     assert done.exit_code == 2
     assert done.stderr == (
@@ -204,7 +204,7 @@ def test_a_campaign_that_is_not_there_is_one_line() -> None:
     )
 
 
-def test_the_page_is_one_file_and_escapes_what_users_write(
+def test_the_page_is_one_file_and_escapes_user_text(
     write: Write, plan: dict[str, Any], full: Store
 ) -> None:
     plan["axes"][1]["title"] = HOSTILE
@@ -216,7 +216,7 @@ def test_the_page_is_one_file_and_escapes_what_users_write(
     html = (full.folder / "campaign.html").read_text(encoding="utf-8")
     assert "<script" not in html
     assert "http" not in html.replace('"http-equiv', "").replace("http-equiv=", "")
-    assert html.count("Student&#39;s t") == 2  # as docs/campaigns.md and statistics.py have it
+    assert html.count("Student&#39;s t") == 2  # as in docs/campaigns.md and statistics.py
     assert "(normal)" not in html
     assert html.count("<figure id=") == len(campaign.figures)
     assert html.count("<svg") == len(campaign.figures)
@@ -240,7 +240,7 @@ def test_the_front_is_what_nothing_dominates(drawn: list[tuple[int, int]]) -> No
     assert (np.diff(x[undominated(x, y)]) > 0).all()
 
 
-def test_figures_take_what_is_infinite_alone_or_many() -> None:
+def test_figures_accept_infinite_single_and_many_values() -> None:
     never, one = estimate(np.full(4, math.inf)), estimate(np.array([2.0]))
     many = estimate(np.geomspace(1e-9, 1e9, 50))
     for values in ([never], [one], [never, one, many]):
@@ -261,7 +261,7 @@ def test_figures_take_what_is_infinite_alone_or_many() -> None:
     assert inline(distribution_figure(values, "cost"), "f", "what").startswith("<svg")
 
 
-def test_a_distribution_reaches_the_share_that_is_finite() -> None:
+def test_a_distribution_ends_at_the_share_of_finite_values() -> None:
     values = np.concatenate([np.linspace(1.0, 2.0, 75), np.full(25, math.inf)])
     figure = distribution_figure({"a": values}, "settling_s")
     (line,) = figure.axes[0].lines
@@ -277,7 +277,7 @@ def test_numbers_are_written_with_their_interval() -> None:
     assert set(METRICS) >= {"cost", "settling_s"}
 
 
-def test_the_terminals_tables_take_names_as_they_are_and_say_which_runs_failed(
+def test_terminal_tables_print_names_literally_and_list_failed_runs(
     write: Write, plan: dict[str, Any], tmp_path: Path
 ) -> None:
     name = "[/x] [red]"
@@ -295,7 +295,7 @@ def test_the_terminals_tables_take_names_as_they_are_and_say_which_runs_failed(
 
 
 @pytest.mark.parametrize("width", range(45, 120))
-def test_no_terminal_is_too_narrow_for_the_tables(width: int) -> None:
+def test_the_tables_fit_narrow_terminals(width: int) -> None:
     headings = ["transmissions", "shortest interval [s]", "cost", "settling time [s]"]
     rows = [
         SummaryRow(

@@ -1,4 +1,4 @@
-"""Runs in virtual time, as a campaign measures them."""
+"""The measures of a sampled campaign: runs in virtual time."""
 
 import math
 from collections.abc import Callable
@@ -48,7 +48,7 @@ def record_of(one: SampledWork, draw: int) -> RunRecord:
 
 
 @pytest.mark.parametrize("overrides", [(), (LATE,), NEVER, ("mode=zoh",)])
-def test_a_row_says_what_the_runs_summary_says(overrides: tuple[str, ...]) -> None:
+def test_a_row_agrees_with_the_summary_of_the_run(overrides: tuple[str, ...]) -> None:
     one = work(*overrides)
     for draw, row in enumerate(one.run(range(3))):
         record = record_of(one, draw)
@@ -67,7 +67,7 @@ def test_a_row_says_what_the_runs_summary_says(overrides: tuple[str, ...]) -> No
         assert told["sup_e_c_norm"] <= row["sup_e_c_scaled"] <= np.e * told["sup_e_c_norm"]
 
 
-def test_the_cost_is_the_integral_along_the_held_inputs() -> None:
+def test_the_cost_is_the_integral_under_the_held_inputs() -> None:
     Q, R = np.diag([1.0, 2.0, 3.0, 4.0]), np.diag([0.5, 0.25])
     one = work("horizon_s=0.2", Q=Q, R=R)
     (row,) = one.run(range(1))
@@ -85,7 +85,7 @@ def test_the_cost_is_the_integral_along_the_held_inputs() -> None:
     assert row["cost"] == pytest.approx(cost, rel=1e-10)
 
 
-def test_what_disturbs_the_plant_is_in_the_integral_and_costs_nothing_itself() -> None:
+def test_disturbances_enter_the_cost_only_through_the_state() -> None:
     gusts = (
         'plant.disturbances=[{kind = "gaussian", std = [3.0, 1.0]},'
         ' {kind = "uniform", at = "state", bound = [0.5, 0.0, 0.0, 2.0]}]'
@@ -107,7 +107,7 @@ def test_what_disturbs_the_plant_is_in_the_integral_and_costs_nothing_itself() -
     assert row["cost"] == pytest.approx(cost, rel=1e-10)
 
 
-def test_a_plant_that_is_not_linear_is_drawn_and_its_cost_is_a_sum() -> None:
+def test_a_nonlinear_plant_is_drawn_and_its_cost_is_a_sum() -> None:
     given = load_scenario(SHIPPED / "cart_pole.toml", ["horizon_s=1.0", "plant.rate_hz=200.0"])
     one = SampledWork(in_virtual_time(given), 7, None, None, 0.5, 1000)
     (row,) = one.run(range(1))
@@ -120,7 +120,7 @@ def test_a_plant_that_is_not_linear_is_drawn_and_its_cost_is_a_sum() -> None:
     assert row["cost"] == pytest.approx(expected, rel=1e-12)
 
 
-def test_every_draw_has_disturbances_and_noise_of_its_own() -> None:
+def test_every_draw_has_its_own_disturbances_and_noise() -> None:
     noisy = ('plant.disturbances=[{kind = "gaussian", std = [1.0, 1.0]}]',
              "plant.measurement.noise_std=[0.1, 0.1, 0.1, 0.1]")  # fmt: skip
     seeds = [drawn_scenario(work(*noisy).scenario, 7, draw).seeds for draw in range(3)]
@@ -128,17 +128,17 @@ def test_every_draw_has_disturbances_and_noise_of_its_own() -> None:
     assert len({s.disturbance for s in seeds} | {s.noise for s in seeds}) == 6
 
 
-def test_a_draw_depends_on_its_number_alone() -> None:
+def test_a_draw_depends_only_on_its_number() -> None:
     one = work(*NEVER)
     assert one.run(range(2, 4)).tobytes() == one.run(range(4))[2:].tobytes()
 
 
-def test_acknowledgements_that_are_lost_cost_transmissions() -> None:
+def test_lost_acknowledgements_cause_transmissions() -> None:
     with_none, with_lost = work().run(range(5)), work(*NEVER).run(range(5))
     assert with_lost["transmissions"].sum() > 3 * with_none["transmissions"].sum()
 
 
-def test_a_run_that_fails_says_how() -> None:
+def test_a_failed_run_has_the_status_of_its_failure() -> None:
     growing = "model.gain=[[0, 0, 0, 0], [0, 0, 0, 0]]"
     (row,) = work(
         growing, "model.allow_unstable=true",
@@ -151,8 +151,8 @@ def test_a_run_that_fails_says_how() -> None:
     assert (row["status"], np.isnan(row["cost"])) == (TOO_MANY_EVENTS, True)
 
 
-def test_nobody_falls_silent_in_virtual_time_whatever_an_actuation_carries() -> None:
-    """So the watchdog never trips, and its policy makes no difference."""
+def test_the_watchdog_policy_does_not_change_a_run_in_virtual_time() -> None:
+    """Actuations never stop in virtual time, so the watchdog does not trip."""
     rows = [work(f"plant.watchdog.policy={policy}").run(range(2)) for policy in ("hold", "model")]
     assert rows[0].tobytes() == rows[1].tobytes()
     assert (rows[0]["status"] == OK).all()
@@ -167,7 +167,9 @@ PLAN = {
 }
 
 
-def test_what_takes_time_has_a_place(write: Callable[..., Path]) -> None:
+def test_delays_and_acknowledgements_are_permitted_in_sampled_campaigns(
+    write: Callable[..., Path],
+) -> None:
     delay = [{"kind": "delay", "delay_s": 0.01}]
     axis = {"name": "network", "variants": {
         "late": {"network.impairments": delay}, "ack": {"network.protocol": "ack"},
@@ -181,14 +183,14 @@ def test_what_takes_time_has_a_place(write: Callable[..., Path]) -> None:
 @pytest.mark.parametrize(
     ("setting", "says"),
     [
-        ({"network.protocol": "ack"}, r'protocol.*with time = "sampled" a campaign runs both'),
+        ({"network.protocol": "ack"}, r'protocol.*time = "sampled" takes both'),
         (
             {"network.impairments": [{"kind": "delay", "delay_s": 0.01}]},
-            r'delay.*or let time = "sampled"',
+            r'delay.*or use time = "sampled"',
         ),
     ],
 )
-def test_continuous_time_refers_to_the_other(
+def test_continuous_time_refuses_settings_that_need_sampled_time(
     write: Callable[..., Path], setting: dict[str, Any], says: str
 ) -> None:
     axis = {"name": "network", "variants": {"plain": {"mode": "zoh"}, "other": setting}}
@@ -197,8 +199,8 @@ def test_continuous_time_refers_to_the_other(
         grid(load(path), path)
 
 
-def test_an_axis_that_plays_no_part_is_refused(write: Callable[..., Path]) -> None:
+def test_an_axis_without_an_effect_is_refused(write: Callable[..., Path]) -> None:
     axis = {"name": "speed", "key": "speed", "values": [1.0, 2.0]}
     path = write(PLAN | {"axes": [axis]})
-    with pytest.raises(CallerError, match="makes no difference"):
+    with pytest.raises(CallerError, match="has no effect"):
         grid(load(path), path)

@@ -1,4 +1,4 @@
-"""Estimates against closed forms, and their intervals by how often they contain the truth."""
+"""Estimates against closed forms, and the coverage of their intervals."""
 
 import math
 
@@ -9,7 +9,7 @@ from scipy.stats import t as student
 from cosim.studies.campaign.draw_statistics import difference, estimate
 
 
-def test_the_means_interval_is_the_textbooks() -> None:
+def test_the_interval_of_a_mean_is_the_textbooks() -> None:
     values = np.array([1.0, 2.0, 4.0, 9.0])
     found = estimate(values)
     assert found.mean == 4.0
@@ -18,21 +18,21 @@ def test_the_means_interval_is_the_textbooks() -> None:
     assert (found.median, found.q05, found.q95, found.largest) == (2.0, 1.0, 9.0, 9.0)
 
 
-def test_intervals_contain_the_truth_as_often_as_they_say() -> None:
+def test_intervals_have_their_nominal_coverage() -> None:
     rng = np.random.default_rng(0)
     trials, of_mean, of_median = 2000, 0, 0
     for _ in range(trials):
         found = estimate(rng.exponential(1.0, 101))
         of_mean += abs(found.mean - 1.0) <= found.halfwidth
         of_median += found.median_low <= math.log(2) <= found.median_high
-    # Standard deviation of a share: 0.005. A normal interval of a skewed law covers a little less.
+    # Standard deviation of a share: 0.005. A normal interval of a skewed law covers slightly less.
     assert 0.92 < of_mean / trials < 0.97
     assert 0.94 < of_median / trials < 0.98
 
 
 @pytest.mark.parametrize("draws", [2, 3, 10])
-def test_the_intervals_of_few_draws_are_as_honest(draws: int) -> None:
-    """A normal interval of two draws contains the truth in 70 % of the cases only."""
+def test_intervals_of_few_draws_have_their_nominal_coverage(draws: int) -> None:
+    """A normal interval of two draws covers the true value in only 70 % of the cases."""
     values = np.random.default_rng(draws).normal(3.0, 2.0, (4000, draws))
     hits = 0
     for row in values:
@@ -41,7 +41,7 @@ def test_the_intervals_of_few_draws_are_as_honest(draws: int) -> None:
     assert abs(hits / len(values) - 0.95) < 0.014  # four standard deviations of a share
 
 
-def test_what_never_happens_counts_for_quantiles_and_not_for_the_mean() -> None:
+def test_infinite_values_count_for_quantiles_and_not_for_the_mean() -> None:
     found = estimate(np.array([3.0, math.inf, 1.0, math.inf, math.inf]))
     assert (found.draws, found.finite, found.mean) == (5, 2, 2.0)
     assert found.median == found.largest == math.inf
@@ -49,7 +49,7 @@ def test_what_never_happens_counts_for_quantiles_and_not_for_the_mean() -> None:
     assert (none.finite, none.mean, none.halfwidth) == (0, math.inf, math.inf)
 
 
-def test_few_draws_give_no_interval_rather_than_a_wrong_one() -> None:
+def test_too_few_draws_give_no_interval() -> None:
     found = estimate(np.array([1.0]))
     assert found.halfwidth == found.median_high == math.inf
     assert found.median_low == -math.inf

@@ -1,4 +1,4 @@
-"""The campaign's folder: whole chunks or none, and no other campaign's."""
+"""The campaign's folder: only complete chunks, and only of one campaign."""
 
 import errno
 import json
@@ -24,7 +24,7 @@ Few = tuple[Campaign, list[Point]]
 
 
 def files(folder: Path) -> dict[str, int]:
-    """Parquet files and when they were written."""
+    """Parquet files and their modification times."""
     return {
         str(path.relative_to(folder)): path.stat().st_mtime_ns for path in folder.rglob("*.parquet")
     }
@@ -38,7 +38,7 @@ def full(tmp_path: Path, campaign: Few) -> Store:
     return store
 
 
-def test_every_chunk_has_its_draws_and_the_axes_beside_them(full: Store, campaign: Few) -> None:
+def test_every_chunk_contains_its_draws_and_their_axis_values(full: Store, campaign: Few) -> None:
     assert len(files(full.folder)) == 4 * 3
     table = pyarrow.dataset.dataset(full.folder / "runs", format="parquet").to_table()
     rows = {(r["policy"], r["beta"], r["draw"]): r for r in table.to_pylist()}
@@ -53,14 +53,14 @@ def test_every_chunk_has_its_draws_and_the_axes_beside_them(full: Store, campaig
         np.testing.assert_array_equal(column, expected["cost"])
 
 
-def test_what_is_there_is_not_made_again(full: Store) -> None:
+def test_existing_chunks_are_not_computed_again(full: Store) -> None:
     before = files(full.folder)
     assert list(full.missing()) == []
     assert run_campaign(full, alone) == 0
     assert files(full.folder) == before
 
 
-def test_a_spoilt_file_is_made_again_and_no_other(full: Store) -> None:
+def test_only_a_damaged_file_is_computed_again(full: Store) -> None:
     before = files(full.folder)
     path = full.folder / "runs" / "point-00001" / "draws-000000003.parquet"
     whole = path.read_bytes()
@@ -72,9 +72,7 @@ def test_a_spoilt_file_is_made_again_and_no_other(full: Store) -> None:
     assert changed == {"runs/point-00001/draws-000000003.parquet"}
 
 
-def test_more_draws_keep_the_chunks_that_are_full_and_fewer_keep_all(
-    full: Store, campaign: Few
-) -> None:
+def test_more_draws_keep_full_chunks_and_fewer_draws_keep_all(full: Store, campaign: Few) -> None:
     more = Store(full.folder, campaign[1], 10, 3)
     assert {(chunk.start, chunk.stop) for chunk in more.missing()} == {(6, 9), (9, 10)}
     run_campaign(more, alone)
@@ -85,7 +83,7 @@ def test_more_draws_keep_the_chunks_that_are_full_and_fewer_keep_all(
     np.testing.assert_array_equal(fewer.columns(2, ["cost"])["cost"], expected[:4])
 
 
-def test_a_full_disk_is_one_line_and_leaves_whole_files_only(
+def test_a_full_disk_gives_one_line_and_leaves_complete_files_only(
     tmp_path: Path, campaign: Few, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plan, points = campaign
@@ -148,7 +146,7 @@ def test_another_campaign_is_refused_in_the_same_folder(
     assert "\n" not in text
 
 
-def test_another_scenario_is_another_campaign_and_other_figures_are_not(
+def test_a_changed_scenario_makes_another_campaign_and_changed_figures_do_not(
     write: Write, plan: dict[str, Any], tmp_path: Path
 ) -> None:
     folder = tmp_path / "out"
@@ -162,7 +160,7 @@ def test_another_scenario_is_another_campaign_and_other_figures_are_not(
         changed_folder(write, folder, plan)
 
 
-def test_a_folder_in_use_and_a_folder_of_someone_else_are_refused(
+def test_a_folder_in_use_or_of_other_content_is_refused(
     write: Write, plan: dict[str, Any], tmp_path: Path
 ) -> None:
     path = write(plan)
@@ -182,7 +180,7 @@ def test_a_folder_in_use_and_a_folder_of_someone_else_are_refused(
         changed_folder(write, path, plan)  # a file, not a folder
 
 
-def test_what_a_kill_left_half_written_is_swept_away(
+def test_incomplete_files_of_a_killed_run_are_removed(
     write: Write, plan: dict[str, Any], tmp_path: Path
 ) -> None:
     folder = tmp_path / "out"
@@ -194,8 +192,8 @@ def test_what_a_kill_left_half_written_is_swept_away(
     assert not left.exists()
 
 
-def test_a_damaged_page_is_one_line_that_says_how_to_mend_it(full: Store) -> None:
-    """Sums over what a disk has changed would be wrong in silence."""
+def test_a_damaged_parquet_page_gives_one_line_with_the_remedy(full: Store) -> None:
+    """Sums over data that the disk has changed would be wrong without a warning."""
     path = full.folder / "runs" / "point-00001" / "draws-000000003.parquet"
     whole = bytearray(path.read_bytes())
     place = whole.find(np.float64(full.columns(1, ["cost"])["cost"][3]).tobytes())
@@ -206,7 +204,7 @@ def test_a_damaged_page_is_one_line_that_says_how_to_mend_it(full: Store) -> Non
         full.columns(1, ["cost"])
 
 
-def test_what_a_file_of_the_scenario_says_is_part_of_the_campaign(
+def test_files_that_the_scenario_refers_to_are_part_of_the_campaign(
     write: Write, plan: dict[str, Any], tmp_path: Path
 ) -> None:
     (tmp_path / "lost.txt").write_text("0 1 1\n")
@@ -218,7 +216,7 @@ def test_what_a_file_of_the_scenario_says_is_part_of_the_campaign(
         changed_folder(write, tmp_path / "out", plan)
 
 
-def test_runs_of_another_noack_are_shown_but_not_added_to(
+def test_runs_of_another_version_are_shown_but_not_extended(
     write: Write, plan: dict[str, Any], tmp_path: Path
 ) -> None:
     path, folder = write(plan), tmp_path / "out"
@@ -241,7 +239,7 @@ def test_runs_of_another_noack_are_shown_but_not_added_to(
 
 
 @pytest.mark.parametrize("text", ["[]", "{}", "nonsense", '{"arithmetic": 3}'])
-def test_a_manifest_that_is_none_is_one_line(
+def test_an_invalid_manifest_gives_one_line(
     write: Write, plan: dict[str, Any], tmp_path: Path, text: str
 ) -> None:
     (tmp_path / "out").mkdir()
@@ -250,6 +248,6 @@ def test_a_manifest_that_is_none_is_one_line(
         changed_folder(write, tmp_path / "out", plan)
 
 
-def test_more_files_than_a_folder_can_bear_are_refused(campaign: Few, tmp_path: Path) -> None:
+def test_too_many_files_for_a_folder_are_refused(campaign: Few, tmp_path: Path) -> None:
     with pytest.raises(CallerError, match=r"would be 400,000,000 files; .* or a larger chunk"):
         Store(tmp_path, campaign[1], 100_000_000, 1)

@@ -1,4 +1,4 @@
-"""What repeats a process's arithmetic computes as that process does: on one BLAS thread."""
+"""Workers repeat the arithmetic of a run's processes exactly: on one BLAS thread."""
 
 import os
 import subprocess
@@ -21,5 +21,5 @@ def computed(script: str, threads: str) -> str:
 
 
 def test_large_matrices_are_rounded_as_in_the_processes_of_a_run() -> None:
-    """The exponential of a 66 x 66 matrix has other last bits on several threads."""
+    """The exponential of a 66 x 66 matrix has different last bits on several threads."""
     assert computed(f"import cosim.cli\n{COMPUTE}", "4") == computed(COMPUTE, "1")

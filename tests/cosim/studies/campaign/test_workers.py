@@ -1,4 +1,4 @@
-"""Local processes: the same results however many, and no harm from kills and interrupts."""
+"""Local worker processes: the same results for any number, and no harm from kills or interrupts."""
 
 import os
 import signal
@@ -44,13 +44,13 @@ def test_neither_workers_nor_the_order_of_chunks_change_a_byte(
 
 @pytest.fixture
 def many(write: Write, plan: dict[str, Any]) -> Path:
-    """A campaign in so many chunks that it takes seconds however fast the engine is."""
+    """A campaign with enough chunks to take seconds, even on a fast machine."""
     return write(plan, draws=80, chunk=1)
 
 
 @pytest.fixture
 def start(many: Path, tmp_path: Path) -> Iterator[Start]:
-    """Starts the command on it, in two processes unless told otherwise."""
+    """Starts the command on it, with two processes by default."""
     started = []
 
     def begin(*options: str) -> "subprocess.Popen[str]":
@@ -79,7 +79,7 @@ def offspring(process: "subprocess.Popen[str]") -> list[psutil.Process]:
     return psutil.Process(process.pid).children(recursive=True)
 
 
-def test_a_killed_campaign_goes_on_where_it_was(start: Start, tmp_path: Path) -> None:
+def test_a_killed_campaign_continues_where_it_stopped(start: Start, tmp_path: Path) -> None:
     folder = tmp_path / "out"
     killed = start()
     wait_for_files(folder, 10, killed)
@@ -103,11 +103,13 @@ def test_a_killed_campaign_goes_on_where_it_was(start: Start, tmp_path: Path) ->
     assert files(folder) == after
 
 
-def test_ctrl_c_ends_it_with_one_line_that_says_how_to_go_on(start: Start, tmp_path: Path) -> None:
+def test_ctrl_c_ends_a_campaign_with_one_line_on_how_to_continue(
+    start: Start, tmp_path: Path
+) -> None:
     process = start()
     wait_for_files(tmp_path / "out", 5, process)
     children = offspring(process)
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: the signal goes to all processes
     _, err = process.communicate()
     assert process.returncode == 130
     assert err.count("\n") == 1, err
@@ -121,7 +123,7 @@ def test_ctrl_c_ends_it_with_one_line_that_says_how_to_go_on(start: Start, tmp_p
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_to_all_ends_it_with_one_line(
+def test_a_signal_to_all_processes_ends_a_campaign_with_one_line(
     start: Start, tmp_path: Path, number: signal.Signals
 ) -> None:
     process = start()
@@ -132,14 +134,14 @@ def test_a_signal_to_all_ends_it_with_one_line(
     assert process.returncode == 143
     lines = [line for line in err.splitlines() if line.startswith("noack: ")]
     assert lines[0].startswith(f"noack: ended by {number.name}; ") or lines[0].startswith(
-        "noack: a worker process was killed"  # it may be the first to hear of it
+        "noack: a worker process was killed"  # a worker may receive it first
     )
     assert lines[0].endswith("the same command continues the campaign")
     assert "Traceback" not in err
     assert psutil.wait_procs(children, timeout=60)[1] == []
 
 
-def test_a_killed_worker_is_one_line_and_no_hang(start: Start, tmp_path: Path) -> None:
+def test_a_killed_worker_gives_one_line_without_a_hang(start: Start, tmp_path: Path) -> None:
     process = start()
     wait_for_files(tmp_path / "out", 5, process)
     workers = [p for p in offspring(process) if "spawn_main" in " ".join(p.cmdline())]

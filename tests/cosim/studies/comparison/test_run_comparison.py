@@ -1,4 +1,4 @@
-"""Runs beside each other: numbers, settings, distance, one figure; and what cannot be compared."""
+"""Comparison of runs: numbers, settings, distance, one figure; and runs that cannot be compared."""
 
 import json
 from pathlib import Path
@@ -41,7 +41,7 @@ def number(found: RunComparison, name: str) -> KeyNumber:
     return next(one for one in found.numbers if one.name == name)
 
 
-def test_numbers_are_those_of_the_summaries_and_differences_are_to_the_first(
+def test_numbers_are_those_of_the_summaries_with_differences_to_the_first_run(
     found: RunComparison,
 ) -> None:
     events = tuple(run.summary["events"] for run in found.runs)
@@ -52,7 +52,7 @@ def test_numbers_are_those_of_the_summaries_and_differences_are_to_the_first(
         assert share == pytest.approx(100 * run.summary["drops"] / crossed)
 
 
-def test_the_distance_is_over_the_times_that_both_have(found: RunComparison) -> None:
+def test_the_distance_is_over_the_common_times(found: RunComparison) -> None:
     """The third run takes every second step of the first, for two of its three seconds."""
     first, _, third = (run.record[PLANT_STEP] for run in found.runs)
     assert len(third) == 501
@@ -63,14 +63,14 @@ def test_the_distance_is_over_the_times_that_both_have(found: RunComparison) -> 
     assert largest.values[2] == pytest.approx(apart.max())
 
 
-def test_a_run_is_at_no_distance_to_itself(runs: list[Path]) -> None:
+def test_a_run_has_distance_zero_to_itself(runs: list[Path]) -> None:
     same = compare_runs([runs[0], runs[0]])
     assert number(same, "distance in x to A, maximum").values == (None, 0.0)
     assert same.settings == {}
     assert all(not apart for one in same.numbers for apart in one.differences)
 
 
-def test_settings_that_differ_are_named_and_no_other(found: RunComparison) -> None:
+def test_only_settings_that_differ_are_named(found: RunComparison) -> None:
     assert found.settings["mode"] == ("model", "zoh", "model")
     assert found.settings["network.mansd"] == ("4", "4", "1")
     assert found.settings["plant.rate_hz"] == ("500.0", "500.0", "250.0")
@@ -94,7 +94,9 @@ def test_the_overlay_shows_every_run_in_every_panel(found: RunComparison) -> Non
 
 
 @pytest.mark.parametrize("name", ["overlay.html", "overlay.svg", "overlay.png"])
-def test_the_command_prints_and_writes(name: str, runs: list[Path], tmp_path: Path) -> None:
+def test_the_command_prints_the_table_and_writes_the_overlay(
+    name: str, runs: list[Path], tmp_path: Path
+) -> None:
     out = tmp_path / "new" / name
     done = compare(*runs, "--out", out)
     assert done.exit_code == 0, done.output
@@ -107,7 +109,7 @@ def test_the_command_prints_and_writes(name: str, runs: list[Path], tmp_path: Pa
     assert [path.name for path in out.parent.iterdir()] == [name]
 
 
-def test_the_page_escapes_and_needs_nothing_else(runs: list[Path], tmp_path: Path) -> None:
+def test_the_page_is_escaped_and_self_contained(runs: list[Path], tmp_path: Path) -> None:
     compare_runs(runs[:2]).save(tmp_path / "page.html")
     html = (tmp_path / "page.html").read_text()
     assert html.count("<svg") == 1
@@ -116,7 +118,7 @@ def test_the_page_escapes_and_needs_nothing_else(runs: list[Path], tmp_path: Pat
 
 
 def test_live_and_simulated_runs_can_be_compared(runs: list[Path]) -> None:
-    """A record is of the same tables whichever it is."""
+    """Records of both kinds have the same tables."""
     before = (runs[1] / "environment.json").read_bytes()
     try:
         write_environment(runs[1], "live")
@@ -125,7 +127,7 @@ def test_live_and_simulated_runs_can_be_compared(runs: list[Path]) -> None:
         (runs[1] / "environment.json").write_bytes(before)
 
 
-def test_a_document_for_programs(runs: list[Path], tmp_path: Path) -> None:
+def test_the_json_document_contains_the_comparison(runs: list[Path], tmp_path: Path) -> None:
     done = compare(*runs[:2], "--out", tmp_path / "a.svg", "--json")
     document = json.loads(done.stdout)
     assert [run["label"] for run in document["runs"]] == ["A", "B"]
@@ -135,7 +137,7 @@ def test_a_document_for_programs(runs: list[Path], tmp_path: Path) -> None:
     assert Path(document["overlay"]).is_file()
 
 
-def test_what_cannot_be_compared_is_one_line(runs: list[Path], tmp_path: Path) -> None:
+def test_runs_that_cannot_be_compared_give_one_line(runs: list[Path], tmp_path: Path) -> None:
     other = noack.simulate(noack.load("double_integrator", {"horizon_s": 1.0}), runs=tmp_path)
     mistakes = {
         (runs[0], other.directory): f"noack: {other.directory}: its plant has 2 states, that of "
@@ -151,14 +153,14 @@ def test_what_cannot_be_compared_is_one_line(runs: list[Path], tmp_path: Path) -
         assert (done.exit_code, done.stderr, done.stdout) == (2, said, "")
 
 
-def test_a_run_that_diverged_is_overlaid_as_far_as_it_goes(runs: list[Path]) -> None:
+def test_a_diverged_run_is_overlaid_up_to_its_end(runs: list[Path]) -> None:
     found = compare_runs(runs[:2])
     found.runs[1].record[PLANT_STEP]["x"][700:] = np.nan
     assert all(one.name != "distance in x to A, RMS" for one in found.numbers)
     assert found.plot().axes
 
 
-def test_the_library_gives_the_same(runs: list[Path], found: RunComparison) -> None:
+def test_the_api_gives_the_same_comparison(runs: list[Path], found: RunComparison) -> None:
     temporary = noack.simulate(noack.load("lane_following", SETTINGS[1]))
     mine = noack.compare(noack.open_run(runs[0]), temporary, runs[2])
     assert mine.rows == found.rows

@@ -1,4 +1,4 @@
-"""A small loop and its designs, made once."""
+"""A small loop and its designs, shared by the tests."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""``noack design``: what it writes is a scenario; mistakes are one line."""
+"""``noack design``: it writes a valid scenario; mistakes give one line."""
 
 import json
 import re
@@ -19,7 +19,7 @@ def run(*words: str) -> tuple[int, str, str]:
     return result.exit_code, result.stdout, result.stderr
 
 
-def test_check_and_certify_accept_what_is_written(mass: Path, tmp_path: Path) -> None:
+def test_check_and_certify_accept_the_written_scenario(mass: Path, tmp_path: Path) -> None:
     out, html = tmp_path / "chosen.toml", tmp_path / "chosen.html"
     status, stdout, stderr = run(
         "design", str(mass), "--settling", "9", "--quantile", "0.8", "--draws", "80",
@@ -91,7 +91,7 @@ def test_mistakes_are_one_line(mass: Path, words: list[str], said: str) -> None:
     assert said in stderr
 
 
-def test_the_page_stands_alone(found: DesignResult) -> None:
+def test_the_page_is_self_contained(found: DesignResult) -> None:
     html = page(found)
     assert "<svg" in html
     assert found.verdict() in html

@@ -1,4 +1,4 @@
-"""The trade-off's figure where there is nothing to trade."""
+"""The trade-off figure without a trade-off."""
 
 from pathlib import Path
 
@@ -7,8 +7,8 @@ from typer.testing import CliRunner
 from cosim.cli import app
 
 
-def test_a_loop_of_which_no_run_ends_is_one_line(mass: Path, tmp_path: Path) -> None:
-    """Numbers beyond 1e100 are said to have diverged."""
+def test_a_loop_with_only_diverging_runs_gives_one_line(mass: Path, tmp_path: Path) -> None:
+    """Values beyond 1e100 count as diverged."""
     page = tmp_path / "page.html"
     result = CliRunner().invoke(app, [
         "design", str(mass), "--settling", "9", "--quantile", "0.5", "--draws", "20",

@@ -1,4 +1,4 @@
-"""Designs of other kinds: under a hold, under the schedule, of one state, with the worst losses."""
+"""Other kinds of design: a hold, the schedule, a single state, the worst-case losses."""
 
 import json
 import math
@@ -48,7 +48,7 @@ def one(tmp_path: Path) -> Path:
 
 
 def largest_errors(scenario: Scenario, seeds: range) -> list[float]:
-    """sup‖e_c‖ at 2,000 times of exact runs, of the scenario's own plants and losses."""
+    """sup‖e_c‖ over 2,000 times of exact runs, with the scenario's own plants and losses."""
     found = []
     for seed in seeds:
         drawn = scenario.seeds.model_copy(update={"plant": seed, "loss": seed})
@@ -62,7 +62,7 @@ def largest_errors(scenario: Scenario, seeds: range) -> list[float]:
     return found
 
 
-def test_a_hold_is_designed_for_as_a_model_is(mass: Path) -> None:
+def test_a_hold_is_designed_like_a_model(mass: Path) -> None:
     limits = DesignLimits(9.0, 0.8, 0.02, {"error": 0.3})
     scenario = load(mass, ['mode="zoh"'])
     found = design(families_of(scenario, ("identity",), None), limits, draws=60, seed=3)
@@ -77,8 +77,10 @@ def test_a_hold_is_designed_for_as_a_model_is(mass: Path) -> None:
     assert max(largest_errors(found.scenario, range(5))) <= found.bounds["error"] <= 0.3
 
 
-def test_a_bound_under_the_schedule_is_that_of_the_schedule(scenario: Scenario) -> None:
-    """A real loop samples, holds and delays: what is certified of it is never less."""
+def test_a_bound_under_the_schedule_is_that_of_the_scheduled_certificate(
+    scenario: Scenario,
+) -> None:
+    """A real loop samples, holds and delays, so its certified bound is never smaller."""
     limits = DesignLimits(9.0, 0.8, 0.02, {"error": 0.2}, schedule=True)
     found = designed(scenario, limits, draws=60)
     assert found.feasible
@@ -94,9 +96,7 @@ def test_a_bound_under_the_schedule_is_that_of_the_schedule(scenario: Scenario) 
     assert found.document()["limits"]["under"] == "schedule"
 
 
-def test_a_chosen_norm_and_gain_are_certified_as_they_are_written(
-    one: Path, tmp_path: Path
-) -> None:
+def test_a_chosen_norm_and_gain_are_certified_as_written(one: Path, tmp_path: Path) -> None:
     out = tmp_path / "chosen.toml"
     status, stdout, stderr = run(
         "design", str(one), "--settling", "4", "--quantile", "0.7", "--draws", "40",
@@ -117,7 +117,7 @@ def test_a_chosen_norm_and_gain_are_certified_as_they_are_written(
     assert best["bounds"]["state"] <= 2
 
 
-def test_without_chance_every_draw_is_the_exact_run(one: Path) -> None:
+def test_without_randomness_every_draw_is_the_exact_run(one: Path) -> None:
     found = design(
         families_of(load(one), ("identity",), None),
         DesignLimits(4.0, 0.5, 0.02, {}),
@@ -137,13 +137,13 @@ def test_without_chance_every_draw_is_the_exact_run(one: Path) -> None:
     assert abs(float(x[0, 0])) == pytest.approx(0.02, rel=1e-6)
 
 
-def test_a_quantile_that_is_small_has_no_lower_end(mass: Path) -> None:
+def test_a_small_quantile_has_the_lower_limit_zero(mass: Path) -> None:
     found = designed(load(mass), DesignLimits(9.0, 0.02, 0.02, {}), draws=20)
     assert found.fresh.settling_low_s == 0
     assert 0 < found.fresh.settling_s <= found.fresh.settling_high_s < math.inf
 
 
-def test_what_never_settles_has_a_page_and_one_line(one: Path, tmp_path: Path) -> None:
+def test_a_loop_that_never_settles_has_a_page_and_one_line(one: Path, tmp_path: Path) -> None:
     html = tmp_path / "p.html"
     status, stdout, stderr = run(
         "design", str(one), "--settling", "4", "--settle", "1e-9", "--draws", "20",
@@ -158,7 +158,7 @@ def test_what_never_settles_has_a_page_and_one_line(one: Path, tmp_path: Path) -
     assert "<svg" in html.read_text()
 
 
-def test_what_cannot_be_certified_is_said(one: Path, tmp_path: Path) -> None:
+def test_a_loop_without_a_certificate_is_reported(one: Path, tmp_path: Path) -> None:
     status, stdout, stderr = run(
         "design", str(one), "--settling", "4", "--draws", "20", "--quantile", "0.5",
         "--weights", "identity", "--bound", "error=1", "--page", str(tmp_path / "p.html"),
@@ -169,7 +169,7 @@ def test_what_cannot_be_certified_is_said(one: Path, tmp_path: Path) -> None:
     assert "no certified bound of sup‖x‖" in stdout
 
 
-def test_no_figure_is_cut_off_in_80_columns(
+def test_no_number_is_cut_off_in_80_columns(
     mass: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")

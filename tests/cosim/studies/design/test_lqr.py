@@ -1,4 +1,4 @@
-"""The regulator's gain, against the equation that defines it and a closed form."""
+"""The regulator's gain, against its defining equation and a closed form."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def test_the_gain_comes_from_a_solution_of_the_riccati_equation() -> None:
     K = lqr_gain(A, B, Q, R)
     closed = A + B @ K
     assert spectral_abscissa(closed) < 0
-    # P is the cost of the closed loop, by another equation; it must be what K is made of.
+    # P is the cost of the closed loop by another equation; K must follow from it.
     cost = Q + K.T @ R @ K
     n = len(A)
     lyapunov = np.kron(np.eye(n), closed.T) + np.kron(closed.T, np.eye(n))
@@ -35,13 +35,13 @@ def test_the_double_integrator_has_its_textbook_gain() -> None:
 @pytest.mark.parametrize(
     ("A", "Q", "R", "word"),
     [
-        ([[1.0, 0.0], [0.0, -1.0]], np.eye(2), 1.0, "stabilising"),  # B does not reach state 1
+        ([[1.0, 0.0], [0.0, -1.0]], np.eye(2), 1.0, "stabilising"),  # B does not affect state 1
         ([[0.0, 1.0], [0.0, 0.0]], -np.eye(2), 1.0, "semidefinite"),
         ([[0.0, 1.0], [0.0, 0.0]], np.array([[1.0, 1.0], [0.0, 1.0]]), 1.0, "symmetric"),
         ([[0.0, 1.0], [0.0, 0.0]], np.eye(2), 0.0, "definite"),
     ],
 )
-def test_what_has_no_regulator_is_said(
+def test_a_system_without_a_regulator_is_refused(
     A: list[list[float]], Q: np.ndarray, R: float, word: str
 ) -> None:
     with pytest.raises(CallerError, match=word):

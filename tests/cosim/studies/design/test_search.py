@@ -1,4 +1,4 @@
-"""What is chosen meets the limits, and nothing cheaper that was tried does."""
+"""The chosen design meets the limits, and no cheaper candidate does."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +20,7 @@ from noack.theory.scenario_certificates import certify_box
 from tests.cosim.studies.design.conftest import LIMITS, designed
 
 
-def test_the_chosen_one_settles_in_time_on_draws_of_another_seed(found: DesignResult) -> None:
+def test_the_chosen_design_settles_in_time_on_draws_of_another_seed(found: DesignResult) -> None:
     assert found.feasible
     assert found.confirmed
     setting = replace(setting_of(resolve(found.scenario)), settle=LIMITS.settle)
@@ -32,7 +32,7 @@ def test_the_chosen_one_settles_in_time_on_draws_of_another_seed(found: DesignRe
     assert abs(rows["transmissions"].mean() - found.fresh.transmissions) < spread
 
 
-def test_the_chosen_one_is_certified_as_asked(found: DesignResult, tmp_path: Path) -> None:
+def test_the_chosen_design_is_certified_as_required(found: DesignResult, tmp_path: Path) -> None:
     path = tmp_path / "chosen.toml"
     path.write_text(dumps(found.scenario))
     resolved = resolve(load(path))
@@ -43,12 +43,12 @@ def test_the_chosen_one_is_certified_as_asked(found: DesignResult, tmp_path: Pat
     smallest = 1.0 if weight is None else np.linalg.svd(np.array(weight), compute_uv=False)[-1]
     bound = certificate.constants.delta * resolved.decaying.beta / smallest
     assert bound <= LIMITS.bounds["error"]
-    # The bound decides here: without it there is a cheaper one.
+    # The bound is the active limit: without it a cheaper design exists.
     assert found.bounds is not None
     assert found.bounds["error"] == pytest.approx(bound)
 
 
-def test_a_limit_costs_transmissions(found: DesignResult, scenario: Scenario) -> None:
+def test_a_tighter_limit_costs_transmissions(found: DesignResult, scenario: Scenario) -> None:
     free = designed(scenario, replace(LIMITS, bounds={}))
     assert free.feasible
     assert free.bounds is not None
@@ -56,7 +56,7 @@ def test_a_limit_costs_transmissions(found: DesignResult, scenario: Scenario) ->
     assert free.best.measured.transmissions < found.best.measured.transmissions
 
 
-def test_nothing_that_was_tried_meets_the_limits_with_fewer_transmissions(
+def test_no_candidate_meets_the_limits_with_fewer_transmissions(
     found: DesignResult,
 ) -> None:
     best = found.best.measured
@@ -70,8 +70,8 @@ def test_nothing_that_was_tried_meets_the_limits_with_fewer_transmissions(
         assert late or trial.bounds["error"] > LIMITS.bounds["error"], trial
 
 
-def test_screening_loses_nothing_that_all_draws_would_find(found: DesignResult) -> None:
-    """Every grid candidate that was only screened out is measured on all draws."""
+def test_screening_excludes_no_design_that_all_draws_would_choose(found: DesignResult) -> None:
+    """Every grid candidate that was only screened out is measured on all draws here."""
     best = found.best.measured
     population = box_of(found.scenario).population(found.seed, range(best.draws))
     rescued = 0
@@ -83,7 +83,7 @@ def test_screening_loses_nothing_that_all_draws_would_find(found: DesignResult) 
     assert rescued == 0
 
 
-def test_the_trade_off_curve_is_what_nothing_dominates(found: DesignResult) -> None:
+def test_the_trade_off_curve_contains_the_nondominated_candidates(found: DesignResult) -> None:
     assert len(found.front) > 3
     points = [(t.measured.transmissions, t.measured.settling_s) for t in found.front]
     assert points == sorted(points)
@@ -103,7 +103,7 @@ def test_the_trade_off_curve_is_what_nothing_dominates(found: DesignResult) -> N
             )
 
 
-def test_the_same_seed_gives_the_same_design_and_another_one_other_draws(
+def test_the_same_seed_gives_the_same_design_and_another_seed_other_draws(
     scenario: Scenario,
 ) -> None:
     limits = replace(LIMITS, bounds={})
@@ -120,7 +120,7 @@ def test_candidates_lie_below_the_decay_rate(found: DesignResult) -> None:
     assert min(trial.candidate.beta for trial in found.trials) > LEVELS[0] / 3
 
 
-def test_what_cannot_be_met_is_said_with_the_closest(scenario: Scenario) -> None:
+def test_infeasible_limits_are_reported_with_the_closest_candidate(scenario: Scenario) -> None:
     limits = DesignLimits(1.0, 0.9, 0.02, {})
     found = designed(scenario, limits, draws=80)
     assert not found.feasible
@@ -133,7 +133,7 @@ def test_what_cannot_be_met_is_said_with_the_closest(scenario: Scenario) -> None
     assert all(t.measured.settling_high_s >= closest for t in found.trials if t.full)
 
 
-def test_a_bound_is_not_certified_for_an_initial_state_that_is_drawn(scenario: Scenario) -> None:
+def test_no_bound_is_certified_for_a_drawn_initial_state(scenario: Scenario) -> None:
     plant = scenario.plant.model_copy(update={"initial_state_halfwidth": (0.1, 0.1)})
     with pytest.raises(CallerError, match="initial_state_halfwidth"):
         designed(scenario.model_copy(update={"plant": plant}), LIMITS)

@@ -1,4 +1,4 @@
-"""The counterexamples, each against a closed form or another way of computing it."""
+"""The counterexamples, each against a closed form or an independent computation."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ def test_the_eigenvalues_are_roots_of_the_characteristic_polynomial() -> None:
     assert (found["rank"], found["rank_squared"]) == (3, 2)
 
 
-def test_the_share_that_a_capped_loss_loses_is_the_simulated_one() -> None:
+def test_the_expected_loss_rate_with_a_cap_is_the_simulated_one() -> None:
     rng = np.random.default_rng(0)
     found = _loss(5)
     for p, share in ((0.8, found["at_0.8"]), (found["half"], 0.5)):
@@ -57,7 +57,7 @@ def test_with_an_exact_model_x_is_the_undisturbed_closed_loop() -> None:
 
 
 @pytest.mark.parametrize("mode", ["model", "zoh"])
-def test_trapped_states_do_not_feel_the_unstable_mode(mode: str) -> None:
+def test_trapped_states_do_not_excite_the_unstable_mode(mode: str) -> None:
     found = _trapped(SCENARIO)
     assert found[mode] == found["n"] - found["unstable"] == 3
     loop = loop_of(resolved_draw(SCENARIO, found["draw"], "model"))
@@ -66,7 +66,7 @@ def test_trapped_states_do_not_feel_the_unstable_mode(mode: str) -> None:
     rate = np.linalg.eigvals(loop.A).real.max()
     late_s = 20.0 / rate
     gamma = np.block([[loop.A, BK], [np.zeros((n, n)), H]])
-    # What is left of (x, x) after long, relative to the unstable mode: one direction of x only.
+    # What remains of (x, x) after a long time, relative to the unstable mode: one direction of x.
     pairs = expm((gamma - rate * np.eye(2 * n)) * late_s)[:n] @ np.vstack([np.eye(n)] * 2)
     singular = np.linalg.svd(pairs, compute_uv=False)
     # The double zero grows like t e^(−rate t).
@@ -86,7 +86,7 @@ def test_the_slow_models_error_is_the_closed_form() -> None:
     assert found["thresholds"][-1] > 1e30
 
 
-def test_the_vehicle_at_rest_is_where_its_free_motion_ends() -> None:
+def test_the_vehicles_rest_state_is_the_limit_of_its_free_motion() -> None:
     found = _standstill(SCENARIO)
     model = lane_following({})
     x0 = np.array(found["x0"])
@@ -95,7 +95,7 @@ def test_the_vehicle_at_rest_is_where_its_free_motion_ends() -> None:
     rate = found["stable_per_s"]
     rest = x0[3] + (x0[0] - 12.0 * x0[1] / rate) / -rate
     assert found["norms"][-1] == pytest.approx(abs(rest), rel=1e-6)
-    # From the second event on ‖e_s‖ tends to what was left when x was measured: d e^(λt).
+    # From the second event on ‖e_s‖ tends to the remaining motion at the measurement: d e^(λt).
     first, second = found["events_s"][1:]
     left = np.linalg.norm(expm(model.A * first) @ x0 - [0.0, 0.0, 0.0, rest])
     assert 0.5 * np.exp(-0.25 * second) == pytest.approx(left, rel=1e-3)

@@ -1,4 +1,4 @@
-"""Measures of a draw, against closed forms and against what the simulator's own summary says."""
+"""Measures of a draw, against closed forms and against the simulator's own summary."""
 
 import math
 
@@ -25,7 +25,7 @@ SCENARIO = SCENARIOS[BASE]
 DRAW = 3
 
 
-def test_an_exponential_settles_when_its_logarithm_says() -> None:
+def test_the_settling_time_of_an_exponential_is_its_closed_form() -> None:
     t_s = np.linspace(0.0, 10.0, 101)
     assert _settling_s(t_s, np.exp(-t_s), 0.05) == pytest.approx(math.log(20), rel=1e-12)
 
@@ -37,7 +37,7 @@ def test_settling_counts_from_the_last_time_above_the_level() -> None:
     assert _settling_s(t_s, np.array([1.0, 0.0, 0.0, 0.0, 1.0]), 0.1) == math.inf
 
 
-def test_the_loop_without_a_network_is_the_exponential() -> None:
+def test_the_loop_without_a_network_is_the_matrix_exponential() -> None:
     loop = loop_of(resolved_draw(SCENARIO, DRAW, "model"))
     closed = loop.A + loop.B @ loop.K
     t_s, norms = _ideal_norms(closed, loop.x0, 20.0)
@@ -61,7 +61,7 @@ def test_other_draws_have_other_plants_starts_and_losses() -> None:
     assert first.seeds.loss != second.seeds.loss
 
 
-def test_measures_are_those_of_the_simulators_summary() -> None:
+def test_measures_agree_with_the_simulators_summary() -> None:
     found = measure_draw(SCENARIO, DRAW)
     for mode, measures in (("model", found.model), ("zoh", found.zoh)):
         resolved = resolved_draw(SCENARIO, DRAW, mode)  # type: ignore[arg-type]
@@ -76,12 +76,12 @@ def test_measures_are_those_of_the_simulators_summary() -> None:
         assert measures.peak >= 1
 
 
-def test_what_is_measured_respects_what_is_certified_and_printed() -> None:
+def test_measured_values_are_within_the_certified_and_printed_bounds() -> None:
     found, bound, theorem = (f(SCENARIO, DRAW) for f in (measure_draw, certified, printed))
     assert 1 < found.model.controller_error <= bound.delta
     assert found.start_norm <= found.model.envelope <= bound.state
     assert theorem.inter_event_s < bound.inter_event_s < found.model.gap_min_s
-    # eq:tau for every t_i is the smaller of its two ends, whichever way F̄ leans.
+    # eq:tau for every t_i is the smaller of its two end values, for either sign of F̄'s slope.
     assert theorem.inter_event_s == pytest.approx(min(theorem.first_s, theorem.late_s), rel=1e-9)
 
 

@@ -1,4 +1,4 @@
-"""The committed page: its words are the template's, its numbers the code's."""
+"""The committed page: its text is the template's, its numbers are computed by the code."""
 
 import json
 import math
@@ -35,7 +35,7 @@ CAMPAIGN, SCENARIOS = load_campaign()
 VARIATIONS = tuple(SCENARIOS)
 COMMITTED = ROOT / "docs" / "figures" / "paper.json"
 DIGITS = 2e-4
-"""Five digits are kept; rounding, which a loop may amplify by 1e5, is far below."""
+"""Five digits are stored; rounding, which a loop may amplify by 1e5, is far below."""
 
 
 @pytest.fixture(scope="module")
@@ -95,8 +95,8 @@ def with_column(results: Results, name: str, values: Any, variation: str = BASE)
     return Results({**results.tables, ("draws", variation): table}, results.evidence)
 
 
-def test_verdicts_follow_the_draws(results: Results) -> None:
-    """A claim that the draws contradict is not confirmed; one that most bear out is so partly."""
+def test_verdicts_follow_from_the_draws(results: Results) -> None:
+    """A claim that the draws contradict is not confirmed; one that most draws confirm is partly."""
     gist = "With ZOH the number of updates increases."
 
     def verdict(changed: Results) -> PaperVerdict:
@@ -107,19 +107,20 @@ def test_verdicts_follow_the_draws(results: Results) -> None:
     assert verdict(with_column(results, "zoh.events", 1)) == PaperVerdict.NOT_CONFIRMED
     most = np.where(some < 6, events, 1)
     assert verdict(with_column(results, "zoh.events", most)) == PaperVerdict.PARTLY
-    # A variation of what the paper leaves open counts, one that leaves its example does not.
+    # A variation of an unspecified detail counts; one that departs from the paper's example does
+    # not.
     assert verdict(with_column(results, "zoh.events", 1, "x(0) × 10")) == PaperVerdict.PARTLY
     assert verdict(with_column(results, "zoh.events", 1, "box × 5")) == PaperVerdict.CONFIRMED
 
 
-def test_a_loop_that_never_settles_is_no_confirmation(results: Results) -> None:
+def test_a_loop_that_never_settles_confirms_no_claim(results: Results) -> None:
     never = with_column(results, "model.settled_1_s", math.inf)
     (claim,) = [c for c in claims(never) if c.gist == "MB-ET stabilises the uncertain system."]
     assert claim.verdict == PaperVerdict.NOT_CONFIRMED
     assert "> 40" in render(never)
 
 
-def test_an_inter_event_time_below_the_certified_one_is_noticed(results: Results) -> None:
+def test_an_inter_event_time_below_the_certified_one_is_reported(results: Results) -> None:
     short = with_column(results, "model.gap_min_s", 1e-3)
     (claim,) = [c for c in claims(short) if "minimum inter-event" in c.gist]
     assert claim.verdict == PaperVerdict.NOT_CONFIRMED
@@ -145,18 +146,18 @@ def test_the_representative_draw_is_nearest_to_the_medians(results: Results) -> 
         (0.0328, "0.0328"), (1e-12, "10⁻¹²"), (2.83e33, "2.83 · 10³³"), (math.inf, "> 40"),
     ],
 )  # fmt: skip
-def test_numbers_are_written_for_people(value: float, text: str) -> None:
+def test_numbers_are_rounded_for_reading(value: float, text: str) -> None:
     assert number(value) == text
     assert SCENARIOS[BASE].horizon_s == HORIZON_S
 
 
-def test_a_share_is_100_percent_only_if_it_is_all() -> None:
+def test_a_share_is_100_percent_only_if_it_is_complete() -> None:
     assert [percent(s) for s in (1.0, 0.999, 0.75, 0.004, 0.0)] == [
         "100 %", "99.9 %", "75 %", "0.4 %", "0 %",
     ]  # fmt: skip
 
 
-def test_quartiles_are_values_of_draws_infinite_ones_too() -> None:
+def test_quartiles_are_values_of_draws_and_may_be_infinite() -> None:
     values = np.array([4.0, 1.0, math.inf, 2.0, 3.0, math.inf, math.inf, math.inf])
     assert quartiles(values) == (2.0, 4.0, math.inf)
     assert spread(values) == "4 (2 … > 40)"
@@ -170,7 +171,7 @@ def test_a_figure_with_draws_that_never_settle_can_be_drawn(results: Results) ->
 
 
 def test_the_command_writes_the_page_that_the_code_computes(tmp_path: Path) -> None:
-    # A process of its own, which starts others.
+    # In its own process, which starts others.
     done = subprocess.run(
         [sys.executable, "-m", "cosim.cli", "paper", "--draws", "4", "--out", tmp_path, "--json"],
         capture_output=True, text=True, check=False, timeout=600, cwd=ROOT,
@@ -181,14 +182,14 @@ def test_the_command_writes_the_page_that_the_code_computes(tmp_path: Path) -> N
     assert all(Path(file).is_file() for file in told["files"])
     written = load_results(tmp_path / "figures" / "paper.json")
     assert (tmp_path / "paper.md").read_text(encoding="utf-8") == render(written)
-    # Other processes, the same numbers.
+    # Computed in other processes, with the same numbers.
     here = results_of(run_parts({BASE: SCENARIOS[BASE]}, 4, alone), {})
     for part in parts(4, (BASE,)):
         key = (part.table, part.variation)
         np.testing.assert_array_equal(written.tables[key], here.tables[key])
 
 
-def test_mistakes_are_told_in_one_line_before_anything_is_simulated(tmp_path: Path) -> None:
+def test_mistakes_give_one_line_before_any_simulation(tmp_path: Path) -> None:
     few = CliRunner().invoke(app, ["paper", "--draws", "1", "--out", str(tmp_path)])
     assert few.exit_code == 2
     assert few.stderr.count("\n") == 1
