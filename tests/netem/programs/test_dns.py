@@ -44,7 +44,7 @@ CASES = {
     "random": Case("loss 70% mansd 2", "loss 70% mansd 2", 3 * 3),
     "bursts": Case("loss gemodel 30% 20% mansd 2", "loss gemodel 30% 20% mansd 1", 3 * 2),
 }
-UNCAPPED = Case("loss 70%", "loss 70%", CASES["random"].most)
+UNCAPPED = Case("loss 85%", "loss 85%", CASES["random"].most)
 
 
 class Asked(NamedTuple):

@@ -115,7 +115,7 @@ LINK = {"name": "a", "listen": ":9000", "to": ":9001"}
         ({"listen": "9000"}, "listen: expected HOST:PORT, e.g. 127.0.0.1:9000, [::1]:9000 or "
          ":9000; found '9000'"),
         ({"to": "::1:9000"}, "to: expected HOST:PORT, e.g. 127.0.0.1:9000, [::1]:9000 or :9000; "
-         "found '::1:9000'; an IPv6 address stands in brackets"),
+         "found '::1:9000'; put an IPv6 address in brackets"),
         ({"to": ":70000"}, "to: expected HOST:PORT"),
         ({"to": "no such.host.invalid:1"}, "to: no such.host.invalid: no such host ("),
         ({"idle_s": 0}, "idle_s = 0: should be greater than 0"),
