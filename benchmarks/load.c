@@ -1,7 +1,7 @@
 /* The load of the relay benchmarks, a shared library that _relay_load.py calls.
  *
- * Every datagram begins with its number, a 64-bit integer. Arrivals are the kernel's receive stamps
- * (SO_TIMESTAMPNS, CLOCK_REALTIME), so that they do not depend on when the sink is read.
+ * Every datagram begins with its number, a 64-bit integer. Arrival times are the kernel's
+ * timestamps (SO_TIMESTAMPNS, CLOCK_REALTIME), which do not depend on when the sink is read.
  * Functions return 0 or an errno.
  */
 #define _GNU_SOURCE
@@ -39,7 +39,7 @@ struct arrival {
     int64_t stamp_ns;
 };
 
-/* Take what is queued at the sink, at most BATCH datagrams, without waiting; -1 if nothing is. */
+/* Receive the datagrams queued at the sink, at most BATCH, without waiting; -1 if there is none. */
 static int take(int sink, struct arrival arrivals[BATCH])
 {
     static char data[BATCH][MAX_BYTES];
@@ -69,8 +69,8 @@ static int take(int sink, struct arrival arrivals[BATCH])
     return taken;
 }
 
-/* Send datagrams number first to first + count - 1 as fast as possible; from sources[number %
- * n_sources], IPv4 addresses in network order, if there are any. */
+/* Send the datagrams number first to first + count - 1 as fast as possible; if there are sources
+ * (IPv4 addresses in network order), send datagram k from sources[k % n_sources]. */
 static int send_all(int out, int64_t first, int64_t count, size_t size, const uint32_t *sources,
                     int64_t n_sources)
 {
@@ -107,12 +107,12 @@ static int send_all(int out, int64_t first, int64_t count, size_t size, const ui
 }
 
 struct burst {
-    int64_t wall_ns;  /* from the relay's going on to the last arrival */
+    int64_t wall_ns;  /* from the relay's continuation to the last arrival */
     int64_t last;     /* highest number that arrived, -1 if none */
-    int64_t received; /* how many arrived */
+    int64_t received; /* number of arrivals */
 };
 
-/* Bytes that wait at the sink, and how many can. */
+/* Number of bytes that wait at the sink, and its maximum. */
 static int64_t waiting(int sink, int64_t *most)
 {
     uint32_t memory[SK_MEMINFO_VARS] = {0};
@@ -122,9 +122,9 @@ static int64_t waiting(int sink, int64_t *most)
     return memory[SK_MEMINFO_RMEM_ALLOC];
 }
 
-/* Take arrivals of datagrams number first and above until the last but `slack` of `count` has come
- * and nothing follows, or nothing has come for patience_ns. The sink is read when it does not grow
- * or gets full: reading it while the relay writes to it would slow the relay down. */
+/* Receive datagrams from number first on. End when datagram count - slack has arrived and none
+ * follows, or when none has arrived for patience_ns. The sink is read when it does not grow or gets
+ * full: reading it while the relay writes to it would slow the relay down. */
 static void gather(int sink, int64_t first, int64_t count, int64_t slack, int64_t begun_ns,
                    int64_t patience_ns, struct burst *found)
 {
@@ -155,7 +155,7 @@ static void gather(int sink, int64_t first, int64_t count, int64_t slack, int64_
     }
 }
 
-/* Stop a child process, fill its receive buffer, let it go on, and see it empty the buffer. */
+/* Stop a child process, fill its receive buffer, continue it, wait until the buffer is empty. */
 int load_burst(int out, int sink, int relay, int64_t first, int64_t count, int64_t size,
                const uint32_t *sources, int64_t n_sources, int64_t slack, int64_t patience_ns,
                struct burst *found)
@@ -171,7 +171,7 @@ int load_burst(int out, int sink, int relay, int64_t first, int64_t count, int64
     return failed;
 }
 
-/* The same without a relay: send straight to the sink; cpu_ns is the calling thread's. */
+/* The same without a relay: send directly to the sink; cpu_ns is the calling thread's CPU time. */
 int load_direct(int out, int sink, int64_t first, int64_t count, int64_t size, int64_t patience_ns,
                 struct burst *found, int64_t *cpu_ns)
 {
@@ -182,8 +182,8 @@ int load_direct(int out, int sink, int64_t first, int64_t count, int64_t size, i
     return failed;
 }
 
-/* Send datagrams one by one, each when the one before has come back or was given up (the sink's
- * SO_RCVTIMEO); delay_ns[k] is -1 for those. */
+/* Send datagrams one by one, each after the previous one has arrived or timed out (the sink's
+ * SO_RCVTIMEO); delay_ns[k] is -1 after a timeout. */
 int load_ping(int out, int sink, int64_t first, int64_t count, int64_t size, int64_t *delay_ns)
 {
     char data[MAX_BYTES] = {0};
@@ -201,7 +201,7 @@ int load_ping(int out, int sink, int64_t first, int64_t count, int64_t size, int
     return 0;
 }
 
-/* Send a datagram every period_ns and note when (CLOCK_REALTIME). */
+/* Send a datagram every period_ns and record its time (CLOCK_REALTIME). */
 int load_pace(int out, int64_t first, int64_t count, int64_t size, int64_t period_ns,
               int64_t *departure_ns)
 {
@@ -218,8 +218,8 @@ int load_pace(int out, int64_t first, int64_t count, int64_t size, int64_t perio
     return 0;
 }
 
-/* Arrival stamps of datagrams number first and above, until all have come or nothing has for
- * patience_ns; of those that have not, arrival_ns is left as it is. */
+/* Collect the arrival times of datagrams from number first on, until all have arrived or none has
+ * for patience_ns; arrival_ns of missing datagrams is not changed. */
 int load_collect(int sink, int64_t first, int64_t count, int64_t patience_ns, int64_t *arrival_ns)
 {
     struct arrival arrivals[BATCH];
@@ -243,9 +243,9 @@ int load_collect(int sink, int64_t first, int64_t count, int64_t patience_ns, in
 struct soak {
     int64_t sent;
     int64_t received;
-    int64_t next;        /* the number that would follow without a loss */
-    int64_t longest_gap; /* most successive numbers that did not arrive */
-    int64_t disordered;  /* arrivals with a lower number than one before: none through a FIFO */
+    int64_t next;        /* the number that would arrive next without a loss */
+    int64_t longest_gap; /* maximum number of consecutive losses */
+    int64_t disordered;  /* arrivals after a higher number; 0 through a FIFO */
 };
 
 static void count_arrivals(int sink, struct soak *state)
@@ -264,8 +264,8 @@ static void count_arrivals(int sink, struct soak *state)
         }
 }
 
-/* Send `groups` groups of `size_of_group` datagrams, one group every period_ns, taking what
- * arrives in between; go on where the state says that it ended. */
+/* Send `groups` groups of `group` datagrams, one group every period_ns, and receive arrivals in
+ * between; continues the numbering of `state`. */
 int load_soak(int out, int sink, int64_t groups, int64_t group, int64_t size, int64_t period_ns,
               struct soak *state)
 {

@@ -1,8 +1,8 @@
-/* A peer of the relay benchmarks: what a relay costs that does nothing but forward.
+/* A peer of the relay benchmarks: a relay that only forwards.
  *
- * Takes up to 64 datagrams with one recvmmsg and sends them with one sendmmsg through a connected
- * socket, to one destination on loopback. With "segment" neighbours of equal size leave as one
- * message that the kernel cuts (UDP_SEGMENT). Prints the port that it listens on.
+ * Receives up to 64 datagrams with one recvmmsg and sends them with one sendmmsg through a connected
+ * socket, to one destination on loopback. With "segment", successive datagrams of equal size are
+ * sent as one message, which the kernel segments (UDP_SEGMENT). Prints its listening port.
  */
 #define _GNU_SOURCE
 #include <arpa/inet.h>
@@ -32,7 +32,7 @@ static void forward(int out, int count)
 {
     for (int sent = 0; sent < count;) {
         int n = sendmmsg(out, batch + sent, (unsigned)(count - sent), 0);
-        sent += n > 0 ? n : 1; /* what met a refusal (nobody listens there) is lost */
+        sent += n > 0 ? n : 1; /* a refused datagram (port unreachable) is lost */
     }
 }
 

@@ -45,7 +45,7 @@ class Watched:
         return used_s / elapsed_s if elapsed_s > 0 else 0.0
 
     def faults(self, role: str) -> list[str]:
-        """Return descriptions of what is not flat."""
+        """Return descriptions of all trends that are not flat."""
         memory = self.memory
         found = []
         if memory.verdict == "unknown":

@@ -66,7 +66,7 @@ def admit(
 
 
 def keep_limit(free: int, decision: PacketDecision) -> None:
-    """Drop a delayed packet or its copy if fewer than needed (``free``) may still be in flight."""
+    """Drop a delayed packet or its copy if it needs more than the ``free`` places in flight."""
     now_ns = decision.arrival_ns
     if decision.release_ns > now_ns and free <= 0:
         refuse(decision, OVERFLOWED)
