@@ -46,7 +46,7 @@ def packet_outcomes(record: RunRecord, flow: Flow = Flow.UPDATE) -> PacketOutcom
     """Return the outcomes of the updates or acknowledgements that reached the network emulator."""
     rows, sequence, event_ns = updates_in(record[NETEM_PACKET], flow)
     releases = record[NETEM_RELEASE]
-    if "flow" in (releases.dtype.names or ()):
+    if record.scenario.protocol.acknowledges:
         way = ACKNOWLEDGEMENTS if flow is Flow.ACKNOWLEDGEMENT else UPDATES
         releases = releases[releases["flow"] == way]
     # Of a datagram and its copy, the first intact one counts; it may be the copy.

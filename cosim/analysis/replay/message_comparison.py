@@ -88,7 +88,7 @@ class _Received:
         self._rows: Rows = record[table]
         self._at = np.arange(len(self._rows))
         self._way = ACKNOWLEDGEMENTS if flow is Flow.ACKNOWLEDGEMENT else UPDATES
-        if table == NETEM_PACKET and "flow" in (self._rows.dtype.names or ()):
+        if table == NETEM_PACKET and record.scenario.protocol.acknowledges:
             self._at = np.flatnonzero(self._rows["flow"] == self._way)
             self._rows = self._rows[self._at]
         self._sent: dict[int, Message] = {

@@ -233,7 +233,7 @@ class ViewFeed:
     def _packets(self, rows: Rows) -> None:
         if not len(rows):
             return
-        if "flow" in (rows.dtype.names or ()):
+        if self._scenario.protocol.acknowledges:
             reverse = updates_in(rows, Flow.ACKNOWLEDGEMENT)[0]
             self._view.packets(
                 reverse["t_ns"], reverse["release_ns"], reverse["fate"], reverse=True

@@ -17,6 +17,7 @@ from typer.testing import CliRunner, Result
 import cosim.analysis.fidelity
 from cosim.analysis.fidelity import Fidelity, compute_fidelity, fidelity_for_summary
 from cosim.analysis.step_schedule import IncomparableError, live_run
+from cosim.analysis.summary_model import NoFidelityPart
 from cosim.cli import app
 from cosim.output.fidelity_table import summary_rows
 from cosim.record.run_record import Rows, RunRecord
@@ -107,9 +108,10 @@ def test_the_difference_is_explained_for_any_policy(policy: str) -> None:
 def test_a_rule_without_a_continuous_time_run_gives_one_line() -> None:
     record = lane(lambda data, now_ns: None, 'trigger={ policy = "lyapunov", rate_per_s = 0.1 }')
     summary = fidelity_for_summary(record)
-    assert "accumulate" in summary["reason"]
-    ((_, told),) = summary_rows(summary)
-    assert told == f"not compared: {summary['reason']}"
+    assert isinstance(summary, NoFidelityPart)
+    assert "accumulate" in summary.reason
+    ((_, told),) = summary_rows(summary.model_dump())
+    assert told == f"not compared: {summary.reason}"
 
 
 def test_a_negative_share_is_said_to_cancel_other_effects() -> None:
@@ -216,8 +218,8 @@ def test_gaps_in_the_record_are_reported(
     with pytest.raises(IncomparableError, match=why):
         compute_fidelity(broken)
     summary = fidelity_for_summary(broken)
-    assert why in summary.pop("reason")
-    assert set(summary.values()) == {None}
+    assert isinstance(summary, NoFidelityPart)
+    assert why in summary.reason
 
 
 def test_an_interrupted_run_is_compared_up_to_its_end(record: RunRecord) -> None:
@@ -241,22 +243,21 @@ def test_an_accumulation_of_events_is_reported() -> None:
         compute_fidelity(unstable, max_events=200)
 
 
-def test_the_summary_always_has_the_same_keys(
+def test_the_summary_has_the_comparison_or_the_reason(
     record: RunRecord, fidelity: Fidelity, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     good = fidelity_for_summary(record)
-    assert good == fidelity.compact()
-    json.dumps(good, allow_nan=False)
+    assert good == fidelity.summary()
+    json.dumps(good.model_dump(), allow_nan=False)
 
     def broken(*_: object) -> Fidelity:
         raise RuntimeError("a bug")
 
     monkeypatch.setattr(cosim.analysis.fidelity, "compute_fidelity", broken)
     bad = fidelity_for_summary(record)
-    assert bad.keys() == good.keys()
-    assert bad["reason"] == "RuntimeError('a bug')"
+    assert bad == NoFidelityPart(reason="RuntimeError('a bug')")
     monkeypatch.setattr(cosim.analysis.fidelity, "_STEPS_AT_THE_END", 100)
-    assert "noack fidelity" in fidelity_for_summary(record)["reason"]
+    assert "noack fidelity" in str(fidelity_for_summary(record).reason)
 
 
 def noack(*arguments: str | Path) -> Result:
