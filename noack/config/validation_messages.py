@@ -227,12 +227,15 @@ def _table_example(value: Any, at: _Place) -> str:
         file = f"my_{at.path[0]}.py"
         return f', e.g. {{ {at.discriminator} = "python", file = "{file}", name = "{value}" }}'
     if at.choices:
-        chosen = str(value) if known else list(at.choices)[1]
-        needed = (
-            f", {name} = ..." for name, field in at.choices[chosen].model_fields.items()
-            if field.is_required() and name != at.discriminator
-        )  # fmt: skip
-        return f', e.g. {{ {at.discriminator} = "{chosen}"{"".join(needed)} }}'
+        needed = {
+            choice: [name for name, field in settings.model_fields.items()
+                     if field.is_required() and name != at.discriminator]
+            for choice, settings in at.choices.items()
+        }  # fmt: skip
+        # The simplest that has settings shows how they are written.
+        chosen = str(value) if known else min(needed, key=lambda one: len(needed[one]) or 99)
+        keys = "".join(f", {name} = ..." for name in needed[chosen])
+        return f', e.g. {{ {at.discriminator} = "{chosen}"{keys} }}'
     in_list = any(isinstance(part, int) for part in at.path)
     return "" if in_list else f", [{'.'.join(map(str, at.path))}]"
 

@@ -62,7 +62,9 @@ def test_the_beginning_and_end_of_a_trip_are_reported(run: RunRecord) -> None:
         "first_s": pytest.approx(1.1), "total_s": pytest.approx(0.302),
     }  # fmt: skip
     shown = dict(key_numbers(summary | {"replay": None, "fidelity": None}))
-    assert shown["actuations too old (watchdog)"] == "once, first at 1.100 s, 0.302 s in all"
+    assert shown["watchdog: newest actuation too old"] == (
+        "once, first at 1.100 s, 0.302 s in total"
+    )
 
 
 def test_the_watchdogs_input_is_not_compared_with_the_ideal_loop(run: RunRecord) -> None:

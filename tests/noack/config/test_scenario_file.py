@@ -149,11 +149,15 @@ LANE_MISTAKES = [
     ("network.loss={probability=1}", "network.loss.model: missing; ", "one of .*bernoulli"),
     # Impairments are a list of tables, each chosen by its kind, with a loss model within a loss.
     ("network.impairments=3", "network.impairments = 3: ", "should be a list"),
-    ("network.impairments=[3]", "network.impairments.0 = 3: ", 'e.g. { kind = "duplicate", proba'),
-    ("network.impairments=[{}]", "network.impairments.0.kind: missing; ", "one of loss, duplicate"),
+    ("network.impairments=[3]", "network.impairments.0 = 3: ", 'e.g. { kind = "blackout", '),
+    (
+        "network.impairments=[{}]",
+        "network.impairments.0.kind: missing; ",
+        "one of blackout, corrupt",
+    ),
     (
         'network.impairments=[{kind="dely"}]',
-        'network.impairments.0.kind = "dely": must be one of loss, ',
+        'network.impairments.0.kind = "dely": must be one of blackout, ',
         "did you mean delay?",
     ),
     (
@@ -190,7 +194,7 @@ LANE_MISTAKES = [
     (
         'network.impairments=[{kind="duplicate",probability=0},{kind="loss",loss={model="x"}}]',
         'network.impairments.1.loss.model = "x": ',
-        "must be one of lossless, bernoulli",
+        "must be one of bernoulli, four_state",
     ),
     (
         'network.impairments=[{kind="loss",loss={model="bernoulli",probability=2}}]',
@@ -443,7 +447,7 @@ def test_a_missing_key_is_named(content: Content, key: str, tmp_path: Path) -> N
 
 @pytest.mark.parametrize(
     ("key", "begins"),
-    [("network.mansd", "M − 1, the "), ("network.loss", "what is lost, ")],
+    [("network.mansd", "M − 1, the "), ("network.loss", "loss of updates, ")],
 )
 def test_the_description_of_a_missing_key_begins_in_lower_case(
     content: Content, key: str, begins: str, tmp_path: Path
