@@ -195,7 +195,10 @@ def test_before_the_start_every_plant_falls_freely(case: Case, share: float, see
     """p = −Kx before the first input, for every plant in the box, constant or switching."""
     system, rng = case.system, np.random.default_rng(seed)
     start_s = share / float(np.linalg.norm(system.A, 2))
-    bound, _ = case.gains().start_up(start_s)
+    try:
+        bound, _ = case.gains().start_up(start_s)
+    except NotDecayingError:  # the box is too large
+        assume(False)
     plants = [A for A, _ in case.plants(rng)]
     for _ in range(5):
         x, t_s = system.x0, 0.0
