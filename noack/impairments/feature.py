@@ -4,11 +4,9 @@ A feature is a loss model, a kind of impairment, or a queue discipline: one clas
 derived from one of the three classes at the end.
 """
 
-import importlib
-import pkgutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Self, TypeVar
+from typing import Any, ClassVar, NamedTuple, Self
 
 from noack.impairments.link_records import QueueState, RuleStage
 from noack.impairments.markov_chain import Chain, Pattern
@@ -192,18 +190,3 @@ class Impairment(Feature):
             reordered: whether packets may be reordered before it.
         """
         return delayed, reordered
-
-
-F = TypeVar("F", bound=Feature)
-
-
-def features_in(package: str, path: Iterable[str], base: type[F]) -> tuple[type[F], ...]:
-    """Return the features that the modules of a package define, by the modules' names."""
-    found: list[type[F]] = []
-    for name in sorted(module.name for module in pkgutil.iter_modules(path)):
-        module = importlib.import_module(f"{package}.{name}")
-        found += [
-            one for one in vars(module).values()
-            if isinstance(one, type) and issubclass(one, base) and one.__module__ == module.__name__
-        ]  # fmt: skip
-    return tuple(found)

@@ -1,14 +1,14 @@
 """Disciplines of the ``rate`` bottleneck's queue, one per file."""
 
-from typing import TYPE_CHECKING, Annotated, Union
+from typing import TYPE_CHECKING
 
-from pydantic import Field
+from noack.impairments.feature import QueueDiscipline
+from noack.settings.registry import kinds_in, union_of
 
-from noack.impairments.feature import QueueDiscipline, features_in
-
-DISCIPLINES = features_in(__name__, __path__, QueueDiscipline)
+_KINDS = kinds_in(__name__, QueueDiscipline)
+DISCIPLINES = tuple(_KINDS.values())
 
 if TYPE_CHECKING:
     Discipline = QueueDiscipline
 else:
-    Discipline = Annotated[Union[DISCIPLINES], Field(discriminator="kind")]  # noqa: UP007 - of a tuple
+    Discipline = union_of(_KINDS)

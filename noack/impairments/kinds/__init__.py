@@ -1,14 +1,14 @@
 """Kinds of impairments, one per file."""
 
-from typing import TYPE_CHECKING, Annotated, Union
+from typing import TYPE_CHECKING
 
-from pydantic import Field
+from noack.impairments.feature import Impairment
+from noack.settings.registry import kinds_in, union_of
 
-from noack.impairments.feature import Impairment, features_in
-
-IMPAIRMENTS = features_in(__name__, __path__, Impairment)
+_KINDS = kinds_in(__name__, Impairment)
+IMPAIRMENTS = tuple(_KINDS.values())
 
 if TYPE_CHECKING:
     AnyImpairment = Impairment
 else:
-    AnyImpairment = Annotated[Union[IMPAIRMENTS], Field(discriminator="kind")]  # noqa: UP007 - of a tuple
+    AnyImpairment = union_of(_KINDS)

@@ -1,14 +1,14 @@
 """Loss models, one per file."""
 
-from typing import TYPE_CHECKING, Annotated, Union
+from typing import TYPE_CHECKING
 
-from pydantic import Field
+from noack.impairments.feature import LossModel
+from noack.settings.registry import kinds_in, union_of
 
-from noack.impairments.feature import LossModel, features_in
-
-LOSS_MODELS = features_in(__name__, __path__, LossModel)
+_KINDS = kinds_in(__name__, LossModel, "model")
+LOSS_MODELS = tuple(_KINDS.values())
 
 if TYPE_CHECKING:
     Loss = LossModel
 else:
-    Loss = Annotated[Union[LOSS_MODELS], Field(discriminator="model")]  # noqa: UP007 - of a tuple
+    Loss = union_of(_KINDS, "model")
