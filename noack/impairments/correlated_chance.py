@@ -6,13 +6,16 @@ for every ρ.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+from noack.impairments.feature import Feature, StageTables
 from noack.impairments.link_records import RuleStage, StageMemory
 from noack.impairments.normal import score
 from noack.impairments.quantities import CORRELATION, PERCENT, brief_percent, percent_text
 from noack.impairments.word_reader import WordReader
+from noack.settings.section import Correlation, Probability
 
 
 @dataclass(slots=True, kw_only=True)
@@ -102,3 +105,20 @@ def correlation_meaning(correlation: float) -> str:
 
 TC_CORRELATION = "its correlation changes the probability, or the spread, of what it is given"
 """What ``tc netem`` does differently."""
+
+
+class CorrelatedChance(Feature):
+    """Settings of a feature that draws a correlated random event for each packet."""
+
+    probability: Probability
+    """Probability of the event."""
+    correlation: Correlation = 0.0
+    """Between successive packets."""
+
+    def stage(self, tables: StageTables) -> ChanceStage:
+        """Return the probability and the correlation as numbers."""
+        return chance_stage(self)
+
+    def tc_notes(self) -> Sequence[str]:
+        """Return the difference that a correlation makes to ``tc netem``."""
+        return (TC_CORRELATION,) if self.correlation else ()

@@ -4,15 +4,14 @@ from collections.abc import Sequence
 from typing import ClassVar, Literal, Self
 
 from noack.impairments.correlated_chance import (
-    TC_CORRELATION,
     ChanceStage,
-    chance_stage,
+    CorrelatedChance,
     chance_text,
     correlation_meaning,
     happens,
     read_chance,
 )
-from noack.impairments.feature import Behaviour, Impairment, StageTables, Word
+from noack.impairments.feature import Behaviour, Impairment, Word
 from noack.impairments.link_records import (
     NEVER_NS,
     FlowState,
@@ -24,7 +23,7 @@ from noack.impairments.link_records import (
 from noack.impairments.markov_chain import Chain, chance_chain
 from noack.impairments.philox import uniforms
 from noack.impairments.quantities import brief_percent
-from noack.settings.section import Correlation, Probability
+from noack.settings.section import Probability
 
 
 def apply(
@@ -53,14 +52,12 @@ def apply(
             decision.copy_bit = int(v * bits)
 
 
-class Corrupt(Impairment):
+class Corrupt(CorrelatedChance, Impairment):
     """Flips one bit of the payload, at random."""
 
     kind: Literal["corrupt"] = "corrupt"
     probability: Probability
     """Probability of a flipped bit."""
-    correlation: Correlation = 0.0
-    """Between successive packets."""
 
     words: ClassVar = (Word("corrupt", "corrupt 1%", read_chance),)
     behaviour: ClassVar = Behaviour(ChanceStage, apply)
@@ -78,12 +75,6 @@ class Corrupt(Impairment):
         how = correlation_meaning(self.correlation)
         return f"flips one bit in {brief_percent(self.probability)} of the packets{how}"
 
-    def stage(self, tables: StageTables) -> ChanceStage:
-        return chance_stage(self)
-
     def chains(self) -> Sequence[Chain]:
         chain = chance_chain(self.probability, self.correlation)
         return (chain._replace(what="corrupt", probability=self.probability),)
-
-    def tc_notes(self) -> Sequence[str]:
-        return (TC_CORRELATION,) if self.correlation else ()

@@ -4,15 +4,14 @@ from collections.abc import Sequence
 from typing import ClassVar, Literal, Self
 
 from noack.impairments.correlated_chance import (
-    TC_CORRELATION,
     ChanceStage,
-    chance_stage,
+    CorrelatedChance,
     chance_text,
     correlation_meaning,
     happens,
     read_chance,
 )
-from noack.impairments.feature import Behaviour, Impairment, StageTables, Word
+from noack.impairments.feature import Behaviour, Impairment, Word
 from noack.impairments.link_records import (
     FlowState,
     LinkMemory,
@@ -23,7 +22,7 @@ from noack.impairments.link_records import (
 from noack.impairments.markov_chain import Chain, chance_chain
 from noack.impairments.philox import uniforms
 from noack.impairments.quantities import brief_percent
-from noack.settings.section import Correlation, Probability
+from noack.settings.section import Probability
 
 
 def apply(
@@ -41,14 +40,12 @@ def apply(
         decision.copy_bit = decision.bit
 
 
-class Duplicate(Impairment):
+class Duplicate(CorrelatedChance, Impairment):
     """Sends a packet twice."""
 
     kind: Literal["duplicate"] = "duplicate"
     probability: Probability
     """Probability of a copy."""
-    correlation: Correlation = 0.0
-    """Between successive packets."""
 
     words: ClassVar = (Word("duplicate", "duplicate 1%", read_chance),)
     behaviour: ClassVar = Behaviour(ChanceStage, apply)
@@ -65,12 +62,6 @@ class Duplicate(Impairment):
         how = correlation_meaning(self.correlation)
         return f"sends {brief_percent(self.probability)} of the packets twice{how}"
 
-    def stage(self, tables: StageTables) -> ChanceStage:
-        return chance_stage(self)
-
     def chains(self) -> Sequence[Chain]:
         chain = chance_chain(self.probability, self.correlation)
         return (chain._replace(what="duplicate", probability=self.probability),)
-
-    def tc_notes(self) -> Sequence[str]:
-        return (TC_CORRELATION,) if self.correlation else ()

@@ -6,8 +6,8 @@ from typing import Annotated, ClassVar, Literal, Self
 from pydantic import Field
 
 from noack.impairments.correlated_chance import (
-    TC_CORRELATION,
     ChanceStage,
+    CorrelatedChance,
     chance_stage,
     chance_text,
     correlation_meaning,
@@ -25,7 +25,7 @@ from noack.impairments.link_records import (
 from noack.impairments.philox import uniforms
 from noack.impairments.quantities import COUNT, brief_percent
 from noack.impairments.word_reader import WordReader
-from noack.settings.section import Correlation, Probability
+from noack.settings.section import Probability
 
 
 def apply(
@@ -55,14 +55,12 @@ def _read_gap(reader: WordReader) -> Table:
     return {"gap": reader.value(COUNT)}
 
 
-class Reorder(Impairment):
+class Reorder(CorrelatedChance, Impairment):
     """Lets a packet leave at once, before packets that arrived earlier and are delayed."""
 
     kind: Literal["reorder"] = "reorder"
     probability: Probability = 1.0
     """Probability of reordering, for every ``gap``-th packet."""
-    correlation: Correlation = 0.0
-    """Between successive packets."""
     gap: Annotated[int, Field(ge=1, le=2**40)] = 1
     """Only every ``gap``-th packet can be reordered."""
 
@@ -100,6 +98,3 @@ class Reorder(Impairment):
     def tc_lacks(self, before: Sequence[Impairment]) -> str:
         delayed = any(getattr(one, "delay_s", 0) for one in before)
         return "" if delayed else "reordering without a delay before it"
-
-    def tc_notes(self) -> Sequence[str]:
-        return (TC_CORRELATION,) if self.correlation else ()

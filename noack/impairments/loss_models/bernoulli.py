@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from typing import ClassVar, Literal, Self
 
 from noack.impairments.correlated_chance import (
-    TC_CORRELATION,
     ChanceStage,
+    CorrelatedChance,
     chance_stage,
     chance_text,
     correlation_meaning,
@@ -45,7 +45,7 @@ def apply(
         flow.score = -score(u) if stage.correlation == 0.0 else memory.score
 
 
-class BernoulliLoss(LossModel):
+class BernoulliLoss(CorrelatedChance, LossModel):
     """Each packet is lost with a probability; independently, unless correlated."""
 
     model: Literal["bernoulli"] = "bernoulli"
@@ -78,6 +78,3 @@ class BernoulliLoss(LossModel):
 
     def tc_text(self) -> str:
         return f"random {chance_text(self)}"
-
-    def tc_notes(self) -> Sequence[str]:
-        return (TC_CORRELATION,) if self.correlation else ()
