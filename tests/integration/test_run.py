@@ -64,7 +64,7 @@ def record(request: pytest.FixtureRequest) -> RunRecord:
         found: RunRecord = request.getfixturevalue("live")
         return found
     path = find_shipped("lane_following", "scenarios")
-    return simulate(resolve(load(path, ["horizon_s=20", *CASES[request.param]])))
+    return simulate(resolve(load(path, ["horizon_s=8", *CASES[request.param]])))
 
 
 def test_a_run_completes_with_a_complete_summary(finished: Finished) -> None:

@@ -159,6 +159,15 @@ def value_and_slope(curve: Array, p: int, s: float, n: Width) -> tuple[Lanes, La
     return total, slope
 
 
+def number_and_slope(g: Array, degree: int, s: float) -> tuple[float, float]:
+    """Return the polynomial and its derivative."""
+    total, slope = g[degree], 0.0
+    for k in range(degree - 1, -1, -1):
+        slope = slope * s + total
+        total = total * s + g[k]
+    return total, slope
+
+
 def bend(curve: Array, p: int, s: float, n: Width) -> float:
     """Return a bound on |ÿ| in [0, s].
 

@@ -35,8 +35,6 @@ from cosim.simulation.continuous.event_detector import (
     LARGEST,
     DetectedEvent,
     DivergedError,
-    EventDetector,
-    NormEventDetector,
     QuadraticEventDetector,
 )
 from cosim.simulation.continuous.exact_flow import ExactFlow, growth_rate
@@ -49,6 +47,7 @@ from noack.trigger.decaying import DecayingTrigger
 from noack.trigger.trigger_condition import QuadraticForm, TriggerCondition
 from noack.trigger.trigger_policy import Policy
 
+EventDetector = QuadraticEventDetector | IntegralEventDetector
 _SMALLEST_THRESHOLD = 1e-200
 _LONGEST_CELL_S = 1e3
 _GRID_SLACK = 1e-9
@@ -97,16 +96,10 @@ class ContinuousLoop:
         self.loop = loop
         self.trigger = trigger
         n, H, BK = loop.n, loop.H, loop.B @ loop.K
-        mismatch = loop.A + BK - H
-        self.generator: Matrix = np.zeros((3 * n, 3 * n))
+        closed, none = loop.A + BK, np.zeros((n, n))
+        E = closed - H
+        self.generator: Matrix = np.block([[closed, none, BK], [-E, H, -BK], [-E, none, H - BK]])
         """G of dz/dt = G z, per second, shape (3n, 3n)."""
-        self.generator[:n, :n] = loop.A + BK
-        self.generator[:n, 2 * n :] = BK
-        self.generator[n : 2 * n, :n] = -mismatch
-        self.generator[n : 2 * n, n : 2 * n] = H
-        self.generator[n : 2 * n, 2 * n :] = -BK
-        self.generator[2 * n :, :n] = -mismatch
-        self.generator[2 * n :, 2 * n :] = H - BK
         self._rule = trigger.trigger_rule(n)
         condition = self._rule.after(0.0, loop.x0)
         scaled = self.generator + condition.rate_per_s * np.eye(3 * n)
@@ -137,28 +130,6 @@ class ContinuousLoop:
         norms: Vector = np.linalg.norm(errors if W is None else errors @ W.T, axis=-1)
         return norms
 
-    def next_event(
-        self, state: LoopState, until_s: float, condition: TriggerCondition | None = None
-    ) -> LoopState | None:
-        """Return the state just before the reset at the next event in [``state.t_s``, ``until_s``].
-
-        Args:
-            state: the loop's state.
-            until_s: end of the search.
-            condition: the trigger condition; by default the policy's after an event (or a start) at
-                ``state``.
-
-        Returns:
-            None if there is no event until ``until_s``. If ``state`` already exceeds the threshold,
-            or equals it and grows, the event is at ``state``.
-
-        Raises:
-            DivergedError: the state becomes too large to compute with before an event.
-            CallerError: the threshold decays below 1e-200 before an event.
-        """
-        found = self.next_crossing(state, until_s, condition or self.condition(state))
-        return None if found is None else found[0]
-
     def condition(self, state: LoopState) -> TriggerCondition:
         """Return the trigger condition after an event at a state."""
         return self._rule.after(state.t_s * 1e9, state.x)
@@ -171,7 +142,7 @@ class ContinuousLoop:
         condition: TriggerCondition,
         auxiliary: float = 0.0,
     ) -> tuple[LoopState, float] | None:
-        """Return the next event like :meth:`next_event`, with the condition's auxiliary variable.
+        """Return the next event in [``state.t_s``, ``until_s``], just before its reset.
 
         Args:
             state: the loop's state.
@@ -179,8 +150,13 @@ class ContinuousLoop:
             condition: the trigger condition.
             auxiliary: η or the integral at ``state``.
 
+        Returns:
+            State and auxiliary variable; None if there is no event. If ``state`` already exceeds
+            the threshold, or equals it and grows, the event is at ``state``.
+
         Raises:
             DivergedError: the run diverges before an event; contains the time.
+            CallerError: the threshold decays below 1e-200 before an event.
         """
         try:
             found = self._next_crossing(state, until_s, condition, auxiliary)
@@ -272,31 +248,22 @@ class ContinuousLoop:
     def _detector(
         self, condition: TriggerCondition, rate_per_s: float, threshold: float
     ) -> EventDetector:
-        """Return the cached detector of a condition; with η, the threshold does not decay."""
-        form, plain = condition.form, not len(condition.form.down)
-        if not condition.integrates:
-            plain = plain and threshold > 0 and condition.dynamic_variable is None
-            rate_per_s = rate_per_s if plain or threshold > 0 else 0.0
-        kind = bytes([plain, condition.integrates])
+        """Return the cached detector of a condition."""
+        form, variable = condition.form, condition.dynamic_variable
+        rate_per_s = rate_per_s if threshold > 0 else 0.0
+        kind = bytes([condition.integrates, variable is None])
         key = (form.up.tobytes() + form.down.tobytes() + kind, rate_per_s)
         if key not in self._detectors:
-            self._detectors[key] = self._new_detector(condition, rate_per_s, plain=plain)
+            self._detectors[key] = (
+                IntegralEventDetector(self.flow, self.generator, form.up, rate_per_s)
+                if condition.integrates
+                else QuadraticEventDetector(
+                    self.flow, self.generator, form, rate_per_s,
+                    None if variable is None else variable.gain,
+                    0.0 if variable is None else variable.decay_per_s,
+                )
+            )  # fmt: skip
         return self._detectors[key]
-
-    def _new_detector(
-        self, condition: TriggerCondition, rate_per_s: float, *, plain: bool
-    ) -> EventDetector:
-        if plain:
-            output = np.zeros((len(condition.form.up), len(self.generator)))
-            output[:, : condition.form.up.shape[1]] = condition.form.up
-            made = IntegralEventDetector if condition.integrates else NormEventDetector
-            return made(self.flow, self.generator, output, rate_per_s)
-        variable = condition.dynamic_variable
-        return QuadraticEventDetector(
-            self.flow, self.generator, condition.form, rate_per_s,
-            None if variable is None else variable.gain,
-            0.0 if variable is None else variable.decay_per_s,
-        )  # fmt: skip
 
     def _advance(
         self, z: Vector, dt_s: float, condition: TriggerCondition, auxiliary: float

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.linalg import schur
 
 from cosim.record.align import join_all
-from cosim.simulation.continuous.continuous_loop import continuous_loop_of
+from cosim.simulation.continuous.continuous_loop import ContinuousLoop, continuous_loop_of
 from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
 from cosim.simulation.continuous.network_fates import network_fates
 from cosim.simulation.virtual_time import simulate
@@ -170,8 +170,7 @@ def _slow_model(M: int) -> Numbers:
     loop = _loop(A, B, np.array(K), model, np.array([1.0, 5.0]))
     horizon_s = 250.0
     run = simulate_continuous(
-        loop,
-        trigger,
+        ContinuousLoop(loop, trigger),
         horizon_s=horizon_s,
         delivered=lambda event: event % M == 0,
         known_start=False,

@@ -1,4 +1,4 @@
-"""Batches against the exact simulator, which uses another method, on the same draws."""
+"""Batches under the paper's policy against the exact simulator, on the same draws."""
 
 import json
 import math
@@ -15,9 +15,7 @@ from cosim.simulation.batch.batch_interface import (
     setting_of,
 )
 from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS
-from cosim.simulation.continuous.continuous_loop import continuous_loop_of
-from cosim.simulation.continuous.continuous_run import simulate_continuous
-from cosim.simulation.continuous.network_fates import network_fates
+from cosim.simulation.continuous.continuous_report import run_continuous
 from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
@@ -26,9 +24,8 @@ from noack.impairments.link_settings import LinkSettings
 from noack.trigger.decaying import DecayingTrigger
 from noack.trigger.quadratic import QuadraticTrigger
 from tests.cosim.simulation.batch.exact import (
-    SIZES,
-    cost_of,
-    dense,
+    check_independence,
+    compare,
     one,
     random_population,
     random_setting,
@@ -36,47 +33,22 @@ from tests.cosim.simulation.batch.exact import (
 )
 
 
-@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("size", [(2, 1), (4, 2)])
 def test_events_fates_and_measures_are_those_of_the_exact_simulator(size: tuple[int, int]) -> None:
     rng = np.random.default_rng(size[0])
     events = lost = settled = 0
-    for _ in range(15):
+    for _ in range(12):
         setting = random_setting(rng, *size)
-        population = random_population(rng, setting, 4)
-        rows = run_batch(setting, population)
-        for i, row in enumerate(rows):
+        population = random_population(rng, setting, 2)
+        for i, row in enumerate(run_batch(setting, population)):
             run = reference(setting, one(population, i))
-            found = run_events(setting, one(population, i))
-            assert row["status"] == OK
-            assert found.delivered.tolist() == run.delivered.tolist()
-            np.testing.assert_allclose(found.event_s, run.event_s, rtol=0, atol=1e-9)
-            assert row["transmissions"] == len(run.event_s)
-            assert row["deliveries"] == run.delivered.sum()
-            gaps_s = np.diff(run.event_s)
-            if len(gaps_s):
-                assert row["inter_event_min_s"] == pytest.approx(gaps_s.min(), abs=2e-9)
-                assert row["inter_event_mean_s"] == pytest.approx(gaps_s.mean(), abs=2e-9)
-            else:
-                assert math.isnan(row["inter_event_min_s"])
-                assert math.isnan(row["inter_event_mean_s"])
-            assert row["cost"] == pytest.approx(cost_of(run, setting), rel=1e-9, abs=1e-15)
-            t_s, norms, errors = dense(run, setting)
-            assert row["final_norm"] == pytest.approx(norms[-1], rel=1e-9)
-            assert errors.max() <= row["sup_e_c_scaled"] * (1 + 1e-9) + 1e-15
-            assert row["sup_e_c_scaled"] <= errors.max() * (1 + 1e-3) + 1e-15
-            above = np.flatnonzero(norms > setting.settle * norms[0])
-            if above[-1] == len(norms) - 1:
-                assert math.isnan(row["settling_s"])
-            else:
-                settled += 1
-                low_s, high_s = t_s[above[-1]], t_s[above[-1] + 1]
-                assert low_s - 1e-12 <= row["settling_s"] <= high_s + 1e-12
-            assert math.isnan(row["diverged_at_s"])
+            compare(setting, row, run_events(setting, one(population, i)), run)
             events += len(run.event_s)
             lost += int((~run.delivered).sum())
-    assert events > 300
-    assert lost > 50
-    assert settled > 3
+            settled += not math.isnan(row["settling_s"])
+    assert events > 150
+    assert lost > 30
+    assert settled > 1
 
 
 def scenario(content: dict[str, Any], **changes: Any) -> Scenario:
@@ -92,10 +64,7 @@ def test_a_batch_setting_of_a_scenario_gives_the_scenarios_run(
     loop = loop_of(resolved)
     draw = Population(loop.A[None], loop.B[None], loop.x0[None], np.array([2**40 + 3], np.uint64))
     found = run_events(setting_of(resolved), draw)
-    run = simulate_continuous(
-        continuous_loop_of(resolved), horizon_s=8.0, delivered=network_fates(resolved),
-        known_start=False,
-    )  # fmt: skip
+    run = run_continuous(resolved)
     assert len(run.event_s) >= (1 if mode == "model" else 5)
     np.testing.assert_allclose(found.event_s, run.event_s, rtol=0, atol=1e-9)
     assert found.delivered.tolist() == run.delivered.tolist()
@@ -103,15 +72,9 @@ def test_a_batch_setting_of_a_scenario_gives_the_scenarios_run(
 
 def test_a_row_depends_only_on_its_own_draw() -> None:
     rng = np.random.default_rng(7)
-    for _ in range(5):
-        setting = random_setting(rng, 3, 2)
-        population = random_population(rng, setting, 40)
-        rows = run_batch(setting, population)
-        order = rng.permutation(40)
-        mixed = run_batch(setting, Population(*(part[order] for part in population)))
-        assert mixed.tobytes() == rows[order].tobytes()
-        alone = np.concatenate([run_batch(setting, one(population, i)) for i in range(40)])
-        assert alone.tobytes() == rows.tobytes()
+    for _ in range(4):
+        setting = random_setting(rng, 2, 1)
+        check_independence(setting, random_population(rng, setting, 10), rng.permutation(10))
 
 
 def turning(depth: float, omega: float, floored: bool) -> tuple[Setting, Population, float]:
@@ -132,8 +95,8 @@ def turning(depth: float, omega: float, floored: bool) -> tuple[Setting, Populat
 
 
 @pytest.mark.parametrize("floored", [False, True])
-@pytest.mark.parametrize("omega", [0.3, 7.0, 200.0])
-@pytest.mark.parametrize("depth", [1e-2, 1e-5, 1e-7, 1e-9, 1e-12])
+@pytest.mark.parametrize("omega", [0.3, 200.0])
+@pytest.mark.parametrize("depth", [1e-2, 1e-7, 1e-12])
 def test_very_short_crossings_are_found(depth: float, omega: float, floored: bool) -> None:
     setting, draw, first_s = turning(depth, omega, floored)
     found = run_events(setting, draw)
