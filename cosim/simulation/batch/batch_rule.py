@@ -125,3 +125,10 @@ def phase_at(rule: Rule, span: Span, t_s: float) -> Phase:
 def last_point(rule: Rule, t_s: float) -> int:
     """Return the last grid point up to a time."""
     return math.floor(t_s / rule.grid_s + _GRID_SLACK)
+
+
+def threshold_after(phase: Phase, s: float) -> float:
+    """Return the threshold ``s`` seconds after the start of a phase."""
+    if phase.rate_per_s > 0.0:
+        return phase.threshold * math.exp(-phase.rate_per_s * s)
+    return phase.threshold

@@ -24,6 +24,7 @@ of the part driven by a small E is relative to E. All norms are Frobenius norms,
 """
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +50,14 @@ _NEGLIGIBLE = 2.0**-53
 _MEASURED = 1e-12
 _LESS_STRICT = tuple((_MEASURED / _NEGLIGIBLE) ** (1.0 / (p + 1)) for p in DEGREES)
 _ROUNDED_UP = 1.0 + 1e-9
+
+
+class Models(NamedTuple):
+    """The state of a run."""
+
+    x_c: Lanes
+    e_c: Lanes
+    d: Lanes
 
 
 def powers(H: Array, at: int, table: Array, n: Width) -> None:
@@ -148,6 +157,12 @@ def value(curve: Array, p: int, s: float, n: Width) -> Lanes:
     for k in range(p - 1, -1, -1):
         total = fma(total, s, load(curve, k * len(n), n))
     return total
+
+
+def state_at(space: Any, p: int, s: float, n: Width) -> Models:
+    """Return the state at a time on a piece, from the coefficients in ``BatchMemory``."""
+    x_c, e_c = value(space.x_c, p, s, n), value(space.e_c, p, s, n)
+    return Models(x_c, e_c, value(space.d, p, s, n))
 
 
 def value_and_slope(curve: Array, p: int, s: float, n: Width) -> tuple[Lanes, Lanes]:

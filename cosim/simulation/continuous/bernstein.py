@@ -1,4 +1,4 @@
-"""Finds the first time at which a polynomial becomes negative, in the Bernstein basis.
+"""Finds the first time at which a polynomial curve leaves the unit ball, in the Bernstein basis.
 
 A polynomial on [0, 1] in the Bernstein basis lies in the convex hull of its coefficients. So a
 curve does not leave the unit ball if all its control points lie in the ball, and a scalar
@@ -20,6 +20,8 @@ from noack.core.linear_systems import Matrix, Vector
 _ROUNDING = 16 * np.finfo(float).eps
 _FINEST = 2.0**-52
 _BISECTIONS = 60
+_NEWTON_STEPS = 100
+_NEWTON_RESOLUTION = 2.0**-50
 
 
 class CurveBasis:
@@ -57,8 +59,7 @@ class CurveBasis:
     def first_negative(self, coefficients: Vector) -> float | None:
         """Return the first u in [0, 1] after which a polynomial of degree 2p becomes negative.
 
-        It is always found if the polynomial becomes smaller than minus its rounding error. A
-        shallower excursion (a tangency in floating point) may be missed.
+        Rounding errors of the coefficients have the effects described in :meth:`first_exit`.
 
         Args:
             coefficients: in the Bernstein basis, shape (2p + 1,).
@@ -88,17 +89,22 @@ class CurveBasis:
     def first_exit(self, taylor: Matrix) -> float | None:
         """Return the first u in [0, 1] after which |y(u)| becomes > 1; None if there is none.
 
+        An excursion is always found if its depth max |y|² − 1 exceeds the rounding error of the
+        polynomial, about 1e-14. A shallower excursion (a tangency in floating point) may be missed.
         A curve that starts on the sphere and moves outward leaves the ball at u = 0.
 
         Args:
             taylor: coefficients of y(u) = Σ_k ``taylor``[k] u^k, shape (p + 1, n).
         """
         control = self.from_taylor @ taylor
-        return self.first_negative(1.0 - self.square @ (control @ control.T).ravel())
+        inside = 1.0 - self.square @ (control @ control.T).ravel()
+        tolerance = _ROUNDING * max(1.0, float(np.abs(inside).max()))
+        bracket = self._isolate(inside, tolerance)
+        return None if bracket is None else _refine(taylor, *bracket)
 
-    def _isolate(self, polynomial: Vector, tolerance: float) -> tuple[float, float] | None:
-        """Return an interval with the first root and no other, or the root as both ends."""
-        pending = [(0.0, 1.0, polynomial)]
+    def _isolate(self, inside: Vector, tolerance: float) -> tuple[float, float] | None:
+        """Return an interval with the first exit and no other root, or the exit as both ends."""
+        pending = [(0.0, 1.0, inside)]
         while pending:
             start, width, coefficients = pending.pop()
             signs = np.sign(coefficients) * (np.abs(coefficients) > tolerance)
@@ -119,3 +125,28 @@ class CurveBasis:
 def curve_basis(degree: int) -> CurveBasis:
     """Return the cached basis of a degree."""
     return CurveBasis(degree)
+
+
+def _refine(taylor: Matrix, inside: float, outside: float) -> float:
+    """Solve |y(u)| = 1 by Newton's method; bisect when a step leaves the bracket."""
+    degree, n = len(taylor) - 1, taylor.shape[1]
+    orders = np.arange(degree + 1.0)
+    both = np.zeros((degree + 1, 2 * n))
+    both[:, :n] = taylor
+    both[:-1, n:] = orders[1:, None] * taylor[1:]
+    u = (inside + outside) / 2
+    for _ in range(_NEWTON_STEPS):
+        values = u**orders @ both
+        y, slope = values[:n], values[n:]
+        excess, growth = float(y @ y) - 1.0, 2.0 * float(y @ slope)
+        if excess > 0:
+            outside = u
+        else:
+            inside = u
+        following = u - excess / growth if growth else inside
+        if not inside <= following <= outside:
+            following = (inside + outside) / 2
+        if abs(following - u) <= _NEWTON_RESOLUTION * outside:
+            return following
+        u = following
+    return u

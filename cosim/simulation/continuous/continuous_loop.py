@@ -35,6 +35,8 @@ from cosim.simulation.continuous.event_detector import (
     LARGEST,
     DetectedEvent,
     DivergedError,
+    EventDetector,
+    NormEventDetector,
     QuadraticEventDetector,
 )
 from cosim.simulation.continuous.exact_flow import ExactFlow, growth_rate
@@ -47,7 +49,6 @@ from noack.trigger.decaying import DecayingTrigger
 from noack.trigger.trigger_condition import QuadraticForm, TriggerCondition
 from noack.trigger.trigger_policy import Policy
 
-EventDetector = QuadraticEventDetector | IntegralEventDetector
 _SMALLEST_THRESHOLD = 1e-200
 _LONGEST_CELL_S = 1e3
 _GRID_SLACK = 1e-9
@@ -248,21 +249,28 @@ class ContinuousLoop:
     def _detector(
         self, condition: TriggerCondition, rate_per_s: float, threshold: float
     ) -> EventDetector:
-        """Return the cached detector of a condition."""
+        """Return the cached detector of a condition; with η, the threshold does not decay."""
         form, variable = condition.form, condition.dynamic_variable
+        plain = not len(form.down) and threshold > 0 and variable is None
         rate_per_s = rate_per_s if threshold > 0 else 0.0
-        kind = bytes([condition.integrates, variable is None])
+        kind = bytes([plain, condition.integrates])
         key = (form.up.tobytes() + form.down.tobytes() + kind, rate_per_s)
         if key not in self._detectors:
-            self._detectors[key] = (
-                IntegralEventDetector(self.flow, self.generator, form.up, rate_per_s)
-                if condition.integrates
-                else QuadraticEventDetector(
-                    self.flow, self.generator, form, rate_per_s,
-                    None if variable is None else variable.gain,
-                    0.0 if variable is None else variable.decay_per_s,
+            size = len(self.generator)
+            output = np.pad(form.up, ((0, 0), (0, size - form.up.shape[1])))
+            if condition.integrates:
+                made: EventDetector = IntegralEventDetector(
+                    self.flow, self.generator, output, rate_per_s
                 )
-            )  # fmt: skip
+            elif plain:
+                made = NormEventDetector(self.flow, self.generator, output, rate_per_s)
+            else:
+                gain = None if variable is None else variable.gain
+                decay_per_s = 0.0 if variable is None else variable.decay_per_s
+                made = QuadraticEventDetector(
+                    self.flow, self.generator, form, rate_per_s, gain, decay_per_s
+                )
+            self._detectors[key] = made
         return self._detectors[key]
 
     def _advance(

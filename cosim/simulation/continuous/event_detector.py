@@ -6,11 +6,9 @@ isolated in the Bernstein basis (:mod:`cosim.simulation.continuous.bernstein`).
 """
 
 import math
-from collections.abc import Iterator
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cosim.simulation.continuous.bernstein import curve_basis
 from cosim.simulation.continuous.exact_flow import CELLS, DEGREE, ExactFlow, taylor_terms
@@ -41,12 +39,88 @@ class DetectedEvent(NamedTuple):
     """Whether the comparison holds just after this time; otherwise this is the end of the span."""
 
 
+class EventDetector(Protocol):
+    """Finds when the comparison of a trigger condition first holds."""
+
+    def first_exit(
+        self, z: Vector, t_s: float, threshold: float, span_s: float, auxiliary: float
+    ) -> DetectedEvent:
+        """Follow the loop until the comparison holds or the span ends.
+
+        Args:
+            z: state at ``t_s``, shape (N,).
+            t_s: time.
+            threshold: at ``t_s``.
+            span_s: length of the span.
+            auxiliary: η or the integral at ``t_s``.
+
+        Raises:
+            DivergedError: the state becomes too large to compute with.
+        """
+        ...
+
+
+class NormEventDetector:
+    """Finds the first time at which (output / decaying threshold) leaves the unit ball.
+
+    Args:
+        flow: the exact flow of the state z.
+        generator: G, shape (N, N).
+        output: C of the output C z that is compared with the threshold, shape (r, N).
+        rate_per_s: decay rate of the threshold; 0 for a constant one.
+    """
+
+    def __init__(
+        self, flow: ExactFlow, generator: Matrix, output: Matrix, rate_per_s: float
+    ) -> None:
+        n, size = output.shape
+        terms = taylor_terms(generator + rate_per_s * np.eye(size), flow.width_s)
+        self._flow = flow
+        self._rate_per_s = rate_per_s
+        self._basis = curve_basis(DEGREE)
+        self._growth = np.exp(rate_per_s * flow.width_s * np.arange(CELLS))
+        self._taylor: Matrix = output @ terms
+        """Taylor coefficients of y from z at the start of a cell, shape (p + 1, r, N)."""
+        control = np.tensordot(self._basis.from_taylor, self._taylor, 1).reshape(-1, size)
+        starts = flow.powers[:CELLS] * self._growth[:, None, None]
+        self._control = (control @ starts).reshape(-1, size)
+        """Control points of y in all cells of a window, stacked as rows."""
+        self._shape = (-1, DEGREE + 1, n)
+        self._slack = _SLACK * max(float(np.abs(self._control).sum(axis=1).max()), 1.0)
+
+    def first_exit(
+        self, z: Vector, t_s: float, threshold: float, span_s: float, auxiliary: float = 0.0
+    ) -> DetectedEvent:
+        """As :meth:`EventDetector.first_exit`."""
+        start = z
+        width_s, window_s = self._flow.width_s, self._flow.window_s
+        rows, window = len(self._control) // CELLS, 0
+        while window == 0 or window * window_s < span_s:
+            begin_s = window * window_s
+            scale = math.exp(self._rate_per_s * begin_s) / threshold
+            largest = float(np.linalg.norm(z))
+            if not largest * max(scale, 1.0) < LARGEST:
+                raise DivergedError(t_s + begin_s)
+            cells = max(min(CELLS, math.ceil((span_s - begin_s) / width_s)), 1)
+            control = (self._control[: cells * rows] @ (z * scale)).reshape(self._shape)
+            reach = np.einsum("cki,cki->ck", control, control).max(axis=1)
+            for cell in np.flatnonzero(reach > 1.0 - self._slack * (1.0 + largest * scale)):
+                in_cell = self._flow.powers[cell] @ z
+                u = self._basis.first_exit(self._taylor @ (in_cell * (scale * self._growth[cell])))
+                after_s = math.inf if u is None else float(begin_s + (cell + u) * width_s)
+                if u is not None and after_s <= span_s:
+                    found = self._flow.within_cell(in_cell, u)
+                    return DetectedEvent(after_s, found, auxiliary, exceeds=True)
+            window += 1
+            z = self._flow.powers[CELLS] @ z
+        return DetectedEvent(span_s, self._flow.advance(start, span_s), auxiliary, exceeds=False)
+
+
 class QuadraticEventDetector:
     """Finds the first time at which ‖P z‖² − ‖N z‖² − η exceeds c²; c is a decaying threshold or 0.
 
     On a cell all terms are polynomials: z has degree p, the squares have degree 2p. The dynamic
-    variable η, with η̇ = −λη + ‖P_η z‖² − ‖N_η z‖², is its Taylor series up to degree 2p = 36. The
-    control points of P z show in which cells there may be an event.
+    variable η, with η̇ = −λη + ‖P_η z‖² − ‖N_η z‖², is its Taylor series up to degree 2p = 36.
 
     Args:
         flow: the exact flow of the state z, with cells of at most 1/(λ + ρ).
@@ -68,32 +142,22 @@ class QuadraticEventDetector:
     ) -> None:
         if gain is not None and rate_per_s:
             raise ValueError("a threshold that decays cannot be combined with η")
+        size = len(generator)
         self._flow, self._rate_per_s = flow, rate_per_s
         self._basis = curve_basis(DEGREE)
-        growth = np.exp(rate_per_s * flow.width_s * np.arange(CELLS))
-        terms = taylor_terms(generator + rate_per_s * np.eye(len(generator)), flow.width_s)
-        cells: Matrix = terms[None] @ (flow.powers[:CELLS] * growth[:, None, None])[:, None]
-        # Maps the scaled z to its Taylor coefficients in all cells, (cells, p + 1, N, N).
-        self._form = _Squares(form, cells)
+        self._growth = np.exp(rate_per_s * flow.width_s * np.arange(CELLS))
+        terms = taylor_terms(generator + rate_per_s * np.eye(size), flow.width_s)
+        self._cells = terms[None] @ (flow.powers[:CELLS] * self._growth[:, None, None])[:, None]
+        """Taylor coefficients of the scaled z in all cells of a window, (cells, p + 1, N, N)."""
+        self._form = _Squares(form, self._cells)
         self._compares = len(form.up) > 0
-        self._gain = None if gain is None else _Squares(gain, cells)
+        self._gain = None if gain is None else _Squares(gain, self._cells)
         self._by_start, self._by_gain = _dynamic_variable_series(decay_per_s, flow.width_s)
 
     def first_exit(
         self, z: Vector, t_s: float, threshold: float, span_s: float, auxiliary: float = 0.0
     ) -> DetectedEvent:
-        """Follow the loop until the comparison holds or the span ends.
-
-        Args:
-            z: state at ``t_s``, shape (N,).
-            t_s: time.
-            threshold: at ``t_s``; it may be 0.
-            span_s: length of the span.
-            auxiliary: η at ``t_s``.
-
-        Raises:
-            DivergedError: the state becomes too large to compute with.
-        """
+        """As :meth:`EventDetector.first_exit`; the threshold may be 0."""
         width_s, begin_s = self._flow.width_s, 0.0
         while True:
             largest = float(np.linalg.norm(z))
@@ -101,11 +165,15 @@ class QuadraticEventDetector:
             if not largest < LARGEST or (level > 0 and not largest / level < LARGEST):
                 raise DivergedError(t_s + begin_s)
             scale = 1.0 / max(level if level > 0 else largest, math.sqrt(abs(auxiliary)), 1e-300)
+            inside = (level * scale) ** 2 - self._form.bernstein(z * scale)
             eta = self._eta_series(z * scale, auxiliary * scale**2)
+            if eta is not None:
+                inside += eta @ curve_basis(2 * DEGREE).from_taylor.T
             last = min(int((span_s - begin_s) / width_s), CELLS)
-            for cell, u in self._crossings(z * scale, level * scale, eta):
-                if cell <= last and begin_s + (cell + u) * width_s <= span_s:
-                    return self._reached(begin_s, z, cell, u, eta, scale, exceeds=True)
+            for cell in np.flatnonzero(inside.min(axis=1) < 0) if self._compares else ():
+                u = self._basis.first_negative(inside[cell]) if cell <= last else None
+                if u is not None and begin_s + (cell + u) * width_s <= span_s:
+                    return self._reached(begin_s, z, int(cell), u, eta, scale, exceeds=True)
             if last < CELLS:
                 u = min((span_s - begin_s) / width_s - last, 1.0)
                 return self._reached(begin_s, z, last, u, eta, scale, exceeds=False)
@@ -113,23 +181,6 @@ class QuadraticEventDetector:
                 auxiliary = float(eta[-1].sum()) / scale**2
             z = self._flow.powers[CELLS] @ z
             begin_s += self._flow.window_s
-
-    def _crossings(
-        self, z: Vector, level: float, eta: Matrix | None
-    ) -> Iterator[tuple[int, float]]:
-        """Yield each cell of a window with an event, and the event's place in it."""
-        if not self._compares:
-            return
-        cells = np.arange(CELLS)
-        if eta is None:
-            cells = np.flatnonzero(self._form.reach(z) > level**2 - _SLACK * (1.0 + float(z @ z)))
-        inside = level**2 - self._form.bernstein(z, cells)
-        if eta is not None:
-            inside += eta @ curve_basis(2 * DEGREE).from_taylor.T
-        for i in np.flatnonzero((inside < 0).any(axis=1)):
-            u = self._basis.first_negative(inside[i])
-            if u is not None:
-                yield int(cells[i]), u
 
     def _eta_series(self, z: Vector, auxiliary: float) -> Matrix | None:
         """Scaled Taylor coefficients of η in all cells of a window, shape (cells, 2p + 1)."""
@@ -173,36 +224,27 @@ class _Squares:
 
     def __init__(self, form: QuadraticForm, cells: Matrix) -> None:
         rows = np.vstack([form.up, form.down])
-        self._up = len(form.up)
-        self._signs = np.concatenate([np.ones(self._up), -np.ones(len(form.down))])
-        self._taylor: Matrix = on_state(rows, cells.shape[-1]) @ cells
+        output = np.zeros((len(rows), cells.shape[-1]))
+        output[:, : rows.shape[1]] = rows
+        self._signs = np.concatenate([np.ones(len(form.up)), -np.ones(len(form.down))])
+        self._taylor: Matrix = output @ cells
         """(cells, p + 1, r, N)."""
         basis = curve_basis(DEGREE)
         self._control: Matrix = np.einsum("ik,ckrn->cirn", basis.from_taylor, self._taylor)
         self._square = basis.square
         self._convolve = _convolution(DEGREE)
 
-    def reach(self, z: Vector) -> Vector:
-        """An upper bound on ‖P z‖² in each cell, from its control points, shape (cells,)."""
-        up = self._control[:, :, : self._up] @ z
-        return np.einsum("ckr,ckr->ck", up, up).max(axis=1)
-
     def taylor(self, z: Vector) -> Matrix:
         """Taylor coefficients of the form, shape (cells, 2p + 1)."""
         return self._products(self._taylor @ z) @ self._convolve.T
 
-    def bernstein(self, z: Vector, cells: NDArray[np.int64]) -> Matrix:
-        """Bernstein coefficients of the form in some cells, shape (len(cells), 2p + 1)."""
-        return self._products(self._control[cells] @ z) @ self._square.T
+    def bernstein(self, z: Vector) -> Matrix:
+        """Bernstein coefficients of the form, shape (cells, 2p + 1)."""
+        return self._products(self._control @ z) @ self._square.T
 
     def _products(self, y: Matrix) -> Matrix:
         products: Matrix = (y * self._signs) @ y.transpose(0, 2, 1)
         return products.reshape(len(y), -1)
-
-
-def on_state(rows: Matrix, size: int) -> Matrix:
-    """Return the output matrix, on a state of ``size`` entries, of rows on its first entries."""
-    return np.pad(rows, ((0, 0), (0, size - rows.shape[1])))
 
 
 def _convolution(degree: int) -> Matrix:

@@ -5,12 +5,7 @@ import math
 import numpy as np
 from scipy.optimize import brentq
 
-from cosim.simulation.continuous.event_detector import (
-    LARGEST,
-    DetectedEvent,
-    DivergedError,
-    on_state,
-)
+from cosim.simulation.continuous.event_detector import LARGEST, DetectedEvent, DivergedError
 from cosim.simulation.continuous.exact_flow import ExactFlow, taylor_terms
 from noack.core.linear_systems import Matrix, Vector
 
@@ -30,7 +25,7 @@ class IntegralEventDetector:
     Args:
         flow: the exact flow of the state z.
         generator: G, shape (N, N).
-        output: C of y, on the first entries of z, shape (r, ·).
+        output: C of y = C z, shape (r, N).
         rate_per_s: decay rate of the threshold; 0 for a constant one.
     """
 
@@ -39,13 +34,12 @@ class IntegralEventDetector:
     ) -> None:
         self._flow = flow
         self._rate_per_s = rate_per_s
-        terms = taylor_terms(generator, flow.width_s)
-        self._taylor: Matrix = on_state(output, len(generator)) @ terms
+        self._taylor: Matrix = output @ taylor_terms(generator, flow.width_s)
 
     def first_exit(
         self, z: Vector, t_s: float, threshold: float, span_s: float, auxiliary: float
     ) -> DetectedEvent:
-        """Follow the loop as ``QuadraticEventDetector``; ``auxiliary`` is the integral."""
+        """As :meth:`EventDetector.first_exit`."""
         width_s, begin_s, cell = self._flow.width_s, 0.0, 0
 
         def excess(u: float) -> float:

@@ -160,7 +160,7 @@ def test_an_envelope_is_not_exceeded_between_dwell_time_and_event() -> None:
             left, right = condition.sides(time_s * 1e9, x, e_s)
             assert left <= right * (1 + 1e-9) + 1e-12
             compared += 1
-    assert compared > 500
+    assert compared > 300
 
 
 @pytest.mark.parametrize("sigma", [0.02, 0.2])
