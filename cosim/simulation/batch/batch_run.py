@@ -82,6 +82,7 @@ def run_many(batch: Batch, squares: QuadraticCurves | None, rows: Any) -> None:
     for run in range(len(rows)):
         renew(batch.network, batch.draws.keys, run, batch.system.first_delivered)
         prepare(batch, run)
+        begin_row(rows[run])
         follow(batch, squares, run, rows[run])
 
 
@@ -162,15 +163,12 @@ def follow(batch: Batch, squares: QuadraticCurves | None, run: int, row: Any) ->
     system, space, n = batch.system, batch.space, batch.n
     x0, nothing = load(batch.draws.x0, run * len(n), n), filled(0.0, n)
     settled, farthest_s = system.settle * size_of(x0), farthest(batch, squares)
-    auxiliary, first_degree = 0.0, 1
-    if squares is not None:
-        auxiliary, first_degree = squares.initial_dynamic_variable, 2
+    auxiliary, first_degree = start_of(squares)
     event = not system.known_start
     state = Models(nothing, nothing - x0, nothing) if event else Models(x0, nothing, nothing)
     t_s, last_s, first_s, status = 0.0, -1.0, 0.0, UNDECIDED
     above, fresh, looked, agree = size_of(x0) > settled, True, False, True
     span, point = Span(0.0, 0.0, 0.0, 0.0, 0.0, 0), 0
-    begin_row(row)
     for _ in range(_MOST_PIECES if farthest_s > 0.0 else 0):
         if event:
             if row.transmissions >= system.most_events or t_s <= last_s:
@@ -206,11 +204,10 @@ def follow(batch: Batch, squares: QuadraticCurves | None, run: int, row: Any) ->
         spent_s = found_s if event else window_s
         if squares is not None:
             auxiliary = dynamic_variable_at(squares, p, spent_s) * (now.scale * now.scale)
-        p = degree_for(space.reach_s, spent_s)
-        state = state_at(space, p, spent_s, n)
+        state = state_at(space, degree_for(space.reach_s, spent_s), spent_s, n)
         if not is_within(state, _LARGEST, threshold_after(phase, spent_s)):
             status = DIVERGED
-            t_s += passed_at(space, p, spent_s, _LARGEST, phase, n)
+            t_s += passed_at(space, spent_s, _LARGEST, phase, n)
             break
         bounded = agree and squares is None and phase.compares and not system.rule.integrates
         ceiling = ceiling_of(batch, phase, t_s, spent_s) if bounded else math.inf
@@ -244,16 +241,16 @@ def find_event(
         if phase.compares or len(squares.gain) > 0:
             degree = compare(squares, p, now.auxiliary / (now.scale * now.scale))
             if phase.compares:
-                search = Search(now.level, 2.0 * phase.rate_per_s, window_s)
+                search = Search(now.level, 2.0 * phase.rate_per_s, window_s, False)
                 found_s, point = first_event(squares, rule, degree, search, point, t_s)
                 return found_s, now.auxiliary, point
     elif rule.integrates:
         level = phase.threshold if phase.compares else math.inf
-        search = Search(level, phase.rate_per_s, window_s)
+        search = Search(level, phase.rate_per_s, window_s, False)
         found_s, integral = first_excess(space.error, p, search, now.auxiliary, batch.n)
         return found_s, integral, point
     elif phase.compares:
-        search = Search(phase.threshold, phase.rate_per_s, window_s)
+        search = Search(phase.threshold, phase.rate_per_s, window_s, False)
         found_s = first_exit(space.error, p, search, MOST_STEPS, batch.n)
         return found_s, now.auxiliary, point
     return NONE, now.auxiliary, point
@@ -330,6 +327,13 @@ def next_span(
     if batch.system.rule.forecasts:
         length = size_of(weighted(batch, x))
     return span_after(batch.system.rule, t_s, left, length)
+
+
+def start_of(squares: QuadraticCurves | None) -> tuple[float, int]:
+    """Return the auxiliary variable at the start, and the degree of the first estimate."""
+    if squares is not None:
+        return squares.initial_dynamic_variable, 2
+    return 0.0, 1
 
 
 def farthest(batch: Batch, squares: QuadraticCurves | None) -> float:

@@ -54,7 +54,7 @@ class Search(NamedTuple):
     rate: float
     """r ≥ 0, per second; 0 if ``backward``."""
     end_s: float
-    backward: bool = False
+    backward: bool
     """Search y(``end_s`` − s) instead of y(s)."""
 
 

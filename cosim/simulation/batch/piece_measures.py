@@ -13,6 +13,7 @@ from cosim.simulation.batch.norm_crossing import NONE, UNRESOLVED, Search, first
 from cosim.simulation.batch.taylor import (
     Array,
     Models,
+    degree_for,
     largest,
     squared,
     state_at,
@@ -101,10 +102,10 @@ def raised(
         if best >= _LARGEST:
             return best
         level = max(best * (1.0 + CERTAINTY), _LEAST) / growth
-        s = first_exit(curve, p, Search(level, rate, end_s), _FEW_STEPS, n)
+        s = first_exit(curve, p, Search(level, rate, end_s, False), _FEW_STEPS, n)
         if s == UNRESOLVED:
             squared(curve, p, filled(1.0, n), squares, n)
-            s = first_root(squares, 2 * p, Search(level * level, 2.0 * rate, end_s), 0.0)
+            s = first_root(squares, 2 * p, Search(level * level, 2.0 * rate, end_s, False), 0.0)
         if s == NONE:
             return best
         if s == UNRESOLVED:
@@ -157,20 +158,17 @@ def last_above(curve: Array, p: int, end_s: float, level: float, ended: Lanes, n
     return last_entry(curve, p, level, end_s, n)
 
 
-def passed_at(
-    space: BatchMemory, p: int, end_s: float, limit: float, phase: Phase, n: Width
-) -> float:
+def passed_at(space: BatchMemory, end_s: float, limit: float, phase: Phase, n: Width) -> float:
     """Return the time on a piece at which the loop's norm exceeds a limit: by ``end_s``, it does.
 
     Args:
         space: has the coefficients of the piece.
-        p: the degree.
         end_s: a time at which a limit is exceeded.
         limit: limit of the norm, and of its ratio to the threshold if there is one.
         phase: of the threshold.
         n: number of states.
     """
-    low_s, high_s = 0.0, end_s
+    low_s, high_s, p = 0.0, end_s, degree_for(space.reach_s, end_s)
     for _ in range(_HALVINGS):
         s = 0.5 * (low_s + high_s)
         level = phase.threshold * math.exp(-phase.rate_per_s * s)
