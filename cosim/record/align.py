@@ -223,24 +223,14 @@ def join_all(record: RunRecord) -> AlignedRun:
 
 
 class IdentityResidual:
-    """Evaluates (I1) along a run, by batches of measurements.
-
-    Args:
-        scenario: the resolved scenario, without acknowledgements: (I1) assumes that x_s is
-            reset at every event.
-    """
+    """Evaluates (I1) along a run without acknowledgements, by batches of measurements."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
         self._missed = ModelDifference(loop_of(scenario).H)
 
     def of(self, measurements: Rows, joined: AlignedRun) -> Reals:
-        """Return the largest entry of |x_c − x_s − Σ e^{H(t−t_k)} e_s(t_k⁻)| by measurement, (k,).
-
-        Args:
-            measurements: the next rows of ``sensor_measurement``.
-            joined: the same rows, aligned.
-        """
+        """Return max |x_c − x_s − Σ e^{H(t−t_k)} e_s(t_k⁻)| at the next measurements, (k,)."""
         missed = self._missed
         residual = np.full(len(measurements), np.nan)
         common = in_common(self._scenario, joined)

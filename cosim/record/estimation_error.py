@@ -15,12 +15,7 @@ Reals = NDArray[np.float64]
 
 
 def true_states(steps: Rows, t_ns: NDArray[np.int64]) -> Reals:
-    """Return the plant's own state at some times, (k, n); NaN if its row is missing.
-
-    Args:
-        steps: rows of ``plant_step``, ordered.
-        t_ns: (k,) times of measurements.
-    """
+    """Return the plant's own state at some times, (k, n); NaN if its row is missing."""
     found = np.full((len(t_ns), steps["x"].shape[1]), np.nan)
     if len(steps):
         place = np.searchsorted(steps["t_ns"], t_ns).clip(max=len(steps) - 1)

@@ -140,12 +140,7 @@ def run_batch(setting: Setting, population: Population) -> NDArray[np.void]:
 
 
 def run_events(setting: Setting, population: Population) -> Events:
-    """Run one draw and return its events; raises the errors of :func:`run_batch`.
-
-    Args:
-        setting: the shared settings.
-        population: a population of one run.
-    """
+    """Run one draw and return its events; raises the errors of :func:`run_batch`."""
     if len(population.A) != 1:
         raise ValueError(f"one run is wanted, not {len(population.A)}")
     rows, log = _run(setting, population, setting.most_events)

@@ -69,13 +69,9 @@ class Span(NamedTuple):
 
 
 def span_after(rule: Rule, t_s: float, left: float, size: float) -> Span:
-    """Return the rule's span after an event or after the start.
+    """Return the rule's span after an event or after the start at ``t_s``.
 
-    Args:
-        rule: the rule.
-        t_s: time of the event.
-        left: ‖P z‖ just after the event; used if the rule is ``from_event``.
-        size: ‖x‖_W; used if the rule has a forecast.
+    ``left`` is ‖P z‖ just after it (for rules ``from_event``), ``size`` ‖x‖_W (for forecasts).
     """
     level, since_s, due_ns, point = rule.level, 0.0, rule.longest_ns, 0
     if rule.from_event:

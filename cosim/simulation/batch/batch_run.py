@@ -273,16 +273,7 @@ def begin_row(row: Any) -> None:
 
 
 def finish_row(row: Any, status: int, t_s: float, span_s: float, above: bool, norm: float) -> None:
-    """Complete a row.
-
-    Args:
-        row: the row, with its sums and extremes up to ``t_s``.
-        status: how the run ended.
-        t_s: end of the run.
-        span_s: time from the first event to the last.
-        above: whether ‖x‖ is above the settling level at the end.
-        norm: ‖x‖ at the end.
-    """
+    """Complete a row."""
     gaps, finished = row.transmissions - 1, status == OK
     row.inter_event_min_s = row.inter_event_min_s if gaps > 0 else math.nan
     row.inter_event_mean_s = span_s / gaps if gaps > 0 else math.nan
@@ -363,12 +354,6 @@ def first_window(
 
 def measure_piece(batch: Batch, row: Any, end: Models, piece: Piece) -> float:
     """Add a piece's contribution to a row.
-
-    Args:
-        batch: the batch; its memory contains the coefficients of the piece.
-        row: the row, with its sums and extremes up to the piece.
-        end: the state at the end of the piece.
-        piece: the piece.
 
     Returns:
         The last time on the piece at which ‖x‖ is above the settling level; NONE; or UNRESOLVED.

@@ -39,13 +39,6 @@ def first_excess(
 ) -> tuple[float, float]:
     """Return the first time at which the integral exceeds the level of a search.
 
-    Args:
-        curve: coefficients of y.
-        p: the degree.
-        search: the search; its level is infinite to compute only the integral.
-        integral: its value at the start of the piece.
-        n: number of entries of y.
-
     Returns:
         The time in seconds from the start of the piece, NONE or UNRESOLVED; and the integral at
         that time, or at the end.

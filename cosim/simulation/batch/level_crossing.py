@@ -42,14 +42,7 @@ _NEARER = 0.6
 
 
 def first_root(g: Array, degree: int, search: Search, grain: float) -> float:
-    """Return the first s in [0, ``end_s``) from which g(s) ≥ c e^{−rs}, NONE or UNRESOLVED.
-
-    Args:
-        g: coefficients g_k.
-        degree: the highest k.
-        search: the search; c may be 0.
-        grain: bound on the rounding error of h(0).
-    """
+    """Return the first s in [0, ``end_s``) from which g(s) ≥ c e^{−rs}, NONE or UNRESOLVED."""
     rate, end_s = search.rate, search.end_s
     s, ahead_s = 0.0, end_s
     most = bend_of(g, degree, end_s)
@@ -85,14 +78,7 @@ def first_root(g: Array, degree: int, search: Search, grain: float) -> float:
 
 
 def safe_step(value: float, slope: float, most: float, span: float) -> float:
-    """Return φ's positive root, given φ(0) ≤ 0, or ``span`` if that is smaller.
-
-    Args:
-        value: φ(0) = h(s).
-        slope: ḣ(s).
-        most: b.
-        span: a − s.
-    """
+    """Return φ's positive root, given φ(0) ≤ 0, or ``span`` if that is smaller."""
     if value + span * (slope + 0.5 * most * span) <= 0.0:
         return span
     root = math.sqrt(slope * slope - 2.0 * most * value)

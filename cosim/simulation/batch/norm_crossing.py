@@ -23,6 +23,9 @@ result is UNRESOLVED. A chord of φ lies above φ, so Newton's method may stop a
 step is then shorter and equally safe. Where h increases, Newton's method takes at most
 NEWTON_STEPS; then its bracket is bisected to the last bit.
 
+In all functions ``curve`` has the coefficients of y, p is its degree, n the number of its entries;
+``most``, ``limit`` and ``span`` are b, c_s and a − s.
+
 This module compares |y| only. Other quadratic event functions are in
 :mod:`cosim.simulation.batch.quadratic_crossing`.
 """
@@ -74,15 +77,7 @@ def level_at(search: Search, s: float) -> float:
 
 
 def first_exit(curve: Array, p: int, search: Search, most_steps: int, n: Width) -> float:
-    """Return the first s in [0, ``end_s``) from which |y(s)| ≥ c e^{−rs}, NONE or UNRESOLVED.
-
-    Args:
-        curve: coefficients of y.
-        p: the degree.
-        search: the search.
-        most_steps: largest number of steps.
-        n: number of entries of y.
-    """
+    """Return the first s in [0, ``end_s``) from which |y(s)| ≥ c e^{−rs}, NONE or UNRESOLVED."""
     rate, end_s, backward = search.rate, search.end_s, search.backward
     s, ahead_s = 0.0, end_s
     most = bend(curve, p, end_s, n)
@@ -124,17 +119,7 @@ def first_exit(curve: Array, p: int, search: Search, most_steps: int, n: Width) 
 def safe(
     square: float, mixed: float, speed: float, limit: float, rate: float, most: float, span: float
 ) -> float:
-    """Return the length of a step that skips no crossing; ``span`` if there is none within it.
-
-    Args:
-        square: |y|².
-        mixed: y·ẏ.
-        speed: |ẏ|².
-        limit: c_s.
-        rate: r.
-        most: b.
-        span: a − s.
-    """
+    """Return the length of a step that skips no crossing; ``span`` if there is none within it."""
     length, below = span, limit - math.sqrt(square)
     above = 0.0
     for _ in range(NEWTON_STEPS):
@@ -157,16 +142,7 @@ def safe(
 def ascent(
     curve: Array, p: int, search: Search, start: Point, ahead_s: float, n: Width | None
 ) -> float:
-    """Return the root of an increasing h in (``start.s``, ``ahead_s``), or NONE.
-
-    Args:
-        curve: coefficients of y, or of a scalar polynomial.
-        p: the degree.
-        search: the search.
-        start: a point where h is negative.
-        ahead_s: a.
-        n: number of entries of y; None for a scalar polynomial.
-    """
+    """Return the root of an increasing h in (``start.s``, ``ahead_s``), or NONE."""
     s, excess, slope = start.s, start.excess, start.slope
     low_s, high_s, beyond = s, ahead_s, False
     for turn in range(TURNS):
@@ -188,14 +164,9 @@ def ascent(
 
 
 def bracketed(following: float, turn: int, low_s: float, high_s: float, beyond: bool) -> float:
-    """Return Newton's next point if it is in the bracket and within NEWTON_STEPS, else a safe one.
+    """Return Newton's point ``following`` if it is in the bracket, else a safe one.
 
-    Args:
-        following: Newton's next point.
-        turn: number of earlier points.
-        low_s: a point below the root, if there is a root.
-        high_s: a point above the root if ``beyond``, else the end of the interval.
-        beyond: whether there is a root below ``high_s``.
+    ``low_s`` is below the root, if there is one; there is one below ``high_s`` if ``beyond``.
     """
     if turn < NEWTON_STEPS and low_s < following < high_s:
         return following

@@ -87,16 +87,6 @@ def raised(
     one level, such as an oscillation, is searched again as the scalar |y|², in which cancelling
     terms vanish (:mod:`cosim.simulation.batch.level_crossing`). The result is UNRESOLVED if this
     search fails too, or if there are too many rises.
-
-    Args:
-        best: the largest value so far.
-        curve: coefficients of y.
-        p: the degree.
-        end_s: end of the interval.
-        rate: per second.
-        growth: a factor.
-        squares: scratch, 2p + 1 numbers.
-        n: number of entries of y.
     """
     for _ in range(_RISES):
         if best >= _LARGEST:
@@ -140,16 +130,7 @@ def _climbed(curve: Array, p: int, low_s: float, high_s: float, rate: float, n: 
 
 
 def last_above(curve: Array, p: int, end_s: float, level: float, ended: Lanes, n: Width) -> float:
-    """Return the last s in [0, ``end_s``] at which |y(s)| > ``level``, NONE or UNRESOLVED.
-
-    Args:
-        curve: coefficients of y.
-        p: the degree.
-        end_s: end of the interval.
-        level: the level.
-        ended: y(``end_s``).
-        n: number of entries of y.
-    """
+    """Return the last s in [0, ``end_s``] at which |y(s)| > ``level``, NONE or UNRESOLVED."""
     square = level * level
     if dot(ended, ended) > square:
         return end_s
@@ -159,15 +140,7 @@ def last_above(curve: Array, p: int, end_s: float, level: float, ended: Lanes, n
 
 
 def passed_at(space: BatchMemory, end_s: float, limit: float, phase: Phase, n: Width) -> float:
-    """Return the time on a piece at which the loop's norm exceeds a limit: by ``end_s``, it does.
-
-    Args:
-        space: has the coefficients of the piece.
-        end_s: a time at which a limit is exceeded.
-        limit: limit of the norm, and of its ratio to the threshold if there is one.
-        phase: of the threshold.
-        n: number of states.
-    """
+    """Return the time on a piece at which the loop's norm exceeds a limit, at most ``end_s``."""
     low_s, high_s, p = 0.0, end_s, degree_for(space.reach_s, end_s)
     for _ in range(_HALVINGS):
         s = 0.5 * (low_s + high_s)

@@ -64,12 +64,7 @@ class QuadraticCurves(NamedTuple):
 
 
 def squares_of(policy: Policy, n: int) -> QuadraticCurves | None:
-    """Return a policy's comparison; None if it has none or compares ‖W e_s‖ with a threshold.
-
-    Args:
-        policy: the policy.
-        n: number of states.
-    """
+    """Return a policy's comparison; None if it has none or compares ‖W e_s‖ with a threshold."""
     rule = policy.trigger_rule(n)
     form, dynamic_variable = rule.form, rule.dynamic_variable
     if not len(form.up):
@@ -128,11 +123,6 @@ def put(squares: QuadraticCurves, k: int, x: Lanes, e_s: Lanes, factor: float) -
 def compare(squares: QuadraticCurves, p: int, dynamic_variable: float) -> int:
     """Compute the comparison's coefficients from those of the state.
 
-    Args:
-        squares: the forms.
-        p: degree of the state's polynomial.
-        dynamic_variable: η at the start, divided by the square of the scale.
-
     Returns:
         The degree of the comparison.
     """
@@ -166,14 +156,7 @@ def left_side(squares: QuadraticCurves, x: Lanes) -> float:
 def first_look(
     squares: QuadraticCurves, level: float, rate: float, dynamic_variable: float
 ) -> float:
-    """Estimate the time of the next event from the first three coefficients of the state.
-
-    Args:
-        squares: the forms.
-        level: squared threshold, divided by the square of the scale.
-        rate: decay rate of ``level``, per second.
-        dynamic_variable: η, divided by the square of the scale.
-    """
+    """Estimate the time of the next event from the first three coefficients of the state."""
     compare(squares, 2, dynamic_variable)
     return estimate(squares.g, level, rate)
 
@@ -182,14 +165,6 @@ def first_event(
     squares: QuadraticCurves, rule: Rule, degree: int, search: Search, point: int, t_s: float
 ) -> tuple[float, int]:
     """Return the first time at which the comparison holds on a piece.
-
-    Args:
-        squares: the forms.
-        rule: the rule.
-        degree: degree of the comparison.
-        search: its level is the squared threshold divided by the square of the scale.
-        point: the next point of the grid, if there is a grid.
-        t_s: start of the piece.
 
     Returns:
         The time in seconds from the piece's start, NONE or UNRESOLVED; and the next point of the

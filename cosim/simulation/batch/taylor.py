@@ -61,14 +61,7 @@ class Models(NamedTuple):
 
 
 def powers(H: Array, at: int, table: Array, n: Width) -> None:
-    """Fill a table with H^k/k!, k = 0 … HIGHEST + 1, each matrix in column-major order.
-
-    Args:
-        H: array with the matrix in column-major order.
-        at: index in ``H`` at which the matrix starts.
-        table: receives (HIGHEST + 2) n² numbers.
-        n: number of states.
-    """
+    """Fill a table with H^k/k!, k = 0 … HIGHEST + 1, each matrix in column-major order."""
     size = len(n)
     for j in range(size):
         store(table, j * size, filled(0.0, n))
@@ -106,18 +99,7 @@ def reaches(
     H_k: Array, A_k: Array, X_k: Array, E: Array, sizes: Array, reach_s: Array,
     measured_s: Array, n: Width,
 ) -> None:  # fmt: skip
-    """Compute the time over which the polynomial of each degree in DEGREES is accurate.
-
-    Args:
-        H_k: table.
-        A_k: table.
-        X_k: table.
-        E: in column-major order.
-        sizes: scratch, (HIGHEST + 2,).
-        reach_s: receives the times in seconds, (len(DEGREES),); 0 where a table is not finite.
-        measured_s: receives the times for the measures, which allow a relative error of _MEASURED.
-        n: number of states.
-    """
+    """Compute the time over which the polynomial of each degree in DEGREES is accurate."""
     area = len(n) * len(n)
     widest = max(square_sum(A_k, area, n), square_sum(H_k, area, n))
     mismatch = square_sum(E, 0, n)

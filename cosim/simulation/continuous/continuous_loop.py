@@ -86,12 +86,7 @@ class Samples(NamedTuple):
 
 
 class ContinuousLoop:
-    """The loop in continuous time, under any policy.
-
-    Args:
-        loop: the matrices.
-        trigger: the event-triggering policy; its weight is W.
-    """
+    """The loop in continuous time, under any policy."""
 
     def __init__(self, loop: LoopMatrices, trigger: Policy) -> None:
         self.loop = loop

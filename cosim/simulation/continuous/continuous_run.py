@@ -49,9 +49,6 @@ class ContinuousRun:
     def at(self, t_s: Vector | Sequence[float]) -> Samples:
         """Return the loop at many times, right-continuous: at an event, the state after the reset.
 
-        Args:
-            t_s: times in [0, ``reached_s``], in ascending order, shape (k,).
-
         Raises:
             ValueError: a time is out of range, or the times are not in ascending order.
         """
