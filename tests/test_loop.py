@@ -1,7 +1,6 @@
 """Check the theory's identities and claims on the whole loop in virtual time."""
 
 import itertools
-import math
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -25,7 +24,6 @@ from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
     NO_SEQUENCE,
-    PLANT_STEP,
     SENSOR_MEASUREMENT,
     tables,
 )
@@ -256,42 +254,6 @@ def test_an_overtaken_update_is_discarded_and_counted_as_dropped(case: Case) -> 
     ]
     rejected = loop.decoders["controller"].rejected
     assert sum(rejected.values()) == rejected[Rejection.STALE]
-
-
-def test_a_linear_loop_without_losses_is_a_linear_recursion() -> None:
-    """The model is exact, so no event occurs; compare x(t_k) with the exact discretisation.
-
-    A scalar plant ẋ = x + u with u = −3 x_c; ticks coincide with the plant's steps. The plant
-    latches the input of tick k at step k + 1 and applies it from then on.
-    """
-    a, b, k, x0 = 1.0, 1.0, -3.0, 2.0
-    h = PERIOD_NS * 1e-9
-    plant = linear_plant(
-        np.array([[a]]), np.array([[b]]), np.array([x0]), horizon_ns=STEPS * PERIOD_NS
-    )
-    H = np.array([[a + b * k]])
-    sensor = Sensor(H, DecayingTrigger(10.0, 1e-3), np.array([x0]))  # no event occurs
-    controller = Controller(
-        H,
-        LinearFeedback(np.array([[k]])),
-        inputs=1,
-        period_ns=PERIOD_NS,
-        phase_ns=0,
-        horizon_ns=STEPS * PERIOD_NS,
-        mansd=0,
-        x0=np.array([x0]),
-    )
-    loop = Loop(plant, sensor, controller, 1, 1, lambda data, now_ns: 0)
-    for _ in loop.run():
-        pass
-    found = [row["x"].item() for row in loop.rows[PLANT_STEP]]
-    x, u, expected = x0, 0.0, []
-    for step in range(STEPS + 1):
-        expected.append(x)
-        x = math.exp(a * h) * x + math.expm1(a * h) / a * b * u
-        u = k * x0 * math.exp((a + b * k) * step * h)
-    np.testing.assert_allclose(found, expected, rtol=1e-12)
-    assert loop.rows[CONTROLLER_DELIVERY] == []
 
 
 def papers_example(mode: str) -> RunRecord:

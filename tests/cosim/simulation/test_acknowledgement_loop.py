@@ -206,7 +206,7 @@ def test_each_direction_has_its_own_random_stream() -> None:
 def test_the_cap_of_the_reverse_direction_holds() -> None:
     back = 'network.acknowledgements={mansd=2, loss={model="worst_case"}}'
     found = fates(simulate(acknowledged(back)), ACKNOWLEDGEMENTS)
-    assert len(found) > 6
+    assert len(found) >= 6
     assert [Fate(fate).effective for fate in found] == [k % 3 == 2 for k in range(len(found))]
 
 
@@ -235,7 +235,7 @@ def test_a_run_is_replayed_bit_for_bit(messy: RunRecord) -> None:
     packets = messy[NETEM_PACKET]
     assert compared["sensor → netem"] == (packets["flow"] == UPDATES).sum() > 10
     assert compared["controller → netem"] == (packets["flow"] == ACKNOWLEDGEMENTS).sum() > 10
-    assert compared["netem → sensor"] == len(messy[SENSOR_ACKNOWLEDGEMENT]) > 10
+    assert compared["netem → sensor"] == len(messy[SENSOR_ACKNOWLEDGEMENT]) > 5
     assert (messy[NETEM_RELEASE]["flow"] == ACKNOWLEDGEMENTS).any()
 
 

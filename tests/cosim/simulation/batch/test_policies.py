@@ -97,6 +97,13 @@ POLICIES: dict[str, Make] = {
         DwellTrigger(dynamic(*given), 300 * MS), 100 * MS
     ),
 }
+NORM_OR_TIME = (
+    "absolute", "periodic", "self_triggered", "deadline of decaying", "dwell of decaying",
+    "dwell of deadline of self_triggered",
+)  # fmt: skip
+"""Policies that run in the same compiled code as the paper's policy."""
+SIZES = {True: (4, 2), False: (2, 1)}
+"""Numbers of states and inputs for these and for the other policies: each is compiled anew."""
 MOST_EVENTS = 500
 
 
@@ -105,7 +112,7 @@ def settings(name: str, seeds: range) -> list[tuple[Setting, Population]]:
     made = []
     for seed in seeds:
         rng = np.random.default_rng([seed, *name.encode()])
-        n, m = 2, 1  # the sizes of test_batch.py, which are compiled already
+        n, m = SIZES[name in NORM_OR_TIME]
         setting = random_setting(rng, n, m)
         policy = POLICIES[name](rng, n, setting.trigger.weight)
         if name == "lyapunov":  # After a lost update, the next event follows at once.
@@ -149,17 +156,24 @@ def turning(sigma: float, omega: float, alpha: float) -> tuple[Setting, Populati
 
 
 def known_loop(H: Matrix, trigger: Policy, horizon_s: float, **more: Any) -> Setting:
-    """A loop of two states without feedback and losses, from a known state."""
+    """A loop without feedback and losses, from a known state."""
     return Setting(
-        H=H, K=np.zeros((1, 2)), trigger=trigger, link=LinkSettings(), horizon_s=horizon_s,
-        known_start=True, **more,
+        H=H, K=np.zeros((len(H) // 2, len(H))), trigger=trigger, link=LinkSettings(),
+        horizon_s=horizon_s, known_start=True, **more,
     )  # fmt: skip
 
 
 def draw_of(A: Matrix) -> Population:
     """A plant with ‖x(0)‖ = 1."""
-    start = np.array([[0.6, 0.8]])
-    return Population(A[None], np.ones((1, 2, 1)), start, np.zeros(1, np.uint64))
+    n = len(A)
+    start = np.array([[0.6, 0.8, *[0.0] * (n - 2)]])
+    return Population(A[None], np.ones((1, n, n // 2)), start, np.zeros(1, np.uint64))
+
+
+def rotation(omega: float) -> Matrix:
+    turn = np.zeros((4, 4))
+    turn[0, 1], turn[1, 0] = omega, -omega
+    return turn
 
 
 @pytest.mark.parametrize("alpha_omega", [0.1, 70.0])
@@ -199,17 +213,16 @@ def test_runs_diverge_at_the_same_time_as_in_the_exact_simulator(name: str) -> N
 
 def test_an_oscillation_close_to_a_level_is_decided() -> None:
     """x rotates and no update arrives: ‖e_c‖ is constantly 1, just below the level 1 + 1e-10."""
-    turn = np.array([[0.0, 100.0], [-100.0, 0.0]])
     lost = LinkSettings(impairments=(LossOf(loss=WorstCaseLoss()),), mansd=None)
-    quiet = known_loop(np.zeros((2, 2)), PeriodicTrigger(1000 * MS), 20.0)
-    (row,) = run_batch(replace(quiet, link=lost, known_start=False), draw_of(turn))
+    quiet = known_loop(np.zeros((4, 4)), PeriodicTrigger(1000 * MS), 20.0)
+    (row,) = run_batch(replace(quiet, link=lost, known_start=False), draw_of(rotation(100.0)))
     assert row["status"] == OK
     assert row["sup_e_c_scaled"] == pytest.approx(1.0, rel=1e-9)
 
 
 def test_a_norm_that_stays_within_rounding_of_a_level_is_undecided() -> None:
     """x rotates with ‖x‖ = 1; the comparison with 1 + 1e-13 takes a million evaluations."""
-    turn = np.array([[0.0, 3.0], [-3.0, 0.0]])
+    turn = rotation(3.0)
     setting = known_loop(turn, AbsoluteTrigger(1.0), 4.0, settle=1 + 1e-13)
     (row,) = run_batch(setting, draw_of(turn))
     assert row["status"] == UNDECIDED
@@ -222,6 +235,6 @@ def test_a_norm_that_stays_within_rounding_of_a_level_is_undecided() -> None:
 @pytest.mark.parametrize("rate_per_s", [1e11, 1e17])
 def test_a_plant_too_fast_for_the_clock_is_undecided(rate_per_s: float) -> None:
     """Polynomials of 1e-10 s take too many steps; a float cannot represent steps of 1e-16 s."""
-    fast = -rate_per_s * np.eye(2)
+    fast = -rate_per_s * np.eye(4)
     (row,) = run_batch(known_loop(fast, PeriodicTrigger(1000 * MS), 4.0), draw_of(fast))
     assert row["status"] == UNDECIDED
