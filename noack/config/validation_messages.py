@@ -244,7 +244,11 @@ def _purpose(section: type[BaseModel] | None, key: str) -> str:
     """Return the purpose of a missing key."""
     field = section.model_fields.get(key) if section is not None else None
     inner = _section_of(field.annotation) if field is not None else None
-    text = (inner.__doc__ if inner is not None else field.description if field else None) or ""
+    if inner is not None:
+        text = inner.__doc__ or ""
+    else:
+        known = section is not None and issubclass(section, ScenarioSection)
+        text = section.key_descriptions().get(key, "") if known else ""
     purpose = " ".join(text.split("\n\n")[0].split()).rstrip(".")
     if purpose[1:2].islower() or purpose.startswith("A "):  # a word, not M or UDP
         purpose = purpose[0].lower() + purpose[1:]
