@@ -25,9 +25,7 @@ _PATIENCE_S = 60.0
 def matrices_as_npz(content: bytes, most_entries: int) -> bytes:
     """Return the matrices of a ``.mat`` file as the content of a ``.npz`` file.
 
-    Args:
-        content: of the file.
-        most_entries: arrays with more entries are left out, as are arrays that are not numeric.
+    Arrays with more than ``most_entries``, and arrays that are not numeric, are left out.
 
     Raises:
         NotImplementedError: the file has the format of MATLAB's v7.3.

@@ -60,11 +60,7 @@ def settings_bytes(settings: Mapping[str, Any]) -> bytes:
 
 
 def settings_of(data: bytes) -> dict[str, Any]:
-    """Read settings from the record.
-
-    Raises:
-        ValueError: the data are not settings.
-    """
+    """Read settings from the record; raise ValueError if the data are not settings."""
     found = json.loads(data.rstrip(b"\0"))
     if not isinstance(found, dict):
         raise ValueError("a change is a table of keys and values")
@@ -73,10 +69,6 @@ def settings_of(data: bytes) -> dict[str, Any]:
 
 def changed(scenario: Scenario, settings: Mapping[str, Any]) -> Scenario:
     """Return a scenario with other settings, validated as a whole.
-
-    Args:
-        scenario: the scenario.
-        settings: values by keys.
 
     Raises:
         CallerError: one line per mistake.
@@ -136,11 +128,7 @@ class FixedMachine:
     """Base of machines with constant settings: those of the acknowledgement baseline."""
 
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
-        """Refuse the announcement of a change.
-
-        Raises:
-            CallerError: always.
-        """
+        """Refuse the announcement of a change by a CallerError."""
         raise CallerError(f"nothing can be changed here during a run: {text_of(change.settings)}")
 
 
@@ -159,9 +147,7 @@ class AppliedParameters(NamedTuple):
 class ChangeSchedule:
     """The scenarios of a run in the order of time, as announced to a machine.
 
-    Args:
-        scenario: the resolved scenario at the start of the run.
-        prepare: computes the data that the machine needs of a scenario, before it is in force.
+    ``prepare`` computes the data that the machine needs of a scenario, before it is in force.
     """
 
     def __init__(

@@ -127,11 +127,7 @@ def loop_of(resolved: Scenario) -> LoopMatrices:
 
 
 def policy_of(resolved: Scenario) -> Policy:
-    """Return the trigger policy of a resolved scenario.
-
-    Raises:
-        CallerError: the policy cannot be used with the scenario's model.
-    """
+    """Return a resolved scenario's trigger policy; raise CallerError if its model excludes it."""
     model = resolved.model
     matrices = ModelMatrices(np.array(model.A), np.array(model.B), np.array(model.gain))
     return resolved.trigger.trigger_policy(matrices)

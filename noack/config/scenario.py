@@ -104,11 +104,7 @@ class Scenario(ScenarioSection):
 
     @property
     def decaying(self) -> DecayingSettings:
-        """Return the trigger, if it is the paper's.
-
-        Raises:
-            CallerError: it is another policy.
-        """
+        """Return the trigger, if it is the paper's; raise CallerError for another policy."""
         if not isinstance(self.trigger, DecayingSettings):
             raise CallerError(
                 f'trigger.policy: needs the paper\'s trigger, "decaying"; '

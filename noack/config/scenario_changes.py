@@ -33,10 +33,6 @@ def with_settings(scenario: "Scenario", settings: Mapping[str, Any]) -> "Scenari
 
     Only the parts that change are validated: the processes of a run do this in their loop.
 
-    Args:
-        scenario: the scenario.
-        settings: values by keys.
-
     Raises:
         ValueError: a key is not a runtime parameter, or the scenario would be invalid.
     """
@@ -68,10 +64,6 @@ def with_settings(scenario: "Scenario", settings: Mapping[str, Any]) -> "Scenari
 def content_with_settings(scenario: "Scenario", settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the content of a scenario with other values of its runtime parameters, unchecked.
 
-    Args:
-        scenario: the scenario.
-        settings: values by keys.
-
     Raises:
         ValueError: a key is not a runtime parameter.
     """
@@ -82,11 +74,7 @@ def content_with_settings(scenario: "Scenario", settings: Mapping[str, Any]) -> 
 
 
 def check_changes(scenario: "Scenario") -> None:
-    """Check the changes that a scenario schedules: their order, times and settings.
-
-    Raises:
-        ValueError: a change is not possible.
-    """
+    """Raise ValueError if a scheduled change is not possible, or the changes are not in order."""
     for (place, one), (_, other) in pairwise(enumerate(scenario.changes)):
         if other.at_s < one.at_s:
             raise ValueError(f"changes.{place + 1}.at_s: earlier than the change before it")

@@ -15,11 +15,7 @@ if TYPE_CHECKING:
 
 
 def check_sections(scenario: "Scenario") -> None:
-    """Check the sections of a scenario against each other.
-
-    Raises:
-        ValueError: two sections do not fit together; the message begins with the key.
-    """
+    """Raise ValueError if two sections do not fit together; the message begins with the key."""
     timing = scenario.timing
     if timing.horizon_ns < timing.plant_period_ns:
         raise ValueError(
@@ -35,21 +31,13 @@ def check_sections(scenario: "Scenario") -> None:
 
 
 def check_trigger(scenario: "Scenario") -> None:
-    """Check the trigger against the model's dimensions and the measurement period.
-
-    Raises:
-        ValueError: they do not fit together.
-    """
+    """Raise ValueError unless the trigger fits the model's dimensions and measurement period."""
     scenario.trigger.check(scenario.model.dimensions[0], _dimensions(scenario))
     scenario.trigger.check_period(scenario.timing.measurement_period_ns)
 
 
 def check_setpoint(scenario: "Scenario") -> None:
-    """Check that an input exists at which the model rests at the set point.
-
-    Raises:
-        ValueError: there is none, or another setting excludes a set point.
-    """
+    """Raise ValueError unless the model can rest at the set point and other settings allow one."""
     key, setpoint = "controller.setpoint", scenario.controller.setpoint
     require_length(setpoint, key, scenario.model.dimensions[0], "one per state")
     if setpoint is None:

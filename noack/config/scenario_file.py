@@ -46,12 +46,9 @@ def load(
 
 
 def completed(content: Mapping[str, Any], path: Path, source: str | None = None) -> Scenario:
-    """Validate parsed content and read the files that it names.
+    """Validate parsed content and read the files that it names, relative to the scenario file.
 
-    Args:
-        content: of a scenario file.
-        path: of the scenario file; relative names in the content are relative to its folder.
-        source: names the content in error messages; by default the path.
+    ``source`` names the content in error messages; by default it is the path.
 
     Raises:
         CallerError: one line per mistake.
@@ -62,11 +59,7 @@ def completed(content: Mapping[str, Any], path: Path, source: str | None = None)
 
 
 def validate(content: Mapping[str, Any], source: str) -> Scenario:
-    """Validate parsed content; ``source`` names it in error messages.
-
-    Raises:
-        CallerError: one line per mistake.
-    """
+    """Validate parsed content; raise CallerError with one line per mistake, named by ``source``."""
     return toml_file.validated(Scenario, content, source)
 
 
@@ -107,13 +100,7 @@ def json_schema() -> dict[str, Any]:
 
 
 def _attributed(lines: str, path: Path, keys: Sequence[str]) -> str:
-    """Name ``--set`` if a key that was set is wrong, or if the file without it is valid.
-
-    Args:
-        lines: mistakes of a file with settings.
-        path: of the file.
-        keys: the keys that were set.
-    """
+    """Name ``--set`` if a key that was set is wrong, or if the file without it is valid."""
     try:
         completed(toml_file.read(path), path)
         alone = True
@@ -168,13 +155,7 @@ def value_of(text: str, source: str) -> Any:
 
 
 def put(content: dict[str, Any], key: str, value: Any, source: str) -> None:
-    """Set the value of a key, whose parts are separated by dots; missing tables are created.
-
-    Args:
-        content: of a scenario file, changed in place.
-        key: e.g. ``trigger.beta``.
-        value: as parsed from TOML.
-        source: names the setting in error messages.
+    """Set the value of a key such as ``trigger.beta``; missing tables are created.
 
     Raises:
         CallerError: a part of the key is a value, not a table; or the key has too many parts.

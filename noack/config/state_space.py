@@ -75,12 +75,7 @@ def save_model(path: str | Path, system: Any, gain: Any = None) -> None:
 def matrices_of(system: Any, gain: Any = None) -> dict[str, Matrix]:
     """Return the matrices of a system by name: A, (n, n), B, (n, m), and the gain if given, (m, n).
 
-    Args:
-        system: as in :func:`model_of`.
-        gain: K of u = K x, (m, n).
-
-    Raises:
-        CallerError: as in :func:`model_of`.
+    Arguments and errors are those of :func:`model_of`.
     """
     if isinstance(system, tuple):
         if len(system) not in (2, 4):

@@ -59,11 +59,7 @@ class TheoryCoverage:
         return None
 
     def require_unacknowledged(self) -> None:
-        """Check that updates are not acknowledged.
-
-        Raises:
-            CallerError: this is the acknowledgement baseline.
-        """
+        """Raise CallerError if updates are acknowledged."""
         if self.scenario.protocol.acknowledges:
             raise CallerError(
                 'network.protocol: needs the loop without acknowledgements, "none"; '
@@ -71,11 +67,7 @@ class TheoryCoverage:
             )
 
     def require_unchanging(self) -> None:
-        """Check that the settings stay the same and the set point is 0.
-
-        Raises:
-            CallerError: the settings change, or the set point is not 0.
-        """
+        """Raise CallerError if the settings change, or the set point is not 0."""
         if self.scenario.changes:
             raise CallerError(
                 "changes: needs settings that stay the same during the run; "
@@ -85,11 +77,7 @@ class TheoryCoverage:
             raise CallerError("controller.setpoint: needs the set point 0")
 
     def require_linear(self) -> None:
-        """Check that the plant is a linear system.
-
-        Raises:
-            CallerError: it is not.
-        """
+        """Raise CallerError if the plant is not linear."""
         if not self.is_linear:
             raise CallerError(
                 'plant.system.kind: needs a linear plant, "linear"; '
@@ -97,11 +85,7 @@ class TheoryCoverage:
             )
 
     def require_exact(self) -> None:
-        """Check that exact simulation covers the plant, controller, measurement and trigger.
-
-        Raises:
-            CallerError: it does not cover one of these.
-        """
+        """Raise CallerError if exact simulation does not cover the scenario."""
         self.require_linear()
         scenario = self.scenario
         if not scenario.controller.is_linear:

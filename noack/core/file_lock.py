@@ -12,15 +12,9 @@ class _Descriptor(Protocol):
 
 
 def lock(file: int | _Descriptor, *, shared: bool = False, wait: bool = False) -> bool:
-    """Lock an open file or folder until it is closed.
+    """Lock an open file or folder until it is closed; return False if another process has the lock.
 
-    Args:
-        file: the file, or its descriptor.
-        shared: other processes may have shared locks at the same time.
-        wait: wait until other processes release their locks.
-
-    Returns:
-        False if another process has the lock and ``wait`` is false.
+    ``shared`` locks exclude only exclusive ones. With ``wait`` it waits for the other processes.
 
     Raises:
         OSError: the file system does not support locks.

@@ -8,13 +8,9 @@ from pathlib import Path
 def read_regular(path: Path, most_bytes: int) -> bytes:
     """Return the bytes of a regular file.
 
-    Args:
-        path: path of the file.
-        most_bytes: its maximum size.
-
     Raises:
         OSError: the file cannot be opened or read.
-        ValueError: the file is a device, a FIFO or a directory, or it is too large.
+        ValueError: it is a device, a FIFO or a directory, or it is larger than ``most_bytes``.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # so that a FIFO does not block
     try:

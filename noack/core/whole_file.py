@@ -7,12 +7,9 @@ from noack.core.errors import MachineError, why
 
 
 def write_whole(path: Path, content: str | bytes, remedy: str = "") -> Path:
-    """Write a file, or replace it, in one step; return its path.
+    """Write a file, or replace it, in one step; return its path. Missing folders are created.
 
-    Args:
-        path: path of the file; missing folders are created.
-        content: text, written as UTF-8, or bytes.
-        remedy: end of the error message if the file cannot be written.
+    Text is written as UTF-8. ``remedy`` ends the error message.
 
     Raises:
         MachineError: the file cannot be written.

@@ -240,13 +240,7 @@ OWNER: Mapping[str, str] = {table.name: table.owner for table in TABLES}
 
 
 def tables(n: int, m: int, **more: int) -> Mapping[str, np.dtype[np.void]]:
-    """Return the row types of the tables of a run with ``n`` states and ``m`` inputs.
-
-    Args:
-        n: number of states.
-        m: number of inputs.
-        more: other sizes, as in :class:`RecordShape`.
-    """
+    """Return the row types of a run's tables; ``more`` has other sizes of :class:`RecordShape`."""
     shape = RecordShape(n, m, **more)  # type: ignore[arg-type]
     return {
         table.name: np.dtype([*_fields((*COMMON, *table.columns), shape)])

@@ -130,12 +130,7 @@ class _Tagger:
 
 
 class Encoder:
-    """Turns messages into datagrams of one run.
-
-    Args:
-        run_id: the run, 0 ≤ run_id < 2⁶⁴.
-        key: the run's secret key, 32 bytes.
-    """
+    """Turns messages into datagrams of one run, under its secret key of 32 bytes."""
 
     def __init__(self, run_id: int, key: bytes) -> None:
         self._run_id = run_id
@@ -171,15 +166,8 @@ class Encoder:
 class Decoder:
     """Turns the datagrams of one flow into messages; all others are counted and rejected.
 
-    Only a datagram that is newer than every one accepted before is accepted.
-
-    Args:
-        flow: the flow that is expected.
-        dimension: entries of its vector.
-        run_id: the run.
-        key: the run's secret key, 32 bytes.
-        not_before_ns: older datagrams are stale: the process before a restart may have accepted
-            them.
+    Only a datagram that is newer than every one accepted before is accepted. A datagram from before
+    ``not_before_ns`` is stale: the process before a restart may have accepted it.
     """
 
     def __init__(
@@ -205,10 +193,7 @@ class Decoder:
     def decode(self, datagram: bytes, *, from_peer: bool = True) -> Message | None:
         """Return the message, or None when the datagram was rejected (see ``rejected``).
 
-        Args:
-            datagram: as received.
-            from_peer: whether it came from the peer's address; from any other source even an
-                authentic datagram is a replay.
+        From any source but the peer's address even an authentic datagram is a replay.
         """
         verdict = self._examine(datagram, from_peer=from_peer)
         if isinstance(verdict, Rejection):

@@ -195,11 +195,7 @@ M = TypeVar("M", bound=ControlMessage)
 
 
 def parse_message(kind: type[M], payload: bytes | str) -> dict[str, Any]:
-    """Return the fields of a message.
-
-    Raises:
-        PeerError: the payload is not a message of this kind.
-    """
+    """Return the fields of a message; raise PeerError if the payload is not one of this kind."""
     try:
         return kind.model_validate_json(payload).model_dump(exclude_unset=True)
     except ValidationError as error:

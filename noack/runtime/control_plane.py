@@ -33,12 +33,9 @@ def secret_of(ticket: Ticket) -> SessionSecret:
 
 
 class ControlPlane:
-    """One process's connection to the control plane of a run.
+    """The connection of a process (``role``) to the control plane of a run.
 
-    Args:
-        ticket: the run's ticket; every key lies below ``noack/RUN``.
-        role: this process.
-        listen: this is the coordinator.
+    Every key lies below ``noack/RUN``. With ``listen`` the process is the coordinator.
 
     Raises:
         NoAnswerError: the coordinator cannot be reached, or the endpoint cannot be listened on.
@@ -96,11 +93,9 @@ class ControlPlane:
         return self._stop_reason
 
     def coordinator_gone(self, *, for_s: float = 0.0) -> bool:
-        """Whether the coordinator's liveliness token has vanished.
+        """Whether the coordinator's liveliness token has vanished, for at least ``for_s`` seconds.
 
-        Args:
-            for_s: for at least how long, in seconds. On a busy machine a connection may break
-                because one end got no CPU time; it comes back by itself.
+        On a busy machine a connection may break because one end got no CPU time; it comes back.
         """
         while (life := self._coordinator.try_recv()) is not None:
             gone = life.kind == zenoh.SampleKind.DELETE
@@ -184,17 +179,11 @@ class ControlPlane:
         timeout_s: float,
         give_up: Callable[[], bool] = lambda: False,
     ) -> bytes:
-        """Send a request to the queryable ``what/ROLE`` and return the answer.
+        """Send a request (as JSON) to the queryable ``what/ROLE`` and return the answer.
 
         The request is sent again while the queryable does not exist, and every five seconds: an
         interrupted connection may lose request or answer. So the answering side must accept a
-        request twice.
-
-        Args:
-            what: name of the queryable.
-            content: sent as JSON.
-            timeout_s: how long to wait for an answer.
-            give_up: ends the wait early when it returns true.
+        request twice. The wait ends early when ``give_up()`` is true.
 
         Raises:
             NoAnswerError: no answer came.

@@ -14,7 +14,7 @@ def quiet_interrupt() -> Iterator[None]:
     """End the process on SIGINT with exit status 130 and no traceback, while the context lasts.
 
     A ``KeyboardInterrupt`` would be printed from within the imports, or caught there. A handler
-    set by another program is kept.
+    that another program has set is not replaced.
     """
     usual = signal.default_int_handler
     if threading.current_thread() is not threading.main_thread() or (

@@ -74,11 +74,7 @@ def new_ticket(scenario: Scenario, endpoint: str, run_dir: Path, *, launched: bo
 
 
 def loads(text: str) -> Ticket:
-    """Parse a ticket.
-
-    Raises:
-        CallerError: the text is not a ticket.
-    """
+    """Parse a ticket; raise CallerError if the text is not one."""
     try:
         fields = _Fields.model_validate_json(text)
     except ValidationError as error:
@@ -87,20 +83,16 @@ def loads(text: str) -> Ticket:
 
 
 def ticket_path(session: str) -> Path:
-    """Path of the ticket of a session, for processes started by hand.
-
-    Raises:
-        CallerError: the name is not fit for a file.
-    """
+    """Return the path of a session's ticket; raise CallerError for an unfit name."""
     require_name(session, "session")
     return private_folder() / f"{session}.json"
 
 
 @contextmanager
 def published(ticket: Ticket, session: str) -> Iterator[Path]:
-    """Keep the ticket in its file, readable by its owner only, while the context lasts.
+    """Publish the ticket in a file that only its owner can read, while the context lasts.
 
-    The file is locked: of several runs of one session name, one succeeds.
+    The file is locked: if several runs use a session's name, one succeeds.
 
     Raises:
         CallerError: the folder is not the user's own, or another run is open in the session.

@@ -122,12 +122,7 @@ TRANSITIONS: Mapping[State, Mapping[Event, State]] = {
 
 
 class LifeCycle:
-    """State of one process, as one side of the control plane knows it.
-
-    Args:
-        role: the process.
-        side: which side keeps this object.
-    """
+    """State of one process (``role``), as one side of the control plane knows it."""
 
     def __init__(self, role: str, side: Side) -> None:
         self.role = role
@@ -139,11 +134,7 @@ class LifeCycle:
         """Why it stops or has ended; the first reason stays."""
 
     def apply(self, event: Event, reason: str | None = None) -> None:
-        """Enter the next state.
-
-        Args:
-            event: what happened.
-            reason: why, of STOP and END.
+        """Enter the next state; ``reason`` says why, for STOP and END.
 
         Raises:
             CallerError: this side caused an event that the state does not allow.

@@ -28,12 +28,9 @@ class LockFile(NamedTuple):
 
 @contextmanager
 def lock_file(kind: str, name: str, content: Mapping[str, object]) -> Iterator[Path]:
-    """Keep a lock file while the context lasts.
+    """Keep a lock file with this content, as JSON, while the context lasts.
 
-    Args:
-        kind: folder in the runtime directory; "" for the directory itself.
-        name: of the file, without suffix.
-        content: the file's content, as JSON.
+    It is in the folder ``kind`` of the runtime directory; "" is the directory itself.
 
     Raises:
         CallerError: the folder cannot be made, or is not the user's own.

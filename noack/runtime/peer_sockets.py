@@ -29,12 +29,8 @@ _MOST_CALM_INTERVALS = 1200
 def open_beside(endpoint: socket.socket, peers: Iterable[Address]) -> tuple[socket.socket, ...]:
     """Open a socket for each peer on the address of ``endpoint``, connected to the peer.
 
-    Args:
-        endpoint: a bound UDP socket; it still receives from all other sources.
-        peers: addresses of the peers.
-
-    Returns:
-        The sockets, non-blocking, in the order of the peers; none if the system cannot do that.
+    ``endpoint`` is a bound UDP socket; it still receives from all other sources. The sockets do not
+    block and have the order of the peers. There are none if the system does not support it.
     """
     if sys.platform != "linux":
         return ()
@@ -88,8 +84,7 @@ class FloodWatch:
     def next_interval(self, dropped: int) -> str | None:
         """Begin the next interval; return a log line about the last one, if there is any.
 
-        Args:
-            dropped: how many the kernel has dropped so far.
+        ``dropped`` is the number of datagrams that the kernel has dropped so far.
         """
         before, self._dropped = self._dropped, dropped
         came = self._allowed - self.left + dropped - before

@@ -72,14 +72,7 @@ OpenChannel = Callable[[socket.socket, Mapping[str, Address]], ReportingChannel[
 
 
 class RunProcess:
-    """A process of a run.
-
-    Args:
-        role: which process.
-        ticket: the run's ticket.
-        plane: its connection to the control plane.
-        signals: the signals it has received.
-    """
+    """A process of a run."""
 
     def __init__(self, role: str, ticket: Ticket, plane: ControlPlane, signals: Signals) -> None:
         self.role = role
@@ -115,8 +108,7 @@ class RunProcess:
     def join(self, address: Address | None) -> Mapping[str, Address]:
         """Wait at the start barrier; return all addresses. Sets the common epoch.
 
-        Args:
-            address: where this process receives; None for the recorder, which is not in the loop.
+        ``address`` is None for the recorder, which is not in the loop.
 
         Raises:
             PeerError: the run never started.
@@ -181,10 +173,6 @@ class RunProcess:
 
     def run(self, machine: Machine[T], open_channel: OpenChannel[T]) -> None:
         """Join, drive the machine to the horizon, hand over the remaining rows, and report.
-
-        Args:
-            machine: the pure machine.
-            open_channel: makes the machine's channel from a bound socket and all addresses.
 
         Raises:
             CallerError: the process's port is taken.
@@ -291,7 +279,7 @@ class RunProcess:
     def _announce(
         self, machine: ReconfigurableMachine[Any] | None, now_ns: int, at_most: int | None
     ) -> Sequence[Record | Notice]:
-        """Pass announced changes on to the machine, at most a number of them."""
+        """Pass announced changes on to the machine."""
         if machine is None:
             return ()
         outputs: list[Record | Notice] = []

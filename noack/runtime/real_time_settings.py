@@ -25,13 +25,10 @@ _CPU_DMA_LATENCY = Path("/dev/cpu_dma_latency")
 def realtime(
     enabled: bool, fifo_priority: int, place: int | None = None
 ) -> Iterator[dict[str, str]]:
-    """Apply the real-time settings to the calling thread; undo them with the context.
+    """Apply the real-time settings to the calling thread, and undo them with the context.
 
-    Args:
-        enabled: whether to apply any.
-        fifo_priority: SCHED_FIFO priority.
-        place: the process's number along the loop; neighbours get different cores, so that a
-            process does not block the one that it wakes. None leaves the choice to the system.
+    Neighbours along the loop have consecutive numbers (``place``) and get different cores, so that
+    a process does not block the one that it wakes. None leaves the choice to the system.
 
     Yields:
         For each setting ``"applied"``, ``"not permitted: why"`` or ``"not requested"``.

@@ -58,11 +58,7 @@ def published(ticket: Ticket, session: str | None) -> Iterator[Path]:
 
 
 def find(session: str | None = None, run_dir: Path | None = None) -> OpenRun:
-    """Return the newest active run of this user.
-
-    Args:
-        session: only a run of this session.
-        run_dir: only the run with this run directory.
+    """Return the newest active run of this user, of this session or with this run directory.
 
     Raises:
         CallerError: no such run is active.

@@ -12,8 +12,7 @@ _KNOWN_SOURCES = 256
 class SourceCount:
     """Counts datagrams by source address, cheaply while the source stays the same.
 
-    Args:
-        peers: addresses that always have their own count; of others only the most frequent.
+    Peers always have a count of their own; of the other sources only the most frequent have one.
     """
 
     def __init__(self, peers: Iterable[Address] = ()) -> None:

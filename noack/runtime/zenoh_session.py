@@ -33,12 +33,7 @@ class SessionSecret(NamedTuple):
 
 
 def open_session(endpoint: str, secret: SessionSecret, *, listen: bool) -> zenoh.Session:
-    """Open a session.
-
-    Args:
-        endpoint: the listening address, e.g. ``tcp/127.0.0.1:7447``.
-        secret: required from all that connect.
-        listen: listen on the endpoint instead of connecting to it.
+    """Open a session that listens on the endpoint, or connects to it.
 
     Raises:
         zenoh.ZError: the endpoint cannot be listened on, or reached; or the secret is wrong.
@@ -68,10 +63,7 @@ def session_config(
 ) -> zenoh.Config:
     """Return the zenoh configuration of a listening or of a connecting session.
 
-    Args:
-        endpoint: the listening address.
-        listen: listen on the endpoint instead of connecting to it.
-        more: further zenoh settings by key.
+    ``more`` has further zenoh settings by key.
     """
     config = zenoh.Config()
     side, other = ("listen", "connect") if listen else ("connect", "listen")

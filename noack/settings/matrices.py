@@ -18,11 +18,7 @@ _LONGEST_SHOWN = 60
 
 
 def shape(rows: tuple[tuple[float, ...], ...], key: str) -> tuple[int, int]:
-    """Return (rows, columns) of a matrix given by rows.
-
-    Raises:
-        ValueError: the rows differ in length.
-    """
+    """Return (rows, columns) of a matrix; raise ValueError if its rows differ in length."""
     widths = {len(row) for row in rows}
     if len(widths) > 1:
         raise ValueError(f"{key}: all rows need the same length, found lengths {sorted(widths)}")
@@ -32,11 +28,7 @@ def shape(rows: tuple[tuple[float, ...], ...], key: str) -> tuple[int, int]:
 def require_shape(
     rows: tuple[tuple[float, ...], ...] | None, key: str, expected: tuple[int, int], why: str
 ) -> None:
-    """Check a matrix given by rows, if it is given.
-
-    Raises:
-        ValueError: it does not have the expected shape.
-    """
+    """Raise ValueError if a matrix is given and does not have the expected shape."""
     if rows is None:
         return
     found = shape(rows, key)
@@ -54,31 +46,19 @@ def _transposed(rows: Iterable[Iterable[float]]) -> str:
 
 
 def require_length(row: tuple[object, ...] | None, key: str, expected: int, why: str) -> None:
-    """Check a vector or a list of names, if it is given.
-
-    Raises:
-        ValueError: it does not have the expected length.
-    """
+    """Raise ValueError if a vector or list of names is given and does not have the expected length."""
     if row is not None and len(row) != expected:
         raise ValueError(f"{key}: expected {expected} entries ({why}), found {len(row)}")
 
 
 def require_non_negative(row: tuple[float, ...], key: str, what: str = "half-widths") -> None:
-    """Check that all entries of a vector are at least 0; ``what`` names them in the message.
-
-    Raises:
-        ValueError: an entry is negative.
-    """
+    """Raise ValueError if an entry of a vector is negative; ``what`` names the entries."""
     if any(entry < 0 for entry in row):
         raise ValueError(f"{key}: {what} cannot be negative")
 
 
 def require_squares(row: tuple[float, ...], key: str, what: str) -> None:
-    """Check the entries of a vector that will be squared: standard deviations, or noise bounds.
-
-    Raises:
-        ValueError: an entry is negative, or its square overflows.
-    """
+    """Raise ValueError if an entry is negative or its square overflows; ``what`` names the entries."""
     require_non_negative(row, key, what)
     if any(entry > _LARGEST for entry in row):
         raise ValueError(f"{key}: {what} can be {_LARGEST:g} at most")

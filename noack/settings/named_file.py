@@ -12,13 +12,9 @@ MOST_BYTES = 64 * 2**20
 
 
 class NamedFile:
-    """A file, and the setting that names it.
+    """A file, and the setting that names it; relative names are relative to ``folder``.
 
-    Args:
-        name: as in the setting.
-        folder: relative names are relative to it.
-        place: the table with the key ``file``, for messages, e.g. ``run.toml: network.loss``;
-            without it, messages name the file only.
+    Messages begin with ``place``, the table with the key ``file``, e.g. ``run.toml: network.loss``.
     """
 
     def __init__(self, name: str, folder: Path, place: str = "") -> None:
@@ -26,30 +22,18 @@ class NamedFile:
         self._named = f'{place}.file = "{name}"' if place else name
 
     def wrong(self, message: str) -> NoReturn:
-        """Refuse the file's content.
-
-        Raises:
-            CallerError: always.
-        """
+        """Refuse the file's content by a CallerError."""
         raise CallerError(f"{self._named}: {message}")
 
     def content(self) -> bytes:
-        """Return the file's bytes.
-
-        Raises:
-            CallerError: it cannot be read.
-        """
+        """Return the file's bytes; raise CallerError if it cannot be read."""
         try:
             return read_regular(self.path, MOST_BYTES)
         except (OSError, ValueError) as error:
             self._unreadable(error)
 
     def sha256(self) -> str:
-        """Return the SHA-256 of the file in hexadecimal digits.
-
-        Raises:
-            CallerError: it cannot be read.
-        """
+        """Return the SHA-256 of the file in hexadecimal; raise CallerError if it cannot be read."""
         try:
             if self.path.exists() and not self.path.is_file():
                 self.wrong("cannot be read: not a regular file")

@@ -47,12 +47,8 @@ class ClassSettings(FileSettings):
 def new_instance(settings: ClassSettings, place: str) -> tuple[Any, str]:
     """Return an instance of the class that loaded settings name, and a description of the class.
 
-    Args:
-        settings: of a loaded scenario.
-        place: the table, for messages, such as ``plant.system``.
-
     Raises:
-        CallerError: the file has changed, or is missing.
+        CallerError: the file has changed, or is missing; ``place`` names the table.
         Exception: anything that the user's code raises; :func:`failure_text` describes it.
     """
     made, description = _class(settings, place)

@@ -51,18 +51,13 @@ def with_tables(section: Table, tables: Mapping[str, BaseModel]) -> Table:
 
 
 def located(settings: Settings, folder: Path, place: str) -> Settings:
-    """Return settings with the absolute path of their file, and its SHA-256.
+    """Return settings with the absolute path of their file (relative to a folder), and its SHA-256.
 
-    If a SHA-256 is already given, it is kept and the file is not read: so the record of a run can
-    be read without the file.
-
-    Args:
-        settings: of a table; settings that name no file are returned unchanged.
-        folder: relative names are relative to it.
-        place: the table, for messages.
+    If a SHA-256 is already given, it is used and the file is not read: so the record of a run can
+    be read without the file. Settings that name no file are returned unchanged.
 
     Raises:
-        CallerError: the file does not exist, or cannot be read.
+        CallerError: the file does not exist, or cannot be read; ``place`` names the table.
     """
     if settings.file is None:
         return settings
@@ -73,10 +68,6 @@ def located(settings: Settings, folder: Path, place: str) -> Settings:
 
 def unchanged(settings: FileSettings, place: str) -> Path:
     """Return the path of the file that loaded settings name.
-
-    Args:
-        settings: with the file's SHA-256.
-        place: the table, for messages.
 
     Raises:
         CallerError: the file is missing, or has changed since the scenario was loaded.

@@ -113,13 +113,7 @@ class ModelSection(ScenarioSection):
 
 
 def instability(A: Matrix, B: Matrix, K: Matrix) -> str | None:
-    """Return why u = K x does not stabilise ẋ = A x + B u, with a remedy; None if it does.
-
-    Args:
-        A: (n, n), per second.
-        B: (n, m).
-        K: (m, n).
-    """
+    """Return why u = K x does not stabilise ẋ = A x + B u, with a remedy; None if it does."""
     loops = (_closed_loop(A, B, K), _closed_loop(A, B, -K))
     growth_per_s, opposite_per_s = (
         spectral_abscissa(loop) if np.isfinite(loop).all() else np.inf for loop in loops
