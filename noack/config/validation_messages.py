@@ -170,11 +170,8 @@ def _alternatives(kind: Any) -> list[Any]:
 
 def sections_of(kind: Any) -> list[type[ScenarioSection]]:
     """Return the tables that a value of an annotation may be."""
-    return [
-        one
-        for one in _alternatives(kind)
-        if isinstance(one, type) and issubclass(one, ScenarioSection)
-    ]
+    types = [one for one in _alternatives(kind) if isinstance(one, type)]
+    return [one for one in types if issubclass(one, ScenarioSection)]
 
 
 def _section_of(kind: Any) -> type[ScenarioSection] | None:

@@ -22,8 +22,8 @@ _CHUNK = struct.Struct("<QQ")
 class SpoolWriter:
     """Appends batches to files in ``folder``, which is created in the run directory.
 
-    The files are named after the ``writer``. The methods raise MachineError if the disk is full or a
-    file cannot be written.
+    The files are named after the ``writer``. The methods raise MachineError if the disk is full or
+    a file cannot be written.
     """
 
     def __init__(self, folder: Path, writer: str) -> None:

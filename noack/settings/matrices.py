@@ -46,7 +46,7 @@ def _transposed(rows: Iterable[Iterable[float]]) -> str:
 
 
 def require_length(row: tuple[object, ...] | None, key: str, expected: int, why: str) -> None:
-    """Raise ValueError if a vector or list of names is given and does not have the expected length."""
+    """Raise ValueError if a vector or list of names is given and has another length."""
     if row is not None and len(row) != expected:
         raise ValueError(f"{key}: expected {expected} entries ({why}), found {len(row)}")
 
@@ -58,7 +58,7 @@ def require_non_negative(row: tuple[float, ...], key: str, what: str = "half-wid
 
 
 def require_squares(row: tuple[float, ...], key: str, what: str) -> None:
-    """Raise ValueError if an entry is negative or its square overflows; ``what`` names the entries."""
+    """Raise ValueError if an entry is negative, or its square overflows."""
     require_non_negative(row, key, what)
     if any(entry > _LARGEST for entry in row):
         raise ValueError(f"{key}: {what} can be {_LARGEST:g} at most")
