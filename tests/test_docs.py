@@ -21,11 +21,9 @@ from cosim.studies.campaign.campaign_file import load as load_campaign
 from cosim.studies.campaign.campaign_grid import grid
 from cosim.studies.campaign.metrics import METRICS
 from netem.words.words_to_settings import KEYWORDS
-from noack.config.disturbances import AnyDisturbance
-from noack.config.observers import AnyObserver
+from noack.config.feature_kinds import POLICIES, AnyDisturbance, AnyObserver
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import json_schema, load
-from noack.config.triggers import POLICIES
 from noack.controllers.controller_settings import ControllerSettings
 from noack.impairments.disciplines import DISCIPLINES
 from noack.impairments.kinds import IMPAIRMENTS

@@ -9,8 +9,8 @@ from typing import Literal
 
 import numpy as np
 
+from noack.config.feature_kinds import AnyObserver
 from noack.config.named_models import NAMED_MODELS
-from noack.config.observers import AnyObserver
 from noack.config.scenario import Scenario
 from noack.config.sections.model_section import ModelSection
 from noack.config.setpoint import input_at

@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from noack.config.controllers import AnyController
+from noack.config.feature_kinds import AnyController, AnyTrigger
 from noack.config.runtime_parameters import LOSS, MANSD, put_settings, require_runtime_parameters
 from noack.config.scenario_checks import check_setpoint, check_trigger
 from noack.config.sections.network_section import NetworkSection
-from noack.config.triggers import AnyTrigger
 from noack.impairments.link_settings import Mansd, require_scores
 from noack.impairments.loss_models import Loss
 from noack.impairments.loss_models.trace import TraceLoss

@@ -4,7 +4,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from noack.config.disturbances import require_disturbances
 from noack.config.setpoint import input_at
 from noack.core.clock import NS_PER_S
 from noack.protocol.wire_format import MAX_DIMENSION
@@ -66,9 +65,20 @@ def _check_plant(scenario: "Scenario") -> None:
     for key in ("initial_state", "initial_state_halfwidth"):
         require_length(getattr(plant, key), f"plant.{key}", n, "one per state")
     plant.system.check(n, m)
-    linear = scenario.coverage.is_linear
-    require_disturbances(plant.disturbances, n, m, linear=linear)
+    _check_disturbances(scenario)
     plant.measurement.check(n, why)
+
+
+def _check_disturbances(scenario: "Scenario") -> None:
+    n, m = scenario.model.dimensions
+    for number, one in enumerate(scenario.plant.disturbances):
+        place = f"plant.disturbances.{number}"
+        if one.at == "state" and not scenario.coverage.is_linear:
+            raise ValueError(
+                f'{place}.at: "state" needs a linear plant; this one can be disturbed at "input"'
+            )
+        size, why = (m, "one per input") if one.at == "input" else (n, "one per state")
+        require_length(one.entries, f"{place}.{one.entries_key}", size, f'at = "{one.at}": {why}')
 
 
 def _check_observer(scenario: "Scenario") -> None:

@@ -13,7 +13,7 @@ from noack.config.matrix_files import with_matrices
 from noack.config.scenario import Scenario
 from noack.config.sections.network_section import AcknowledgementSection, NetworkSection
 from noack.core.errors import CallerError, printable, shortened
-from noack.settings.user_files import file_tables, located, with_tables
+from noack.settings.named_file import file_tables, located, with_tables
 
 _ENTRY = r"""[-+\w.]+|"[^"\\\n]*\""""
 _ROW = re.compile(rf"\[\n((?:\s*(?:{_ENTRY}),\n)+)\s*\]")

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from noack.config.validation_messages import explain
 from noack.core.errors import CallerError, printable
-from noack.core.regular_file import read_regular
+from noack.core.file_access import read_regular
 from noack.settings.section import ScenarioSection
 
 M = TypeVar("M", bound=ScenarioSection)

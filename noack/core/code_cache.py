@@ -19,7 +19,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from noack.core.file_lock import locked
+from noack.core.file_access import locked
 
 _ROOM_BYTES = 16 * 1024 * 1024
 _KEPT_S = 30 * 24 * 3600

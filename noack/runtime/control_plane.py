@@ -8,16 +8,19 @@ import hashlib
 import json
 import secrets
 import time
-from collections.abc import Callable
-from typing import Self
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from typing import Any, Self
 
 import zenoh
 from zenoh import CongestionControl, Priority
 from zenoh.handlers import FifoChannel, RingChannel
 
+from noack.config.parameter_changes import ParameterChange
 from noack.config.scenario import MOST_CHANGES
 from noack.core.errors import NoAnswerError, PeerError
 from noack.protocol.topology import COORDINATOR
+from noack.runtime.control_messages import ChangeAnnouncement, parse_message
 from noack.runtime.join_ticket import Ticket
 from noack.runtime.zenoh_session import SessionSecret, cause_of, open_session
 
@@ -214,3 +217,29 @@ class ControlPlane:
                     raise PeerError(reply.err.payload.to_bytes().decode(errors="replace"))
             time.sleep(0.02)
         raise NoAnswerError(f"no answer to {what!r} within {timeout_s:g} s")
+
+
+class ParameterUpdates:
+    """Announced changes that the process has not taken yet, each once and in order."""
+
+    def __init__(self, plane: ControlPlane) -> None:
+        self._plane = plane
+        self._waiting: list[dict[str, Any]] = []
+        self._next_number = 0
+
+    def extend(self, announcements: Iterable[dict[str, Any]]) -> None:
+        """Add the changes that were announced before this process joined."""
+        self._waiting.extend(announcements)
+
+    def take(self, at_most: int | None = None) -> list[tuple[ParameterChange, Mapping[str, Any]]]:
+        """Return waiting changes, at most a number of them, each with its announcement."""
+        while (message := self._plane.next_change()) is not None:
+            with suppress(PeerError):  # not from the coordinator
+                self._waiting.append(parse_message(ChangeAnnouncement, message))
+        taken: list[tuple[ParameterChange, Mapping[str, Any]]] = []
+        while self._waiting and (at_most is None or len(taken) < at_most):
+            one = self._waiting.pop(0)
+            if one["number"] >= self._next_number:  # a late process receives some twice
+                self._next_number = one["number"] + 1
+                taken.append((ParameterChange(one["number"], one["t_ns"], one["settings"]), one))
+        return taken

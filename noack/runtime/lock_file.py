@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from noack.core.file_lock import lock
+from noack.core.file_access import lock
 from noack.runtime.private_folder import PrivateFolder, open_private
 
 _SUFFIX = ".json"

@@ -32,10 +32,9 @@ from noack.protocol.wire_format import Decoder, Encoder, Flow, Message
 from noack.runtime.address import Address
 from noack.runtime.command_line import print_to_stderr
 from noack.runtime.control_messages import Admission, ControlMessage, RunStart, parse_message
-from noack.runtime.control_plane import ControlPlane
+from noack.runtime.control_plane import ControlPlane, ParameterUpdates
 from noack.runtime.join_ticket import Ticket
 from noack.runtime.life_cycle import HORIZON, LAUNCHER_GONE, Event, LifeCycle, Side, State
-from noack.runtime.parameter_updates import ParameterUpdates
 from noack.runtime.real_time_loop import Channel, run_loop
 from noack.runtime.real_time_settings import realtime
 from noack.runtime.record_handover import deliver_report, persisted_rows, spool_rows

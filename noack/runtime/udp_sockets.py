@@ -13,8 +13,7 @@ from noack.core.errors import CallerError
 from noack.protocol.machine_interface import Notice
 from noack.protocol.wire_format import MAX_DATAGRAM_BYTES, Decoder, Encoder, Flow, Message, flow_of
 from noack.runtime.address import Address, text_of
-from noack.runtime.peer_sockets import FloodWatch, open_beside
-from noack.runtime.unknown_sources import SourceCount
+from noack.runtime.peer_sockets import FloodWatch, SourceCount, open_beside
 
 LOOPBACK = "127.0.0.1"
 

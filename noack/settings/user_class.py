@@ -17,7 +17,7 @@ from pydantic import Field, FiniteFloat, model_validator
 from noack.core.errors import one_line
 from noack.core.linear_systems import Vector
 from noack.settings.matrices import Row, Rows
-from noack.settings.user_files import FileSettings, unchanged
+from noack.settings.named_file import FileSettings, unchanged
 
 _PACKAGES = ("noack", "plant_server", "sensor_node", "controller_node", "netem", "cosim")
 _ROOT = Path(__file__).parents[2]
