@@ -31,11 +31,8 @@ def with_matrices(content: Mapping[str, Any], folder: Path, source: str) -> Mapp
     """Return a scenario's content with the matrices of the files that it names.
 
     ``model.file`` gives A, B and, unless the scenario has one, the gain; ``plant.file`` gives A and
-    B. Names are relative to ``folder``. Invalid content is returned unchanged. ``source`` names the
-    content in error messages.
-
-    Raises:
-        CallerError: one line; a file cannot be read, or lacks a matrix.
+    B. Names are relative to ``folder``. Invalid content is returned unchanged. If a file cannot be
+    read or lacks a matrix, CallerError has one line, which begins with ``source``.
     """
     read = dict(content)
     for table, keys in (("model", ("A", "B", GAIN)), ("plant", ("A", "B"))):
@@ -47,7 +44,7 @@ def with_matrices(content: Mapping[str, Any], folder: Path, source: str) -> Mapp
 
 
 def _can_be_read(section: Mapping[str, Any]) -> bool:
-    """Whether a section names a file correctly; incorrect entries are refused by the validation."""
+    """Whether a section names a file correctly; the validation refuses incorrect entries."""
     names = section.get("names", {})
     return (
         isinstance(section.get("file"), str)

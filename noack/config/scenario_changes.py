@@ -30,10 +30,8 @@ _CHANGEABLE: Mapping[str, TypeAdapter[Any]] = {
 def with_settings(scenario: "Scenario", settings: Mapping[str, Any]) -> "Scenario":
     """Return a scenario with other values of its runtime parameters.
 
-    Only the parts that change are validated: the processes of a run do this in their loop.
-
-    Raises:
-        ValueError: a key is not a runtime parameter, or the scenario would be invalid.
+    Only the parts that change are validated: the processes of a run do this in their loop. Raise
+    ValueError if a key is not a runtime parameter, or the scenario would be invalid.
     """
     if scenario.protocol.acknowledges:
         raise ValueError('network.protocol: with "ack", nothing can be changed during a run')
@@ -61,10 +59,9 @@ def with_settings(scenario: "Scenario", settings: Mapping[str, Any]) -> "Scenari
 
 
 def content_with_settings(scenario: "Scenario", settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of a scenario with other values of its runtime parameters, unchecked.
+    """Return a scenario's content with other values of its runtime parameters, unchecked.
 
-    Raises:
-        ValueError: a key is not a runtime parameter.
+    Raise ValueError if a key is not a runtime parameter.
     """
     require_runtime_parameters(settings, scenario.trigger)
     content = scenario.model_dump(mode="json", exclude_none=True, exclude={"changes"})

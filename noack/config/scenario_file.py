@@ -48,10 +48,8 @@ def load(
 def completed(content: Mapping[str, Any], path: Path, source: str | None = None) -> Scenario:
     """Validate parsed content and read the files that it names, relative to the scenario file.
 
-    ``source`` names the content in error messages; by default it is the path.
-
-    Raises:
-        CallerError: one line per mistake.
+    ``source`` (by default the path) names the content in error messages: CallerError has one line
+    per mistake.
     """
     source = source or str(path)
     content = with_matrices(content, path.parent, source)
@@ -109,7 +107,7 @@ def _attributed(lines: str, path: Path, keys: Sequence[str]) -> str:
 
     names = [shortened(key) for key in keys]
 
-    def said_of(line: re.Match[str]) -> str:
+    def attributed(line: re.Match[str]) -> str:
         if any(re.match(rf"{re.escape(name)}[.:=\s]", line["rest"]) for name in names):
             return f"--set {line['rest']}"
         if not alone:
@@ -120,11 +118,10 @@ def _attributed(lines: str, path: Path, keys: Sequence[str]) -> str:
         return f"{line['file']} with --set {', '.join(nearest)}: {line['rest']}"
 
     file = re.escape(printable(str(path)))
-    return re.sub(rf"^(?P<file>{file}): (?P<rest>.*)", said_of, lines, flags=re.MULTILINE)
+    return re.sub(rf"^(?P<file>{file}): (?P<rest>.*)", attributed, lines, flags=re.MULTILINE)
 
 
 def _shared(one: Sequence[str], other: Sequence[str]) -> int:
-    """Return the number of equal parts at the beginning of two keys."""
     return sum(
         1 for _ in takewhile(lambda parts: parts[0] == parts[1], zip(one, other, strict=False))
     )
@@ -143,8 +140,7 @@ def _apply(content: dict[str, Any], override: str) -> str:
 def value_of(text: str, source: str) -> Any:
     """Return the value of a text on the command line; a bare word is a string.
 
-    Raises:
-        CallerError: the text is not a TOML value; ``source`` names it.
+    Raise CallerError if the text is not a TOML value; ``source`` names it.
     """
     try:
         return toml_file.parsed(f"value = {text}", source)["value"]

@@ -82,11 +82,7 @@ def parsed(text: str, source: str) -> dict[str, Any]:
 
 
 def validated(model: type[M], content: Mapping[str, Any], source: str) -> M:
-    """Validate parsed content; ``source`` names it in error messages.
-
-    Raises:
-        CallerError: one line per mistake, each with file, key, value and remedy.
-    """
+    """Validate parsed content; raise CallerError with one line per mistake, named by ``source``."""
     if _is_deeper(content, MOST_LEVELS):
         raise CallerError(f"{source}: {_TOO_DEEP}")
     try:
@@ -108,7 +104,6 @@ def json_schema(model: type[ScenarioSection]) -> dict[str, Any]:
 
 
 def _is_deeper(value: Any, levels: int) -> bool:
-    """Whether tables and lists are nested more than this number of levels deep."""
     if not isinstance(value, dict | list | tuple):
         return False
     inner = value.values() if isinstance(value, dict) else value
@@ -116,7 +111,6 @@ def _is_deeper(value: Any, levels: int) -> bool:
 
 
 def _missing(path: Path, model: type[ScenarioSection]) -> str:
-    """Return a message that the file does not exist, with files of the same kind in its folder."""
     needed = {name for name, field in model.model_fields.items() if field.is_required()}
     others = []
     for other in sorted(path.parent.glob("*.toml"))[:_MOST_LOOKED_AT]:

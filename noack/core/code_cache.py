@@ -52,8 +52,7 @@ def cache_folder(name: str, sources: Iterable[Path]) -> Path | None:
 def _make_own(folder: Path) -> None:
     """Create a folder, and missing folders above it, with access for the user only.
 
-    Raises:
-        PermissionError: another user may change the folder or a folder above it.
+    Raise PermissionError if another user may change the folder or a folder above it.
     """
     for level in (*reversed(folder.parents), folder):
         with suppress(FileExistsError):

@@ -14,10 +14,7 @@ from noack.core.errors import MachineError, why
 def write_whole(path: Path, content: str | bytes, remedy: str = "") -> Path:
     """Write a file, or replace it, in one step; return its path. Missing folders are created.
 
-    Text is written as UTF-8. ``remedy`` ends the error message.
-
-    Raises:
-        MachineError: the file cannot be written.
+    Text is written as UTF-8. ``remedy`` ends the message of a MachineError.
     """
     scratch = path.with_name(f".{path.name}.partial")
     try:
@@ -59,9 +56,7 @@ def lock(file: int | _Descriptor, *, shared: bool = False, wait: bool = False) -
     """Lock an open file or folder until it is closed; return False if another process has the lock.
 
     ``shared`` locks exclude only exclusive ones. With ``wait`` it waits for the other processes.
-
-    Raises:
-        OSError: the file system does not support locks.
+    Raise OSError if the file system does not support locks.
     """
     kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
     try:
@@ -73,10 +68,6 @@ def lock(file: int | _Descriptor, *, shared: bool = False, wait: bool = False) -
 
 @contextmanager
 def locked(path: Path, *, shared: bool = False, wait: bool = False) -> Iterator[bool]:
-    """Lock a file, which is created if missing, while the context lasts; yields :func:`lock`.
-
-    Raises:
-        OSError: the file cannot be opened or locked.
-    """
+    """Lock a file, which is created if missing, while the context lasts; yields :func:`lock`."""
     with path.open("a") as file:
         yield lock(file, shared=shared, wait=wait)

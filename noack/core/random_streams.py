@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 def stream(seed: int, *name: str) -> "np.random.Generator":
     """Return the random stream of this path, e.g. ``("netem", "update", "loss")``, under a seed.
 
-    Raises:
-        ValueError: ``seed`` is negative or ``name`` is empty.
+    Raise ValueError if the seed is negative or the path is empty.
     """
     return np.random.Generator(np.random.PCG64DXSM(_sequence(seed, name)))
 

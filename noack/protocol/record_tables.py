@@ -200,8 +200,8 @@ TABLES = (
     Table(CONTROLLER_STEP, "controller", "tick of the controller", (
         _MODEL_TIME,
         _state("x_c", "the model"),
-        _input("u", "K x_c, with a set-point K(x_c − x_r) + u_r; the safe input while the "
-               "controller has no state"),
+        _input("u", "the controller's output, by default K x_c, or K(x_c − x_r) + u_r with a set "
+               "point; the safe input while the controller has no state"),
     )),
     Table(NETEM_PACKET, "netem", "datagram received by the network emulator; `sequence` counts "
           "the datagrams of its flow", (

@@ -28,8 +28,6 @@ DEFAULT_SESSION = "default"
 
 
 class _Fields(ScenarioSection):
-    """A ticket as JSON."""
-
     run_id: Seed
     key: Annotated[str, Field(pattern=rf"^[0-9a-f]{{{2 * KEY_BYTES}}}$")]
     endpoint: str
@@ -92,10 +90,8 @@ def ticket_path(session: str) -> Path:
 def published(ticket: Ticket, session: str) -> Iterator[Path]:
     """Publish the ticket in a file that only its owner can read, while the context lasts.
 
-    The file is locked: if several runs use a session's name, one succeeds.
-
-    Raises:
-        CallerError: the folder is not the user's own, or another run is open in the session.
+    The file is locked: if several runs use a session's name, one succeeds. Raise CallerError if
+    another run is open in the session, or the folder is not the user's own.
     """
     path = ticket_path(session)
     with ExitStack() as stack:
@@ -113,9 +109,7 @@ def wait_for_ticket(
 ) -> Ticket:
     """Wait until a recorder or launcher has published the session's ticket, and return it.
 
-    Raises:
-        CallerError: the folder or the file is not the user's own.
-        PeerError: there was none in time.
+    Raise PeerError if there was none in time.
     """
     path = ticket_path(session)
     deadline_s = time.monotonic() + timeout_s

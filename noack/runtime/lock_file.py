@@ -53,11 +53,7 @@ def lock_file(kind: str, name: str, content: Mapping[str, object]) -> Iterator[P
 
 
 def live_lock_files(kind: str) -> list[LockFile]:
-    """Return the lock files of a kind whose process runs, by name.
-
-    Raises:
-        CallerError: the folder, or a file in it, is not the user's own.
-    """
+    """Return the lock files of a kind whose process runs, by name."""
     try:
         with open_private(*_inside(kind)) as folder:
             names = sorted(name for name in folder.names() if name.endswith(_SUFFIX))
@@ -71,7 +67,6 @@ def _inside(kind: str) -> tuple[str, ...]:
 
 
 def _put(folder: PrivateFolder, scratch: str, name: str) -> None:
-    """Give the file its name, unless a running process has a file of this name."""
     for attempt in range(2):
         try:
             folder.link(scratch, name)

@@ -77,10 +77,6 @@ class PrivateFolder:
         """Give a file a second name; raise FileExistsError if that exists."""
         os.link(name, other, src_dir_fd=self.descriptor, dst_dir_fd=self.descriptor)
 
-    def replace(self, name: str, other: str) -> None:
-        """Rename a file, replacing any of the other name."""
-        os.replace(name, other, src_dir_fd=self.descriptor, dst_dir_fd=self.descriptor)
-
     def remove(self, name: str) -> None:
         """Remove a file; raise FileNotFoundError if there is none."""
         os.unlink(name, dir_fd=self.descriptor)

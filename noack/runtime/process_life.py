@@ -93,9 +93,7 @@ class RunProcess:
     def request_admission(self) -> None:
         """Ask the coordinator for admission to the run.
 
-        Raises:
-            NoAnswerError: no answer came within ten seconds.
-            PeerError: the coordinator refused.
+        Raise NoAnswerError without an answer within ten seconds, PeerError if it refuses.
         """
         admission = self._request("admit", {}, Admission, _ADMISSION_TIMEOUT_S)
         self.life.apply(Event.ADMIT)
@@ -107,10 +105,8 @@ class RunProcess:
     def join(self, address: Address | None) -> Mapping[str, Address]:
         """Wait at the start barrier; return all addresses. Sets the common epoch.
 
-        ``address`` is None for the recorder, which is not in the loop.
-
-        Raises:
-            PeerError: the run never started.
+        ``address`` is None for the recorder, which is not in the loop. Raise PeerError if the run
+        never started.
         """
         self.life.apply(Event.JOIN)
         begin = self._request("join", {"address": address}, RunStart, _JOIN_TIMEOUT_S)
@@ -173,9 +169,7 @@ class RunProcess:
     def run(self, machine: Machine[T], open_channel: OpenChannel[T]) -> None:
         """Join, drive the machine to the horizon, hand over the remaining rows, and report.
 
-        Raises:
-            CallerError: the process's port is taken.
-            PeerError: the run never started.
+        Raise CallerError if the process's port is taken, PeerError if the run never started.
         """
         settings, port = self.scenario.realtime, getattr(self.scenario.ports, self.role)
         port = port if self._address is None else self._address[1]
@@ -278,7 +272,6 @@ class RunProcess:
     def _announce(
         self, machine: ReconfigurableMachine[Any] | None, now_ns: int, at_most: int | None
     ) -> Sequence[Record | Notice]:
-        """Pass announced changes on to the machine."""
         if machine is None:
             return ()
         outputs: list[Record | Notice] = []

@@ -46,11 +46,7 @@ def deliver_report(
 
 
 def spool_rows(run_dir: Path, role: str, writer: str, telemetry: TelemetryBuffer) -> None:
-    """Write all rows that the buffer still holds to the spool; ``writer`` names its files.
-
-    Raises:
-        MachineError: the spool cannot be written.
-    """
+    """Write all rows that the buffer still holds to the spool; ``writer`` names its files."""
     spool = SpoolWriter(run_dir / SPOOL, writer)
 
     def append(table: str, header: bytes, payload: bytes) -> None:

@@ -41,8 +41,7 @@ T = TypeVar("T")
 def bind(port: int, key: str, host: str = LOOPBACK) -> socket.socket:
     """Return a non-blocking UDP socket bound to ``host:port`` (port 0: any free one).
 
-    Raises:
-        CallerError: the port is taken or not permitted; ``key`` names the setting to change.
+    Raise CallerError, which names the setting ``key``, if the port is taken or not permitted.
     """
     endpoint = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:

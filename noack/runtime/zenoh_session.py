@@ -35,8 +35,7 @@ class SessionSecret(NamedTuple):
 def open_session(endpoint: str, secret: SessionSecret, *, listen: bool) -> zenoh.Session:
     """Open a session that listens on the endpoint, or connects to it.
 
-    Raises:
-        zenoh.ZError: the endpoint cannot be listened on, or reached; or the secret is wrong.
+    Raise zenoh.ZError if that fails, or the secret is wrong.
     """
     if not listen:
         shown = {f"transport/auth/usrpwd/{key}": value for key, value in secret._asdict().items()}
@@ -93,8 +92,7 @@ def session_config(
 def answer_to(session: zenoh.Session, key: str, question: str, timeout_s: float) -> str | None:
     """Send a request to the listening session and return its answer; None without one in time.
 
-    Raises:
-        CallerError: the request was refused as wrong.
+    Raise CallerError if the request was refused as wrong.
     """
     replies = session.get(key, FifoChannel(4), payload=question, timeout=timeout_s)
     deadline_s = time.monotonic() + timeout_s

@@ -95,10 +95,8 @@ def located(settings: Settings, folder: Path, place: str) -> Settings:
     """Return settings with the absolute path of their file (relative to a folder), and its SHA-256.
 
     If a SHA-256 is already given, it is used and the file is not read: so the record of a run can
-    be read without the file. Settings that name no file are returned unchanged.
-
-    Raises:
-        CallerError: the file does not exist, or cannot be read; ``place`` names the table.
+    be read without the file. Settings that name no file are returned unchanged. Raise CallerError
+    if the file cannot be read; ``place`` names the table.
     """
     if settings.file is None:
         return settings
@@ -108,11 +106,7 @@ def located(settings: Settings, folder: Path, place: str) -> Settings:
 
 
 def unchanged(settings: FileSettings, place: str) -> Path:
-    """Return the path of the file that loaded settings name.
-
-    Raises:
-        CallerError: the file is missing, or has changed since the scenario was loaded.
-    """
+    """Return the path of a loaded setting's file; raise CallerError if missing or changed."""
     file = NamedFile(settings.file or "", Path(), place)
     if (found := file.sha256()) != settings.sha256:
         file.wrong(
