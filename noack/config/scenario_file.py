@@ -92,11 +92,6 @@ def dumps(scenario: Scenario) -> str:
     return _ROW.sub(lambda row: f"[{', '.join(re.findall(_ENTRY, row[1]))}]", text)
 
 
-def json_schema() -> dict[str, Any]:
-    """Return the JSON Schema of scenario files, for editors."""
-    return toml_file.json_schema(Scenario)
-
-
 def _attributed(lines: str, path: Path, keys: Sequence[str]) -> str:
     """Name ``--set`` if a key that was set is wrong, or if the file without it is valid."""
     try:

@@ -137,7 +137,7 @@ class Encoder:
         self._tag = _Tagger(key)
 
     def encode(self, message: Message) -> bytes:
-        """Return the datagram of a message; raise ValueError if the vector or a number does not fit."""
+        """Return the datagram of a message; raise ValueError if a value does not fit."""
         vector = np.ascontiguousarray(message.vector, dtype="<f8")
         if message.flow is Flow.ACKNOWLEDGEMENT:
             if vector.size:
