@@ -2,7 +2,8 @@
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import takewhile
+from contextlib import suppress
+from os.path import commonprefix
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +63,6 @@ def validate(content: Mapping[str, Any], source: str) -> Scenario:
 
 
 def _with_files(scenario: Scenario, path: Path, source: str) -> Scenario:
-    """Replace file names by the files' content; they are relative to the scenario file."""
     network, place = scenario.network, f"{source}: network"
     update: dict[str, Any] = _read(network, path.parent, place)
     if (back := network.acknowledgements) is not None:
@@ -94,21 +94,20 @@ def dumps(scenario: Scenario) -> str:
 
 def _attributed(lines: str, path: Path, keys: Sequence[str]) -> str:
     """Name ``--set`` if a key that was set is wrong, or if the file without it is valid."""
-    try:
+    is_valid_alone = False
+    with suppress(CallerError):
         completed(toml_file.read(path), path)
-        alone = True
-    except CallerError:
-        alone = False
-
+        is_valid_alone = True
     names = [shortened(key) for key in keys]
 
     def attributed(line: re.Match[str]) -> str:
         if any(re.match(rf"{re.escape(name)}[.:=\s]", line["rest"]) for name in names):
             return f"--set {line['rest']}"
-        if not alone:
+        if not is_valid_alone:
             return line[0]
         place = re.split(r"[:\s]", line["rest"], maxsplit=1)[0].split(".")
-        shared = [_shared(place, key.split(".")) for key in keys]
+        # The number of equal parts at the beginning of two keys.
+        shared = [len(commonprefix([place, key.split(".")])) for key in keys]  # noqa: RUF071
         nearest = [name for name, parts in zip(names, shared, strict=True) if parts == max(shared)]
         return f"{line['file']} with --set {', '.join(nearest)}: {line['rest']}"
 
@@ -116,14 +115,7 @@ def _attributed(lines: str, path: Path, keys: Sequence[str]) -> str:
     return re.sub(rf"^(?P<file>{file}): (?P<rest>.*)", attributed, lines, flags=re.MULTILINE)
 
 
-def _shared(one: Sequence[str], other: Sequence[str]) -> int:
-    return sum(
-        1 for _ in takewhile(lambda parts: parts[0] == parts[1], zip(one, other, strict=False))
-    )
-
-
 def _apply(content: dict[str, Any], override: str) -> str:
-    """Put ``key=value`` into the content; return the key."""
     key, equals, text = override.partition("=")
     if not equals or not key.strip():
         shown = shortened(printable(override))

@@ -238,7 +238,6 @@ def _table_example(value: Any, at: _Place) -> str:
 
 
 def _purpose(section: type[ScenarioSection] | None, key: str) -> str:
-    """Return the purpose of a missing key."""
     field = section.model_fields.get(key) if section is not None else None
     inner = _section_of(field.annotation) if field is not None else None
     if inner is not None:

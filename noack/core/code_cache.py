@@ -99,7 +99,6 @@ def while_compiling(what: str, kept: bool, about_s: float | None = None) -> str:
 
 
 def _forget_old(folder: Path, name: str) -> None:
-    """Delete the code of other sources if it has not been used for 30 days."""
     os.utime(folder)
     for other in folder.parent.glob(f"{name}-*"):
         if other.stat().st_mtime < time.time() - _KEPT_S:

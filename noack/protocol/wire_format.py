@@ -190,13 +190,13 @@ class Decoder:
 
         From any source but the peer's address even an authentic datagram is a replay.
         """
-        verdict = self._examine(datagram, from_peer=from_peer)
-        if isinstance(verdict, Rejection):
-            self.rejected[verdict] += 1
+        examined = self._examine(datagram, from_peer=from_peer)
+        if isinstance(examined, Rejection):
+            self.rejected[examined] += 1
             return None
-        self._newest = verdict.sequence
+        self._newest = examined.sequence
         self.accepted += 1
-        return verdict
+        return examined
 
     def report(self) -> dict[str, object]:
         """Counters, for the run's summary."""

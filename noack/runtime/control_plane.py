@@ -22,7 +22,7 @@ from noack.core.errors import NoAnswerError, PeerError
 from noack.protocol.topology import COORDINATOR
 from noack.runtime.control_messages import ChangeAnnouncement, parse_message
 from noack.runtime.join_ticket import Ticket
-from noack.runtime.zenoh_session import SessionSecret, cause_of, open_session
+from noack.runtime.zenoh_session import SessionSecret, cause_of, first_reply, open_session
 
 _REQUEST_AGAIN_S = 5.0
 _POLL_S = 0.01
@@ -202,19 +202,12 @@ class ControlPlane:
                 payload=payload,
                 timeout=wait_s + _REQUEST_AGAIN_S,  # zenoh would report its own as an error answer
             )
-            again_s = time.monotonic() + wait_s
-            while not give_up() and time.monotonic() < again_s:
-                try:
-                    reply = replies.try_recv()
-                except zenoh.ZError:  # the query ended without an answer
-                    break
-                if reply is None:
-                    time.sleep(_POLL_S)
-                    continue
-                if reply.ok is not None:
-                    return reply.ok.payload.to_bytes()
-                if reply.err is not None:
-                    raise PeerError(reply.err.payload.to_bytes().decode(errors="replace"))
+            until_s = time.monotonic() + wait_s
+            reply = first_reply(replies, until_s, poll_s=_POLL_S, give_up=give_up)
+            if reply is not None and reply.ok is not None:
+                return reply.ok.payload.to_bytes()
+            if reply is not None and reply.err is not None:
+                raise PeerError(reply.err.payload.to_bytes().decode(errors="replace"))
             time.sleep(0.02)
         raise NoAnswerError(f"no answer to {what!r} within {timeout_s:g} s")
 

@@ -7,7 +7,7 @@ sent, and refuses all other connections.
 import json
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -95,18 +95,24 @@ def answer_to(session: zenoh.Session, key: str, question: str, timeout_s: float)
     Raise CallerError if the request was refused as wrong.
     """
     replies = session.get(key, FifoChannel(4), payload=question, timeout=timeout_s)
-    deadline_s = time.monotonic() + timeout_s
-    while time.monotonic() < deadline_s:
+    reply = first_reply(replies, time.monotonic() + timeout_s, poll_s=0.002)
+    if reply is not None and reply.err is not None:
+        raise CallerError(reply.err.payload.to_string())
+    return None if reply is None or reply.ok is None else reply.ok.payload.to_string()
+
+
+def first_reply(
+    replies: Any, until_s: float, *, poll_s: float, give_up: Callable[[], bool] = lambda: False
+) -> zenoh.Reply | None:
+    """Return the first reply before a reading of the monotonic clock; None without one."""
+    while time.monotonic() < until_s and not give_up():
         try:
-            reply = replies.try_recv()
+            reply: zenoh.Reply | None = replies.try_recv()
         except zenoh.ZError:  # the query ended without an answer
             return None
-        if reply is None:
-            time.sleep(0.002)
-        elif reply.ok is not None:
-            return reply.ok.payload.to_string()
-        elif reply.err is not None:
-            raise CallerError(reply.err.payload.to_string())
+        if reply is not None:
+            return reply
+        time.sleep(poll_s)
     return None
 
 

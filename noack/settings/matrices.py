@@ -6,6 +6,7 @@ from typing import Annotated
 
 from pydantic import Field, FiniteFloat
 
+from noack.core.linear_systems import Matrix
 from noack.protocol.wire_format import MAX_DIMENSION
 
 Row = Annotated[tuple[FiniteFloat, ...], Field(min_length=1, max_length=MAX_DIMENSION)]
@@ -15,6 +16,11 @@ Rows = Annotated[tuple[Row, ...], Field(min_length=1, max_length=MAX_DIMENSION)]
 
 _LARGEST = 1e100
 _LONGEST_SHOWN = 60
+
+
+def rows_of(matrix: Matrix) -> tuple[tuple[float, ...], ...]:
+    """Return a matrix by rows."""
+    return tuple(map(tuple, matrix.tolist()))
 
 
 def shape(rows: tuple[tuple[float, ...], ...], key: str) -> tuple[int, int]:
@@ -40,7 +46,6 @@ def require_shape(
 
 
 def _transposed(rows: Iterable[Iterable[float]]) -> str:
-    """Suggest the transposed matrix, written out if it is short."""
     other = json.dumps([list(column) for column in zip(*rows, strict=True)])
     return "; looks transposed" + (f": try {other}" if len(other) <= _LONGEST_SHOWN else "")
 
