@@ -2,6 +2,8 @@
 
 import ast
 import inspect
+import sys
+from functools import cache
 from itertools import pairwise
 from typing import Annotated, Any
 
@@ -29,15 +31,7 @@ class ScenarioSection(BaseModel):
         """
         found: dict[str, str] = {}
         for section in reversed(cls.__mro__[: cls.__mro__.index(ScenarioSection)]):
-            (tree,) = ast.parse(inspect.getsource(section)).body
-            assert isinstance(tree, ast.ClassDef)
-            for pair in pairwise(tree.body):
-                match pair:
-                    case (
-                        ast.AnnAssign(target=ast.Name(id=key)),
-                        ast.Expr(value=ast.Constant(value=str(text))),
-                    ):
-                        found[key] = inspect.cleandoc(text)
+            found |= _docstrings(section.__module__).get(section.__name__, {})
         return found
 
     @classmethod
@@ -51,3 +45,19 @@ class ScenarioSection(BaseModel):
         for key in properties.keys() & descriptions.keys():
             properties[key]["description"] = descriptions[key]
         return schema
+
+
+@cache
+def _docstrings(module: str) -> dict[str, dict[str, str]]:
+    """Return the docstrings of the attributes of a module's classes, by class."""
+    statements = ast.parse(inspect.getsource(sys.modules[module])).body
+    found: dict[str, dict[str, str]] = {}
+    for section in [one for one in statements if isinstance(one, ast.ClassDef)]:
+        for pair in pairwise(section.body):
+            match pair:
+                case (
+                    ast.AnnAssign(target=ast.Name(id=key)),
+                    ast.Expr(value=ast.Constant(value=str(text))),
+                ):
+                    found.setdefault(section.name, {})[key] = inspect.cleandoc(text)
+    return found
