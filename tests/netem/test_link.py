@@ -362,7 +362,7 @@ def test_every_datagram_is_counted_once(order: list[int], mansd: int | None) -> 
         of.delivered, of.dropped, of.forced, of.corrupted, of.overflowed, of.blacked_out,
     )  # fmt: skip
     assert list(counted) == [found.count(fate) for fate in Fate]
-    assert of.arrived == len(order)
+    assert of.received == len(order)
     assert of.forwarded == of.delivered + of.forced + of.corrupted + of.duplicated
 
 

@@ -5,8 +5,8 @@ import re
 import numpy as np
 import pytest
 
+from netem.cli.explain_links import settings_meaning
 from netem.link_machine import Link
-from netem.words.explanation import settings_meaning
 from netem.words.words_to_settings import settings_of
 
 DRAWS = 20_000
