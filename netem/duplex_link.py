@@ -7,6 +7,7 @@ its own settings, random streams and guarantee.
 from collections.abc import Sequence
 
 from netem.link_machine import Datagram, link_of, update_link_of
+from noack.config.parameter_changes import FixedMachine
 from noack.config.scenario import Scenario
 from noack.protocol.machine_interface import BEGINNING, Machine, Notice, Record, Start
 from noack.protocol.record_tables import ACKNOWLEDGEMENTS, UPDATES
@@ -15,7 +16,7 @@ ACKNOWLEDGEMENT_LINK = "acknowledgement"
 """Name of the link from controller to sensor; part of its random streams' names."""
 
 
-class Duplex:
+class Duplex(FixedMachine):
     """The machine of a network with a reverse direction.
 
     Args:

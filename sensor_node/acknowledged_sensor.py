@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from noack.config.parameter_changes import FixedMachine
 from noack.core.linear_systems import Matrix, Propagator, Vector, norm
 from noack.protocol.machine_interface import Output, Record
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_ACKNOWLEDGEMENT, SENSOR_MEASUREMENT
@@ -17,7 +18,7 @@ from noack.protocol.wire_format import Flow, Message
 from noack.trigger.trigger_policy import Policy, new_trigger
 
 
-class AcknowledgedSensor:
+class AcknowledgedSensor(FixedMachine):
     """The machine of the sensor node, if updates are acknowledged.
 
     Its time is the time of the measurements. An acknowledgement resets the model at the time of the

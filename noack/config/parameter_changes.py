@@ -121,6 +121,14 @@ class ReconfigurableMachine(Machine[T], Protocol[T]):
         ...
 
 
+class FixedMachine:
+    """Base of machines with constant settings: those of the acknowledgement baseline."""
+
+    def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
+        """Refuse the announcement of a change by a CallerError."""
+        raise CallerError(f"nothing can be changed here during a run: {text_of(change.settings)}")
+
+
 class AppliedParameters(NamedTuple):
     """A scenario, and the machine's own time from which it is in force."""
 

@@ -42,10 +42,12 @@ def model_of(
     """
     states = state_names or _labels(system, "state_labels")
     inputs = input_names or _labels(system, "input_labels")
-    matrices = {key: rows_of(value) for key, value in matrices_of(system, gain).items()}
+    matrices = matrices_of(system, gain)
     try:
         return ModelSection(
-            **matrices,
+            A=rows_of(matrices["A"]),
+            B=rows_of(matrices["B"]),
+            gain=rows_of(matrices[GAIN]),
             state_names=None if states is None else tuple(states),
             input_names=None if inputs is None else tuple(inputs),
         )

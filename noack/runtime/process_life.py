@@ -218,8 +218,7 @@ class RunProcess:
 
     def _drive(self, machine: Machine[T], channel: Channel[T], telemetry: TelemetryBuffer) -> int:
         """Run the loop; return the simulated time up to which the machine has done its work."""
-        is_changeable = self.role in CHANGEABLE and not self.scenario.protocol.acknowledges
-        changeable = cast(ReconfigurableMachine[T], machine) if is_changeable else None
+        changeable = cast(ReconfigurableMachine[T], machine) if self.role in CHANGEABLE else None
         limits = chain([None], repeat(_CHANGES_AT_ONCE))  # before the first step: all of them
         late_ns = run_loop(
             machine,
