@@ -77,7 +77,6 @@ class Certificates:
     """W of the trigger's norm, (n, n), if this call chose it; else None."""
 
     def __init__(self, scenario: Scenario, late_periods: int, weight: Matrix | None = None) -> None:
-        scenario.coverage.require_unacknowledged()
         scenario.coverage.require_unchanging()
         scenario.coverage.require_exact()
         self.scenario, self.weight = scenario, weight

@@ -5,7 +5,8 @@ from typing import Annotated
 import typer
 
 from cosim.cli import command as cli
-from noack.config.scenario_file import json_schema
+from noack.config.scenario import Scenario
+from noack.config.toml_file import json_schema
 from noack.core.errors import ExitStatus
 
 
@@ -34,5 +35,5 @@ def schema(
 
         cli.print_json(links_schema())
     else:
-        cli.print_json(json_schema())
+        cli.print_json(json_schema(Scenario))
     return ExitStatus.OK

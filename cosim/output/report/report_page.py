@@ -19,8 +19,8 @@ from cosim.output.run_verdict import BAD, GOOD, NEUTRAL, verdict
 from cosim.record.run_directory import ENVIRONMENT_FILE, REPORT_FILE, SCENARIO_FILE, read_object
 from cosim.record.run_record import RunRecord
 from noack.config.scenario import Scenario
+from noack.core.file_access import write_whole
 from noack.core.number_format import number, percent
-from noack.core.whole_file import write_whole
 
 _NONE = "–"
 _TONES = {
