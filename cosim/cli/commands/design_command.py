@@ -101,7 +101,7 @@ def design(
     """
     from cosim.live.progress import work_bar
     from cosim.studies.design import design_page as pages
-    from cosim.studies.design.design_run import design as designed
+    from cosim.studies.design.design_search import design as designed
     from cosim.studies.design.loop_families import families_of
 
     loaded = load(find_scenario(scenario), settings or ())
