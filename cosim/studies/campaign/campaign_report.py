@@ -20,8 +20,8 @@ from cosim.studies.campaign.campaign_summary import CampaignSummary
 from cosim.studies.campaign.chunk_store import RUNS, Store
 from cosim.studies.campaign.draw_statistics import Estimate
 from cosim.studies.campaign.metrics import METRICS
+from noack.core.file_access import write_whole
 from noack.core.number_format import plus_minus
-from noack.core.whole_file import write_whole
 
 PAGE, SUMMARY = "campaign.html", "summary.json"
 _NONE = "–"

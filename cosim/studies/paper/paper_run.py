@@ -20,7 +20,7 @@ from cosim.studies.paper.paper_figures import draw_figure, ensemble_figure
 from cosim.studies.paper.paper_page import render
 from cosim.studies.paper.paper_results import REPRESENTED, Results, dumps, results_of
 from noack.core.errors import CallerError, MachineError, why
-from noack.core.whole_file import write_whole
+from noack.core.file_access import write_whole
 
 PAGE, FIGURES, RESULTS = "paper.md", "figures", "paper.json"
 FEWEST_DRAWS = 4
