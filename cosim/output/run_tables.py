@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cosim.analysis.model_comparison import said
+from cosim.analysis.model_comparison import linearisation_rows
 from cosim.analysis.run_summary import Summary
 from cosim.output.assumptions_table import print_assumptions
 from cosim.output.fidelity_table import summary_rows
@@ -83,7 +83,7 @@ def key_numbers(summary: Summary) -> Numbers:
         *_restarts(summary.get("restarts")),
         *changes_in(summary),
         *_watchdog(summary.get("watchdog")),
-        *(said(found) if (found := summary.get("linearisation")) else ()),
+        *(linearisation_rows(found) if (found := summary.get("linearisation")) else ()),
         *_estimation(summary.get("estimation")),
         *_disturbances(summary.get("disturbances")),
         *_replay_rows(summary.get("replay")),

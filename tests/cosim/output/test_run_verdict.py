@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 
 import noack
-from cosim.analysis.run_outcome import Outcome
+from cosim.analysis.run_summary import Outcome
 from cosim.live.finalize import reopen
 from cosim.output.remarks import remarks
 from cosim.output.run_tables import short_numbers
