@@ -158,7 +158,6 @@ def study(resolved: Scenario, late_periods: int, weight: Matrix | None = None) -
         CallerError: its updates are acknowledged, its plant is nonlinear or disturbed, or its
             state is not measured exactly.
     """
-    resolved.coverage.require_unacknowledged()
     resolved.coverage.require_unchanging()
     resolved.coverage.require_exact()
     ideal, scheduled = ideal_conditions(resolved), nominal_conditions(resolved, late_periods)

@@ -22,8 +22,8 @@ from cosim.record.run_directory import DEFAULT_RUNS
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import dumps, load, value_of
 from noack.core.errors import CallerError, ExitStatus
+from noack.core.file_access import write_whole
 from noack.core.linear_systems import Matrix
-from noack.core.whole_file import write_whole
 
 if TYPE_CHECKING:
     from cosim.studies.design.candidate_measures import DesignLimits

@@ -5,7 +5,8 @@ from typing import Annotated
 import typer
 
 from cosim.cli.command import FILES, JsonOption, command, print_json
-from noack.config.scenario_file import json_schema
+from noack.config.scenario import Scenario
+from noack.config.toml_file import json_schema
 from noack.core.errors import ExitStatus
 
 
@@ -34,5 +35,5 @@ def schema(
 
         print_json(links_schema())
     else:
-        print_json(json_schema())
+        print_json(json_schema(Scenario))
     return ExitStatus.OK

@@ -11,7 +11,7 @@ from cosim.output.report.report_page import Embedded, page
 from cosim.output.report.run_figures import Envelope, run_figures
 from cosim.record.run_directory import ENVIRONMENT_FILE, REPORT_FILE, SCENARIO_FILE, read_object
 from cosim.record.run_record import RunRecord
-from noack.core.whole_file import write_whole
+from noack.core.file_access import write_whole
 
 
 def write_report(
