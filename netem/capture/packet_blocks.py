@@ -80,13 +80,7 @@ _PACKET = _text(", packet ")
 
 @_compiled
 def blocks_bytes(events: Events, data_bytes: int, interfaces: int) -> int:
-    """Return an upper bound on the bytes of the events' blocks, or −1 − i if event i is invalid.
-
-    Args:
-        events: shape (n,), of type :data:`netem.relay_events.EVENT`.
-        data_bytes: size of the batch's data.
-        interfaces: number of interfaces.
-    """
+    """Return an upper bound on the bytes of the events' blocks, or −1 − i if event i is invalid."""
     total = 0
     for i in range(events.size):
         event = events[i]
@@ -111,7 +105,7 @@ def put_blocks(events: Events, data: Bytes, missing: Counts, written: Counts, ou
     """Write the events' enhanced packet blocks into ``out`` and return their bytes.
 
     Args:
-        events: shape (n,), checked by :func:`blocks_bytes`.
+        events: (n,) of type :data:`netem.relay_events.EVENT`, checked by :func:`blocks_bytes`.
         data: the payloads.
         missing: (interfaces,) missing events before these; written in the next block, then reset.
         written: (interfaces,) number of written events; incremented.

@@ -13,7 +13,7 @@ from netem.control.control_server import ControlServer
 from netem.control.live_screen import Screen
 from netem.control.statistics_lines import statistics_lines
 from netem.control.statistics_thread import StatisticsThread
-from netem.engine.relay_interface import Relay
+from netem.engine.relay_base import Relay
 from noack.core.errors import CallerError
 
 _VIEW_S = 1.0
@@ -70,22 +70,17 @@ def options_of(parsed: argparse.Namespace) -> Options:
     return Options(parsed.control, stats_s, Path(file) if file is not None else None, parsed.view)
 
 
-class AttachedRelay:
-    """The relay thread's access to the threads that watch the relay.
+class AttachedRelay(NamedTuple):
+    """The relay thread's access to the threads that watch the relay."""
 
-    Args:
-        commands: to be run in the relay's thread, at least every 50 ms.
-        screen: the live screen, if there is one.
-    """
-
-    def __init__(self, commands: CommandQueue, screen: Screen | None) -> None:
-        self.commands = commands
-        self._screen = screen
+    commands: CommandQueue
+    """To be run in the relay's thread, at least every 50 ms."""
+    screen: Screen | None
 
     @property
     def quit_requested(self) -> bool:
         """Whether the user has pressed q on the live screen."""
-        return self._screen is not None and self._screen.quit_requested
+        return self.screen is not None and self.screen.quit_requested
 
 
 @contextmanager

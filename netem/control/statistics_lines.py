@@ -6,7 +6,6 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TextIO
 
 from netem.control.command_queue import CommandQueue
 from netem.control.emulator_statistics import Statistics
@@ -33,35 +32,22 @@ def statistics_lines(commands: CommandQueue, period_s: float, path: Path | None)
         file = sys.stdout if path is None else path.open("w")
     except OSError as error:
         raise CallerError(f"--stats-file {path}: cannot be written ({error.strerror})") from None
-    writer = _LineWriter(file, "standard output" if path is None else str(path))
+
+    def write(document: Statistics) -> None:
+        try:
+            file.write(json.dumps(document) + "\n")
+            file.flush()
+        except OSError as error:
+            name = "standard output" if path is None else path
+            say(f"statistics cannot be written to {name} ({error.strerror}); the relay continues")
+            # Also, closing the file writes the buffer once more; this must not fail.
+            nothing = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nothing, file.fileno())
+            os.close(nothing)
+
     try:
-        with StatisticsThread(commands, period_s, writer.write, at_end=True):
+        with StatisticsThread(commands, period_s, write, at_end=True):
             yield
     finally:
         if path is not None:
             file.close()
-
-
-class _LineWriter:
-    def __init__(self, file: TextIO, name: str) -> None:
-        self._file = file
-        self._name = name
-        self._failed = False
-
-    def write(self, document: Statistics) -> None:
-        """Write a line, unless an earlier one failed."""
-        if self._failed:
-            return
-        try:
-            self._file.write(json.dumps(document) + "\n")
-            self._file.flush()
-        except OSError as error:
-            self._failed = True
-            say(
-                f"statistics cannot be written to {self._name} ({error.strerror}); "
-                "the relay continues"
-            )
-            # Closing the file writes the buffer once more; this must not fail.
-            nothing = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nothing, self._file.fileno())
-            os.close(nothing)

@@ -221,9 +221,7 @@ _OPTIONAL = ("predicted", "p99", "forwarded")
 
 def _table(history: History, latest: Statistics, width: int, lines: int) -> RenderableType:
     """Return a table with a row for each direction that has received datagrams."""
-    rows = [
-        (link, name) for link in latest["links"] for name in DIRECTIONS if link[name]["arrived"]
-    ]
+    rows = _used(latest)
     shown = rows[:lines]
     names = [f" {'→' if name == 'forward' else '←'} {link['name']}" for link, name in shown]
     name_width = min(max(map(len, names), default=0), width // 3)

@@ -3,18 +3,18 @@
 import json
 import os
 import pty
-import subprocess
 import sys
 import termios
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
-from netem.control import emulator_commands
+from netem.control import control_client, emulator_commands
 from netem.control.command_queue import CommandQueue
 from netem.control.control_server import ControlServer
+from netem.control.live_screen import Screen
 from netem.words.words_to_settings import settings_of
 from noack.core.errors import ExitStatus
 from tests.netem.control.processes import read_until
@@ -127,59 +127,65 @@ def test_with_several_emulators_a_name_is_required(
     assert other.settings["x", "forward"] == settings_of("loss 5%")
 
 
-@contextmanager
-def watching(stdout: int, stdin: int) -> Iterator[subprocess.Popen[bytes]]:
-    with subprocess.Popen(
-        [sys.executable, "-m", "netem", "watch", "lab"],
-        env=os.environ | {"TERM": "xterm-256color"},
-        stdin=stdin,
-        stdout=stdout,
-        stderr=subprocess.PIPE,
-    ) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
-
-
 def test_watch_prints_lines_to_a_pipe_until_its_reader_closes_it(
-    relay: FakeRelay, server: ControlServer
+    relay: FakeRelay, server: ControlServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     relay.counters["up", "forward"].arrived = 7
-    with watching(subprocess.PIPE, subprocess.DEVNULL) as process:
-        assert process.stdout is not None
-        assert process.stderr is not None
-        assert all("  up forward  " in process.stdout.readline().decode() for _ in range(2))
-        process.stdout.close()
-        assert process.wait(60) == ExitStatus.OK
-        assert process.stderr.read() == b""
+    end, pipe = os.pipe()
+    lines: list[str] = []
+
+    def read_two() -> None:
+        with os.fdopen(end) as reader:
+            lines.extend(reader.readline() for _ in range(2))
+
+    with os.fdopen(pipe, "w") as stdout, ThreadPoolExecutor() as threads:
+        monkeypatch.setattr(sys, "stdout", stdout)
+        reading = threads.submit(read_two)
+        assert run("watch lab") == ExitStatus.OK
+        reading.result()
+    assert all("  up forward  " in line for line in lines)
 
 
-def test_watch_fails_when_the_emulator_ends(relay: FakeRelay, commands: CommandQueue) -> None:
+def test_watch_fails_when_the_emulator_ends(
+    relay: FakeRelay,
+    commands: CommandQueue,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(control_client, "_SILENCE_S", 0.1)
     relay.counters["up", "forward"].arrived = 7
-    with ExitStack() as emulator:
-        emulator.enter_context(ControlServer("lab", commands))
-        with watching(subprocess.PIPE, subprocess.DEVNULL) as process:
-            assert process.stdout is not None
-            assert process.stderr is not None
-            process.stdout.readline()
-            emulator.close()
-            assert process.wait(60) == ExitStatus.FAILED
-            assert process.stderr.read() == b"noack netem watch: emulator 'lab' has ended\n"
+    emulator = ControlServer("lab", commands).__enter__()
+    monkeypatch.setattr(Screen, "show", lambda *_: emulator.__exit__())
+    assert run("watch lab") == ExitStatus.FAILED
+    assert capsys.readouterr().err == "noack netem watch: emulator 'lab' has ended\n"
 
 
-def test_watch_redraws_on_a_terminal_until_q(relay: FakeRelay, server: ControlServer) -> None:
+def test_watch_redraws_on_a_terminal_until_q(
+    relay: FakeRelay, server: ControlServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     relay.counters["up", "forward"].arrived = 7
     terminal, end = pty.openpty()
     termios.tcsetwinsize(end, (24, 80))
     before = termios.tcgetattr(end)
-    with watching(end, end) as process:
+    monkeypatch.setenv("TERM", "xterm-256color")
+
+    def press_q() -> str:
         drawn = read_until(terminal, lambda text: "q ends" in text and "→ up" in text)
-        assert LEAVE not in drawn
         os.write(terminal, b"q")
-        # The last screen stays visible.
-        read_until(terminal, lambda text: "╯" in text.partition(LEAVE)[2])
-        assert process.wait(60) == ExitStatus.OK
+        return drawn
+
+    with (
+        os.fdopen(os.dup(end), "w") as stdout,
+        os.fdopen(os.dup(end)) as stdin,
+        ThreadPoolExecutor() as threads,
+    ):
+        monkeypatch.setattr(sys, "stdout", stdout)
+        monkeypatch.setattr(sys, "stdin", stdin)
+        pressing = threads.submit(press_q)
+        assert run("watch") == ExitStatus.OK
+    assert LEAVE not in pressing.result()
+    # The last screen stays visible.
+    read_until(terminal, lambda text: "╯" in text.partition(LEAVE)[2])
     assert termios.tcgetattr(end) == before
     os.close(terminal)
     os.close(end)
