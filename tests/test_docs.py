@@ -21,11 +21,10 @@ from cosim.studies.campaign.campaign_file import load as load_campaign
 from cosim.studies.campaign.campaign_grid import grid
 from cosim.studies.campaign.metrics import METRICS
 from netem.words.words_to_settings import KEYWORDS
-from noack.config.disturbances import AnyDisturbance
-from noack.config.observers import AnyObserver
+from noack.config.feature_kinds import POLICIES, AnyDisturbance, AnyObserver
 from noack.config.scenario import Scenario
-from noack.config.scenario_file import json_schema, load
-from noack.config.triggers import POLICIES
+from noack.config.scenario_file import load
+from noack.config.toml_file import json_schema
 from noack.controllers.controller_settings import ControllerSettings
 from noack.impairments.disciplines import DISCIPLINES
 from noack.impairments.kinds import IMPAIRMENTS
@@ -244,7 +243,7 @@ def test_every_option_of_design_is_documented_and_no_other() -> None:
 
 
 def test_the_exported_schema_matches_the_code() -> None:
-    assert json.loads((ROOT / "docs/scenario.schema.json").read_text()) == json_schema()
+    assert json.loads((ROOT / "docs/scenario.schema.json").read_text()) == json_schema(Scenario)
 
 
 def test_the_network_in_the_how_to_page_is_valid(tmp_path: Path) -> None:

@@ -183,9 +183,7 @@ def rewrite_report(run_dir: Path) -> Path:
 
 
 def _report(record: RunRecord, summary: Summary, run_dir: Path, claims: RunClaims) -> Path:
-    from cosim.output.report.report_file import (
-        write_report,  # imports matplotlib
-    )
+    from cosim.output.report.report_page import write_report  # imports matplotlib
 
     try:
         envelopes = claims.envelopes()

@@ -20,14 +20,10 @@ _CHUNK = struct.Struct("<QQ")
 
 
 class SpoolWriter:
-    """Appends batches to the spool.
+    """Appends batches to files in ``folder``, which is created in the run directory.
 
-    Args:
-        folder: the spool's directory; it is created in the run directory.
-        writer: names this writer's files.
-
-    Raises:
-        MachineError: the folder cannot be made.
+    The files are named after the ``writer``. The methods raise MachineError if the disk is full or
+    a file cannot be written.
     """
 
     def __init__(self, folder: Path, writer: str) -> None:
@@ -38,20 +34,12 @@ class SpoolWriter:
             folder.mkdir(exist_ok=True)
 
     def append(self, table: str, first: int, payload: bytes) -> None:
-        """Write one batch through to the operating system.
-
-        Raises:
-            MachineError: the disk is full or the folder cannot be written.
-        """
+        """Write one batch through to the operating system."""
         with self._named():
             _write_complete(self._open(table), _CHUNK.pack(first, len(payload)) + payload)
 
     def prepare(self, tables: Iterable[str]) -> None:
-        """Open the files of tables before the first rows.
-
-        Raises:
-            MachineError: the folder cannot be written.
-        """
+        """Open the files of tables before the first rows."""
         with self._named():
             for table in tables:
                 self._open(table)
@@ -67,11 +55,7 @@ class SpoolWriter:
             ) from None
 
     def require_present(self) -> None:
-        """Check that the files are still in place: rows in deleted files are lost.
-
-        Raises:
-            MachineError: a file was deleted or moved.
-        """
+        """Raise MachineError if a file was deleted or moved: rows in deleted files are lost."""
         for table, file in self._files.items():
             path = self._path(table)
             try:
@@ -98,11 +82,7 @@ class SpoolWriter:
 
 
 def _write_complete(file: BinaryIO, chunk: bytes) -> None:
-    """Write a complete chunk or nothing: a partial chunk would be read as rows later.
-
-    Raises:
-        OSError: the system did not write all of it.
-    """
+    """Write a complete chunk or nothing: a partial chunk would be read as rows later."""
     written = 0
     try:
         while written < len(chunk):
@@ -120,11 +100,7 @@ def read_chunks(folder: Path, table: str) -> Iterator[tuple[int, bytes]]:
 
 
 class SpoolTail:
-    """Reads a spool while it is written, to the end even if its files are removed.
-
-    Args:
-        folder: the spool's directory; it need not exist yet.
-    """
+    """Reads a spool while it is written, to the end even if its files are removed."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder

@@ -23,7 +23,7 @@ from cosim.studies.campaign.campaign_page import (
 from cosim.studies.campaign.campaign_summary import CampaignSummary
 from cosim.studies.campaign.chunk_store import RUNS, Store
 from cosim.studies.campaign.metrics import METRICS
-from noack.core.whole_file import write_whole
+from noack.core.file_access import write_whole
 
 PAGE, SUMMARY = "campaign.html", "summary.json"
 _MOST_ROWS = 40

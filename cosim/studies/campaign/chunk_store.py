@@ -24,7 +24,7 @@ from cosim.studies.campaign.campaign_grid import Point
 from cosim.studies.campaign.campaign_workers import Chunk
 from cosim.studies.campaign.worker_identity import arithmetic, difference
 from noack.core.errors import CallerError, MachineError
-from noack.core.file_lock import locked
+from noack.core.file_access import locked
 
 RUNS, MANIFEST = "runs", "campaign.json"
 _LOCK = ".lock"

@@ -37,7 +37,7 @@ from cosim.record.align import AlignedRun, join_all
 from cosim.studies.comparison.run_comparison import ComparedRun, RunComparison
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
-from noack.core.whole_file import write_whole
+from noack.core.file_access import write_whole
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, NO_SEQUENCE, SENSOR_MEASUREMENT
 
 _MOST_STATES = 6

@@ -218,7 +218,7 @@ def test_a_change_received_too_late_is_reported_and_voids_its_claims() -> None:
     assert list(made.late) == ["controller"]
     assert made.everywhere_ns == made.late["controller"] > 990 * MS
     (violation,) = summarise(record, 0, "horizon").to_json()["assumption_violations"]
-    assert "heard of a change too late" in violation["what"]
+    assert "change received too late" in violation["what"]
     assert violation["process"] == "controller"
     claims = [one for one in RunClaims(record).judge() if one.source == "(I1)"]
     assert [one.verdict for one in claims] == [ClaimVerdict.HELD] * 4

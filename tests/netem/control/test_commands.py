@@ -130,7 +130,7 @@ def test_with_several_emulators_a_name_is_required(
 def test_watch_prints_lines_to_a_pipe_until_its_reader_closes_it(
     relay: FakeRelay, server: ControlServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    relay.counters["up", "forward"].arrived = 7
+    relay.counters["up", "forward"].received = 7
     end, pipe = os.pipe()
     lines: list[str] = []
 
@@ -153,7 +153,7 @@ def test_watch_fails_when_the_emulator_ends(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(control_client, "_SILENCE_S", 0.1)
-    relay.counters["up", "forward"].arrived = 7
+    relay.counters["up", "forward"].received = 7
     emulator = ControlServer("lab", commands).__enter__()
     monkeypatch.setattr(Screen, "show", lambda *_: emulator.__exit__())
     assert run("watch lab") == ExitStatus.FAILED
@@ -163,7 +163,7 @@ def test_watch_fails_when_the_emulator_ends(
 def test_watch_redraws_on_a_terminal_until_q(
     relay: FakeRelay, server: ControlServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    relay.counters["up", "forward"].arrived = 7
+    relay.counters["up", "forward"].received = 7
     terminal, end = pty.openpty()
     termios.tcsetwinsize(end, (24, 80))
     before = termios.tcgetattr(end)

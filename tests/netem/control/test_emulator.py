@@ -36,7 +36,7 @@ def test_a_cap_set_at_runtime_is_kept(capsys: pytest.CaptureFixture[str]) -> Non
 
         assert emulator_commands.main(["show", "--json"]) == ExitStatus.OK
         found = json.loads(capsys.readouterr().out)["links"][0]["forward"]
-        assert (found["arrived"], found["forwarded"]) == (320, 120)
+        assert (found["received"], found["forwarded"]) == (320, 120)
         assert found["fates"] | {"delivered": 0} == {
             "delivered": 0, "dropped": 200, "forced": 100, "corrupted": 0, "overflowed": 0,
             "blacked_out": 0,

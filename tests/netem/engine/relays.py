@@ -60,12 +60,12 @@ class Running:
     def report(self, number: int = 0) -> LinkReport:
         return self.relay.report()[number]
 
-    def settle(self, arrived: int, side: str = "forward", number: int = 0) -> None:
-        """Relay until ``arrived`` datagrams have arrived and none is in flight."""
+    def settle(self, received: int, side: str = "forward", number: int = 0) -> None:
+        """Relay until ``received`` datagrams have been received and none is in flight."""
 
         def is_settled() -> bool:
             direction = getattr(self.report(number), side)
-            return bool(direction.counters.arrived >= arrived and direction.in_flight == 0)
+            return bool(direction.counters.received >= received and direction.in_flight == 0)
 
         self.until(is_settled)
 

@@ -72,7 +72,7 @@ def test_the_cap_holds_in_both_directions_for_every_client(
                         client.sendto(sealed(number, "there", 20 + number % 3), one.address())
                 sent += count
                 if other is not None:
-                    one.until(lambda: one.report().forward.counters.arrived > 0)
+                    one.until(lambda: one.report().forward.counters.received > 0)
                     one.relay.change("test", "forward", other)
                     other = None
             one.settle(sent * CLIENTS)

@@ -92,8 +92,8 @@ def test_a_one_way_link_sends_from_one_port_and_discards_answers(
             one.settle(2)
             report = one.report()
             assert drain(server) == []
-    assert (report.clients_ever, report.forward.counters.arrived) == (2, 2)
-    assert report.reverse.counters.arrived == 0
+    assert (report.clients_ever, report.forward.counters.received) == (2, 2)
+    assert report.reverse.counters.received == 0
     if sys.platform == "linux":
         assert report.discarded == 10
     ports = set(tap.events["source_port"][tap.events["departure"] == 1].tolist())
@@ -122,7 +122,7 @@ def test_only_answers_of_the_server_reach_the_client(engine: Engine) -> None:
         stranger.sendto(b"lie", path)
         server.sendto(b"truth", path)
         assert [data for data, _ in one.receive(client)] == [b"truth"]
-        assert one.report().reverse.counters.arrived == 1
+        assert one.report().reverse.counters.received == 1
 
 
 def test_an_absent_server_is_reported_and_causes_no_later_loss(
@@ -264,7 +264,7 @@ def test_a_lack_of_file_descriptors_is_reported_and_counted(
         try:
             for client in clients:
                 client.sendto(b"x", one.address())
-            one.until(lambda: one.report().refused + one.report().forward.counters.arrived == 12)
+            one.until(lambda: one.report().refused + one.report().forward.counters.received == 12)
         finally:
             resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
         assert one.report().refused > 0
@@ -301,12 +301,12 @@ def test_datagrams_beyond_the_available_memory_are_dropped_and_counted(
         one.until(lambda: all_of(one.report().forward) == 51)
         forward = one.report().forward
     assert forward.unintended[os.strerror(errno.ENOMEM)] > 10
-    assert forward.in_flight == forward.counters.arrived
+    assert forward.in_flight == forward.counters.received
 
 
 def all_of(direction: DirectionReport) -> int:
-    """Return the number of datagrams that have arrived or were lost unintentionally."""
-    return direction.counters.arrived + sum(direction.unintended.values())
+    """Return the number of datagrams that were received or were lost unintentionally."""
+    return direction.counters.received + sum(direction.unintended.values())
 
 
 @pytest.fixture
@@ -368,7 +368,7 @@ def test_segments_are_separate_datagrams(engine: Engine, segment: bool) -> None:
             client.sendmsg([b"".join(parts)], cut)
             sent += parts
         one.settle(len(sent))
-        assert one.report().forward.counters.arrived == len(sent)
+        assert one.report().forward.counters.received == len(sent)
         expected = [data for number, data in enumerate(sent) if number % 3]
         assert [data for data, _ in drain(server)] == expected
 

@@ -50,6 +50,10 @@ def coordinator(ticket: Ticket) -> Iterator[Coordinator]:
     coordinator.close()
 
 
+def changed(ticket: Ticket, **update: Any) -> Ticket:
+    return ticket.model_copy(update=update)
+
+
 def shown_by(stranger: str, ticket: Ticket) -> dict[str, str]:
     """The credentials that a connection without the key presents."""
     own = secret_of(ticket)
@@ -57,7 +61,7 @@ def shown_by(stranger: str, ticket: Ticket) -> dict[str, str]:
         "wrong password": SessionSecret(own.user, "0" * len(own.password)),
         "wrong user": SessionSecret("root", own.password),
         "no password": SessionSecret(own.user, ""),
-        "another run's": secret_of(ticket._replace(key=bytes(32), run_id=ticket.run_id ^ 1)),
+        "another run's": secret_of(changed(ticket, key=bytes(32), run_id=ticket.run_id ^ 1)),
     }
     if stranger not in secrets:
         return {}
@@ -150,7 +154,7 @@ def test_a_process_refuses_an_endpoint_without_authentication(ticket: Ticket) ->
 
 
 def test_the_secret_is_derived_as_documented(ticket: Ticket) -> None:
-    known = ticket._replace(run_id=0x0123456789ABCDEF, key=bytes(range(32)))
+    known = changed(ticket, run_id=0x0123456789ABCDEF, key=bytes(range(32)))
     password = hashlib.blake2b(
         b"the control plane's password", key=bytes(range(32)), digest_size=32
     ).hexdigest()
@@ -162,7 +166,7 @@ def test_the_secret_is_derived_from_the_key_and_does_not_reveal_it(ticket: Ticke
     assert secret == secret_of(ticket)
     assert ticket.key.hex() not in secret.password
     assert re.fullmatch("[0-9a-f]{64}", secret.password)
-    assert secret_of(ticket._replace(key=bytes(32))).password != secret.password
+    assert secret_of(changed(ticket, key=bytes(32))).password != secret.password
 
 
 def test_the_coordinator_listens_on_loopback_only(coordinator: Coordinator, ticket: Ticket) -> None:
@@ -290,7 +294,7 @@ def test_a_launched_process_connects_again_until_it_is_admitted(
 
     monkeypatch.setattr(noack.runtime.process_entry, "ControlPlane", Silent)
     monkeypatch.setattr(noack.runtime.process_entry, "lifeline_cut", lambda: False)
-    asking = partial(_admitted, "plant", ticket._replace(launched=launched), Signals())
+    asking = partial(_admitted, "plant", changed(ticket, launched=launched), Signals())
     if launched:
         assert asking().plane is cast(Any, tries[2])
         assert [one.is_closed for one in tries] == [False, True, False]
@@ -322,7 +326,7 @@ def test_a_short_loss_of_the_coordinator_is_tolerated(ticket: Ticket) -> None:
 
 
 def test_an_admission_request_waits_for_a_coordinator_to_come_back(ticket: Ticket) -> None:
-    ticket = ticket._replace(launched=False)
+    ticket = changed(ticket, launched=False)
     first = Coordinator(ticket)
     with ControlPlane(ticket, "plant") as plane, ThreadPoolExecutor() as pool:
         node = RunProcess("plant", ticket, plane, Signals())

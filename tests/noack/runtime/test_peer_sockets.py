@@ -9,9 +9,14 @@ import pytest
 
 from noack.protocol.wire_format import Encoder, Rejection
 from noack.runtime import udp_sockets
-from noack.runtime.peer_sockets import IN_A_FLOOD, IN_AN_INTERVAL, FloodWatch, open_beside
+from noack.runtime.peer_sockets import (
+    IN_A_FLOOD,
+    IN_AN_INTERVAL,
+    FloodWatch,
+    SourceCount,
+    open_beside,
+)
 from noack.runtime.udp_sockets import LOOPBACK, SHED, bind, drops_of
-from noack.runtime.unknown_sources import SourceCount
 from tests.noack.runtime.any_socket import KEY, RUN_ID, Ear, opened, sent_to
 
 BEGUN, OVER = "flood:", "the flood is over:"
