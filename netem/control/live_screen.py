@@ -17,8 +17,7 @@ from rich.live import Live
 from rich.text import Text
 
 from netem.control.emulator_statistics import Statistics
-from netem.control.statistics_history import History
-from netem.control.statistics_view import plain_lines, render
+from netem.control.statistics_view import History, plain_lines, render
 
 _MESSAGES_SHOWN = 3
 

@@ -1,6 +1,5 @@
 """Clients of the Linux engine: a row in the pump's memory and a return path for each."""
 
-import errno
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -58,12 +57,8 @@ class ClientTable:
         """Add a client by its packed name; if that is impossible, mark the link as full."""
         warnings, present, path, error = self._warnings[link], self.present[link], None, 0
         if warnings.accepts_client(present) and self._links[link].spec.return_path:
-            try:
-                path = return_path(self._links[link].server)
-            except OSError as failure:
-                error = failure.errno or errno.EIO
-                warnings.no_descriptor_left(error, present)
-        if warnings.accepts_client(present):
+            path, error = return_path(self._links[link].server)
+        if not warnings.no_descriptor_left(error, present) and warnings.accepts_client(present):
             self._accept(link, name, path, error)
         else:
             self._memory.memory.directions["full"][2 * link] = 1
@@ -87,11 +82,10 @@ class ClientTable:
         sockets, first = self._memory.memory.sockets, self._memory.first_path
         clients = self._memory.memory.clients
         for row in np.flatnonzero(sockets["error"][first:]).tolist():
-            try:
-                path = return_path(self._links[clients["link"][row]].server)
-            except OSError as failure:
-                sockets["error"][first + row] = failure.errno or errno.EIO
-            else:
+            path, sockets["error"][first + row] = return_path(
+                self._links[clients["link"][row]].server
+            )
+            if path is not None:
                 self._set_path(row, path)
 
     def query_some_drops(self) -> None:
@@ -168,7 +162,6 @@ class ClientTable:
         self._paths[row] = path
         self._drops[row] = 0
         memory.sockets["fd"][place] = path.fileno()
-        memory.sockets["error"][place] = 0
         local, _ = packed_name(path.getsockname())
         memory.clients["local"][row] = np.frombuffer(local, np.uint8)
         self._epoll.add(path.fileno(), place)

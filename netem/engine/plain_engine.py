@@ -8,11 +8,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from netem.engine.headroom import has_headroom
 from netem.engine.link_listeners import OpenLink
 from netem.engine.plain_direction import PlainDirection, ScheduledDeparture
 from netem.engine.plain_taps import PlainTaps, TapRoute
-from netem.engine.relay_base import RARE_PERIOD_NS, REPORTED_FLOWS, STALL_NS, Relay
+from netem.engine.relay_base import RARE_PERIOD_NS, REPORTED_FLOWS, STALL_NS, Relay, has_headroom
 from netem.engine.relay_interface import (
     DIRECTIONS,
     Address,
@@ -211,16 +210,12 @@ class PlainRelay(Relay):
 
     def _add(self, link: _PlainLink, name: Any, now_ns: int) -> _Client | None:
         """Add a client; return None if there are too many."""
-        path, error, warnings = None, 0, self._warnings[link.number]
-        if not warnings.accepts_client(len(link.clients)):
+        warnings, present = self._warnings[link.number], len(link.clients)
+        if not warnings.accepts_client(present):
             return None
-        if link.link.spec.return_path:
-            try:
-                path = return_path(link.link.server)
-            except OSError as failure:
-                error = failure.errno or errno.EIO
-                if warnings.no_descriptor_left(error, len(link.clients)):
-                    return None
+        path, error = return_path(link.link.server) if link.link.spec.return_path else (None, 0)
+        if warnings.no_descriptor_left(error, present):
+            return None
         local = address_of(link.link.local)
         client = _Client(link.clients_ever, name, path, error, local, now_ns)
         link.clients_ever += 1
@@ -231,7 +226,7 @@ class PlainRelay(Relay):
         return client
 
     def _set_path(self, link: _PlainLink, client: _Client, path: Endpoint) -> None:
-        client.path, client.error = path, 0
+        client.path = path
         client.local = address_of(path.getsockname())
         self._selector.register(path, selectors.EVENT_READ, (link, client))
 
@@ -249,15 +244,9 @@ class PlainRelay(Relay):
                 if client.last_ns < now_ns - idle_ns and not client.in_flight:
                     self._forget(link, client)
                 elif client.error:
-                    self._reconnect(link, client)
-
-    def _reconnect(self, link: _PlainLink, client: _Client) -> None:
-        try:
-            path = return_path(link.link.server)
-        except OSError as failure:
-            client.error = failure.errno or errno.EIO
-        else:
-            self._set_path(link, client, path)
+                    path, client.error = return_path(link.link.server)
+                    if path is not None:
+                        self._set_path(link, client, path)
 
     def _forget(self, link: _PlainLink, client: _Client) -> None:
         if client.path is not None:

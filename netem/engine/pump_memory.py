@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.engine.headroom import has_headroom
 from netem.engine.histogram import BUCKETS
 from netem.engine.pump import pump_layout
 from netem.engine.pump.pump_layout import Array, Memory
+from netem.engine.relay_base import has_headroom
 from netem.relay_events import EVENT
 from noack.impairments.link_records import Counters, LinkState, dtype_of
 

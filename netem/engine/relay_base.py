@@ -4,6 +4,8 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
+import numpy as np
+
 from netem.engine.link_listeners import open_links
 from netem.engine.link_warnings import LinkWarnings, UnintendedLosses
 from netem.engine.relay_interface import (
@@ -24,6 +26,18 @@ RARE_PERIOD_NS = 250_000_000
 STALL_NS = 1_000_000_000
 """An engine that has not checked for idle clients for this time was stopped, or got no CPU time."""
 REPORTED_FLOWS = 16
+_HEADROOM_BYTES = 48 * 1024 * 1024
+"""Reserve for everything but delayed datagrams. malloc serves blocks of this size from the system,
+not from its heap, and returns them to the system when they are freed."""
+
+
+def has_headroom(wanted_bytes: int = 0) -> bool:
+    """Whether ``wanted_bytes`` and the headroom can be allocated; the check takes microseconds."""
+    try:
+        np.empty(_HEADROOM_BYTES + wanted_bytes, np.uint8)
+    except MemoryError:
+        return False
+    return True
 
 
 class Relay(ABC):

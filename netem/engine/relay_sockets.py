@@ -6,7 +6,7 @@ import socket
 import struct
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from ipaddress import IPv4Address, IPv6Address, ip_address
 from typing import Any
 
@@ -80,20 +80,20 @@ def listen(spec: LinkSpec, name: SocketName) -> Endpoint:
     return endpoint
 
 
-def return_path(server: SocketName) -> Endpoint:
-    """Return a socket connected to the server; it receives the server's answers only.
+def return_path(server: SocketName) -> tuple[Endpoint | None, int]:
+    """Return a socket connected to the server, which receives the server's answers only, and 0.
 
-    Raises:
-        OSError: there is no route to the server, or no file descriptor left.
+    If there is no route to the server, or no file descriptor left: None and the errno.
     """
-    endpoint = _udp_socket(server)
-    try:
-        endpoint.connect(server)
+    with ExitStack() as undo:
+        try:
+            endpoint = undo.enter_context(_udp_socket(server))
+            endpoint.connect(server)
+        except OSError as error:
+            return None, error.errno or errno.EIO
         _prepare(endpoint)
-    except BaseException:
-        endpoint.close()
-        raise
-    return endpoint
+        undo.pop_all()
+    return endpoint, 0
 
 
 def one_way_path(server: SocketName) -> Endpoint:
@@ -105,8 +105,8 @@ def one_way_path(server: SocketName) -> Endpoint:
     Raises:
         OSError: there is no file descriptor left.
     """
-    endpoint = _udp_socket(server)
-    try:
+    with ExitStack() as undo:
+        endpoint = undo.enter_context(_udp_socket(server))
         _drop_received(endpoint)
         # Bind to the address that it will send from, if there is a route to the server.
         with suppress(OSError), _udp_socket(server) as probe:
@@ -116,9 +116,7 @@ def one_way_path(server: SocketName) -> Endpoint:
             endpoint.bind(("", 0))
         endpoint.setblocking(False)
         _prepare_to_send(endpoint)
-    except BaseException:
-        endpoint.close()
-        raise
+        undo.pop_all()
     return endpoint
 
 

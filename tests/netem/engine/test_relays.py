@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from netem.engine import engine_choice, headroom, plain_taps, pump_memory
+from netem.engine import engine_choice, plain_taps, pump_memory, relay_base
 from netem.engine.engine_choice import Engine, open_relay
 from netem.engine.relay_interface import DirectionReport
 from netem.engine.relay_sockets import raise_file_limit
@@ -295,7 +295,7 @@ def test_datagrams_beyond_the_available_memory_are_dropped_and_counted(
     ):
         client.sendto(b"stored", one.address())
         one.until(lambda: one.report().forward.in_flight == 1)
-        monkeypatch.setattr(headroom, "_HEADROOM_BYTES", 2**60)
+        monkeypatch.setattr(relay_base, "_HEADROOM_BYTES", 2**60)
         for _ in range(50):
             client.sendto(bytes(60_000), one.address())
         one.until(lambda: all_of(one.report().forward) == 51)
