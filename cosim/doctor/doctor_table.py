@@ -11,16 +11,12 @@ from rich.text import Text
 from cosim.doctor.findings import FindingStatus, MachineFinding, worst
 from cosim.doctor.machine_facts import MachineFacts, RunRequirements
 
-_COLOURS = {
-    FindingStatus.GOOD: "green",
-    FindingStatus.LIMITED: "yellow",
-    FindingStatus.BAD: "bold red",
-}
 _VERDICTS = {
-    FindingStatus.GOOD: "ready",
-    FindingStatus.LIMITED: "ready, with the limits above",
-    FindingStatus.BAD: "not ready: no run is possible",
+    FindingStatus.GOOD: ("green", "ready"),
+    FindingStatus.LIMITED: ("yellow", "ready, with the limits above"),
+    FindingStatus.BAD: ("bold red", "not ready: no run is possible"),
 }
+"""Colour of a finding; verdict on the machine if this is the worst finding."""
 
 
 def document(
@@ -52,11 +48,7 @@ def print_findings(
             text.append(f"\n{one.means}", "" if one.verdict is not FindingStatus.GOOD else "dim")
         if one.remedy:
             text.append(f"\n→ {one.remedy}", "cyan")
-        table.add_row(Text(one.verdict, _COLOURS[one.verdict]), Text(one.what), text)
+        table.add_row(Text(one.verdict, _VERDICTS[one.verdict][0]), Text(one.what), text)
     console.print(table)
-    verdict = worst(findings)
-    console.print(
-        Text.assemble(
-            "this machine, for ", wanted.name, ": ", (_VERDICTS[verdict], _COLOURS[verdict])
-        )
-    )
+    colour, verdict = _VERDICTS[worst(findings)]
+    console.print(Text.assemble("this machine, for ", wanted.name, ": ", (verdict, colour)))
