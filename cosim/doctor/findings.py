@@ -1,8 +1,13 @@
-"""Judges the measurements of a machine: findings, their meaning for a run, remedies."""
+"""Findings on a machine, from its measurements: their meaning for a run, remedies, a table."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 from cosim.doctor.machine_facts import Lateness, MachineFacts, RunRequirements
 from noack.core.number_format import byte_size, duration
@@ -58,6 +63,12 @@ class MachineFinding(NamedTuple):
 
 
 GOOD, LIMITED, BAD = FindingStatus
+_VERDICTS = {
+    GOOD: ("green", "ready"),
+    LIMITED: ("yellow", "ready, with the limits above"),
+    BAD: ("bold red", "not ready: no run is possible"),
+}
+"""Colour of a finding; verdict on the machine if this is the worst finding."""
 
 
 def judge(machine: MachineFacts, wanted: RunRequirements) -> list[MachineFinding]:
@@ -278,3 +289,38 @@ def _versions(machine: MachineFacts) -> MachineFinding:
         return MachineFinding("versions", GOOD, ", ".join(known))
     means = f"{', '.join(missing)}: not installed as a package, so runs cannot record the version"
     return MachineFinding("versions", LIMITED, ", ".join(known), means, "`pip install noack`")
+
+
+def document(
+    machine: MachineFacts, wanted: RunRequirements, findings: Sequence[MachineFinding]
+) -> dict[str, Any]:
+    """Return ``verdict``, ``findings``, and the numbers behind them, for JSON."""
+    return {
+        "scenario": wanted._asdict() | {"ports": dict(wanted.ports)},
+        "verdict": worst(findings),
+        "findings": [one._asdict() for one in findings],
+        "measured": {
+            name: value._asdict() if hasattr(value, "_asdict") else value
+            for name, value in asdict(machine).items()
+        },
+    }
+
+
+def print_findings(
+    console: Console, wanted: RunRequirements, findings: Sequence[MachineFinding]
+) -> None:
+    """Print each finding, its meaning for a run, and a remedy."""
+    table = Table.grid(padding=(0, 2))
+    table.add_column(no_wrap=True)
+    table.add_column(max_width=26)
+    table.add_column(ratio=1)
+    for one in findings:
+        text = Text(one.found)
+        if one.means:
+            text.append(f"\n{one.means}", "" if one.verdict is not GOOD else "dim")
+        if one.remedy:
+            text.append(f"\n→ {one.remedy}", "cyan")
+        table.add_row(Text(one.verdict, _VERDICTS[one.verdict][0]), Text(one.what), text)
+    console.print(table)
+    colour, verdict = _VERDICTS[worst(findings)]
+    console.print(Text.assemble("this machine, for ", wanted.name, ": ", (verdict, colour)))

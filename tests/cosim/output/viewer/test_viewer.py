@@ -567,18 +567,6 @@ def test_other_host_names_and_files_are_refused(tmp_path: Path) -> None:
         assert get(server.address + "../recording.rrd")[0] == 404
 
 
-@pytest.mark.parametrize("asked", [b"/\xe9", b"/\xff\x80", b"/a\x01b"])
-def test_a_path_that_is_not_ascii_is_a_bad_request(
-    asked: bytes, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    with RecordingServer(tmp_path / "recording.rrd", follow=False) as server:
-        port = int(server.origin.rpartition(":")[2])
-        with socket.create_connection(("127.0.0.1", port), timeout=60) as client:
-            client.sendall(b"GET " + asked + b" HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
-            assert b" 400 " in client.recv(1000)
-    assert capfd.readouterr().err == ""
-
-
 @pytest.mark.parametrize("content", [None, b"", b"<html>"])
 def test_a_file_that_is_not_a_recording_is_not_served(
     content: bytes | None, tmp_path: Path
