@@ -80,12 +80,12 @@ def test_moderate_traffic_does_not_prolong_a_flood() -> None:
 
 
 def test_repeated_floods_log_a_bounded_number_of_lines() -> None:
-    """A flood that pauses just long enough to end, repeated for a day."""
+    """A flood that pauses just long enough to end, repeated for two hours."""
     watch, dropped, lines = FloodWatch(), 0, 0
-    for _ in range(24 * 3600 * 20):
+    for _ in range(2 * 3600 * 20):
         dropped += 0 if watch.is_flood else 1000
         lines += watch.next_interval(dropped) is not None
-    assert 100 < lines < 24 * 60 * 3
+    assert 100 < lines < 2 * 60 * 3
 
 
 @pytest.fixture
@@ -202,13 +202,13 @@ def test_many_sources_take_bounded_memory_and_a_short_report() -> None:
     count = SourceCount([peer, rare])
     count.add(rare)
     total = 1
-    for number in range(100_000):
+    for number in range(10_000):
         for source in (peer, (f"127.0.1.{number % 251}", number % 65_521)):
             count.add(source)
             total += 1
     assert len(count._others) <= 256
     report = count.report()
-    assert report["127.0.0.1:1"] == 100_000
+    assert report["127.0.0.1:1"] == 10_000
     assert report["127.0.0.1:2"] == 1
     assert len(report) <= 20
     assert sum(report.values()) == total
