@@ -49,6 +49,12 @@ network = { mansd = 2, loss = { model = "worst_case" } }
 """
 
 
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    (tmp_path / "some.toml").write_text(LANE)
+    return tmp_path / "some.toml"
+
+
 def mistakes(text: str, folder: Path, lines: Sequence[str] = ()) -> list[str]:
     """The error message for a scenario file with these ``key=value`` settings added."""
     content = tomllib.loads(text)
@@ -317,15 +323,8 @@ def test_an_error_in_a_setting_is_not_attributed_to_the_file(
 
 
 def test_an_empty_file_reports_every_required_key(tmp_path: Path) -> None:
-    lines = mistakes("", tmp_path)
-    assert [line.split(": ")[1] for line in lines] == [
-        "name",
-        "horizon_s",
-        "model",
-        "plant",
-        "trigger",
-        "network",
-    ]
+    required = ["name", "horizon_s", "model", "plant", "trigger", "network"]
+    assert [line.split(": ")[1] for line in mistakes("", tmp_path)] == required
 
 
 def test_a_long_value_is_shortened(tmp_path: Path) -> None:
@@ -384,19 +383,15 @@ def test_an_unreadable_file_is_reported(tmp_path: Path) -> None:
     ],
 )
 def test_settings_replace_values_of_the_file(
-    setting: str, read: Callable[[Scenario], bool], tmp_path: Path
+    setting: str, read: Callable[[Scenario], bool], path: Path
 ) -> None:
-    path = tmp_path / "some.toml"
-    path.write_text(LANE)
     assert not read(load(path))
     changed = load(path, [setting])
     assert read(changed)
     assert changed.ports == load(path).ports  # all other settings are unchanged
 
 
-def test_the_last_setting_of_a_key_wins(tmp_path: Path) -> None:
-    path = tmp_path / "some.toml"
-    path.write_text(LANE)
+def test_the_last_setting_of_a_key_wins(path: Path) -> None:
     assert load(path, ["speed=2", "speed=3"]).speed == 3
 
 
@@ -407,10 +402,8 @@ def test_the_last_setting_of_a_key_wins(tmp_path: Path) -> None:
         ("=3", "--set =3: write it as key=value, e.g. trigger.beta=0.3"),
         (" =3", "--set  =3: write it as key=value, e.g. trigger.beta=0.3"),
         ("trigger.beta.x=1", "--set trigger.beta.x=1: beta is not a table"),
-        (
-            "plant.initial_state=[1,2",
-            "--set plant.initial_state: not valid TOML: Unclosed array (at end of document)",
-        ),
+        ("plant.initial_state=[1,2",
+         "--set plant.initial_state: not valid TOML: Unclosed array (at end of document)"),
         ('mode="zoh', "--set mode: not valid TOML: Unterminated string (at end of document)"),
         (
             "plant.initial_state.0=1",
@@ -418,7 +411,7 @@ def test_the_last_setting_of_a_key_wins(tmp_path: Path) -> None:
             "(a list is set as a whole)",
         ),
     ],
-)
+)  # fmt: skip
 def test_a_setting_that_cannot_be_applied_is_reported(
     setting: str, says: str, tmp_path: Path
 ) -> None:
@@ -441,6 +434,11 @@ def test_shipped_scenarios_are_unchanged_by_writing_and_reading(path: Path, tmp_
     assert resolve(load(copy)) == resolved
 
 
+LOSSES = [
+    {"model": "worst_case"},
+    {"model": "bernoulli", "probability": 1 / 3},
+    {"model": "gilbert_elliott", "good_to_bad": 0.1, "bad_to_good": 0.7},
+]
 numbers = st.floats(-1e3, 1e3)  # a step with larger values may overflow to infinity
 
 
@@ -482,16 +480,7 @@ def contents(draw: st.DrawFn) -> Content:
         },
         "network": {
             "mansd": draw(st.integers(0, 1_000_000)),
-            "loss": draw(
-                st.sampled_from(
-                    [
-                        {"model": "lossless"},
-                        {"model": "worst_case"},
-                        {"model": "bernoulli", "probability": 1 / 3},
-                        {"model": "gilbert_elliott", "good_to_bad": 0.1, "bad_to_good": 0.7},
-                    ]
-                )
-            ),
+            "loss": draw(st.sampled_from(LOSSES)),
         },
         "seeds": {"plant": draw(st.integers(0, 2**64 - 1))},
     }

@@ -5,6 +5,7 @@ import json
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -106,13 +107,8 @@ def test_a_refused_session_neither_sends_nor_receives(
         ]
         asked = []
         for session in strangers:
-            for key in (
-                "stop",
-                f"ended/plant/{plant.instance}",
-                "progress",
-                "telemetry/plant/plant_step",
-                "persisted/plant",
-            ):
+            for key in ("stop", f"ended/plant/{plant.instance}", "progress",
+                        "telemetry/plant/plant_step", "persisted/plant"):  # fmt: skip
                 session.put(plant.key(*key.split("/")), "evil")
             session.liveliness().declare_token(plant.key("alive", "sensor", "evil"))
             for what in ("admit", "join", "report"):
@@ -182,20 +178,17 @@ def test_every_zenoh_session_needs_a_secret() -> None:
 
 
 def test_the_password_is_not_stored_on_disk_and_no_pipe_stays_open(ticket: Ticket) -> None:
-    own = psutil.Process()
-    before = [file.path for file in own.open_files()], pipes()
+    own, before = psutil.Process(), pipes()
     with open_session(ticket.endpoint, secret_of(ticket), listen=True):
         assert not [f for f in own.open_files() if "password" in f.path]
-        assert pipes() == before[1]
+        assert pipes() == before
 
 
 def pipes() -> set[str]:
     links = []
     for descriptor in Path("/proc/self/fd").iterdir():
-        try:
+        with suppress(FileNotFoundError):
             links.append(str(descriptor.readlink()))
-        except FileNotFoundError:
-            continue
     return {link for link in links if link.startswith("pipe:")}
 
 
