@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from cosim.record.run_record import merge_rows
 from noack.core.errors import MachineError
-from noack.runtime.spool import SpoolTail, SpoolWriter, read_chunks
+from noack.runtime.spool import SpoolWriter, read_chunks
 
 ROW = np.dtype([("input", "<i8")])
 
@@ -96,31 +96,6 @@ def test_a_full_disk_is_reported_by_the_batch_that_does_not_fit(tmp_path: Path) 
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         writer.close()
     assert [first for first, _ in read_chunks(tmp_path, "step")] == [0]
-
-
-def test_a_spool_is_read_while_it_is_written(tmp_path: Path) -> None:
-    tail = SpoolTail(tmp_path / "spool")
-    assert list(tail.read()) == []
-    writer = SpoolWriter(tmp_path / "spool", "recorder")
-    writer.append("plant_step", 0, numbers(0, 2))
-    assert list(tail.read()) == [("plant_step", 0, numbers(0, 2))]
-    assert list(tail.read()) == []
-    writer.append("plant_step", 2, numbers(2, 3))
-    writer.append("notices_plant", 0, b"{}")
-    assert sorted(tail.read()) == [("notices_plant", 0, b"{}"), ("plant_step", 2, numbers(2, 3))]
-    writer.close()
-    tail.close()
-
-
-def test_a_deleted_spool_is_read_to_its_end(tmp_path: Path) -> None:
-    path = spool(tmp_path, "recorder", "plant_step", (0, b"abc"))
-    tail = SpoolTail(tmp_path)
-    next(tail.read())
-    with path.open("ab") as file:
-        file.write(struct.pack("<QQ", 3, 2) + b"de")
-    path.unlink()
-    assert list(tail.read()) == [("plant_step", 3, b"de")]
-    tail.close()
 
 
 @pytest.mark.parametrize("what", ["deleted", "moved", "replaced", "folder"])
