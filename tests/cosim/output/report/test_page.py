@@ -2,7 +2,6 @@
 
 import json
 import re
-from dataclasses import asdict
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -224,7 +223,7 @@ def test_the_replay_has_a_section(record: RunRecord) -> None:
     assert "The 10,001 recorded inputs were replayed" in text
     assert "bit for bit" in text
     assert "gaps" not in text
-    other = asdict(difference("plant_step", 7, 5, "another x", "x_1", 1.0, 2.0))
+    other = difference("plant_step", 7, 5, "another x", "x_1", 1.0, 2.0).model_dump()
     text = shown(record, replay=replayed(bit_exact=False, complete=False, first_difference=other))
     assert "differs from its record" in text
     assert "plant_step row 7, x_1: another x: recorded 1.0" in text
