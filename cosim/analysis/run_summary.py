@@ -3,6 +3,8 @@
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -52,6 +54,16 @@ from plant_server.watchdog import too_old
 
 Summary = dict[str, Any]
 """The content of ``summary.json``: :class:`~cosim.analysis.summary_model.RunSummary` as JSON."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The outcome of a run, for tables and programs."""
+
+    run_dir: Path
+    status: ExitStatus
+    reason: str
+    summary: Summary
 
 
 @np.errstate(all="ignore")  # a diverging run overflows and has a summary all the same

@@ -8,7 +8,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from cosim.analysis.model_comparison import said
+from cosim.analysis.model_comparison import linearisation_rows
 from cosim.analysis.run_summary import Summary
 from cosim.output.assumptions_table import print_assumptions
 from cosim.output.fidelity_table import summary_rows
@@ -75,7 +75,7 @@ def key_numbers(summary: Summary) -> Numbers:
         *_norms(summary),
         *_record(summary),
         *_watchdog(summary["watchdog"]),
-        *(said(found) if (found := summary.get("linearisation")) else ()),
+        *(linearisation_rows(found) if (found := summary.get("linearisation")) else ()),
         *_estimation(summary["estimation"]),
         *_disturbances(summary["disturbances"]),
         *_replay_rows(summary.get("replay")),

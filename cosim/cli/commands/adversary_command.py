@@ -55,7 +55,7 @@ def adversary(
     Exit status 1: a certified bound was exceeded.
     """
     from cosim.analysis.adversary import Objective, find_worst
-    from cosim.analysis.adversary.adversary_report import document, print_worst
+    from cosim.analysis.adversary.worst_run import document, print_worst
     from cosim.live.progress import search_status
     from noack.config.resolution import resolve
     from noack.theory.run_conditions import ideal_conditions

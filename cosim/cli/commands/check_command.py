@@ -52,7 +52,7 @@ def check(
 def _print_plant(console: Console, resolved: Scenario) -> None:
     """Print a nonlinear plant's linearisation, and the defaults that depend on other keys."""
     from controller_node.controller import law_of
-    from cosim.analysis.model_comparison import linearisation, said
+    from cosim.analysis.model_comparison import linearisation, linearisation_rows
     from plant_server.plant import system_of
 
     if not resolved.coverage.is_linear:
@@ -61,7 +61,7 @@ def _print_plant(console: Console, resolved: Scenario) -> None:
     if (law := getattr(law_of(resolved), "about", None)) is not None:
         console.print(f"the controller: {law}", highlight=False, markup=False)
     if (near := linearisation(resolved)) is not None:
-        for what, value in said(near):
+        for what, value in linearisation_rows(near):
             console.print(f"{what}: {value}", highlight=False, markup=False)
     for line in _dependent_defaults(resolved):
         console.print(line, highlight=False, markup=False)

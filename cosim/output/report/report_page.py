@@ -10,7 +10,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from cosim.analysis.fidelity import is_against
-from cosim.analysis.replay.replay_result import ReplayDifference
+from cosim.analysis.summary_model import ReplayDifference
 from cosim.output.remarks import remarks
 from cosim.output.report.figure_files import inline
 from cosim.output.report.run_figures import Envelope, RunFigure, pictures

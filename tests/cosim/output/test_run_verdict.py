@@ -11,7 +11,7 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 import noack
-from cosim.analysis.run_outcome import Outcome
+from cosim.analysis.run_summary import Outcome
 from cosim.cli import app
 from cosim.live.finalize import reopen
 from cosim.output.remarks import remarks

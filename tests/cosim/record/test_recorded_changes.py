@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from controller_node.controller import controller_of
-from cosim.analysis.claims.claim import ClaimVerdict
 from cosim.analysis.claims.claims_by_part import RunClaims
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
+from cosim.analysis.summary_model import ClaimVerdict
 from cosim.record.align import identity_residual, join_all
 from cosim.record.recorded_changes import changes_of
 from cosim.record.run_record import RunRecord

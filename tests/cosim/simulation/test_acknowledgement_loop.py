@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.analysis.claims.claim import ClaimVerdict
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
+from cosim.analysis.summary_model import ClaimVerdict
 from cosim.live.simulated_run import simulate_run
 from cosim.output.certificate_report import Certificates
 from cosim.record.align import join_all
