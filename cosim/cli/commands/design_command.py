@@ -94,7 +94,7 @@ def design(
     """
     from cosim.live.progress import work_bar
     from cosim.studies.design import design_page as pages
-    from cosim.studies.design.design_run import design as designed
+    from cosim.studies.design.design_search import design as designed
     from cosim.studies.design.loop_families import families_of
 
     loaded = cli.load_scenario(scenario, settings)

@@ -26,8 +26,13 @@ def paper(
 ) -> int:
     """Reproduce the paper's Section V: a page with figures, tables and verdicts."""
     from cosim.live.progress import PatientConsole, draws_bar
-    from cosim.studies.paper.paper_run import document, make_folder, reproduce, write_page
-    from cosim.studies.paper.paper_table import print_claims
+    from cosim.studies.paper.paper_run import (
+        document,
+        make_folder,
+        print_claims,
+        reproduce,
+        write_page,
+    )
 
     make_folder(out)
     with draws_bar(PatientConsole(stderr=True)) as progress:
