@@ -39,14 +39,6 @@ def test_the_file_is_the_documented_sequence_of_chunks(tmp_path: Path) -> None:
     assert path.read_bytes() == expected
 
 
-def test_a_batch_is_on_disk_as_soon_as_it_is_appended(tmp_path: Path) -> None:
-    writer = SpoolWriter(tmp_path, "recorder")
-    for k in range(3):
-        writer.append("plant_step", k, b"x")
-        assert [first for first, _ in read_chunks(tmp_path, "plant_step")] == list(range(k + 1))
-    writer.close()
-
-
 def test_an_incomplete_chunk_is_ignored(tmp_path: Path) -> None:
     batches = [(0, b"first"), (5, b"second")]
     path = spool(tmp_path, "recorder", "plant_step", *batches)
@@ -80,11 +72,14 @@ def test_rows_spooled_twice_are_merged(
     assert rows["input"].tolist() == list(range(20))
 
 
-def test_a_folder_that_cannot_be_written_is_an_environment_error(tmp_path: Path) -> None:
+def test_a_removed_folder_is_a_machine_error_and_not_created_again(tmp_path: Path) -> None:
     writer = SpoolWriter(tmp_path / "spool", "recorder")
     (tmp_path / "spool").rmdir()
     with pytest.raises(MachineError, match=r"spool: the record cannot be written: .*No such file"):
         writer.append("step", 0, b"a")
+    with pytest.raises(MachineError, match=r"/gone/spool: the record cannot be written"):
+        SpoolWriter(tmp_path / "gone" / "spool", "recorder")
+    assert not (tmp_path / "gone").exists()
 
 
 def test_a_full_disk_is_reported_by_the_batch_that_does_not_fit(tmp_path: Path) -> None:
@@ -123,9 +118,3 @@ def test_files_that_are_deleted_meanwhile_are_noticed(tmp_path: Path, what: str)
     with pytest.raises(MachineError, match=r"/step\.recorder: was deleted or moved"):
         writer.require_present()
     writer.close()
-
-
-def test_a_deleted_run_directory_is_not_created_again(tmp_path: Path) -> None:
-    with pytest.raises(MachineError, match=r"/gone/spool: the record cannot be written"):
-        SpoolWriter(tmp_path / "gone" / "spool", "recorder")
-    assert not (tmp_path / "gone").exists()
