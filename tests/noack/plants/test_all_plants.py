@@ -1,5 +1,7 @@
 """Properties of every kind of plant that has a shipped scenario."""
 
+import re
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -68,6 +70,24 @@ def row(kind: str, settings: type[PlantSettings]) -> str:
     states, inputs = ("; ".join(names) or "any" for names in (settings.states, settings.inputs))
     scenario = f"`{settings.scenario}`" if settings.scenario else ""
     return f"| `{kind}` | {summary} | {states} | {inputs} | {scenario} |"
+
+
+def test_the_documented_keys_are_those_of_the_settings() -> None:
+    """docs/scenarios.md has a row per kind, with every key and some defaults."""
+    text = (ROOT / "docs/scenarios.md").read_text()
+    section = text[text.index("\n## Plants\n") : text.index("\n### Vehicles\n")]
+    for kind, settings in PLANTS.items():
+        row = next(line for line in section.splitlines() if line.startswith(f"| `{kind}` |"))
+        keys = dict(re.findall(r"`(\w+)(?: = ([^`]+))?`", row.split("|")[-2]))
+        fields = {key: field for key, field in settings.model_fields.items() if key != "kind"}
+        assert keys.keys() == fields.keys(), kind
+        for key, default in keys.items():
+            if default:
+                assert tomllib.loads(f"value = {default}")["value"] == list_of(fields[key].default)
+
+
+def list_of(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
 
 
 def test_the_documented_kinds_are_those_of_the_registry() -> None:

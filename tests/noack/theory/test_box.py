@@ -140,7 +140,8 @@ MUTANTS: dict[type[BoxGains], dict[str, Any]] = {
     NoStart: {"mansd": 0, "hold_steps": 4, "lag_steps": 2, "beta": 0.01, "step_share": 0.03},
     HalfTheBox: {"size": 0.6, "n": 1, "beta": 0.01, "mansd": 0, **INSTANT},
     NoModelErrorInState: {
-        "size": 0.2, "n": 3, "spread": 3.0, "beta": 0.01, "alpha_share": 0.8, **INSTANT,
+        "size": 0.3, "n": 2, "spread": 3.0, "beta": 0.01, "alpha_share": 0.5, "mansd": 0,
+        **INSTANT, "step_share": 0.03,
     },
 }  # fmt: skip
 
@@ -149,17 +150,20 @@ MUTANTS: dict[type[BoxGains], dict[str, Any]] = {
 def test_runs_exceed_a_broken_certificate_and_not_the_true_one(mutant: type[BoxGains]) -> None:
     def is_caught(drawn: tuple[Case, int]) -> bool:
         case, seed = drawn
-        certified, true = case.constants(mutant), case.constants()
+        certified = case.constants(mutant)
         if certified is None:
             return False
         trace = case.simulate(seed)
+        if not trace.exceeded(case.system, certified):
+            return False
+        true = case.constants()
         assert true is None or trace.exceeded(case.system, true) == []
-        return trace.exceeded(case.system, certified) != []
+        return True
 
     find(
         st.tuples(cases(**MUTANTS[mutant]), seeds),
         is_caught,
-        settings=settings(SEARCH, max_examples=300, database=None),
+        settings=settings(SEARCH, max_examples=150, database=None),
     )
 
 
