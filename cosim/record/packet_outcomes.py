@@ -47,8 +47,8 @@ def packet_outcomes(record: RunRecord, flow: Flow = Flow.UPDATE) -> PacketOutcom
     rows, sequence, event_ns = updates_in(record[NETEM_PACKET], flow)
     releases = record[NETEM_RELEASE]
     if record.scenario.protocol.acknowledges:
-        way = ACKNOWLEDGEMENTS if flow is Flow.ACKNOWLEDGEMENT else UPDATES
-        releases = releases[releases["flow"] == way]
+        number = ACKNOWLEDGEMENTS if flow is Flow.ACKNOWLEDGEMENT else UPDATES
+        releases = releases[releases["flow"] == number]
     # Of a datagram and its copy, the first intact one counts; it may be the copy.
     which = (rows["bit"] >= 0).astype(np.int64)
     numbers = 2 * rows["sequence"] + which

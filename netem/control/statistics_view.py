@@ -116,7 +116,7 @@ def _cells(
     def series(key: str) -> Sequence[float | None]:
         return history.series(link["name"], direction, key, width)
 
-    arrivals, departures = series("arrived_per_s"), series("forwarded_per_s")
+    arrivals, departures = series("received_per_s"), series("forwarded_per_s")
     losses, top = series("loss"), _top([*arrivals, *departures])
     recent, delay, late = of["recent"], of["delay_ns"], of["lateness_ns"]
     if recent is not None and recent["delay_ns"]["p50"] is not None:
@@ -124,7 +124,7 @@ def _cells(
     return [
         ("", Text(_ARROWS[direction], "bold cyan")),
         ("", _wrapped(of["words"] or "no impairment", width)),
-        ("received", Text(_flow(of, "arrived"))),
+        ("received", Text(_flow(of, "received"))),
         ("", Text(sparkline(arrivals, top), "green")),
         ("forwarded", Text(_flow(of, "forwarded"))),
         ("", Text(sparkline(departures, top), "green")),
@@ -207,7 +207,7 @@ def _burst_of_cap(of: DirectionStatistics) -> str:
 
 
 _COLUMNS: dict[str, Callable[[DirectionStatistics], str]] = {
-    "received": lambda of: _rate(of, "arrived_per_s"),
+    "received": lambda of: _rate(of, "received_per_s"),
     "forwarded": lambda of: _rate(of, "forwarded_per_s"),
     "loss": lambda of: percent_text(of["loss"]["lost"]),
     "predicted": lambda of: percent_text(of["loss"]["predicted"]),
@@ -222,7 +222,7 @@ _OPTIONAL = ("predicted", "p99", "forwarded")
 def _table(history: History, latest: Statistics, width: int, lines: int) -> RenderableType:
     """Return a table with a row for each direction that has received datagrams."""
     rows = [
-        (link, name) for link in latest["links"] for name in DIRECTIONS if link[name]["arrived"]
+        (link, name) for link in latest["links"] for name in DIRECTIONS if link[name]["received"]
     ]
     shown = rows[:lines]
     names = [f" {'→' if name == 'forward' else '←'} {link['name']}" for link, name in shown]
@@ -241,7 +241,8 @@ def _table(history: History, latest: Statistics, width: int, lines: int) -> Rend
     chart_width = min(room() - 1, _CHART_WIDTH)
     if chart_width >= _MIN_CHART_WIDTH:
         series = [
-            history.series(link["name"], name, "arrived_per_s", chart_width) for link, name in shown
+            history.series(link["name"], name, "received_per_s", chart_width)
+            for link, name in shown
         ]
         columns["last minute"[:chart_width]] = [sparkline(one, _top(one)) for one in series]
 
@@ -261,7 +262,7 @@ def _table(history: History, latest: Statistics, width: int, lines: int) -> Rend
 def _used(statistics: Statistics) -> list[tuple[LinkStatistics, Direction]]:
     """Return the directions that have received datagrams."""
     links = statistics["links"]
-    return [(link, name) for link in links for name in DIRECTIONS if link[name]["arrived"]]
+    return [(link, name) for link in links for name in DIRECTIONS if link[name]["received"]]
 
 
 def plain_lines(statistics: Statistics) -> list[str]:
@@ -272,7 +273,7 @@ def plain_lines(statistics: Statistics) -> list[str]:
 def _plain_line(elapsed_s: float, link: LinkStatistics, name: Direction) -> str:
     of = link[name]
     parts = [
-        f"{elapsed_s:.1f} s", f"{link['name']} {name}", f"received {_flow(of, 'arrived')}",
+        f"{elapsed_s:.1f} s", f"{link['name']} {name}", f"received {_flow(of, 'received')}",
         f"forwarded {_flow(of, 'forwarded')}", f"loss {_loss(of)}", f"drawn {_drawn(of)}",
         f"longest loss burst {burst_text(of)}", f"forced {of['fates']['forced']:,}",
         f"delay p99 {time_text((of['recent'] or of)['delay_ns']['p99'])}",

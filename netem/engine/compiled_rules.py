@@ -152,9 +152,7 @@ def _register(modules: Sequence[ModuleType]) -> None:
                 register_jitable(**_OPTIONS)(function)
 
 
-def compiled_dispatch(
-    program: Any, state: Any, stage: Any, memory: Any, flow: Any, decision: Any
-) -> Callable[..., None]:
+def compiled_dispatch(packet: Any, stage: Any, memory: Any) -> Callable[..., None]:
     """Return :func:`noack.impairments.stage_dispatch.apply_stage` for compiled code.
 
     It compares a stage's kind with each behaviour's number in order: ``if kind == 0: ... else: if
@@ -167,19 +165,15 @@ def compiled_dispatch(
 def _comparisons() -> Callable[..., None]:
     from numba.extending import register_jitable
 
-    def nothing(
-        program: Any, state: Any, stage: Any, memory: Any, flow: Any, decision: Any
-    ) -> None:
+    def nothing(packet: Any, stage: Any, memory: Any) -> None:
         pass
 
     def one(kind: int, behaviour: Any, others: Any) -> Callable[..., None]:
-        def dispatch(
-            program: Any, state: Any, stage: Any, memory: Any, flow: Any, decision: Any
-        ) -> None:
+        def dispatch(packet: Any, stage: Any, memory: Any) -> None:
             if stage.kind == kind:
-                behaviour(program, state, stage, memory, flow, decision)
+                behaviour(packet, stage, memory)
             else:
-                others(program, state, stage, memory, flow, decision)
+                others(packet, stage, memory)
 
         return dispatch
 

@@ -19,7 +19,7 @@ from pydantic import Field, FiniteFloat, model_validator
 from noack.core.errors import NoackError, one_line
 from noack.core.linear_systems import Vector
 from noack.settings.matrices import Row, Rows
-from noack.settings.user_files import FileSettings, unchanged
+from noack.settings.named_file import FileSettings, unchanged
 
 _PACKAGES = ("noack", "plant_server", "sensor_node", "controller_node", "netem", "cosim")
 _ROOT = Path(__file__).parents[2]
@@ -49,12 +49,8 @@ class ClassSettings(FileSettings):
 def new_instance(settings: ClassSettings, place: str) -> tuple[Any, str]:
     """Return an instance of the class that loaded settings name, and a description of the class.
 
-    Args:
-        settings: of a loaded scenario.
-        place: the table, for messages, such as ``plant.system``.
-
     Raises:
-        CallerError: the file has changed, or is missing.
+        CallerError: the file has changed, or is missing; ``place`` names the table.
         Exception: anything that the user's code raises; :func:`user_code` describes it.
     """
     made, description = _class(settings, place)

@@ -11,7 +11,7 @@ from noack.trigger.policy_settings import Interval, PolicySettings
 from noack.trigger.trigger_policy import Policy
 
 if TYPE_CHECKING:
-    AnyTrigger = PolicySettings  # noack.config.triggers inserts the union of all policies
+    AnyTrigger = PolicySettings  # noack.config.feature_kinds inserts the union of all policies
 
 
 class CombinedSettings(PolicySettings):

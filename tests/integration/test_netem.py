@@ -88,7 +88,7 @@ def test_the_emulator_relays_any_udp_program(words: str, run: int, engine: str) 
             stdout, _ = ended(process)
     assert arrived == list(range(0, 40, run + 1))
     told = forward_of(stdout)
-    assert told["arrived"] == 40
+    assert told["received"] == 40
     assert told["fates"] == {
         "delivered": 0 if run else 40, "dropped": 30 if run else 0, "forced": 10 if run else 0,
         "corrupted": 0, "overflowed": 0, "blacked_out": 0,
@@ -181,7 +181,7 @@ def test_a_capture_and_statistics_are_written(tmp_path: Path) -> None:
     assert b"passes" in content
     assert b"dropped by the loss model" in content
     told = [json.loads(line) for line in lines.read_text().splitlines()]
-    assert told[-1]["links"][0]["forward"]["arrived"] == 2
+    assert told[-1]["links"][0]["forward"]["received"] == 2
 
 
 def test_a_taken_port_is_reported(tmp_path: Path) -> None:

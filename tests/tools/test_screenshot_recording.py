@@ -1,5 +1,6 @@
 """Check the recording on a screenshot of the viewer in a browser."""
 
+import runpy
 import shutil
 import subprocess
 import sys
@@ -13,10 +14,8 @@ from PIL import Image
 from cosim.output import palette
 from tests.integration.conftest import run_scenario, settings
 
-ROOT = Path(__file__).parents[2]
+TOOL = Path(__file__).parents[2] / "tools" / "screenshot_recording.py"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
-
-
 CAR, SENSOR, CONTROLLER = palette.PLANT, palette.SENSOR, palette.CONTROLLER
 
 
@@ -29,7 +28,7 @@ def test_a_recording_shows_the_car_and_the_position_in_each_model(tmp_path: Path
     picture = tmp_path / "run.png"
     done = subprocess.run(
         [
-            sys.executable, str(ROOT / "tools" / "screenshot_recording.py"),
+            sys.executable, str(TOOL),
             str(finished.run_dir / "recording.rrd"), str(picture),
             "--size", "1200x800", "--theme", "light",
         ],
@@ -58,3 +57,22 @@ def near(image: Image.Image, colour: palette.Colour) -> Any:
     """Return the positions (k, 2) of pixels of this colour, with a tolerance for smoothed edges."""
     pixels = np.asarray(image, dtype=int)
     return np.argwhere(np.abs(pixels - colour).max(axis=2) < 20)
+
+
+@pytest.mark.parametrize("missing", ["recording", "browser"])
+def test_a_missing_file_or_program_gives_one_line(
+    missing: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = tmp_path / "recording.rrd"
+    if missing == "browser":
+        path.write_bytes(b"RRF2")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(sys, "argv", [str(TOOL), str(path), str(tmp_path / "picture.png")])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(TOOL), run_name="__main__")
+    assert ended.value.code == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert ("no such recording" if missing == "recording" else "no browser") in line

@@ -6,22 +6,9 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from cosim.cli.command import (
-    RUNS,
-    JsonOption,
-    ReportOption,
-    RunsOption,
-    ScenarioArgument,
-    SetOption,
-    VerboseOption,
-    command,
-    find_scenario,
-    print_json,
-)
+from cosim.cli import command as cli
 from cosim.cli.execute_run import RunOutput, finalize_run, warn_of_violations
-from cosim.record.run_directory import DEFAULT_RUNS
 from noack.config.scenario import Scenario
-from noack.config.scenario_file import load
 from noack.core.errors import ExitStatus
 
 
@@ -32,15 +19,15 @@ class TriggerMode(StrEnum):
     CONTINUOUS = "continuous"
 
 
-@command(RUNS, 30, [
+@cli.command(cli.RUNS, 30, [
     ("noack simulate lane_following", "the processes of a live run, without sockets"),
     ("noack simulate lane_following --trigger continuous", "the paper's loop, exactly"),
     ("noack simulate reactor_petc --no-report --json", "print the summary as JSON"),
 ])  # fmt: skip
 def simulate(
-    scenario: ScenarioArgument,
+    scenario: cli.ScenarioArgument,
     *,
-    settings: SetOption = None,
+    settings: cli.SetOption = None,
     trigger: Annotated[
         TriggerMode,
         typer.Option(
@@ -48,16 +35,16 @@ def simulate(
             "continuous: at all times."
         ),
     ] = TriggerMode.SAMPLED,
-    runs: RunsOption = DEFAULT_RUNS,
-    report: ReportOption = True,
-    verbose: VerboseOption = False,
-    json: JsonOption = False,
+    runs: cli.RunsOption = cli.DEFAULT_RUNS,
+    report: cli.ReportOption = True,
+    verbose: cli.VerboseOption = False,
+    json: cli.JsonOption = False,
 ) -> int:
     """Run a scenario in virtual time: no sockets, no deadlines missed.
 
     The trigger, the losses and the controller are those of a live run.
     """
-    loaded = load(find_scenario(scenario), settings or ())
+    loaded = cli.load_scenario(scenario, settings)
     warn_of_violations(loaded)
     if trigger is TriggerMode.CONTINUOUS:
         return _simulate_continuously(loaded, json=json)
@@ -79,7 +66,7 @@ def _simulate_continuously(scenario: Scenario, *, json: bool) -> int:
     with PatientConsole(stderr=True).status("simulating"):
         run = run_continuous(resolved)
     if json:
-        print_json(document(run, resolved))
+        cli.print_json(document(run, resolved))
     else:
         print_run(Console(), run, resolved)
     return ExitStatus(summary(run, resolved)["exit"]["status"])

@@ -46,7 +46,7 @@ class RecordingServer:
 
     Args:
         path: the recording.
-        follow: at the end of the file, wait for more until ``finish``.
+        follow: at the end of the file, wait for more until ``finished`` is set.
 
     Attributes:
         address: address of the page; the recording is ``recording.rrd`` below it. Everyone who has
@@ -108,10 +108,6 @@ class RecordingServer:
             if window.poll() is not None:
                 return None
         return window
-
-    def finish(self) -> None:
-        """Let downloads end at the end of the file."""
-        self.finished.set()
 
     def drain(self) -> None:
         """Wait a moment for downloads in progress to reach the end of the file."""

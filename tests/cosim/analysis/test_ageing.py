@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.analysis.claims.claim import ClaimVerdict
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
+from cosim.analysis.summary_model import ClaimVerdict
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve

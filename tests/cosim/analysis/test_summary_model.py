@@ -12,8 +12,7 @@ import pytest
 from rich.console import Console
 
 import noack
-from cosim.analysis.run_outcome import Outcome
-from cosim.analysis.run_summary import summarise
+from cosim.analysis.run_summary import Outcome, summarise
 from cosim.analysis.summary_model import RunSummary, can_be_shown
 from cosim.output.report.report_page import page
 from cosim.output.run_verdict import print_outcome

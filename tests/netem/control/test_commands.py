@@ -145,7 +145,7 @@ def watching(stdout: int, stdin: int) -> Iterator[subprocess.Popen[bytes]]:
 def test_watch_prints_lines_to_a_pipe_until_its_reader_closes_it(
     relay: FakeRelay, server: ControlServer
 ) -> None:
-    relay.counters["up", "forward"].arrived = 7
+    relay.counters["up", "forward"].received = 7
     with watching(subprocess.PIPE, subprocess.DEVNULL) as process:
         assert process.stdout is not None
         assert process.stderr is not None
@@ -156,7 +156,7 @@ def test_watch_prints_lines_to_a_pipe_until_its_reader_closes_it(
 
 
 def test_watch_fails_when_the_emulator_ends(relay: FakeRelay, commands: CommandQueue) -> None:
-    relay.counters["up", "forward"].arrived = 7
+    relay.counters["up", "forward"].received = 7
     with ExitStack() as emulator:
         emulator.enter_context(ControlServer("lab", commands))
         with watching(subprocess.PIPE, subprocess.DEVNULL) as process:
@@ -169,7 +169,7 @@ def test_watch_fails_when_the_emulator_ends(relay: FakeRelay, commands: CommandQ
 
 
 def test_watch_redraws_on_a_terminal_until_q(relay: FakeRelay, server: ControlServer) -> None:
-    relay.counters["up", "forward"].arrived = 7
+    relay.counters["up", "forward"].received = 7
     terminal, end = pty.openpty()
     termios.tcsetwinsize(end, (24, 80))
     before = termios.tcgetattr(end)

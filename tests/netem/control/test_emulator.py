@@ -47,7 +47,7 @@ def test_a_cap_set_at_runtime_is_kept(engine: str, capsys: pytest.CaptureFixture
         assert received == list(range(22, 320, 3))
 
         found = shown(capsys)["links"][0]["forward"]
-        assert (found["arrived"], found["forwarded"]) == (320, 120)
+        assert (found["received"], found["forwarded"]) == (320, 120)
         assert found["fates"] | {"delivered": 0} == {
             "delivered": 0, "dropped": 200, "forced": 100, "corrupted": 0, "overflowed": 0,
             "blacked_out": 0,
@@ -99,7 +99,7 @@ def run_through(
         send_through(address, payloads)
         while True:
             found = shown(capsys)["links"][0]["forward"]
-            if found["arrived"] == len(payloads) and found["in_flight"] == 0:
+            if found["received"] == len(payloads) and found["in_flight"] == 0:
                 return [server.recv(100) for _ in range(found["forwarded"])]
 
 

@@ -29,20 +29,20 @@ def client(server: ControlServer) -> Any:
 
 
 def test_statistics_can_be_queried(relay: FakeRelay, client: Client) -> None:
-    relay.counters["down", "reverse"] = Counters(arrived=12, delivered=12)
+    relay.counters["down", "reverse"] = Counters(received=12, delivered=12)
     document = client.ask("report")
     assert [link["name"] for link in document["links"]] == ["up", "down"]
-    assert document["links"][1]["reverse"]["arrived"] == 12
+    assert document["links"][1]["reverse"]["received"] == 12
 
 
 def test_statistics_are_published(relay: FakeRelay, client: Client) -> None:
-    relay.counters["up", "forward"].arrived = 1
+    relay.counters["up", "forward"].received = 1
     heard = client.follow(lambda: False)
     first = next(heard)
-    relay.counters["up", "forward"].arrived = 1001
+    relay.counters["up", "forward"].received = 1001
     second = next(heard)
     before, after = (document["links"][0]["forward"] for document in (first, second))
-    assert after["arrived"] - before["arrived"] in (
+    assert after["received"] - before["received"] in (
         0,
         1000,
     )  # the server may have sampled the counters just before the change

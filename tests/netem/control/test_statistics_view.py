@@ -25,8 +25,8 @@ def documents(relay: FakeRelay, seconds: int = 3) -> Sequence[Statistics]:
             if way == "forward":
                 counters = relay.counters[name, way]
                 came = 1000 * second
-                counters.arrived += came
-                counters.arrived_bytes += 100 * came
+                counters.received += came
+                counters.received_bytes += 100 * came
                 counters.dropped += came // 5
                 counters.forced += came // 10
                 counters.delivered += came - came // 5 - came // 10

@@ -88,7 +88,7 @@ class Running:
 
         def is_settled() -> bool:
             found = getattr(self.relay.report()[number], side)
-            return bool(found.counters.arrived >= arrived and found.in_flight == 0)
+            return bool(found.counters.received >= arrived and found.in_flight == 0)
 
         self.until(is_settled)
 

@@ -124,7 +124,7 @@ def test_memory_stays_flat_over_a_million_datagrams() -> None:
 
 def handled(report: object) -> int:
     forward = report.forward  # type: ignore[attr-defined]
-    return int(forward.counters.arrived + forward.unintended["lost_in_kernel"])
+    return int(forward.counters.received + forward.unintended["lost_in_kernel"])
 
 
 FIRST_START = """

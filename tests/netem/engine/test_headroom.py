@@ -31,10 +31,10 @@ def test_datagrams_beyond_the_memory_limit_are_dropped_and_counted(engine: Engin
         sent, forward = 0, {}
         for line in process.stdout:
             forward = json.loads(line)["links"][0]["forward"]
-            if forward["arrived"] + sum(forward["unintended"].values()) == sent:
+            if forward["received"] + sum(forward["unintended"].values()) == sent:
                 if NO_MEMORY in forward["unintended"]:
                     break
                 assert sent < MOST
                 send_through(address, [bytes(SIZE_BYTES)] * BATCH)
                 sent += BATCH
-        assert forward["in_flight"] == forward["arrived"] > 100
+        assert forward["in_flight"] == forward["received"] > 100

@@ -90,8 +90,8 @@ def test_a_one_way_link_sends_from_one_port_and_discards_answers(
             report = one.report()
             assert drain(server) == []
     assert len(sources) == 1
-    assert (report.clients_ever, report.forward.counters.arrived) == (2, 2)
-    assert report.reverse.counters.arrived == 0
+    assert (report.clients_ever, report.forward.counters.received) == (2, 2)
+    assert report.reverse.counters.received == 0
     if sys.platform == "linux":
         assert report.discarded == 10
     ports = tap.events["source_port"][tap.events["departure"] == 1]
@@ -120,7 +120,7 @@ def test_only_answers_of_the_server_reach_the_client(engine: Engine) -> None:
         server.sendto(b"truth", path)
         assert client.recv(100) == b"truth"
         assert drain(client) == []
-        assert one.report().reverse.counters.arrived == 1
+        assert one.report().reverse.counters.received == 1
 
 
 def test_an_absent_server_is_reported_and_causes_no_later_loss(
@@ -301,7 +301,7 @@ def test_a_lack_of_file_descriptors_is_reported_and_counted(
 
 
 def sum_of(report: Any) -> int:
-    return int(report.refused + report.forward.counters.arrived)
+    return int(report.refused + report.forward.counters.received)
 
 
 @pytest.mark.parametrize("return_path", [True, False])
@@ -368,7 +368,7 @@ def test_all_kernel_drops_of_segmented_messages_are_counted(engine: Engine) -> N
 
 
 def all_of(way: Any) -> int:
-    return int(way.counters.arrived + way.unintended["lost_in_kernel"])
+    return int(way.counters.received + way.unintended["lost_in_kernel"])
 
 
 @pytest.mark.parametrize("segment", [False, True])
@@ -391,7 +391,7 @@ def test_segments_are_separate_datagrams(engine: Engine, segment: bool) -> None:
             sent += run
             total += count
         one.settled(total)
-        assert one.report().forward.counters.arrived == total
+        assert one.report().forward.counters.received == total
         kept = [data for number, data in enumerate(sent) if number % 3]
         assert [data for data, _ in drain(server)] == kept
 

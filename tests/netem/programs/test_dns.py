@@ -129,7 +129,7 @@ def ask(emulate: Emulate, case: Case) -> list[Asked]:
         with closing(Client(emulator.host, emulator.port)) as client:
             asked = [client.ask(number) for number in range(QUESTIONS)]
         link = emulator.finish()
-    assert link["forward"]["arrived"] == client.tries
+    assert link["forward"]["received"] == client.tries
     got = list(islice(answered(case), client.tries))
     assert [one.answered for one in asked] == [got.index(True, one.first) for one in asked]
     return asked

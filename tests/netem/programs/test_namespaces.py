@@ -244,7 +244,7 @@ def test_packets_refused_by_a_full_output_queue_are_counted(
             counting.kill()
     forward = link["forward"]
     kernel, queue = (forward["unintended"][key] for key in ("lost_in_kernel", QUEUE_FULL))
-    assert forward["arrived"] + kernel == MANY
+    assert forward["received"] + kernel == MANY
     assert forward["forwarded"] == int(said) + queue
     assert queue > 0
     assert "queue on the way out was full" in stderr

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.config.plants import PLANTS
+from noack.config.feature_kinds import PLANTS
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load

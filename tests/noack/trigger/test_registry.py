@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from noack.config.feature_kinds import POLICIES
 from noack.config.resolution import policy_of, resolve
 from noack.config.scenario_file import validate
-from noack.config.triggers import POLICIES
 from noack.trigger.trigger_policy import Trigger
 
 N = 2

@@ -212,7 +212,7 @@ def test_a_delivery_of_a_dropped_update_is_found() -> None:
     differences = {leg.leg: leg.difference for leg in found.messages}
     delivery = differences["netem → controller"]
     assert delivery is not None
-    assert delivery.what == "netem does not let it through"
+    assert delivery.what == "netem did not forward it"
     assert (delivery.table, delivery.row) == (CONTROLLER_DELIVERY, row)
     assert differences["sensor → netem"] is None
 

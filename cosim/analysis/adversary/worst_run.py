@@ -1,14 +1,19 @@
-"""The worst run that the adversary found, compared with a certificate."""
+"""The worst run that the adversary found, compared with a certificate; as a table and as JSON."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
+from rich.console import Console
+from rich.table import Table
 
-from cosim.analysis.adversary.loss_patterns import Pattern
 from cosim.analysis.adversary.objective import Measure, Objective
 from cosim.analysis.adversary.pattern_evaluation import Valued
+from cosim.analysis.adversary.search_nodes import Pattern
+from noack.config.scenario import Scenario
+from noack.core.number_format import number
 from noack.theory.certificate import Constants
 from noack.theory.scenario_certificates import ScenarioCertificate
 
@@ -48,7 +53,7 @@ class Worst:
     @property
     def tightness(self) -> float | None:
         """Found / certified value, or certified / found for inter-event times: at most 1."""
-        if self.value is None or self.certified is None or not self.certified or not self.value:
+        if not self.value or not self.certified:
             return None
         if self.objective is Objective.INTER_EVENT:
             return self.certified / self.value
@@ -82,14 +87,14 @@ class Worst:
         return {key: None if value == math.inf else value for key, value in found.items()}
 
 
-def shown(value: float, objective: Objective) -> float | None:
-    """Return a value with the sign of the reported quantity."""
+def reported(value: float, objective: Objective) -> float | None:
+    """Return the reported quantity of an objective's value."""
     if objective is not Objective.INTER_EVENT:
         return value
     return None if value == -math.inf else -value
 
 
-def certified(
+def certified_value(
     certificate: ScenarioCertificate, measure: Measure, horizon_s: float, valued: Valued
 ) -> float | None:
     """Return the certificate's bound on the same quantity at the same time."""
@@ -102,7 +107,7 @@ def certified(
         until_s = min(horizon_s, certificate.floor_from_s) if late is not None else horizon_s
         cost = _square_integral(first, until_s)
         return cost if late is None else cost + late.state**2 * (horizon_s - until_s)
-    at_s = np.array([0.0 if valued.at_s is None else valued.at_s])
+    at_s = np.array([valued.at_s or 0.0])
     level = float(measure.level(at_s)[0])
     if measure.objective is Objective.STATE:
         return float(certificate.state(at_s)[0]) / level
@@ -113,3 +118,58 @@ def _square_integral(constants: Constants, until_s: float) -> float:
     """Return ∫(X e^{−rt})² dt up to ``until_s``."""
     rate = 2 * constants.rate_per_s
     return constants.state**2 * (-math.expm1(-rate * until_s) / rate if rate else until_s)
+
+
+def document(
+    found: Sequence[Worst], resolved: Scenario, certificate: ScenarioCertificate
+) -> dict[str, Any]:
+    """Return the results as JSON."""
+    return {
+        "scenario": resolved.name,
+        "mode": resolved.mode,
+        "mansd": resolved.network.mansd,
+        "horizon_s": resolved.horizon_s,
+        "certificate": certificate.to_json(),
+        "worst": {worst.objective.value: worst.to_json() for worst in found},
+    }
+
+
+def print_worst(
+    console: Console, found: Sequence[Worst], resolved: Scenario, certificate: ScenarioCertificate
+) -> None:
+    """Print the results and their loss patterns."""
+    table = Table(
+        title=f"{resolved.name}: worst losses found, at most M − 1 = {resolved.network.mansd} "
+        f"consecutive, {resolved.horizon_s:g} s"
+    )
+    for heading in ("", "no loss", "own seed", "worst", "certified", "worst / certified"):
+        table.add_column(heading, justify="right" if heading else "left")
+    for worst in found:
+        values = (worst.lossless, worst.own, worst.value, worst.certified)
+        table.add_row(
+            _quantity(worst.objective, certificate),
+            *(number(value, 4) for value in values),
+            "[bold red]exceeded[/]" if worst.breaches else number(worst.tightness, 4),
+        )
+    console.print(table)
+    for worst in found:
+        at = "" if worst.at_s is None else f"at {worst.at_s:.6f} s; "
+        how = "all patterns searched" if worst.exact else "not all patterns searched"
+        speed = f"{worst.nodes:,} segments, {worst.nodes / worst.elapsed_s:,.0f}/s"
+        console.print(f"{worst.objective.value}: {at}{how} ({speed})")
+        console.print(f"  {worst.text}", soft_wrap=True, highlight=False)
+    console.print("[dim]D delivered, · lost; --json prints the times of the events[/]")
+
+
+def _quantity(objective: Objective, certificate: ScenarioCertificate) -> str:
+    rate = certificate.alpha_per_s
+    if certificate.constants is not None:
+        rate = certificate.constants.rate_per_s
+    symbol = "α" if rate == certificate.alpha_per_s else f"{rate:.3g}"
+    growth = f" e^({symbol}t)" if rate else ""
+    return {
+        Objective.ERROR: f"Δ: ‖e_c‖{growth} / β",
+        Objective.STATE: f"X: ‖x‖{growth}",
+        Objective.COST: "∫ ‖x‖² dt",
+        Objective.INTER_EVENT: "inter-event time, s",
+    }[objective]
