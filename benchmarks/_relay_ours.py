@@ -67,7 +67,7 @@ def totals_of(stdout: str) -> Totals:
         _, _, totals = stdout.partition("\n")  # the first line reports that it is ready
         forward = json.loads(totals)["links"][0]["forward"]
         return Totals(
-            arrived=forward["arrived"],
+            arrived=forward["received"],
             forwarded=forward["forwarded"],
             longest_loss_burst=forward["longest_loss_burst"],
             lost_in_kernel=forward["unintended"]["lost_in_kernel"],

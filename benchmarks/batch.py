@@ -36,11 +36,11 @@ from cosim.simulation.batch.batch_interface import (
 from cosim.simulation.continuous.continuous_loop import ContinuousLoop
 from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
 from cosim.simulation.continuous.network_fates import network_fates
+from noack.config.feature_kinds import POLICIES
 from noack.config.resolution import LoopMatrices, loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
 from noack.config.sections.run_sections import SeedsSection
-from noack.config.triggers import POLICIES
 from noack.core.linear_systems import Vector
 
 Mode = Literal["model", "zoh"]

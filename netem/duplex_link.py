@@ -21,32 +21,32 @@ class Duplex(FixedMachine):
 
     Args:
         forward: the link for flow 0.
-        back: the link for flow 1.
+        reverse: the link for flow 1.
         first_number: number of the first input.
     """
 
     def __init__(
-        self, forward: Machine[Datagram], back: Machine[Datagram], *, first_number: int = 0
+        self, forward: Machine[Datagram], reverse: Machine[Datagram], *, first_number: int = 0
     ) -> None:
-        self._ways = {UPDATES: forward, ACKNOWLEDGEMENTS: back}
+        self._links = {UPDATES: forward, ACKNOWLEDGEMENTS: reverse}
         self._inputs = first_number
 
     def next_deadline_ns(self) -> int | None:
         """Time of the next departure in either direction; None: nothing is in flight."""
-        due = (way.next_deadline_ns() for way in self._ways.values())
+        due = (link.next_deadline_ns() for link in self._links.values())
         return min((t_ns for t_ns in due if t_ns is not None), default=None)
 
     def on_timer(self, now_ns: int) -> Sequence[Datagram | Record | Notice]:
         """Forward the datagram that is due; if one is due in each direction, the one of flow 0."""
         next_ns = self.next_deadline_ns()
-        way = next(way for way in self._ways.values() if way.next_deadline_ns() == next_ns)
-        return self._numbered(way.on_timer(now_ns))
+        link = next(link for link in self._links.values() if link.next_deadline_ns() == next_ns)
+        return self._numbered(link.on_timer(now_ns))
 
     def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
         """Process a datagram; return it if it is neither lost nor delayed."""
-        if message.flow not in self._ways:
-            raise ValueError(f"a network with a way back has no flow {message.flow}")
-        return self._numbered(self._ways[message.flow].handle(message, now_ns))
+        if message.flow not in self._links:
+            raise ValueError(f"a network with a reverse direction has no flow {message.flow}")
+        return self._numbered(self._links[message.flow].handle(message, now_ns))
 
     def _numbered(
         self, outputs: Sequence[Datagram | Record | Notice]
@@ -72,5 +72,7 @@ def network_of(
     forward = update_link_of(resolved, start) if forward is None else forward
     if not resolved.protocol.acknowledges:
         return forward
-    back = link_of(resolved.network.reverse.link, resolved.seeds.loss, ACKNOWLEDGEMENT_LINK, start)
-    return Duplex(forward, back, first_number=start.first_number)
+    reverse = link_of(
+        resolved.network.reverse.link, resolved.seeds.loss, ACKNOWLEDGEMENT_LINK, start
+    )
+    return Duplex(forward, reverse, first_number=start.first_number)

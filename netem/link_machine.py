@@ -172,18 +172,10 @@ class Link:
         record = Record(NETEM_PACKET, row)
         if decision.release_ns == NEVER_NS:
             return (record,)
-        outputs: list[Datagram | Record | Notice] = []
-        intact = decision.bit < 0
-        self._release(
-            outputs, message, decision.release_ns, decision.bit, now_ns, copy=False, counts=intact
-        )
+        leaving = self._release(message, decision.release_ns, decision.bit, copy=False)
         if decision.copy_ns != NEVER_NS:
-            counts = not intact and decision.copy_bit < 0
-            self._release(
-                outputs, message, decision.copy_ns, decision.copy_bit, now_ns,
-                copy=True, counts=counts,
-            )  # fmt: skip
-        return (*outputs, record)
+            leaving += self._release(message, decision.copy_ns, decision.copy_bit, copy=True)
+        return (*leaving, record)
 
     def decide(self, flow: int, size_bytes: int, now_ns: int) -> PacketDecision:
         """Decide for a flow's next packet; the next call overwrites the decision."""
@@ -194,31 +186,25 @@ class Link:
         return self._decision
 
     def _release(
-        self,
-        outputs: list[Datagram | Record | Notice],
-        message: Datagram,
-        release_ns: int,
-        bit: int,
-        now_ns: int,
-        *,
-        copy: bool,
-        counts: bool,
-    ) -> None:
-        """Forward a datagram, or keep it until it is due."""
+        self, message: Datagram, release_ns: int, bit: int, *, copy: bool
+    ) -> tuple[Datagram, ...]:
+        """Return a datagram that leaves at once, or keep it until it is due."""
+        decision = self._decision
+        counts = bit < 0 and not (copy and decision.bit < 0)
         if bit >= 0:
             message = message._replace(data=flipped(message.data, bit))
         self._put_in_flight += 1
         leaving = _InFlight(
-            release_ns, self._put_in_flight, self._decision.packet, copy, counts,
-            release_ns > now_ns, message,
+            release_ns, self._put_in_flight, decision.packet, copy, counts,
+            release_ns > decision.arrival_ns, message,
         )  # fmt: skip
         # Overdue datagrams leave first, even if ``on_timer`` has not been called for them yet.
         overdue = bool(self._in_flight) and self._in_flight[0].release_ns <= release_ns
         if leaving.delayed or overdue:
             heapq.heappush(self._in_flight, leaving)
-        else:
-            self._leave(leaving)
-            outputs.append(message)
+            return ()
+        self._leave(leaving)
+        return (message,)
 
     def _leave(self, leaving: _InFlight) -> bool:
         return leave(
@@ -276,17 +262,14 @@ class RunLink(Link):
         has reached the new cap, the datagram passes. Hence a loss burst is never longer than the
         largest cap that applied during it.
         """
-        said = self._schedule.announce(
-            NETEM_SETTING, change, self._inputs, now_ns, self._reached_ns
-        )
-        self._inputs += 1
-        return said
+        number, self._inputs = self._inputs, self._inputs + 1
+        return self._schedule.announce(NETEM_SETTING, change, number, now_ns, self._reached_ns)
 
     def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
         """Process a datagram; return it if it is neither lost nor delayed."""
         if self._schedule.next_ns is not None:
-            while (found := self._schedule.take(now_ns)) is not None:
-                self._apply(found.prepared)
+            while (change := self._schedule.take(now_ns)) is not None:
+                self._apply(change.prepared)
         self._reached_ns = now_ns
         return super().handle(message, now_ns)
 

@@ -40,14 +40,6 @@ class LossPrediction(NamedTuple):
     """Why there is no rate, or the condition under which the rate holds; else empty."""
 
 
-def predicted_loss(settings: LinkSettings) -> float | None:
-    """Return the expected share of a flow's packets that are dropped or corrupted.
-
-    None if it cannot be predicted; :func:`predict` says why.
-    """
-    return predict(settings).rate
-
-
 @lru_cache(maxsize=64)
 def predict(settings: LinkSettings) -> LossPrediction:
     """Predict the loss rate of a direction; the settings must not name files.

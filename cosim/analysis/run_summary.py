@@ -3,6 +3,8 @@
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,7 +34,7 @@ from cosim.record.estimation_error import disturbance_summary, estimation_summar
 from cosim.record.packet_outcomes import packet_outcomes
 from cosim.record.recorded_changes import changes_of
 from cosim.record.run_record import Life, Rows, RunRecord
-from netem.loss_prediction import predicted_loss
+from netem.loss_prediction import predict
 from noack.config.runtime_parameters import text_of
 from noack.core.clock import NS_PER_S
 from noack.core.errors import ExitStatus
@@ -52,6 +54,16 @@ from plant_server.watchdog import too_old
 
 Summary = dict[str, Any]
 """The content of ``summary.json``: :class:`~cosim.analysis.summary_model.RunSummary` as JSON."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The outcome of a run, for tables and programs."""
+
+    run_dir: Path
+    status: ExitStatus
+    reason: str
+    summary: Summary
 
 
 @np.errstate(all="ignore")  # a diverging run overflows and has a summary all the same
@@ -120,7 +132,7 @@ def _transmissions(record: RunRecord) -> dict[str, Any]:
         "events": len(events),
         "deliveries": len(deliveries),
         "drops": int(outcomes.lost.sum()),
-        "loss_expected": None if scenario.changes else predicted_loss(scenario.network.link),
+        "loss_expected": None if scenario.changes else predict(scenario.network.link).rate,
         "drops_by_cause": drops_by_cause(outcomes),
         "forced_deliveries": int((outcomes.rows["fate"] == Fate.FORCED).sum()),
         "longest_loss_burst": max(outcomes.longest_loss_burst(), longest),

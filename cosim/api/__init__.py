@@ -6,9 +6,10 @@ function imports these modules when it is first called.
 
 from importlib.metadata import version
 
-from cosim.api.certificates import Certificates, certify
+from cosim.api.certificates import certify
 from cosim.api.runs import Run, compare, open_run, run, simulate
 from cosim.api.scenarios import from_system, load, with_settings
+from cosim.output.certificate_report import Certificates
 from noack.config.scenario import Scenario
 from noack.core.errors import NoackError
 

@@ -17,9 +17,9 @@ from noack.protocol.record_tables import (
     entry_names,
 )
 
-_NOT_THERE = "none"
-_OVERTAKEN = "delivered_out_of_order"
-_UNDER_WAY = "in_flight"
+_NOT_RECEIVED = "none"
+_OUT_OF_ORDER = "delivered_out_of_order"
+_IN_FLIGHT = "in_flight"
 
 
 def with_seconds(table: pa.Table) -> pa.Table:
@@ -51,15 +51,15 @@ def events(record: RunRecord) -> pa.Table:
     crossed = packet_outcomes(record)
     fates = np.array([fate.name.lower() for fate in Fate], dtype=object)[crossed.rows["fate"]]
     # The emulator forwarded them, but they were not delivered.
-    fates[effective(crossed.rows["fate"]) & crossed.lost] = _OVERTAKEN
-    fates[crossed.in_flight] = _UNDER_WAY
+    fates[effective(crossed.rows["fate"]) & crossed.lost] = _OUT_OF_ORDER
+    fates[crossed.in_flight] = _IN_FLIGHT
     known = dict(zip(crossed.sequence.tolist(), fates.tolist(), strict=True))
     columns = {
         "event": sent["event"],
         "t_s": t_s,
         "t_ns": sent["t_ns"],
         "interval_s": np.diff(t_s, prepend=np.nan),
-        "fate": np.array([known.get(int(n), _NOT_THERE) for n in sent["event"]], dtype=np.str_),
+        "fate": np.array([known.get(int(n), _NOT_RECEIVED) for n in sent["event"]], dtype=np.str_),
         "received": np.isin(sent["event"], record[CONTROLLER_DELIVERY]["sequence"]),
     }
     return _table(columns)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from cosim.analysis.fidelity import Fidelity
     from cosim.analysis.replay import Replay
-    from cosim.analysis.run_outcome import Outcome
+    from cosim.analysis.run_summary import Outcome
     from cosim.record.run_record import RunRecord
     from cosim.studies.comparison.run_comparison import RunComparison
 
@@ -128,9 +128,9 @@ class Run:
         Returns:
             ``event``, its number; ``t_s`` and ``t_ns``; ``interval_s``, the inter-event time, NaN
             for the first event; ``fate`` in the network: delivered, forced (delivered because M − 1
-            was reached), dropped, corrupted, overflowed, blacked_out, overtaken (delivered out of
-            order), in_flight at the end, or none, if it did not reach the network; ``received``,
-            whether the controller processed it.
+            was reached), dropped, corrupted, overflowed, blacked_out, delivered_out_of_order,
+            in_flight at the end, or none, if it did not reach the network; ``received``, whether
+            the controller processed it.
         """
         from cosim.api.data_frames import events
 

@@ -114,7 +114,7 @@ class ChildProcesses:
             raise MachineError(f"{role} cannot be started: {error}") from None
         assert child.stdin is not None
         with contextlib.suppress(BrokenPipeError):
-            child.stdin.write(self._ticket.dumps() + "\n")
+            child.stdin.write(self._ticket.model_dump_json() + "\n")
             child.stdin.flush()
         return child
 

@@ -9,14 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from cosim.analysis.claims.claim import as_json
 from cosim.analysis.claims.claims_by_part import RunClaims
 from cosim.analysis.fidelity import fidelity_for_summary
 from cosim.analysis.loss_statistics import list_violations
 from cosim.analysis.model_comparison import linearisation
 from cosim.analysis.replay import replay
-from cosim.analysis.run_outcome import Outcome
-from cosim.analysis.run_summary import Summary, summarise
+from cosim.analysis.run_summary import Outcome, Summary, summarise
 from cosim.analysis.summary_model import ExitPart, RunSummary, can_be_shown
 from cosim.record.run_directory import (
     ENDING_FILE,
@@ -30,7 +28,7 @@ from cosim.record.run_directory import (
 from cosim.record.run_ending import EndingFile, RunEnding
 from cosim.record.run_record import RunRecord, finish_record, load_record
 from noack.core.errors import CallerError, ExitStatus, MachineError
-from noack.core.whole_file import write_whole
+from noack.core.file_access import write_whole
 from noack.runtime.spool import SPOOL
 
 
@@ -113,7 +111,7 @@ def _with_results(record: RunRecord, claims: RunClaims, summary: RunSummary) -> 
             longest = max(longest, int(claims.conditions["dropouts"] or 0))
         results |= {
             "conditions": claims.conditions,
-            "claims": as_json(claims.judge()),
+            "claims": claims.judge(),
             "judged_until_s": claims.judged_until_s,
             "assumption_violations": violations,
             "longest_loss_burst": longest,
@@ -171,7 +169,7 @@ def rewrite_report(run_dir: Path) -> Path:
 
 
 def _report(record: RunRecord, summary: Summary, run_dir: Path, claims: RunClaims) -> Path:
-    from cosim.output.report.report_file import write_report  # imports matplotlib
+    from cosim.output.report.report_page import write_report  # imports matplotlib
 
     try:
         envelopes = claims.envelopes()

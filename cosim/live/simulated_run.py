@@ -20,7 +20,7 @@ from cosim.simulation.virtual_time import Progress, simulate
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import ExitStatus, MachineError, why
-from noack.core.whole_file import write_whole
+from noack.core.file_access import write_whole
 from noack.runtime.life_cycle import HORIZON
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from cosim.record.run_directory import ENVIRONMENT_FILE, read_object
-from noack.core.whole_file import write_whole
+from noack.core.file_access import write_whole
 
 Kind = Literal["live", "simulated"]
 """Whether a run used processes (live) or virtual time (simulated)."""

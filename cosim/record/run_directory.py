@@ -14,10 +14,8 @@ from typing import Any
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import dumps
 from noack.core.errors import CallerError, MachineError, why
-from noack.core.file_lock import locked
-from noack.core.regular_file import read_regular
-from noack.core.whole_file import write_whole
-from noack.settings.user_files import file_tables, unchanged, with_tables
+from noack.core.file_access import locked, read_regular, write_whole
+from noack.settings.named_file import file_tables, unchanged, with_tables
 
 DEFAULT_RUNS = Path("runs")
 """Folder for run directories, relative to the current folder."""

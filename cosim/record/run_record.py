@@ -23,7 +23,7 @@ from noack.config.resolution import LoopMatrices, loop_of, tables_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, MachineError, PeerError, one_line, why
-from noack.core.whole_file import write_whole
+from noack.core.file_access import write_whole
 from noack.protocol.machine_interface import GENERATION, RESTART
 from noack.protocol.record_tables import OWNER, entry_names
 from noack.protocol.topology import LOOP_ROLES, RECORDER

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from netem.engine.relay_interface import LinkSpec
 from netem.words.links_file import load_links
-from netem.words.words_to_settings import KEYWORDS, parse, require_no_dashes, settings_of
+from netem.words.words_to_settings import GRAMMAR, KEYWORDS, parse, require_no_dashes, settings_of
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings, read_files
 from noack.impairments.quantities import OWN_TIME_S
@@ -25,20 +25,7 @@ _EXAMPLE_LISTEN, _EXAMPLE_TO = ":9000", ":9001"
 
 _EPILOG = """
 words, in the order in which they apply; T is a time (10ms), P a percentage (5%), N a number:
-  loss P [CORR]
-  loss gemodel P [R [1-H [1-K]]]
-  loss state P13 [P31 [P32 [P23 [P14]]]]
-  loss burst MEAN_LOSS MEAN_BURST
-  loss periodic B/N [from N]  (B consecutive datagrams of every N)
-  loss script N,N,... [every N]
-  loss trace FILE [once]
-  loss worst | loss none
-  delay T [JITTER [CORR]] [distribution uniform|normal|pareto|paretonormal|FILE] [lossrel P]
-  delay T samples T,T,... [lossrel P]
-  duplicate P [CORR] | corrupt P [CORR]
-  reorder P [CORR] [gap N] | gap N
-  rate RATE [OVERHEAD [CELL [CELL_OVERHEAD]]] [queue N]
-  blackout T-T[,T-T...] [every T]
+  {grammar}
 
 settings, at any place:
   mansd N    at most N consecutive losses in each flow
@@ -99,7 +86,7 @@ def parser() -> Parser:
         description="A UDP relay that emulates a network, configured in the words of `tc netem`. "
         "With mansd N, at most N consecutive datagrams of a flow are lost. Without --listen, it "
         "joins the run that `noack record SCENARIO` has opened.",
-        epilog=_EPILOG,
+        epilog=_EPILOG.format(grammar="\n  ".join(GRAMMAR)),
         formatter_class=_Formatter,
         allow_abbrev=False,
     )

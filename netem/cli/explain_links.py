@@ -2,8 +2,8 @@
 
 import json
 import textwrap
-from collections.abc import Mapping, Sequence
-from typing import Any, TypedDict
+from collections.abc import Sequence
+from typing import Any
 
 import tomli_w
 from pydantic import BaseModel
@@ -13,7 +13,6 @@ from rich.text import Text
 
 from netem.engine.relay_interface import LinkSpec
 from netem.loss_prediction import predict
-from netem.words.explanation import settings_meaning
 from netem.words.tc_command import tc_command
 from netem.words.words_to_settings import text_of
 from noack.impairments.link_settings import LinkSettings
@@ -25,40 +24,6 @@ _NARROW_WIDTH, _WIDE_WIDTH = 20, 44
 """Minimum and maximum columns for words."""
 
 
-class DirectionExplanation(TypedDict):
-    """One direction of a link."""
-
-    words: str
-    settings: Mapping[str, Any]
-    meaning: Sequence[str]
-    predicted_loss: float | None
-    predicted_loss_note: str
-    """Why there is no prediction, or which losses it does not count."""
-    predicted_loss_without_cap: float | None
-    tc: str | None
-    """The nearest command, after ``tc qdisc add dev DEVICE root netem``."""
-    tc_lacks: Sequence[str]
-    tc_notes: Sequence[str]
-
-
-class LinkExplanation(TypedDict):
-    """One link."""
-
-    name: str
-    listen: str
-    to: str
-    seed: int
-    forward: DirectionExplanation
-    reverse: DirectionExplanation | None
-    """None: not relayed."""
-
-
-class Explanation(TypedDict):
-    """The links of a relay."""
-
-    links: Sequence[LinkExplanation]
-
-
 def explain(specs: Sequence[LinkSpec], *, as_json: bool, as_file: bool) -> None:
     """Print the effect of links' settings on standard output.
 
@@ -68,7 +33,7 @@ def explain(specs: Sequence[LinkSpec], *, as_json: bool, as_file: bool) -> None:
         as_file: also print them as a file of links; False: print their names instead.
     """
     if as_json:
-        print(json.dumps(Explanation(links=[_link_document(spec) for spec in specs]), indent=2))
+        print(json.dumps({"links": [_link_document(spec) for spec in specs]}, indent=2))
         return
     console = Console(highlight=False)
     for number, spec in enumerate(specs):
@@ -84,7 +49,7 @@ def explain(specs: Sequence[LinkSpec], *, as_json: bool, as_file: bool) -> None:
             console.print(Text(_cut(toml, _MAX_TOML)), soft_wrap=True)
 
 
-def _link_document(spec: LinkSpec) -> LinkExplanation:
+def _link_document(spec: LinkSpec) -> dict[str, Any]:
     return {
         "name": spec.name,
         "listen": address_text(spec.listen),
@@ -95,7 +60,7 @@ def _link_document(spec: LinkSpec) -> LinkExplanation:
     }
 
 
-def _document(settings: LinkSettings) -> DirectionExplanation:
+def _document(settings: LinkSettings) -> dict[str, Any]:
     prediction, tc = predict(settings), tc_command(settings)
     return {
         "words": text_of(settings),
@@ -109,6 +74,29 @@ def _document(settings: LinkSettings) -> DirectionExplanation:
         "tc_lacks": list(tc.lacks),
         "tc_notes": list(tc.notes),
     }
+
+
+def settings_meaning(settings: LinkSettings) -> list[tuple[str, str]]:
+    """Return (words, meaning) of the cap and the other settings."""
+    found = []
+    if settings.mansd is not None:
+        found.append((
+            f"mansd {settings.mansd}",
+            f"the cap (M − 1): at most {settings.mansd} consecutive packets of a flow are not "
+            "delivered; the next one passes, whatever the impairments say",
+        ))  # fmt: skip
+    if settings.first_delivered:
+        found.append((
+            "first",
+            "the first packet of each flow is delivered, whatever the impairments say; the cap "
+            "for later packets is mansd",
+        ))  # fmt: skip
+    if any(one.delays for one in settings.impairments):
+        found.append((
+            f"limit {settings.limit}",
+            f"at most {settings.limit} packets are delayed at once; more are dropped",
+        ))  # fmt: skip
+    return found
 
 
 def _heading(spec: LinkSpec) -> str:

@@ -63,7 +63,7 @@ def print_totals(totals: Statistics, console: Console, *, predicted: bool) -> No
 
 def _table(link: LinkStatistics, predicted: bool) -> Table:
     reverse = link["reverse"]
-    both = bool(reverse["arrived"] or reverse["words"] or link["discarded"])
+    both = bool(reverse["received"] or reverse["words"] or link["discarded"])
     table = Table(box=None, padding=(0, 2, 0, 0))
     table.add_column("")
     for name in DIRECTIONS[: 1 + both]:
@@ -79,12 +79,12 @@ def _rows(link: LinkStatistics, predicted: bool) -> Iterator[_Row]:
     def row(label: str, text: Callable[[DirectionStatistics], str]) -> _Row:
         return _Row(label, tuple(map(text, sides)))
 
-    yield row("received", lambda side: f"{side['arrived']:,}")
+    yield row("received", lambda side: f"{side['received']:,}")
     yield row("forwarded", lambda side: f"{side['forwarded']:,}")
     for label, count in _COUNTS.items():
         if any(map(count, sides)):
             yield row(label, _number(count))
-    if any(side["arrived_before"] for side in sides):
+    if any(side["received_before"] for side in sides):
         yield _Row("since the last change:", (), "dim")
     yield row("longest loss burst", burst_text)
     yield row("loss rate", lambda side: percent_text(side["loss"]["lost"]))

@@ -13,8 +13,9 @@ from queue import SimpleQueue
 from threading import Lock
 from typing import Any, NamedTuple, TypeVar
 
-from netem.engine.relay_interface import DIRECTIONS, Direction, LinkReport, Relay
-from netem.loss_prediction import predicted_loss
+from netem.engine.relay_base import Relay
+from netem.engine.relay_interface import DIRECTIONS, Direction, LinkReport
+from netem.loss_prediction import predict
 from netem.words.words_to_settings import text_of
 from noack.core.errors import PeerError
 from noack.impairments.link_records import Counters
@@ -40,7 +41,7 @@ class AppliedSettings:
     @cached_property
     def predicted_loss(self) -> float | None:
         """See :mod:`netem.loss_prediction`; this may take seconds."""
-        return predicted_loss(self.settings)
+        return predict(self.settings).rate
 
 
 class Snapshot(NamedTuple):

@@ -38,7 +38,7 @@ class DelayQuantiles(TypedDict):
 
 
 class LossStatistics(TypedDict):
-    """Shares of the datagrams that arrived under the present settings; null if unknown."""
+    """Shares of the datagrams received under the present settings; null if unknown."""
 
     realised: float | None
     """Share not effectively delivered: lost, or delivered out of order (stale)."""
@@ -54,13 +54,13 @@ class RecentRates(TypedDict):
     """Rates since the previous document."""
 
     seconds: float
-    arrived_per_s: float
-    arrived_bits_per_s: float
+    received_per_s: float
+    received_bits_per_s: float
     """Payload only."""
     forwarded_per_s: float
     forwarded_bits_per_s: float
     loss: float | None
-    """Share of the arrived datagrams that was not effectively delivered."""
+    """Share of the received datagrams that was not effectively delivered."""
     delay_ns: DelayQuantiles
     lateness_ns: DelayQuantiles
 
@@ -79,11 +79,11 @@ class DirectionStatistics(TypedDict):
 
     words: str
     """Its settings in the words of ``tc netem``; long tables are cut."""
-    arrived_before: int
-    """Datagrams that arrived before these settings applied; ``loss`` and ``longest_loss_burst``
+    received_before: int
+    """Datagrams received before these settings applied; ``loss`` and ``longest_loss_burst``
     count from there."""
-    arrived: int
-    arrived_bytes: int
+    received: int
+    received_bytes: int
     forwarded: int
     """Forwarded datagrams and copies."""
     forwarded_bytes: int
@@ -119,7 +119,7 @@ class DirectionStatistics(TypedDict):
 
 
 class LinkStatistics(TypedDict):
-    """One link."""
+    """One link; see :class:`netem.engine.relay_interface.LinkReport`."""
 
     name: str
     listen: str
@@ -127,12 +127,8 @@ class LinkStatistics(TypedDict):
     clients: int
     clients_ever: int
     refused: int
-    """Datagrams of clients beyond the maximum number of clients."""
     discarded: int
-    """Answers to a link without a reverse direction; 0 if the system does not count them."""
     port_unreachable: int
-    """ICMP port-unreachable messages from the server's host; a lower bound on the datagrams lost
-    there."""
     forward: DirectionStatistics
     reverse: DirectionStatistics
 
@@ -149,12 +145,7 @@ class Statistics(TypedDict):
 
 
 def statistics(after: Snapshot, before: Snapshot | None = None) -> Statistics:
-    """Return the statistics of a relay.
-
-    Args:
-        after: the state of the relay.
-        before: an earlier snapshot of the same relay, for the recent rates.
-    """
+    """Return the statistics of a relay; the recent rates need an earlier snapshot."""
     earlier = {link.name: link for link in before.links} if before is not None else {}
     seconds = (after.elapsed_ns - before.elapsed_ns) / NS_PER_S if before is not None else 0.0
     links = [_link(link, earlier.get(link.name), seconds, after) for link in after.links]
@@ -196,9 +187,9 @@ def _direction(
     counters, since, words = report.counters, in_force.since, in_force.words
     return {
         "words": words if len(words) <= _MAX_WORDS else words[: _MAX_WORDS - 1] + "…",
-        "arrived_before": since.arrived,
-        "arrived": counters.arrived,
-        "arrived_bytes": counters.arrived_bytes,
+        "received_before": since.received,
+        "received": counters.received,
+        "received_bytes": counters.received_bytes,
         "forwarded": counters.forwarded,
         "forwarded_bytes": counters.forwarded_bytes,
         "fates": {fate.name.lower(): getattr(counters, fate.name.lower()) for fate in Fate},
@@ -229,8 +220,8 @@ def _recent(after: DirectionReport, before: DirectionReport, seconds: float) -> 
     new, old = after.counters, before.counters
     return {
         "seconds": seconds,
-        "arrived_per_s": (new.arrived - old.arrived) / seconds,
-        "arrived_bits_per_s": (new.arrived_bytes - old.arrived_bytes) * 8 / seconds,
+        "received_per_s": (new.received - old.received) / seconds,
+        "received_bits_per_s": (new.received_bytes - old.received_bytes) * 8 / seconds,
         "forwarded_per_s": (new.forwarded - old.forwarded) / seconds,
         "forwarded_bits_per_s": (new.forwarded_bytes - old.forwarded_bytes) * 8 / seconds,
         "loss": loss_share(new, old),
@@ -246,16 +237,16 @@ def unintended(totals: Statistics) -> int:
 
 
 def loss_share(after: Counters, before: Counters) -> float | None:
-    """Return the share of the arrived datagrams that was not effectively delivered.
+    """Return the share of the received datagrams that was not effectively delivered.
 
-    None if no datagram arrived. A stale datagram counts when it is forwarded; in a short interval,
-    more datagrams may therefore be lost than arrived. The share is limited to 1.
+    None if no datagram was received. A stale datagram counts when it is forwarded; in a short
+    interval, more datagrams may therefore be lost than received. The share is limited to 1.
     """
-    arrived = after.arrived - before.arrived
-    if arrived == 0:
+    received = after.received - before.received
+    if received == 0:
         return None
-    lost = arrived - _effective(after) + _effective(before)
-    return min(max(lost, 0) / arrived, 1.0)
+    lost = received - _effective(after) + _effective(before)
+    return min(max(lost, 0) / received, 1.0)
 
 
 def _effective(counters: Counters) -> int:
@@ -263,10 +254,10 @@ def _effective(counters: Counters) -> int:
 
 
 def _share(after: Counters, before: Counters, *fates: str) -> float | None:
-    """Return the share of the arrived datagrams with one of these fates; None if none arrived."""
-    arrived = after.arrived - before.arrived
+    """Return the share of the received datagrams with one of these fates; None without any."""
+    received = after.received - before.received
     lost: int = sum(getattr(after, fate) - getattr(before, fate) for fate in fates)
-    return lost / arrived if arrived else None
+    return lost / received if received else None
 
 
 def quantiles(counts: NDArray[np.int64]) -> DelayQuantiles:

@@ -5,6 +5,7 @@ panels, a table has one row per direction.
 """
 
 import textwrap
+from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 
 from rich.console import Group, RenderableType
@@ -16,6 +17,7 @@ from netem.control.emulator_statistics import (
     DelayQuantiles,
     DirectionStatistics,
     LinkStatistics,
+    RecentRates,
     Statistics,
 )
 from netem.control.number_texts import (
@@ -28,9 +30,9 @@ from netem.control.number_texts import (
     sparkline,
     time_text,
 )
-from netem.control.statistics_history import History
 from netem.engine.relay_interface import DIRECTIONS, Direction
 
+_SPAN_S = 60.0
 _ARROWS = {"forward": "forward →", "reverse": "← reverse"}
 _LABEL_WIDTH = 9
 _FRAME_WIDTH = 4
@@ -38,6 +40,51 @@ _WORDS_LINES = 3
 _CHART_WIDTH = 20
 _MIN_CHART_WIDTH = 8
 _LOST = ("dropped", "corrupted", "overflowed", "blacked_out")
+
+
+class History:
+    """The latest statistics, and the rates of the last minute."""
+
+    def __init__(self) -> None:
+        self.latest: Statistics | None = None
+        self._samples: defaultdict[
+            tuple[str, Direction], deque[tuple[float, RecentRates]]
+        ] = defaultdict(deque)  # fmt: skip
+
+    def add(self, statistics: Statistics) -> None:
+        """Add statistics that are newer than those before."""
+        self.latest = statistics
+        now_s = statistics["elapsed_s"]
+        for link in statistics["links"]:
+            for direction in DIRECTIONS:
+                recent = link[direction]["recent"]
+                samples = self._samples[link["name"], direction]
+                if recent is not None:
+                    samples.append((now_s, recent))
+                while samples and samples[0][0] <= now_s - _SPAN_S:
+                    samples.popleft()
+
+    def series(
+        self, link: str, direction: Direction, key: str, points: int
+    ) -> Sequence[float | None]:
+        """Return the last minute of a value of :class:`RecentRates`, (points,); None: unknown.
+
+        A sample covers the time since the previous sample. A point is the mean of its samples.
+        """
+        if self.latest is None:
+            return [None] * points
+        begin_s = self.latest["elapsed_s"] - _SPAN_S
+        width_s = _SPAN_S / points
+        found: list[list[float]] = [[] for _ in range(points)]
+        for end_s, recent in self._samples[link, direction]:
+            value: float | None = recent[key]  # type: ignore[literal-required]
+            if value is None:
+                continue
+            first = int(max(end_s - recent["seconds"] - begin_s, 0) / width_s)
+            last = min(int((end_s - begin_s) / width_s - 1e-9), points - 1)
+            for point in range(first, max(last, first) + 1):
+                found[min(point, points - 1)].append(value)
+        return [sum(values) / len(values) if values else None for values in found]
 
 
 def render(history: History, title: str, width: int, height: int | None) -> RenderableType:
@@ -116,7 +163,7 @@ def _cells(
     def series(key: str) -> Sequence[float | None]:
         return history.series(link["name"], direction, key, width)
 
-    arrivals, departures = series("arrived_per_s"), series("forwarded_per_s")
+    arrivals, departures = series("received_per_s"), series("forwarded_per_s")
     losses, top = series("loss"), _top([*arrivals, *departures])
     recent, delay, late = of["recent"], of["delay_ns"], of["lateness_ns"]
     if recent is not None and recent["delay_ns"]["p50"] is not None:
@@ -124,7 +171,7 @@ def _cells(
     return [
         ("", Text(_ARROWS[direction], "bold cyan")),
         ("", _wrapped(of["words"] or "no impairment", width)),
-        ("received", Text(_flow(of, "arrived"))),
+        ("received", Text(_flow(of, "received"))),
         ("", Text(sparkline(arrivals, top), "green")),
         ("forwarded", Text(_flow(of, "forwarded"))),
         ("", Text(sparkline(departures, top), "green")),
@@ -207,7 +254,7 @@ def _burst_of_cap(of: DirectionStatistics) -> str:
 
 
 _COLUMNS: dict[str, Callable[[DirectionStatistics], str]] = {
-    "received": lambda of: _rate(of, "arrived_per_s"),
+    "received": lambda of: _rate(of, "received_per_s"),
     "forwarded": lambda of: _rate(of, "forwarded_per_s"),
     "loss": lambda of: percent_text(of["loss"]["lost"]),
     "predicted": lambda of: percent_text(of["loss"]["predicted"]),
@@ -221,9 +268,7 @@ _OPTIONAL = ("predicted", "p99", "forwarded")
 
 def _table(history: History, latest: Statistics, width: int, lines: int) -> RenderableType:
     """Return a table with a row for each direction that has received datagrams."""
-    rows = [
-        (link, name) for link in latest["links"] for name in DIRECTIONS if link[name]["arrived"]
-    ]
+    rows = _used(latest)
     shown = rows[:lines]
     names = [f" {'→' if name == 'forward' else '←'} {link['name']}" for link, name in shown]
     name_width = min(max(map(len, names), default=0), width // 3)
@@ -241,7 +286,8 @@ def _table(history: History, latest: Statistics, width: int, lines: int) -> Rend
     chart_width = min(room() - 1, _CHART_WIDTH)
     if chart_width >= _MIN_CHART_WIDTH:
         series = [
-            history.series(link["name"], name, "arrived_per_s", chart_width) for link, name in shown
+            history.series(link["name"], name, "received_per_s", chart_width)
+            for link, name in shown
         ]
         columns["last minute"[:chart_width]] = [sparkline(one, _top(one)) for one in series]
 
@@ -261,7 +307,7 @@ def _table(history: History, latest: Statistics, width: int, lines: int) -> Rend
 def _used(statistics: Statistics) -> list[tuple[LinkStatistics, Direction]]:
     """Return the directions that have received datagrams."""
     links = statistics["links"]
-    return [(link, name) for link in links for name in DIRECTIONS if link[name]["arrived"]]
+    return [(link, name) for link in links for name in DIRECTIONS if link[name]["received"]]
 
 
 def plain_lines(statistics: Statistics) -> list[str]:
@@ -272,7 +318,7 @@ def plain_lines(statistics: Statistics) -> list[str]:
 def _plain_line(elapsed_s: float, link: LinkStatistics, name: Direction) -> str:
     of = link[name]
     parts = [
-        f"{elapsed_s:.1f} s", f"{link['name']} {name}", f"received {_flow(of, 'arrived')}",
+        f"{elapsed_s:.1f} s", f"{link['name']} {name}", f"received {_flow(of, 'received')}",
         f"forwarded {_flow(of, 'forwarded')}", f"loss {_loss(of)}", f"drawn {_drawn(of)}",
         f"longest loss burst {burst_text(of)}", f"forced {of['fates']['forced']:,}",
         f"delay p99 {time_text((of['recent'] or of)['delay_ns']['p99'])}",

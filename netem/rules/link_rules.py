@@ -11,6 +11,7 @@ from noack.impairments.link_records import (
     Counters,
     LinkMemory,
     LinkProgram,
+    PacketContext,
     PacketDecision,
     RecordedDecision,
     refuse,
@@ -51,16 +52,17 @@ def admit(
     decision.must_pass = must_pass(flow, program.mansd)
     decision.spared = 0
     flow.packets += 1
-    counters.arrived += 1
-    counters.arrived_bytes += size_bytes
+    counters.received += 1
+    counters.received_bytes += size_bytes
     if flow.number + 1 < len(program.decisions_begin):
         place = program.decisions_begin[flow.number] + decision.packet
         if place < program.decisions_begin[flow.number + 1]:
             repeat(program.decisions[place], decision)
             settle(program, state, row, decision)
             return
+    packet = PacketContext(program, state, flow, decision)
     for number in range(len(program.stages)):
-        apply_stage(program, state, program.stages[number], memories[number], flow, decision)
+        apply_stage(packet, program.stages[number], memories[number])
     keep_limit(program.limit - state.link.in_flight, decision)
     settle(program, state, row, decision)
 

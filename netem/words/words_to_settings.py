@@ -43,9 +43,11 @@ EXAMPLES: Mapping[str, str] = {
     "limit": "limit 1000",
 }
 """By word; ``seed`` is missing because it is also an option."""
+GRAMMAR = [word.grammar for kind in IMPAIRMENTS for word in kind.words if word.grammar]
+"""The words of each impairment, for ``--help``."""
 _IMPAIRMENT: TypeAdapter[Any] = TypeAdapter(AnyImpairment)
+_LINK, _SEED = TypeAdapter(LinkSettings), TypeAdapter[int](Seed)
 _LIMIT = LinkSettings.model_fields["limit"].default
-_SEED: TypeAdapter[int] = TypeAdapter(Seed)
 
 
 class LinkWords(NamedTuple):
@@ -81,11 +83,17 @@ def parse(words: str | Sequence[str]) -> LinkWords:
         if word in settings:
             reader.wrong("given twice")
         settings[word] = True if word == "first" else reader.value(COUNT)
-        _check_setting(reader, word, settings[word])
-    return LinkWords(
-        _settings(impairments, settings),
-        settings.get("seed"),
-    )
+        if word == "seed":
+            _validated(_SEED, settings[word], reader)
+        else:
+            _validated(_LINK, {_SETTINGS[word]: settings[word]}, reader)
+    seed = settings.pop("seed", None)
+    given = {_SETTINGS[word]: value for word, value in settings.items()}
+    try:
+        return LinkWords(LinkSettings(impairments=tuple(impairments), **given), seed)
+    except ValidationError as error:
+        # Each setting is valid by itself; the error is a combination of settings.
+        raise CallerError(f"lossrel: {_message(error).partition(': ')[2]}") from None
 
 
 def settings_of(words: str | Sequence[str]) -> LinkSettings:
@@ -135,31 +143,9 @@ def _require_keyword(reader: WordReader, word: str) -> None:
         reader.unknown(word, KEYWORDS)
 
 
-def _settings(impairments: list[Impairment], settings: Mapping[str, Any]) -> LinkSettings:
-    given: Table = {}
-    for word, key in _SETTINGS.items():
-        if word in settings:
-            given[key] = settings[word]
+def _validated(kind: TypeAdapter[Any], given: object, reader: WordReader) -> Any:
     try:
-        return LinkSettings(impairments=tuple(impairments), **given)
-    except ValidationError as error:
-        # Each setting is valid by itself; the error is a combination of settings.
-        raise CallerError(f"lossrel: {_message(error).partition(': ')[2]}") from None
-
-
-def _check_setting(reader: WordReader, word: str, value: Any) -> None:
-    if word == "seed":
-        try:
-            _SEED.validate_python(value)
-        except ValidationError as error:
-            reader.wrong(_message(error))
-    else:
-        _validated(TypeAdapter(LinkSettings), {_SETTINGS[word]: value}, reader)
-
-
-def _validated(kind: TypeAdapter[Any], table: Table, reader: WordReader) -> Any:
-    try:
-        return kind.validate_json(json.dumps(table))  # strict mode: lists for tuples only in JSON
+        return kind.validate_json(json.dumps(given))  # strict mode: lists for tuples only in JSON
     except ValidationError as error:
         reader.wrong(_message(error))
 

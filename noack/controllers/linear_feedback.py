@@ -12,10 +12,8 @@ class LinearFeedbackSettings(ControllerSettings):
     is_linear: ClassVar = True
 
     kind: Literal["linear"] = "linear"
-    """The kind of controller."""
 
     def law(self, model: ControlModel) -> "LinearFeedback":
-        """Return the law with the scenario's gain."""
         return LinearFeedback(model.K)
 
 
@@ -33,7 +31,6 @@ class LinearFeedback:
         """The law depends on x_c alone."""
 
     def input(self, t_s: float, x_c: Vector, setpoint: tuple[Vector, Vector] | None) -> Vector:
-        """Return u, shape (m,)."""
         if setpoint is None:
             u: Vector = self._K @ x_c
             return u

@@ -8,10 +8,11 @@ for every ρ.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Self
 
-from noack.impairments.feature import Feature, StageTables
+from noack.impairments.feature import StageFeature, StageTables
 from noack.impairments.link_records import RuleStage, StageMemory
+from noack.impairments.markov_chain import Chain, chance_chain
 from noack.impairments.normal import score
 from noack.impairments.quantities import CORRELATION, PERCENT, brief_percent, percent_text
 from noack.impairments.word_reader import WordReader
@@ -32,18 +33,6 @@ class ChanceStage(RuleStage):
     """Only every ``gap``-th packet can be affected."""
     scored: int = 0
     """1: a later delay is correlated with this event."""
-
-
-class Chance(Protocol):
-    """Settings with a probability and a correlation."""
-
-    @property
-    def probability(self) -> float:
-        """Probability."""
-
-    @property
-    def correlation(self) -> float:
-        """Between the latent variables of successive packets."""
 
 
 def latent(correlation: float, innovation: float, memory: StageMemory, u: float) -> float:
@@ -71,19 +60,6 @@ def happens(stage: ChanceStage, memory: StageMemory, u: float) -> bool:
     return latent(stage.correlation, stage.innovation, memory, u) > stage.threshold
 
 
-def chance_stage(chance: Chance, *, gap: int = 1, scored: bool = False) -> ChanceStage:
-    """Return a probability and a correlation as numbers."""
-    p, correlation = chance.probability, chance.correlation
-    return ChanceStage(
-        probability=p,
-        threshold=-score(p) if 0 < p < 1 else math.copysign(math.inf, 0.5 - p),
-        correlation=correlation,
-        innovation=math.sqrt(1 - correlation**2),
-        gap=gap,
-        scored=int(scored),
-    )
-
-
 def read_chance(reader: WordReader) -> dict[str, float]:
     """Read ``PERCENT [CORRELATION]``."""
     table = {"probability": reader.value(PERCENT)}
@@ -92,22 +68,11 @@ def read_chance(reader: WordReader) -> dict[str, float]:
     return table
 
 
-def chance_text(chance: Chance) -> str:
-    """Return the words that :func:`read_chance` reads."""
-    correlation = f" {percent_text(chance.correlation)}" if chance.correlation else ""
-    return percent_text(chance.probability) + correlation
-
-
-def correlation_meaning(correlation: float) -> str:
-    """Return the explanation of a correlation."""
-    return f", correlation {brief_percent(correlation)}" if correlation else ""
-
-
 TC_CORRELATION = "its correlation changes the probability, or the spread, of what it is given"
 """What ``tc netem`` does differently."""
 
 
-class CorrelatedChance(Feature):
+class CorrelatedChance(StageFeature):
     """Settings of a feature that draws a correlated random event for each packet."""
 
     probability: Probability
@@ -115,10 +80,39 @@ class CorrelatedChance(Feature):
     correlation: Correlation = 0.0
     """Between successive packets."""
 
+    action: ClassVar[str] = ""
+    """Its action as a Markov chain; see :class:`Chain`; empty: it does not change the loss rate."""
+
+    @classmethod
+    def examples(cls) -> Sequence[Self]:
+        chances = ((0.0, 0.0), (0.1, 0.0), (0.5, 0.7), (0.9, 0.0), (1.0, 0.0))
+        return [cls(probability=p, correlation=correlation) for p, correlation in chances]
+
+    @property
+    def chance_text(self) -> str:
+        """The words that :func:`read_chance` reads."""
+        correlation = f" {percent_text(self.correlation)}" if self.correlation else ""
+        return percent_text(self.probability) + correlation
+
+    @property
+    def correlation_meaning(self) -> str:
+        """The explanation of the correlation."""
+        return f", correlation {brief_percent(self.correlation)}" if self.correlation else ""
+
     def stage(self, tables: StageTables) -> ChanceStage:
-        """Return the probability and the correlation as numbers."""
-        return chance_stage(self)
+        p = self.probability
+        return ChanceStage(
+            probability=p,
+            threshold=-score(p) if 0 < p < 1 else math.copysign(math.inf, 0.5 - p),
+            correlation=self.correlation,
+            innovation=math.sqrt(1 - self.correlation**2),
+            scored=int(tables.scored),
+        )
+
+    def chains(self) -> Sequence[Chain]:
+        if not self.action:
+            return ()
+        return (chance_chain(self.probability, self.correlation, self.action),)
 
     def tc_notes(self) -> Sequence[str]:
-        """Return the difference that a correlation makes to ``tc netem``."""
         return (TC_CORRELATION,) if self.correlation else ()

@@ -4,6 +4,7 @@ A feature is a loss model, a kind of impairment, or a queue discipline: one clas
 derived from one of the three classes at the end.
 """
 
+from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Self
@@ -26,6 +27,9 @@ class Word(NamedTuple):
     """Reads the words that follow it; None: it is not the first word of its feature."""
     after: str = ""
     """The words that precede it, if it is not the first word."""
+    grammar: str = ""
+    """The words of its feature, for ``--help``; T is a time, P a percentage, N a number. Empty:
+    another word has it."""
 
 
 class Behaviour(NamedTuple):
@@ -34,9 +38,9 @@ class Behaviour(NamedTuple):
     stage: type[RuleStage]
     """Its settings as numbers."""
     apply: Callable[..., None]
-    """``apply(program, state, stage, memory, flow, decision)`` changes the decision for a packet.
-    It is called for every packet of a flow, lost or not, so that a stage's random draws do not
-    depend on other stages. ``memory`` is the stage's memory of the packet's flow."""
+    """``apply(packet, stage, memory)`` changes the decision for a packet. It is called for every
+    packet of a flow, lost or not, so that a stage's random draws do not depend on other stages.
+    ``memory`` is the stage's memory of the packet's flow."""
     queue: type[QueueState] = QueueState
     """Its state that all flows share."""
 
@@ -73,26 +77,60 @@ class Feature(ScenarioSection):
     behaviour: ClassVar[Behaviour | None] = None
     """None: it has no effect by itself."""
 
+    tc_missing: ClassVar[str] = ""
+    """The feature that ``tc netem`` would need for it; empty if it has it."""
+
     @classmethod
     def examples(cls) -> Sequence[Self]:
         """Return settings for tests, mainly extreme ones; together they use every key."""
-        raise NotImplementedError
+        return (cls(),)
 
+    @abstractmethod
     def text(self) -> str:
         """Return words that are read as the same settings."""
-        raise NotImplementedError
 
+    @abstractmethod
     def meaning(self) -> str:
         """Return the effect in plain words."""
-        raise NotImplementedError
 
+    @property
+    def prediction_note(self) -> str:
+        """Return the condition under which the prediction of the loss rate holds."""
+        return ""
+
+    def tc_lacks(self, before: Sequence["Impairment"]) -> str:
+        """Return the missing feature of ``tc netem``; empty if none is missing.
+
+        Args:
+            before: the impairments that tc applies before it.
+        """
+        return self.tc_missing
+
+
+class QueueDiscipline(Feature):
+    """Base class of queue disciplines of ``rate``; their words follow those of ``rate``."""
+
+    kind: str
+
+    @abstractmethod
+    def queue_stage(self, bottleneck: Mapping[str, int]) -> RuleStage:
+        """Return the settings as numbers.
+
+        Args:
+            bottleneck: the fields of :class:`noack.impairments.bottleneck.BottleneckStage`.
+        """
+
+
+class StageFeature(Feature):
+    """Base class of the features that are a stage of a link."""
+
+    @abstractmethod
     def stage(self, tables: StageTables) -> RuleStage | None:
         """Return its settings as numbers; None if they never have an effect.
 
         Raises:
             ValueError: it names a file that has not been read.
         """
-        raise NotImplementedError
 
     def chains(self) -> Sequence[Chain | Pattern]:
         """Return its effect on packets as Markov chains, to predict the loss rate.
@@ -102,12 +140,7 @@ class Feature(ScenarioSection):
         """
         return ()
 
-    @property
-    def prediction_note(self) -> str:
-        """Return the condition under which the prediction holds."""
-        return ""
-
-    def without_files(self, folder: Path, place: str) -> "Feature":
+    def without_files(self, folder: Path, place: str) -> Feature:
         """Return settings with the files' contents instead of their names.
 
         Args:
@@ -123,20 +156,12 @@ class Feature(ScenarioSection):
         """Return the words of ``tc netem`` for it; empty if it has no effect."""
         return self.text()
 
-    def tc_lacks(self, before: Sequence["Impairment"]) -> str:
-        """Return the missing feature of ``tc netem``; empty if none is missing.
-
-        Args:
-            before: the impairments that tc applies before it.
-        """
-        return ""
-
     def tc_notes(self) -> Sequence[str]:
         """Return the differences of ``tc netem`` in behaviour."""
         return ()
 
 
-class LossModel(Feature):
+class LossModel(StageFeature):
     """Base class of loss models; their words follow ``loss``."""
 
     model: str
@@ -144,21 +169,7 @@ class LossModel(Feature):
     """Whether a delay after it can be correlated with its losses."""
 
 
-class QueueDiscipline(Feature):
-    """Base class of queue disciplines of ``rate``; their words follow those of ``rate``."""
-
-    kind: str
-
-    def queue_stage(self, bottleneck: Mapping[str, int]) -> RuleStage:
-        """Return the settings as numbers.
-
-        Args:
-            bottleneck: the fields of :class:`noack.impairments.bottleneck.BottleneckStage`.
-        """
-        raise NotImplementedError
-
-
-class Impairment(Feature):
+class Impairment(StageFeature):
     """Base class of impairments; each has its own first word."""
 
     kind: str

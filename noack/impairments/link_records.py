@@ -169,8 +169,8 @@ class PacketDecision:
 class Counters:
     """Counts of one direction of a link."""
 
-    arrived: int = 0
-    arrived_bytes: int = 0
+    received: int = 0
+    received_bytes: int = 0
     delivered: int = 0
     """Fates; see :class:`noack.protocol.record_tables.Fate`."""
     dropped: int = 0
@@ -227,6 +227,15 @@ class LinkMemory(NamedTuple):
     """The rings of the queues."""
     link: LinkState
     counters: Counters
+
+
+class PacketContext(NamedTuple):
+    """A packet for which a link decides, and the link."""
+
+    program: LinkProgram
+    state: LinkMemory
+    flow: FlowState
+    decision: PacketDecision
 
 
 def refuse(decision: PacketDecision, fate: int) -> None:

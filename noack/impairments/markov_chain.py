@@ -62,20 +62,21 @@ def pattern(period: int, lost: Iterable[int]) -> Pattern:
     return Pattern(flags)
 
 
-def chance_chain(probability: float, correlation: float) -> Chain:
-    """Return the chain of :mod:`noack.impairments.correlated_chance`.
+def chance_chain(probability: float, correlation: float, what: str) -> Chain:
+    """Return the chain of :mod:`noack.impairments.correlated_chance`, with its action.
 
     Raises:
         NotPredictableError: the correlation is too high.
     """
     if correlation == 0.0 or probability in (0.0, 1.0):
-        return Chain(np.ones(1), np.ones((1, 1)), np.array([probability]))
+        certain = np.ones(1), np.ones((1, 1)), np.array([probability])
+        return Chain(*certain, what, probability)
     nodes, weights, acts = _nodes(probability, correlation)
     innovation = math.sqrt(1 - correlation**2)
     steps = (nodes - correlation * nodes[:, None]) / innovation
     moves = stochastic(np.exp(-(steps**2) / 2) * weights)
     start = np.exp(-(nodes**2) / 2) * weights
-    return Chain(start / start.sum(), moves, acts)
+    return Chain(start / start.sum(), moves, acts, what, probability)
 
 
 def _nodes(probability: float, correlation: float) -> tuple[Array, Array, Array]:

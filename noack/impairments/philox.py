@@ -4,6 +4,8 @@ The numbers drawn for a datagram are a function of the stream's key and of the n
 datagram. They do not depend on time, on other flows, or on batches; no generator state is needed.
 """
 
+from noack.impairments.link_records import PacketContext, RuleStage
+
 _WORD = 0xFFFFFFFF
 _UNIT = 1.0 / 9007199254740992.0
 """2⁻⁵³."""
@@ -43,3 +45,8 @@ def uniforms(key0: int, key1: int, flow: int, packet: int, block: int) -> tuple[
         ((a >> 5) * 67108864 + (b >> 6)) * _UNIT,
         ((c >> 5) * 67108864 + (d >> 6)) * _UNIT,
     )
+
+
+def draw(packet: PacketContext, stage: RuleStage, block: int) -> tuple[float, float]:
+    """Return two uniform numbers of a stage for a packet; ``block`` numbers the pairs."""
+    return uniforms(stage.key0, stage.key1, packet.flow.number, packet.decision.packet, block)

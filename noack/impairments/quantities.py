@@ -41,8 +41,18 @@ class Quantity(Generic[T]):
 
     expected: str
     """Description of a word, with an example: ``a time, e.g. 10ms``."""
-    read: Callable[[str], T]
-    """Reads a word; raises ValueError if the word is not such a quantity."""
+    convert: Callable[[str], T]
+
+    def read(self, word: str) -> T:
+        """Read a word.
+
+        Raises:
+            ValueError: it is not such a quantity.
+        """
+        try:
+            return self.convert(word)
+        except (DecimalException, OverflowError):  # an exponent that is far too large
+            raise ValueError from None
 
 
 def _split(text: str) -> tuple[Decimal, str]:
@@ -59,18 +69,7 @@ def _float(number: Decimal) -> float:
     return value
 
 
-def _exact(read: Callable[[str], T]) -> Callable[[str], T]:
-    def reading(text: str) -> T:
-        try:
-            return read(text)
-        except (DecimalException, OverflowError):  # an exponent that is far too large
-            raise ValueError from None
-
-    return reading
-
-
 def _percent(low: int, high: int, *, below: bool = False) -> Callable[[str], float]:
-    @_exact
     def read(text: str) -> float:
         number, unit = _split(text)
         if unit not in ("", "%") or not low <= number <= high:
@@ -83,7 +82,6 @@ def _percent(low: int, high: int, *, below: bool = False) -> Callable[[str], flo
     return read
 
 
-@_exact
 def _time_s(text: str) -> float:
     number, unit = _split(text)
     scale = _TIME_UNITS["us"] if unit == "" else _TIME_UNITS.get(unit.lower())
@@ -92,7 +90,6 @@ def _time_s(text: str) -> float:
     return _float(number * scale)
 
 
-@_exact
 def _own_time_s(text: str) -> float:
     number, unit = _split(text)
     scale = _TIME_UNITS.get(unit.lower())
@@ -101,13 +98,19 @@ def _own_time_s(text: str) -> float:
     return 0.0 if scale is None else _float(number * scale)
 
 
-@_exact
 def _rate_bps(text: str) -> int:
     number, unit = _split(text)
     scale = _RATE_UNITS.get(unit.lower())
     if scale is None or not 0 <= number * scale < 10**15:
         raise ValueError
     return int((number * scale).to_integral_value())
+
+
+def _number(text: str) -> float:
+    number, unit = _split(text)
+    if unit:
+        raise ValueError
+    return _float(number)
 
 
 def _integer(pattern: str) -> Callable[[str], int]:
@@ -131,16 +134,7 @@ OWN_TIME_S = Quantity("a time in s, ms, us or ns, e.g. 10ms", _own_time_s)
 RATE_BPS = Quantity("a rate in bit, kbit, mbit, gbit, kbps (bytes!), ..., e.g. 1mbit", _rate_bps)
 COUNT = Quantity("a whole number, e.g. 5", _integer("[0-9]{1,20}"))
 SIGNED_COUNT = Quantity("a whole number, e.g. 28 or -14", _integer("-?[0-9]{1,20}"))
-
-
-def _read_number(text: str) -> float:
-    number, unit = _split(text)
-    if unit:
-        raise ValueError
-    return _float(number)
-
-
-NUMBER = Quantity("a number, e.g. 2.5", _exact(_read_number))
+NUMBER = Quantity("a number, e.g. 2.5", _number)
 
 
 def _digits(number: Decimal) -> str:

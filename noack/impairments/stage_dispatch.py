@@ -5,14 +5,7 @@ from collections.abc import Sequence
 from noack.impairments.disciplines import DISCIPLINES
 from noack.impairments.feature import Behaviour
 from noack.impairments.kinds import IMPAIRMENTS
-from noack.impairments.link_records import (
-    FlowState,
-    LinkMemory,
-    LinkProgram,
-    PacketDecision,
-    RuleStage,
-    StageMemory,
-)
+from noack.impairments.link_records import PacketContext, RuleStage, StageMemory
 from noack.impairments.loss_models import LOSS_MODELS
 
 BEHAVIOURS: Sequence[Behaviour] = tuple(
@@ -25,17 +18,10 @@ STAGE_RECORDS: Sequence[type] = (RuleStage, *(behaviour.stage for behaviour in B
 QUEUE_RECORDS: Sequence[type] = tuple(dict.fromkeys(behaviour.queue for behaviour in BEHAVIOURS))
 
 
-def apply_stage(
-    program: LinkProgram,
-    state: LinkMemory,
-    stage: RuleStage,
-    memory: StageMemory,
-    flow: FlowState,
-    decision: PacketDecision,
-) -> None:
+def apply_stage(packet: PacketContext, stage: RuleStage, memory: StageMemory) -> None:
     """Apply a stage's behaviour to a packet; see :class:`noack.impairments.feature.Behaviour`.
 
     Compiled code has a comparison for each behaviour instead; see
     :func:`netem.engine.compiled_rules.compiled_dispatch`.
     """
-    BEHAVIOURS[stage.kind].apply(program, state, stage, memory, flow, decision)
+    BEHAVIOURS[stage.kind].apply(packet, stage, memory)

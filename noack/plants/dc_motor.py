@@ -39,7 +39,6 @@ class DcMotorSettings(PlantSettings):
     scenario: ClassVar = "dc_motor"
 
     kind: Literal["dc_motor"]
-    """The kind of plant."""
     resistance_ohm: Positive = 4.0
     """R of the armature."""
     inductance_h: Positive = 2.75e-6
@@ -72,7 +71,6 @@ class DcMotorSettings(PlantSettings):
         return np.array(rows), np.array([0.0, 1 / L])
 
     def system(self, start: PlantStart) -> "DcMotor":
-        """Return the motor at x(0)."""
         return DcMotor(self, start.x0)
 
 

@@ -11,15 +11,13 @@ _EMPTY = np.zeros(0)
 
 
 class LinearSettings(PlantSettings):
-    """ẋ = A x + B u, with A and B as the plant's other keys draw them."""
+    """ẋ = A x + B u; the plant's other keys define A and B."""
 
     scenario: ClassVar = "lane_following"
 
     kind: Literal["linear"] = "linear"
-    """The kind of plant."""
 
     def system(self, start: PlantStart) -> "LinearSystem":
-        """Return the system at x(0)."""
         return LinearSystem(start.A, start.B, start.x0, step_ns=start.step_ns)
 
 

@@ -128,14 +128,13 @@ class ErrorGains:
             self.kernels[output].sups(spacing_s * np.arange(events, dtype=np.float64)).sum()
         )
 
-    def growth(self, mismatch: Matrix, pushed: Matrix, until_s: float, cells: int) -> Growth:
+    def growth(self, mismatch: Matrix, forced: Matrix, until_s: float, cells: int) -> Growth:
         """Return the growth of ‖e_s‖_W if E x and B p act through these columns."""
-        return Growth(
-            *(
-                response_until(self.scaled_H, D, until_s, cells).through(self.weight)
-                for D in (mismatch, pushed)
-            )
-        )
+
+        def kernel(D: Matrix) -> KernelBounds:
+            return response_until(self.scaled_H, D, until_s, cells).through(self.weight)
+
+        return Growth(kernel(mismatch), kernel(forced))
 
     def stretch(self, until_s: float) -> float:
         """Return sup‖e^{(H+αI)τ}‖_W over τ ≤ ``until_s``, the growth of a sampled error."""
@@ -149,13 +148,8 @@ class ErrorGains:
         if hold_s == 0:
             return 0.0
         curvature = self.split_K[1] @ self.H @ self.H
-        return max(
-            0.5 * hold_s**2 * followed.through(curvature).sup_on_grid()
-            for followed in (
-                response_until(generator, self.inverse_weight, hold_s, 16)
-                for generator in (-self.H, self.H)
-            )
-        )
+        responses = (response_until(G, self.inverse_weight, hold_s, 16) for G in (-self.H, self.H))
+        return 0.5 * hold_s**2 * max(one.through(curvature).sup_on_grid() for one in responses)
 
 
 @dataclass(frozen=True)
@@ -218,7 +212,7 @@ class PlantGains:
         return response(self.closed_loop, self.input_matrix)
 
     def start_up(self, start_s: float) -> tuple[float, Mapping[Output, float]]:
-        """Return the effect of zero input before ``start_s``: p = −K x there.
+        """Return the effect of zero input before ``start_s``, where p = −K x.
 
         Returns:
             sup‖p‖ over the start, and its contribution to every sup‖C x‖.

@@ -1,6 +1,7 @@
 """What an event-triggering policy is, and the machine that applies one to measurements."""
 
-from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -30,26 +31,17 @@ class Policy(Protocol):
         ...
 
 
-class CodedPolicy(ABC):
+@dataclass(frozen=True)
+class CodedPolicy:
     """A policy that decides by code of its own, and so has no trigger rule."""
 
+    weight: Matrix | None
+    new_trigger: Callable[[], "EventTrigger"]
+    """Returns a trigger that has not started."""
     initial_dynamic_variable = 0.0
 
-    @property
-    @abstractmethod
-    def weight(self) -> Matrix | None:
-        """W of the norm in which errors are shown, (n, n); None is the identity."""
-
-    @abstractmethod
-    def new_trigger(self) -> "EventTrigger":
-        """Return a trigger that has not started."""
-
     def trigger_rule(self, n: int) -> TriggerRule:
-        """Not available.
-
-        Raises:
-            CallerError: always.
-        """
+        """Raise a CallerError."""
         raise CallerError("trigger.policy: this one is code and has no trigger rule")
 
 
@@ -88,11 +80,7 @@ class TriggerDecision(NamedTuple):
 
 
 class Trigger:
-    """Applies a policy at measurements.
-
-    Args:
-        policy: the policy.
-    """
+    """Applies a policy at measurements."""
 
     def __init__(self, policy: Policy) -> None:
         self._policy = policy

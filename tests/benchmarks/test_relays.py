@@ -222,7 +222,7 @@ def test_the_command_line_of_our_relay() -> None:
 
 def test_missing_totals_are_an_error() -> None:
     forward = {
-        "arrived": 9, "forwarded": 8, "longest_loss_burst": 1, "unintended": {"lost_in_kernel": 0},
+        "received": 9, "forwarded": 8, "longest_loss_burst": 1, "unintended": {"lost_in_kernel": 0},
     }  # fmt: skip
     text = json.dumps({"links": [{"forward": forward}], "more": 1})
     assert totals_of(f'{{"ready": []}}\n{text}') == Totals(9, 8, 1, 0)

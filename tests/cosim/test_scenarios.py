@@ -14,7 +14,7 @@ import pytest
 from scipy.linalg import eigvals, solve_continuous_are
 
 from cosim.analysis.claims.run_evidence import scheduled_certificates
-from cosim.analysis.model_comparison import linearisation, said
+from cosim.analysis.model_comparison import linearisation, linearisation_rows
 from cosim.analysis.run_summary import summarise
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
@@ -239,7 +239,7 @@ def test_a_summary_compares_the_cars_linearisation_with_the_model() -> None:
     believed = loop("lane_vehicle")
     np.testing.assert_allclose(np.array(found["A"]) - found["off_A"], believed.A_model, atol=1e-12)
     np.testing.assert_allclose(np.array(found["B"]) - found["off_B"], believed.B_model, atol=1e-12)
-    assert said(found)[1][1].endswith("inside the box")
+    assert linearisation_rows(found)[1][1].endswith("inside the box")
 
 
 def test_another_car_is_reported_outside_the_box_with_its_entries() -> None:
@@ -247,7 +247,7 @@ def test_another_car_is_reported_outside_the_box_with_its_entries() -> None:
     assert found is not None
     assert found["in_box"] is False
     worst = np.abs(np.array(found["off_B"])).max()
-    assert said(found)[1][1] == f"B[2, 1], by {worst:.3g}, outside the box"
+    assert linearisation_rows(found)[1][1] == f"B[2, 1], by {worst:.3g}, outside the box"
 
 
 def test_a_plant_without_a_box_and_a_linear_plant_have_no_box_check() -> None:
@@ -261,8 +261,8 @@ def test_the_summary_reports_a_plant_without_a_linearisation() -> None:
     found = linearisation(shipped("lane_vehicle", "plant.system.model=kinematic"))
     assert found is not None
     assert set(found.values()) == {None}
-    assert said(found) == (
-        ("the plant, linearised", "none: x does not tell what follows, or not smoothly"),
+    assert linearisation_rows(found) == (
+        ("the plant, linearised", "none: x is not its whole state, or it is not smooth"),
     )
 
 

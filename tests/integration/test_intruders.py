@@ -83,7 +83,7 @@ class Intruder:
 
     def guess(self) -> None:
         own = secret_of(self._ticket)
-        other = secret_of(self._ticket._replace(key=bytes(32)))
+        other = secret_of(self._ticket.model_copy(update={"key": bytes(32)}))
         for secret in ({}, own._replace(password="guess")._asdict(), other._asdict()):
             more: dict[str, Any] = {f"transport/auth/usrpwd/{k}": v for k, v in secret.items()}
             more["connect/timeout_ms"] = 200

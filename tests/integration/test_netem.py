@@ -83,7 +83,7 @@ def test_the_emulator_relays_any_udp_program(words: str) -> None:
             totals, _ = ended(process)
     assert arrived == list(range(0, 40, burst + 1))
     forward = forward_of(totals)
-    assert forward["arrived"] == 40
+    assert forward["received"] == 40
     assert forward["fates"] == {
         "delivered": 0 if burst else 40, "dropped": 30 if burst else 0,
         "forced": 10 if burst else 0, "corrupted": 0, "overflowed": 0, "blacked_out": 0,
@@ -140,7 +140,7 @@ def test_several_links_a_capture_and_statistics(tmp_path: Path) -> None:
     assert b"dropped by the loss model" in content
     newest = json.loads(lines.read_text().splitlines()[-1])["links"]
     assert [link["name"] for link in newest] == ["first", "second"]
-    assert [link["forward"]["arrived"] for link in newest] == [2, 1]
+    assert [link["forward"]["received"] for link in newest] == [2, 1]
 
 
 def test_recorded_fates_are_replayed(tmp_path: Path) -> None:

@@ -38,13 +38,13 @@ def test_the_link_decides_the_example_as_documented(words: str, column: int) -> 
             RecordedDecision(Fate.DROPPED if lost else Fate.DELIVERED, delay_ns, -1, -1, -1)
         )
     link = Link(settings_of(words), 0, "test", decisions=[decisions])
-    leaves_ns, held, forced = [], [], []
+    leaves_ns, held_back, forced = [], [], []
     for row in rows:
-        verdict = link.decide(0, 100, ns(row[1]))
-        leaves_ns.append(verdict.release_ns)
-        held.append(verdict.hold_back_ns > 0)
-        forced.append(verdict.fate == Fate.FORCED)
+        decision = link.decide(0, 100, ns(row[1]))
+        leaves_ns.append(decision.release_ns)
+        held_back.append(decision.hold_back_ns > 0)
+        forced.append(decision.fate == Fate.FORCED)
     assert leaves_ns == [ns(row[column]) for row in rows]
     if column == 3:
-        assert held == ["held back" in row[4] for row in rows]
+        assert held_back == ["held back" in row[4] for row in rows]
         assert forced == ["forced" in row[4] for row in rows]

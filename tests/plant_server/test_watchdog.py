@@ -77,7 +77,7 @@ def test_before_the_first_actuation_its_age_counts_from_the_start() -> None:
     assert driven.notices == [
         Notice(
             60 * MS, "watchdog",
-            "there has been no actuation for 0.06 s, 0.05 s allowed: the input is held",
+            "no actuation for 0.06 s, 0.05 s allowed; the input is held",
         )
     ]  # fmt: skip
     assert driven.u(60 * MS) == 0.0
@@ -96,8 +96,8 @@ def test_the_watchdog_reports_each_trip_once_with_its_duration(policy: str) -> N
         (60 * MS, "watchdog"), (130 * MS, "watchdog"), (170 * MS, "watchdog"),
     ]  # fmt: skip
     trip, end, _ = (notice.text for notice in driven.notices)
-    assert trip.startswith("the newest actuation is as old as 0.055 s, 0.05 s allowed: ")
-    assert end == "actuations are back; there was none in time for 0.07 s"
+    assert trip.startswith("the newest actuation is too old: 0.055 s, 0.05 s allowed; ")
+    assert end == "actuations arrive again; there was none in time for 0.07 s"
     # the newest actuation, even if it is not applied
     assert driven.steps[80 * MS]["actuation"] == 0
     assert driven.u(50 * MS) == driven.u(130 * MS) == 2.0

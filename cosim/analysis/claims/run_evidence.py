@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.claims.claim import Reals
 from cosim.analysis.claims.condition_reader import read_conditions
 from cosim.analysis.claims.observed_conditions import (
     AssumptionViolation,
     ObservedConditions,
+    Reals,
     SampledSeries,
     VoidFrom,
     causes_of,

@@ -1,6 +1,6 @@
 """The figures of a run, drawn from its record."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Literal, NamedTuple
 
@@ -43,13 +43,6 @@ class RunFigure(NamedTuple):
 
 BOUNDED = ("errors", "state-norm", "inter-event")
 """The figures that show certified bounds."""
-
-
-def run_figures(
-    record: RunRecord, envelopes: Sequence[Envelope] = (), *, timed: bool = True
-) -> Iterator[RunFigure]:
-    """Draw the figures of a run, as :func:`pictures` lists them."""
-    return (draw() for draw in pictures(record, envelopes, timed=timed).values())
 
 
 def pictures(

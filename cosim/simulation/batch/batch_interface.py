@@ -110,7 +110,6 @@ def setting_of(resolved: Scenario) -> Setting:
     Raises:
         CallerError: exact simulation does not support the scenario.
     """
-    resolved.coverage.require_unacknowledged()
     resolved.coverage.require_unchanging()
     resolved.coverage.require_exact()
     loop = loop_of(resolved)

@@ -335,7 +335,6 @@ def continuous_loop_of(resolved: Scenario) -> ContinuousLoop:
     Raises:
         CallerError: exact simulation does not support the scenario.
     """
-    resolved.coverage.require_unacknowledged()
     resolved.coverage.require_unchanging()
     resolved.coverage.require_exact()
     return ContinuousLoop(loop_of(resolved), policy_of(resolved))

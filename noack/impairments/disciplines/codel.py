@@ -24,15 +24,12 @@ from pydantic import Field, FiniteFloat
 
 from noack.core.clock import NS_PER_S
 from noack.impairments.bottleneck import BottleneckStage, enters, occupy, serve
-from noack.impairments.feature import Behaviour, Impairment, QueueDiscipline, Table, Word
+from noack.impairments.feature import Behaviour, QueueDiscipline, Table, Word
 from noack.impairments.link_records import (
     DELIVERED,
     NEVER_NS,
     OVERFLOWED,
-    FlowState,
-    LinkMemory,
-    LinkProgram,
-    PacketDecision,
+    PacketContext,
     QueueState,
     StageMemory,
     refuse,
@@ -111,18 +108,12 @@ def note_drop(stage: CodelStage, queue: CodelQueue) -> None:
     queue.drop_next_ns = control_law(stage, now_ns, queue.drops)
 
 
-def apply(
-    program: LinkProgram,
-    state: LinkMemory,
-    stage: CodelStage,
-    memory: StageMemory,
-    flow: FlowState,
-    decision: PacketDecision,
-) -> None:
+def apply(packet: PacketContext, stage: CodelStage, memory: StageMemory) -> None:
     """Put the packet and then its copy into the queue; ignore a packet that is lost already."""
+    decision = packet.decision
     if decision.fate != DELIVERED:
         return
-    queue, ring_ns = state.queues[stage.place], state.departures_ns
+    queue, ring_ns = packet.state.queues[stage.place], packet.state.departures_ns
     if not enters(stage, queue, ring_ns, decision.release_ns):
         refuse(decision, OVERFLOWED)
     if decision.fate == DELIVERED:
@@ -146,7 +137,6 @@ def apply(
 
 
 def _read(reader: WordReader) -> Table:
-    """``codel [target TIME] [interval TIME] [mtu BYTES]``."""
     table: Table = {}
     for word, key in (("target", "target_s"), ("interval", "interval_s")):
         if reader.accept(word):
@@ -172,11 +162,12 @@ class Codel(QueueDiscipline):
     """A packet with at most this number of bytes before it in the queue is not dropped."""
 
     words: ClassVar = (
-        Word("codel", _EXAMPLE, _read),
+        Word("codel", _EXAMPLE, _read, grammar="codel [target T] [interval T] [mtu BYTES]"),
         *(Word(name, _EXAMPLE, after="rate RATE codel") for name in ("target", "interval")),
         Word("mtu", f"{_EXAMPLE} mtu 1200", after="rate RATE codel"),
     )
     behaviour: ClassVar = Behaviour(CodelStage, apply, CodelQueue)
+    tc_missing: ClassVar = "the discipline codel, which is a qdisc of its own"
 
     @property
     def prediction_note(self) -> str:
@@ -203,6 +194,3 @@ class Codel(QueueDiscipline):
             interval_ns=round(self.interval_s * NS_PER_S),
             mtu_ns=self.mtu_bytes * 8 * NS_PER_S // bottleneck["rate_bps"],
         )
-
-    def tc_lacks(self, before: Sequence[Impairment]) -> str:
-        return "the discipline codel, which is a qdisc of its own"

@@ -1,7 +1,7 @@
 """Tail drop: a packet that finds the queue full is lost."""
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar, Literal, Self
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 from noack.impairments.bottleneck import BottleneckStage, enters, serve
 from noack.impairments.feature import Behaviour, QueueDiscipline
@@ -9,27 +9,18 @@ from noack.impairments.link_records import (
     DELIVERED,
     NEVER_NS,
     OVERFLOWED,
-    FlowState,
-    LinkMemory,
-    LinkProgram,
-    PacketDecision,
+    PacketContext,
     StageMemory,
     refuse,
 )
 
 
-def apply(
-    program: LinkProgram,
-    state: LinkMemory,
-    stage: BottleneckStage,
-    memory: StageMemory,
-    flow: FlowState,
-    decision: PacketDecision,
-) -> None:
+def apply(packet: PacketContext, stage: BottleneckStage, memory: StageMemory) -> None:
     """Put the packet and then its copy into the queue; ignore a packet that is lost already."""
+    decision = packet.decision
     if decision.fate != DELIVERED:
         return
-    queue, ring_ns = state.queues[stage.place], state.departures_ns
+    queue, ring_ns = packet.state.queues[stage.place], packet.state.departures_ns
     if not enters(stage, queue, ring_ns, decision.release_ns):
         refuse(decision, OVERFLOWED)
     if decision.fate == DELIVERED:
@@ -47,10 +38,6 @@ class TailDrop(QueueDiscipline):
     kind: Literal["tail_drop"] = "tail_drop"
 
     behaviour: ClassVar = Behaviour(BottleneckStage, apply)
-
-    @classmethod
-    def examples(cls) -> Sequence[Self]:
-        return (cls(),)
 
     def text(self) -> str:
         return ""

@@ -12,10 +12,7 @@ from noack.core.clock import NS_PER_S
 from noack.impairments.feature import Behaviour, Impairment, StageTables, Table, Word
 from noack.impairments.link_records import (
     BLACKED_OUT,
-    FlowState,
-    LinkMemory,
-    LinkProgram,
-    PacketDecision,
+    PacketContext,
     RuleStage,
     StageMemory,
     refuse,
@@ -38,16 +35,10 @@ class BlackoutStage(RuleStage):
     """0: the intervals do not repeat."""
 
 
-def apply(
-    program: LinkProgram,
-    state: LinkMemory,
-    stage: BlackoutStage,
-    memory: StageMemory,
-    flow: FlowState,
-    decision: PacketDecision,
-) -> None:
+def apply(packet: PacketContext, stage: BlackoutStage, memory: StageMemory) -> None:
     """Lose the packet if it arrives during an interval."""
-    times_ns, now_ns = program.integers, decision.arrival_ns
+    decision = packet.decision
+    times_ns, now_ns = packet.program.integers, decision.arrival_ns
     if stage.period_ns > 0 and now_ns >= 0:
         now_ns %= stage.period_ns
     for place in range(stage.begin, stage.end, 2):
@@ -59,7 +50,6 @@ def apply(
 
 
 def _read(reader: WordReader) -> Table:
-    """``blackout BEGIN-END[,BEGIN-END...] [every TIME]``."""
     intervals: list[tuple[float, ...]] = []
     for part in reader.word(_EXPECTED).split(","):
         found = re.fullmatch(f"({TIME})-({TIME})", part)
@@ -82,10 +72,11 @@ class Blackout(Impairment):
     """The intervals repeat after this time."""
 
     words: ClassVar = (
-        Word("blackout", "blackout 2s-3s", _read),
+        Word("blackout", "blackout 2s-3s", _read, grammar="blackout T-T[,T-T...] [every T]"),
         Word("every", "blackout 2s-3s every 10s", after="blackout BEGIN-END"),
     )
     behaviour: ClassVar = Behaviour(BlackoutStage, apply)
+    tc_missing: ClassVar = "blackouts"
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -120,6 +111,3 @@ class Blackout(Impairment):
 
     def chains(self) -> Sequence[Chain]:
         raise NotPredictableError("losses in a blackout depend on when packets arrive")
-
-    def tc_lacks(self, before: Sequence[Impairment]) -> str:
-        return "blackouts"

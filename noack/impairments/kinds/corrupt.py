@@ -1,41 +1,19 @@
 """Corruption: one bit of the payload is flipped."""
 
-from collections.abc import Sequence
-from typing import ClassVar, Literal, Self
+from typing import ClassVar, Literal
 
-from noack.impairments.correlated_chance import (
-    ChanceStage,
-    CorrelatedChance,
-    chance_text,
-    correlation_meaning,
-    happens,
-    read_chance,
-)
+from noack.impairments.correlated_chance import ChanceStage, CorrelatedChance, happens, read_chance
 from noack.impairments.feature import Behaviour, Impairment, Word
-from noack.impairments.link_records import (
-    NEVER_NS,
-    FlowState,
-    LinkMemory,
-    LinkProgram,
-    PacketDecision,
-    StageMemory,
-)
-from noack.impairments.markov_chain import Chain, chance_chain
-from noack.impairments.philox import uniforms
+from noack.impairments.link_records import NEVER_NS, PacketContext, StageMemory
+from noack.impairments.philox import draw
 from noack.impairments.quantities import brief_percent
 from noack.settings.section import Probability
 
 
-def apply(
-    program: LinkProgram,
-    state: LinkMemory,
-    stage: ChanceStage,
-    memory: StageMemory,
-    flow: FlowState,
-    decision: PacketDecision,
-) -> None:
+def apply(packet: PacketContext, stage: ChanceStage, memory: StageMemory) -> None:
     """Draw whether a bit of the packet, and of its copy, is flipped; not of an empty payload."""
-    u, v = uniforms(stage.key0, stage.key1, flow.number, decision.packet, 0)
+    decision = packet.decision
+    u, v = draw(packet, stage, 0)
     corrupts = happens(stage, memory, u)
     bits = decision.size_bytes * 8
     if bits == 0:
@@ -47,7 +25,7 @@ def apply(
     if corrupts:
         decision.bit = int(v * bits)
     if decision.copy_ns != NEVER_NS:
-        u, v = uniforms(stage.key0, stage.key1, flow.number, decision.packet, 1)
+        u, v = draw(packet, stage, 1)
         if u < stage.probability:
             decision.copy_bit = int(v * bits)
 
@@ -59,22 +37,14 @@ class Corrupt(CorrelatedChance, Impairment):
     probability: Probability
     """Probability of a flipped bit."""
 
-    words: ClassVar = (Word("corrupt", "corrupt 1%", read_chance),)
+    words: ClassVar = (Word("corrupt", "corrupt 1%", read_chance, grammar="corrupt P [CORR]"),)
     behaviour: ClassVar = Behaviour(ChanceStage, apply)
+    action: ClassVar = "corrupt"
     flips_bits: ClassVar = True
 
-    @classmethod
-    def examples(cls) -> Sequence[Self]:
-        chances = ((0.0, 0.0), (0.2, 0.7), (0.8, 0.0), (1.0, 0.0))
-        return [cls(probability=p, correlation=rho) for p, rho in chances]
-
     def text(self) -> str:
-        return f"corrupt {chance_text(self)}"
+        return f"corrupt {self.chance_text}"
 
     def meaning(self) -> str:
-        how = correlation_meaning(self.correlation)
+        how = self.correlation_meaning
         return f"flips one bit in {brief_percent(self.probability)} of the packets{how}"
-
-    def chains(self) -> Sequence[Chain]:
-        chain = chance_chain(self.probability, self.correlation)
-        return (chain._replace(what="corrupt", probability=self.probability),)

@@ -20,14 +20,12 @@ from noack.impairments.feature import Behaviour, Impairment, StageTables, Table,
 from noack.impairments.link_records import (
     NEVER_NS,
     FlowState,
-    LinkMemory,
-    LinkProgram,
-    PacketDecision,
+    PacketContext,
     RuleStage,
     StageMemory,
 )
 from noack.impairments.normal import cdf, score
-from noack.impairments.philox import uniforms
+from noack.impairments.philox import draw
 from noack.impairments.quantities import (
     CORRELATION,
     OWN_TIME_S,
@@ -114,29 +112,20 @@ def drawn_ns(
     return int(min(max(stage.constant_ns + quantile_ns(stage, table_ns, u), 0.0), _LONGEST_NS))
 
 
-def apply(
-    program: LinkProgram,
-    state: LinkMemory,
-    stage: DelayStage,
-    memory: StageMemory,
-    flow: FlowState,
-    decision: PacketDecision,
-) -> None:
+def apply(packet: PacketContext, stage: DelayStage, memory: StageMemory) -> None:
     """Delay the packet and its copy; the copy's delay is drawn as if it were the next packet."""
-    u, v = uniforms(stage.key0, stage.key1, flow.number, decision.packet, 0)
-    decision.release_ns += drawn_ns(stage, program.reals, memory, flow, u)
+    decision = packet.decision
+    u, v = draw(packet, stage, 0)
+    decision.release_ns += drawn_ns(stage, packet.program.reals, memory, packet.flow, u)
     if decision.copy_ns != NEVER_NS:
         # The next packet's delay must not depend on the existence of a copy.
         phase, latest = memory.phase, memory.score
-        decision.copy_ns += drawn_ns(stage, program.reals, memory, flow, v)
+        decision.copy_ns += drawn_ns(stage, packet.program.reals, memory, packet.flow, v)
         memory.phase, memory.score = phase, latest
 
 
 def _read(reader: WordReader) -> Table:
-    """``delay TIME [JITTER [CORRELATION]] [distribution NAME | samples TIMES] [lossrel PERCENT]``.
-
-    The clauses at the end may stand in any order.
-    """
+    """Read a delay; the clauses after its numbers may stand in any order."""
     table: Table = {"delay_s": reader.value(TIME_S)}
     if reader.number_follows():
         table["jitter_s"] = reader.value(TIME_S)
@@ -173,6 +162,7 @@ def _read_distribution(reader: WordReader, table: Table) -> None:
         reader.wrong("has no effect without jitter; write delay TIME JITTER distribution NAME")
 
 
+_GRAMMAR = f"delay T [JITTER [CORR]] [distribution {'|'.join(SHAPES)}|FILE] [lossrel P]"
 _DelayS = Annotated[FiniteFloat, Field(ge=0, le=MOST_DELAY_S)]
 _Samples = Annotated[
     tuple[Annotated[FiniteFloat, Field(ge=-MOST_DELAY_S, le=MOST_DELAY_S)], ...],
@@ -204,13 +194,16 @@ class Delay(Impairment):
     more."""
 
     words: ClassVar = (
-        Word("delay", "delay 10ms", _read),
+        Word("delay", "delay 10ms", _read, grammar=_GRAMMAR),
         Word("latency", "delay 10ms", _read),
         Word("jitter", "delay 10ms 2ms", after="delay TIME"),
         Word("distribution", "delay 10ms 2ms distribution normal", after="delay TIME JITTER"),
-        Word("samples", "delay 0s samples 1ms,2ms,10ms", after="delay TIME"),
+        Word(
+            "samples", "delay 0s samples 1ms,2ms,10ms", after="delay TIME",
+            grammar="delay T samples T,T,... [lossrel P]",
+        ),
         Word("lossrel", "loss 5% delay 10ms 2ms lossrel 50%", after="delay TIME"),
-    )
+    )  # fmt: skip
     behaviour: ClassVar = Behaviour(DelayStage, apply)
     delays: ClassVar = True
 

@@ -47,7 +47,10 @@ class LossOf(Impairment):
         Word("loss", "loss 30%", _read),
         Word("drop", "loss 30%", _read),
         *(
-            word._replace(read=None, after=word.after or "loss")
+            word._replace(
+                read=None, after=word.after or "loss",
+                grammar=word.grammar and f"loss {word.grammar}",
+            )
             for model in LOSS_MODELS for word in model.words
         ),
     )  # fmt: skip

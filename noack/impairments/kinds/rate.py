@@ -17,7 +17,6 @@ _TC_HEADERS_BYTES = 42
 
 
 def _read(reader: WordReader) -> Table:
-    """``rate RATE [OVERHEAD [CELL [CELL_OVERHEAD]]] [queue PACKETS] [DISCIPLINE ...]``."""
     table: Table = {"rate_bps": reader.value(RATE_BPS)}
     for key, signs in (("overhead_bytes", "-"), ("cell_bytes", ""), ("cell_overhead_bytes", "-")):
         if not reader.number_follows(signs):
@@ -51,10 +50,16 @@ class Rate(Impairment):
     """Which packets the queue drops."""
 
     words: ClassVar = (
-        Word("rate", "rate 1mbit", _read),
+        Word(
+            "rate", "rate 1mbit", _read,
+            grammar="rate RATE [OVERHEAD [CELL [CELL_OVERHEAD]]] [queue N]",
+        ),
         Word("queue", "rate 1mbit queue 20", after="rate RATE"),
         *(
-            word._replace(read=None, after=word.after or "rate RATE")
+            word._replace(
+                read=None, after=word.after or "rate RATE",
+                grammar=word.grammar and f"rate RATE ... {word.grammar}",
+            )
             for discipline in DISCIPLINES for word in discipline.words
         ),
     )  # fmt: skip

@@ -5,45 +5,24 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field
 
-from noack.impairments.correlated_chance import (
-    ChanceStage,
-    CorrelatedChance,
-    chance_stage,
-    chance_text,
-    correlation_meaning,
-    happens,
-    read_chance,
-)
+from noack.impairments.correlated_chance import ChanceStage, CorrelatedChance, happens, read_chance
 from noack.impairments.feature import Behaviour, Impairment, StageTables, Table, Word
-from noack.impairments.link_records import (
-    FlowState,
-    LinkMemory,
-    LinkProgram,
-    PacketDecision,
-    StageMemory,
-)
-from noack.impairments.philox import uniforms
+from noack.impairments.link_records import PacketContext, StageMemory
+from noack.impairments.philox import draw
 from noack.impairments.quantities import COUNT, brief_percent
 from noack.impairments.word_reader import WordReader
 from noack.settings.section import Probability
 
 
-def apply(
-    program: LinkProgram,
-    state: LinkMemory,
-    stage: ChanceStage,
-    memory: StageMemory,
-    flow: FlowState,
-    decision: PacketDecision,
-) -> None:
+def apply(packet: PacketContext, stage: ChanceStage, memory: StageMemory) -> None:
     """Draw whether a gap-th packet's delay is undone; every packet advances the latent process."""
-    u, _ = uniforms(stage.key0, stage.key1, flow.number, decision.packet, 0)
+    decision = packet.decision
+    u, _ = draw(packet, stage, 0)
     if happens(stage, memory, u) and (decision.packet + 1) % stage.gap == 0:
         decision.release_ns = decision.arrival_ns
 
 
 def _read(reader: WordReader) -> Table:
-    """``reorder PERCENT [CORRELATION] [gap N]``."""
     table: Table = {**read_chance(reader)}
     if reader.accept("gap"):
         table["gap"] = reader.value(COUNT)
@@ -51,7 +30,6 @@ def _read(reader: WordReader) -> Table:
 
 
 def _read_gap(reader: WordReader) -> Table:
-    """``gap N``."""
     return {"gap": reader.value(COUNT)}
 
 
@@ -65,8 +43,8 @@ class Reorder(CorrelatedChance, Impairment):
     """Only every ``gap``-th packet can be reordered."""
 
     words: ClassVar = (
-        Word("reorder", "delay 10ms reorder 5%", _read),
-        Word("gap", "delay 10ms gap 5", _read_gap),
+        Word("reorder", "delay 10ms reorder 5%", _read, grammar="reorder P [CORR] [gap N]"),
+        Word("gap", "delay 10ms gap 5", _read_gap, grammar="gap N"),
     )
     behaviour: ClassVar = Behaviour(ChanceStage, apply)
 
@@ -81,7 +59,7 @@ class Reorder(CorrelatedChance, Impairment):
 
     def text(self) -> str:
         gap = f" gap {self.gap}" if self.gap != 1 else ""
-        return f"reorder {chance_text(self)}{gap}"
+        return f"reorder {self.chance_text}{gap}"
 
     def meaning(self) -> str:
         which = f"{brief_percent(self.probability)} of the packets"
@@ -89,11 +67,13 @@ class Reorder(CorrelatedChance, Impairment):
             which = f"every {self.gap}th packet"
             if self.probability < 1:
                 which += f", with probability {brief_percent(self.probability)},"
-        how = correlation_meaning(self.correlation)
+        how = self.correlation_meaning
         return f"sends {which} at once, before those that are delayed{how}"
 
     def stage(self, tables: StageTables) -> ChanceStage:
-        return chance_stage(self, gap=self.gap)
+        stage = super().stage(tables)
+        stage.gap = self.gap
+        return stage
 
     def tc_lacks(self, before: Sequence[Impairment]) -> str:
         delayed = any(getattr(one, "delay_s", 0) for one in before)

@@ -12,18 +12,9 @@ import numpy as np
 from pydantic import model_validator
 
 from noack.impairments.feature import Behaviour, LossModel, StageTables, Table, Word
-from noack.impairments.link_records import (
-    DROPPED,
-    FlowState,
-    LinkMemory,
-    LinkProgram,
-    PacketDecision,
-    RuleStage,
-    StageMemory,
-    refuse,
-)
+from noack.impairments.link_records import DROPPED, PacketContext, RuleStage, StageMemory, refuse
 from noack.impairments.markov_chain import Chain
-from noack.impairments.philox import uniforms
+from noack.impairments.philox import draw
 from noack.impairments.quantities import PERCENT, brief_percent, percent_text, percents_text
 from noack.impairments.word_reader import WordReader
 from noack.settings.section import Probability
@@ -40,16 +31,9 @@ class FourStateStage(RuleStage):
     p14: float
 
 
-def apply(
-    program: LinkProgram,
-    state: LinkMemory,
-    stage: FourStateStage,
-    memory: StageMemory,
-    flow: FlowState,
-    decision: PacketDecision,
-) -> None:
+def apply(packet: PacketContext, stage: FourStateStage, memory: StageMemory) -> None:
     """Advance the chain; the packet is lost in states 3 and 4."""
-    u, _ = uniforms(stage.key0, stage.key1, flow.number, decision.packet, 0)
+    u, _ = draw(packet, stage, 0)
     now = memory.phase + 1
     if now == 1:
         if u < stage.p13:
@@ -68,11 +52,11 @@ def apply(
         now = 1
     memory.phase = now - 1
     if now >= 3:
-        refuse(decision, DROPPED)
+        refuse(packet.decision, DROPPED)
 
 
 def _read(reader: WordReader) -> Table:
-    """``state p13 [p31 [p32 [p23 [p14]]]]``; p13 alone makes independent losses, as in tc."""
+    """Read the transitions; p13 alone makes independent losses, as in tc."""
     p13 = reader.value(PERCENT)
     table: Table = {"p13": p13, "p31": 1 - p13}
     for key in ("p31", "p32", "p23", "p14"):
@@ -101,7 +85,9 @@ class FourStateLoss(LossModel):
     p14: Probability = 0.0
     """Probability of a single loss within a gap."""
 
-    words: ClassVar = (Word("state", "loss state 1% 10%", _read),)
+    words: ClassVar = (
+        Word("state", "loss state 1% 10%", _read, grammar="state P13 [P31 [P32 [P23 [P14]]]]"),
+    )
     behaviour: ClassVar = Behaviour(FourStateStage, apply)
 
     @model_validator(mode="after")

@@ -15,19 +15,10 @@ import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
 from noack.impairments.feature import Behaviour, LossModel, StageTables, Table, Word
-from noack.impairments.link_records import (
-    DROPPED,
-    FlowState,
-    LinkMemory,
-    LinkProgram,
-    PacketDecision,
-    RuleStage,
-    StageMemory,
-    refuse,
-)
+from noack.impairments.link_records import DROPPED, PacketContext, RuleStage, StageMemory, refuse
 from noack.impairments.markov_chain import Chain
 from noack.impairments.normal import score
-from noack.impairments.philox import uniforms
+from noack.impairments.philox import draw
 from noack.impairments.quantities import (
     NUMBER,
     PERCENT,
@@ -58,35 +49,28 @@ class GilbertElliottStage(RuleStage):
     """1: a later delay is correlated with the state."""
 
 
-def apply(
-    program: LinkProgram,
-    state: LinkMemory,
-    stage: GilbertElliottStage,
-    memory: StageMemory,
-    flow: FlowState,
-    decision: PacketDecision,
-) -> None:
+def apply(packet: PacketContext, stage: GilbertElliottStage, memory: StageMemory) -> None:
     """Advance the chain, and draw whether the packet is lost.
 
     If a delay is correlated with loss, the packet gets a score: the scores in the bad state are the
     highest share p/(p + r) of all scores.
     """
-    u, v = uniforms(stage.key0, stage.key1, flow.number, decision.packet, 0)
+    u, v = draw(packet, stage, 0)
     if memory.phase == BAD:
         if u < stage.bad_to_good:
             memory.phase = GOOD
     elif u < stage.good_to_bad:
         memory.phase = BAD
     if stage.scored != 0:
-        w, _ = uniforms(stage.key0, stage.key1, flow.number, decision.packet, 1)
+        w, _ = draw(packet, stage, 1)
         bad = stage.share_bad
-        flow.score = -score(w * bad if memory.phase == BAD else bad + w * (1.0 - bad))
+        packet.flow.score = -score(w * bad if memory.phase == BAD else bad + w * (1.0 - bad))
     if v < (stage.loss_in_bad if memory.phase == BAD else stage.loss_in_good):
-        refuse(decision, DROPPED)
+        refuse(packet.decision, DROPPED)
 
 
 def _read_chain(reader: WordReader) -> Table:
-    """``gemodel p [r [1-h [1-k]]]``; p alone makes independent losses, as in tc."""
+    """Read the probabilities; p alone makes independent losses, as in tc."""
     p = reader.value(PERCENT)
     table: Table = {"good_to_bad": p, "bad_to_good": 1 - p}
     for key in ("bad_to_good", "loss_in_bad", "loss_in_good"):
@@ -97,7 +81,6 @@ def _read_chain(reader: WordReader) -> Table:
 
 
 def _read_means(reader: WordReader) -> Table:
-    """``burst PERCENT LENGTH``."""
     return {"mean_loss": reader.value(PERCENT), "mean_burst": reader.value(NUMBER)}
 
 
@@ -122,8 +105,8 @@ class GilbertElliottLoss(LossModel):
     """Mean number of consecutive losses, with mean_loss."""
 
     words: ClassVar = (
-        Word("gemodel", "loss gemodel 1% 10%", _read_chain),
-        Word("burst", "loss burst 5% 3", _read_means),
+        Word("gemodel", "loss gemodel 1% 10%", _read_chain, grammar="gemodel P [R [1-H [1-K]]]"),
+        Word("burst", "loss burst 5% 3", _read_means, grammar="burst MEAN_LOSS MEAN_BURST"),
     )
     behaviour: ClassVar = Behaviour(GilbertElliottStage, apply)
     gives_score: ClassVar = True

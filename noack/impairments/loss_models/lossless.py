@@ -1,7 +1,6 @@
 """No losses."""
 
-from collections.abc import Sequence
-from typing import ClassVar, Literal, Self
+from typing import ClassVar, Literal
 
 from noack.impairments.feature import LossModel, StageTables, Word
 
@@ -11,11 +10,7 @@ class NoLoss(LossModel):
 
     model: Literal["lossless"] = "lossless"
 
-    words: ClassVar = (Word("none", "loss none", lambda reader: {}),)
-
-    @classmethod
-    def examples(cls) -> Sequence[Self]:
-        return (cls(),)
+    words: ClassVar = (Word("none", "loss none", lambda reader: {}, grammar="none"),)
 
     def text(self) -> str:
         return "none"

@@ -7,17 +7,8 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from noack.impairments.feature import Behaviour, Impairment, LossModel, StageTables, Table, Word
-from noack.impairments.link_records import (
-    DROPPED,
-    FlowState,
-    LinkMemory,
-    LinkProgram,
-    PacketDecision,
-    RuleStage,
-    StageMemory,
-    refuse,
-)
+from noack.impairments.feature import Behaviour, LossModel, StageTables, Table, Word
+from noack.impairments.link_records import DROPPED, PacketContext, RuleStage, StageMemory, refuse
 from noack.impairments.markov_chain import LONGEST_PATTERN, Pattern, pattern
 from noack.impairments.quantities import COUNT
 from noack.impairments.word_reader import WordReader
@@ -34,22 +25,15 @@ class PeriodicStage(RuleStage):
     first: int
 
 
-def apply(
-    program: LinkProgram,
-    state: LinkMemory,
-    stage: PeriodicStage,
-    memory: StageMemory,
-    flow: FlowState,
-    decision: PacketDecision,
-) -> None:
+def apply(packet: PacketContext, stage: PeriodicStage, memory: StageMemory) -> None:
     """Lose the packet if its number is one of the lost ones of its period."""
+    decision = packet.decision
     number = decision.packet - stage.first
     if number >= 0 and number % stage.period < stage.burst:
         refuse(decision, DROPPED)
 
 
 def _read(reader: WordReader) -> Table:
-    """``periodic BURST/PERIOD [from NUMBER]``."""
     found = re.fullmatch("([0-9]+)/([0-9]+)", reader.word(_EXPECTED))
     if found is None:
         reader.wrong(f"expected {_EXPECTED}")
@@ -72,10 +56,14 @@ class PeriodicLoss(LossModel):
     """Number of the first packet that is lost."""
 
     words: ClassVar = (
-        Word("periodic", "loss periodic 2/100", _read),
+        Word(
+            "periodic", "loss periodic 2/100", _read,
+            grammar="periodic B/N [from N]  (B consecutive datagrams of every N)",
+        ),
         Word("from", "loss periodic 2/100 from 3", after="loss periodic BURST/PERIOD"),
-    )
+    )  # fmt: skip
     behaviour: ClassVar = Behaviour(PeriodicStage, apply)
+    tc_missing: ClassVar = "losses by the packets' numbers"
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -102,6 +90,3 @@ class PeriodicLoss(LossModel):
     def chains(self) -> Sequence[Pattern]:
         lost = range(self.first, self.first + min(self.burst, LONGEST_PATTERN))
         return (pattern(self.period, (number % self.period for number in lost)),)
-
-    def tc_lacks(self, before: Sequence[Impairment]) -> str:
-        return "losses by the packets' numbers"

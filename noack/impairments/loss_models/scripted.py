@@ -7,17 +7,8 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from noack.impairments.feature import Behaviour, Impairment, LossModel, StageTables, Table, Word
-from noack.impairments.link_records import (
-    DROPPED,
-    FlowState,
-    LinkMemory,
-    LinkProgram,
-    PacketDecision,
-    RuleStage,
-    StageMemory,
-    refuse,
-)
+from noack.impairments.feature import Behaviour, LossModel, StageTables, Table, Word
+from noack.impairments.link_records import DROPPED, PacketContext, RuleStage, StageMemory, refuse
 from noack.impairments.markov_chain import NotPredictableError, Pattern, pattern
 from noack.impairments.quantities import COUNT
 from noack.impairments.word_reader import WordReader
@@ -36,16 +27,10 @@ class ScriptStage(RuleStage):
     end: int
 
 
-def apply(
-    program: LinkProgram,
-    state: LinkMemory,
-    stage: ScriptStage,
-    memory: StageMemory,
-    flow: FlowState,
-    decision: PacketDecision,
-) -> None:
+def apply(packet: PacketContext, stage: ScriptStage, memory: StageMemory) -> None:
     """Lose the packet if its number is in the script."""
-    numbers = program.integers
+    decision = packet.decision
+    numbers = packet.program.integers
     wanted = decision.packet % stage.period if stage.period > 0 else decision.packet
     low, high = stage.begin, stage.end
     while low < high:
@@ -59,7 +44,6 @@ def apply(
 
 
 def _read(reader: WordReader) -> Table:
-    """``script NUMBERS [every COUNT]``."""
     table: Table = {"lost": [] if reader.accept("none") else reader.values(COUNT, _EXPECTED)}
     if reader.accept("every"):
         table["repeat_every"] = reader.value(COUNT)
@@ -76,10 +60,11 @@ class ScriptedLoss(LossModel):
     """The script repeats after this number of packets; 0: it does not repeat."""
 
     words: ClassVar = (
-        Word("script", "loss script 3,4,17", _read),
+        Word("script", "loss script 3,4,17", _read, grammar="script N,N,... [every N]"),
         Word("every", "loss script 3,4 every 20", after="loss script NUMBERS"),
     )
     behaviour: ClassVar = Behaviour(ScriptStage, apply)
+    tc_missing: ClassVar = "losses by the packets' numbers"
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -112,6 +97,3 @@ class ScriptedLoss(LossModel):
                 "a script that is played once loses the same packets however long a flow is"
             )
         return (pattern(self.repeat_every, self.lost),)
-
-    def tc_lacks(self, before: Sequence[Impairment]) -> str:
-        return "losses by the packets' numbers"

@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from noack.impairments.feature import Impairment, LossModel, StageTables, Table, Word
+from noack.impairments.feature import LossModel, StageTables, Table, Word
 from noack.impairments.loss_models.scripted import MAX_SCRIPT, ScriptedLoss
 from noack.impairments.markov_chain import NotPredictableError, Pattern
 from noack.impairments.word_reader import WordReader
@@ -18,7 +18,6 @@ _SPACES = b" \t\r\n\v\f"
 
 
 def _read(reader: WordReader) -> Table:
-    """``trace FILE [once]``."""
     return {"file": reader.file("a file of zeros and ones"), "repeat": not reader.accept("once")}
 
 
@@ -32,9 +31,10 @@ class TraceLoss(LossModel):
     """true: repeat the trace; false: deliver all packets after its end."""
 
     words: ClassVar = (
-        Word("trace", "loss trace FILE", _read),
+        Word("trace", "loss trace FILE", _read, grammar="trace FILE [once]"),
         Word("once", "loss trace FILE once", after="loss trace FILE"),
     )
+    tc_missing: ClassVar = "losses by the packets' numbers"
 
     @classmethod
     def examples(cls) -> Sequence[Self]:
@@ -65,6 +65,3 @@ class TraceLoss(LossModel):
             file.wrong(f"loses {lost.size} packets; at most {MAX_SCRIPT} can be")
         repeat_every = marks.size if self.repeat else 0
         return ScriptedLoss(lost=tuple(lost.tolist()), repeat_every=repeat_every)
-
-    def tc_lacks(self, before: Sequence[Impairment]) -> str:
-        return "losses by the packets' numbers"

@@ -1,34 +1,18 @@
 """The worst case: as many losses as the cap allows."""
 
 from collections.abc import Sequence
-from typing import ClassVar, Literal, Self
+from typing import ClassVar, Literal
 
 import numpy as np
 
-from noack.impairments.feature import Behaviour, Impairment, LossModel, StageTables, Word
-from noack.impairments.link_records import (
-    DROPPED,
-    FlowState,
-    LinkMemory,
-    LinkProgram,
-    PacketDecision,
-    RuleStage,
-    StageMemory,
-    refuse,
-)
+from noack.impairments.feature import Behaviour, LossModel, StageTables, Word
+from noack.impairments.link_records import DROPPED, PacketContext, RuleStage, StageMemory, refuse
 from noack.impairments.markov_chain import Pattern
 
 
-def apply(
-    program: LinkProgram,
-    state: LinkMemory,
-    stage: RuleStage,
-    memory: StageMemory,
-    flow: FlowState,
-    decision: PacketDecision,
-) -> None:
+def apply(packet: PacketContext, stage: RuleStage, memory: StageMemory) -> None:
     """Lose the packet."""
-    refuse(decision, DROPPED)
+    refuse(packet.decision, DROPPED)
 
 
 class WorstCaseLoss(LossModel):
@@ -36,12 +20,9 @@ class WorstCaseLoss(LossModel):
 
     model: Literal["worst_case"] = "worst_case"
 
-    words: ClassVar = (Word("worst", "loss worst mansd 4", lambda reader: {}),)
+    words: ClassVar = (Word("worst", "loss worst mansd 4", lambda reader: {}, grammar="worst"),)
     behaviour: ClassVar = Behaviour(RuleStage, apply)
-
-    @classmethod
-    def examples(cls) -> Sequence[Self]:
-        return (cls(),)
+    tc_missing: ClassVar = "a worst case"
 
     def text(self) -> str:
         return "worst"
@@ -54,6 +35,3 @@ class WorstCaseLoss(LossModel):
 
     def chains(self) -> Sequence[Pattern]:
         return (Pattern(np.ones(1, bool)),)
-
-    def tc_lacks(self, before: Sequence[Impairment]) -> str:
-        return "a worst case"

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from controller_node.controller import controller_of
-from cosim.analysis.claims.claim import ClaimVerdict
 from cosim.analysis.claims.claims_by_part import RunClaims
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
+from cosim.analysis.summary_model import ClaimVerdict
 from cosim.record.align import identity_residual, join_all
 from cosim.record.recorded_changes import changes_of
 from cosim.record.run_record import RunRecord
@@ -218,7 +218,7 @@ def test_a_change_received_too_late_is_reported_and_voids_its_claims() -> None:
     assert list(made.late) == ["controller"]
     assert made.everywhere_ns == made.late["controller"] > 990 * MS
     (violation,) = summarise(record, 0, "horizon").to_json()["assumption_violations"]
-    assert "heard of a change too late" in violation["what"]
+    assert "change received too late" in violation["what"]
     assert violation["process"] == "controller"
     claims = [one for one in RunClaims(record).judge() if one.source == "(I1)"]
     assert [one.verdict for one in claims] == [ClaimVerdict.HELD] * 4

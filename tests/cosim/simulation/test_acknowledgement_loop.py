@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.analysis.claims.claim import ClaimVerdict
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
+from cosim.analysis.summary_model import ClaimVerdict
 from cosim.live.simulated_run import simulate_run
-from cosim.output.certificate_report import study
+from cosim.output.certificate_report import Certificates
 from cosim.record.align import join_all
 from cosim.record.run_record import RunRecord, load_record, write_record
 from cosim.simulation.continuous.continuous_loop import continuous_loop_of
@@ -295,7 +295,7 @@ def test_the_baseline_has_no_claims() -> None:
     assert ClaimEvaluation(record).envelopes() == []
     (assumption,) = [a for a in assumptions(record.scenario) if "acknowledged" in a.what]
     assert assumption.verdict is AssumptionStatus.VIOLATED
-    for refuse in (continuous_loop_of, lambda scenario: study(scenario, 2)):
+    for refuse in (continuous_loop_of, lambda scenario: Certificates(scenario, 2)):
         with pytest.raises(CallerError, match=r'network\.protocol: .*"none".* has "ack"'):
             refuse(record.scenario)
 

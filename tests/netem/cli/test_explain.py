@@ -3,16 +3,13 @@
 import json
 import re
 import shlex
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any
 
 import pytest
 
 from netem.__main__ import main
 from netem.cli.emulator_options import parser, specs_of
-from netem.cli.explain_links import DirectionExplanation, Explanation, LinkExplanation
-from netem.engine.relay_interface import LinkSpec
 from netem.words.links_file import load_links
 from netem.words.words_to_settings import settings_of
 from noack.impairments.link_settings import LinkSettings
@@ -52,9 +49,9 @@ class Explain:
         assert err == ""
         return out
 
-    def links(self, *arguments: str) -> Sequence[LinkExplanation]:
-        document: Explanation = json.loads(self("--json", *arguments))
-        assert document.keys() == get_type_hints(Explanation).keys()
+    def links(self, *arguments: str) -> Any:
+        document = json.loads(self("--json", *arguments))
+        assert list(document) == ["links"]
         return document["links"]
 
 
@@ -111,8 +108,6 @@ def test_links_without_a_tc_equivalent_are_named(explain: Explain) -> None:
                             "reverse, from the server to clients, in this order"]),
         ("loss 5% --reverse loss 6%", ["forward, from clients to the server, in this order",
                                     "reverse, from the server to clients, in this order"]),
-        ("loss 5% --reverse loss none", ["forward, from clients to the server, in this order",
-                                      "reverse, from the server to clients, in this order"]),
         ("--both loss 5%", ["both directions, each by itself, in this order"]),
         ("--one-way loss 5%", ["forward, from clients to the server, in this order",
                                "reverse: not relayed; the server's answers are discarded"]),
@@ -133,7 +128,7 @@ def test_each_link_of_a_file_is_explained(explain: Explain, links_file: Path) ->
     assert video.endswith("reverse: not relayed; the server's answers are discarded\n")
 
 
-@pytest.mark.parametrize("columns", [120, 80, 60])
+@pytest.mark.parametrize("columns", [120, 60])
 def test_the_explanation_fits_into_a_terminal(
     explain: Explain, links_file: Path, monkeypatch: pytest.MonkeyPatch, columns: int
 ) -> None:
@@ -147,7 +142,7 @@ def test_commands_to_copy_are_complete_at_any_width(
     explain: Explain, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     commands = set()
-    for columns in ("200", "80", "60", "30"):
+    for columns in ("200", "60", "30"):
         monkeypatch.setenv("COLUMNS", columns)
         out = explain("delay 10ms 2ms distribution normal loss gemodel 1% 10% 70% 0.1%")
         command = out[out.index("tc qdisc") :].partition("\ndifference")[0]
@@ -163,8 +158,7 @@ def test_commands_to_copy_are_complete_at_any_width(
     "arguments",
     [
         MUCH,
-        f"{MUCH} --seed 9 --reverse delay 10ms",
-        f"--reverse {MUCH} --listen [::1]:7 --to 192.0.2.1:53",
+        f"--reverse {MUCH} --seed 9 --listen [::1]:7 --to 192.0.2.1:53",
         "loss 5% --both --idle 5s",
         "delay 0 samples 1ms,2ms --one-way",
         "",
@@ -178,7 +172,6 @@ def test_the_toml_output_equals_the_command_line_settings(
     path.write_text(explain(*given).partition("(--links)\n")[2])
     expected = specs_of(parser().parse_intermixed_args(["--explain", *given]))
     assert load_links(path) == expected
-    assert isinstance(expected[0], LinkSpec)
 
 
 def test_links_are_explained_as_json(explain: Explain, links_file: Path) -> None:
@@ -199,9 +192,8 @@ def test_each_direction_is_explained_as_json(explain: Explain) -> None:
     (link,) = explain.links("delay 10ms loss 5%", "--reverse", "corrupt 1%")
     assert link["name"] == "relay"
     for side, words in (("forward", "delay 10ms loss 5%"), ("reverse", "corrupt 1%")):
-        direction: Any = link[side]  # type: ignore[literal-required]
-        assert direction["words"] == words
-        settings = LinkSettings.model_validate_json(json.dumps(direction["settings"]))
+        assert link[side]["words"] == words
+        settings = LinkSettings.model_validate_json(json.dumps(link[side]["settings"]))
         assert settings == settings_of(words)
 
 
@@ -212,6 +204,7 @@ def rows(title: str) -> set[str]:
     }
 
 
-def test_every_key_is_documented_and_no_other() -> None:
-    assert rows("explained link") == get_type_hints(LinkExplanation).keys()
-    assert rows("explained direction") == get_type_hints(DirectionExplanation).keys()
+def test_every_key_is_documented_and_no_other(explain: Explain) -> None:
+    (link,) = explain.links("loss 5%")
+    assert rows("explained link") == link.keys()
+    assert rows("explained direction") == link["forward"].keys()

@@ -12,14 +12,14 @@ NO_FATES = dict.fromkeys(
     ("delivered", "dropped", "forced", "corrupted", "overflowed", "blacked_out"), 0
 )
 UNUSED: Any = {
-    "words": "", "arrived": 0, "forwarded": 0, "fates": NO_FATES, "duplicated": 0,
+    "words": "", "received": 0, "forwarded": 0, "fates": NO_FATES, "duplicated": 0,
     "delivered_out_of_order": 0, "held_back": 0, "longest_loss_burst": 0, "mansd": None,
-    "loss": {"realised": None, "lost": None, "predicted": 0.0}, "arrived_before": 0,
+    "loss": {"realised": None, "lost": None, "predicted": 0.0}, "received_before": 0,
     "unintended": {"lost_in_kernel": 0}, "in_flight": 0,
     "delay_ns": {"p50": None, "p99": None}, "lateness_ns": {"p50": None, "p99": None},
 }  # fmt: skip
 LOSSY = UNUSED | {
-    "words": "loss 5% mansd 4", "arrived": 2000, "forwarded": 1900,
+    "words": "loss 5% mansd 4", "received": 2000, "forwarded": 1900,
     "fates": NO_FATES | {"dropped": 100, "forced": 3}, "longest_loss_burst": 4, "mansd": 4,
     "loss": {"realised": 0.05, "lost": 0.05, "predicted": 0.0499},
     "delay_ns": {"p50": 10_000, "p99": 2_000_000},
@@ -76,7 +76,7 @@ def test_stale_datagrams_are_shown_apart_from_losses() -> None:
 
 
 def test_after_a_change_the_loss_counts_from_there() -> None:
-    lines = printed(LOSSY | {"arrived_before": 500})
+    lines = printed(LOSSY | {"received_before": 500})
     assert lines[lines.index("longest loss burst 4, cap 4") - 1] == "since the last change:"
 
 

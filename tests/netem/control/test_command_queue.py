@@ -8,7 +8,7 @@ from netem.link_machine import Datagram
 from netem.words.words_to_settings import settings_of
 from noack.core.errors import CallerError, PeerError
 from noack.impairments.link_records import Counters
-from tests.netem.control.relays import SETTINGS, FakeRelay, spec_of
+from tests.netem.control.relays import FakeRelay, spec_of
 
 
 def test_the_relay_is_accessed_from_its_own_thread_only(
@@ -23,11 +23,11 @@ def test_the_relay_is_accessed_from_its_own_thread_only(
 def test_a_change_returns_the_time_from_which_it_applies(
     relay: FakeRelay, commands: CommandQueue
 ) -> None:
-    relay.counters["up", "reverse"] = Counters(arrived=17)
+    relay.counters["up", "reverse"] = Counters(received=17)
     commands.change("up", ["reverse"], settings_of("loss 50% mansd 1"))
-    relay.counters["up", "reverse"].arrived = 20
+    relay.counters["up", "reverse"].received = 20
     in_force = commands.snapshot().in_force
-    assert in_force["up", "reverse"].since.arrived == 17
+    assert in_force["up", "reverse"].since.received == 17
     assert in_force["up", "reverse"].words == "loss 50% mansd 1"
     assert in_force["up", "forward"].since == Counters()
     assert in_force["up", "forward"].words == "loss 10% delay 10ms mansd 2"
@@ -78,7 +78,7 @@ def test_a_command_to_a_stuck_relay_times_out(
 
 def test_a_report_of_the_plain_engine_does_not_change_afterwards() -> None:
     """Rates are differences of two reports."""
-    direction = PlainDirection(spec_of("up"), "forward", SETTINGS)
-    before = direction.report(()).counters
+    direction = PlainDirection(spec_of("up"), "forward")
+    before = direction.report((), {}).counters
     direction.link.handle(Datagram(0, b"x"), 0)
-    assert (before.arrived, direction.report(()).counters.arrived) == (0, 1)
+    assert (before.received, direction.report((), {}).counters.received) == (0, 1)

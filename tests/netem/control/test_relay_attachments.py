@@ -62,13 +62,13 @@ def test_attachments_end_with_the_relay(relay: FakeRelay, tmp_path: Path) -> Non
         assert sys.getswitchinterval() < interval
         for _ in range(3):
             side.commands.run_pending()
-        relay.counters["up", "forward"].arrived = 5
-        assert side.commands.look().links[0].forward.counters.arrived == 5
+        relay.counters["up", "forward"].received = 5
+        assert side.commands.look().links[0].forward.counters.received == 5
     assert running() == []
     assert threading.active_count() == threads
     assert sys.getswitchinterval() == interval
     last = file.read_text().splitlines()[-1]
-    assert json.loads(last)["links"][0]["forward"]["arrived"] == 5
+    assert json.loads(last)["links"][0]["forward"]["received"] == 5
 
 
 def test_a_full_disk_is_reported_and_the_relay_continues(

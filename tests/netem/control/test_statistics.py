@@ -34,7 +34,7 @@ def forward(document: Statistics, link: int = 0) -> DirectionStatistics:
 
 def test_the_statistics_contain_every_counter_of_a_relay(relay: FakeRelay) -> None:
     relay.counters["up", "forward"] = Counters(
-        arrived=100, arrived_bytes=7200, delivered=80, dropped=8, forced=5, corrupted=4,
+        received=100, received_bytes=7200, delivered=80, dropped=8, forced=5, corrupted=4,
         overflowed=2, blacked_out=1, duplicated=3, held_back=6, forwarded=91,
         forwarded_bytes=6552, delivered_out_of_order=9, longest_loss_burst=2, most_in_flight=17,
     )  # fmt: skip
@@ -48,7 +48,7 @@ def test_the_statistics_contain_every_counter_of_a_relay(relay: FakeRelay) -> No
     assert (up["clients"], up["clients_ever"], up["refused"]) == (1, 3, 0)
     found = forward(document)
     assert found["words"] == "loss 10% delay 10ms mansd 2"
-    assert (found["arrived"], found["arrived_bytes"]) == (100, 7200)
+    assert (found["received"], found["received_bytes"]) == (100, 7200)
     assert (found["forwarded"], found["forwarded_bytes"]) == (91, 6552)
     assert found["fates"] == {
         "delivered": 80, "dropped": 8, "forced": 5, "corrupted": 4, "overflowed": 2,
@@ -65,12 +65,16 @@ def test_the_statistics_contain_every_counter_of_a_relay(relay: FakeRelay) -> No
     assert found["loss"]["drawn"] == pytest.approx((8 + 4) / 100)
     assert found["loss"]["lost"] == pytest.approx((8 + 4 + 2 + 1) / 100)
     assert found["recent"] is None
-    assert (down["name"], down["forward"]["arrived"], down["reverse"]["mansd"]) == ("down", 0, None)
+    assert (down["name"], down["forward"]["received"], down["reverse"]["mansd"]) == (
+        "down",
+        0,
+        None,
+    )
 
 
 def test_the_document_is_json_and_has_the_documented_keys(relay: FakeRelay) -> None:
     first = look(relay, 1)
-    relay.counters["up", "forward"] = Counters(arrived=10, delivered=10)
+    relay.counters["up", "forward"] = Counters(received=10, delivered=10)
     relay.delays = times(1000)
     document = statistics(look(relay, 2), first)
     assert json.loads(json.dumps(document, allow_nan=False)) == document
@@ -84,32 +88,37 @@ def test_the_document_is_json_and_has_the_documented_keys(relay: FakeRelay) -> N
 
 def test_rates_are_differences_of_two_documents(relay: FakeRelay) -> None:
     relay.counters["up", "forward"] = Counters(
-        arrived=50, arrived_bytes=5000, delivered=40, dropped=10, forwarded=40, forwarded_bytes=4000
+        received=50,
+        received_bytes=5000,
+        delivered=40,
+        dropped=10,
+        forwarded=40,
+        forwarded_bytes=4000,
     )
     relay.delays = times(1_000_000)
     before = look(relay, 10)
     relay.counters["up", "forward"] = Counters(
-        arrived=450, arrived_bytes=45_000, delivered=140, dropped=310, forwarded=140,
+        received=450, received_bytes=45_000, delivered=140, dropped=310, forwarded=140,
         forwarded_bytes=14_000,
     )  # fmt: skip
     relay.delays = times(1_000_000, 5_000_000, 5_000_000)
     recent = forward(statistics(look(relay, 12), before))["recent"]
     assert recent is not None
     assert recent["seconds"] == 2
-    assert (recent["arrived_per_s"], recent["arrived_bits_per_s"]) == (200, 160_000)
+    assert (recent["received_per_s"], recent["received_bits_per_s"]) == (200, 160_000)
     assert (recent["forwarded_per_s"], recent["forwarded_bits_per_s"]) == (50, 40_000)
     assert recent["loss"] == pytest.approx(0.75)
     assert recent["delay_ns"]["p50"] == pytest.approx(5_000_000, rel=0.03)
 
 
 def test_loss_is_counted_since_the_settings_came_into_force(relay: FakeRelay) -> None:
-    now = Counters(arrived=300, delivered=150, dropped=150)
+    now = Counters(received=300, delivered=150, dropped=150)
     relay.counters["up", "forward"] = now
-    since = {("up", "forward"): Counters(arrived=100, delivered=100)}
+    since = {("up", "forward"): Counters(received=100, delivered=100)}
     found = forward(statistics(look(relay, 1, since)))
     assert found["loss"]["realised"] == pytest.approx(0.75)
     assert found["loss"]["lost"] == pytest.approx(0.75)
-    assert (found["arrived_before"], found["arrived"]) == (100, 300)
+    assert (found["received_before"], found["received"]) == (100, 300)
 
 
 def test_the_prediction_uses_the_settings_in_force(relay: FakeRelay) -> None:
@@ -120,7 +129,7 @@ def test_the_prediction_uses_the_settings_in_force(relay: FakeRelay) -> None:
 
 def test_late_stale_packets_do_not_raise_the_loss_above_one(relay: FakeRelay) -> None:
     before = look(relay, 1)
-    relay.counters["up", "forward"] = Counters(arrived=1, delivered=1, delivered_out_of_order=5)
+    relay.counters["up", "forward"] = Counters(received=1, delivered=1, delivered_out_of_order=5)
     recent = forward(statistics(look(relay, 2), before))["recent"]
     assert recent is not None
     assert recent["loss"] == 1

@@ -1,19 +1,19 @@
 from typing import Any, cast
 
 from netem.control.emulator_statistics import Statistics
-from netem.control.statistics_history import History
+from netem.control.statistics_view import History
 
 
 def statistics(elapsed_s: float, rate: float | None, seconds: float = 1.0) -> Statistics:
     recent: dict[str, Any] | None = None
     if rate is not None:
-        recent = {"seconds": seconds, "arrived_per_s": rate, "loss": None}
+        recent = {"seconds": seconds, "received_per_s": rate, "loss": None}
     side = {"recent": recent}
     document = {"elapsed_s": elapsed_s, "links": [{"name": "up", "forward": side, "reverse": side}]}
     return cast(Statistics, document)
 
 
-def series(history: History, points: int, key: str = "arrived_per_s") -> list[float | None]:
+def series(history: History, points: int, key: str = "received_per_s") -> list[float | None]:
     return [*history.series("up", "forward", key, points)]
 
 

@@ -8,8 +8,7 @@ from rich.console import Console
 
 from netem.control.command_queue import CommandQueue
 from netem.control.emulator_statistics import Statistics, statistics
-from netem.control.statistics_history import History
-from netem.control.statistics_view import plain_lines, render
+from netem.control.statistics_view import History, plain_lines, render
 from netem.engine.relay_interface import LinkSpec
 from netem.words.words_to_settings import settings_of
 from noack.core.clock import NS_PER_S
@@ -25,8 +24,8 @@ def documents(relay: FakeRelay, seconds: int = 3) -> Sequence[Statistics]:
             if way == "forward":
                 counters = relay.counters[name, way]
                 came = 1000 * second
-                counters.arrived += came
-                counters.arrived_bytes += 100 * came
+                counters.received += came
+                counters.received_bytes += 100 * came
                 counters.dropped += came // 5
                 counters.forced += came // 10
                 counters.delivered += came - came // 5 - came // 10

@@ -48,7 +48,7 @@ def payload(flow: int, packet: int, size_bytes: int) -> bytes:
 class Run:
     """The decisions and departures of a link."""
 
-    verdicts: list[PacketDecision] = field(default_factory=list)
+    decisions: list[PacketDecision] = field(default_factory=list)
     arrivals: list[tuple[int, int, int]] = field(default_factory=list)
     """Time in ns, flow, size in bytes."""
     departures: list[tuple[int, int, bytes]] = field(default_factory=list)
@@ -57,15 +57,14 @@ class Run:
     @property
     def events(self) -> NDArray[Any]:
         """The events of the arrivals, as a relay hands them to a tap."""
-        events = np.zeros(len(self.verdicts), EVENT)
-        for event, verdict, came in zip(events, self.verdicts, self.arrivals, strict=True):
+        events = np.zeros(len(self.decisions), EVENT)
+        for event, decision, came in zip(events, self.decisions, self.arrivals, strict=True):
             now_ns, event["flow"], event["size_bytes"] = came
             event["t_ns"] = 10**18 + now_ns
             for name in ("packet", "consecutive_losses", "fate", "bit", "copy_bit", "hold_back_ns"):
-                event[name] = getattr(verdict, name)
-            gone, copied = verdict.release_ns != -1, verdict.copy_ns != -1
-            event["delay_ns"] = verdict.release_ns - now_ns if gone else -1
-            event["copy_delay_ns"] = verdict.copy_ns - now_ns if copied else -1
+                event[name] = getattr(decision, name)
+            for name, t_ns in (("", decision.release_ns), ("copy_", decision.copy_ns)):
+                event[f"{name}delay_ns"] = t_ns - now_ns if t_ns != -1 else -1
         return events
 
 
@@ -88,7 +87,7 @@ def drive(link: Link, came: Sequence[Arrival]) -> Run:
         data = payload(arrival.flow, counts[arrival.flow], arrival.size_bytes)
         counts[arrival.flow] += 1
         leaves(now_ns, link.handle(Datagram(arrival.flow, data), now_ns))
-        run.verdicts.append(PacketDecision(**asdict(link.decision)))
+        run.decisions.append(PacketDecision(**asdict(link.decision)))
         run.arrivals.append((now_ns, arrival.flow, arrival.size_bytes))
     release(float("inf"))
     return run

@@ -92,7 +92,7 @@ def test_content_arrives_unchanged_in_both_directions(
     assert answer == content[::-1]
     for direction in ("forward", "reverse"):
         of = link[direction]
-        assert of["arrived_bytes"] > CONTENT_BYTES
+        assert of["received_bytes"] > CONTENT_BYTES
         assert of["fates"]["dropped"] > 0
         assert of["fates"]["corrupted"] > 0
         assert of["duplicated"] > 0

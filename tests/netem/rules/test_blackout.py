@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from netem.link_machine import Link
-from noack.impairments.kinds.blackout import Blackout
-from noack.impairments.link_settings import LinkSettings
+from netem.words.words_to_settings import settings_of
 
 NS = 10**9
 
@@ -20,12 +19,11 @@ def test_every_packet_is_lost_from_begin_until_just_before_end(
     ends = sorted(borders)[: len(borders) // 2 * 2]
     intervals = list(zip(ends[::2], ends[1::2], strict=True))
     period = None if extra is None else ends[-1] + extra
-    blackout = Blackout(
-        intervals_s=tuple((a * 1e-6, b * 1e-6) for a, b in intervals),
-        every_s=None if period is None else period * 1e-6,
-    )
-    other = Blackout(intervals_s=((10.0, 11.0),))  # so that the interval's table offset is not 0
-    link = Link(LinkSettings(impairments=(other, blackout)), 0, "a")
+    words = "blackout " + ",".join(f"{a}us-{b}us" for a, b in intervals)
+    if period is not None:
+        words += f" every {period}us"
+    # Another blackout comes first, so that the interval's table offset is not 0.
+    link = Link(settings_of(f"blackout 10s-11s {words}"), 0, "a")
     borders_ns = [1000 * t for t in range(200)]
     for t_ns in sorted({*borders_ns, *(t - 1 for t in borders_ns[1:])}):
         place = t_ns if period is None else t_ns % (1000 * period)
@@ -34,12 +32,12 @@ def test_every_packet_is_lost_from_begin_until_just_before_end(
 
 
 def test_only_packets_that_must_pass_are_delivered(decide: Any) -> None:
-    blackout = Blackout(intervals_s=((0.1, 0.3),), every_s=0.5)
+    words = "blackout 100ms-300ms every 500ms"
     arrivals = np.arange(1000) * NS // 1000
     in_blackout = (arrivals % (NS // 2) >= NS // 10) & (arrivals % (NS // 2) < 3 * NS // 10)
-    freely = decide([blackout], 1000, arrivals_ns=arrivals)
+    freely = decide(words, 1000, arrivals_ns=arrivals)
     np.testing.assert_array_equal(freely.fates, np.where(in_blackout, 5, 0))
-    capped = decide(LinkSettings(impairments=(blackout,), mansd=3), 1000, arrivals_ns=arrivals)
-    np.testing.assert_array_equal(capped.fates != 0, in_blackout)
+    capped = decide(f"{words} mansd 3", 1000, arrivals_ns=arrivals).fates
+    np.testing.assert_array_equal(capped != 0, in_blackout)
     for begin in (100, 600):  # 200 consecutive packets
-        assert capped.fates[begin : begin + 200].tolist() == [5, 5, 5, 2] * 50
+        assert capped[begin : begin + 200].tolist() == [5, 5, 5, 2] * 50

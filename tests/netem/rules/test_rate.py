@@ -12,14 +12,10 @@ from hypothesis import strategies as st
 
 from netem.rule_program import empty_state, program_of
 from noack.impairments.bottleneck import enters, serve
-from noack.impairments.kinds.duplicate import Duplicate
-from noack.impairments.kinds.loss import LossOf
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_models.worst_case import WorstCaseLoss
 
 NS = 10**9
-Queue = tuple[Rate, list[tuple[int, int, bool]]]
 
 rates = st.builds(
     Rate,
@@ -89,18 +85,18 @@ def test_the_long_term_rate_is_exact_to_a_bit(decide: Any, rate_bps: int) -> Non
     """The line is never idle: packet k leaves when all bits up to it are sent."""
     count = 20_000
     sizes = np.random.default_rng(3).integers(0, 1500, count)
-    rate = Rate(rate_bps=rate_bps, queue=count)
-    decided = decide([rate], count, sizes_bytes=sizes, arrivals_ns=0)
+    words = f"rate {rate_bps}bit queue {count}"
+    decided = decide(words, count, sizes_bytes=sizes, arrivals_ns=0)
     through = np.cumsum(8 * (sizes + 28)).tolist()
     expected = [bits_so_far * NS // rate_bps for bits_so_far in through]
-    assert decided.verdicts["release_ns"].tolist() == expected
+    assert decided.decisions["release_ns"].tolist() == expected
 
 
 def test_packets_that_arrive_at_a_full_queue_are_dropped(decide: Any) -> None:
     """1 kB every ms through 4 Mbit/s: once the queue is full, it accepts every second packet."""
     rate = Rate(rate_bps=4_000_000, queue=10, overhead_bytes=0)
     arrivals = np.arange(10_000) * 10**6
-    decided = decide([rate], 10_000, sizes_bytes=1000, arrivals_ns=arrivals)
+    decided = decide("rate 4mbit 0 queue 10", 10_000, sizes_bytes=1000, arrivals_ns=arrivals)
     exact = departures(rate, [(t, 1000, False) for t in arrivals.tolist()])
     np.testing.assert_array_equal(decided.fates, [4 if t is None else 0 for t in exact])
     assert abs(np.mean(decided.fates[100:] == 4) - 0.5) < 1e-3
@@ -108,39 +104,31 @@ def test_packets_that_arrive_at_a_full_queue_are_dropped(decide: Any) -> None:
 
 
 def test_a_forced_packet_leaves_after_a_full_queue(decide: Any) -> None:
-    rate = Rate(rate_bps=8_000, queue=2, overhead_bytes=0)  # 1 s per packet
-    settings = LinkSettings(impairments=(rate,), mansd=2)
-    decided = decide(settings, 8, sizes_bytes=1000, arrivals_ns=0)
+    words = "rate 8kbit 0 queue 2 mansd 2"  # 1 s per packet
+    decided = decide(words, 8, sizes_bytes=1000, arrivals_ns=0)
     assert decided.fates.tolist() == [0, 0, 4, 4, 2, 4, 4, 2]
-    leaving = decided.verdicts["release_ns"]
-    assert leaving[decided.leaves].tolist() == [k * NS for k in (1, 2, 3, 4)]
+    assert decided.delays_ns.tolist() == [k * NS for k in (1, 2, 3, 4)]
 
 
 def test_packets_lost_before_the_queue_use_no_line_time(decide: Any) -> None:
-    rate = Rate(rate_bps=8_000, queue=100, overhead_bytes=0)
-    lost = LossOf(loss=WorstCaseLoss())
-    for impairments, last_s in (((lost, rate), 2), ((rate, lost), 5)):
-        settings = LinkSettings(impairments=impairments, mansd=1, first_delivered=True)
-        decided = decide(settings, 5, sizes_bytes=1000, arrivals_ns=0)
+    for words, last_s in (("loss worst rate 8kbit 0", 3), ("rate 8kbit 0 loss worst", 5)):
+        decided = decide(f"{words} mansd 1 first", 5, sizes_bytes=1000, arrivals_ns=0)
         assert decided.fates.tolist() == [2, 1, 2, 1, 2]
-        assert decided.verdicts["release_ns"][-1] == (last_s + (impairments[0] is lost)) * NS
+        assert decided.delays_ns[-1] == last_s * NS
 
 
 def test_copies_use_line_time_unless_the_original_is_dropped(decide: Any) -> None:
-    rate = Rate(rate_bps=8_000, queue=3, overhead_bytes=0)
-    arrivals = np.array([0, 0, 0, NS, 10 * NS])
-    decided = decide([Duplicate(probability=1.0), rate], 5, sizes_bytes=1000, arrivals_ns=arrivals)
-    verdicts = decided.verdicts
-    assert verdicts["fate"].tolist() == [0, 0, 4, 0, 0]
-    assert (verdicts["release_ns"] // NS).tolist() == [1, 3, -1, 4, 11]
-    assert (verdicts["copy_ns"] // NS).tolist() == [2, -1, -1, -1, 12]
+    words, arrivals = "duplicate 100% rate 8kbit 0 queue 3", [0, 0, 0, NS, 10 * NS]
+    decisions = decide(words, 5, sizes_bytes=1000, arrivals_ns=arrivals).decisions
+    assert decisions["fate"].tolist() == [0, 0, 4, 0, 0]
+    assert (decisions["release_ns"] // NS).tolist() == [1, 3, -1, 4, 11]
+    assert (decisions["copy_ns"] // NS).tolist() == [2, -1, -1, -1, 12]
 
 
 def test_departures_of_forced_packets_stay_within_the_largest_time(decide: Any) -> None:
     """At 1 bit/s, packets that must all pass queue up for centuries."""
-    slow = Rate(rate_bps=1, queue=1, cell_bytes=1, cell_overhead_bytes=1000)
-    decided = decide(LinkSettings(impairments=(slow,), mansd=0), 30, sizes_bytes=65_507)
-    assert np.all(np.diff(decided.verdicts["release_ns"]) >= 0)
-    assert decided.verdicts["release_ns"][0] == (65_507 + 28) * 1001 * 8 * NS
-    assert decided.verdicts["release_ns"][-1] == 2**61
-    assert np.all(decided.verdicts["consecutive_losses"] == 0)
+    decisions = decide("rate 1bit 28 1 1000 queue 1 mansd 0", 30, sizes_bytes=65_507).decisions
+    assert np.all(np.diff(decisions["release_ns"]) >= 0)
+    assert decisions["release_ns"][0] == (65_507 + 28) * 1001 * 8 * NS
+    assert decisions["release_ns"][-1] == 2**61
+    assert np.all(decisions["consecutive_losses"] == 0)

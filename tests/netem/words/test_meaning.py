@@ -1,12 +1,12 @@
 """The explanations of words."""
 
 import re
+from typing import Any
 
 import numpy as np
 import pytest
 
-from netem.link_machine import Link
-from netem.words.explanation import settings_meaning
+from netem.cli.explain_links import settings_meaning
 from netem.words.words_to_settings import settings_of
 
 DRAWS = 20_000
@@ -24,15 +24,13 @@ DRAWS = 20_000
         "delay 0 samples -5ms,-1ms,3ms",
     ],
 )
-def test_the_share_of_delays_cut_at_zero_is_shown(words: str) -> None:
-    settings = settings_of(words)
-    (delay,) = settings.impairments
-    said = re.search(r"negative delays become 0 \((.*)% of the draws\)", delay.meaning())
-    assert said is not None
-    share = float(said[1]) / 100
+def test_the_share_of_delays_cut_at_zero_is_shown(decide: Any, words: str) -> None:
+    (delay,) = settings_of(words).impairments
+    note = re.search(r"negative delays become 0 \((.*)% of the draws\)", delay.meaning())
+    assert note is not None
+    share = float(note[1]) / 100
     # One draw per flow: draws are independent even with a correlation.
-    link = Link(settings, 3, "test")
-    cut = np.mean([link.decide(flow, 1, 0).release_ns == 0 for flow in range(DRAWS)])
+    cut = np.mean(decide(words, DRAWS, flows=np.arange(DRAWS)).delays_ns == 0)
     error = np.sqrt(share * (1 - share) / DRAWS)
     assert cut == pytest.approx(share, abs=5 * error + 0.05 * share)
 

@@ -1,8 +1,6 @@
-import io
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +8,8 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from PIL import ImageColor
 
 from cosim.output import palette
 from cosim.output.report import signal_figures
@@ -20,8 +18,9 @@ from cosim.output.report.figure_files import inline, save_figure
 from cosim.output.report.figure_style import printed, settings
 from noack.core.errors import CallerError
 from tests.cosim.output.report.conftest import HOSTILE
+from tests.cosim.output.test_palette import BACKGROUNDS, luminance
 
-SIZES = {"normal": 1000, "empty": 0, "one": 1, "not finite": 1000, "ten": 300, "long": 100_000}
+SIZES = {"empty": 0, "one": 1, "not finite": 1000, "ten": 300, "long": 100_000}
 UNITS = re.compile(r"\[(s|wall µs)\]$")
 UNITLESS = re.compile(r"x_\d|norm|input|count|share of steps at least as late")
 """Dimensionless quantities, and those in the model's own units."""
@@ -87,10 +86,8 @@ def test_every_axis_has_a_label_with_its_unit(drawn: dict[str, Figure]) -> None:
 def test_every_figure_can_be_saved(drawn: dict[str, Figure], tmp_path: Path) -> None:
     """Warnings are errors here: no log of zero, no limits that coincide, no layout that fails."""
     for name, figure in drawn.items():
-        save_figure(figure, tmp_path / f"{name}.png")
         save_figure(figure, tmp_path / f"{name}.svg")
-        assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
-        assert (tmp_path / f"{name}.svg").stat().st_size < 1_000_000
+        assert 0 < (tmp_path / f"{name}.svg").stat().st_size < 1_000_000
 
 
 def test_nothing_is_cut_off_and_no_texts_overlap(drawn: dict[str, Figure]) -> None:
@@ -103,8 +100,9 @@ def test_nothing_is_cut_off_and_no_texts_overlap(drawn: dict[str, Figure]) -> No
             assert box.x1 <= size_in[0], name
             assert box.y1 <= size_in[1], name
             for axes in figure.axes:
-                heads = [*axes.texts, axes.title, axes.yaxis.get_offset_text(), axes._left_title]
                 legend = axes.get_legend()
+                assert not legend or legend.get_window_extent().y0 >= axes.bbox.y1 - 1, name
+                heads = [*axes.texts, axes.title, axes.yaxis.get_offset_text(), axes._left_title]
                 heads += legend.get_texts() if legend else []
                 boxes = [text.get_window_extent() for text in heads if text.get_text()]
                 for i, one in enumerate(boxes):
@@ -231,14 +229,6 @@ def test_a_legend_has_as_few_rows_as_its_width_permits() -> None:
     assert axes.get_legend()._ncols == 2
 
 
-def test_no_legend_covers_data() -> None:
-    for name, figure in drawn_for("ten").items():
-        figure.savefig(io.BytesIO())  # computes the layout
-        for axes in figure.axes:
-            if axes.get_legend() is not None:
-                assert axes.get_legend().get_window_extent().y0 >= axes.bbox.y1 - 1, name
-
-
 def test_the_distribution_of_lateness_is_exact_at_its_ends() -> None:
     late_us = np.random.default_rng(1).lognormal(3, 1, 5000)
     (axes,) = signal_figures.lateness_figure({"plant": late_us}).axes
@@ -252,20 +242,14 @@ def test_the_distribution_of_lateness_is_exact_at_its_ends() -> None:
     assert len(share) < 300
 
 
-def same(draw: Callable[[], Figure], tmp_path: Path, ending: str) -> set[bytes]:
-    found = set()
-    for _ in range(2):
-        save_figure(draw(), tmp_path / f"figure.{ending}")
-        found.add((tmp_path / f"figure.{ending}").read_bytes())
-        with mpl.rc_context({"lines.linewidth": 9, "font.size": 20, "svg.hashsalt": "other"}):
-            save_figure(draw(), tmp_path / f"figure.{ending}")
-            found.add((tmp_path / f"figure.{ending}").read_bytes())
-    return found
-
-
 @pytest.mark.parametrize("ending", ["svg", "png"])
 def test_the_same_figure_gives_the_same_bytes(tmp_path: Path, ending: str) -> None:
-    (content,) = same(lambda: drawn_for("normal")["error"], tmp_path, ending)
+    path, found, t_s = tmp_path / f"figure.{ending}", set(), np.arange(1.0, 5.0)
+    for own in ({}, {"lines.linewidth": 9, "font.size": 20, "svg.hashsalt": "other"}):
+        with mpl.rc_context(own):
+            save_figure(signal_figures.error_figure(t_s, t_s, t_s, t_s), path)
+        found.add(path.read_bytes())
+    (content,) = found
     for trace in (b"http://purl", b"matplotlib.org", b"dc:date", b"Software"):
         assert trace not in content
 
@@ -281,24 +265,15 @@ def test_drawing_does_not_change_matplotlibs_settings() -> None:
     assert dict(mpl.rcParams) == before
 
 
-def luminance(colour: Any) -> float:
-    """Relative luminance by WCAG 2.2."""
-    parts = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in to_rgb(colour)]
-    return float(np.dot(parts, [0.2126, 0.7152, 0.0722]))
-
-
-def contrast(one: Any, other: Any) -> float:
-    low, high = sorted((luminance(one), luminance(other)))
+def contrast(one: str, other: str) -> float:
+    low, high = sorted(luminance(ImageColor.getrgb(colour)[:3]) for colour in (one, other))
     return (high + 0.05) / (low + 0.05)
 
 
-@pytest.mark.parametrize("paper", ["#ffffff", "#14181d"])
-def test_every_colour_has_enough_contrast_on_light_and_dark_backgrounds(paper: str) -> None:
-    """3 to 1, WCAG's minimum for graphics."""
+def test_the_palette_is_tested_on_the_backgrounds_of_the_page() -> None:
     css = Path(signal_figures.__file__).with_name("report.css").read_text()
-    assert f"--paper: {paper}" in css
-    for colour in {*palette.SERIES, *palette.PROCESSES.values(), palette.THRESHOLD, palette.FORCED}:
-        assert contrast(printed(colour), paper) >= 3, colour
+    found = {ImageColor.getrgb(colour) for colour in re.findall(r"--paper: (#\w+)", css)}
+    assert found <= set(BACKGROUNDS.values())
 
 
 @pytest.mark.parametrize("paper", ["#ffffff", "#14181d"])
@@ -319,7 +294,7 @@ def test_matplotlib_is_not_imported_before_it_is_needed() -> None:
         "import sys, cosim.cli, cosim.live.finalize, cosim.output.run_tables, cosim.live.recorder, "
         "plant_server.__main__, sensor_node.__main__, controller_node.__main__, netem.__main__\n"
         "assert not {'matplotlib', 'jinja2'} & sys.modules.keys()\n"
-        "import cosim.output.report.report_file\n"
+        "import cosim.output.report.report_page\n"
         "assert 'matplotlib.pyplot' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

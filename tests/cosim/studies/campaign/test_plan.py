@@ -83,7 +83,11 @@ MISTAKES: list[tuple[str, Any, str]] = [
     ("axes.1.key", None, "key: missing; an axis needs both key and values"),
     ("axes.0.name", "Axis", "use small letters, digits and _, beginning with a letter"),
     ("axes.1.values", [1, 1.0], "1 is given twice"),
-    ("axes.1.values", [[[1.0]], [[2.0]]], "axes.1.values: should be numbers, texts, true or false"),
+    (
+        "axes.1.values",
+        [[[1.0]]],
+        "axes.1.values.0: should be a number, a text, true or false; for matrices",
+    ),
     ("compare.reference", [1], "compare.reference: should be a number, a text, true or false"),
     (
         "axes.0.variants",

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from cosim.cli import app
 from cosim.studies.design.design_page import page
 from cosim.studies.design.design_result import DesignResult
-from cosim.studies.design.lqr import lqr_gain
+from cosim.studies.design.loop_families import lqr_gain
 
 
 def run(*words: str) -> tuple[int, str, str]:

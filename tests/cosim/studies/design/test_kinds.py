@@ -14,7 +14,7 @@ from cosim.simulation.continuous.continuous_run import simulate_continuous
 from cosim.simulation.continuous.network_fates import network_fates
 from cosim.studies.campaign.random_draws import box_of
 from cosim.studies.design.candidate_measures import DesignLimits, certificate_of
-from cosim.studies.design.design_run import design
+from cosim.studies.design.design_search import design
 from cosim.studies.design.loop_families import families_of
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cosim.studies.design.lqr import lqr_gain
+from cosim.studies.design.loop_families import lqr_gain
 from noack.config.named_models import lane_following
 from noack.core.errors import CallerError
 from noack.core.linear_systems import spectral_abscissa

@@ -1,0 +1,154 @@
+"""Compare loss models with closed forms: rates, joint probabilities, first packets."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from netem.link_machine import Link
+from netem.words.words_to_settings import settings_of
+
+COUNT = 400_000
+Joint = Callable[[int], float]
+"""Probability that a packet and the one ``lag`` later are lost; for lag 0 the loss rate."""
+
+
+def correlated(p: float, correlation: float = 0.0) -> Joint:
+    """P(z₁ > t, z₂ > t) for bivariate normal z, with P(z > t) = p; AR(1): at lag k it is ρᵏ."""
+    t = stats.norm.ppf(p)
+
+    def joint(lag: int) -> float:
+        covariance = [[1.0, correlation**lag], [correlation**lag, 1.0]]
+        normal = stats.multivariate_normal(cov=covariance, allow_singular=True)
+        return p if lag == 0 else float(normal.cdf([t, t]))
+
+    return joint
+
+
+def chain(moves: Any, losses: Sequence[float]) -> Joint:
+    """For a Markov chain: π Λ Pᵏ Λ 1, with its stationary distribution π."""
+    P, lost = np.array(moves), np.array(losses)
+    values, vectors = np.linalg.eig(P.T)
+    stationary = np.real(vectors[:, np.argmax(np.real(values))])
+    stationary /= stationary.sum()
+
+    def joint(lag: int) -> float:
+        later = np.linalg.matrix_power(P, lag) @ lost if lag else np.ones(len(lost))
+        return float(stationary * lost @ later)
+
+    return joint
+
+
+def two_states(p: float, r: float, good: float = 0.0, bad: float = 1.0) -> Joint:
+    return chain([[1 - p, p], [r, 1 - r]], [good, bad])
+
+
+def four_states(p13: float, p31: float, p32: float, p23: float, p14: float) -> Any:
+    return [[1 - p13 - p14, 0, p13, p14], [0, 1 - p23, p23, 0], [p31, p32, 1 - p31 - p32, 0],
+            [1, 0, 0, 0]]  # fmt: skip
+
+
+LOST = [0.0, 0.0, 1.0, 1.0]
+JOINT: dict[str, Joint] = {
+    "loss 30%": correlated(0.3),
+    "loss 2% 90%": correlated(0.02, 0.9),
+    "loss 80% 70%": correlated(0.8, 0.7),
+    "loss gemodel 5% 25%": two_states(0.05, 0.25),
+    "loss gemodel 10% 30% 60% 5%": two_states(0.1, 0.3, 0.05, 0.6),
+    "loss burst 60% 8": two_states(0.6 / 0.4 / 8, 1 / 8),
+    "loss state 5% 20%": chain(four_states(0.05, 0.2, 0, 1, 0), LOST),
+    "loss state 2% 10% 30% 40% 3%": chain(four_states(0.02, 0.1, 0.3, 0.4, 0.03), LOST),
+    "loss state 10% 50% 50% 90% 90%": chain(four_states(0.1, 0.5, 0.5, 0.9, 0.9), LOST),
+}
+
+
+@pytest.mark.parametrize("words", JOINT)
+def test_losses_have_the_rate_and_the_joint_probabilities(
+    decide: Any, share_is: Callable[..., None], words: str
+) -> None:
+    lost = decide(words, COUNT).fates == 1
+    share_is(lost, JOINT[words](0))
+    for lag in (1, 2, 5):
+        share_is(lost[lag:] & lost[:-lag], JOINT[words](lag))
+
+
+@pytest.mark.parametrize(
+    ("words", "start", "moves", "losses"),
+    [
+        ("loss 20% 95%", [1.0], [[1.0]], [0.2]),  # the latent process is stationary from the start
+        ("loss gemodel 20% 1%", [1.0, 0.0], [[0.8, 0.2], [0.01, 0.99]], [0.0, 1.0]),
+        ("loss state 2% 10% 30% 40% 3%", [1.0, 0, 0, 0], four_states(0.02, 0.1, 0.3, 0.4, 0.03),
+         LOST),
+    ],
+)  # fmt: skip
+def test_the_chain_begins_in_its_first_state_and_moves_before_each_packet(
+    decide: Any, words: str, start: list[float], moves: Any, losses: list[float]
+) -> None:
+    """The distribution of the k-th packet's state is e₁ Pᵏ⁺¹ (average over many flows)."""
+    flows, steps = 20_000, 3
+    fates = decide(words, steps * flows, flows=np.tile(np.arange(flows), steps)).fates
+    state = np.array(start)
+    for of_step in fates.reshape(steps, flows) == 1:
+        state = state @ np.array(moves)
+        p = float(state @ losses)
+        assert abs(of_step.mean() - p) <= 5 * np.sqrt(p * (1 - p) / flows)
+
+
+@pytest.mark.parametrize("share", [0, 1])
+def test_probabilities_0_and_1_are_exact(decide: Any, share: int) -> None:
+    words = ["loss 0%", "loss 0% 99.9%", "loss gemodel 0% 0%", "loss burst 0% 1", "loss none"]
+    if share:
+        words = ["loss 100%", "loss 100% 99.9%", "loss gemodel 100% 0%", "loss worst"]
+    for one in words:
+        assert (decide(one, 10_000).fates == share).all()
+
+
+@pytest.mark.parametrize("words", ["loss 50%", "loss 60% 70%", "loss gemodel 20% 5%"])
+def test_the_cap_does_not_change_the_draws(decide: Any, words: str) -> None:
+    freely, capped = decide(words, 10_000).fates, decide(f"{words} mansd 2", 10_000).fates
+    np.testing.assert_array_equal(capped != 0, freely != 0)
+    assert (capped == 2).any()
+
+
+def lost_packets(words: str, packets: Any) -> list[bool]:
+    """Return which packets are lost; another script comes first, so the table offset is not 0."""
+    link = Link(settings_of(f"loss script {2**39},{2**39 + 1} {words}"), 0, "a")
+    link.decide(0, 1, 0)
+    flow = link.flow(0)
+    assert flow is not None
+    found = []
+    for flow.packets in packets:
+        found.append(link.decide(0, 1, 0).fate == 1)
+    return found
+
+
+@given(st.sets(st.integers(0, 60)), st.integers(0, 40))
+def test_exactly_the_packets_of_a_script_are_lost(numbers: set[int], extra: int) -> None:
+    """A script applied once, and a repeated script."""
+    script = ",".join(map(str, sorted(numbers))) or "none"
+    assert lost_packets(f"loss script {script}", range(80)) == [k in numbers for k in range(80)]
+    every = max(numbers, default=0) + 1 + extra
+    again = lost_packets(f"loss script {script} every {every}", range(300))
+    assert again == [k % every in numbers for k in range(300)]
+
+
+@given(st.integers(1, 30), st.data(), st.integers(0, 50))
+def test_of_every_period_a_burst_is_lost(period: int, data: st.DataObject, first: int) -> None:
+    burst = data.draw(st.integers(0, period))
+    found = lost_packets(f"loss periodic {burst}/{period} from {first}", range(200))
+    assert found == [k >= first and (k - first) % period < burst for k in range(200)]
+
+
+def test_large_packet_numbers_can_be_scripted() -> None:
+    last = 2**40 - 1
+    packets = [0, 1, last - 1, last, last + 1]
+    assert lost_packets(f"loss script 0,{last}", packets) == [k in (0, last) for k in packets]
+
+
+def test_each_flow_has_its_own_packet_count(decide: Any) -> None:
+    decided = decide("loss script 0,2", 8, flows=[0, 1, 1, 0, 1, 0, 0, 1])
+    assert ((decided.fates == 1) == np.isin(decided.decisions["packet"], (0, 2))).all()
