@@ -11,10 +11,10 @@ from typing import Protocol
 from noack.core.errors import MachineError, why
 
 
-def write_whole(path: Path, content: str | bytes, remedy: str = "") -> Path:
+def write_whole(path: Path, content: str | bytes) -> Path:
     """Write a file, or replace it, in one step; return its path. Missing folders are created.
 
-    Text is written as UTF-8. ``remedy`` ends the message of a MachineError.
+    Text is written as UTF-8. Raise MachineError if the file cannot be written.
     """
     scratch = path.with_name(f".{path.name}.partial")
     try:
@@ -24,7 +24,7 @@ def write_whole(path: Path, content: str | bytes, remedy: str = "") -> Path:
     except OSError as error:
         with suppress(OSError):
             scratch.unlink(missing_ok=True)
-        raise MachineError(f"{path}: cannot be written: {why(error)}{remedy}") from None
+        raise MachineError(f"{path}: cannot be written: {why(error)}") from None
     return path
 
 
