@@ -6,7 +6,7 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Protocol
+from typing import IO, Any
 
 from noack.core.errors import MachineError, why
 
@@ -48,11 +48,7 @@ def read_regular(path: Path, most_bytes: int) -> bytes:
     return content
 
 
-class _Descriptor(Protocol):
-    def fileno(self) -> int: ...
-
-
-def lock(file: int | _Descriptor, *, shared: bool = False, wait: bool = False) -> bool:
+def lock(file: int | IO[Any], *, shared: bool = False, wait: bool = False) -> bool:
     """Lock an open file or folder until it is closed; return False if another process has the lock.
 
     ``shared`` locks exclude only exclusive ones. With ``wait`` it waits for the other processes.
