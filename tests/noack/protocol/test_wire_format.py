@@ -122,6 +122,7 @@ def test_published_vectors_hold_in_both_directions(vector: Vector) -> None:
     assert decoded[:3] == message[:3]
     assert decoded.vector.tobytes() == struct.pack(f"<{len(values)}d", *values)
     assert read_header(data) == Header(1, FLOWS[flow], len(values), run_id, sequence, t_ns)
+    assert read_header(data[:31]) is read_header(b"x" + data) is None
 
 
 def test_the_page_gives_the_reasons_in_the_order_of_the_tests() -> None:
