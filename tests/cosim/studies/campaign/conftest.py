@@ -11,6 +11,7 @@ from cosim.studies.campaign.campaign_file import Campaign, load
 from cosim.studies.campaign.campaign_grid import Point, grid
 
 Write = Callable[..., Path]
+Few = tuple[Campaign, list[Point]]
 
 
 @pytest.fixture
@@ -49,15 +50,19 @@ def write(tmp_path: Path, content: dict[str, Any]) -> Write:
 
     def written(plan: dict[str, Any], **changed: Any) -> Path:
         path = tmp_path / "few.toml"
-        said = {key: value for key, value in (plan | changed).items() if value is not None}
-        path.write_text(tomli_w.dumps(said))
+        settings = {key: value for key, value in (plan | changed).items() if value is not None}
+        path.write_text(tomli_w.dumps(settings))
         return path
 
     return written
 
 
 @pytest.fixture
-def campaign(write: Write, plan: dict[str, Any]) -> tuple[Campaign, list[Point]]:
-    path = write(plan)
+def campaign(write: Write, plan: dict[str, Any]) -> Few:
+    return few_of(write(plan))
+
+
+def few_of(path: Path) -> Few:
+    """Return a campaign and its grid points."""
     loaded = load(path)
     return loaded, grid(loaded, path)

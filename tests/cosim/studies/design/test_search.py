@@ -24,11 +24,11 @@ def test_the_chosen_design_settles_in_time_on_draws_of_another_seed(found: Desig
     assert found.feasible
     assert found.confirmed
     setting = replace(setting_of(resolve(found.scenario)), settle=LIMITS.settle)
-    rows = run_batch(setting, box_of(found.scenario).population(99, range(4000)))
+    rows = run_batch(setting, box_of(found.scenario).population(99, range(2000)))
     share = float(np.mean(rows["settling_s"] <= LIMITS.settling_s))
     assert share >= LIMITS.quantile
     # 4 standard deviations of the difference of two means
-    spread = 4 * np.hypot(found.fresh.halfwidth, 0.08) / 1.96
+    spread = 4 * np.hypot(found.fresh.halfwidth, 0.12) / 1.96
     assert abs(rows["transmissions"].mean() - found.fresh.transmissions) < spread
 
 
@@ -107,7 +107,7 @@ def test_the_same_seed_gives_the_same_design_and_another_seed_other_draws(
     scenario: Scenario,
 ) -> None:
     limits = replace(LIMITS, bounds={})
-    one, again, other = (designed(scenario, limits, draws=80, seed=s) for s in (5, 5, 6))
+    one, again, other = (designed(scenario, limits, draws=40, seed=s) for s in (5, 5, 6))
     assert again.document() == one.document()
     assert other.fresh != one.fresh
 
@@ -121,15 +121,11 @@ def test_candidates_lie_below_the_decay_rate(found: DesignResult) -> None:
 
 
 def test_infeasible_limits_are_reported_with_the_closest_candidate(scenario: Scenario) -> None:
-    limits = DesignLimits(1.0, 0.9, 0.02, {})
-    found = designed(scenario, limits, draws=80)
+    found = designed(scenario, DesignLimits(1.0, 0.5, 0.02, {}), draws=20)
     assert not found.feasible
     assert not found.confirmed
-    verdict = found.verdict()
-    assert "\n" not in verdict
-    assert verdict.startswith("no design meets the limits; the closest has a settling time of ")
+    assert f"{found.best.measured.settling_s:.4g} s" in found.verdict()
     closest = found.best.measured.settling_high_s
-    assert f"{found.best.measured.settling_s:.4g} s" in verdict
     assert all(t.measured.settling_high_s >= closest for t in found.trials if t.full)
 
 
