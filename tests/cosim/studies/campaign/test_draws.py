@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 
 from cosim.simulation.batch.batch_interface import run_batch
-from cosim.simulation.continuous.continuous_loop import continuous_loop_of
-from cosim.simulation.continuous.continuous_run import simulate_continuous
-from cosim.simulation.continuous.network_fates import network_fates
+from cosim.simulation.continuous.continuous_report import run_continuous
 from cosim.studies.campaign.random_draws import box_of, drawn_scenario
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
@@ -56,9 +54,7 @@ def test_draws_are_uniform_in_the_box(campaign: Few) -> None:
     assert len(set(found.loss_seeds.tolist())) == 20_000
 
 
-def test_vertex_draws_are_corners_and_nominal_and_given_plants_are_constant(
-    campaign: Few,
-) -> None:
+def test_vertex_draws_are_corners_and_nominal_and_given_plants_are_constant(campaign: Few) -> None:
     scenario = campaign[1][0].scenario
     vertices = box_of(with_plant(scenario, draw="vertex")).population(0, range(200)).A
     assert set(np.round(vertices[:, 1, 0], 12)) == {-0.2, 0.2}
@@ -73,19 +69,13 @@ def test_vertex_draws_are_corners_and_nominal_and_given_plants_are_constant(
 def test_a_draw_of_a_campaign_can_be_run_as_a_scenario(campaign: Few) -> None:
     plan, points = campaign
     for point in points:
-        rows = point.work.run(range(4))
-        for draw in range(4):
+        for draw, row in enumerate(point.work.run(range(4))):
             alone = drawn_scenario(point.scenario, plan.seed, draw)
-            run = simulate_continuous(
-                continuous_loop_of(alone),
-                horizon_s=alone.horizon_s,
-                delivered=network_fates(alone),
-                known_start=False,
-            )
-            assert rows[draw]["transmissions"] == len(run.event_s)
-            assert rows[draw]["deliveries"] == run.delivered.sum()
+            run = run_continuous(alone)
+            assert row["transmissions"] == len(run.event_s)
+            assert row["deliveries"] == run.delivered.sum()
             end = run.at([alone.horizon_s]).x[0]
-            assert rows[draw]["final_norm"] == pytest.approx(np.linalg.norm(end), rel=1e-9)
+            assert row["final_norm"] == pytest.approx(np.linalg.norm(end), rel=1e-9)
 
 
 def test_chunks_do_not_change_the_measures(campaign: Few) -> None:

@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 from cosim.cli import app
 from cosim.output.report.figure_files import inline
 from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS
+from cosim.studies.campaign import campaign_grid
 from cosim.studies.campaign.campaign_figures import (
     curve_figure,
     distribution_figure,
@@ -26,12 +27,7 @@ from cosim.studies.campaign.campaign_figures import (
 )
 from cosim.studies.campaign.campaign_file import load
 from cosim.studies.campaign.campaign_grid import base_of
-from cosim.studies.campaign.campaign_report import (
-    SummaryRow,
-    tables_of,
-    write_report,
-    written,
-)
+from cosim.studies.campaign.campaign_report import SummaryRow, tables_of, write_report, written
 from cosim.studies.campaign.campaign_run import run_campaign
 from cosim.studies.campaign.campaign_summary import summarise
 from cosim.studies.campaign.campaign_workers import alone
@@ -44,18 +40,10 @@ from noack.config.scenario_file import load as load_scenario
 from noack.config.scenario_file import validate
 from noack.theory.run_conditions import ideal_conditions
 from noack.theory.scenario_certificates import certify
-from tests.cosim.studies.campaign.conftest import Few, Write, few_of
+from tests.cosim.studies.campaign.conftest import Command, Few, Write, few_of
 
 ROOT = Path(__file__).parents[4]
 HOSTILE = "</title></svg><script>alert('x')</script> & \"$\\frac{1}{2}$\""
-
-
-@pytest.fixture
-def full(tmp_path: Path, campaign: Few) -> Store:
-    plan, points = campaign
-    store = Store(tmp_path / "out", points, plan.draws, plan.chunk)
-    run_campaign(store, alone)
-    return store
 
 
 def scalar(content: dict[str, Any], **changed: Any) -> Scenario:
@@ -123,12 +111,12 @@ def test_a_curve_has_gaps_where_a_metric_is_unknown(
                                       "strong": {"model.gain": [[-9.0, -6.0]]}}},
         {"name": "alpha", "key": "trigger.alpha_per_s", "values": [4.0, 0.25, 2.0]},
     ]  # fmt: skip
-    figure = {"kind": "curve", "x": "alpha", "metric": "certificate_used"}
-    campaign, points = few_of(write(plan, compare=None, figures=[figure], draws=2))
+    curve = {"kind": "curve", "x": "alpha", "metric": "certificate_used"}
+    campaign, points = few_of(write(plan, compare=None, figures=[curve], draws=2))
     store = Store(tmp_path / "out", points, 2, 3)
     run_campaign(store, alone)
-    (one,) = figures(summarise(campaign, store), store)
-    lines = [np.asarray(line.get_xydata()) for line in one.figure.axes[0].lines]
+    ((_, figure, _),) = figures(summarise(campaign, store), store)
+    lines = [np.asarray(line.get_xydata()) for line in figure.axes[0].lines]
     assert [line[:, 0].tolist() for line in lines] == 2 * [[0.25, 2.0]]
     assert [np.isfinite(line[:, 1]).tolist() for line in lines] == [[True, False], [True, True]]
 
@@ -150,32 +138,27 @@ def test_a_summary_covers_all_draws_and_pairs_them(full: Store, campaign: Few) -
 
 
 def test_an_exceeded_certificate_is_reported_in_every_output(
-    write: Write, plan: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(
-        "cosim.studies.campaign.campaign_grid.certified_error", lambda resolved: 1e-3
-    )
-    out = tmp_path / "out"
-    path = write(plan, figures=[])
-    done = CliRunner().invoke(app, ["campaign", str(path), "--workers", "1", "--out", str(out)])
+    write: Write, plan: dict[str, Any], tmp_path: Path, run_command: Command,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(campaign_grid, "certified_error", lambda resolved: 1e-3)
+    done = run_command(write(plan, figures=[]))
     assert done.exit_code == 1
     assert "28 of 28 runs exceed a certified bound." in done.output
-    assert 'class="verdict bad"' in (out / "campaign.html").read_text()
+    assert 'class="verdict bad"' in (tmp_path / "out" / "campaign.html").read_text()
 
 
 def test_the_command_writes_the_reported_files_and_keeps_complete_chunks(
-    write: Write, plan: dict[str, Any], tmp_path: Path
+    write: Write, plan: dict[str, Any], tmp_path: Path, run_command: Command
 ) -> None:
-    out = tmp_path / "out"
-    arguments = ["campaign", str(write(plan, figures=[])), "--out", str(out), "--json"]
-    arguments += ["--workers", "1"]
-    done = CliRunner().invoke(app, [*arguments, "--draws", "4"])
+    path = write(plan, figures=[])
+    done = run_command(path, "--json", "--draws", "4")
     assert done.exit_code == 0, done.output
     report = json.loads(done.stdout)
     assert report.pop("made") == 16
     assert all(Path(file).exists() for file in report.pop("files"))
-    assert json.loads((out / "summary.json").read_text()) == report
-    assert json.loads(CliRunner().invoke(app, arguments).stdout)["made"] == 4 * (7 - 3)
+    assert json.loads((tmp_path / "out" / "summary.json").read_text()) == report
+    assert json.loads(run_command(path, "--json").stdout)["made"] == 4 * (7 - 3)
 
 
 def test_a_missing_campaign_gives_one_line() -> None:
@@ -259,14 +242,12 @@ def test_numbers_are_written_with_their_interval() -> None:
 
 
 def test_terminal_tables_print_names_literally_and_list_failed_runs(
-    write: Write, plan: dict[str, Any], tmp_path: Path
+    write: Write, plan: dict[str, Any], run_command: Command
 ) -> None:
     name = "[/x] [red]"
     plan["axes"][0]["variants"] = {name: {"mode": "model"}, "ZOH": {"mode": "zoh"}}
     plan["axes"][1]["title"] = "[/b]"
-    path = write(plan, figures=[], draws=2, metrics={"most_events": 1})
-    out = str(tmp_path / "out")
-    result = CliRunner().invoke(app, ["campaign", str(path), "--out", out, "--workers", "1"])
+    result = run_command(write(plan, figures=[], draws=2, metrics={"most_events": 1}))
     assert result.exit_code == 0, result.output
     assert name in result.stdout
     assert "[/b]" in result.stdout

@@ -65,43 +65,31 @@ def test_a_row_agrees_with_the_summary_of_the_run(overrides: tuple[str, ...]) ->
         assert expected["sup_e_c_norm"] <= row["sup_e_c_scaled"] <= np.e * expected["sup_e_c_norm"]
 
 
-def test_the_cost_is_the_integral_under_the_held_inputs() -> None:
+GUSTS = (
+    'plant.disturbances=[{kind = "gaussian", std = [3.0, 1.0]},'
+    ' {kind = "uniform", at = "state", bound = [0.5, 0.0, 0.0, 2.0]}]'
+)
+
+
+@pytest.mark.parametrize("overrides", [(), (GUSTS,)])
+def test_the_cost_is_the_integral_under_the_held_inputs(overrides: tuple[str, ...]) -> None:
+    """Disturbances enter the cost only through the state."""
     Q, R = np.diag([1.0, 2.0, 3.0, 4.0]), np.diag([0.5, 0.25])
-    one = work("horizon_s=0.2", Q=Q, R=R)
+    one = work("horizon_s=0.1", *overrides, Q=Q, R=R)
     (row,) = one.run(range(1))
     record = record_of(one, 0)
-    drift = np.zeros((6, 6))
-    drift[:4, :4], drift[:4, 4:] = record.loop.A, record.loop.B
-
-    def rate(s: float, z: Any) -> float:
-        now = expm(drift * s) @ z
-        return float(now[:4] @ Q @ now[:4] + now[4:] @ R @ now[4:])
-
     cost = 0.0
-    for x, u in zip(record["plant_step"]["x"][:-1], record["plant_step"]["u"], strict=False):
-        cost += quad_vec(partial(rate, z=np.concatenate([x, u])), 0.0, 0.02, epsrel=1e-12)[0]
-    assert row["cost"] == pytest.approx(cost, rel=1e-10)
-
-
-def test_disturbances_enter_the_cost_only_through_the_state() -> None:
-    gusts = (
-        'plant.disturbances=[{kind = "gaussian", std = [3.0, 1.0]},'
-        ' {kind = "uniform", at = "state", bound = [0.5, 0.0, 0.0, 2.0]}]'
-    )
-    one = work("horizon_s=0.2", gusts)
-    (row,) = one.run(range(1))
-    steps, loop = record_of(one, 0)["plant_step"], record_of(one, 0).loop
-    cost = 0.0
-    for step in steps[:-1]:
-        moving = loop.B @ (step["u"] + step["d"]) + step["w"]
+    for step in record["plant_step"][:-1]:
+        d, w = (step["d"], step["w"]) if overrides else (0.0, 0.0)
         drift = np.zeros((5, 5))
-        drift[:4, :4], drift[:4, 4] = loop.A, moving
+        drift[:4, :4], drift[:4, 4] = record.loop.A, record.loop.B @ (step["u"] + d) + w
 
         def rate(s: float, z: Any, G: Any) -> float:
-            return float(((expm(G * s) @ z)[:4] ** 2).sum())
+            x = (expm(G * s) @ z)[:4]
+            return float(x @ Q @ x)
 
-        squared = partial(rate, z=np.append(step["x"], 1.0), G=drift)
-        cost += quad_vec(squared, 0.0, 0.02, epsrel=1e-12)[0] + 0.02 * float(step["u"] @ step["u"])
+        of_x = partial(rate, z=np.append(step["x"], 1.0), G=drift)
+        cost += quad_vec(of_x, 0.0, 0.02, epsrel=1e-12)[0] + 0.02 * step["u"] @ R @ step["u"]
     assert row["cost"] == pytest.approx(cost, rel=1e-10)
 
 
@@ -128,12 +116,7 @@ def test_every_draw_has_its_own_disturbances_and_noise() -> None:
 
 def test_a_draw_depends_only_on_its_number() -> None:
     one = work(*NEVER)
-    assert one.run(range(2, 4)).tobytes() == one.run(range(4))[2:].tobytes()
-
-
-def test_lost_acknowledgements_cause_transmissions() -> None:
-    with_none, with_lost = work().run(range(5)), work(*NEVER).run(range(5))
-    assert with_lost["transmissions"].sum() > 3 * with_none["transmissions"].sum()
+    assert one.run(range(1, 2)).tobytes() == one.run(range(2))[1:].tobytes()
 
 
 def test_a_failed_run_has_the_status_of_its_failure() -> None:

@@ -24,14 +24,6 @@ def files(folder: Path) -> dict[str, int]:
     }
 
 
-@pytest.fixture
-def full(tmp_path: Path, campaign: Few) -> Store:
-    plan, points = campaign
-    store = Store(tmp_path / "out", points, plan.draws, plan.chunk)
-    assert run_campaign(store, alone) == 28
-    return store
-
-
 def test_every_chunk_contains_its_draws_and_their_axis_values(full: Store, campaign: Few) -> None:
     assert len(files(full.folder)) == 4 * 3
     table = pyarrow.dataset.dataset(full.folder / "runs", format="parquet").to_table()
