@@ -94,7 +94,7 @@ def test_the_kalman_filter_is_the_conditional_mean() -> None:
         x = following.take(k * H_NS, y[k : k + 1], inputs)
     expected, covariance = batch_estimate(P0, x0, u, y)
     np.testing.assert_allclose(x, expected, rtol=1e-10)
-    np.testing.assert_allclose(following._observer.covariance, covariance, rtol=1e-8)  # type: ignore[attr-defined]
+    np.testing.assert_allclose(following.observer.covariance, covariance, rtol=1e-8)  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("steps", [1, 3])
