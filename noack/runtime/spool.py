@@ -96,43 +96,8 @@ def read_chunks(folder: Path, table: str) -> Iterator[tuple[int, bytes]]:
     """Yield ``(first row, rows)`` of each complete batch of a table, from all writers."""
     for path in sorted(folder.glob(f"{table}.*")):
         with path.open("rb") as file:
-            yield from _complete_chunks(file)
-
-
-class SpoolTail:
-    """Reads a spool while it is written, to the end even if its files are removed."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._files: dict[str, BinaryIO] = {}
-
-    def read(self) -> Iterator[tuple[str, int, bytes]]:
-        """Yield ``(table, first row, rows)`` of each complete batch that was not read before."""
-        for path in sorted(self._folder.glob("*.*")):
-            if path.name not in self._files:
-                with contextlib.suppress(FileNotFoundError):  # just removed
-                    self._files[path.name] = path.open("rb")
-        for name, file in self._files.items():
-            for first, payload in _complete_chunks(file):
-                yield name.partition(".")[0], first, payload
-
-    def close(self) -> None:
-        """Close all files."""
-        for file in self._files.values():
-            file.close()
-        self._files.clear()
-
-
-def _complete_chunks(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
-    """Yield the complete batches; leave the file position after the last of them."""
-    size = os.fstat(file.fileno()).st_size
-    while True:
-        start = file.tell()
-        head = file.read(_CHUNK.size)
-        if len(head) == _CHUNK.size:
-            first, length = _CHUNK.unpack(head)
-            if file.tell() + length <= size:
-                yield first, file.read(length)
-                continue
-        file.seek(start)
-        return
+            while len(head := file.read(_CHUNK.size)) == _CHUNK.size:
+                first, length = _CHUNK.unpack(head)
+                if len(payload := file.read(length)) < length:
+                    break
+                yield first, payload
