@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import noack
 from cosim.output import palette
-from tests.integration.conftest import run_scenario, settings
 
 TOOL = Path(__file__).parents[2] / "tools" / "screenshot_recording.py"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
@@ -24,12 +24,12 @@ CAR, SENSOR, CONTROLLER = palette.PLANT, palette.SENSOR, palette.CONTROLLER
     not any(map(shutil.which, BROWSERS)), reason="there is no Chromium or Chrome on the PATH"
 )
 def test_a_recording_shows_the_car_and_the_position_in_each_model(tmp_path: Path) -> None:
-    finished = run_scenario(tmp_path, *settings(speed=5.0, horizon_s=8.0))
+    run = noack.simulate(noack.load("lane_following", {"horizon_s": 8.0}), runs=tmp_path)
     picture = tmp_path / "run.png"
     done = subprocess.run(
         [
             sys.executable, str(TOOL),
-            str(finished.run_dir / "recording.rrd"), str(picture),
+            str(run.directory / "recording.rrd"), str(picture),
             "--size", "1200x800", "--theme", "light",
         ],
         capture_output=True, text=True, timeout=330, check=False,

@@ -22,9 +22,8 @@ from typing import Any, Self
 from urllib.parse import parse_qs, quote
 
 from cosim.output.viewer.opening_time import move_window_to, opening_time_ns, script_to_open_at
-from cosim.output.viewer.peer_user import peer_user
 from cosim.output.viewer.rerun_program import start_rerun
-from cosim.output.viewer.web_viewer import HOST, WebViewer
+from cosim.output.viewer.web_viewer import HOST, WebViewer, peer_user
 from noack.core.errors import MachineError, PeerError
 
 RECORDING = "recording.rrd"

@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from cosim.doctor.doctor_table import print_findings
-from cosim.doctor.findings import FindingStatus, MachineFinding, judge, worst
+from cosim.doctor.findings import FindingStatus, MachineFinding, judge, print_findings, worst
 from cosim.doctor.machine_facts import (
     Buffer,
     Disk,

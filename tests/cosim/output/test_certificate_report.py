@@ -3,6 +3,7 @@
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,13 @@ from typer.testing import CliRunner
 
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.cli import app
-from cosim.output.certificate_report import IDEAL, SCHEDULE, Certificates, with_weight
+from cosim.output.certificate_report import (
+    IDEAL,
+    SCHEDULE,
+    Certificates,
+    certificates_of,
+    with_weight,
+)
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
@@ -102,20 +109,20 @@ def test_beyond_the_largest_certified_schedule_there_is_no_certificate(lane: Cer
 
 
 def test_the_chosen_weight_makes_the_model_contract_and_keeps_the_volume() -> None:
-    resolved = scenario(
-        "lane_following", 'model={name="double_integrator"}', "plant={initial_state=[1.0,0.0]}"
-    )
+    settings = ('model={name="double_integrator"}', "plant={initial_state=[1.0,0.0]}")
+    loaded = load(ROOT / "scenarios" / "lane_following.toml", settings)
     shares: list[float] = []
-    weighted, W = with_weight(resolved, "chosen", shares.append)
+    weighted = certificates_of(loaded, "chosen", 0, shares.append)
+    W = weighted.weight
     assert W is not None
     assert abs(np.linalg.det(W)) == pytest.approx(1.0)
     assert shares[-1] == 1.0
-    np.testing.assert_array_equal(np.array(weighted.trigger.weight), W)
-    loop = loop_of(weighted)
-    turned = W @ (loop.H + 0.25 * np.eye(2)) @ np.linalg.inv(W)
+    np.testing.assert_array_equal(np.array(weighted.scenario.trigger.weight), W)
+    turned = W @ (loop_of(weighted.scenario).H + 0.25 * np.eye(2)) @ np.linalg.inv(W)
     assert np.linalg.eigvalsh(turned + turned.T).max() <= 1e-9
-    better = constants(Certificates(weighted, 0, W).paper)
-    plain = constants(Certificates(resolved, 0).paper)
+    better, plain = (
+        constants(one.paper) for one in (weighted, certificates_of(loaded, late_periods=0))
+    )
     assert better.delta <= 5.0
     assert better.inter_event_s >= plain.inter_event_s
 
@@ -133,10 +140,15 @@ def test_identity_removes_the_weight() -> None:
     assert plain.trigger.weight is None
 
 
-def test_the_command_prints_one_document() -> None:
+@pytest.fixture(scope="module")
+def document() -> dict[str, Any]:
     result = CliRunner().invoke(app, ["certify", "unstable_pendulum", "--late", "1", "--json"])
     assert result.exit_code == 0, result.output
-    document = json.loads(result.stdout)
+    found: dict[str, Any] = json.loads(result.stdout)
+    return found
+
+
+def test_the_command_prints_one_document(document: dict[str, Any]) -> None:
     assert [c["under"] for c in document["certificates"]] == [IDEAL, IDEAL, SCHEDULE, SCHEDULE]
     first = document["certificates"][0]
     assert first["constants"]["delta"] > 1
@@ -155,16 +167,12 @@ def test_a_missing_certificate_fails_with_the_reason() -> None:
     assert "grows at" in result.stdout
 
 
-def test_the_text_states_the_bounds_and_their_conditions() -> None:
-    result = CliRunner().invoke(app, ["certify", "unstable_pendulum"])
-    said = " ".join(result.stdout.split())
-    sentences = said.split("In words: ")[1:]
+def test_the_text_states_the_bounds_and_their_conditions(document: dict[str, Any]) -> None:
+    result = CliRunner().invoke(app, ["certify", "unstable_pendulum", "--late", "1"])
+    sentences = " ".join(result.stdout.split()).split("In words: ")[1:]
     assert [one.partition(",")[0] for one in sentences] == [
         "for the scenario's plant", "for every plant of the box"
     ]  # fmt: skip
-    document = json.loads(
-        CliRunner().invoke(app, ["certify", "unstable_pendulum", "--json"]).stdout
-    )
     scheduled = [one for one in document["certificates"] if one["under"] == "schedule"]
     for sentence, one in zip(sentences, scheduled, strict=True):
         assert "under the assumptions above" in sentence

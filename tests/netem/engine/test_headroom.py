@@ -6,9 +6,6 @@ import os
 import resource
 from pathlib import Path
 
-import pytest
-
-from netem.engine.engine_choice import Engine
 from noack.core.errors import ExitStatus
 from tests.netem.control.processes import emulator, send_through, udp_socket
 
@@ -18,12 +15,13 @@ MORE_BYTES = 120 * 1024 * 1024
 NO_MEMORY = os.strerror(errno.ENOMEM)
 
 
-@pytest.mark.parametrize("engine", ["batched", "plain"])
-def test_datagrams_beyond_the_memory_limit_are_dropped_and_counted(engine: Engine) -> None:
-    options = ("--engine", engine, "--stats", "0.05", "delay", "1000s")
+def test_datagrams_beyond_the_memory_limit_are_dropped_and_counted() -> None:
     status = ExitStatus.UNINTENDED_LOSSES
-    with udp_socket() as server, emulator(server.getsockname(), *options, status=status) as running:
-        address, process = running
+    with (
+        udp_socket() as server,
+        emulator(server.getsockname(), "--stats", "0.05", "delay", "1000s", status=status)
+        as (address, process),
+    ):  # fmt: skip
         used_bytes = int(Path(f"/proc/{process.pid}/statm").read_text().split()[0]) * 4096
         limit_bytes = used_bytes + MORE_BYTES
         resource.prlimit(process.pid, resource.RLIMIT_AS, (limit_bytes, limit_bytes))

@@ -13,8 +13,8 @@ import sys
 import threading
 from contextlib import suppress
 
-TIMEOUT_S = 0.1
-QUIET_S = 1.0
+TIMEOUT_S = 0.05
+QUIET_S = 0.3
 """Longer than the travel time of the last datagram after it has left the queue."""
 SIZE_BYTES = 500
 SO_RCVBUFFORCE = 33

@@ -44,7 +44,6 @@ CASES = {
     "random": Case("loss 70% mansd 2", "loss 70% mansd 2", 3 * 3),
     "bursts": Case("loss gemodel 30% 20% mansd 2", "loss gemodel 30% 20% mansd 1", 3 * 2),
 }
-UNCAPPED = Case("loss 85%", "loss 85%", CASES["random"].most)
 
 
 class Asked(NamedTuple):
@@ -135,21 +134,22 @@ def ask(emulate: Emulate, case: Case) -> list[Asked]:
     return asked
 
 
-@pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
-def test_with_a_cap_the_number_of_tries_is_bounded(emulate: Emulate, case: Case) -> None:
+@pytest.mark.parametrize("name", ["worst", "random"])
+def test_with_a_cap_the_number_of_tries_is_bounded(emulate: Emulate, name: str) -> None:
+    case = CASES[name]
     needed = [one.answered - one.first + 1 for one in ask(emulate, case)]
     assert max(needed) <= case.most
-    if case is CASES["worst"]:  # here the bound is reached
+    if name == "worst":  # here the bound is reached
         assert needed[0] == case.most
 
 
-def test_without_a_cap_the_number_of_tries_exceeds_the_bound(emulate: Emulate) -> None:
-    needed = [one.answered - one.first + 1 for one in ask(emulate, UNCAPPED)]
-    assert needed[0] > UNCAPPED.most
+def test_without_a_cap_the_number_of_tries_exceeds_the_bound() -> None:
+    uncapped = Case("loss 85%", "loss 85%", 0)
+    assert list(islice(answered(uncapped), 100)).index(True) >= CASES["random"].most
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
 def test_the_bound_on_tries_holds_from_any_question_on(case: Case) -> None:
-    expected = list(islice(answered(case), 20_000))
-    runs = [len(list(run)) for got, run in groupby(expected) if not got]
-    assert max(runs) == case.most - 1
+    expected = list(islice(answered(case), 3000))
+    bursts = [len(list(burst)) for got, burst in groupby(expected) if not got]
+    assert max(bursts) == case.most - 1
