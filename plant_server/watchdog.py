@@ -53,12 +53,9 @@ def zero(newest: Actuation, t_ns: int) -> Vector:
 
 
 class PredictedInput:
-    """The input of the controller's model, propagated from the last model state received.
+    """The input of the controller's model H, propagated from the last model state received.
 
-    Args:
-        H: the matrix that the controller's model integrates, shape (n, n), per second.
-        K: gain, shape (m, n).
-        period_ns: the plant's step, over which the state is advanced each time.
+    The state is advanced over the plant's step each time.
     """
 
     def __init__(self, H: Matrix, K: Matrix, period_ns: int) -> None:
@@ -88,11 +85,8 @@ def too_old(t_ns: Any, newest_ns: Any, timeout_ns: int) -> Any:
 class Watchdog:
     """Chooses the plant's input at each step, and reports when the newest actuation is too old.
 
-    Args:
-        inputs: m.
-        timeout_ns: largest permitted age of an actuation.
-        fallback: chooses the input if the newest actuation is older.
-        input_name: describes that input in notices.
+    The fallback chooses the input if the newest actuation is older than the timeout;
+    ``input_name`` describes that input in notices.
     """
 
     def __init__(
@@ -117,11 +111,7 @@ class Watchdog:
         return self.newest
 
     def input(self, t_ns: int) -> tuple[Vector, tuple[Notice, ...]]:
-        """Return the input that is applied from ``t_ns`` on, shape (m,), and notices.
-
-        Args:
-            t_ns: time of the step; not before that of the last call.
-        """
+        """Return the input that is applied from ``t_ns`` on, shape (m,), and notices."""
         newest, tripped_ns = self.newest, self._tripped_ns
         if not too_old(t_ns, newest.t_ns, self._timeout_ns):
             if tripped_ns is None:

@@ -45,10 +45,6 @@ class PythonLaw:
     It has ``on_tick(t_s, x_c)``, which returns u, and may have ``start(model)``, which receives a
     :class:`ControlModel` once, and ``on_update(t_s, x)``.
 
-    Args:
-        settings: of a loaded scenario.
-        model: the data that the law receives about the loop.
-
     Raises:
         CallerError: the class does not exist, raises, or has no ``on_tick``.
     """

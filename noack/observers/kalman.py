@@ -5,6 +5,7 @@ At every step of the plant x̂ ← Âd x̂ + B̂d u, P ← Âd P Âdᵀ + Q. At 
 symmetric and positive semidefinite for any rounding error of L.
 """
 
+from dataclasses import dataclass
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -119,27 +120,21 @@ def _require_covariance(key: str, rows: Rows | None, *, definite: bool) -> None:
         raise ValueError(f"observer.{key}: must be positive semidefinite")
 
 
+@dataclass
 class KalmanObserver:
-    """The filter.
+    """The filter, at x̂ and P before the first measurement."""
 
-    Args:
-        model: the model and the covariances that the filter assumes.
-        x: x̂ before the first measurement, shape (n,).
-        covariance: P before it, shape (n, n).
-    """
-
-    def __init__(self, model: EstimationModel, x: Vector, covariance: Matrix) -> None:
-        self._model = model
-        self.x = x
-        self.covariance = covariance
+    model: EstimationModel
+    x: Vector
+    covariance: Matrix
 
     def predict(self, u: Vector) -> None:
-        Ad, Bd, Q = self._model.Ad, self._model.Bd, self._model.Q
+        Ad, Bd, Q = self.model.Ad, self.model.Bd, self.model.Q
         self.x = Ad @ self.x + Bd @ u
         self.covariance = Ad @ self.covariance @ Ad.T + Q
 
     def correct(self, y: Vector) -> None:
-        C, R, P = self._model.C, self._model.R, self.covariance
+        C, R, P = self.model.C, self.model.R, self.covariance
         L = np.linalg.solve(C @ P @ C.T + R, C @ P).T
         rest = np.eye(len(P)) - L @ C
         self.x = self.x + L @ (y - C @ self.x)

@@ -4,6 +4,7 @@ x̂(t_k) = x̂⁻ + L (y − C x̂⁻), where x̂⁻ ← Âd x̂ + B̂d u at eve
 the model, the error follows e(t_k) = (I − L C) Â^(T) e(t_(k−1)).
 """
 
+from dataclasses import dataclass
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -85,22 +86,16 @@ class LuenbergerSettings(ObserverSettings):
         return LuenbergerObserver(assumed, np.array(self.gain), x)
 
 
+@dataclass
 class LuenbergerObserver:
-    """The observer.
+    """The observer with the gain L, (n, p), at x̂ before the first measurement."""
 
-    Args:
-        model: the model that predicts x̂.
-        gain: L, shape (n, p).
-        x: x̂ before the first measurement, shape (n,).
-    """
-
-    def __init__(self, model: EstimationModel, gain: Matrix, x: Vector) -> None:
-        self._model = model
-        self._gain = gain
-        self.x = x
+    model: EstimationModel
+    gain: Matrix
+    x: Vector
 
     def predict(self, u: Vector) -> None:
-        self.x = self._model.Ad @ self.x + self._model.Bd @ u
+        self.x = self.model.Ad @ self.x + self.model.Bd @ u
 
     def correct(self, y: Vector) -> None:
-        self.x = self.x + self._gain @ (y - self._model.C @ self.x)
+        self.x = self.x + self.gain @ (y - self.model.C @ self.x)

@@ -75,12 +75,7 @@ class DcMotorSettings(PlantSettings):
 
 
 class DcMotor:
-    """The motor; z is empty.
-
-    Args:
-        settings: its parameters.
-        x0: shaft angle, speed, current, shape (3,).
-    """
+    """The motor; x is shaft angle, speed and current, and z is empty."""
 
     def __init__(self, settings: DcMotorSettings, x0: Vector) -> None:
         self._settings = settings

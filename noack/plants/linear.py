@@ -24,10 +24,7 @@ class LinearSettings(PlantSettings):
 class LinearSystem:
     """``dx/dt = A x + B u``; z is empty.
 
-    Args:
-        A, B: shapes (n, n) and (n, m), per second.
-        x0: x(0), shape (n,).
-        step_ns: the expected step; its matrices are computed before the first deadline.
+    The matrices of the expected step are computed before the first deadline.
     """
 
     def __init__(self, A: Matrix, B: Matrix, x0: Vector, *, step_ns: int) -> None:

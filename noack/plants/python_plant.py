@@ -54,11 +54,6 @@ class PythonSystem:
     The second is ``start(x0)``, ``advance(u, t_s, dt_s)`` and ``x``, with ``z`` if z is to be
     recorded. ``docs/plants.md`` has examples.
 
-    Args:
-        settings: of a loaded scenario.
-        x0: x(0), shape (n,).
-        m: number of inputs.
-
     Raises:
         CallerError: the class does not exist, raises, or lacks a required method.
     """

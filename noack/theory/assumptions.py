@@ -235,12 +235,8 @@ def certificate_assumptions(
 ) -> list[Assumption]:
     """Return the assumptions of a certificate, with verdicts.
 
-    Args:
-        resolved: the scenario.
-        conditions: the assumptions about network and schedule.
-        decay: decay rates per second, of "the models" (infinite if they hold) and of "A + BK".
-        constants: constants of the certificate; None if there is no certificate.
-        void: reason for having no certificate.
+    ``decay`` has the decay rates per second of "the models" (infinite if they hold) and "A + BK".
+    Without a certificate, ``constants`` is None and ``void`` is the reason.
     """
     alpha = resolved.decaying.alpha_per_s
     slower = 0.0 if constants is None else constants.rate_per_s

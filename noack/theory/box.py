@@ -27,11 +27,7 @@ from noack.theory.gains import Coefficients, Growth, Output, PlantGains
 
 @dataclass(frozen=True)
 class BoxGains(PlantGains):
-    """Gains that hold for all plants of a box; A and B are its centre.
-
-    Args:
-        halfwidth_A, halfwidth_B: the box, (n, n) and (n, m).
-    """
+    """Gains that hold for all plants of a box around A and B; half-widths (n, n) and (n, m)."""
 
     halfwidth_A: Matrix
     halfwidth_B: Matrix

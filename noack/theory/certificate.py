@@ -241,12 +241,8 @@ def first_passage_s(
 
     This is iterated from ρ = ``level``; every iterate is a bound until the level is reached.
 
-    Args:
-        plant: provides the kernels.
-        level: ‖e_s‖_W at an event.
-        mismatch: sup‖R_E x‖.
-        input_error: π', the input error without the effect of the present e_s.
-        own: ‖K W^{−1}‖.
+    ``level`` is ‖e_s‖_W at an event, ``mismatch`` sup‖R_E x‖, ``own`` ‖K W^{−1}‖, and
+    ``input_error`` π', the input error without the effect of the present e_s.
     """
     window_s, cells = _first_window_s(plant, level, mismatch, input_error + own * level), _COARSE
     known_s = 0.0

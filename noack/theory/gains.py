@@ -58,14 +58,7 @@ class Growth(NamedTuple):
 
 @dataclass(frozen=True)
 class ErrorGains:
-    """Gains of the models: they depend on H, K and W only, not on the plant.
-
-    Args:
-        H: matrix of the models, (n, n).
-        K: gain, (m, n).
-        weight: W, (n, n).
-        alpha_per_s: α of the scaling.
-    """
+    """Gains of the models, which depend on H (n, n), K (m, n), W (n, n) and α of the scaling."""
 
     H: Matrix
     K: Matrix
@@ -154,13 +147,10 @@ class ErrorGains:
 
 @dataclass(frozen=True)
 class PlantGains:
-    """Gains of one known plant.
+    """Gains of one known plant, A (n, n) and B (n, m).
 
-    Args:
-        error: gains of the models.
-        A, B: the plant, (n, n) and (n, m).
-        start: x(0) as a column, (n, 1); or a matrix that maps the unit ball to a set with x(0).
-        alpha_per_s: α of the scaling; may differ from that of ``error``.
+    ``start`` is x(0) as a column, (n, 1), or a matrix that maps the unit ball to a set with x(0).
+    α of the scaling may differ from that of the models.
     """
 
     error: ErrorGains

@@ -197,7 +197,7 @@ class CertificateScope:
         name: name of the plants.
         resolved: the scenario.
         closed_loop: A + BK, for a box that of its centre, (n, n).
-        plant_at: returns the plants' constants.
+        plant_at: returns the plants' gains.
         start_error: sup‖u − Kx‖, scaled, while the plant still applies inputs of an earlier run
             at the start. The certificate exists only if its own π is at least that large, so that
             it covers these inputs.

@@ -56,9 +56,6 @@ class PythonTrigger:
     ``test(t_s, x, e_s)``. ``test`` returns whether to transmit, or a pair of numbers: then the
     sensor transmits if the first exceeds the second, and both are recorded.
 
-    Args:
-        settings: of a loaded scenario.
-
     Raises:
         CallerError: the class does not exist, raises, or lacks a method.
     """

@@ -117,13 +117,7 @@ class Trigger:
             self._condition = policy.trigger_rule(len(x)).after(t_ns, x)
 
     def test(self, t_ns: int, x: Vector, e_s: Vector) -> TriggerDecision:
-        """Decide whether a measurement is an event; :meth:`start` comes first.
-
-        Args:
-            t_ns: its time, not before the last one's.
-            x: the measured state, shape (n,).
-            e_s: x_s − x, shape (n,).
-        """
+        """Decide whether a measurement is an event; call :meth:`start` first."""
         condition = self._started()
         if condition.has_auxiliary:
             (rate,) = condition.auxiliary_rates(np.concatenate([x, e_s])[None]).tolist()
@@ -136,12 +130,9 @@ class Trigger:
         return TriggerDecision(due or (left > right and condition.counts_at(t_ns)), left, right)
 
     def first_event(self, t_ns: NDArray[np.int64], x: Matrix, e_s: Matrix) -> int | None:
-        """Test successive measurements up to the first event, and return its index.
+        """Test k successive measurements up to the first event, and return its index.
 
-        Args:
-            t_ns: their times, shape (k,).
-            x: the measured states, shape (k, n).
-            e_s: x_s − x without an event among them, shape (k, n).
+        x and ``e_s`` = x_s − x without an event among them have the shape (k, n).
         """
         condition = self._started()
         if not len(t_ns):

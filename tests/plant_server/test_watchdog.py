@@ -103,15 +103,6 @@ def test_the_watchdog_reports_each_trip_once_with_its_duration(policy: str) -> N
     assert driven.u(50 * MS) == driven.u(130 * MS) == 2.0
 
 
-def test_the_policies_hold_and_zero_apply_the_last_input_or_zero() -> None:
-    for policy, then in (("hold", 2.0), ("zero", 0.0)):
-        driven = Driven(plant_of(scenario(policy)))
-        driven.take(0, 0, 2.0)
-        driven.until(90 * MS)
-        assert driven.u(50 * MS) == 2.0
-        assert [driven.u(t_ns) for t_ns in (60 * MS, 90 * MS)] == [then, then]
-
-
 def test_the_model_policy_applies_the_input_that_the_controller_would_send() -> None:
     """u = K e^{Ht} x_c at every step, from actuations of any age, including one that is too old."""
     driven = Driven(plant_of(scenario("model")))

@@ -45,10 +45,6 @@ _LONGEST = 300
 class FmuSystem:
     """An instance of an FMU, initialised at x(0).
 
-    Args:
-        settings: of a loaded scenario.
-        x0: x(0), shape (n,).
-
     Raises:
         CallerError: FMPy is missing, the FMU does not match the settings, or it cannot be started.
     """

@@ -35,12 +35,7 @@ def library(module: str, name: str | None = None) -> Any:
 
 
 def equations(model: str, parameters: Any) -> Rates:
-    """Return the equations of a model.
-
-    Args:
-        model: the library's name, e.g. ``st``.
-        parameters: the library's parameters of a vehicle.
-    """
+    """Return the equations of a model (the library's name, e.g. ``st``) for a vehicle."""
     if (compiled := compiled_dynamics(model)) is None:
         dynamics = _dynamics(model)
         return lambda z, *inputs: np.array(dynamics(z.tolist(), list(inputs), parameters))

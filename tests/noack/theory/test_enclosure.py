@@ -19,7 +19,6 @@ from noack.theory.contraction import decay_of
 from noack.theory.enclosure import (
     KernelBounds,
     NotDecayingError,
-    constant_kernel,
     factors,
     norm_bounds,
     response,
@@ -148,15 +147,6 @@ def test_no_integral_is_above_its_enclosure_and_the_enclosure_is_tight(
     assert kernel.integral() <= 1.01 * float(areas.sum())
 
 
-@pytest.mark.parametrize("rate", [1e-3, 1e5])
-def test_the_integral_of_one_mode_is_its_closed_form(rate: float) -> None:
-    kernel = response(np.array([[-rate]]), np.array([[2.0]])).through(np.array([[3.0]]))
-    assert 1.0 <= kernel.integral() / (6 / rate) <= 1.002
-    assert 1.0 <= kernel.sup() / 6 <= 1.001
-    for after in (0.0, 0.5, 3.0, 100.0):  # the last one is far beyond the grid
-        assert kernel.sups(np.array([after / rate]))[0] >= 6 * math.exp(-after)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_tail_bounds_all_times_beyond_the_grid(kind: str) -> None:
     """The grid ends before any mode has decayed."""
@@ -198,15 +188,6 @@ def test_over_a_finite_time_growing_systems_are_enclosed_too(
     if reach <= cells / 16:
         assert kernel.sup_on_grid() <= 1.01 * found.max()
     assert kernel.tail_highest == kernel.tail_area == math.inf  # not requested
-
-
-def test_a_fast_decaying_mode_hardly_loosens_a_coarse_grid() -> None:
-    """10 cells for 1000 time constants of the fast mode, beyond the range of Taylor's formula."""
-    G = np.array([[-1.0, 1.0], [0.0, -1e4]])
-    kernel = response_until(G, np.eye(2), 0.1, 10).through(np.eye(2))
-    assert kernel.sup_on_grid() < 20_000
-    slow = response_until(G, np.array([[1.0], [0.0]]), 0.1, 10).through(np.eye(2))
-    assert slow.sup_on_grid() <= 1.0001
 
 
 def test_a_maximum_within_a_single_cell_is_enclosed() -> None:
@@ -319,12 +300,6 @@ def test_the_rank_of_a_factor_is_detected_and_preserved() -> None:
     L, R = factors(np.zeros((3, 2)))
     assert L.shape[1] == R.shape[0] == 1
     assert not R.any()
-
-
-def test_a_constant_system_is_enclosed() -> None:
-    kernel = constant_kernel(2.5)
-    np.testing.assert_array_equal(kernel.sups(np.array([0.0, 0.3, 1.0, 1e9])), [2.5] * 4)
-    assert kernel.integral() == math.inf
 
 
 def test_many_states_take_little_memory_and_are_enclosed() -> None:
