@@ -87,8 +87,10 @@ def _with_reason(ending: RunEnding) -> Iterator[None]:
 
 
 def _write_summary(run_dir: Path, summary: RunSummary) -> None:
-    remedy = f"; try `noack summary {run_dir}` later"
-    write_whole(run_dir / SUMMARY_FILE, summary.model_dump_json(indent=2), remedy)
+    try:
+        write_whole(run_dir / SUMMARY_FILE, summary.model_dump_json(indent=2))
+    except MachineError as error:
+        raise MachineError(f"{error}; try `noack summary {run_dir}` later") from None
 
 
 def _with_results(record: RunRecord, claims: RunClaims, summary: RunSummary) -> RunSummary:
