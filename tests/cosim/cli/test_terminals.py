@@ -101,11 +101,13 @@ def test_the_exit_status_does_not_depend_on_the_reader(tmp_path: Path) -> None:
 def test_a_line_is_written_at_once(line_buffering: bool, write_through: bool) -> None:
     """``PYTHONUNBUFFERED`` requests ``write_through``."""
     reading, writing = os.pipe()
+    os.set_blocking(reading, False)
     with (
         open(writing, "wb") as raw,  # noqa: PTH123
         io.TextIOWrapper(raw, line_buffering=line_buffering, write_through=write_through) as stream,
     ):
-        patient_stream(stream).write("waiting\n")
+        patient = patient_stream(stream)
+        patient.write("waiting\n")
         assert os.read(reading, 100) == b"waiting\n"
     os.close(reading)
 
