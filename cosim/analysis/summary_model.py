@@ -221,19 +221,19 @@ class Claim(SummaryPart):
     source: str
     bound: str
     """The claim as a formula with its numbers."""
-    certified: Real = None
+    certified: Real
     """The claimed constant."""
-    observed: Real = None
+    observed: Real
     """The smallest constant with which the claim holds for this run."""
-    ratio: Real = None
+    ratio: Real
     """Largest share of the bound that was reached; at most 1 if the claim held."""
     verdict: Annotated[ClaimVerdict, Field(strict=False)]
     since_s: Real
     """Time from which the claim was violated, void or not applicable."""
     why: str
-    from_s: float = 0.0
+    from_s: float
     """The claim begins here: at the start of the run, or after a change of settings."""
-    until_s: Real = None
+    until_s: Real
     """The claim ends here, at a change of settings; None: at the end of the run."""
 
 

@@ -210,7 +210,7 @@ def _at(
     return x_c, received
 
 
-def join_all(record: RunRecord) -> AlignedRun:
+def align_tables(record: RunRecord) -> AlignedRun:
     """Align a whole run."""
     steps = record[CONTROLLER_STEP]
     track = controller_track(initial_track(record.scenario), steps, record[CONTROLLER_DELIVERY])

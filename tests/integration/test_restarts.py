@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
-from cosim.record.align import join_all
+from cosim.record.align import align_tables
 from cosim.record.run_record import Rows, load_record
 from noack.config.resolution import tables_of
 from noack.config.scenario_file import load
@@ -162,7 +162,7 @@ def test_a_restarted_controller_outputs_zero_until_its_first_update(
 def test_the_loop_converges_again_and_its_identity_holds(restarted: Finished) -> None:
     record = load_record(restarted.run_dir)
     assert restarted.summary["identity_residual_max"] < 1e-11
-    joined = join_all(record)
+    joined = align_tables(record)
     away = np.isnan(joined.x_c).any(axis=1)
     _, controller = record.lives("controller")
     known_ns = controller.rows["controller_delivery"]["model_t_ns"][0]

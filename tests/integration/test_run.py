@@ -12,7 +12,7 @@ from scipy.linalg import expm
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.replay import replay
 from cosim.output.viewer import blueprint
-from cosim.record.align import identity_residual, join_all
+from cosim.record.align import align_tables, identity_residual
 from cosim.record.run_record import RunRecord, load_record
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
@@ -225,7 +225,7 @@ def test_the_fates_depend_on_the_seed_only(record: RunRecord) -> None:
 
 
 def test_identity_i1_holds_to_rounding_at_every_sample(record: RunRecord) -> None:
-    joined = join_all(record)
+    joined = align_tables(record)
     residual = identity_residual(record, joined)
     in_common = joined.t_ns >= 0
     if record.scenario.network.initial_sync == "first_packet":

@@ -45,8 +45,8 @@ def void_claim(
 ) -> Claim:
     """Return a claim that cannot be checked because there is no bound."""
     return Claim(
-        what=what, source=source, bound="none", verdict=ClaimVerdict.VOID, since_s=since_s,
-        why=why, from_s=since_s, until_s=until_s,
+        what=what, source=source, bound="none", certified=None, observed=None, ratio=None,
+        verdict=ClaimVerdict.VOID, since_s=since_s, why=why, from_s=since_s, until_s=until_s,
     )  # fmt: skip
 
 
@@ -79,7 +79,7 @@ def check(
     formula = bound.formula if constant is None else bound.formula.format(constant)
     return Claim(
         what=statement, source=source, bound=formula, certified=constant, observed=observed,
-        ratio=ratio, verdict=verdict, since_s=since_s, why=why,
+        ratio=ratio, verdict=verdict, since_s=since_s, why=why, from_s=0.0, until_s=None,
     )  # fmt: skip
 
 

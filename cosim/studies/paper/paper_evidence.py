@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import schur
 
-from cosim.record.align import join_all
+from cosim.record.align import align_tables
 from cosim.simulation.continuous.continuous_loop import continuous_loop_of
 from cosim.simulation.continuous.continuous_report import run_continuous
 from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
@@ -279,7 +279,7 @@ def _sampled(scenario: Scenario, representative: int) -> Numbers:
     resolved = resolved_draw(scenario, representative, "model")
     continuous = run_continuous(resolved)
     record = simulate(resolved)
-    joined = join_all(record)
+    joined = align_tables(record)
     tested = record[SENSOR_MEASUREMENT]["event"] > 0  # event 0 happens without a test
     beyond = joined.e_s_norm[tested] / joined.threshold[tested]
     exact = continuous.at(joined.t_ns / NS_PER_S)

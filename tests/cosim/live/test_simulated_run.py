@@ -12,7 +12,7 @@ from cosim.cli import app
 from cosim.live.simulated_run import simulate_run
 from cosim.output.viewer import blueprint
 from cosim.output.viewer.opening_time import opening_time_ns
-from cosim.record.align import join_all
+from cosim.record.align import align_tables
 from cosim.record.environment import write_environment
 from cosim.record.run_record import RunRecord, load_record
 from cosim.simulation.virtual_time import Progress, simulate
@@ -133,7 +133,7 @@ def test_a_run_directory_without_a_kind_is_a_live_run(runs: Path, tmp_path: Path
 def test_the_view_opens_at_the_largest_controller_error(runs: Path) -> None:
     run_dir = runs / "latest"
     record = load_record(run_dir)
-    joined = join_all(record)
+    joined = align_tables(record)
     e_c = np.where(joined.since_delivery(record.scenario), joined.e_c_norm, -1.0)
     summary = json.loads((run_dir / "summary.json").read_text())
     assert summary["sup_e_c_norm"] == e_c.max()

@@ -13,7 +13,7 @@ from cosim.analysis.run_summary import summarise
 from cosim.analysis.summary_model import ClaimVerdict
 from cosim.live.simulated_run import simulate_run
 from cosim.output.certificate_report import Certificates
-from cosim.record.align import join_all
+from cosim.record.align import align_tables
 from cosim.record.run_record import RunRecord, load_record, write_record
 from cosim.simulation.continuous.continuous_loop import continuous_loop_of
 from cosim.simulation.virtual_time import simulate
@@ -119,7 +119,7 @@ def test_every_policy_continues_from_the_last_acknowledged_state(policy: str) ->
     ids=["messy", "lossy", "known start"],
 )
 def test_the_models_agree_whenever_all_acknowledgements_have_arrived(record: RunRecord) -> None:
-    joined, answers = join_all(record), record[SENSOR_ACKNOWLEDGEMENT]
+    joined, answers = align_tables(record), record[SENSOR_ACKNOWLEDGEMENT]
     rows = record[SENSOR_MEASUREMENT]
     before = np.searchsorted(answers["input"], rows["input"])
     known = np.append(NO_SEQUENCE, answers["sequence"])[before]

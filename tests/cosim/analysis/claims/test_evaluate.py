@@ -259,7 +259,7 @@ def test_inter_event_times_are_exact_in_a_long_run(run: RunRecord) -> None:
 def test_values_that_are_not_finite_are_null_in_json() -> None:
     claim = Claim(
         what="w", source="s", bound="b", certified=math.inf, observed=math.nan,
-        ratio=np.float64(0.5), verdict=HELD, since_s=None, why="",
+        ratio=np.float64(0.5), verdict=HELD, since_s=None, why="", from_s=0.0, until_s=None,
     )  # fmt: skip
     assert claim.model_dump(mode="json") == {
         "what": "w", "source": "s", "bound": "b", "certified": None, "observed": None,

@@ -25,6 +25,7 @@ from noack.trigger.periodic_trigger import PeriodicTrigger
 from noack.trigger.quadratic import QuadraticTrigger
 from noack.trigger.relative import relative_trigger
 from noack.trigger.self_triggered import SelfTrigger
+from noack.trigger.self_triggered_interval import Forecast
 from noack.trigger.trigger_policy import Policy
 from tests.cosim.simulation.batch.exact import (
     cost_of,
@@ -71,7 +72,7 @@ def quadratic(rng: np.random.Generator, n: int, W: Matrix | None) -> Policy:
 
 def self_triggered(rng: np.random.Generator, n: int, W: Matrix | None) -> Policy:
     growth_per_s = rng.choice([0.0, 2.0])
-    return SelfTrigger(0.3, 0.5, 0.01, growth_per_s, 1.0, 0.1, 10 * MS, 1000 * MS, W)
+    return SelfTrigger(Forecast(0.3, 0.5, 0.01, growth_per_s, 1.0, 0.1), 10 * MS, 1000 * MS, W)
 
 
 POLICIES: dict[str, Make] = {

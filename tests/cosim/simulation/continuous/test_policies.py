@@ -27,6 +27,7 @@ from noack.trigger.periodic_trigger import PeriodicTrigger
 from noack.trigger.quadratic import QuadraticTrigger
 from noack.trigger.relative import relative_trigger
 from noack.trigger.self_triggered import SelfTrigger
+from noack.trigger.self_triggered_interval import Forecast
 from noack.trigger.trigger_policy import Policy
 
 Vector = NDArray[np.float64]
@@ -223,7 +224,7 @@ def test_a_self_trigger_stays_below_the_threshold_under_its_assumption() -> None
     """ZOH, no losses: |ė| = |ẋ| ≤ |A| |e| + |A+BK| |x_k|, as x = x_k − e."""
     loop = loop_of(zoh=True, mismatch=0.0)
     L, a = np.linalg.norm(loop.A, 2), np.linalg.norm(CLOSED, 2)
-    policy = SelfTrigger(0.5, 0.2, 0.0, float(L), float(a), 0.0, 1000, 10**9)
+    policy = SelfTrigger(Forecast(0.5, 0.2, 0.0, float(L), float(a), 0.0), 1000, 10**9)
     run = simulate_continuous(
         loop, policy, horizon_s=6.0, delivered=lambda event: True, known_start=True
     )

@@ -60,7 +60,6 @@ def require_sound(record: RunRecord, status: ExitStatus = ExitStatus.OK) -> dict
     "trigger",
     [
         {"beta": 1e-310, "alpha_per_s": 0.25},
-        {"beta": 0.5, "alpha_per_s": 400.0},
         {"beta": 0.5, "alpha_per_s": 1e300},
         {"beta": 5e-324, "alpha_per_s": 5e-324},
     ],
@@ -68,13 +67,8 @@ def require_sound(record: RunRecord, status: ExitStatus = ExitStatus.OK) -> dict
 def test_a_threshold_that_underflows_makes_every_error_an_event(
     content: dict[str, Any], trigger: dict[str, float]
 ) -> None:
-    resolved = scenario(
-        content,
-        trigger=trigger,
-        horizon_s=5.0,
-        **plant([[0.0, 1.0], [0.0, 0.0]], [[0], [1]], [[-1.0, -1.7]], 1.1),
-    )
-    record = simulate(resolved)
+    settings = plant([[0.0, 1.0], [0.0, 0.0]], [[0], [1]], [[-1.0, -1.7]], 1.1)
+    record = simulate(scenario(content, trigger=trigger, horizon_s=3.0, **settings))
     require_sound(record)
     rows = record["sensor_measurement"][1:]
     late = rows[rows["threshold"] < 1e-300]
@@ -87,7 +81,7 @@ def test_a_threshold_that_underflows_makes_every_error_an_event(
 def test_a_floor_prevents_events_after_an_underflow(content: dict[str, Any]) -> None:
     trigger = {"beta": 0.5, "alpha_per_s": 400.0, "floor": 0.05}
     record = simulate(
-        scenario(content, trigger=trigger, horizon_s=5.0, **plant([[-1.0]], [[1.0]], [[-1.0]], 1.1))
+        scenario(content, trigger=trigger, horizon_s=3.0, **plant([[-1.0]], [[1.0]], [[-1.0]], 1.1))
     )
     rows = record["sensor_measurement"]
     assert rows["threshold"][-1] == 0.05
@@ -97,17 +91,14 @@ def test_a_floor_prevents_events_after_an_underflow(content: dict[str, Any]) -> 
 
 def test_a_run_with_the_longest_horizon_is_possible(content: dict[str, Any]) -> None:
     resolved = scenario(
-        content,
-        rate_hz=1e-4,
-        horizon_s=1e7,
-        trigger={"beta": 0.1, "alpha_per_s": 1e-6},
+        content, rate_hz=1e-4, horizon_s=1e7, trigger={"beta": 0.1, "alpha_per_s": 1e-6},
         **plant([[-1e-5]], [[1e-5]], [[-0.5]]),
-    )
+    )  # fmt: skip
     found = require_sound(simulate(resolved))
     assert found["reached_s"] == 1e7
 
 
-@pytest.mark.parametrize("size", [1e300, 1e160, 1e150, 1e-150, 1e-160, 1e-300, 5e-324])
+@pytest.mark.parametrize("size", [1e300, 1e150, 1e-160, 5e-324])
 def test_states_of_any_magnitude_are_judged_alike(content: dict[str, Any], size: float) -> None:
     resolved = scenario(
         content,
@@ -119,16 +110,13 @@ def test_states_of_any_magnitude_are_judged_alike(content: dict[str, Any], size:
 
 
 STIFF = np.diag([-1e6, -1e3, -1.0, -1e-3])
-MANY = -np.eye(64) + 0.01 * np.random.default_rng(0).normal(size=(64, 64))
 PLANTS = {
     "stiff": plant(STIFF, [[1.0]] * 4, [[0.0, 0.0, -0.1, 0.0]]),
     "defective": plant(-np.eye(3) + np.eye(3, k=1), [[0], [0], [1]], [[0.0, 0.0, 0.0]]),
-    "badly_scaled_6": plant([[-1.0, 1e6], [0.0, -2.0]], [[0], [1e-6]], [[0.0, -1.0]]),
-    "badly_scaled_12": plant([[-1.0, 1e12], [0.0, -2.0]], [[0], [1e-12]], [[0.0, -1.0]]),
+    "badly_scaled": plant([[-1.0, 1e12], [0.0, -2.0]], [[0], [1e-12]], [[0.0, -1.0]]),
     "far_from_normal": plant(
         -np.eye(20) + 10 * np.eye(20, k=1), [[0.0]] * 19 + [[1.0]], [[0.0] * 20]
     ),
-    "one_input": plant(MANY, np.ones((64, 1)), [[-0.01] * 64]),
 }
 
 
@@ -140,25 +128,25 @@ def test_unusual_plants_run_and_replay(content: dict[str, Any], name: str) -> No
 
 
 def test_as_many_inputs_as_states_are_replayed(content: dict[str, Any]) -> None:
-    settings = plant(MANY, np.eye(64), (-0.1 * np.eye(64)).tolist())
+    many = -np.eye(64) + 0.01 * np.random.default_rng(0).normal(size=(64, 64))
+    settings = plant(many, np.eye(64), (-0.1 * np.eye(64)).tolist())
     record = simulate(scenario(content, horizon_s=0.2, **settings))
     assert record["plant_step"]["u"].shape == (21, 64)
     assert replay(record).bit_exact is True
     summarise(record, 0, "horizon").model_dump_json()
 
 
-@pytest.mark.parametrize("x", [[-0.0, 0.0], [5e-324, -5e-324], [-0.0, -1e-310]])
+@pytest.mark.parametrize("x", [[-0.0, 5e-324], [-5e-324, -1e-310]])
 def test_signs_of_zero_and_subnormal_numbers_are_replayed(
     content: dict[str, Any], x: list[float]
 ) -> None:
     record = simulate(scenario(content, plant__initial_state=x))
-    first = record["sensor_measurement"]["x"][0]
-    assert first.tobytes() == np.array(x).tobytes()
+    assert record["sensor_measurement"]["x"][0].tobytes() == np.array(x).tobytes()
     require_sound(record)
 
 
 def test_a_diverged_run_reports_the_time_of_divergence(content: dict[str, Any]) -> None:
-    resolved = scenario(content, horizon_s=20.0, **plant([[50.0]], [[1.0]], [[-0.1]]))
+    resolved = scenario(content, 20.0, horizon_s=20.0, **plant([[50.0]], [[1.0]], [[-0.1]]))
     found = require_sound(simulate(resolved), ExitStatus.FAILED)
     assert 10 < found["diverged_at_s"] < 20
     assert found["exit"]["reason"].startswith("diverged: x is not finite at")
@@ -180,9 +168,7 @@ def test_a_non_finite_input_is_not_applied(content: dict[str, Any]) -> None:
     assert found["rejected_datagrams"]["plant"]["not_finite"] == sent.sum()
 
 
-def test_a_model_that_overflows_in_one_step_is_refused(
-    content: dict[str, Any],
-) -> None:
+def test_a_model_that_overflows_in_one_step_is_refused(content: dict[str, Any]) -> None:
     with pytest.raises(CallerError, match="take one step to infinity"):
         simulate(scenario(content, **plant([[-1.0]], [[1.0]], [[-1e308]])))
 
