@@ -6,12 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from cosim.simulation.continuous.continuous_run import ContinuousRun
 from noack.config.resolution import LoopMatrices
-from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
+from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.theory.certificate import NetworkConditions
 from noack.theory.paper_bounds import Interval, Theorem2, longest_interval_s, theorem_1, theorem_2
 from tests.noack.theory.exact_loops import loop_of, observe
@@ -23,8 +21,6 @@ from tests.noack.theory.loops import (
     seeds,
     systems,
 )
-
-EVENTFUL = {"mismatch": 0.5, "beta": 0.01}
 
 
 def norm(matrix: Matrix) -> float:
@@ -132,58 +128,6 @@ def test_theorem_2_is_never_exceeded_in_the_papers_loop(system: System, seed: in
         assert (np.linalg.norm(samples.x, axis=1) <= bound * ROUNDING).all()
         if len(run.before) > 1:
             assert np.diff(run.event_s).min() >= found.inter_event_s / ROUNDING
-
-
-def missed_events(run: ContinuousRun) -> list[list[int]]:
-    """The missed events between two deliveries, or to the end of the run."""
-    found: list[list[int]] = []
-    missed: list[int] = []
-    for event, delivered in enumerate(run.delivered):
-        missed = [] if delivered else [*missed, event]
-        found.append(list(missed))
-    return found
-
-
-def interval(run: ContinuousRun, event: int) -> Interval:
-    """From an event to the next, or to the end."""
-    ends_s = [*run.event_s[1:], run.reached_s]
-    t_s = np.linspace(run.event_s[event], ends_s[event], 60)
-    state, H = run.after[event], run.system.loop.H
-    inside = run.system.sample(state, t_s)
-    model = expm(H * (t_s - t_s[0])[:, None, None]) @ state.x
-    return Interval(t_s, np.linalg.norm(inside.x, axis=1), np.linalg.norm(model, axis=1))
-
-
-def deltas(system: System, run: ContinuousRun) -> tuple[list[float], Vector]:
-    """Theorem 1's Δ after each event, and the largest ‖e_c‖e^{αt}/β from there to the next one."""
-    H, alpha, beta = run.system.loop.H, system.alpha, system.beta
-    kappa = min(alpha, -spectral_abscissa(H)) if H.any() else 0.0
-    intervals = [interval(run, event) for event in range(len(run.before))]
-    longest_s = [longest_interval_s(found, beta, alpha, kappa) for found in intervals]
-    lasted_s = [float(found.t_s[-1] - found.t_s[0]) for found in intervals]
-    assert all(bound >= real / ROUNDING for bound, real in zip(longest_s, lasted_s, strict=True))
-    claimed, seen = [], []
-    for event, missed in enumerate(missed_events(run)):
-        claimed.append(theorem_1(H, alpha, [longest_s[k] for k in missed]))
-        t_s = intervals[event].t_s
-        errors = run.system.norms(run.system.sample(run.after[event], t_s).e_c)
-        seen.append(float((errors * np.exp(alpha * t_s)).max() / beta))
-    return claimed, np.array(seen)
-
-
-@settings(SEARCH, max_examples=5)
-@given(systems(weighted=False, mansd=3, known_start=True, **EVENTFUL), seeds, st.booleans())
-def test_theorem_1_is_never_exceeded_on_its_own_trajectory(
-    system: System, seed: int, held: bool
-) -> None:
-    """Theorem 3, too, for a hold. δ̄_j is never shorter than the interval that it bounds."""
-    if held:
-        system = replace(system, H=np.zeros_like(system.H))
-    for run, _ in observe(system, 6.0, seed, samples=2):
-        if len(run.before) > 60:  # other examples contain runs that are long enough
-            continue
-        claimed, seen = deltas(system, run)
-        assert (seen <= np.array(claimed) * ROUNDING).all()
 
 
 @pytest.mark.parametrize("alpha", [0.1, 2.0])
