@@ -1,7 +1,6 @@
 """The paper's bounds: recomputed from the formulas; never exceeded under their assumptions."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -85,29 +84,6 @@ def test_no_other_decay_rate_gives_a_longer_inter_event_time(system: System) -> 
         F += (1 + tilde * c / gap) * push / (hat + system.alpha)
         best_s = max(best_s, math.log1p(system.beta / F) / (hat + bar))
     assert best_s <= 1.05 * found.inter_event_s
-
-
-def test_where_f_bar_is_negative_the_time_is_that_of_the_far_future() -> None:
-    """From x(0) = 0, F grows with t_i, and its limit determines the bound."""
-    one = np.ones((1, 1))
-    names = ("x",)
-    loop = LoopMatrices(
-        one, one, -3 * one, -2 * one, 1.2 * one, one, np.zeros(1), None, names, names
-    )
-    beta, alpha, delta = 0.1, 0.5, 3.0
-    found = theorem_2(loop, beta, alpha, delta)
-    assert found is not None
-    bar = found.alpha_bar_per_s
-    assert found.c == pytest.approx(1.0, rel=1e-3)
-    F = (1 + 0.2 * found.c / (bar - alpha)) * beta * delta * 3
-    expected = math.log(1 + beta * (2 + alpha) / F) / (2 + bar)
-    assert found.inter_event_s == pytest.approx(expected, rel=1e-12)
-    away = theorem_2(replace(loop, x0=np.array([100.0])), beta, alpha, delta)
-    assert away is not None
-    assert away.inter_event_s < found.inter_event_s
-    # Where the largest F is not at t_i = 0, using t_i = 0 would give too large a bound.
-    at_0 = 0.2 * found.c * (0 - beta * delta * 3 / (bar - alpha)) / (2 + bar) + F / (2 + alpha)
-    assert math.log(1 + beta / at_0) / (2 + bar) > found.inter_event_s
 
 
 def test_theorem_2_requires_a_threshold_that_decays_more_slowly_than_the_loop() -> None:
