@@ -25,12 +25,9 @@ _NARROW_WIDTH, _WIDE_WIDTH = 20, 44
 
 
 def explain(specs: Sequence[LinkSpec], *, as_json: bool, as_file: bool) -> None:
-    """Print the effect of links' settings on standard output.
+    """Print the effect of links' settings on standard output, as tables or as JSON.
 
-    Args:
-        specs: the links.
-        as_json: print one JSON document instead of tables for people.
-        as_file: also print them as a file of links; False: print their names instead.
+    ``as_file``: tables have the links as a file of links instead of their names.
     """
     if as_json:
         print(json.dumps({"links": [_link_document(spec) for spec in specs]}, indent=2))

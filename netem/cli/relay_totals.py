@@ -40,13 +40,7 @@ class _Row(NamedTuple):
 
 
 def print_totals(totals: Statistics, console: Console, *, predicted: bool) -> None:
-    """Print a table for each link.
-
-    Args:
-        totals: the statistics at the end.
-        console: the output.
-        predicted: whether the settings predict the loss; they do not predict replayed fates.
-    """
+    """Print a table for each link; settings do not predict the loss of replayed fates."""
     for link in totals["links"]:
         clients = link["clients_ever"]
         title = f"{link['name']}: {link['listen']} → {link['to']}, {clients:,} client"

@@ -59,10 +59,7 @@ class LinkWords(NamedTuple):
 
 
 def parse(words: str | Sequence[str]) -> LinkWords:
-    """Read the settings of one direction of a link from words.
-
-    Args:
-        words: one string of words, as on a shell's command line, or a sequence of such strings.
+    """Read the settings of one direction of a link; see :class:`WordReader`.
 
     Raises:
         CallerError: one line with the wrong word, the expected words, and the nearest known word.
@@ -123,11 +120,7 @@ def text_of(settings: LinkSettings, seed: int | None = None) -> str:
 
 
 def require_no_dashes(arguments: Sequence[str]) -> None:
-    """Require that no word begins with dashes.
-
-    Raises:
-        CallerError: a word does.
-    """
+    """Raise a CallerError if a word begins with dashes."""
     for argument in arguments:
         word = argument.lstrip("-").partition("=")[0]
         if argument.startswith("-") and word in EXAMPLES:

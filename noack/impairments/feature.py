@@ -46,14 +46,11 @@ class Behaviour(NamedTuple):
 
 
 class StageTables:
-    """Tables of numbers that the stages of a program read.
-
-    Args:
-        scored: a delay is correlated with loss, and needs a score of the link's state.
-    """
+    """Tables of numbers that the stages of a program read."""
 
     def __init__(self, *, scored: bool = False) -> None:
         self.scored = scored
+        """A delay is correlated with loss, and needs a score of the link's state."""
         self.integers: list[int] = []
         self.reals: list[float] = []
 
@@ -99,11 +96,7 @@ class Feature(ScenarioSection):
         return ""
 
     def tc_lacks(self, before: Sequence["Impairment"]) -> str:
-        """Return the missing feature of ``tc netem``; empty if none is missing.
-
-        Args:
-            before: the impairments that tc applies before it.
-        """
+        """Return the missing feature of tc, which applies the impairments ``before`` before it."""
         return self.tc_missing
 
 
@@ -114,11 +107,7 @@ class QueueDiscipline(Feature):
 
     @abstractmethod
     def queue_stage(self, bottleneck: Mapping[str, int]) -> RuleStage:
-        """Return the settings as numbers.
-
-        Args:
-            bottleneck: the fields of :class:`noack.impairments.bottleneck.BottleneckStage`.
-        """
+        """Return the settings as numbers, with the fields of a ``BottleneckStage``."""
 
 
 class StageFeature(Feature):
@@ -194,10 +183,5 @@ class Impairment(StageFeature):
         return True
 
     def reorders(self, delayed: bool, reordered: bool) -> tuple[bool, bool]:
-        """Return whether packets may be delayed, and reordered, after it.
-
-        Args:
-            delayed: whether packets may be delayed before it.
-            reordered: whether packets may be reordered before it.
-        """
+        """Return whether packets may be delayed, and reordered, after it; given both before it."""
         return delayed, reordered

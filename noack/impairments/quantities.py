@@ -154,12 +154,17 @@ def brief_percent(share: float) -> str:
     return percent_text(float(f"{share:.6g}"))
 
 
+def without_defaults(values: Sequence[T], defaults: Sequence[T | None]) -> Sequence[T]:
+    """Return the values without those at the end that have their default value."""
+    count = len(values)
+    while count > 0 and values[count - 1] == defaults[count - 1]:
+        count -= 1
+    return values[:count]
+
+
 def percents_text(shares: Sequence[float], defaults: Sequence[float | None]) -> str:
     """Percentages, without those at the end that have their default value."""
-    count = len(shares)
-    while shares[count - 1] == defaults[count - 1]:
-        count -= 1
-    return " ".join(map(percent_text, shares[:count]))
+    return " ".join(map(percent_text, without_defaults(shares, defaults)))
 
 
 def time_text(time_s: float) -> str:

@@ -9,8 +9,7 @@ from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import dumps, json_schema, load, validate
 from tests.fuzz.choices import EDITS, Choices
-from tests.fuzz.edits import edited, key, value, vocabulary
-from tests.fuzz.files import bases, quoted, write_named
+from tests.fuzz.edits import bases, edited, key, quoted, value, vocabulary, write_named
 from tests.fuzz.harness import FOLDER, refusal, workspace
 
 KNOWN = vocabulary(json_schema(), dates=True)

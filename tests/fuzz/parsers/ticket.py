@@ -13,8 +13,7 @@ from noack.config.scenario_file import json_schema, validate
 from noack.runtime import join_ticket
 from noack.runtime.private_folder import open_private
 from tests.fuzz.choices import EDITS, Choices
-from tests.fuzz.edits import Vocabulary, edited, vocabulary
-from tests.fuzz.files import bases
+from tests.fuzz.edits import Vocabulary, bases, edited, vocabulary
 from tests.fuzz.harness import refusal, workspace
 
 _TICKET = join_ticket.new_ticket(
