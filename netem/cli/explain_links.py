@@ -15,6 +15,7 @@ from netem.engine.relay_interface import LinkSpec
 from netem.loss_prediction import predict
 from netem.words.tc_command import tc_command
 from netem.words.words_to_settings import text_of
+from noack.core.errors import shortened
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import text_of as address_text
 
@@ -43,7 +44,7 @@ def explain(specs: Sequence[LinkSpec], *, as_json: bool, as_file: bool) -> None:
             console.print(Text("\nas a file of links (--links)", "bold"))
             # Text to be copied must not be wrapped.
             toml = tomli_w.dumps({"link": [_link_table(spec)]}).strip()
-            console.print(Text(_cut(toml, _MAX_TOML)), soft_wrap=True)
+            console.print(Text(shortened(toml, _MAX_TOML)), soft_wrap=True)
 
 
 def _link_document(spec: LinkSpec) -> dict[str, Any]:
@@ -131,7 +132,7 @@ def _table(settings: LinkSettings, width: int) -> Table:
     table.add_column(overflow="fold")
     for number, one in enumerate(settings.impairments, 1):
         # As text: a bracket in a file's name is not markup.
-        words, meaning = _cut(one.text(), 200), one.meaning()
+        words, meaning = shortened(one.text(), 200), one.meaning()
         table.add_row(str(number), Text(words), Text(meaning))
     if not settings.impairments:
         table.add_row("", "", "no impairment")
@@ -199,7 +200,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, BaseModel):
         return _given(value)
     return [_plain(entry) for entry in value] if isinstance(value, tuple) else value
-
-
-def _cut(text: str, limit: int) -> str:
-    return text if len(text) <= limit else f"{text[: limit - 3]}..."

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from noack.core.errors import shortened
 from noack.impairments.feature import Impairment
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.quantities import percent_text
@@ -36,7 +37,7 @@ def tc_command(settings: LinkSettings) -> TcCommand:
         if any(other.kind == one.kind for other in kept):
             what = f"a second {one.kind}"
         if what:
-            lacks.append(f"{_cut(one.text())} ({what})")
+            lacks.append(f"{shortened(one.text(), _LONGEST)} ({what})")
         else:
             kept.append(one)
     if settings.mansd is not None:
@@ -55,7 +56,3 @@ def _differences(impairments: Sequence[Impairment]) -> tuple[str, ...]:
     if order != sorted(order):
         notes.append(f"its order is fixed: {', '.join(_FIXED_ORDER)}")
     return tuple(dict.fromkeys(notes))
-
-
-def _cut(text: str) -> str:
-    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
