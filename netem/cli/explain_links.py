@@ -19,7 +19,6 @@ from noack.core.errors import shortened
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import text_of as address_text
 
-_FROM_TO = {"forward": "from clients to the server", "reverse": "from the server to clients"}
 _MAX_TOML = 4000
 _NARROW_WIDTH, _WIDE_WIDTH = 20, 44
 """Minimum and maximum columns for words."""
@@ -106,10 +105,10 @@ def _print_link(console: Console, spec: LinkSpec) -> None:
     if spec.return_path and spec.forward == spec.reverse:
         _print_direction(console, "both directions, each by itself", spec.forward)
         return
-    _print_direction(console, f"forward, {_FROM_TO['forward']}", spec.forward)
+    _print_direction(console, "forward, from clients to the server", spec.forward)
     console.print()
     if spec.return_path:
-        _print_direction(console, f"reverse, {_FROM_TO['reverse']}", spec.reverse)
+        _print_direction(console, "reverse, from the server to clients", spec.reverse)
     else:
         console.print(Text("reverse: not relayed; the server's answers are discarded", "bold"))
 

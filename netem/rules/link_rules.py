@@ -121,7 +121,11 @@ def settle(program: LinkProgram, state: LinkMemory, row: int, decision: PacketDe
         if program.tracks:
             needed_ns = needed_until_ns(flow, recent_ns, program.mansd, packet)
             if needed_ns > effective_ns:
-                hold_back(decision, effective_ns, needed_ns)
+                decision.hold_back_ns = needed_ns - effective_ns
+                if decision.bit < 0:
+                    decision.release_ns = needed_ns
+                if decision.copy_ns != NEVER_NS:
+                    decision.copy_ns = max(decision.copy_ns, needed_ns)
                 effective_ns = needed_ns
                 counters.held_back += 1
             decision.makes_stale = make_stale(recent_ns, program.mansd, packet, effective_ns)
@@ -147,18 +151,6 @@ def settle(program: LinkProgram, state: LinkMemory, row: int, decision: PacketDe
     if decision.copy_ns > now_ns:
         state.link.in_flight += 1
     counters.most_in_flight = max(counters.most_in_flight, state.link.in_flight)
-
-
-def hold_back(decision: PacketDecision, effective_ns: int, needed_ns: int) -> None:
-    """Delay a packet, and its copy, until an earlier packet has left at ``needed_ns``.
-
-    ``effective_ns`` is the planned departure of the first intact one of the two.
-    """
-    decision.hold_back_ns = needed_ns - effective_ns
-    if decision.bit < 0:
-        decision.release_ns = needed_ns
-    if decision.copy_ns != NEVER_NS:
-        decision.copy_ns = max(decision.copy_ns, needed_ns)
 
 
 def count(counters: Counters, fate: int) -> None:

@@ -1,6 +1,5 @@
 """The nearest ``tc`` command to a link's settings, and the settings that it leaves out."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 from noack.core.errors import shortened
@@ -47,12 +46,8 @@ def tc_command(settings: LinkSettings) -> TcCommand:
     if wanted and not kept:
         return TcCommand(None, tuple(lacks), ())
     words = " ".join([f"limit {settings.limit}", *(one.tc_text() for one in kept)])
-    return TcCommand(words, tuple(lacks), _differences(kept))
-
-
-def _differences(impairments: Sequence[Impairment]) -> tuple[str, ...]:
-    notes = [note for one in impairments for note in one.tc_notes()]
-    order = [_FIXED_ORDER.index(one.kind) for one in impairments if one.kind in _FIXED_ORDER]
+    notes = [note for one in kept for note in one.tc_notes()]
+    order = [_FIXED_ORDER.index(one.kind) for one in kept if one.kind in _FIXED_ORDER]
     if order != sorted(order):
         notes.append(f"its order is fixed: {', '.join(_FIXED_ORDER)}")
-    return tuple(dict.fromkeys(notes))
+    return TcCommand(words, tuple(lacks), tuple(dict.fromkeys(notes)))

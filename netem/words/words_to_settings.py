@@ -68,7 +68,12 @@ def parse(words: str | Sequence[str]) -> LinkWords:
     impairments: list[Impairment] = []
     settings: Table = {}
     while (word := reader.begin()) is not None:
-        _require_keyword(reader, word)
+        if word in _REFUSED:
+            reader.wrong(_REFUSED[word])
+        if word in _AFTER:
+            reader.wrong(f"goes right after {_AFTER[word]}")
+        if word not in KEYWORDS:
+            reader.unknown(word, KEYWORDS)
         if word in _FEATURES:
             kind, found = _FEATURES[word]
             assert found.read is not None
@@ -125,15 +130,6 @@ def require_no_dashes(arguments: Sequence[str]) -> None:
         word = argument.lstrip("-").partition("=")[0]
         if argument.startswith("-") and word in EXAMPLES:
             raise CallerError(f"{argument}: write words without the dashes, e.g. {EXAMPLES[word]}")
-
-
-def _require_keyword(reader: WordReader, word: str) -> None:
-    if word in _REFUSED:
-        reader.wrong(_REFUSED[word])
-    if word in _AFTER:
-        reader.wrong(f"goes right after {_AFTER[word]}")
-    if word not in KEYWORDS:
-        reader.unknown(word, KEYWORDS)
 
 
 def _validated(kind: TypeAdapter[Any], given: object, reader: WordReader) -> Any:

@@ -7,13 +7,14 @@ derived from one of the three classes at the end.
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
 from noack.impairments.link_records import QueueState, RuleStage
 from noack.impairments.markov_chain import Chain, Pattern
 from noack.impairments.word_reader import WordReader
 from noack.settings.section import ScenarioSection
 
+T = TypeVar("T")
 Table = dict[str, Any]
 """A table of settings, before it is validated."""
 
@@ -54,17 +55,12 @@ class StageTables:
         self.integers: list[int] = []
         self.reals: list[float] = []
 
-    def add_integers(self, numbers: Iterable[int]) -> tuple[int, int]:
-        """Add integers; return the range [begin, end) of their places."""
-        begin = len(self.integers)
-        self.integers.extend(map(int, numbers))
-        return begin, len(self.integers)
 
-    def add_reals(self, numbers: Iterable[float]) -> tuple[int, int]:
-        """Add numbers; return the range [begin, end) of their places."""
-        begin = len(self.reals)
-        self.reals.extend(numbers)
-        return begin, len(self.reals)
+def add_numbers(table: list[T], numbers: Iterable[T]) -> tuple[int, int]:
+    """Append numbers to a table; return the range [begin, end) of their places."""
+    begin = len(table)
+    table.extend(numbers)
+    return begin, len(table)
 
 
 class Feature(ScenarioSection):

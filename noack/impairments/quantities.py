@@ -173,12 +173,8 @@ def time_text(time_s: float) -> str:
     if exact == 0:
         return "0s"
     units = (("s", 0), ("ms", 3), ("us", 6), ("ns", 9))
-    return min((_digits(exact.scaleb(shift)) + unit for unit, shift in units), key=_ease)
-
-
-def _ease(text: str) -> tuple[int, bool]:
-    """Sort key: shorter numbers first, then whole numbers."""
-    return len(text), "." in text
+    texts = (_digits(exact.scaleb(shift)) + unit for unit, shift in units)
+    return min(texts, key=lambda text: (len(text), "." in text))
 
 
 def rate_text(rate_bps: int) -> str:
