@@ -30,31 +30,29 @@ def explain(specs: Sequence[LinkSpec], *, as_json: bool, as_file: bool) -> None:
     ``as_file``: tables have the links as a file of links instead of their names.
     """
     if as_json:
-        print(json.dumps({"links": [_link_document(spec) for spec in specs]}, indent=2))
+        links = [
+            {
+                "name": spec.name, "listen": address_text(spec.listen),
+                "to": address_text(spec.to), "seed": spec.seed, "forward": _document(spec.forward),
+                "reverse": _document(spec.reverse) if spec.return_path else None,
+            }
+            for spec in specs
+        ]  # fmt: skip
+        print(json.dumps({"links": links}, indent=2))
         return
     console = Console(highlight=False)
     for number, spec in enumerate(specs):
         if number:
             console.print()
         if not as_file:
-            console.print(Text(_heading(spec), "bold underline"))
+            seed = f", seed {spec.seed}" if spec.seed else ""
+            addresses = f"{address_text(spec.listen)} → {address_text(spec.to)}"
+            console.print(Text(f"{spec.name}: {addresses}{seed}", "bold underline"))
         _print_link(console, spec)
         if as_file:
             console.print(Text("\nas a file of links (--links)", "bold"))
-            # Text to be copied must not be wrapped.
             toml = tomli_w.dumps({"link": [_link_table(spec)]}).strip()
-            console.print(Text(shortened(toml, _MAX_TOML)), soft_wrap=True)
-
-
-def _link_document(spec: LinkSpec) -> dict[str, Any]:
-    return {
-        "name": spec.name,
-        "listen": address_text(spec.listen),
-        "to": address_text(spec.to),
-        "seed": spec.seed,
-        "forward": _document(spec.forward),
-        "reverse": _document(spec.reverse) if spec.return_path else None,
-    }
+            console.print(Text(shortened(toml, _MAX_TOML)), soft_wrap=True)  # for copying
 
 
 def _document(settings: LinkSettings) -> dict[str, Any]:
@@ -94,11 +92,6 @@ def settings_meaning(settings: LinkSettings) -> list[tuple[str, str]]:
             f"at most {settings.limit} packets are delayed at once; more are dropped",
         ))  # fmt: skip
     return found
-
-
-def _heading(spec: LinkSpec) -> str:
-    seed = f", seed {spec.seed}" if spec.seed else ""
-    return f"{spec.name}: {address_text(spec.listen)} → {address_text(spec.to)}{seed}"
 
 
 def _print_link(console: Console, spec: LinkSpec) -> None:

@@ -199,12 +199,6 @@ def test_drops_are_spaced_by_the_interval_over_the_root_of_their_number() -> Non
     assert np.all(np.abs(np.array(at_ns[1:]) - due_ns) <= 1.5 * MS)  # a packet takes 1 ms
 
 
-def test_never_more_consecutive_losses_than_the_cap(decide: Any, longest_undelivered: Any) -> None:
-    words = "duplicate 50% rate 8mbit queue 5 codel target 1us interval 1us mtu 0 mansd 3"
-    decided = decide(words, 20_000, arrivals_ns=np.arange(20_000) * 10_000)
-    assert longest_undelivered(decided) == 3
-
-
 def test_words_and_their_meaning() -> None:
     words = "rate 10mbit queue 500 codel target 2ms interval 50ms mtu 9000 loss 5%"
     settings = settings_of(words)

@@ -46,16 +46,6 @@ def test_shape_and_correlation(decide: Any, shape: str, correlation: float) -> N
         assert abs(measured - correlation**lag) < 5 * error
 
 
-@pytest.mark.parametrize("shape", [*SHAPES, "paretonormal"])
-def test_mean_and_deviation(decide: Any, shape: str) -> None:
-    """Mean 0; the jitter is the standard deviation, or the half-width for a uniform shape."""
-    found = random_parts(decide, f"distribution {shape}")
-    deviation = 1 / np.sqrt(3) if shape == "uniform" else 1.0
-    assert abs(found.mean()) < 5 * deviation / np.sqrt(COUNT)
-    # The Pareto distribution has an infinite fourth moment.
-    assert found.std() == pytest.approx(deviation, rel=0.05 if "pareto" in shape else 0.01)
-
-
 def test_the_mixture_combines_quantiles() -> None:
     """N/4 + 3P/4 of the same u, scaled to standard deviation 1, compared with quadrature."""
 

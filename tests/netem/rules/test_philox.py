@@ -1,6 +1,5 @@
 """Known answers of Philox, and statistical tests of the random numbers that netem uses."""
 
-import itertools
 from typing import Any
 
 import numpy as np
@@ -79,22 +78,3 @@ def test_random_numbers_are_uniform_and_independent(places: dict[str, Any]) -> N
     for one, other in ((pair[:, 0], pair[:, 1]), (pair[1:, 0], pair[:-1, 0])):
         cells = np.histogram2d(one, other, 32, ((0, 1), (0, 1)))[0].ravel()
         assert stats.chisquare(cells).pvalue > 1e-6
-
-
-def test_neighbouring_streams_are_uncorrelated() -> None:
-    """All pairs of streams that differ by one in key, flow or block."""
-    packets = np.arange(20_000)
-    streams = [
-        column
-        for key0, key1, flow, block in itertools.product((0, 1), repeat=4)
-        for column in drawn(packet=packets, key0=key0, key1=key1, flow=flow, block=block).T
-    ]
-    correlation = np.corrcoef(streams) - np.eye(len(streams))
-    assert np.abs(correlation).max() < 5.5 / np.sqrt(len(packets))
-
-
-def test_the_low_bits_are_fair() -> None:
-    numbers = (drawn(packet=np.arange(DRAWS)) * 2**53).astype(np.int64)
-    for bit in range(53):
-        ones = int((numbers >> bit & 1).sum())
-        assert abs(ones - DRAWS) < 5 * np.sqrt(DRAWS / 2)
