@@ -182,12 +182,14 @@ for host in ("127.0.0.1", "0.0.0.0"):
 
 
 @needs_root
-def test_a_windows_address_is_served_to_this_user_only(server: RecordingServer) -> None:
+def test_a_windows_address_is_served_to_this_user_only(own_server: RecordingServer) -> None:
     """The address is on a command line, where other users can read it."""
-    assert output_of_another_user(THEIR_GET, server.window_address + RECORDING) == "404"
-    assert not server.requested.is_set()
-    assert ask(server.window_address + RECORDING)[::2] == (200, CONTENT)
-    assert output_of_another_user(THEIR_GET, server.address + RECORDING) == f"200 {len(CONTENT)}"
+    assert output_of_another_user(THEIR_GET, own_server.window_address + RECORDING) == "404"
+    assert not own_server.requested.is_set()
+    assert ask(own_server.window_address + RECORDING)[::2] == (200, CONTENT)
+    assert (
+        output_of_another_user(THEIR_GET, own_server.address + RECORDING) == f"200 {len(CONTENT)}"
+    )
 
 
 @needs_root
