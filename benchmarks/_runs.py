@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 
 from benchmarks._report import MeasurementError
 
-_PROGRESS = re.compile(r"^([0-9.]+)/[0-9.e+]+ s\b")
+PROGRESS = re.compile(r"^([0-9.]+)/[0-9.e+]+ s\b")
+"""A progress line of a run; the group is the time in the run, s."""
 _ROUNDING_S = 0.05
 """Rounding error of a progress line, which shows tenths of a second."""
 
@@ -66,8 +67,8 @@ def execute(command: Sequence[str], cwd: Path | None = None) -> Finished:
             lines = [Line(time.monotonic(), text.rstrip()) for text in process.stderr]
         stdout.seek(0)
         if process.returncode != 0:
-            said = lines[-1].text if lines else "nothing"
-            raise MeasurementError(f"{command[0]} ended with {process.returncode}, said {said!r}")
+            last = lines[-1].text if lines else "no message"
+            raise MeasurementError(f"{command[0]} ended with {process.returncode}: {last}")
         return Finished(begun_s, lines, stdout.read())
 
 
@@ -83,7 +84,7 @@ def first_step_s(begun_s: float, lines: Iterable[Line]) -> float | None:
     bounds_s = [
         line.at_s - (float(found[1]) - _ROUNDING_S) - begun_s
         for line in lines
-        if (found := _PROGRESS.match(line.text)) is not None
+        if (found := PROGRESS.match(line.text)) is not None
     ]
     return min(bounds_s, default=None)
 

@@ -20,7 +20,7 @@ from benchmarks._report import Benchmark, Goal, Peer, Row, say
 from benchmarks._ticks import FIFO_PRIORITY
 from cosim.cli import find_scenario
 from cosim.simulation.virtual_time import simulate
-from noack.config.plants import PLANTS
+from noack.config.feature_kinds import PLANTS
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load

@@ -8,7 +8,7 @@ In a run, it is one of the run's processes. On its own, it relays for any UDP pr
 import sys
 from collections.abc import Sequence
 
-from noack.runtime.interrupt import quiet_interrupt
+from noack.runtime.signals import quiet_interrupt
 
 with quiet_interrupt():
     from netem.duplex_link import network_of

@@ -1,3 +1,4 @@
+# ruff: noqa: F405
 """What every process agrees on: scenario, wire format, linear systems, records, clock.
 
 To a program or a notebook, ``import noack`` is the laboratory, too: scenarios, runs, certificates
@@ -8,21 +9,7 @@ looked up when they are first used: a process that imports a module from here lo
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from cosim.api import (
-        Certificates,
-        NoackError,
-        Run,
-        Scenario,
-        __version__,
-        certify,
-        compare,
-        from_system,
-        load,
-        open_run,
-        run,
-        simulate,
-        with_settings,
-    )
+    from cosim.api import *  # noqa: F403
 else:
 
     def __getattr__(name: str) -> object:
@@ -39,17 +26,6 @@ else:
 
 
 __all__ = [
-    "Certificates",
-    "NoackError",
-    "Run",
-    "Scenario",
-    "__version__",
-    "certify",
-    "compare",
-    "from_system",
-    "load",
-    "open_run",
-    "run",
-    "simulate",
-    "with_settings",
-]
+    "Certificates", "NoackError", "Run", "Scenario", "__version__", "certify", "compare",
+    "from_system", "load", "open_run", "run", "simulate", "with_settings",
+]  # fmt: skip

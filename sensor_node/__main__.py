@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Sequence
 
-from noack.runtime.interrupt import quiet_interrupt
+from noack.runtime.signals import quiet_interrupt
 
 with quiet_interrupt():
     from noack.core.errors import ExitStatus

@@ -1,7 +1,6 @@
 """Run the documentation's commands and snippets, and compare its key tables with the code."""
 
 import json
-import os
 import re
 import shlex
 import signal
@@ -14,6 +13,7 @@ from typing import Any, get_args
 import pytest
 from pydantic import BaseModel
 from typer.main import get_command
+from typer.testing import CliRunner
 
 from cosim.cli import app
 from cosim.studies.campaign.campaign_file import Axis, Campaign, Figure, Metrics, PairedComparison
@@ -21,11 +21,10 @@ from cosim.studies.campaign.campaign_file import load as load_campaign
 from cosim.studies.campaign.campaign_grid import grid
 from cosim.studies.campaign.metrics import METRICS
 from netem.words.words_to_settings import KEYWORDS
-from noack.config.disturbances import AnyDisturbance
-from noack.config.observers import AnyObserver
+from noack.config.feature_kinds import POLICIES, AnyDisturbance, AnyObserver
 from noack.config.scenario import Scenario
-from noack.config.scenario_file import json_schema, load
-from noack.config.triggers import POLICIES
+from noack.config.scenario_file import load
+from noack.config.toml_file import json_schema
 from noack.controllers.controller_settings import ControllerSettings
 from noack.impairments.disciplines import DISCIPLINES
 from noack.impairments.kinds import IMPAIRMENTS
@@ -59,17 +58,16 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "scenarios").symlink_to(ROOT / "scenarios")
     (links,) = blocks("docs/netem.md", "toml")
     (folder / "links.toml").write_text(links)
-    (folder / ".venv" / "bin").mkdir(parents=True)
     for code in [*blocks("docs/plants.md", "python"), *blocks("docs/plants.md", "toml")]:
         if (named := re.match(r"# (\w+\.(?:py|toml))\n", code)) is not None:
             (folder / named[1]).write_text(code)
         elif code.startswith("import control"):  # this snippet writes the matrices file
             subprocess.run([sys.executable, "-c", code], cwd=folder, check=True)
-    noack = folder / ".venv" / "bin" / "noack"
-    noack.write_text(f'#!/bin/sh\nexec {sys.executable} -m cosim.cli "$@"\n')
-    noack.chmod(0o755)
     result = subprocess.run(
-        [noack, "run", "lane_following", "--json", "--set", "ports={}", "--set", "horizon_s=2"],
+        [
+            sys.executable, "-m", "cosim.cli", "run", "lane_following", "--json",
+            "--set", "ports={}", "--set", "horizon_s=2",
+        ],
         cwd=folder, capture_output=True, text=True, check=False, timeout=250,
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
@@ -80,46 +78,58 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 SHORTER = {
-    "simulate": ("--set", "horizon_s=4", "--no-report"),
+    "simulate": ("--no-report", "--set", "horizon_s=4"),
     "demo": ("--no-report",),
     "run": ("--no-report",),
+    "adversary": ("--set", "horizon_s=2", "--nodes", "2000"),
+    "design": ("--draws", "100"),
+    "doctor": ("--seconds", "0.1"),
 }
 """Arguments added to a command to shorten it; other tests cover reports and long runs."""
 
 
 def shorter(words: list[str]) -> list[str]:
-    command = next((word for word in words[1:] if not word.startswith("-")), "")
-    if command == "netem" and words[2:3] in (["--listen"], ["--links"]):
-        return [*words[:2], "--engine", "plain", *words[2:]]  # needs no compilation
-    more = SHORTER.get(command, ()) if words[0].endswith("noack") else ()
-    long = "horizon_s" in " ".join(words)
-    return [*words, *(more[2:] if long and more[:1] == ("--set",) else more)]
+    more = SHORTER.get(words[0], ())
+    return [*words, *(more[:1] if "horizon_s" in " ".join(words) else more)]
 
 
 @pytest.mark.parametrize("command", sorted(set(commands())))
-def test_every_command_works(command: str, run_folder: Path) -> None:
-    words = shorter(shlex.split(command.partition(" > ")[0]))
-    if words[0] == "make":
+def test_every_command_works(
+    command: str, run_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program, *words = shlex.split(command.partition(" > ")[0])
+    if program == "make":
         # Running a make target could run this test again: check only that the target exists.
         done = subprocess.run(
-            ["make", "--dry-run", *words[1:]], cwd=ROOT, capture_output=True, text=True, check=False
+            ["make", "--dry-run", *words], cwd=ROOT, capture_output=True, text=True, check=False
         )
         assert done.returncode == 0, done.stderr
         return
-    program = run_folder / ".venv" / "bin" / "noack"
-    environment = os.environ | {"PATH": f"{program.parent}:{os.environ['PATH']}"}
+    assert program == "noack"
+    if command in blocks("README.md", "sh")[-1]:
+        emulate(words, run_folder)
+        return
+    if "--listen" in words or "--links" in words:
+        words.insert(1, "--explain")  # the emulator does not start
+    monkeypatch.chdir(run_folder)
+    finished = CliRunner().invoke(app, shorter(words))
+    assert finished.exit_code == 0, finished.output
+    if "--json" in words:
+        json.loads(finished.stdout)
+
+
+def emulate(words: list[str], folder: Path) -> None:
+    """Start the network emulator, wait until it is ready, and end it as Ctrl-C does."""
+    plain = ["netem", "--engine", "plain", *words[1:]]  # needs no compilation
     with subprocess.Popen(
-        words, cwd=run_folder, env=environment,
+        [sys.executable, "-m", "cosim.cli", *plain], cwd=folder,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     ) as process:  # fmt: skip
-        if "netem" in words and "--explain" not in words:
-            assert process.stderr is not None
-            assert any("Ctrl-C ends" in line for line in process.stderr)
-            process.send_signal(signal.SIGINT)
-        stdout, stderr = process.communicate(timeout=250)
+        assert process.stderr is not None
+        assert any("Ctrl-C ends" in line for line in process.stderr)
+        process.send_signal(signal.SIGINT)
+        _, stderr = process.communicate(timeout=250)
     assert process.returncode == 0, stderr
-    if "--json" in words:
-        json.loads(stdout)
 
 
 def snippets() -> list[str]:
@@ -130,12 +140,13 @@ def snippets() -> list[str]:
 
 
 @pytest.mark.parametrize("snippet", snippets())
-def test_every_snippet_runs(snippet: str, run_folder: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", snippet], cwd=run_folder, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.strip()
+def test_every_snippet_runs(
+    snippet: str, run_folder: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(run_folder)
+    exec(compile(snippet, "snippet", "exec"), {"__name__": "__main__"})
+    assert capsys.readouterr().out.strip()
 
 
 def keys_of(section: type[BaseModel], prefix: str = "") -> Iterator[str]:
@@ -244,7 +255,7 @@ def test_every_option_of_design_is_documented_and_no_other() -> None:
 
 
 def test_the_exported_schema_matches_the_code() -> None:
-    assert json.loads((ROOT / "docs/scenario.schema.json").read_text()) == json_schema()
+    assert json.loads((ROOT / "docs/scenario.schema.json").read_text()) == json_schema(Scenario)
 
 
 def test_the_network_in_the_how_to_page_is_valid(tmp_path: Path) -> None:

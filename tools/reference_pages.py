@@ -11,6 +11,7 @@ import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 from rich.text import Text
 from typer.main import get_command
@@ -75,17 +76,14 @@ def _examples(epilog: str) -> str:
 
 
 def _netem_help() -> str:
-    said = io.StringIO()
-    columns = os.environ.get("COLUMNS")
-    os.environ["COLUMNS"] = "100"
-    try:
-        with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
-            netem_main(["--help"])
-    finally:
-        os.environ.pop("COLUMNS")
-        if columns is not None:
-            os.environ["COLUMNS"] = columns
-    return said.getvalue().strip()
+    output = io.StringIO()
+    with (
+        patch.dict(os.environ, COLUMNS="100"),
+        contextlib.redirect_stdout(output),
+        contextlib.suppress(SystemExit),
+    ):
+        netem_main(["--help"])
+    return output.getvalue().strip()
 
 
 def shipped(folder: str) -> str:

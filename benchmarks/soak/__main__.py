@@ -20,7 +20,7 @@ _LEAST_MINUTES = 0.2
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the soak; return 0 if all memory was flat and no invariant was violated."""
+    """Run the soak; return 0 if all memory was flat and no claim was violated."""
     options = _options(arguments)
     console = Console()
     if not console.is_terminal:
@@ -50,7 +50,7 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.soak",
         description="Run the loop for an hour at speed 1, then for a day of simulated time in half "
-        "an hour, and watch it: memory, descriptors and threads must stay flat, every invariant "
+        "an hour, and watch it: memory, descriptors and threads must stay flat, every claim must "
         "hold.",
     )
     parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"of {', '.join(KINDS)}")

@@ -92,8 +92,6 @@ class Result:
     disk_bytes: int
     """Size of the run directory at the end of the loop."""
     watched: Mapping[str, Watched]
-    account: Mapping[str, Any]
-    """What the invariants checked."""
     summary: Mapping[str, Any]
     faults: Sequence[str] = field(default_factory=list)
     """Descriptions of all faults."""
@@ -112,7 +110,6 @@ class Result:
             "end_peak_kib": dict(self.end_peak_kib),
             "disk_bytes": self.disk_bytes,
             "processes": {role: watched.as_json() for role, watched in self.watched.items()},
-            "invariants": dict(self.account),
             "summary": {key: self.summary.get(key) for key in kept},
             "faults": list(self.faults),
         }
@@ -150,8 +147,6 @@ def print_result(console: Console, result: Result) -> None:
 
 
 def _lines(result: Result) -> list[str]:
-    account = result.account
-    rows = account["rows"]
     replay = result.summary.get("replay") or {}
     lateness = result.summary.get("lateness_us") or {}
     late = ", ".join(
@@ -161,11 +156,7 @@ def _lines(result: Result) -> list[str]:
     )
     peaks = ", ".join(f"{role} {kib / 1024:,.0f}" for role, kib in result.end_peak_kib.items())
     return [
-        f"checked on the way: {sum(rows.values()):,} rows, {account['events']:,} events, "
-        f"{account['deliveries']:,} deliveries; "
-        f"longest loss burst {account['longest_loss_burst']}; "
-        f"(I1) to {account['identity_residual_relative']:.1e} of ‖x_s‖; at most "
-        f"{account['most_held']:,} rows held; {account['broken']} broken",
+        f"longest loss burst: {result.summary.get('longest_loss_burst')}",
         f"replayed at the end: {replay.get('inputs') or 0:,} inputs, bit exact: "
         f"{replay.get('bit_exact')}",
         f"lateness, p50/p99/max in µs (reported, not judged): {late or 'unknown'}",

@@ -2,26 +2,28 @@
 
 import json
 import math
+import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from benchmarks._report import MeasurementError
+from benchmarks._runs import PLAIN_TERMINAL, PROGRESS
 from benchmarks.soak.figure import memory_figure
-from benchmarks.soak.invariants import Invariants
 from benchmarks.soak.result import Result, Watched
 from benchmarks.soak.watch import LAUNCHER, Processes, Sample, size_bytes
 from cosim.output.report.figure_files import save_figure
 from cosim.record.run_directory import LATEST, RECORD, SCENARIO_FILE, SUMMARY_FILE
+from cosim.record.run_record import load_record
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
-from noack.core.clock import NS_PER_S
+from noack.protocol.record_tables import NETEM_RELEASE
 from noack.protocol.topology import LOOP_ROLES, RECORDER
-from noack.runtime.spool import SPOOL, SpoolTail
+from noack.runtime.spool import SPOOL
 
 RESULT_FILE, PICTURE_FILE = "soak.json", "soak.png"
 FREE_PORTS = ("--set", "ports={}")
@@ -46,7 +48,7 @@ def soak(path: Path, settings: tuple[str, ...], runs: Path, say: Say) -> Result:
     """Soak a scenario.
 
     Args:
-        path: the scenario file; its trigger is the paper's, and nothing is acknowledged.
+        path: the scenario file.
         settings: values to replace, as after ``--set``.
         runs: folder in which the run directory is made, in its own subfolder.
         say: called with the progress at intervals.
@@ -63,12 +65,16 @@ def soak(path: Path, settings: tuple[str, ...], runs: Path, say: Say) -> Result:
     with (
         (folder / "stdout.json").open("w") as stdout,
         (folder / "stderr.log").open("w") as stderr,
-        subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=stdout, stderr=stderr) as run,
-    ):
+        subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=stdout, stderr=stderr,
+            env=os.environ | PLAIN_TERMINAL,
+        ) as run,
+    ):  # fmt: skip
         processes = Processes(run.pid)
         try:
             run_dir = _started(run, folder)
-            return _Soak(run, run_dir, processes, say).watch()
+            with (folder / "stderr.log").open() as log:
+                return _Soak(run, run_dir, processes, log, say).watch()
         finally:
             if run.poll() is None:
                 processes.kill()
@@ -81,22 +87,22 @@ def _started(run: "subprocess.Popen[bytes]", folder: Path) -> Path:
         if latest.exists() and (latest / SPOOL).is_dir():
             return latest.resolve()
         time.sleep(0.05)
-    said = (folder / "stderr.log").read_text(errors="replace").strip().splitlines()
-    raise MeasurementError(f"the run never began: {said[-1] if said else 'it said nothing'}")
+    lines = (folder / "stderr.log").read_text(errors="replace").strip().splitlines()
+    raise MeasurementError(f"the run never began: {lines[-1] if lines else 'no message'}")
 
 
 class _Soak:
     def __init__(
-        self, run: "subprocess.Popen[bytes]", run_dir: Path, processes: Processes, say: Say
-    ) -> None:
+        self, run: "subprocess.Popen[bytes]", run_dir: Path, processes: Processes, log: TextIO,
+        say: Say,
+    ) -> None:  # fmt: skip
         self._run = run
         self._run_dir = run_dir
         self._processes = processes
+        self._log = log
         self._say = say
         self._scenario: Scenario = load(run_dir / SCENARIO_FILE)
         self._length_s = self._scenario.horizon_s / self._scenario.speed
-        self._invariants = Invariants(self._scenario)
-        self._tail = SpoolTail(run_dir / SPOOL)
         self._looks: dict[str, list[tuple[float, Sample]]] = {}
         self._faults: list[str] = []
 
@@ -104,8 +110,6 @@ class _Soak:
         began_s, disk_bytes = self._loop()
         end_began_s = time.monotonic()
         peaks = self._end(_END_PATIENCE * self._length_s + 600.0)
-        self._read(final=True)
-        self._tail.close()
         ended_s = time.monotonic()
         summary = self._judge_end()
         watched = self._watched(began_s, min(self._length_s, end_began_s - began_s) - _LAST_S)
@@ -114,10 +118,9 @@ class _Soak:
                 self._faults.append(f"{role}: was never seen")
             else:
                 self._faults += watched[role].faults(role)
-        self._faults += self._invariants.broken
         result = Result(
             self._scenario.name, self._run_dir, end_began_s - began_s, ended_s - end_began_s, peaks,
-            disk_bytes, watched, self._invariants.account(), summary, self._faults,
+            disk_bytes, watched, summary, self._faults,
         )  # fmt: skip
         (self._run_dir / RESULT_FILE).write_text(result.dumps(), encoding="utf-8")
         if watched:
@@ -142,29 +145,27 @@ class _Soak:
         """Sample the run until its horizon.
 
         Returns:
-            The time of t = 0 on our clock (the minimum over all rows, since each row is read after
-            it was made), and the final size of the run directory.
+            The time of t = 0 on our clock (the minimum over all progress lines, since each is read
+            after it was printed), and the final size of the run directory.
         """
         pause_s = min(self._length_s / _LEAST_LOOKS, _LONGEST_PAUSE_S)
-        look_s = told_s = moved_s = time.monotonic()
-        began_s, told, newest_ns, disk_bytes = math.inf, 0, 0, 0
-        while self._run.poll() is None and newest_ns < self._scenario.timing.horizon_ns:
-            self._read()
-            now_s = time.monotonic()
-            if self._invariants.t_ns > newest_ns:
-                newest_ns, moved_s = self._invariants.t_ns, now_s
-                began_s = min(began_s, now_s - newest_ns / NS_PER_S / self._scenario.speed)
-            if newest_ns and now_s >= look_s:
+        look_s = reported_s = moved_s = time.monotonic()
+        began_s, tenths, reached_s, disk_bytes = math.inf, 0, 0.0, 0
+        while self._run.poll() is None and (now_s := time.monotonic()) < began_s + self._length_s:
+            for t_s in self._progress_lines():
+                reached_s, moved_s = t_s, now_s
+                began_s = min(began_s, now_s - t_s / self._scenario.speed)
+            if reached_s and now_s >= look_s:
                 self._look(now_s)
                 disk_bytes = size_bytes(self._run_dir)
                 look_s = max(look_s + pause_s, now_s)
             if now_s - moved_s > _STUCK_S:
-                self._faults.append(f"nothing was recorded for {_STUCK_S:g} s; the run was ended")
+                self._faults.append(f"no progress for {_STUCK_S:g} s; the run was ended")
                 self._run.terminate()
                 break
-            share = newest_ns / self._scenario.timing.horizon_ns
-            if int(10 * share) > told or now_s - told_s > _SAY_S:
-                told, told_s = int(10 * share), now_s
+            share = reached_s / self._scenario.horizon_s
+            if int(10 * share) > tenths or now_s - reported_s > _SAY_S:
+                tenths, reported_s = int(10 * share), now_s
                 self._say(self._progress(share))
             time.sleep(min(_POLL_S, pause_s))
         return min(began_s, time.monotonic()), disk_bytes
@@ -178,7 +179,6 @@ class _Soak:
             for role, sample in self._processes.sample().items():
                 if role in (LAUNCHER, RECORDER):
                     peaks[role] = max(peaks.get(role, 0.0), sample.rss_kib)
-            self._read()
             if time.monotonic() > deadline_s:
                 self._faults.append(f"the end of the run took more than {patience_s:.0f} s")
                 self._processes.kill()
@@ -189,19 +189,19 @@ class _Soak:
         for role, sample in self._processes.sample().items():
             self._looks.setdefault(role, []).append((at_s, sample))
 
-    def _read(self, *, final: bool = False) -> None:
-        for table, first, payload in self._tail.read():
-            self._invariants.take(table, first, payload)
-        self._invariants.advance(final=final)
+    def _progress_lines(self) -> Iterator[float]:
+        """Yield the times in the run of the new progress lines."""
+        for line in self._log:
+            if (found := PROGRESS.match(line)) is not None:
+                yield float(found[1])
 
     def _progress(self, share: float) -> str:
         memory = ", ".join(
             f"{role} {looks[-1][1].uss_kib / 1024:.1f}" for role, looks in self._looks.items()
         )
-        account = self._invariants
         return (
-            f"{100 * share:.0f} % of {self._scenario.horizon_s:g} s; own memory in MiB: {memory}; "
-            f"{sum(account.rows.values()):,} rows, {account.broken_count} broken"
+            f"{100 * share:.0f} % of {self._scenario.horizon_s:g} s; "
+            f"private memory in MiB: {memory}"
         )
 
     def _judge_end(self) -> dict[str, Any]:
@@ -218,24 +218,19 @@ class _Soak:
         except (OSError, ValueError) as error:
             faults.append(f"no summary: {error}; exit status {status}")
             return {}
-        faults += ended_badly(
-            summary, status, self._invariants.rows, self._invariants.delivered_out_of_order
-        )
+        stale = int(load_record(self._run_dir)[NETEM_RELEASE]["stale"].sum())
+        faults += ended_badly(summary, status, stale)
         return summary
 
 
 def ended_badly(
-    summary: Mapping[str, Any],
-    status: int,
-    rows: Mapping[str, int],
-    delivered_out_of_order: int = 0,
+    summary: Mapping[str, Any], status: int, delivered_out_of_order: int = 0
 ) -> list[str]:
     """Return descriptions of the faults in a run's summary.
 
     Args:
         summary: summary of the run.
         status: exit status of ``noack run``.
-        rows: number of rows received during the run, by table.
         delivered_out_of_order: updates that left the network after a newer one.
     """
     faults = []
@@ -257,8 +252,6 @@ def ended_badly(
     replay = summary["replay"] or {}
     if not (replay.get("bit_exact") and replay.get("complete")):
         faults.append(f"the replay: {replay}")
-    elif replay["inputs"] != sum(rows.values()):
-        faults.append(f"{replay['inputs']} inputs in the record, {sum(rows.values())} on the way")
     faults += [
         f"claim violated since {claim['since_s']} s: {claim['what']} ({claim['source']})"
         for claim in summary["claims"]

@@ -32,7 +32,7 @@ from cosim.simulation.continuous.continuous_run import (
     TooManyEventsError,
     simulate_continuous,
 )
-from cosim.simulation.continuous.plant_grid_loop import SampledLoop
+from cosim.simulation.continuous.plant_grid_loop import SampledLoop, StepSchedule
 from noack.core.errors import NoackError
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.number_format import percent
@@ -45,7 +45,7 @@ _ROUNDING = 1e-9
 _NUDGE = 1e-13
 """Perturbation of x(0), relative, about the size of rounding. If it changes the events of a run,
 rounding does so too."""
-_PARTED_PERIODS = 10
+_SPLIT_PERIODS = 10
 """Two event sequences differ from the first event that is further apart, in measurements."""
 _LARGEST = 1e100
 _STEPS_AT_THE_END, _EVENTS_AT_THE_END = 500_000, 10_000
@@ -195,19 +195,21 @@ def compute_fidelity(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelit
     events_s.append(live.event_s)
     if not all(np.abs(x).max() < _LARGEST for x in states):
         raise IncomparableError("a simulation of the run diverges")
-    whole = live.x - states[0]
-    total, remainder = _difference(whole), _difference(live.x - states[-2])
-    if remainder.rms > EXPLAINED * total.rms:
-        other = replace(system.loop, x0=system.loop.x0 * (1 + _NUDGE))
-        nudged = SampledLoop(ContinuousLoop(other, system.trigger), schedule, known_start=known)
-        moved = nudged.run(delay=True, hold=True).x[schedule.measured] - states[-2]
-        if not _difference(moved).rms < EXPLAINED * total.rms:
-            raise IncomparableError(
-                "the loop turns rounding into another run: so does a change of x(0) by "
-                f"{_NUDGE:g} of itself; a shorter run can be compared"
-            )
-    part_s = _PARTED_PERIODS * scenario.plant.measure_every * period_s
-    effects = [after - before for before, after in pairwise(states)]
+    whole, effects = live.x - states[0], [after - before for before, after in pairwise(states)]
+    total, residual = _difference(whole), _difference(effects[-1])
+    if residual.rms > EXPLAINED * total.rms:
+        _require_stable_events(system, schedule, states[-2], EXPLAINED * total.rms, known)
+    split_s = _SPLIT_PERIODS * scenario.plant.measure_every * period_s
+    stages = (
+        FidelityStage(
+            name, _difference(effect), _share(effect, whole), len(after_s),
+            *_event_changes(before_s, after_s, split_s),
+        )
+        for name, effect, (before_s, after_s) in zip(
+            _STAGES, effects, pairwise(events_s), strict=True
+        )
+    )  # fmt: skip
+    largest_s, first_different = _event_changes(ideal.event_s, live.event_s, split_s)
     return Fidelity(
         scenario=scenario.name,
         mode=scenario.mode,
@@ -216,25 +218,33 @@ def compute_fidelity(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelit
         state_names=record.loop.state_names,
         rms_live=_difference(live.x).rms,
         total=total,
-        stages=tuple(
-            FidelityStage(
-                name,
-                _difference(effects[i]),
-                _share(effects[i], whole),
-                len(events_s[i + 1]),
-                _largest(_apart(events_s[i], events_s[i + 1])),
-                _parted(events_s[i], events_s[i + 1], part_s),
-            )
-            for i, name in enumerate(_STAGES)
-        ),
-        explained_relative=remainder.rms / total.rms if total.rms else 0.0,
+        stages=tuple(stages),
+        explained_relative=residual.rms / total.rms if total.rms else 0.0,
         events_ideal=len(ideal.event_s),
         events_live=len(live.event_s),
-        max_event_difference_s=_largest(_apart(ideal.event_s, live.event_s)),
-        first_different_event=_parted(ideal.event_s, live.event_s, part_s),
+        max_event_difference_s=largest_s,
+        first_different_event=first_different,
         t_s=t_s,
         stage_norms=np.array([np.linalg.norm(effect, axis=1) for effect in effects]),
     )
+
+
+def _require_stable_events(
+    system: ContinuousLoop, schedule: StepSchedule, x: Matrix, limit: float, known_start: bool
+) -> None:
+    """Require that a change of x(0) by rounding changes the simulation ``x`` less than ``limit``.
+
+    Raises:
+        IncomparableError: it does not.
+    """
+    other = replace(system.loop, x0=system.loop.x0 * (1 + _NUDGE))
+    nudged = SampledLoop(ContinuousLoop(other, system.trigger), schedule, known_start=known_start)
+    moved = nudged.run(delay=True, hold=True).x[schedule.measured] - x
+    if not _difference(moved).rms < limit:
+        raise IncomparableError(
+            "the loop turns rounding into another run: so does a change of x(0) by "
+            f"{_NUDGE:g} of itself; a shorter run can be compared"
+        )
 
 
 def _ideal(
@@ -242,12 +252,9 @@ def _ideal(
 ) -> ContinuousRun:
     try:
         ideal = simulate_continuous(
-            system,
-            horizon_s=horizon_s,
-            delivered=live.schedule.delivered,
-            known_start=known_start,
-            max_events=max_events,
-        )
+            system, horizon_s=horizon_s, delivered=live.schedule.delivered,
+            known_start=known_start, max_events=max_events,
+        )  # fmt: skip
     except TooManyEventsError:
         raise IncomparableError(
             f"the ideal loop has more than {max_events} events, which accumulate"
@@ -277,20 +284,16 @@ def _share(part: Matrix, whole: Matrix) -> float:
     return float((part * whole).sum()) / energy if energy else 0.0
 
 
-def _apart(first_s: Vector, second_s: Vector) -> Vector:
-    """Return the time differences between events of equal number, over those that both have."""
+def _event_changes(
+    first_s: Vector, second_s: Vector, tolerance_s: float
+) -> tuple[float | None, int | None]:
+    """Return the largest time difference of events of equal number, and the first other event.
+
+    The latter is further apart than the tolerance, or only one of the two runs has it.
+    """
     both = min(len(first_s), len(second_s))
-    apart_s: Vector = np.abs(first_s[:both] - second_s[:both])
-    return apart_s
-
-
-def _largest(values: Vector) -> float | None:
-    return float(values.max()) if len(values) else None
-
-
-def _parted(first_s: Vector, second_s: Vector, tolerance_s: float) -> int | None:
-    apart_s = _apart(first_s, second_s)
-    far = np.flatnonzero(apart_s > tolerance_s)
-    if len(far):
-        return int(far[0])
-    return len(apart_s) if len(first_s) != len(second_s) else None
+    apart_s = np.abs(first_s[:both] - second_s[:both])
+    largest_s = float(apart_s.max()) if both else None
+    if (far := np.flatnonzero(apart_s > tolerance_s)).size:
+        return largest_s, int(far[0])
+    return largest_s, both if len(first_s) != len(second_s) else None

@@ -15,6 +15,9 @@ from plant_server.plant import system_of
 
 Linearisation = dict[str, Any]
 
+_EXACT = 1e-3
+"""Tolerance for an entry with a half-width of 0, as the linearisation uses finite differences."""
+
 
 def linearisation(resolved: Scenario) -> Linearisation | None:
     """Return the linearisation of a resolved scenario's plant; None for a linear plant.
@@ -57,31 +60,24 @@ def linearisation(resolved: Scenario) -> Linearisation | None:
     }
 
 
-_EXACT = 1e-3
-"""Tolerance for an entry with a half-width of 0, as the linearisation uses finite differences."""
-
-
 def _within(off: Matrix, halfwidth: ArrayLike | None) -> bool:
     allowed = np.zeros_like(off) if halfwidth is None else np.array(halfwidth)
     return bool((np.abs(off) <= np.maximum(allowed, _EXACT)).all())
 
 
-def said(found: Linearisation) -> tuple[tuple[str, str], ...]:
+def linearisation_rows(found: Linearisation) -> tuple[tuple[str, str], ...]:
     """Return a linearisation as text: quantities and their values."""
     if found["A"] is None:
-        return (("the plant, linearised", "none: x does not tell what follows, or not smoothly"),)
+        return (("the plant, linearised", "none: x is not its whole state, or it is not smooth"),)
     slowest = max(real for real, _ in found["eigenvalues"])
-    worst, where = max(_entries("A", found["off_A"]) + _entries("B", found["off_B"]))
+    worst, where = max(
+        (abs(entry), f"{name}[{i}, {j}]")
+        for name in "AB"
+        for i, row in enumerate(found[f"off_{name}"], 1)
+        for j, entry in enumerate(row, 1)
+    )
     box = {True: ", inside the box", False: ", outside the box", None: ""}[found["in_box"]]
     return (
         ("the plant, linearised: poles of A + BK", f"up to {slowest:.3g} /s"),
-        ("  farthest from the model", f"{where}, by {worst:.3g}{box}"),
+        ("  largest difference to the model", f"{where}, by {worst:.3g}{box}"),
     )
-
-
-def _entries(name: str, rows: list[list[float]]) -> list[tuple[float, str]]:
-    return [
-        (abs(entry), f"{name}[{i}, {j}]")
-        for i, row in enumerate(rows, 1)
-        for j, entry in enumerate(row, 1)
-    ]

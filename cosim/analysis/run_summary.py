@@ -3,6 +3,8 @@
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,7 +28,7 @@ from cosim.analysis.summary_model import (
     WatchdogPart,
 )
 from cosim.analysis.timing_statistics import latency, lateness
-from cosim.record.align import AlignedRun, identity_residual, join_all
+from cosim.record.align import AlignedRun, align_tables, identity_residual
 from cosim.record.divergence import Divergence, divergence
 from cosim.record.estimation_error import disturbance_summary, estimation_summary, true_states
 from cosim.record.packet_outcomes import packet_outcomes
@@ -54,6 +56,16 @@ Summary = dict[str, Any]
 """The content of ``summary.json``: :class:`~cosim.analysis.summary_model.RunSummary` as JSON."""
 
 
+@dataclass(frozen=True)
+class Outcome:
+    """The outcome of a run, for tables and programs."""
+
+    run_dir: Path
+    status: ExitStatus
+    reason: str
+    summary: Summary
+
+
 @np.errstate(all="ignore")  # a diverging run overflows and has a summary all the same
 def summarise(
     record: RunRecord, exit_status: int, reason: str, startup_s: float | None = None
@@ -70,7 +82,7 @@ def summarise(
     missing, lost, diverged = missing_rows(record), unintended_losses(record), _divergence(record)
     if exit_status == ExitStatus.OK and (why := _why_failed(record, missing, diverged)):
         exit_status, reason = ExitStatus.FAILED, why
-    joined = join_all(record)
+    joined = align_tables(record)
     return RunSummary(
         kind=record.kind,
         startup_s=startup_s,

@@ -49,7 +49,6 @@ def live_run(record: RunRecord) -> LiveRun:
             model.
         CallerError: exact simulation does not support the scenario.
     """
-    record.scenario.coverage.require_unacknowledged()
     if changes_of(record):
         raise IncomparableError(
             "no ideal loop is like it: its settings were changed during the run"

@@ -2,11 +2,10 @@
 
 import math
 from collections.abc import Mapping
+from enum import StrEnum
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
-
-from cosim.analysis.claims.claim import ClaimVerdict
 
 
 def _or_none(value: Any) -> Any:
@@ -109,18 +108,41 @@ class DisturbancePart(SummaryPart):
     max: Real
 
 
-class DifferencePart(SummaryPart):
-    """The first difference between record and replay."""
+class ReplayDifference(SummaryPart):
+    """A value that differs between record and replay.
+
+    Floating-point values also have their ``float.hex()``, which shows every bit; a value that is
+    not finite has this form only.
+    """
 
     table: Text
     row: Count
+    """Index in the table, from 0."""
     column: Text
+    """Name as in the Parquet file, such as ``x_2``; empty if no single column differs."""
     recorded: Count | float | str | None
     recorded_hex: str | None
     replayed: Count | float | str | None
     replayed_hex: str | None
     what: str
+    """The difference in words."""
     now_ns: Count
+    """The row's recorded time."""
+
+    def __str__(self) -> str:
+        column = f", {self.column}" if self.column else ""
+        values = ""
+        if self.recorded is not None or self.recorded_hex is not None:
+            recorded = _value_text(self.recorded, self.recorded_hex)
+            replayed = _value_text(self.replayed, self.replayed_hex)
+            values = f": recorded {recorded}, replayed {replayed}"
+        return f"{self.table} row {self.row}{column}: {self.what}{values}"
+
+
+def _value_text(value: float | str | None, as_hex: str | None) -> str:
+    if value is None:
+        return as_hex or "nothing"
+    return f"{value} ({as_hex})" if as_hex else str(value)
 
 
 class ReplayPart(SummaryPart):
@@ -129,7 +151,7 @@ class ReplayPart(SummaryPart):
     bit_exact: bool | None
     complete: bool = True
     inputs: Count = 0
-    first_difference: DifferencePart | None = None
+    first_difference: ReplayDifference | None = None
     error: str | None = None
 
     @model_validator(mode="after")
@@ -180,20 +202,39 @@ class NoLinearisationPart(SummaryPart):
     A: None
 
 
-class ClaimPart(SummaryPart):
+class ClaimVerdict(StrEnum):
+    """The result of checking a claim against a run."""
+
+    HELD = "held"
+    VIOLATED = "violated"
+    VOID = "void"
+    """An assumption of the claim was violated before the end of the run."""
+    NOT_APPLICABLE = "not applicable"
+    """The bound was exceeded, but no sampled loop meets the claim's assumptions: this run does not
+    refute it."""
+
+
+class Claim(SummaryPart):
     """A claim, checked against the run."""
 
     what: str
     source: str
     bound: str
+    """The claim as a formula with its numbers."""
     certified: Real
+    """The claimed constant."""
     observed: Real
+    """The smallest constant with which the claim holds for this run."""
     ratio: Real
+    """Largest share of the bound that was reached; at most 1 if the claim held."""
     verdict: Annotated[ClaimVerdict, Field(strict=False)]
     since_s: Real
+    """Time from which the claim was violated, void or not applicable."""
     why: str
     from_s: float
+    """The claim begins here: at the start of the run, or after a change of settings."""
     until_s: Real
+    """The claim ends here, at a change of settings; None: at the end of the run."""
 
 
 class ConditionsPart(SummaryPart):
@@ -282,7 +323,7 @@ class RunSummary(SummaryPart):
     linearisation: LinearisationPart | NoLinearisationPart | None = None
     fidelity: FidelityPart | NoFidelityPart | None = None
     conditions: ConditionsPart | None = None
-    claims: list[ClaimPart] = []
+    claims: list[Claim] = []
     judged_until_s: Real = None
     exit: ExitPart
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from cosim.analysis.fidelity import Fidelity
     from cosim.analysis.replay import Replay
-    from cosim.analysis.run_outcome import Outcome
+    from cosim.analysis.run_summary import Outcome
     from cosim.record.run_record import RunRecord
     from cosim.studies.comparison.run_comparison import RunComparison
 

@@ -17,7 +17,10 @@ from rich.markup import escape
 
 from cosim.cli import commands, completion
 from cosim.cli.program import NAME, Program, be_patient
+from cosim.record.run_directory import DEFAULT_RUNS as DEFAULT_RUNS
 from cosim.shipped_files import find_shipped
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import load
 from noack.core.errors import ExitStatus, NoackError, why
 from noack.runtime.command_line import failed
 
@@ -181,6 +184,11 @@ def register_commands() -> None:
 def find_scenario(name: str) -> Path:
     """Return the path of a scenario given by path, or by the name of a shipped one."""
     return find_shipped(name, "scenarios")
+
+
+def load_scenario(name: str, settings: Sequence[str] | None) -> Scenario:
+    """Load a scenario given by path or name, with the values of ``--set``."""
+    return load(find_scenario(name), settings or ())
 
 
 def cores() -> int:

@@ -85,10 +85,11 @@ def be_patient() -> None:
 
     Hence `noack run ... | head -1` runs to its end, with the run's exit status.
     """
-    sys.stdout, sys.stderr = _patient(sys.stdout), _patient(sys.stderr)
+    sys.stdout, sys.stderr = patient_stream(sys.stdout), patient_stream(sys.stderr)
 
 
-def _patient(stream: Any) -> Any:
+def patient_stream(stream: Any) -> Any:
+    """Return a standard stream that discards output after its reader has closed it."""
     if not isinstance(stream, io.TextIOWrapper):  # the shell closed it by >&-
         return stream
     return io.TextIOWrapper(

@@ -1,8 +1,13 @@
-"""Judges the measurements of a machine: findings, their meaning for a run, remedies."""
+"""Findings on a machine, from its measurements: their meaning for a run, remedies, a table."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 from cosim.doctor.machine_facts import Lateness, MachineFacts, RunRequirements
 from noack.core.number_format import byte_size, duration
@@ -58,6 +63,12 @@ class MachineFinding(NamedTuple):
 
 
 GOOD, LIMITED, BAD = FindingStatus
+_VERDICTS = {
+    GOOD: ("green", "ready"),
+    LIMITED: ("yellow", "ready, with the limits above"),
+    BAD: ("bold red", "not ready: no run is possible"),
+}
+"""Colour of a finding; verdict on the machine if this is the worst finding."""
 
 
 def judge(machine: MachineFacts, wanted: RunRequirements) -> list[MachineFinding]:
@@ -95,20 +106,17 @@ def _cores(machine: MachineFacts) -> MachineFinding:
         known.append(f"load {machine.load:.1f}")
     if machine.governor is not None:
         known.append(f"governor {machine.governor}")
-    means, remedy, verdict = "", "", GOOD
+    what, found = "cores", ", ".join(known)
     if machine.cores < 2:
-        verdict = LIMITED
         means = f"the {LOOP_PROCESSES} processes of a run compete for one core"
-        remedy = "use two cores or more"
-    elif machine.load is not None and machine.load > machine.cores:
-        verdict = LIMITED
+        return MachineFinding(what, LIMITED, found, means, "use two cores or more")
+    if machine.load is not None and machine.load > machine.cores:
         means = "other programs use the cores: the measurements below are of a busy machine"
-        remedy = "measure again when the machine is idle"
-    elif machine.governor == "powersave":
-        verdict = LIMITED
-        means = "cores run slowly after waking up"
+        return MachineFinding(what, LIMITED, found, means, "measure again when it is idle")
+    if machine.governor == "powersave":
         remedy = "`sudo cpupower frequency-set --governor performance`"
-    return MachineFinding("cores", verdict, ", ".join(known), means, remedy)
+        return MachineFinding(what, LIMITED, found, "cores run slowly after waking up", remedy)
+    return MachineFinding(what, GOOD, found)
 
 
 def _settings(machine: MachineFacts, wanted: RunRequirements) -> Iterator[MachineFinding]:
@@ -120,10 +128,9 @@ def _settings(machine: MachineFacts, wanted: RunRequirements) -> Iterator[Machin
         answer = machine.granted.get(key, "not known")
         if not answer.startswith("not permitted"):
             continue
+        verdict, means = GOOD, f"{wanted.name} does not use it"
         if wanted.realtime:
-            means, verdict = "runs work without it, and report it", LIMITED
-        else:
-            means, verdict = f"{wanted.name} does not use it", GOOD
+            verdict, means = LIMITED, "runs work without it, and report it"
         yield MachineFinding(what, verdict, f"{name}: {answer}", means, _REMEDIES.get(key, ""))
 
 
@@ -134,7 +141,7 @@ def _timer(machine: MachineFacts) -> MachineFinding:
         known.append(f"default slack {duration(slack * 1e-9)}")
     found = ", ".join(known)
     if machine.timer_resolution_ns >= _SLOW_TIMER_NS:
-        means = "shorter steps cannot be told apart"
+        means = "shorter steps cannot be distinguished"
         return MachineFinding("timers", LIMITED, found, means, "lower plant.rate_hz")
     return MachineFinding("timers", GOOD, found)
 
@@ -197,12 +204,10 @@ def _buffer(machine: MachineFacts, wanted: RunRequirements) -> MachineFinding:
 
 
 def _ports(machine: MachineFacts, wanted: RunRequirements) -> Iterator[MachineFinding]:
-    what = f"ports of {wanted.name}"
+    what, means = f"ports of {wanted.name}", f"{wanted.name} cannot run on its configured ports"
+    remedy = "stop the program that uses the port, or `--set ports={}`"
     for line in machine.ports_taken:
-        means = f"{wanted.name} cannot run on its configured ports"
-        yield MachineFinding(
-            what, BAD, line, means, "stop the program that uses the port, or `--set ports={}`"
-        )
+        yield MachineFinding(what, BAD, line, means, remedy)
     if not machine.ports_taken:
         numbers = ", ".join(str(port) for port in wanted.ports.values())
         yield MachineFinding(what, GOOD, f"{numbers} free" if numbers else "any free port")
@@ -214,9 +219,8 @@ def _control(machine: MachineFacts) -> MachineFinding:
         means = "the processes of a run cannot join it"
         remedy = "allow TCP connections to 127.0.0.1"
         return MachineFinding(what, BAD, found, means, remedy)
-    return MachineFinding(
-        what, GOOD, f"zenoh over TCP on the loopback answers in {duration(found)}"
-    )
+    text = f"zenoh over TCP on the loopback answers in {duration(found)}"
+    return MachineFinding(what, GOOD, text)
 
 
 def _disk(machine: MachineFacts, wanted: RunRequirements) -> MachineFinding:
@@ -241,9 +245,8 @@ def _runtime_folder(machine: MachineFacts) -> MachineFinding:
     if problem is None:
         return MachineFinding(what, GOOD, "private to this user")
     means = "`noack record` cannot open a run for other terminals, and `noack set` finds no run"
-    return MachineFinding(
-        what, LIMITED, problem, means, "set XDG_RUNTIME_DIR to a folder that you own"
-    )
+    remedy = "set XDG_RUNTIME_DIR to a folder that you own"
+    return MachineFinding(what, LIMITED, problem, means, remedy)
 
 
 def _cache(machine: MachineFacts) -> MachineFinding:
@@ -286,3 +289,38 @@ def _versions(machine: MachineFacts) -> MachineFinding:
         return MachineFinding("versions", GOOD, ", ".join(known))
     means = f"{', '.join(missing)}: not installed as a package, so runs cannot record the version"
     return MachineFinding("versions", LIMITED, ", ".join(known), means, "`pip install noack`")
+
+
+def document(
+    machine: MachineFacts, wanted: RunRequirements, findings: Sequence[MachineFinding]
+) -> dict[str, Any]:
+    """Return ``verdict``, ``findings``, and the numbers behind them, for JSON."""
+    return {
+        "scenario": wanted._asdict() | {"ports": dict(wanted.ports)},
+        "verdict": worst(findings),
+        "findings": [one._asdict() for one in findings],
+        "measured": {
+            name: value._asdict() if hasattr(value, "_asdict") else value
+            for name, value in asdict(machine).items()
+        },
+    }
+
+
+def print_findings(
+    console: Console, wanted: RunRequirements, findings: Sequence[MachineFinding]
+) -> None:
+    """Print each finding, its meaning for a run, and a remedy."""
+    table = Table.grid(padding=(0, 2))
+    table.add_column(no_wrap=True)
+    table.add_column(max_width=26)
+    table.add_column(ratio=1)
+    for one in findings:
+        text = Text(one.found)
+        if one.means:
+            text.append(f"\n{one.means}", "" if one.verdict is not GOOD else "dim")
+        if one.remedy:
+            text.append(f"\n→ {one.remedy}", "cyan")
+        table.add_row(Text(one.verdict, _VERDICTS[one.verdict][0]), Text(one.what), text)
+    console.print(table)
+    colour, verdict = _VERDICTS[worst(findings)]
+    console.print(Text.assemble("this machine, for ", wanted.name, ": ", (verdict, colour)))

@@ -118,8 +118,8 @@ def _wake_ups(
             timeout=_PATIENCE_S + 10 * duration_s,
         )  # fmt: skip
     except (OSError, subprocess.SubprocessError) as error:
-        said = one_line(error)
-        return said, said, {}
+        reason = one_line(error)
+        return reason, reason, {}
     found: dict[str, Any] = json.loads(done.stdout)
     plain, realtime = (lateness(found[name], wanted.allowance_ns) for name in ("plain", "realtime"))
     return plain, realtime, found["granted"]
@@ -176,12 +176,10 @@ def _buffer() -> Buffer:
         for _ in range(_FLOOD):
             sender.send(_DATAGRAM)
         held = 0
-        try:
+        with suppress(BlockingIOError):
             while held < _FLOOD:
                 endpoint.recv(len(_DATAGRAM) + 1)
                 held += 1
-        except BlockingIOError:
-            pass
         granted = endpoint.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
     most = _read(Path("/proc/sys/net/core/rmem_max"))
     return Buffer(held, granted, int(most) if most else None)
@@ -271,7 +269,6 @@ def _cache() -> bool:
 
 
 def _timer_slack_ns() -> int | None:
-    """Return the default timer slack."""
     if sys.platform != "linux":
         return None
     found: int = ctypes.CDLL(None).prctl(_PR_GET_TIMERSLACK, 0, 0, 0, 0)

@@ -117,7 +117,7 @@ def _publish_session(stack: contextlib.ExitStack, ticket: Ticket, session: str) 
         CallerError: another run is open in the session.
     """
     try:
-        stack.enter_context(published(ticket._replace(launched=False), session))
+        stack.enter_context(published(ticket.model_copy(update={"launched": False}), session))
     except CallerError:
         shutil.rmtree(ticket.run_dir, ignore_errors=True)
         raise

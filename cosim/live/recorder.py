@@ -21,7 +21,7 @@ from cosim.output.viewer.run_view import open_view, write_view
 from cosim.output.viewer.table_feed import ViewFeed
 from cosim.record.run_directory import active_run
 from cosim.record.run_record import Rows, RunRecord, finish_record, report_of, write_reports
-from noack.config.parameter_changes import ParameterChange, said_of
+from noack.config.parameter_changes import ParameterChange, change_notice
 from noack.config.runtime_parameters import is_of_loss_alone
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
@@ -142,7 +142,7 @@ class Recorder:
     def change(self, change: ParameterChange, announcement: Mapping[str, Any]) -> None:
         """Log a change of runtime parameters, with the time of its request."""
         at_s, date = announcement["requested_ns"] / NS_PER_S, announcement["requested_at"]
-        notice = said_of(change, f"; requested at {at_s:.3f} s, {date}")
+        notice = change_notice(change, f"; requested at {at_s:.3f} s, {date}")
         self.note(notice)
         self._progress.add_change(notice.text)
         if not is_of_loss_alone(change.settings):

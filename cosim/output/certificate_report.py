@@ -1,7 +1,6 @@
 """The certificates of a scenario, as tables and as JSON."""
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -10,11 +9,12 @@ from rich.markup import escape
 from rich.table import Table
 
 from cosim.output.assumptions_table import print_assumptions
+from cosim.output.row_display import Rows, as_html, as_text
 from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
-from noack.core.number_format import duration, number
+from noack.core.number_format import NONE, duration, number
 from noack.theory.assumptions import assumptions
 from noack.theory.certificate import NetworkConditions
 from noack.theory.enclosure import NotDecayingError
@@ -47,56 +47,120 @@ class NetworkLimits(NamedTuple):
     hold_s: float
 
 
-@dataclass(frozen=True)
-class Study:
-    """All certificates of a scenario.
+class Certificates:
+    """The certificates of a scenario's plant, and of all plants in its uncertainty box.
+
+    A certificate has ``constants``, or None with the reason in ``void``. It has ``conditions`` on
+    network and schedule, which it assumes, and ``assumptions``, each with its verdict. It has
+    ``inter_event_s``, the minimum inter-event time δ̲, and three bounds as functions of time in
+    seconds: ``sensor_error``, ``controller_error`` and ``state``. The constants include ``delta``,
+    Δ of ‖e_c‖ ≤ Δβe^(−αt), ``state``, X of ‖x‖ ≤ Xe^(−αt), and ``rate_per_s``, the decay rate of
+    all bounds. ``docs/theory.md`` derives them.
+
+    Iteration yields each certificate with the conditions that it assumes: IDEAL or SCHEDULE.
 
     Args:
-        resolved: the resolved scenario.
-        certificates: under the paper's conditions and under the schedule's.
-        scopes: the plants that they cover.
-        scheduled: the schedule's conditions.
-        theorem_2: the paper's bounds, with Δ from the ideal certificate.
+        scenario: the resolved scenario.
+        late_periods: allowed lateness in steps of the plant.
         weight: W, if noack chose it.
+
+    Raises:
+        CallerError: its updates are acknowledged, its plant is nonlinear or disturbed, or its
+            state is not measured exactly.
     """
 
-    resolved: Scenario
-    certificates: Sequence[tuple[str, ScenarioCertificate]]
-    scopes: Sequence[CertificateScope]
-    scheduled: NetworkConditions
+    scenario: Scenario
+    """The resolved scenario of the certificates, with the requested weight."""
     theorem_2: Theorem2 | None
+    """Theorem 2 by the paper's formula, with Δ of ``paper``; None if it cannot be evaluated."""
     weight: Matrix | None
+    """W of the trigger's norm, (n, n), if this call chose it; else None."""
 
-    @cached_property
-    def limits(self) -> dict[str, NetworkLimits]:
-        """Limits by scope; computed at first use, from about a hundred certificates."""
-        return {scope.name: _limits(scope, self.scheduled) for scope in self.scopes}
+    def __init__(self, scenario: Scenario, late_periods: int, weight: Matrix | None = None) -> None:
+        scenario.coverage.require_unchanging()
+        scenario.coverage.require_exact()
+        self.scenario, self.weight = scenario, weight
+        self._scheduled = nominal_conditions(scenario, late_periods)
+        conditions = {IDEAL: ideal_conditions(scenario), SCHEDULE: self._scheduled}
+        scopes = (own_plant(scenario), box(scenario))
+        self._scopes = [scope for scope in scopes if scope is not None]
+        self._certificates = [
+            (under, scope.certificate(of)) for under, of in conditions.items()
+            for scope in self._scopes
+        ]  # fmt: skip
+        self.theorem_2 = _theorem_2(scenario, self.paper)
 
-    def certificate(self, under: str) -> ScenarioCertificate:
-        """The certificate of the scenario's own plant, under IDEAL or SCHEDULE."""
-        return next(one for key, one in self.certificates if key == under)
+    def __iter__(self) -> Iterator[tuple[str, ScenarioCertificate]]:
+        return iter(self._certificates)
 
-    def box_certificate(self, under: str) -> ScenarioCertificate | None:
-        """The certificate of the scenario's uncertainty box; None if it has none."""
-        of_box = (one for key, one in self.certificates if key == under and one.scope == BOX)
-        return next(of_box, None)
+    @property
+    def paper(self) -> ScenarioCertificate:
+        """Under the paper's conditions: no sampling, no delay and no held input."""
+        return self._of(IDEAL)[0]
+
+    @property
+    def schedule(self) -> ScenarioCertificate:
+        """Under the scenario's own schedule, with its permitted lateness."""
+        return self._of(SCHEDULE)[0]
+
+    @property
+    def paper_box(self) -> ScenarioCertificate | None:
+        """For every plant in the box, under the paper's conditions; None if there is no box."""
+        return next(iter(self._of(IDEAL)[1:]), None)
+
+    @property
+    def schedule_box(self) -> ScenarioCertificate | None:
+        """For every plant in the box, under the scenario's schedule; None if there is no box."""
+        return next(iter(self._of(SCHEDULE)[1:]), None)
+
+    @property
+    def limits(self) -> NetworkLimits:
+        """Limits of the schedule's times for the scenario's plant, each varied alone, in s.
+
+        They are computed at the first access, which takes about a second.
+        """
+        return next(iter(self._limits.values()))
 
     def to_json(self) -> dict[str, Any]:
-        """Return the study as one JSON document."""
-        theorem = None if self.theorem_2 is None else self.theorem_2._asdict()
+        """Return all certificates as one document, as ``noack certify --json`` prints it."""
         return {
-            "scenario": self.resolved.name,
+            "scenario": self.scenario.name,
             "weight": None if self.weight is None else self.weight.tolist(),
             "paper": {
-                "assumptions": [a._asdict() for a in assumptions(self.resolved)],
-                "theorem_2": theorem,
+                "assumptions": [a._asdict() for a in assumptions(self.scenario)],
+                "theorem_2": None if self.theorem_2 is None else self.theorem_2._asdict(),
             },
-            "certificates": [
-                {"under": under, **certificate.to_json()}
-                for under, certificate in self.certificates
-            ],
-            "limits": {scope: limits._asdict() for scope, limits in self.limits.items()},
+            "certificates": [{"under": under, **one.to_json()} for under, one in self],
+            "limits": {scope: limits._asdict() for scope, limits in self._limits.items()},
         }
+
+    @cached_property
+    def _limits(self) -> dict[str, NetworkLimits]:
+        """Limits by scope, from about a hundred certificates."""
+        return {scope.name: _limits(scope, self._scheduled) for scope in self._scopes}
+
+    def _of(self, conditions: str) -> list[ScenarioCertificate]:
+        return [one for under, one in self if under == conditions]
+
+    def _rows(self) -> Rows:
+        heads = [f"{under}, {_whose(one)}" for under, one in self]
+        rows = [[label, *values] for label, values, _ in _constants(self)]
+        return [[self.scenario.name, *heads], *rows]
+
+    def __repr__(self) -> str:
+        return as_text(self._rows())
+
+    def _repr_html_(self) -> str:
+        return as_html(self._rows())
+
+
+def _theorem_2(scenario: Scenario, certificate: ScenarioCertificate) -> Theorem2 | None:
+    trigger, constants = scenario.decaying, certificate.constants
+    if constants is None or constants.rate_per_s != trigger.alpha_per_s:
+        return None
+    if trigger.floor or trigger.weight is not None:
+        return None
+    return theorem_2(loop_of(scenario), trigger.beta, trigger.alpha_per_s, constants.delta)
 
 
 def with_weight(
@@ -126,13 +190,13 @@ def with_weight(
     return resolved.model_copy(update={"trigger": trigger}), weight
 
 
-def study_scenario(
+def certificates_of(
     scenario: Scenario,
     weight: str = "given",
     late_periods: int | None = None,
     progress: Callable[[float], None] = lambda share: None,
-) -> Study:
-    """Certify a scenario as :func:`study` does, with a chosen norm and allowed lateness.
+) -> Certificates:
+    """Certify a scenario under the paper's conditions and under its own schedule.
 
     Args:
         scenario: as loaded; it is resolved here.
@@ -148,58 +212,31 @@ def study_scenario(
     if not 0 <= allowed <= MOST_LATE:
         raise CallerError(f"late: {allowed} steps; give 0 to {MOST_LATE}")
     weighted, W = with_weight(resolved, weight, progress)
-    return study(weighted, allowed, W)
-
-
-def study(resolved: Scenario, late_periods: int, weight: Matrix | None = None) -> Study:
-    """Certify a scenario under the paper's conditions and under its own schedule.
-
-    Raises:
-        CallerError: its updates are acknowledged, its plant is nonlinear or disturbed, or its
-            state is not measured exactly.
-    """
-    resolved.coverage.require_unacknowledged()
-    resolved.coverage.require_unchanging()
-    resolved.coverage.require_exact()
-    ideal, scheduled = ideal_conditions(resolved), nominal_conditions(resolved, late_periods)
-    scopes = [scope for scope in (own_plant(resolved), box(resolved)) if scope is not None]
-    certificates = [(IDEAL, scope.certificate(ideal)) for scope in scopes]
-    certificates += [(SCHEDULE, scope.certificate(scheduled)) for scope in scopes]
-    first = certificates[0][1].constants
-    trigger = resolved.decaying
-    theorem = (
-        theorem_2(loop_of(resolved), trigger.beta, trigger.alpha_per_s, first.delta)
-        if first is not None and first.rate_per_s == trigger.alpha_per_s and not trigger.floor
-        and trigger.weight is None
-        else None
-    )  # fmt: skip
-    return Study(resolved, certificates, scopes, scheduled, theorem, weight)
+    return Certificates(weighted, allowed, W)
 
 
 def _limits(scope: CertificateScope, scheduled: NetworkConditions) -> NetworkLimits:
-    return NetworkLimits(
-        scope.largest(
-            scheduled, lambda c, value: c._replace(sampling_s=value, spacing_s=value), _MOST_S
-        ),
-        scope.largest(
-            scheduled, lambda c, value: c._replace(delay_s=value, start_s=value), _MOST_S
-        ),
-        scope.largest(scheduled, lambda c, value: c._replace(hold_s=value), _MOST_S),
+    sampled = scope.largest(
+        scheduled, lambda c, value: c._replace(sampling_s=value, spacing_s=value), _MOST_S
     )
+    delayed = scope.largest(
+        scheduled, lambda c, value: c._replace(delay_s=value, start_s=value), _MOST_S
+    )
+    held = scope.largest(scheduled, lambda c, value: c._replace(hold_s=value), _MOST_S)
+    return NetworkLimits(sampled, delayed, held)
 
 
-def print_study(console: Console, found: Study) -> None:
+def print_certificates(console: Console, found: Certificates) -> None:
     """Print the tables."""
     _print_constants(console, found)
     _print_limits(console, found)
-    if (outside := outside_box(found.resolved)) is not None:
+    if (outside := outside_box(found.scenario)) is not None:
         console.print(f"[yellow]the box certificates do not cover this plant:[/] {outside}")
     console.print("assumptions of the certificates for the schedule:")
-    certificate = next(c for under, c in found.certificates if under == SCHEDULE)
-    print_assumptions(console, [a._asdict() for a in certificate.assumptions])
+    print_assumptions(console, [a._asdict() for a in found.schedule.assumptions])
     console.print("assumptions of the paper's theorems:")
-    print_assumptions(console, [a._asdict() for a in assumptions(found.resolved)])
-    for sentence in in_words(found):
+    print_assumptions(console, [a._asdict() for a in assumptions(found.scenario)])
+    for sentence in _in_words(found):
         console.print(sentence, markup=False, highlight=False)
     if found.weight is not None:
         rows = ",\n".join(f"  {[float(f'{v:.6g}') for v in row]}" for row in found.weight)
@@ -209,9 +246,9 @@ def print_study(console: Console, found: Study) -> None:
         )  # fmt: skip
 
 
-def in_words(found: Study) -> Iterator[str]:
+def _in_words(found: Certificates) -> Iterator[str]:
     """Yield sentences with the certified bounds for the scenario's schedule."""
-    for under, certificate in found.certificates:
+    for under, certificate in found:
         constants, dropouts = certificate.constants, certificate.conditions.dropouts
         if under != SCHEDULE or constants is None:
             continue
@@ -229,90 +266,77 @@ def in_words(found: Study) -> Iterator[str]:
         )
 
 
-def _print_constants(console: Console, found: Study) -> None:
-    trigger = found.resolved.decaying
+def _print_constants(console: Console, found: Certificates) -> None:
+    trigger = found.scenario.decaying
     norm = "‖W·‖" if trigger.weight is not None else "‖·‖"
     table = Table(
-        title=f"{found.resolved.name}: certified bounds, M − 1 = {found.resolved.network.mansd}, "
+        title=f"{found.scenario.name}: certified bounds, M − 1 = {found.scenario.network.mansd}, "
         f"β = {trigger.beta:g}, α = {trigger.alpha_per_s:g} /s, errors in {norm}"
     )
     table.add_column("")
-    for under, certificate in found.certificates:
-        table.add_column(f"{under},\n{whose(certificate)}", justify="right")
+    for under, certificate in found:
+        table.add_column(f"{under},\n{_whose(certificate)}", justify="right")
     printed = found.theorem_2 is not None
     if printed:
         table.add_column("paper's\nTheorem 2", justify="right")
-    for label, values, of_theorem in constants(found):
+    for label, values, of_theorem in _constants(found):
         table.add_row(label, *values, *([of_theorem] if printed else []))
     console.print(table)
     console.print(
-        "[dim]All bounds are multiplied by e^(−rate·t). paper: no sampling, no delay, no hold. "
-        "schedule: the scenario's rates, plus the lateness that it allows. plant: the scenario's "
-        "plant. box: every plant of the uncertainty box.[/]"
+        "[dim]Each bound of a norm is multiplied by e^(−rate·t). paper: no sampling, no delay, no "
+        "hold. schedule: the scenario's rates, plus the lateness that it allows. plant: the "
+        "scenario's plant. box: every plant of the uncertainty box.[/]"
     )
-    for under, certificate in found.certificates:
+    for under, certificate in found:
         if certificate.void:
             console.print(
                 f"[yellow]void[/] ({under}, {certificate.scope}): {escape(certificate.void)}"
             )
 
 
-def whose(certificate: ScenarioCertificate) -> str:
+def _whose(certificate: ScenarioCertificate) -> str:
     """Return which plants a certificate covers: "box" or "plant"."""
     return "box" if certificate.scope == BOX else "plant"
 
 
-def constants(found: Study) -> Iterator[tuple[str, list[str], str]]:
+def _constants(found: Certificates) -> Iterator[tuple[str, list[str], str]]:
     """Yield rows: label, the value of each certificate, the value of Theorem 2."""
-    theorem, all_certificates = found.theorem_2, [c for _, c in found.certificates]
+    certificates = [certificate for _, certificate in found]
 
     def row(value: Callable[[ScenarioCertificate], float | None]) -> list[str]:
-        return [number(value(c), 4) if c.constants else "void" for c in all_certificates]
+        return [number(value(c), 4) if c.constants else "void" for c in certificates]
 
     def constant(name: str) -> list[str]:
         return row(lambda c: getattr(c.constants, name))
 
-    yield (
-        "decay rate, 1/s",
-        constant("rate_per_s"),
-        number(found.resolved.decaying.alpha_per_s, 4),
-    )
-    yield "updates outstanding", constant("missing_events"), "-"
-    yield (
-        "Δ, bound of ‖e_c‖/β",
-        constant("delta"),
-        ("(same)" if theorem is not None else "-"),
-    )
+    def after_floor(name: str) -> list[str]:
+        return row(lambda c: getattr(c.floor_constants, name, None))
+
+    delta_2 = state_2 = spacing_2 = NONE
+    if (theorem := found.theorem_2) is not None:
+        delta_2 = "(same)"
+        state_2 = number(theorem.state_start + theorem.state_forced, 4)
+        spacing_2 = number(theorem.inter_event_s, 4)
+    rate_2 = number(found.scenario.decaying.alpha_per_s, 4)
+    yield "decay rate, 1/s", constant("rate_per_s"), rate_2
+    yield "updates outstanding", constant("missing_events"), NONE
+    yield "Δ, bound of ‖e_c‖/β", constant("delta"), delta_2
     yield "bound of ‖e_s‖/β", constant("overshoot"), "1"
-    yield "bound of ‖u − Kx‖", constant("input_error"), "-"
-    yield (
-        "X, bound of ‖x‖",
-        constant("state"),
-        (number(theorem.state_start + theorem.state_forced, 4) if theorem is not None else "-"),
-    )
-    yield (
-        "inter-event time, s",
-        row(lambda c: c.inter_event_s),
-        (number(theorem.inter_event_s, 4) if theorem is not None else "-"),
-    )
-    yield "loop gain (< 1)", constant("loop_gain"), "-"
-    if any(c.floor_constants for c in all_certificates):
-        yield "floor reached at, s", row(lambda c: c.floor_from_s), "-"
-        for label, name in (("from then on, ‖e_c‖/ε", "delta"), ("from then on, ‖x‖", "state")):
-            yield (
-                label,
-                row(
-                    lambda c, name=name: getattr(c.floor_constants, name, None)  # type: ignore[misc]
-                ),
-                "-",
-            )
+    yield "bound of ‖u − Kx‖", constant("input_error"), NONE
+    yield "X, bound of ‖x‖", constant("state"), state_2
+    yield "inter-event time, s", row(lambda c: c.inter_event_s), spacing_2
+    yield "loop gain (< 1)", constant("loop_gain"), NONE
+    if any(c.floor_constants for c in certificates):
+        yield "floor reached at, s", row(lambda c: c.floor_from_s), NONE
+        yield "from then on, ‖e_c‖/ε", after_floor("delta"), NONE
+        yield "from then on, ‖x‖", after_floor("state"), NONE
 
 
-def _print_limits(console: Console, found: Study) -> None:
+def _print_limits(console: Console, found: Certificates) -> None:
     table = Table(title="schedule: largest value that is certified, one quantity at a time")
     for heading in ("", "sampling period", "delay of updates", "age of inputs"):
         table.add_column(heading, justify="right" if heading else "left")
-    for scope, limits in found.limits.items():
+    for scope, limits in found._limits.items():
         table.add_row(scope, *map(_limit, limits))
     console.print(table)
 

@@ -43,7 +43,7 @@ def _warnings(summary: Summary) -> Iterator[str]:
         yield f"the plant missed {share:.0f} % of its deadlines: lower speed or plant.rate_hz"
     first, last = summary["initial_state_norm"], summary["final_state_norm"]
     grew = first is not None and last is not None and last > _MOST_GROWTH * first > 0
-    if grew and summary.get("diverged_at_s") is None:  # else it is the reason why the run ended
+    if grew and summary["diverged_at_s"] is None:  # else it is the reason why the run ended
         yield f"‖x‖ grew from {first:.3g} to {last:.3g} during the run"
     if (summary.get("fidelity") or {}).get("explained") is False:
         yield "sampling, delay and hold do not explain the difference to the ideal loop"
@@ -53,22 +53,17 @@ def _warnings(summary: Summary) -> Iterator[str]:
     if summary["unintended_losses"]:
         where = ", ".join(f"{n} on {leg}" for leg, n in summary["unintended_losses_by_leg"].items())
         yield f"{summary['unintended_losses']} datagrams were lost elsewhere (kernel): {where}"
-    for one in summary.get("restarts") or ():
+    for one in summary["restarts"]:
         yield f"{one['process']} was restarted, {away(one)}; claims are void from then on"
     for when, what in changes_in(summary):
         yield f"{when}: {what}"
     for role, reasons in summary["rejected_datagrams"].items():
         counts = ", ".join(f"{reason.replace('_', ' ')} {n}" for reason, n in reasons.items())
         yield f"{role} rejected datagrams: {counts}"
-    if _was_late(summary):
+    # Claims are void because this machine was late.
+    causes = {one["cause"] for one in summary["assumption_violations"]} & {"delay", "hold"}
+    if causes and summary["kind"] == "live" and not summary["restarts"]:
         yield (
             "This machine was late, so some claims were not judged to the end. To allow more "
             "lateness, raise certificate.late_periods."
         )
-
-
-def _was_late(summary: Summary) -> bool:
-    """Whether claims are void because this machine was late."""
-    undisturbed = summary.get("kind", "live") == "live" and not summary.get("restarts")
-    causes = {one["cause"] for one in summary["assumption_violations"]}
-    return undisturbed and bool(causes & {"delay", "hold"})

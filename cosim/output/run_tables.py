@@ -6,8 +6,9 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
-from cosim.analysis.model_comparison import said
+from cosim.analysis.model_comparison import linearisation_rows
 from cosim.analysis.run_summary import Summary
 from cosim.output.assumptions_table import print_assumptions
 from cosim.output.fidelity_table import summary_rows
@@ -16,6 +17,7 @@ from noack.core.number_format import NONE, number, ratio, seconds, whole
 Numbers = tuple[tuple[str, str], ...]
 """Quantities and their values, as text."""
 _QUANTILES = ("p50", "p99", "p999", "max")
+TIMING_HEADINGS = ("p50", "p99", "p99.9", "max", "count", "missed")
 
 
 def print_details(console: Console, summary: Summary) -> None:
@@ -31,9 +33,9 @@ def print_details(console: Console, summary: Summary) -> None:
 
 def number_table(summary: Summary, rows: Numbers) -> Table:
     """Return a run's numbers as a table; its title names scenario, mode and cap."""
-    kind = summary.get("kind", "live")
-    how = "" if kind == "live" else f", {kind}"
-    title = f"{summary['scenario']}, {_mode(summary)}, M − 1 = {summary['mansd']}{how}"
+    mode = "model-based" if summary["mode"] == "model" else "zero-order hold"
+    kind = "" if summary["kind"] == "live" else f", {summary['kind']}"
+    title = f"{summary['scenario']}, {mode}, M − 1 = {summary['mansd']}{kind}"
     table = Table(title=escape(title))
     table.add_column("quantity")
     table.add_column("value", justify="right")
@@ -44,16 +46,17 @@ def number_table(summary: Summary, rows: Numbers) -> Table:
 
 def short_numbers(summary: Summary) -> Numbers:
     """Return the most important numbers of a run, for 80 columns."""
-    lost, longest, *intervals = loss_and_interval_rows(summary)
+    fidelity = summary.get("fidelity")
+    compared = fidelity is not None and fidelity["reason"] is None
     return (
-        lost,
-        longest,
+        _lost(summary),
+        _longest_burst(summary),
         _forced(summary),
-        *intervals,
+        *_intervals(summary),
         *_norms(summary),
         *_lateness(summary),
         *_replay_rows(summary.get("replay")),
-        *_ideal_difference(summary.get("fidelity")),
+        *([next(summary_rows(fidelity))] if compared else ()),
     )
 
 
@@ -67,32 +70,35 @@ def key_numbers(summary: Summary) -> Numbers:
     return (
         ("transmissions", str(summary["events"])),
         ("deliveries", str(summary["deliveries"])),
-        _forced(summary),
-        _lost(summary),
-        *_expected(summary.get("loss_expected")),
-        *_causes(summary),
-        *_acknowledgements(summary.get("acknowledgements")),
-        _longest_burst(summary),
-        ("loss bursts beyond M − 1", str(_bursts_beyond_mansd(summary))),
+        *_losses(summary),
         *_intervals(summary),
         *_norms(summary),
-        ("numerical check of x_c − x_s (I1)", number(summary["identity_residual_relative"])),
-        *_judged_until(summary.get("judged_until_s")),
-        ("missing samples", str(summary["missing_samples"])),
-        ("lost elsewhere (kernel)", str(summary["unintended_losses"])),
-        *_restarts(summary.get("restarts")),
-        *changes_in(summary),
-        *_watchdog(summary.get("watchdog")),
-        *(said(found) if (found := summary.get("linearisation")) else ()),
-        *_estimation(summary.get("estimation")),
-        *_disturbances(summary.get("disturbances")),
+        *_record(summary),
+        *_watchdog(summary["watchdog"]),
+        *(linearisation_rows(found) if (found := summary.get("linearisation")) else ()),
+        *_estimation(summary["estimation"]),
+        *_disturbances(summary["disturbances"]),
         *_replay_rows(summary.get("replay")),
         *summary_rows(summary.get("fidelity")),
-    )  # fmt: skip
+    )
 
 
-def _bursts_beyond_mansd(summary: Summary) -> int:
-    return sum(one["cause"] == "dropouts" for one in summary["assumption_violations"])
+def _losses(summary: Summary) -> Iterator[tuple[str, str]]:
+    yield _forced(summary)
+    yield _lost(summary)
+    if (rate := summary["loss_expected"]) is not None:
+        yield "  expected loss rate with the cap", f"{100 * rate:.3g} %"
+    causes = summary["drops_by_cause"]
+    if set(causes) - {"dropped"}:
+        for cause, count in causes.items():
+            yield f"  of these {cause.replace('_', ' ')}", str(count)
+    if (sent := summary.get("acknowledgements")) is not None:
+        yield "acknowledgements", str(sent["sent"])
+        yield "  lost", f"{sent['lost']} ({ratio(sent['lost'], sent['sent'])})"
+        yield "  longest loss burst", str(sent["longest_loss_burst"])
+    yield _longest_burst(summary)
+    beyond = sum(one["cause"] == "dropouts" for one in summary["assumption_violations"])
+    yield "loss bursts beyond M − 1", str(beyond)
 
 
 def _lost(summary: Summary) -> tuple[str, str]:
@@ -101,9 +107,8 @@ def _lost(summary: Summary) -> tuple[str, str]:
 
 
 def _longest_burst(summary: Summary) -> tuple[str, str]:
-    return f"longest loss burst (cap M − 1 = {summary['mansd']})", str(
-        summary["longest_loss_burst"]
-    )
+    cap, longest = summary["mansd"], summary["longest_loss_burst"]
+    return f"longest loss burst (cap M − 1 = {cap})", str(longest)
 
 
 def _forced(summary: Summary) -> tuple[str, str]:
@@ -123,9 +128,15 @@ def _norms(summary: Summary) -> Iterator[tuple[str, str]]:
     yield "maximum ‖e_s‖, ‖e_c‖", ", ".join(map(number, errors))
 
 
-def _ideal_difference(fidelity: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
-    if fidelity is not None and fidelity["reason"] is None:
-        yield next(summary_rows(fidelity))
+def _record(summary: Summary) -> Iterator[tuple[str, str]]:
+    yield "numerical check of x_c − x_s (I1)", number(summary["identity_residual_relative"])
+    if (until_s := summary.get("judged_until_s")) is not None:
+        yield "claims checked until", seconds(until_s)
+    yield "missing samples", str(summary["missing_samples"])
+    yield "lost elsewhere (kernel)", str(summary["unintended_losses"])
+    for one in summary["restarts"]:
+        yield f"{one['process']} was restarted", away(one)
+    yield from changes_in(summary)
 
 
 def _lateness(summary: Summary) -> Iterator[tuple[str, str]]:
@@ -133,8 +144,7 @@ def _lateness(summary: Summary) -> Iterator[tuple[str, str]]:
     if latency := summary["latency_us"]:
         quantiles = " / ".join(whole(latency[key]) for key in ("p50", "p99"))
         yield "sensor-to-controller latency p50 / p99", f"{quantiles} µs"
-    late = summary["lateness_us"]
-    if late:
+    if late := summary["lateness_us"]:
         worst = max(late, key=lambda role: late[role]["late_steps"])
         missed, steps = late[worst]["late_steps"], late[worst]["steps"]
         if missed:
@@ -143,34 +153,15 @@ def _lateness(summary: Summary) -> Iterator[tuple[str, str]]:
             yield "deadlines missed", "none"
 
 
-def _causes(summary: Summary) -> Iterator[tuple[str, str]]:
-    causes = summary.get("drops_by_cause") or {}
-    if set(causes) - {"dropped"}:
-        for cause, number in causes.items():
-            yield f"  of these {cause.replace('_', ' ')}", str(number)
-
-
-def _acknowledgements(found: dict[str, int] | None) -> Iterator[tuple[str, str]]:
-    if found is not None:
-        yield "acknowledgements", str(found["sent"])
-        yield "  lost", f"{found['lost']} ({ratio(found['lost'], found['sent'])})"
-        yield "  longest loss burst", str(found["longest_loss_burst"])
-
-
-def _restarts(found: list[dict[str, Any]] | None) -> Iterator[tuple[str, str]]:
-    for one in found or ():
-        yield f"{one['process']} was restarted", away(one)
-
-
 def changes_in(summary: Summary) -> Iterator[tuple[str, str]]:
     """Yield the changes during the run, each with its time."""
-    for one in summary.get("changes") or ():
+    for one in summary["changes"]:
         yield f"changed at {one['t_s']:.3f} s", one["what"]
 
 
 def interval_of(claim: dict[str, Any]) -> str:
     """Return the interval of a claim; empty for the whole run."""
-    from_s, until_s = claim.get("from_s") or 0.0, claim.get("until_s")
+    from_s, until_s = claim["from_s"], claim["until_s"]
     if from_s == 0 and until_s is None:
         return ""
     return f"from {from_s:.3f} s " + ("on" if until_s is None else f"to {until_s:.3f} s")
@@ -184,9 +175,9 @@ def away(restart: dict[str, Any]) -> str:
     return f"{when}: {why}" if why else when
 
 
-def _watchdog(found: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
-    if found is not None and found["trips"]:
-        times = "once" if found["trips"] == 1 else f"{found['trips']} times"
+def _watchdog(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    if trips := found["trips"]:
+        times = "once" if trips == 1 else f"{trips} times"
         first, total = seconds(found["first_s"]), seconds(found["total_s"])
         yield "watchdog: newest actuation too old", f"{times}, first at {first}, {total} in total"
         yield "  policy applied", found["policy"]
@@ -194,30 +185,19 @@ def _watchdog(found: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
 
 def _estimation(found: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
     if found is not None:
-        rms, expected = number(found["rms_second_half"]), number(found["expected_rms"])
         what = f"estimated ({found['observer']})" if found["observer"] else "measured with noise"
-        yield f"state {what}: RMS ‖x̂ − x‖ in the second half", rms
-        yield "  predicted for an exact model", expected
+        errors = (found["max"], found["sup_e_c_norm"])
         yield (
-            "maximum ‖x̂ − x‖, ‖x_c − x‖",
-            f"{number(found['max'])}, {number(found['sup_e_c_norm'])}",
-        )
+            f"state {what}: RMS ‖x̂ − x‖ in the second half", number(found["rms_second_half"])
+        )  # fmt: skip
+        yield "  predicted for an exact model", number(found["expected_rms"])
+        yield "maximum ‖x̂ − x‖, ‖x_c − x‖", ", ".join(map(number, errors))
 
 
-def _judged_until(until_s: float | None) -> Iterator[tuple[str, str]]:
-    if until_s is not None:
-        yield "claims checked until", seconds(until_s)
-
-
-def _expected(rate: float | None) -> Iterator[tuple[str, str]]:
-    if rate is not None:
-        yield "  expected loss rate with the cap", f"{100 * rate:.3g} %"
-
-
-def _disturbances(found: list[dict[str, Any]] | None) -> Iterator[tuple[str, str]]:
-    for one in found or ():
-        what = f"disturbance at the {one['at']}: RMS, maximum"
-        yield what, f"{number(one['rms'])}, {number(one['max'])}"
+def _disturbances(found: list[dict[str, Any]]) -> Iterator[tuple[str, str]]:
+    for one in found:
+        sizes = f"{number(one['rms'])}, {number(one['max'])}"
+        yield f"disturbance at the {one['at']}: RMS, maximum", sizes
 
 
 def print_claims(console: Console, summary: Summary) -> None:
@@ -230,14 +210,13 @@ def print_claims(console: Console, summary: Summary) -> None:
     for heading in ("source", "claim", *(["interval"] if parts else []), "used", "verdict"):
         table.add_column(heading, justify="right" if heading == "used" else "left")
     for claim in claims:
-        used = NONE if claim["ratio"] is None else f"{100 * claim['ratio']:.3g} %"
         since = "" if claim["since_s"] is None else f" since {claim['since_s']:.3f} s"
-        colour = _CLAIM_COLOURS[claim["verdict"]]
         table.add_row(
-            *(escape(claim[key]) for key in ("source", "bound")),
+            escape(claim["source"]),
+            escape(claim["bound"]),
             *([interval_of(claim)] if parts else []),
-            used,
-            f"[{colour}]{claim['verdict']}{since}[/]",
+            NONE if claim["ratio"] is None else f"{100 * claim['ratio']:.3g} %",
+            Text(claim["verdict"] + since, _CLAIM_COLOURS[claim["verdict"]]),
         )
     console.print(table)
     if any(claim["ratio"] is not None for claim in claims):
@@ -245,15 +224,13 @@ def print_claims(console: Console, summary: Summary) -> None:
             "[dim]used: largest share of the bound reached during the run; "
             "bounds on ‖e_c‖ that are computed from the run itself are tight[/]"
         )
-    for verdict, why in dict.fromkeys((c["verdict"], c["why"]) for c in claims):
-        if verdict != "held" and why:
-            console.print(f"{verdict}: {_sources(claims, verdict, why)}: {why}",
-                          highlight=False, markup=False)  # fmt: skip
-
-
-def _sources(claims: list[dict[str, Any]], verdict: str, why: str) -> str:
-    same = (c["source"] for c in claims if (c["verdict"], c["why"]) == (verdict, why))
-    return "; ".join(dict.fromkeys(same))
+    sources: dict[tuple[str, str], list[str]] = {}
+    for claim in claims:
+        if claim["verdict"] != "held" and claim["why"]:
+            sources.setdefault((claim["verdict"], claim["why"]), []).append(claim["source"])
+    for (verdict, why), of in sources.items():
+        text = f"{verdict}: {'; '.join(dict.fromkeys(of))}: {why}"
+        console.print(text, highlight=False, markup=False)
 
 
 _CLAIM_COLOURS = {
@@ -269,30 +246,28 @@ def _replay_rows(verdict: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
     elif verdict["bit_exact"]:
         word = f"bit-exact, {verdict['inputs']:,} inputs"
     else:
-        found = verdict["first_difference"]
-        word = f"differs: {found['table']}, row {found['row']}, {found['column']}"
+        first = verdict["first_difference"]
+        word = f"differs: {first['table']}, row {first['row']}, {first['column']}"
     yield "replay", word if verdict.get("complete", True) else f"{word} (record incomplete)"
 
 
 def _timing_table(summary: Summary) -> Table:
     table = Table(title="timing in µs of wall time (missed: deadlines missed)")
-    for heading in ("", "p50", "p99", "p99.9", "max", "count", "missed"):
+    for heading in ("", *TIMING_HEADINGS):
         table.add_column(heading, justify="right" if heading else "left")
-    for role, late in summary["lateness_us"].items():
-        table.add_row(
-            f"{role} lateness",
-            *(whole(late[key]) for key in _QUANTILES),
-            str(late["steps"]),
-            str(late["late_steps"]),
-        )
-    latency = summary["latency_us"]
-    table.add_row(
-        "sensor-to-controller latency",
-        *(whole(latency[key]) for key in _QUANTILES),
-        str(latency["updates"]),
-        "",
-    )
+    for row in timing_rows(summary):
+        table.add_row(*row)
     return table
+
+
+def timing_rows(summary: Summary) -> Iterator[tuple[str, ...]]:
+    """Yield the lateness of each process, and the latency; their columns: TIMING_HEADINGS."""
+    for role, late in summary["lateness_us"].items():
+        counts = str(late["steps"]), str(late["late_steps"])
+        yield f"{role} lateness", *(whole(late[key]) for key in _QUANTILES), *counts
+    if latency := summary["latency_us"]:
+        quantiles = (whole(latency[key]) for key in _QUANTILES)
+        yield "sensor-to-controller latency", *quantiles, str(latency["updates"]), ""
 
 
 def _print_realtime(console: Console, realtime: dict[str, dict[str, str]]) -> None:
@@ -307,7 +282,3 @@ def _print_realtime(console: Console, realtime: dict[str, dict[str, str]]) -> No
     for text, roles in roles_by_settings.items():
         whose = "" if len(roles) == len(realtime) else f" of {', '.join(roles)}"
         console.print(f"real-time settings{whose}: {text}", highlight=False, markup=False)
-
-
-def _mode(summary: Summary) -> str:
-    return "model-based" if summary["mode"] == "model" else "zero-order hold"

@@ -11,8 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.text import Text
 
-from cosim.analysis.run_outcome import Outcome
-from cosim.analysis.run_summary import Summary
+from cosim.analysis.run_summary import Outcome, Summary
 from cosim.output.remarks import remarks
 from cosim.output.run_tables import number_table, print_details, short_numbers
 from cosim.record.run_directory import RECORDING_FILE, REPORT_FILE

@@ -210,7 +210,7 @@ def _at(
     return x_c, received
 
 
-def join_all(record: RunRecord) -> AlignedRun:
+def align_tables(record: RunRecord) -> AlignedRun:
     """Align a whole run."""
     steps = record[CONTROLLER_STEP]
     track = controller_track(initial_track(record.scenario), steps, record[CONTROLLER_DELIVERY])
@@ -222,44 +222,23 @@ def join_all(record: RunRecord) -> AlignedRun:
     )  # fmt: skip
 
 
-class IdentityResidual:
-    """Evaluates (I1) along a run, by batches of measurements.
-
-    Args:
-        scenario: the resolved scenario, without acknowledgements: (I1) assumes that x_s is
-            reset at every event.
-    """
-
-    def __init__(self, scenario: Scenario) -> None:
-        self._scenario = scenario
-        self._missed = ModelDifference(loop_of(scenario).H)
-
-    def of(self, measurements: Rows, joined: AlignedRun) -> Reals:
-        """Return the largest entry of |x_c − x_s − Σ e^{H(t−t_k)} e_s(t_k⁻)| by measurement, (k,).
-
-        Args:
-            measurements: the next rows of ``sensor_measurement``.
-            joined: the same rows, aligned.
-        """
-        missed = self._missed
-        residual = np.full(len(measurements), np.nan)
-        common = in_common(self._scenario, joined)
-        for i, row in enumerate(measurements):
-            missed.advance_to(int(row["t_ns"]))
-            if row["event"] != NO_SEQUENCE:
-                missed.event(int(row["event"]), row["x_s"] - row["x"])
-            missed.received(int(joined.received[i]))
-            if common[i]:
-                residual[i] = np.max(np.abs(joined.x_c[i] - joined.x_s[i] - missed.total()))
-        return residual
-
-
 def identity_residual(record: RunRecord, joined: AlignedRun) -> Reals:
-    """Return (I1)'s residual over a whole run, (k,); see :class:`IdentityResidual`.
+    """Return max |x_c − x_s − Σ e^{H(t−t_k)} e_s(t_k⁻)| at each measurement, (k,).
 
-    It is zero up to rounding on every run, for all losses. It is NaN if x_c is not recorded, and
-    before the first delivery unless x(0) is known. In a run with acknowledgements all are NaN.
+    This is the residual of (I1). It is zero up to rounding on every run, for all losses. It is NaN
+    if x_c is not recorded, and before the first delivery unless x(0) is known. In a run with
+    acknowledgements all are NaN, since (I1) assumes that x_s is reset at every event.
     """
+    residual = np.full(len(joined.t_ns), np.nan)
     if record.scenario.protocol.acknowledges:
-        return np.full(len(joined.t_ns), np.nan)
-    return IdentityResidual(record.scenario).of(record[SENSOR_MEASUREMENT], joined)
+        return residual
+    missed = ModelDifference(loop_of(record.scenario).H)
+    common = in_common(record.scenario, joined)
+    for i, row in enumerate(record[SENSOR_MEASUREMENT]):
+        missed.advance_to(int(row["t_ns"]))
+        if row["event"] != NO_SEQUENCE:
+            missed.event(int(row["event"]), row["x_s"] - row["x"])
+        missed.received(int(joined.received[i]))
+        if common[i]:
+            residual[i] = np.max(np.abs(joined.x_c[i] - joined.x_s[i] - missed.total()))
+    return residual

@@ -14,18 +14,16 @@ from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
 Reals = NDArray[np.float64]
 
 
-def true_states(steps: Rows, t_ns: NDArray[np.int64]) -> Reals:
+def true_states(steps: Rows, t_ns: NDArray[np.int64], column: str = "x") -> Reals:
     """Return the plant's own state at some times, (k, n); NaN if its row is missing.
 
-    Args:
-        steps: rows of ``plant_step``, ordered.
-        t_ns: (k,) times of measurements.
+    ``column`` of ``plant_step`` is ``x``, or ``z`` for the whole state of a nonlinear plant.
     """
-    found = np.full((len(t_ns), steps["x"].shape[1]), np.nan)
+    found = np.full((len(t_ns), steps[column].shape[1]), np.nan)
     if len(steps):
         place = np.searchsorted(steps["t_ns"], t_ns).clip(max=len(steps) - 1)
         there = steps["t_ns"][place] == t_ns
-        found[there] = steps["x"][place[there]]
+        found[there] = steps[column][place[there]]
     return found
 
 

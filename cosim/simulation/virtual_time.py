@@ -20,7 +20,7 @@ from netem.link_machine import Datagram
 from noack.config.parameter_changes import (
     ParameterChange,
     ReconfigurableMachine,
-    said_of,
+    change_notice,
     scheduled,
 )
 from noack.config.resolution import tables_of
@@ -61,11 +61,7 @@ _HAPPENINGS_PER_WORD = 4096
 
 
 class DecidedLink:
-    """A link with given losses and delays: of a pattern, an adversary or another run.
-
-    Args:
-        decide: the network's decision for each datagram.
-    """
+    """A link with given losses and delays: of a pattern, an adversary or another run."""
 
     def __init__(self, decide: Network) -> None:
         self._decide = decide
@@ -258,7 +254,7 @@ def simulate(
     changes = scheduled(resolved)
     shuttle.announce(changes)
     for change in changes:
-        gathered.take(RECORDER, said_of(change))
+        gathered.take(RECORDER, change_notice(change))
     with np.errstate(all="ignore"):  # a diverging loop overflows and is recorded all the same
         for happened, now_ns in enumerate(shuttle.run()):
             if progress is not None and happened % _HAPPENINGS_PER_WORD == 0:

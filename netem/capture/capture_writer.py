@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from netem.capture.packet_blocks import Bytes, Events
-from netem.capture.pcapng import PcapngInterface, PcapngSection
+from netem.capture.pcapng import PcapngSection
 from netem.engine.relay_interface import LinkSpec
 from noack.core.errors import CallerError
 from noack.runtime.address import text_of
@@ -24,7 +24,7 @@ _STDOUT = 1
 class _Batch(NamedTuple):
     events: Events
     data: Bytes
-    missing: NDArray[np.int64] | None
+    missing: NDArray[np.int64]
     """(interfaces,) Number of missing events before this batch."""
 
 
@@ -50,7 +50,7 @@ class CaptureWriter:
         """Why the capture ended early, in one line; None if it did not."""
         self._section = PcapngSection(
             [
-                PcapngInterface(f"{spec.name} {side}", text_of(address))
+                (f"{spec.name} {side}", text_of(address))
                 for spec in specs
                 for side, address in (("client", spec.listen), ("server", spec.to))
             ]
@@ -81,46 +81,23 @@ class CaptureWriter:
         return self._written
 
     def take(self, events: Events, data: Bytes) -> None:
-        """Queue a copy of a batch; never waits.
-
-        Args:
-            events: shape (n,), of type :data:`netem.relay_events.EVENT`.
-            data: their payloads.
-        """
-        if self._closed or self.error is not None or not events.size:
-            self._count_missing(events.size)
-        elif self._queue.qsize() >= self._batches:
-            self._miss(np.bincount(events["interface"], minlength=self._unreported.size))
-        else:
-            missing = self._unreported if self._unreported.any() else None
-            try:
-                self._queue.put(_Batch(events.copy(), data.copy(), missing))
-            except MemoryError:
-                self.missing(events.size)
+        """Queue a copy of a batch; never waits."""
+        self._received_events += events.size
+        if self._closed or self.error is not None:
+            self._missing_events += events.size
+            return
+        if self._queue.qsize() < self._batches:
+            with suppress(MemoryError):
+                self._queue.put(_Batch(events.copy(), data.copy(), self._unreported))
+                self._unreported = np.zeros_like(self._unreported)
                 return
-            self._received_events += events.size
-            if missing is not None:
-                self._unreported = np.zeros_like(missing)
-
-    def missing(self, events: int) -> None:
-        """Count events for which the relay had no room; they count for the first interface."""
-        missed = np.zeros_like(self._unreported)
-        missed[0] = events
-        self._miss(missed)
-
-    def _miss(self, events: NDArray[np.int64]) -> None:
-        self._unreported += events
-        self._count_missing(int(events.sum()))
-
-    def _count_missing(self, events: int) -> None:
-        self._received_events += events
-        self._missing_events += events
+        self._unreported += np.bincount(events["interface"], minlength=self._unreported.size)
+        self._missing_events += events.size
 
     def close(self, patience_s: float = 5.0) -> None:
         """Write the queued batches and the statistics, and close the file.
 
-        Args:
-            patience_s: maximum time to wait for a disk or a reader that accepts nothing.
+        It waits for ``patience_s`` for a disk or a reader that accepts nothing.
         """
         if not self._closed:
             self._closed = True
@@ -151,8 +128,7 @@ class CaptureWriter:
             self._fail(str(error))
 
     def _write_batch(self, batch: _Batch) -> None:
-        if batch.missing is not None:
-            self._section.miss(batch.missing)
+        self._section.miss(batch.missing)
         self._write(self._section.packets(batch.events, batch.data))
         self._written += batch.events.size
 

@@ -42,51 +42,27 @@ _INBOUND, _OUTBOUND = 1, 2
 _DELIVERED, _FORCED, _CORRUPTED, _UNKNOWN = 0, 2, 3, 6
 
 
-def _text(words: str, width: int = 0) -> Bytes:
-    return np.frombuffer(words.encode().ljust(width, b"\0"), np.uint8)
+def _rows(*texts: bytes) -> Bytes:
+    return np.stack([np.frombuffer(text.ljust(32, b"\0"), np.uint8) for text in texts])
 
 
 # In the order of noack.protocol.record_tables.Fate; the last row is for any other number.
-_FATES = np.stack(
-    [
-        _text("delivered", 32),
-        _text("dropped by the loss model", 32),
-        _text("forced: delivered", 32),
-        _text("corrupted", 32),
-        _text("dropped by a full queue", 32),
-        _text("dropped in a blackout", 32),
-        _text("unknown fate", 32),
-    ]
+_FATES = _rows(
+    b"delivered",
+    b"dropped by the loss model",
+    b"forced: delivered",
+    b"corrupted",
+    b"dropped by a full queue",
+    b"dropped in a blackout",
+    b"unknown fate",
 )
-_COPY = _text("copy, ")
-_AS_FIRST = _text(" as the first of its flow")
-_BY_CAP = _text(" by the cap")
-_STALE = _text("delivered out of order (stale)")
-_COMMA = _text(", ")
-_IN_BIT = _text(" in bit ")
-_CORRUPTED_IN_BIT = _text(", corrupted in bit ")
-_OF = _text(" of ")
-_CONSECUTIVE_LOSSES = _text(" consecutive losses")
-_CONSECUTIVE_LOSS = _text(", consecutive loss ")
-_CAP = _text(", cap ")
-_DELAYED = _text(", delayed ")
-_AFTER = _text(", after ")
-_HELD_BACK = _text(", held back ")
-_FOR_THE_GUARANTEE = _text(" for the guarantee")
-_MS = _text(" ms")
-_DIRECTIONS = np.stack([_text("; forward, flow ", 16), _text("; reverse, flow ", 16)])
-_PACKET = _text(", packet ")
+_DIRECTIONS = _rows(b"; forward, flow ", b"; reverse, flow ")
+_STALE = b"delivered out of order (stale)"
 
 
 @_compiled
 def blocks_bytes(events: Events, data_bytes: int, interfaces: int) -> int:
-    """Return an upper bound on the bytes of the events' blocks, or −1 − i if event i is invalid.
-
-    Args:
-        events: shape (n,), of type :data:`netem.relay_events.EVENT`.
-        data_bytes: size of the batch's data.
-        interfaces: number of interfaces.
-    """
+    """Return an upper bound on the bytes of the events' blocks, or −1 − i if event i is invalid."""
     total = 0
     for i in range(events.size):
         event = events[i]
@@ -111,7 +87,7 @@ def put_blocks(events: Events, data: Bytes, missing: Counts, written: Counts, ou
     """Write the events' enhanced packet blocks into ``out`` and return their bytes.
 
     Args:
-        events: shape (n,), checked by :func:`blocks_bytes`.
+        events: (n,) of type :data:`netem.relay_events.EVENT`, checked by :func:`blocks_bytes`.
         data: the payloads.
         missing: (interfaces,) missing events before these; written in the next block, then reset.
         written: (interfaces,) number of written events; incremented.
@@ -234,39 +210,40 @@ def _put_comment(out: Bytes, start: int, event: Any) -> int:
     fate, losses, mansd = min(event["fate"], _UNKNOWN), event["consecutive_losses"], event["mansd"]
     at = start + 4
     if event["copy"]:
-        at = _put(out, at, _COPY)
+        at = _put(out, at, b"copy, ")
     if event["stale"] and fate == _DELIVERED:
         at = _put(out, at, _STALE)
     else:
         at = _put(out, at, _FATES[fate])
     if fate == _FORCED and event["packet"] == 0 and mansd != 0:
-        at = _put(out, at, _AS_FIRST)
+        at = _put(out, at, b" as the first of its flow")
     elif fate == _FORCED:
-        at = _put(out, at, _BY_CAP)
+        at = _put(out, at, b" by the cap")
         if mansd >= 0:
-            at = _put_number(out, _put(out, at, _OF), mansd)
-            at = _put(out, at, _CONSECUTIVE_LOSSES)
+            at = _put_number(out, _put(out, at, b" of "), mansd)
+            at = _put(out, at, b" consecutive losses")
     if event["bit"] >= 0:
-        words = _IN_BIT if fate == _CORRUPTED else _CORRUPTED_IN_BIT
-        at = _put_number(out, _put(out, at, words), event["bit"])
+        if fate != _CORRUPTED:
+            at = _put(out, at, b", corrupted")
+        at = _put_number(out, _put(out, at, b" in bit "), event["bit"])
     if event["stale"] and fate != _DELIVERED:
-        at = _put(out, _put(out, at, _COMMA), _STALE)
+        at = _put(out, _put(out, at, b", "), _STALE)
     if event["departure"]:
-        at = _put_ms(out, _put(out, at, _AFTER), event["delay_ns"])
+        at = _put_ms(out, _put(out, at, b", after "), event["delay_ns"])
     else:
         if losses > 0 and fate != _DELIVERED and fate != _FORCED:
-            at = _put_number(out, _put(out, at, _CONSECUTIVE_LOSS), losses)
+            at = _put_number(out, _put(out, at, b", consecutive loss "), losses)
             if mansd >= 0:
-                at = _put_number(out, _put(out, at, _CAP), mansd)
+                at = _put_number(out, _put(out, at, b", cap "), mansd)
         is_forwarded = fate in (_DELIVERED, _FORCED, _CORRUPTED)
         if is_forwarded and event["delay_ns"] > 0:
-            at = _put_ms(out, _put(out, at, _DELAYED), event["delay_ns"])
+            at = _put_ms(out, _put(out, at, b", delayed "), event["delay_ns"])
         if is_forwarded and event["hold_back_ns"] > 0:
-            at = _put_ms(out, _put(out, at, _HELD_BACK), event["hold_back_ns"])
-            at = _put(out, at, _FOR_THE_GUARANTEE)
+            at = _put_ms(out, _put(out, at, b", held back "), event["hold_back_ns"])
+            at = _put(out, at, b" for the guarantee")
     at = _put(out, at, _DIRECTIONS[1 if event["direction"] else 0])
     at = _put_number(out, at, event["flow"])
-    at = _put_number(out, _put(out, at, _PACKET), event["packet"])
+    at = _put_number(out, _put(out, at, b", packet "), event["packet"])
     _put_u16(out, start, _COMMENT)
     _put_u16(out, start + 2, at - start - 4)
     return _pad(out, at)
@@ -287,7 +264,7 @@ def _put_ms(out: Bytes, at: int, time_ns: int) -> int:
             rest %= scale
             scale //= 10
             at += 1
-    return _put(out, at, _MS)
+    return _put(out, at, b" ms")
 
 
 @_part
@@ -308,8 +285,8 @@ def _put_number(out: Bytes, at: int, value: int) -> int:
 
 
 @_part
-def _put(out: Bytes, at: int, text: Bytes) -> int:
-    for i in range(text.size):
+def _put(out: Bytes, at: int, text: bytes | Bytes) -> int:
+    for i in range(len(text)):
         if text[i] == 0:
             break
         out[at] = text[i]

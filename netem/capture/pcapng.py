@@ -20,19 +20,12 @@ import platform
 import struct
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
 from importlib.metadata import version
 
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.capture.packet_blocks import (
-    FOLDER,
-    Bytes,
-    Events,
-    blocks_bytes,
-    put_blocks,
-)
+from netem.capture.packet_blocks import FOLDER, Bytes, Events, blocks_bytes, put_blocks
 from netem.compile_notice import announced
 from netem.relay_events import EVENT
 from noack.core.code_cache import is_kept
@@ -48,26 +41,17 @@ _NAME, _DESCRIPTION, _RESOLUTION = 2, 3, 9
 _START, _END, _RECEIVED, _DROPPED = 2, 3, 4, 5
 
 
-@dataclass(frozen=True, slots=True)
-class PcapngInterface:
-    """One side of a link."""
-
-    name: str
-    """Short, for example ``link0 client``."""
-    description: str = ""
-    """For example its address."""
-
-
 class PcapngSection:
     """The blocks of one capture file, in file order: header, packets, ..., statistics.
 
     The first instance compiles the code that formats packets. This takes some seconds.
 
     Args:
-        interfaces: the ``interface`` of an event is an index into them.
+        interfaces: name and description of each side of each link; the ``interface`` of an event
+            is an index into them.
     """
 
-    def __init__(self, interfaces: Sequence[PcapngInterface]) -> None:
+    def __init__(self, interfaces: Sequence[tuple[str, str]]) -> None:
         self._interfaces = tuple(interfaces)
         self._missing = np.zeros(len(interfaces), np.int64)
         self._all_missing = np.zeros(len(interfaces), np.int64)
@@ -94,20 +78,16 @@ class PcapngSection:
             _block(
                 _INTERFACE,
                 struct.pack("<HHI", _LINKTYPE_RAW, 0, _SNAP_BYTES),
-                (_NAME, interface.name.encode()),
-                (_DESCRIPTION, interface.description.encode()),
+                (_NAME, name.encode()),
+                (_DESCRIPTION, description.encode()),
                 (_RESOLUTION, b"\x09"),
             )
-            for interface in self._interfaces
+            for name, description in self._interfaces
         ]
         return b"".join(blocks)
 
     def packets(self, events: Events, data: Bytes) -> memoryview:
         """Return the events' packets, which are valid until the next call.
-
-        Args:
-            events: shape (n,), of type :data:`netem.relay_events.EVENT`.
-            data: their payloads.
 
         Raises:
             ValueError: an event has an unknown interface, is too large, or points beyond the data.

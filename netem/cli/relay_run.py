@@ -19,7 +19,8 @@ from netem.control import relay_attachments
 from netem.control.emulator_session import starting
 from netem.control.emulator_statistics import Statistics, statistics, unintended
 from netem.engine.engine_choice import compiled_engine_is_missing, open_relay
-from netem.engine.relay_interface import DIRECTIONS, Direction, LinkSpec, Relay, Tap
+from netem.engine.relay_base import Relay
+from netem.engine.relay_interface import DIRECTIONS, Direction, LinkSpec, Tap
 from netem.fates.fate_recorder import FateRecorder
 from netem.fates.fate_replay import read_fates
 from netem.standard_error import say

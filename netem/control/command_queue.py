@@ -13,7 +13,8 @@ from queue import SimpleQueue
 from threading import Lock
 from typing import Any, NamedTuple, TypeVar
 
-from netem.engine.relay_interface import DIRECTIONS, Direction, LinkReport, Relay
+from netem.engine.relay_base import Relay
+from netem.engine.relay_interface import DIRECTIONS, Direction, LinkReport
 from netem.loss_prediction import predict
 from netem.words.words_to_settings import text_of
 from noack.core.errors import PeerError

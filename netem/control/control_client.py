@@ -20,10 +20,7 @@ _POLL_S = 0.02
 
 
 class Client:
-    """A connection to a running emulator.
-
-    Args:
-        session: its address and secret, from :func:`netem.control.emulator_session.find`.
+    """A connection to a running emulator, from its address and secret.
 
     Raises:
         PeerError: the emulator does not accept the connection.

@@ -14,8 +14,7 @@ from rich.console import Console
 from netem.control.control_client import Client
 from netem.control.emulator_session import Session, find, running
 from netem.control.live_screen import Screen
-from netem.control.statistics_history import History
-from netem.control.statistics_view import render
+from netem.control.statistics_view import History, render
 from netem.engine.relay_interface import DIRECTIONS
 from netem.words.words_to_settings import require_no_dashes, settings_of
 from noack.core.errors import CallerError, ExitStatus, NoackError

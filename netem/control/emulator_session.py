@@ -5,7 +5,7 @@ While the emulator runs, its file is in the user's runtime directory, readable b
 """
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -46,23 +46,18 @@ def _locked(kind: str, name: str, content: Mapping[str, object]) -> Iterator[Pat
         raise _in_use(name) from None
 
 
-@contextmanager
-def published(session: Session) -> Iterator[Path]:
+def published(session: Session) -> AbstractContextManager[Path]:
     """Keep a session's file within the context.
 
     Raises:
         CallerError: the name is not allowed or in use, or the folder is not the user's own.
     """
-    with _locked(_KIND, session.name, session._asdict()) as path:
-        yield path
+    return _locked(_KIND, session.name, session._asdict())
 
 
 @contextmanager
 def starting(name: str | None) -> Iterator[None]:
-    """Publish within the context that an emulator starts; the start may take long.
-
-    Args:
-        name: the emulator's name; None: nothing is published.
+    """Publish within the context that an emulator of this name, if any, starts.
 
     Raises:
         CallerError: the name is not allowed or in use, or the folder is not the user's own.

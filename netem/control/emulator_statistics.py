@@ -119,7 +119,7 @@ class DirectionStatistics(TypedDict):
 
 
 class LinkStatistics(TypedDict):
-    """One link."""
+    """One link; see :class:`netem.engine.relay_interface.LinkReport`."""
 
     name: str
     listen: str
@@ -127,12 +127,8 @@ class LinkStatistics(TypedDict):
     clients: int
     clients_ever: int
     refused: int
-    """Datagrams of clients beyond the maximum number of clients."""
     discarded: int
-    """Answers to a link without a reverse direction; 0 if the system does not count them."""
     port_unreachable: int
-    """ICMP port-unreachable messages from the server's host; a lower bound on the datagrams lost
-    there."""
     forward: DirectionStatistics
     reverse: DirectionStatistics
 
@@ -149,12 +145,7 @@ class Statistics(TypedDict):
 
 
 def statistics(after: Snapshot, before: Snapshot | None = None) -> Statistics:
-    """Return the statistics of a relay.
-
-    Args:
-        after: the state of the relay.
-        before: an earlier snapshot of the same relay, for the recent rates.
-    """
+    """Return the statistics of a relay; the recent rates need an earlier snapshot."""
     earlier = {link.name: link for link in before.links} if before is not None else {}
     seconds = (after.elapsed_ns - before.elapsed_ns) / NS_PER_S if before is not None else 0.0
     links = [_link(link, earlier.get(link.name), seconds, after) for link in after.links]

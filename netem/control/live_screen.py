@@ -8,7 +8,6 @@ import select
 import sys
 import termios
 import tty
-from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack
 from typing import Self
@@ -18,8 +17,7 @@ from rich.live import Live
 from rich.text import Text
 
 from netem.control.emulator_statistics import Statistics
-from netem.control.statistics_history import History
-from netem.control.statistics_view import plain_lines, render
+from netem.control.statistics_view import History, plain_lines, render
 
 _MESSAGES_SHOWN = 3
 
@@ -41,7 +39,7 @@ class Screen:
         self._history = History()
         self._live: Live | None = None
         self._size = self._console.size
-        self._messages = _Messages()
+        self._messages = io.StringIO()
         self._keys = False
         self._stack = ExitStack()
         self.quit_requested = False
@@ -88,7 +86,7 @@ class Screen:
 
     def _draw(self) -> None:
         assert self._live is not None
-        messages = list(self._messages.lines)[-_MESSAGES_SHOWN:]
+        messages = self._messages.getvalue().splitlines()[-_MESSAGES_SHOWN:]
         height = self._console.height - len(messages) - 1
         picture = render(self._history, self._title, self._console.width, height)
         below = [Text(f" {message}", "yellow", no_wrap=True) for message in messages]
@@ -98,24 +96,7 @@ class Screen:
     def _leave(self) -> None:
         if self._history.latest is not None:
             self._console.print(render(self._history, self._title, self._console.width, None))
-        for message in self._messages.lines:
-            print(message, file=sys.stderr)
-
-
-class _Messages(io.TextIOBase):
-    """Keeps the last lines written to it."""
-
-    def __init__(self) -> None:
-        self.lines: deque[str] = deque(maxlen=1000)
-        self._begun = ""
-
-    def writable(self) -> bool:
-        return True
-
-    def write(self, text: str) -> int:
-        *lines, self._begun = (self._begun + text).split("\n")
-        self.lines.extend(lines)
-        return len(text)
+        print(self._messages.getvalue(), end="", file=sys.stderr)
 
 
 @contextlib.contextmanager

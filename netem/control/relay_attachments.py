@@ -1,7 +1,9 @@
 """Live control, statistics lines and the live screen of a running relay."""
 
 import argparse
+import json
 import math
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -10,10 +12,11 @@ from typing import NamedTuple
 
 from netem.control.command_queue import CommandQueue
 from netem.control.control_server import ControlServer
+from netem.control.emulator_statistics import Statistics
 from netem.control.live_screen import Screen
-from netem.control.statistics_lines import statistics_lines
 from netem.control.statistics_thread import StatisticsThread
-from netem.engine.relay_interface import Relay
+from netem.engine.relay_base import Relay
+from netem.standard_error import say
 from noack.core.errors import CallerError
 
 _VIEW_S = 1.0
@@ -70,22 +73,17 @@ def options_of(parsed: argparse.Namespace) -> Options:
     return Options(parsed.control, stats_s, Path(file) if file is not None else None, parsed.view)
 
 
-class AttachedRelay:
-    """The relay thread's access to the threads that watch the relay.
+class AttachedRelay(NamedTuple):
+    """The relay thread's access to the threads that watch the relay."""
 
-    Args:
-        commands: to be run in the relay's thread, at least every 50 ms.
-        screen: the live screen, if there is one.
-    """
-
-    def __init__(self, commands: CommandQueue, screen: Screen | None) -> None:
-        self.commands = commands
-        self._screen = screen
+    commands: CommandQueue
+    """To be run in the relay's thread, at least every 50 ms."""
+    screen: Screen | None
 
     @property
     def quit_requested(self) -> bool:
         """Whether the user has pressed q on the live screen."""
-        return self._screen is not None and self._screen.quit_requested
+        return self.screen is not None and self.screen.quit_requested
 
 
 @contextmanager
@@ -103,7 +101,7 @@ def attached(relay: Relay, options: Options) -> Iterator[AttachedRelay]:
     screen = None
     with ExitStack() as stack:
         if options.stats_s is not None:
-            stack.enter_context(statistics_lines(commands, options.stats_s, options.stats_file))
+            stack.enter_context(_statistics_lines(commands, options.stats_s, options.stats_file))
         if options.name is not None:
             stack.enter_context(ControlServer(options.name, commands))
         if options.view:
@@ -116,3 +114,34 @@ def attached(relay: Relay, options: Options) -> Iterator[AttachedRelay]:
         stack.callback(sys.setswitchinterval, sys.getswitchinterval())
         sys.setswitchinterval(_SWITCH_S)
         yield AttachedRelay(commands, screen)
+
+
+@contextmanager
+def _statistics_lines(commands: CommandQueue, period_s: float, path: Path | None) -> Iterator[None]:
+    """Write JSON lines to a file, or to standard output, until the relay has ended.
+
+    If a line cannot be written, a message on standard error reports it, and the relay continues.
+    """
+    try:
+        file = sys.stdout if path is None else path.open("w")
+    except OSError as error:
+        raise CallerError(f"--stats-file {path}: cannot be written ({error.strerror})") from None
+
+    def write(document: Statistics) -> None:
+        try:
+            file.write(json.dumps(document) + "\n")
+            file.flush()
+        except OSError as error:
+            name = "standard output" if path is None else path
+            say(f"statistics cannot be written to {name} ({error.strerror}); the relay continues")
+            # Also, closing the file writes the buffer once more; this must not fail.
+            nothing = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nothing, file.fileno())
+            os.close(nothing)
+
+    try:
+        with StatisticsThread(commands, period_s, write, at_end=True):
+            yield
+    finally:
+        if path is not None:
+            file.close()

@@ -5,6 +5,7 @@ panels, a table has one row per direction.
 """
 
 import textwrap
+from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 
 from rich.console import Group, RenderableType
@@ -16,6 +17,7 @@ from netem.control.emulator_statistics import (
     DelayQuantiles,
     DirectionStatistics,
     LinkStatistics,
+    RecentRates,
     Statistics,
 )
 from netem.control.number_texts import (
@@ -28,9 +30,9 @@ from netem.control.number_texts import (
     sparkline,
     time_text,
 )
-from netem.control.statistics_history import History
 from netem.engine.relay_interface import DIRECTIONS, Direction
 
+_SPAN_S = 60.0
 _ARROWS = {"forward": "forward →", "reverse": "← reverse"}
 _LABEL_WIDTH = 9
 _FRAME_WIDTH = 4
@@ -38,6 +40,51 @@ _WORDS_LINES = 3
 _CHART_WIDTH = 20
 _MIN_CHART_WIDTH = 8
 _LOST = ("dropped", "corrupted", "overflowed", "blacked_out")
+
+
+class History:
+    """The latest statistics, and the rates of the last minute."""
+
+    def __init__(self) -> None:
+        self.latest: Statistics | None = None
+        self._samples: defaultdict[
+            tuple[str, Direction], deque[tuple[float, RecentRates]]
+        ] = defaultdict(deque)  # fmt: skip
+
+    def add(self, statistics: Statistics) -> None:
+        """Add statistics that are newer than those before."""
+        self.latest = statistics
+        now_s = statistics["elapsed_s"]
+        for link in statistics["links"]:
+            for direction in DIRECTIONS:
+                recent = link[direction]["recent"]
+                samples = self._samples[link["name"], direction]
+                if recent is not None:
+                    samples.append((now_s, recent))
+                while samples and samples[0][0] <= now_s - _SPAN_S:
+                    samples.popleft()
+
+    def series(
+        self, link: str, direction: Direction, key: str, points: int
+    ) -> Sequence[float | None]:
+        """Return the last minute of a value of :class:`RecentRates`, (points,); None: unknown.
+
+        A sample covers the time since the previous sample. A point is the mean of its samples.
+        """
+        if self.latest is None:
+            return [None] * points
+        begin_s = self.latest["elapsed_s"] - _SPAN_S
+        width_s = _SPAN_S / points
+        found: list[list[float]] = [[] for _ in range(points)]
+        for end_s, recent in self._samples[link, direction]:
+            value: float | None = recent[key]  # type: ignore[literal-required]
+            if value is None:
+                continue
+            first = int(max(end_s - recent["seconds"] - begin_s, 0) / width_s)
+            last = min(int((end_s - begin_s) / width_s - 1e-9), points - 1)
+            for point in range(first, max(last, first) + 1):
+                found[min(point, points - 1)].append(value)
+        return [sum(values) / len(values) if values else None for values in found]
 
 
 def render(history: History, title: str, width: int, height: int | None) -> RenderableType:
@@ -221,9 +268,7 @@ _OPTIONAL = ("predicted", "p99", "forwarded")
 
 def _table(history: History, latest: Statistics, width: int, lines: int) -> RenderableType:
     """Return a table with a row for each direction that has received datagrams."""
-    rows = [
-        (link, name) for link in latest["links"] for name in DIRECTIONS if link[name]["received"]
-    ]
+    rows = _used(latest)
     shown = rows[:lines]
     names = [f" {'→' if name == 'forward' else '←'} {link['name']}" for link, name in shown]
     name_width = min(max(map(len, names), default=0), width // 3)

@@ -1,88 +1,72 @@
 """Clients of the Linux engine: a row in the pump's memory and a return path for each."""
 
-import errno
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from netem.engine.batched_directions import BatchedDirection
-from netem.engine.compiled_pump import Functions
+from netem.engine.compiled_rules import compile_rule
 from netem.engine.epoll_waiter import Epoll
 from netem.engine.link_listeners import OpenLink
+from netem.engine.link_warnings import LinkWarnings
+from netem.engine.pump.client_table import insert, remove
 from netem.engine.pump_memory import PumpMemory
-from netem.engine.refused_clients import STOPPED_NS, RefusedClients
+from netem.engine.relay_base import STALL_NS
 from netem.engine.relay_interface import Address
 from netem.engine.relay_sockets import (
     Endpoint,
-    ListenAddress,
     has_data,
+    packed_name,
     return_path,
     stamp_arrivals,
+    unpacked_address,
 )
-from netem.engine.socket_names import address_of_name, name_of
 from noack.runtime.udp_sockets import drops_of
 
-_LOOKED_AT = 256
+_QUERIED_AT_ONCE = 256
 
 
 class ClientTable:
-    """All clients of a relay.
-
-    Args:
-        links: the links.
-        ways: (2 · links,) forward and reverse direction of each link.
-        memory: the pump's memory.
-        functions: the compiled functions of the pump.
-        epoll: the epoll object with which the pump waits.
-    """
+    """All clients of a relay."""
 
     def __init__(
         self,
         links: Sequence[OpenLink],
-        ways: Sequence[BatchedDirection],
+        warnings: Sequence[LinkWarnings],
+        directions: Sequence[BatchedDirection],
         memory: PumpMemory,
-        functions: Functions,
         epoll: Epoll,
     ) -> None:
-        self._links, self._ways = links, ways
-        self._memory, self._functions, self._epoll = memory, functions, epoll
+        self._links, self._warnings, self._directions = links, warnings, directions
+        self._memory, self._epoll = memory, epoll
+        self._insert_compiled, self._remove_compiled = compile_rule(insert), compile_rule(remove)
         self._free_rows = list(reversed(range(len(memory.memory.clients))))
         self._free_places: list[list[int]] = [[] for _ in links]
         self._places = [0] * len(links)
         self.ever = [0] * len(links)
-        self.now = [0] * len(links)
+        self.present = [0] * len(links)
         self._paths: dict[int, Endpoint] = {}
         self._drops: dict[int, int] = {}
         self.drops = [0] * len(links)
         """(links,) Datagrams dropped by the kernel at the return paths, when last queried."""
-        self._unasked: Iterator[int] = iter(())
+        self._not_queried: Iterator[int] = iter(())
         self._idle_ns = np.array([round(link.spec.idle_s * 1e9) for link in links], np.int64)
-        self._refusals = [RefusedClients(link.spec) for link in links]
         self._expired_ns = 0
 
     def add(self, link: int, name: bytes) -> None:
-        """Add a client; if that is impossible, mark the link as full.
-
-        Args:
-            link: number of the client's link.
-            name: its socket address, NAME_BYTES long.
-        """
-        refusals, path, error = self._refusals[link], None, 0
-        if refusals.accepts(self.now[link]) and self._links[link].spec.return_path:
-            try:
-                path = return_path(self._links[link].server)
-            except OSError as failure:
-                error = failure.errno or errno.EIO
-                refusals.is_exhausted(error, self.now[link])
-        if refusals.accepts(self.now[link]):
-            self._take(link, name, path, error)
+        """Add a client by its packed name; if that is impossible, mark the link as full."""
+        warnings, present, path, error = self._warnings[link], self.present[link], None, 0
+        if warnings.accepts_client(present) and self._links[link].spec.return_path:
+            path, error = return_path(self._links[link].server)
+        if not warnings.no_descriptor_left(error, present) and warnings.accepts_client(present):
+            self._accept(link, name, path, error)
         else:
             self._memory.memory.directions["full"][2 * link] = 1
 
     def expire(self, now_ns: int) -> None:
         """Remove the clients that have been idle and have no datagram in flight."""
         clients = self._memory.memory.clients
-        if now_ns - self._expired_ns > STOPPED_NS:
+        if now_ns - self._expired_ns > STALL_NS:
             # The engine was stopped: datagrams that arrived meanwhile have not been read yet.
             clients["last_ns"] = now_ns
         self._expired_ns = now_ns
@@ -98,27 +82,26 @@ class ClientTable:
         sockets, first = self._memory.memory.sockets, self._memory.first_path
         clients = self._memory.memory.clients
         for row in np.flatnonzero(sockets["error"][first:]).tolist():
-            try:
-                path = return_path(self._links[clients["link"][row]].server)
-            except OSError as failure:
-                sockets["error"][first + row] = failure.errno or errno.EIO
-            else:
+            path, sockets["error"][first + row] = return_path(
+                self._links[clients["link"][row]].server
+            )
+            if path is not None:
                 self._set_path(row, path)
 
-    def ask_some(self) -> None:
+    def query_some_drops(self) -> None:
         """Query the kernel's drop counters of some return paths; successive calls cover all."""
-        for _ in range(_LOOKED_AT):
-            row = next(self._unasked, None)
+        for _ in range(_QUERIED_AT_ONCE):
+            row = next(self._not_queried, None)
             if row is None:
-                self._unasked = iter(tuple(self._paths))
+                self._not_queried = iter(tuple(self._paths))
                 return
             if row in self._paths:
-                self._ask(row)
+                self._query_drops(row)
 
-    def ask_all(self) -> None:
+    def query_all_drops(self) -> None:
         """Query the kernel's drop counters of all return paths."""
         for row in self._paths:
-            self._ask(row)
+            self._query_drops(row)
 
     def rows_of(self, link: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
         """Return the rows of a link's clients."""
@@ -127,7 +110,7 @@ class ClientTable:
 
     def address(self, row: int) -> Address:
         """Return a client's address."""
-        return address_of_name(self._memory.memory.clients["name"][row].tobytes())
+        return unpacked_address(self._memory.memory.clients["name"][row].tobytes())
 
     def stamp_arrivals(self, link: int) -> None:
         """Enable kernel timestamps for the answers to a link's clients."""
@@ -141,7 +124,7 @@ class ClientTable:
             path.close()
         self._paths.clear()
 
-    def _take(self, link: int, name: bytes, path: Endpoint | None, error: int) -> None:
+    def _accept(self, link: int, name: bytes, path: Endpoint | None, error: int) -> None:
         if not self._free_rows:
             self._grow()
         row = self._free_rows.pop()
@@ -153,12 +136,12 @@ class ClientTable:
             self._places[link] += 1
         number = self.ever[link]
         self.ever[link] += 1
-        self.now[link] += 1
-        for way in self._ways[2 * link : 2 * link + 2]:
-            way.start_flow(place, number)
+        self.present[link] += 1
+        for direction in self._directions[2 * link : 2 * link + 2]:
+            direction.start_flow(place, number)
         memory = self._memory.memory
-        _, name_bytes = name_of(self._links[link].here)
-        local, _ = name_of(self._links[link].local)
+        _, name_bytes = packed_name(self._links[link].name)
+        local, _ = packed_name(self._links[link].local)
         client = memory.clients[row]
         client["last_ns"] = self._memory.pump["now_ns"]
         client["number"], client["link"], client["place"] = number, link, place
@@ -174,22 +157,21 @@ class ClientTable:
 
     def _set_path(self, row: int, path: Endpoint) -> None:
         memory, place = self._memory.memory, self._memory.first_path + row
-        if self._ways[2 * int(memory.clients["link"][row]) + 1].program.tracks:
+        if self._directions[2 * int(memory.clients["link"][row]) + 1].program.tracks:
             stamp_arrivals(path)
         self._paths[row] = path
         self._drops[row] = 0
         memory.sockets["fd"][place] = path.fileno()
-        memory.sockets["error"][place] = 0
-        local, _ = name_of(ListenAddress(int(path.family), path.getsockname()))
+        local, _ = packed_name(path.getsockname())
         memory.clients["local"][row] = np.frombuffer(local, np.uint8)
         self._epoll.add(path.fileno(), place)
 
     def _forget(self, row: int) -> None:
         memory = self._memory.memory
         link, place = int(memory.clients["link"][row]), int(memory.clients["place"][row])
-        self._functions.remove(memory.table, memory.clients, row)
+        self._remove_compiled(memory.table, memory.clients, row)
         if row in self._paths:
-            self._ask(row)
+            self._query_drops(row)
             del self._drops[row]
             self._paths.pop(row).close()
         memory.clients["number"][row] = -1
@@ -197,9 +179,9 @@ class ClientTable:
         memory.sockets["error"][self._memory.first_path + row] = 0
         self._free_rows.append(row)
         self._free_places[link].append(place)
-        self.now[link] -= 1
+        self.present[link] -= 1
         memory.directions["full"][2 * link] = 0
-        self._refusals[link].end()
+        self._warnings[link].client_removed()
 
     def _grow(self) -> None:
         count = len(self._memory.memory.clients)
@@ -213,10 +195,10 @@ class ClientTable:
         memory = self._memory.memory
         # A writable copy has the array type for which the function was compiled.
         name = np.frombuffer(memory.clients["name"][row].tobytes(), np.int64).copy()
-        self._functions.insert(memory.table, memory.clients, row, name)
+        self._insert_compiled(memory.table, memory.clients, row, name)
 
-    def _ask(self, row: int) -> None:
-        found = drops_of(self._paths[row])
-        if found is not None:
-            self.drops[int(self._memory.memory.clients["link"][row])] += found - self._drops[row]
-            self._drops[row] = found
+    def _query_drops(self, row: int) -> None:
+        drops = drops_of(self._paths[row])
+        if drops is not None:
+            self.drops[int(self._memory.memory.clients["link"][row])] += drops - self._drops[row]
+            self._drops[row] = drops

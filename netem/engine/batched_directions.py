@@ -1,60 +1,42 @@
 """The directions of links in the pump's memory: programs, and states that grow with the flows."""
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.engine.compiled_pump import functions
-from netem.engine.compiled_rules import compiled_program, compiled_state, set_flow
-from netem.engine.pump.pump_layout import STATES, TABLES
+from netem.engine.compiled_rules import compile_rule, compiled_program, compiled_state, set_flow
+from netem.engine.pump.pump_layout import PER_FLOW, STATES, TABLES, Memory
+from netem.engine.pump_memory import doubled
+from netem.engine.relay_interface import DIRECTIONS, LinkSpec
 from netem.rule_program import empty_state, program_of, recent_width
-from noack.impairments.link_records import LinkMemory, LinkProgram, RecordedDecision
+from netem.rules.settings_change import carry
+from noack.impairments.link_records import LinkMemory, LinkProgram
 from noack.impairments.link_settings import LinkSettings
 
 _ROWS = 16
-
-
-class Grown(NamedTuple):
-    """The arrays whose length is the number of flows."""
-
-    flows: NDArray[Any]
-    memory: NDArray[Any]
-    recent_ns: NDArray[Any]
 
 
 class BatchedDirection:
     """One direction of a link.
 
     Args:
-        settings: the settings.
-        seed: seed of the random streams.
-        name: names of the link and the direction.
-        decisions: recorded decisions per flow.
-        row: its row of :data:`netem.engine.pump.pump_layout.DIRECTION`, (1,).
-        link_state: its row of :class:`noack.impairments.link_records.LinkState`, (1,).
-        counters: its row of :class:`noack.impairments.link_records.Counters`, (1,).
+        spec: the link.
+        number: number of the direction in the pump's memory; even: forward, odd: reverse.
+        memory: the pump's memory.
     """
 
-    def __init__(
-        self,
-        settings: LinkSettings,
-        seed: int,
-        name: tuple[str, str],
-        decisions: Sequence[Sequence[RecordedDecision]],
-        row: NDArray[Any],
-        link_state: NDArray[Any],
-        counters: NDArray[Any],
-    ) -> None:
-        self.settings = settings
-        self._seed, self._name = seed, name
-        self._row = row
-        self._link_state, self._counters = link_state, counters
-        plain = program_of(settings, seed, *name, decisions=decisions)
+    def __init__(self, spec: LinkSpec, number: int, memory: Memory) -> None:
+        name = DIRECTIONS[number % 2]
+        self.settings: LinkSettings = getattr(spec, name)
+        self._seed, self._name = spec.seed, (spec.name, name)
+        self._row = memory.directions[number : number + 1]
+        self._link_state, self._counters = memory.link_states[number], memory.counters[number]
+        decisions = spec.decisions.get(name, ())
+        plain = program_of(self.settings, self._seed, *self._name, decisions=decisions)
         self.program = compiled_program(plain)
         self.state = self._state(plain, _ROWS)
-        self._show()
+        self._write_row()
 
     @property
     def rows(self) -> int:
@@ -64,7 +46,9 @@ class BatchedDirection:
     def start_flow(self, row: int, number: int) -> None:
         """Initialise a free row for a new flow; grow if necessary."""
         while row >= self.rows:
-            self._grow()
+            grown: dict[str, Any] = {one: doubled(getattr(self.state, one)) for one in PER_FLOW}
+            self.state = self.state._replace(**grown)
+            self._write_row()
         set_flow(self.state, row, number, self.settings.first_delivered)
 
     def change(self, settings: LinkSettings, latest_ns: NDArray[np.int64]) -> None:
@@ -83,22 +67,16 @@ class BatchedDirection:
         state = self._state(plain, self.rows)._replace(flows=self.state.flows)
         recent_ns: NDArray[np.int64] = state.recent_ns  # type: ignore[assignment]
         recent_ns[:] = -1
-        functions().carry(old, self.state, program, state, latest_ns)
+        compile_rule(carry)(old, self.state, program, state, latest_ns)
         self.settings, self.program, self.state = settings, program, state
-        self._show()
+        self._write_row()
 
     def _state(self, plain: LinkProgram, rows: int) -> LinkMemory:
         state = compiled_state(plain, empty_state(plain), rows, recent_width(plain))
-        return state._replace(link=self._link_state[0], counters=self._counters[0])
+        return state._replace(link=self._link_state, counters=self._counters)
 
-    def _grow(self) -> None:
-        old = self.state
-        grown = Grown(*(_doubled(getattr(old, field)) for field in Grown._fields))
-        self.state = old._replace(**grown._asdict())
-        self._show()
-
-    def _show(self) -> None:
-        """Store the addresses and lengths of all arrays in the direction's row."""
+    def _write_row(self) -> None:
+        """Write the addresses and lengths of all arrays."""
         row = self._row
         for name in TABLES:
             table: Any = getattr(self.program, name)
@@ -114,9 +92,3 @@ class BatchedDirection:
         row["rows"] = len(state.flows)
         row["width"] = state.recent_ns.shape[1]
         row["departure_rows"] = len(state.departures_ns)
-
-
-def _doubled(array: NDArray[Any]) -> NDArray[Any]:
-    grown = np.zeros((2 * len(array), *array.shape[1:]), array.dtype)
-    grown[: len(array)] = array
-    return grown

@@ -92,21 +92,25 @@ _OPTIONS = {"_nrt": False, "forceinline": True}
 
 @cache
 def compile_rule(function: Callable[..., Any]) -> Any:
-    """Compile a function that calls rules; it runs without the interpreter lock, cached on disk.
-
-    The function must not allocate: no new arrays, lists or strings.
-    """
-    return compiler(_prepare(), nogil=True, _nrt=False)(function)
+    """Compile a function that calls rules; see :func:`compile_kept`."""
+    return compile_kept(function, prepare())
 
 
 def compile_kept(function: Callable[..., Any], folder: Path | None) -> Any:
-    """Compile a function; cache it in a folder of :func:`prepare`, if there is one."""
+    """Compile a function, which runs without the interpreter lock.
+
+    The function must not allocate: no new arrays, lists or strings.
+
+    Args:
+        function: the function.
+        folder: its cache folder, from :func:`prepare`; None if there is no cache.
+    """
     return compiler(folder, nogil=True, _nrt=False)(function)
 
 
 @cache
-def prepare(name: str, modules: tuple[ModuleType, ...]) -> Path | None:
-    """Prepare the compilation of modules that call rules.
+def prepare(name: str = "netem", modules: tuple[ModuleType, ...] = ()) -> Path | None:
+    """Prepare the compilation of the rules and of modules that call them.
 
     Args:
         name: name of the compiled code.
@@ -115,29 +119,17 @@ def prepare(name: str, modules: tuple[ModuleType, ...]) -> Path | None:
     Returns:
         The cache folder of the compiled code; None if there is no cache.
     """
-    _prepare()
-    _register(modules)
-    sources = (*_compiled_modules(), *modules, relay_events)
+    rules = tuple(_compiled_modules())
+    if modules:
+        prepare()
+    _register(modules or rules)
+    sources = (*rules, *modules, relay_events)
     return cache_folder(name, (Path(str(module.__file__)) for module in sources))
 
 
 def is_kept(function: Callable[..., Any]) -> bool:
     """Whether compiled code of a function is in the cache, for this machine."""
-    return code_cache.is_kept(_prepare(), function)
-
-
-def folder() -> Path | None:
-    """Return the cache folder of the compiled code; None if there is no cache."""
-    return _prepare()
-
-
-@cache
-def _prepare() -> Path | None:
-    """Prepare the compilation of the rules; return the cache folder, None if there is none."""
-    modules = list(_compiled_modules())
-    _register(modules)
-    sources = (*modules, relay_events)
-    return cache_folder("netem", (Path(str(module.__file__)) for module in sources))
+    return code_cache.is_kept(prepare(), function)
 
 
 def _register(modules: Sequence[ModuleType]) -> None:

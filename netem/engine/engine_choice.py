@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from typing import Literal
 
 from netem.engine.plain_engine import PlainRelay
-from netem.engine.relay_interface import LinkSpec, Relay, Tap
+from netem.engine.relay_base import Relay
+from netem.engine.relay_interface import LinkSpec, Tap
 from noack.core.errors import CallerError
 
 Engine = Literal["auto", "batched", "plain"]

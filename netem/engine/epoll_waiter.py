@@ -24,12 +24,7 @@ class Epoll:
         return self._epoll.fileno()
 
     def add(self, fd: int, number: int) -> None:
-        """Add a socket to wait for; closing the socket removes it.
-
-        Args:
-            fd: file descriptor of the socket.
-            number: returned when the socket is ready.
-        """
+        """Wait for a socket too; ``number`` is returned when it is ready. Closing removes it."""
         pad = [0] * (READY_WORDS - 3)
         event = struct.pack(_FORMAT, select.EPOLLIN, *pad, number)
         if self._libc.epoll_ctl(self.fileno(), _EPOLL_CTL_ADD, fd, event) != 0:
@@ -40,11 +35,11 @@ class Epoll:
         """Whether the kernel has epoll_pwait2."""
         event = ctypes.create_string_buffer(4 * READY_WORDS)
         limit = struct.pack("=qq", 0, 0)
-        found = self._libc.syscall(
+        status = self._libc.syscall(
             *map(ctypes.c_long, (SYS_EPOLL_PWAIT2, self.fileno())),
             event, ctypes.c_long(1), limit, None, ctypes.c_long(0),
         )  # fmt: skip
-        return bool(found >= 0)
+        return bool(status >= 0)
 
     def close(self) -> None:
         """Close the epoll object."""

@@ -24,18 +24,10 @@ def bucket_of(t_ns: int) -> int:
     if t_ns >> _MOST_BITS != 0:
         return BUCKETS - 1
     octave, rest = 0, t_ns
-    if rest >> 32 != 0:
-        octave, rest = octave + 32, rest >> 32
-    if rest >> 16 != 0:
-        octave, rest = octave + 16, rest >> 16
-    if rest >> 8 != 0:
-        octave, rest = octave + 8, rest >> 8
-    if rest >> 4 != 0:
-        octave, rest = octave + 4, rest >> 4
-    if rest >> 2 != 0:
-        octave, rest = octave + 2, rest >> 2
-    if rest >> 1 != 0:
-        octave += 1
+    for k in range(6):  # int.bit_length does not compile
+        bits = 32 >> k
+        if rest >> bits != 0:
+            octave, rest = octave + bits, rest >> bits
     shift = octave - _STEP_BITS
     return (shift << _STEP_BITS) + (t_ns >> shift)
 
@@ -51,11 +43,7 @@ def lower_ns(bucket: int) -> int:
 def coarse(counts: NDArray[np.int64]) -> list[list[int]]:
     """Return a coarser histogram for people and plots: four buckets for each doubling.
 
-    Args:
-        counts: (BUCKETS,) a histogram.
-
-    Returns:
-        (shortest time in ns, count) of each bucket that is not empty.
+    Each entry is the shortest time in ns and the count of a bucket that is not empty.
     """
     joined = counts.reshape(-1, _JOINED).sum(axis=1)
     return [[lower_ns(_JOINED * k), int(joined[k])] for k in np.flatnonzero(joined).tolist()]
@@ -67,12 +55,7 @@ def empty() -> NDArray[np.int64]:
 
 
 def quantile_ns(counts: Sequence[int] | NDArray[np.int64], share: float) -> float:
-    """Return a quantile in ns, accurate to 3 %; nan if the histogram is empty.
-
-    Args:
-        counts: (BUCKETS,) a histogram.
-        share: level of the quantile, 0.5 for the median.
-    """
+    """Return the quantile of a level in ns, accurate to 3 %; nan if the histogram is empty."""
     reached = np.cumsum(counts)
     if reached[-1] == 0:
         return float("nan")

@@ -1,5 +1,6 @@
 """Links with their listening sockets; used by both engines."""
 
+from collections import defaultdict
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -7,12 +8,12 @@ from dataclasses import dataclass
 from netem.engine.relay_interface import Address, LinkSpec
 from netem.engine.relay_sockets import (
     Endpoint,
-    ListenAddress,
+    SocketName,
     address_of,
     leads_to,
     listen,
     one_way_path,
-    place_of,
+    socket_name,
 )
 from noack.core.errors import CallerError
 from noack.runtime.address import text_of
@@ -26,26 +27,25 @@ class OpenLink:
     spec: LinkSpec
     endpoint: Endpoint
     """The socket to which clients send."""
-    server: ListenAddress
+    server: SocketName
     path: Endpoint | None
     """The socket that sends to the server, if there is no reverse direction; else None: each client
     has its own return path."""
 
     @property
-    def here(self) -> ListenAddress:
-        """The address at which the link listens, for its socket."""
-        return ListenAddress(int(self.endpoint.family), self.endpoint.getsockname())
+    def name(self) -> SocketName:
+        """The address at which the link listens, in the form that sockets use."""
+        return tuple(self.endpoint.getsockname())
 
     @property
-    def local(self) -> ListenAddress:
+    def local(self) -> SocketName:
         """The address that sends to the server, unless each client has its own return path."""
-        endpoint = self.path or self.endpoint
-        return ListenAddress(int(endpoint.family), endpoint.getsockname())
+        return tuple((self.path or self.endpoint).getsockname())
 
     @property
     def address(self) -> Address:
         """The address at which the link listens."""
-        return address_of(self.endpoint.getsockname())
+        return address_of(self.name)
 
     @property
     def discarded(self) -> int:
@@ -72,14 +72,14 @@ def open_links(specs: Sequence[LinkSpec]) -> Sequence[OpenLink]:
     with ExitStack() as undo:
         links = []
         for spec in specs:
-            here = place_of(spec.listen, f"link {spec.name}: listen")
-            server = place_of(spec.to, f"link {spec.name}: to")
+            own_name = socket_name(spec.listen, f"link {spec.name}: listen")
+            server = socket_name(spec.to, f"link {spec.name}: to")
             if spec.to[1] == 0:
                 raise CallerError(
                     f"link {spec.name}: to {text_of(spec.to)}: nobody can be at port 0; give the "
                     "server's"
                 )
-            endpoint = undo.enter_context(listen(spec, here))
+            endpoint = undo.enter_context(listen(spec, own_name))
             path = None if spec.return_path else undo.enter_context(one_way_path(server))
             links.append(OpenLink(spec, endpoint, server, path))
         _refuse_loops(links)
@@ -89,14 +89,14 @@ def open_links(specs: Sequence[LinkSpec]) -> Sequence[OpenLink]:
 
 def _refuse_loops(links: Sequence[OpenLink]) -> None:
     """Refuse links that form a loop: each returning datagram would count as a new client's."""
-    by_port: dict[int, list[tuple[OpenLink, ListenAddress]]] = {}
+    by_port: defaultdict[int, list[tuple[OpenLink, SocketName]]] = defaultdict(list)
     for link in links:
-        by_port.setdefault(link.address[1], []).append((link, link.here))
+        by_port[link.address[1]].append((link, link.name))
     following = {
         link.spec.name: other
         for link in links
-        for other, here in by_port.get(link.spec.to[1], ())
-        if leads_to(link.server, here)
+        for other, name in by_port.get(link.spec.to[1], ())
+        if leads_to(link.server, name)
     }
     for link in links:
         passed = [link.spec.name]

@@ -1,17 +1,16 @@
 """One direction of a link in the portable engine: the machine and its counters."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 from netem.engine.histogram import bucket_of, empty
 from netem.engine.relay_interface import Direction, DirectionReport, FlowReport, LinkSpec
-from netem.engine.unintended_losses import UnintendedLosses
 from netem.link_machine import Datagram, Link
 from noack.impairments.link_records import PacketDecision
 from noack.impairments.link_settings import LinkSettings
-from noack.protocol.machine_interface import Notice, Record
+from noack.protocol.machine_interface import Record
 from noack.protocol.record_tables import NETEM_RELEASE
 
 
@@ -27,64 +26,53 @@ class ScheduledDeparture(NamedTuple):
     bit: int
     delayed: bool
     copy: bool
-    stale: bool
-
-
-class _Kept(NamedTuple):
-    """A datagram that is in flight, or whose copy is."""
-
-    arrival_ns: int
-    fate: int
-    bits: tuple[int, int]
-    """Flipped bits of the datagram and of its copy."""
-    left: int
-    """Number of these two that are still in flight."""
+    stale: bool = False
 
 
 class PlainDirection:
-    """One direction of a link.
+    """One direction of a link."""
 
-    Args:
-        spec: the link.
-        direction: forward or reverse.
-        settings: the settings.
-    """
-
-    def __init__(self, spec: LinkSpec, direction: Direction, settings: LinkSettings) -> None:
-        self.settings = settings
+    def __init__(self, spec: LinkSpec, direction: Direction) -> None:
+        self.settings: LinkSettings = getattr(spec, direction)
         decisions = spec.decisions.get(direction, ())
-        self.link = Link(settings, spec.seed, spec.name, direction, decisions=decisions)
-        self.losses = UnintendedLosses(spec.name, direction)
+        self.link = Link(self.settings, spec.seed, spec.name, direction, decisions=decisions)
         self.errors: Counter[int] = Counter()
         """Number of datagrams that could not be sent or stored, by errno."""
         self._delays, self._lateness = empty(), empty()
-        self._kept: dict[tuple[int, int], _Kept] = {}
+        self._in_flight: dict[tuple[int, int, int], ScheduledDeparture] = {}
+        """By flow, packet and copy."""
 
     def admit(
         self, flow: int, data: bytes, now_ns: int
     ) -> tuple[PacketDecision, Sequence[ScheduledDeparture]]:
         """Decide for a datagram; return the departures that are due at once."""
         outputs = self.link.handle(Datagram(flow, data), now_ns)
+        datagrams = iter([output for output in outputs if isinstance(output, Datagram)])
         decision = self.link.decision
-        times_ns = (decision.release_ns, decision.copy_ns)
-        bits = (decision.bit, decision.copy_bit)
-        left = sum(t_ns > now_ns for t_ns in times_ns)
-        if left:
-            self._kept[flow, decision.packet] = _Kept(now_ns, decision.fate, bits, left)
-        now = [which for which in range(2) if times_ns[which] == now_ns]
-        datagrams = [output for output in outputs if isinstance(output, Datagram)]
-        return decision, [
-            ScheduledDeparture(
-                flow, datagram.data, decision.packet, decision.fate, now_ns, now_ns, bits[which],
-                delayed=False, copy=which == 1, stale=False,
-            )
-            for which, datagram in zip(now, datagrams, strict=True)
-        ]  # fmt: skip
+        departures = []
+        for copy, t_ns, bit in (
+            (False, decision.release_ns, decision.bit),
+            (True, decision.copy_ns, decision.copy_bit),
+        ):
+            departure = ScheduledDeparture(
+                flow, data, decision.packet, decision.fate, now_ns, t_ns, bit,
+                delayed=t_ns > now_ns, copy=copy,
+            )  # fmt: skip
+            if t_ns > now_ns:
+                self._in_flight[flow, decision.packet, copy] = departure
+            elif t_ns == now_ns:
+                departures.append(departure._replace(data=next(datagrams).data))
+        return decision, departures
 
     def due(self, now_ns: int) -> Iterator[ScheduledDeparture]:
         """Yield the departures that are due, one by one."""
         while (deadline_ns := self.link.next_deadline_ns()) is not None and deadline_ns <= now_ns:
-            yield self._departure(self.link.on_timer(now_ns))
+            datagram, record = self.link.on_timer(now_ns)
+            if not isinstance(datagram, Datagram) or not isinstance(record, Record):
+                raise TypeError(f"not a datagram with a {NETEM_RELEASE}: {datagram}, {record}")
+            _, packet, _, _, flow, copy, stale = record.row
+            departure = self._in_flight.pop((flow, packet, copy))
+            yield departure._replace(data=datagram.data, stale=bool(stale))
 
     def sent(self, departure: ScheduledDeparture, now_ns: int) -> None:
         """Record that a datagram was sent."""
@@ -97,29 +85,9 @@ class PlainDirection:
         self.settings = settings
         self.link.change(settings)
 
-    def report(self, flows: Sequence[FlowReport]) -> DirectionReport:
+    def report(self, flows: Sequence[FlowReport], unintended: Mapping[str, int]) -> DirectionReport:
         """Return the counts so far."""
-        for error, datagrams in self.errors.items():
-            self.losses.not_sent(error, datagrams)
         return DirectionReport(
-            settings=self.settings,
-            counters=replace(self.link.counters),
-            unintended=self.losses.counts(),
-            in_flight=self.link.in_flight,
-            flows=flows,
-            delays=self._delays.copy(),
-            lateness=self._lateness.copy(),
-        )
-
-    def _departure(self, outputs: Sequence[Datagram | Record | Notice]) -> ScheduledDeparture:
-        datagram, record = outputs
-        if not isinstance(datagram, Datagram) or not isinstance(record, Record):
-            raise TypeError(f"not what a {NETEM_RELEASE} comes with: {outputs}")
-        _, packet, release_ns, _, flow, copy, stale = record.row
-        kept = self._kept.pop((flow, packet))
-        if kept.left > 1:
-            self._kept[flow, packet] = kept._replace(left=kept.left - 1)
-        return ScheduledDeparture(
-            flow, datagram.data, packet, kept.fate, kept.arrival_ns, release_ns, kept.bits[copy],
-            delayed=True, copy=bool(copy), stale=bool(stale),
+            self.settings, replace(self.link.counters), unintended, self.link.in_flight, flows,
+            self._delays.copy(), self._lateness.copy(),
         )  # fmt: skip

@@ -4,51 +4,37 @@ import errno
 import select
 import selectors
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
-from netem.engine.headroom import has_headroom
-from netem.engine.link_listeners import OpenLink, open_links
+from netem.engine.link_listeners import OpenLink
 from netem.engine.plain_direction import PlainDirection, ScheduledDeparture
-from netem.engine.plain_taps import PlainTaps, TapDirection, TapEndpoints
-from netem.engine.refused_clients import STOPPED_NS, RefusedClients
+from netem.engine.plain_taps import PlainTaps, TapRoute
+from netem.engine.relay_base import RARE_PERIOD_NS, REPORTED_FLOWS, STALL_NS, Relay, has_headroom
 from netem.engine.relay_interface import (
     DIRECTIONS,
     Address,
-    Direction,
+    DirectionReport,
     FlowReport,
-    LinkReport,
     LinkSpec,
     Tap,
 )
-from netem.engine.relay_sockets import (
-    Endpoint,
-    address_of,
-    has_data,
-    icmp_errors,
-    raise_file_limit,
-    return_path,
-)
-from netem.engine.unreachable_servers import UnreachableServers
-from noack.core.errors import CallerError
+from netem.engine.relay_sockets import Endpoint, address_of, has_data, icmp_errors, return_path
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.udp_sockets import MAX_UDP_BYTES, drops_of
 
-_PERIOD_NS = 20_000_000
-_RARELY_NS = 250_000_000
 _NS = 1_000_000_000
 _BATCH = 64
 _TRIES, _MOST_TRIES = 3, 64
 _PATIENCE_S = 0.05
 """See :mod:`netem.engine.pump.pump_send`."""
-_REPORTED_FLOWS = 16
 
 
 @dataclass
 class _Client:
     number: int
-    place: Any
+    name: Any
     """The client's address in the form that sockets use."""
     path: Endpoint | None
     error: int
@@ -57,147 +43,85 @@ class _Client:
     """Local address of the return path."""
     last_ns: int
     in_flight: int = 0
-    drops: int = 0
 
 
+@dataclass
 class _PlainLink:
     """A link with its clients."""
 
-    def __init__(self, number: int, link: OpenLink) -> None:
-        self.number, self.link = number, link
-        spec = link.spec
-        self.ways = (
-            PlainDirection(spec, "forward", spec.forward),
-            PlainDirection(spec, "reverse", spec.reverse),
-        )
-        self.clients: dict[Any, _Client] = {}
-        self.by_number: dict[int, _Client] = {}
-        self.ever = 0
-        self.closed_drops = 0
-        self.refused = 0
-        self.port_unreachable = 0
-        self.refusals = RefusedClients(spec)
-        self.unreachable = UnreachableServers(spec)
+    number: int
+    link: OpenLink
+    clients: dict[Any, _Client] = field(default_factory=dict)
+    by_number: dict[int, _Client] = field(default_factory=dict)
+    clients_ever: int = 0
+    closed_drops: int = 0
+    refused: int = 0
+    port_unreachable: int = 0
 
     def take_errors(self, endpoint: Endpoint) -> bool:
         """Empty a socket's error queue; return whether there were ICMP errors."""
-        found = icmp_errors(endpoint)
+        errors = icmp_errors(endpoint)
         if endpoint is not self.link.endpoint:
-            self.port_unreachable += found.count(errno.ECONNREFUSED)
-        return bool(found)
-
-    def way(self, back: bool) -> TapDirection:
-        """Return a direction as reported to taps."""
-        mansd = self.ways[back].settings.mansd
-        return TapDirection(self.number, back, -1 if mansd is None else mansd)
-
-    def ends(self, client: _Client) -> TapEndpoints:
-        """Return the addresses between which a client's datagrams are sent."""
-        spec = self.link.spec
-        return TapEndpoints(address_of(client.place), self.link.address, client.local, spec.to)
+            self.port_unreachable += errors.count(errno.ECONNREFUSED)
+        return bool(errors)
 
 
-class PlainRelay:
-    """See :class:`netem.engine.relay_interface.Relay`; all of it is called in one thread.
-
-    Args:
-        specs: the links.
-        taps: receivers of all events.
-
-    Raises:
-        CallerError: a socket cannot be bound, or a link is invalid.
-    """
+class PlainRelay(Relay):
+    """A relay that runs everywhere; the taps receive all its events."""
 
     engine = "plain"
 
     def __init__(self, specs: Sequence[LinkSpec], taps: Sequence[Tap] = ()) -> None:
-        self.specs: Sequence[LinkSpec] = tuple(specs)
-        raise_file_limit()
         # Opened before any link: select supports low file descriptors only.
         self._selector = selectors.DefaultSelector()
-        self._links = [_PlainLink(*one) for one in enumerate(open_links(self.specs))]
+        super().__init__(specs)
+        self._links = [_PlainLink(*one) for one in enumerate(self._open_links)]
+        self._directions = [PlainDirection(spec, one) for spec in specs for one in DIRECTIONS]
         self._taps = PlainTaps(taps)
         for link in self._links:
             self._selector.register(link.link.endpoint, selectors.EVENT_READ, (link, None))
-        self._epoch_ns = 0
         self._rarely_ns = 0
         self._no_memory = False
-        self.began_unix_ns: int | None = None
-        """Unix time at which the relay started to run; the origin of its times."""
-
-    def addresses(self) -> Mapping[str, Address]:
-        """Return the address at which each link listens."""
-        return {link.link.spec.name: link.link.address for link in self._links}
-
-    def run(self, stop: Callable[[], bool], housekeeping: Callable[[], None]) -> None:
-        """Relay until ``stop()``; both are called every 20 ms, in this thread."""
-        if self.began_unix_ns is None:
-            self._epoch_ns = time.monotonic_ns()
-            self.began_unix_ns = time.time_ns()
-            self._taps.unix_ns = self.began_unix_ns
-        while not stop():
-            housekeeping()
-            # Until the next check, new datagrams use less memory than the headroom.
-            self._no_memory = not has_headroom()
-            self._keep_house()
-            until_ns = self._now_ns() + _PERIOD_NS
-            while (now_ns := self._now_ns()) < until_ns:
-                self._let_out(now_ns)
-                for link, client in self._wait(until_ns):
-                    self._take(link, client)
-            self._taps.tell()
-        self._look_at_losses()
-        for link in self._links:
-            for way in link.ways:
-                way.losses.tell()
-
-    def change(self, link: str, direction: Direction, settings: LinkSettings) -> None:
-        """Change a direction's impairments; see :meth:`netem.engine.relay_interface.Relay.change`.
-
-        Raises:
-            CallerError: there is no such link.
-        """
-        for one in self._links:
-            if one.link.spec.name == link:
-                one.ways[DIRECTIONS.index(direction)].change(settings)
-                return
-        names = ", ".join(spec.name for spec in self.specs)
-        raise CallerError(f"link {link}: there is none of this name, but {names}")
-
-    def report(self) -> Sequence[LinkReport]:
-        """Return the counts so far."""
-        self._look_at_losses()
-        return [
-            LinkReport(
-                name=link.link.spec.name,
-                listen=link.link.address,
-                to=link.link.spec.to,
-                clients=len(link.clients),
-                clients_ever=link.ever,
-                refused=link.refused,
-                discarded=link.link.discarded,
-                port_unreachable=link.port_unreachable,
-                forward=link.ways[0].report(_flows(link, link.ways[0])),
-                reverse=link.ways[1].report(_flows(link, link.ways[1])),
-            )
-            for link in self._links
-        ]
 
     def close(self) -> None:
         """Close all sockets."""
+        super().close()
         self._selector.close()
         for link in self._links:
-            link.link.close()
             for client in link.clients.values():
                 if client.path is not None:
                     client.path.close()
 
-    def _now_ns(self) -> int:
-        return time.monotonic_ns() - self._epoch_ns
+    def _relay_until(self, until_ns: int) -> None:
+        self._taps.unix_ns = self.began_unix_ns or 0
+        # Until the next check, new datagrams use less memory than the headroom.
+        self._no_memory = not has_headroom()
+        while (now_ns := self._now_ns()) < until_ns:
+            self._send_due(now_ns)
+            for link, client in self._wait(until_ns):
+                self._receive(link, client)
+        self._taps.report()
+
+    def _change(self, direction: int, settings: LinkSettings) -> None:
+        self._directions[direction].change(settings)
+
+    def _link_counts(self, link: int) -> tuple[int, int, int, int]:
+        one = self._links[link]
+        return len(one.clients), one.clients_ever, one.refused, one.port_unreachable
+
+    def _report_direction(self, direction: int) -> DirectionReport:
+        flows = []
+        of = self._directions[direction]
+        for client in self._links[direction // 2].clients.values():
+            flow = of.link.flow(client.number)
+            counts = (flow.packets, flow.longest_loss_burst) if flow is not None else (0, 0)
+            flows.append(FlowReport(client.number, address_of(client.name), *counts))
+        busiest = sorted(flows, key=lambda flow: -flow.packets)[:REPORTED_FLOWS]
+        return of.report(busiest, self._losses[direction].counts())
 
     def _wait(self, until_ns: int) -> Iterable[tuple[_PlainLink, _Client | None]]:
         """Wait for datagrams or the next departure; return the sockets that are ready."""
-        deadlines_ns = [way.link.next_deadline_ns() for link in self._links for way in link.ways]
+        deadlines_ns = [one.link.next_deadline_ns() for one in self._directions]
         wake_ns = min([until_ns, *(t_ns for t_ns in deadlines_ns if t_ns is not None)])
         wait_s = max(wake_ns - self._now_ns(), 0) / _NS
         if isinstance(self._selector, selectors.EpollSelector):
@@ -208,130 +132,121 @@ class PlainRelay:
                 return []
         return [key.data for key, _ in self._selector.select(wait_s)]
 
-    def _take(self, link: _PlainLink, client: _Client | None) -> None:
+    def _receive(self, link: _PlainLink, client: _Client | None) -> None:
         """Receive the datagrams at a socket: a client's return path, or the listening socket."""
-        back = client is not None
         endpoint = client.path if client is not None else link.link.endpoint
         if endpoint is None:
             return
-        way = link.ways[back]
         for number in range(_BATCH):
             try:
                 data, source = endpoint.recvfrom(MAX_UDP_BYTES)
             except OSError as failure:
-                nothing = isinstance(failure, BlockingIOError)
-                if not (nothing and number):  # else the socket was ready because of an ICMP error
+                is_empty = isinstance(failure, BlockingIOError)
+                if not (is_empty and number):  # else the socket was ready because of an ICMP error
                     link.take_errors(endpoint)
-                if nothing:
+                if is_empty:
                     return
                 continue
             now_ns = self._now_ns()
-            self._let_out(now_ns)
+            self._send_due(now_ns)
             sender = client or link.clients.get(source) or self._add(link, source, now_ns)
             if sender is None:
                 link.refused += 1
                 continue
             sender.last_ns = now_ns
-            if self._no_memory and way.link.delays:
-                way.errors[errno.ENOMEM] += 1
-                continue
-            verdict, departures = way.admit(sender.number, data, now_ns)
-            sender.in_flight += (verdict.release_ns > now_ns) + (verdict.copy_ns > now_ns)
-            if self._taps:
-                self._taps.arrival(
-                    link.way(back), link.ends(sender), sender.number, data, verdict, now_ns
-                )
-            for departure in departures:
-                self._send(link, back, sender, departure)
+            self._admit(link, client is not None, sender, data, now_ns)
 
-    def _let_out(self, now_ns: int) -> None:
-        """Send all datagrams that are due, in order of release time."""
-        due: list[tuple[int, int, _PlainLink, int]] = []
-        while True:
-            due = [
-                (t_ns, link.number, link, side)
-                for link in self._links
-                for side, way in enumerate(link.ways)
-                if (t_ns := way.link.next_deadline_ns()) is not None and t_ns <= now_ns
-            ]
-            if not due:
-                return
-            for _, _, link, side in due:
-                for departure in link.ways[side].due(now_ns):
-                    client = link.by_number[departure.flow]
-                    client.in_flight -= 1
-                    self._send(link, side == 1, client, departure)
+    def _admit(
+        self, link: _PlainLink, reverse: bool, client: _Client, data: bytes, now_ns: int
+    ) -> None:
+        """Decide for a datagram; send it if it leaves at once."""
+        direction = self._directions[2 * link.number + reverse]
+        if self._no_memory and direction.link.delays:
+            direction.errors[errno.ENOMEM] += 1
+            return
+        decision, departures = direction.admit(client.number, data, now_ns)
+        client.in_flight += (decision.release_ns > now_ns) + (decision.copy_ns > now_ns)
+        if self._taps:
+            route = self._route(link, reverse, client)
+            self._taps.arrival(route, client.number, data, decision, now_ns)
+        for departure in departures:
+            self._send(link, reverse, client, departure)
+
+    def _send_due(self, now_ns: int) -> None:
+        """Send the datagrams that are due, those of a direction in order of release time."""
+        for number, direction in enumerate(self._directions):
+            link = self._links[number // 2]
+            for departure in direction.due(now_ns):
+                client = link.by_number[departure.flow]
+                client.in_flight -= 1
+                self._send(link, number % 2 == 1, client, departure)
 
     def _send(
-        self, link: _PlainLink, back: bool, client: _Client, departure: ScheduledDeparture
+        self, link: _PlainLink, reverse: bool, client: _Client, departure: ScheduledDeparture
     ) -> None:
-        way, error = link.ways[back], 0
-        if back:
-            error = _transmit(link, link.link.endpoint, departure.data, client.place)
+        direction = self._directions[2 * link.number + reverse]
+        if reverse:
+            error = _transmit(link, link.link.endpoint, departure.data, client.name)
         elif link.link.path is not None:
-            error = _transmit(link, link.link.path, departure.data, link.link.server.address)
+            error = _transmit(link, link.link.path, departure.data, link.link.server)
         elif client.path is not None:
             error = _transmit(link, client.path, departure.data, None)
         else:
             error = client.error
         if error:
-            way.errors[error] += 1
+            direction.errors[error] += 1
             return
         now_ns = self._now_ns()
-        way.sent(departure, now_ns)
+        direction.sent(departure, now_ns)
         if self._taps:
-            self._taps.departure(link.way(back), link.ends(client), departure, now_ns)
+            self._taps.departure(self._route(link, reverse, client), departure, now_ns)
 
-    def _add(self, link: _PlainLink, place: Any, now_ns: int) -> _Client | None:
+    def _route(self, link: _PlainLink, reverse: bool, client: _Client) -> TapRoute:
+        mansd = self._directions[2 * link.number + reverse].settings.mansd
+        return TapRoute(
+            link.number, reverse, -1 if mansd is None else mansd, address_of(client.name),
+            link.link.address, client.local, link.link.spec.to,
+        )  # fmt: skip
+
+    def _add(self, link: _PlainLink, name: Any, now_ns: int) -> _Client | None:
         """Add a client; return None if there are too many."""
-        path, error = None, 0
-        if not link.refusals.accepts(len(link.clients)):
+        warnings, present = self._warnings[link.number], len(link.clients)
+        if not warnings.accepts_client(present):
             return None
-        if link.link.spec.return_path:
-            try:
-                path = return_path(link.link.server)
-            except OSError as failure:
-                error = failure.errno or errno.EIO
-                if link.refusals.is_exhausted(error, len(link.clients)):
-                    return None
-        local = address_of(link.link.local.address)
-        client = _Client(link.ever, place, path, error, local, now_ns)
-        link.ever += 1
-        link.clients[place] = client
+        path, error = return_path(link.link.server) if link.link.spec.return_path else (None, 0)
+        if warnings.no_descriptor_left(error, present):
+            return None
+        local = address_of(link.link.local)
+        client = _Client(link.clients_ever, name, path, error, local, now_ns)
+        link.clients_ever += 1
+        link.clients[name] = client
         link.by_number[client.number] = client
         if path is not None:
             self._set_path(link, client, path)
         return client
 
     def _set_path(self, link: _PlainLink, client: _Client, path: Endpoint) -> None:
-        client.path, client.error = path, 0
+        client.path = path
         client.local = address_of(path.getsockname())
         self._selector.register(path, selectors.EVENT_READ, (link, client))
 
-    def _keep_house(self) -> None:
-        now_ns = self._now_ns()
+    def _keep_house(self, now_ns: int) -> None:
         if now_ns < self._rarely_ns:
             return
-        stopped = now_ns - self._rarely_ns > STOPPED_NS - _RARELY_NS
-        self._rarely_ns = now_ns + _RARELY_NS
-        self._look_at_losses()
+        stalled = now_ns - self._rarely_ns > STALL_NS - RARE_PERIOD_NS
+        self._rarely_ns = now_ns + RARE_PERIOD_NS
+        self._update_losses()
         for link in self._links:
             idle_ns = round(link.link.spec.idle_s * _NS)
             for client in list(link.clients.values()):
-                if stopped:  # datagrams that arrived meanwhile have not been read
+                if stalled:  # datagrams that arrived meanwhile have not been read
                     client.last_ns = now_ns
                 if client.last_ns < now_ns - idle_ns and not client.in_flight:
                     self._forget(link, client)
                 elif client.error:
-                    self._reconnect(link, client)
-
-    def _reconnect(self, link: _PlainLink, client: _Client) -> None:
-        try:
-            path = return_path(link.link.server)
-        except OSError as failure:
-            client.error = failure.errno or errno.EIO
-        else:
-            self._set_path(link, client, path)
+                    path, client.error = return_path(link.link.server)
+                    if path is not None:
+                        self._set_path(link, client, path)
 
     def _forget(self, link: _PlainLink, client: _Client) -> None:
         if client.path is not None:
@@ -340,38 +255,31 @@ class PlainRelay:
             link.closed_drops += drops_of(client.path) or 0
             self._selector.unregister(client.path)
             client.path.close()
-        del link.clients[client.place], link.by_number[client.number]
-        for way in link.ways:
-            way.link.forget(client.number)
-        link.refusals.end()
+        del link.clients[client.name], link.by_number[client.number]
+        for direction in self._directions[2 * link.number : 2 * link.number + 2]:
+            direction.link.forget(client.number)
+        self._warnings[link.number].client_removed()
 
-    def _look_at_losses(self) -> None:
-        for link in self._links:
-            link.unreachable.seen(link.port_unreachable)
-            link.ways[0].losses.lost_in_kernel(drops_of(link.link.endpoint) or 0)
-            paths = [client.path for client in link.clients.values() if client.path is not None]
-            drops = link.closed_drops + sum(drops_of(path) or 0 for path in paths)
-            link.ways[1].losses.lost_in_kernel(drops)
+    def _path_drops(self, link: int) -> int:
+        clients = self._links[link].clients.values()
+        paths = [client.path for client in clients if client.path is not None]
+        return self._links[link].closed_drops + sum(drops_of(path) or 0 for path in paths)
 
-
-def _flows(link: _PlainLink, way: PlainDirection) -> Sequence[FlowReport]:
-    known = []
-    for client in link.clients.values():
-        flow = way.link.flow(client.number)
-        packets, longest = (flow.packets, flow.longest_loss_burst) if flow is not None else (0, 0)
-        known.append(FlowReport(client.number, address_of(client.place), packets, longest))
-    return sorted(known, key=lambda flow: -flow.packets)[:_REPORTED_FLOWS]
+    def _send_errors(self) -> Iterator[tuple[int, int, int]]:
+        for number, direction in enumerate(self._directions):
+            for error, datagrams in direction.errors.items():
+                yield number, error, datagrams
 
 
-def _transmit(link: _PlainLink, endpoint: Endpoint, data: bytes, place: Any) -> int:
+def _transmit(link: _PlainLink, endpoint: Endpoint, data: bytes, name: Any) -> int:
     """Send a datagram; return 0, or the errno of a permanent failure."""
     tries, give_up_s = 0, time.monotonic() + _PATIENCE_S
     while True:
         try:
-            if place is None:
+            if name is None:
                 endpoint.send(data)
             else:
-                endpoint.sendto(data, place)
+                endpoint.sendto(data, name)
         except OSError as failure:
             error = failure.errno or errno.EIO
             if error == errno.EAGAIN and time.monotonic() < give_up_s:

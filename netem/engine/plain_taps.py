@@ -14,9 +14,12 @@ from noack.impairments.link_records import NEVER_NS, PacketDecision
 _MOST = 512
 
 
-class TapEndpoints(NamedTuple):
-    """The addresses between which a client's datagrams are sent."""
+class TapRoute(NamedTuple):
+    """A direction of a link, and the addresses between which a client's datagrams are sent."""
 
+    link: int
+    reverse: bool
+    mansd: int
     client: Address
     listen: Address
     path: Address
@@ -24,20 +27,8 @@ class TapEndpoints(NamedTuple):
     server: Address
 
 
-class TapDirection(NamedTuple):
-    """A direction of a link."""
-
-    link: int
-    back: bool
-    mansd: int
-
-
 class PlainTaps:
-    """Taps, and the events that have not been passed to them yet.
-
-    Args:
-        taps: the taps.
-    """
+    """Taps, and the events that have not been passed to them yet."""
 
     def __init__(self, taps: Sequence[Tap]) -> None:
         self._taps = tuple(taps)
@@ -52,39 +43,28 @@ class PlainTaps:
         return bool(self._taps)
 
     def arrival(
-        self,
-        way: TapDirection,
-        ends: TapEndpoints,
-        flow: int,
-        data: bytes,
-        verdict: PacketDecision,
-        now_ns: int,
+        self, route: TapRoute, flow: int, data: bytes, decision: PacketDecision, now_ns: int
     ) -> None:
         """Report the arrival of a datagram and the decision."""
-        event = self._add(way, ends, way.back, data, now_ns)
-        event["flow"], event["packet"], event["fate"] = flow, verdict.packet, verdict.fate
-        event["consecutive_losses"] = verdict.consecutive_losses
-        event["delay_ns"] = _delay(verdict.release_ns, now_ns)
-        event["copy_delay_ns"] = _delay(verdict.copy_ns, now_ns)
-        event["hold_back_ns"] = verdict.hold_back_ns
-        event["bit"], event["copy_bit"] = verdict.bit, verdict.copy_bit
-        event["departure"] = 0
+        event = self._add(route, route.reverse, data, now_ns)
+        event["flow"], event["packet"], event["fate"] = flow, decision.packet, decision.fate
+        event["consecutive_losses"] = decision.consecutive_losses
+        event["delay_ns"] = _delay(decision.release_ns, now_ns)
+        event["copy_delay_ns"] = _delay(decision.copy_ns, now_ns)
+        event["hold_back_ns"] = decision.hold_back_ns
+        event["bit"], event["copy_bit"] = decision.bit, decision.copy_bit
 
-    def departure(
-        self, way: TapDirection, ends: TapEndpoints, departure: ScheduledDeparture, now_ns: int
-    ) -> None:
+    def departure(self, route: TapRoute, departure: ScheduledDeparture, now_ns: int) -> None:
         """Report the departure of a datagram or a copy."""
-        event = self._add(way, ends, not way.back, departure.data, now_ns)
+        event = self._add(route, not route.reverse, departure.data, now_ns)
         event["flow"], event["packet"] = departure.flow, departure.packet
-        event["fate"] = departure.fate
+        event["fate"], event["bit"] = departure.fate, departure.bit
         event["delay_ns"] = now_ns - departure.arrival_ns
         event["copy_delay_ns"] = event["copy_bit"] = -1
-        event["consecutive_losses"] = event["hold_back_ns"] = 0
-        event["bit"] = departure.bit
         event["departure"] = 1
         event["copy"], event["stale"] = departure.copy, departure.stale
 
-    def tell(self) -> None:
+    def report(self) -> None:
         """Pass the collected events to the taps."""
         if self._count:
             data = np.frombuffer(bytes(self._data), np.uint8)
@@ -94,21 +74,18 @@ class PlainTaps:
             self._count = 0
             self._data.clear()
 
-    def _add(
-        self, way: TapDirection, ends: TapEndpoints, server_side: bool, data: bytes, now_ns: int
-    ) -> np.void:
+    def _add(self, route: TapRoute, server_side: bool, data: bytes, now_ns: int) -> np.void:
         if self._count == _MOST:
-            self.tell()
+            self.report()
         event: np.void = self._events[self._count]
         self._count += 1
         event["t_ns"] = self.unix_ns + now_ns
-        event["link"], event["direction"], event["mansd"] = way.link, way.back, way.mansd
-        event["interface"] = 2 * way.link + server_side
-        event["size_bytes"] = len(data)
-        event["offset"] = len(self._data)
-        near, far = (ends.path, ends.server) if server_side else (ends.client, ends.listen)
+        event["link"], event["direction"], event["mansd"] = route[:3]
+        event["interface"] = 2 * route.link + server_side
+        event["size_bytes"], event["offset"] = len(data), len(self._data)
+        ends = (route.path, route.server) if server_side else (route.client, route.listen)
         for field, (host, port) in zip(
-            ("source", "destination"), (far, near) if way.back else (near, far), strict=True
+            ("source", "destination"), ends[::-1] if route.reverse else ends, strict=True
         ):
             address = ipaddress.ip_address(host.partition("%")[0])
             packed = address.packed.ljust(ADDRESS_BYTES, b"\0")

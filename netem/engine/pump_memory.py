@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.engine.headroom import has_headroom
 from netem.engine.histogram import BUCKETS
 from netem.engine.pump import pump_layout
 from netem.engine.pump.pump_layout import Array, Memory
+from netem.engine.relay_base import has_headroom
 from netem.relay_events import EVENT
 from noack.impairments.link_records import Counters, LinkState, dtype_of
 
@@ -27,53 +27,44 @@ _TABLE_SHARE = 4
 
 
 class PumpMemory:
-    """The pump's memory.
-
-    Args:
-        links: number of links.
-        segment: whether datagrams of equal size are sent as one message.
-        taps: 0: none, 1: taps without data, 2: taps with data.
-    """
+    """The pump's memory for a number of links; ``segment`` and ``taps`` as in its layout."""
 
     def __init__(self, links: int, segment: bool, taps: int) -> None:
-        def rows(count: int, dtype: Any) -> Array:
-            return np.zeros(count, dtype)
-
-        ways = 2 * links
+        directions = 2 * links
         self.first_path = 2 * links
         self._buffers = np.empty(_BUFFERS * pump_layout.SLOT_STRIDE + 64, np.uint8)
         self._chunks: list[Array] = []
         self.memory = Memory(
-            pump=rows(1, pump_layout.PUMP),
-            sockets=rows(2 * links + _CLIENTS, pump_layout.SOCKET),
-            clients=rows(_CLIENTS, pump_layout.CLIENT),
+            pump=np.zeros(1, pump_layout.PUMP),
+            sockets=np.zeros(2 * links + _CLIENTS, pump_layout.SOCKET),
+            clients=np.zeros(_CLIENTS, pump_layout.CLIENT),
             table=np.full(_TABLE_SHARE * _CLIENTS, -1, np.int32),
-            directions=rows(ways, pump_layout.DIRECTION),
-            link_states=rows(ways, dtype_of(LinkState)),
-            counters=rows(ways, dtype_of(Counters)),
-            delays=np.zeros((ways, BUCKETS), np.int64),
-            lateness=np.zeros((ways, BUCKETS), np.int64),
-            errors=np.zeros((ways, 256), np.int64),
+            directions=np.zeros(directions, pump_layout.DIRECTION),
+            link_states=np.zeros(directions, dtype_of(LinkState)),
+            counters=np.zeros(directions, dtype_of(Counters)),
+            delays=np.zeros((directions, BUCKETS), np.int64),
+            lateness=np.zeros((directions, BUCKETS), np.int64),
+            errors=np.zeros((directions, 256), np.int64),
             time=np.zeros(2, np.int64),
             poll=np.zeros(2, np.int32),
             ready=np.zeros(_READY * pump_layout.READY_WORDS, np.uint32),
-            in_headers=rows(_BUFFERS, pump_layout.HEADER),
-            in_vectors=rows(_BUFFERS, pump_layout.VECTOR),
+            in_headers=np.zeros(_BUFFERS, pump_layout.HEADER),
+            in_vectors=np.zeros(_BUFFERS, pump_layout.VECTOR),
             in_names=np.zeros((_BUFFERS, pump_layout.NAME_BYTES // 8), np.int64),
             in_controls=np.zeros((_BUFFERS, pump_layout.CONTROL_BYTES // 8), np.int64),
-            error_headers=rows(_ERRORS, pump_layout.HEADER),
+            error_headers=np.zeros(_ERRORS, pump_layout.HEADER),
             error_controls=np.zeros((_ERRORS, pump_layout.ERROR_CONTROL_BYTES // 8), np.int64),
-            out_headers=rows(_LEAVING, pump_layout.HEADER),
+            out_headers=np.zeros(_LEAVING, pump_layout.HEADER),
             out_first=np.zeros(_LEAVING, np.int32),
-            out_vectors=rows(_VECTORS, pump_layout.VECTOR),
-            out_controls=rows(_LEAVING, pump_layout.CONTROL),
-            leaving=rows(_LEAVING, pump_layout.LEAVING),
+            out_vectors=np.zeros(_VECTORS, pump_layout.VECTOR),
+            out_controls=np.zeros(_LEAVING, pump_layout.CONTROL),
+            leaving=np.zeros(_LEAVING, pump_layout.LEAVING),
             order=np.zeros(_LEAVING, np.int32),
-            heap=rows(_SLOTS, pump_layout.ENTRY),
-            slots=rows(_SLOTS, pump_layout.SLOT),
+            heap=np.zeros(_SLOTS, pump_layout.ENTRY),
+            slots=np.zeros(_SLOTS, pump_layout.SLOT),
             chunks=np.zeros(0, np.int64),
             block_next=np.zeros(0, np.int32),
-            events=rows(_EVENTS if taps else 0, EVENT),
+            events=np.zeros(_EVENTS if taps else 0, EVENT),
             data=np.zeros(_DATA_BYTES if taps == 2 else 0, np.uint8),
             integers=np.zeros(1, np.int32),
         )
@@ -102,17 +93,13 @@ class PumpMemory:
         headers["control_bytes"] = pump_layout.CONTROL_BYTES
 
     def add_room(self) -> bool:
-        """Make room for one more delayed datagram of any size, and its copy.
-
-        Returns:
-            Whether there is enough memory.
-        """
+        """Make room for one more delayed datagram and its copy; return whether memory sufficed."""
         old = self.memory
         if not has_headroom(2 * (old.heap.nbytes + old.slots.nbytes)):
             return False
         if self.pump["free_slots"] < 2:
             count = len(old.slots)
-            self.memory = old._replace(heap=_doubled(old.heap), slots=_doubled(old.slots))
+            self.memory = old._replace(heap=doubled(old.heap), slots=doubled(old.slots))
             self._free_slots(count)
         # Any two datagrams fit into one chunk.
         if self.pump["free_blocks"] < pump_layout.CHUNK_BLOCKS // 2:
@@ -138,7 +125,7 @@ class PumpMemory:
         """Double the maximum number of clients; the new hash table is empty."""
         old = self.memory
         count = len(old.clients)
-        clients = _doubled(old.clients)
+        clients = doubled(old.clients)
         clients["number"][count:] = -1
         sockets = np.zeros(self.first_path + 2 * count, pump_layout.SOCKET)
         sockets["fd"] = -1
@@ -146,12 +133,12 @@ class PumpMemory:
         table = np.full(2 * _TABLE_SHARE * count, -1, np.int32)
         self.memory = old._replace(clients=clients, sockets=sockets, table=table)
 
-    def latest_ns(self, way: int, rows: int) -> NDArray[np.int64]:
+    def latest_ns(self, direction: int, rows: int) -> NDArray[np.int64]:
         """Return the last departure time (rows,) of each flow's packets in flight; −1: none."""
         memory = self.memory
         heap = memory.heap[: self.pump["heap"]]
         slots = memory.slots[heap["slot"]]
-        own = slots["direction"] == way
+        own = slots["direction"] == direction
         latest = np.full(rows, -1, np.int64)
         places = memory.clients["place"][slots["client"][own]]
         np.maximum.at(latest, places, heap["release_ns"][own])
@@ -182,7 +169,8 @@ class PumpMemory:
         )
 
 
-def _doubled(array: Array) -> Array:
-    grown = np.zeros(2 * len(array), array.dtype)
+def doubled(array: Array) -> Array:
+    """Return an array of twice the length; the new elements are 0."""
+    grown = np.zeros((2 * len(array), *array.shape[1:]), array.dtype)
     grown[: len(array)] = array
     return grown

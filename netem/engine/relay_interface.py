@@ -5,7 +5,7 @@ its flow in both directions, and a return path: its own socket towards the serve
 server's answers arrive.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
@@ -111,42 +111,3 @@ class Tap(Protocol):
 
         Both arrays are overwritten after the call.
         """
-        ...
-
-    def missing(self, events: int) -> None:
-        """Count events that were lost because there was no room for them."""
-        ...
-
-
-class Relay(Protocol):
-    """An engine with its links."""
-
-    engine: str
-    """``batched`` or ``plain``."""
-    specs: Sequence[LinkSpec]
-    began_unix_ns: int | None
-    """Unix time at which it started to run; the origin of its times, including blackouts."""
-
-    def addresses(self) -> Mapping[str, Address]:
-        """Return the address at which each link listens."""
-        ...
-
-    def run(self, stop: Callable[[], bool], housekeeping: Callable[[], None]) -> None:
-        """Relay until ``stop()``; both are called at least every 50 ms, in this thread."""
-        ...
-
-    def change(self, link: str, direction: Direction, settings: LinkSettings) -> None:
-        """Change a direction's impairments between two datagrams.
-
-        Flows keep their numbers, the positions in their random streams, and their counters. Packets
-        in flight leave at their planned times.
-        """
-        ...
-
-    def report(self) -> Sequence[LinkReport]:
-        """Return the counts so far."""
-        ...
-
-    def close(self) -> None:
-        """Close all sockets."""
-        ...

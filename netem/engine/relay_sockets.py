@@ -6,10 +6,11 @@ import socket
 import struct
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from ipaddress import IPv4Address, IPv6Address, ip_address
-from typing import Any, NamedTuple
+from typing import Any
 
+from netem.engine.pump.pump_layout import NAME_BYTES
 from netem.engine.relay_interface import Address, LinkSpec
 from noack.core.errors import CallerError
 from noack.runtime.address import text_of
@@ -29,42 +30,41 @@ _RECVERR = ((socket.IPPROTO_IP, 11), (socket.IPPROTO_IPV6, 25))
 _ERROR_BYTES = 128
 
 Endpoint = socket.socket
+SocketName = tuple[Any, ...]
+"""An address in the form that sockets use: host and port; IPv6: also flow label and scope."""
 
 
-class ListenAddress(NamedTuple):
-    """An address to which datagrams can be sent: a family, and the address in its sockets' form."""
-
-    family: int
-    address: Any
-
-
-def place_of(address: Address, what: str) -> ListenAddress:
+def socket_name(address: Address, what: str) -> SocketName:
     """Return an address in the form that sockets use.
 
     Raises:
         CallerError: the host is not numeric.
     """
-    host, port = address
+    numeric = socket.AI_NUMERICHOST | socket.AI_NUMERICSERV
     try:
-        found = socket.getaddrinfo(
-            host, port, type=socket.SOCK_DGRAM, flags=socket.AI_NUMERICHOST | socket.AI_NUMERICSERV
-        )
+        results = socket.getaddrinfo(*address, type=socket.SOCK_DGRAM, flags=numeric)
     except OSError as error:
         raise CallerError(
-            f"{what}: {host}: not an address of IPv4 or IPv6 ({error.strerror})"
+            f"{what}: {address[0]}: not an address of IPv4 or IPv6 ({error.strerror})"
         ) from None
-    return ListenAddress(int(found[0][0]), found[0][4])
+    return results[0][4]
 
 
-def listen(spec: LinkSpec, place: ListenAddress) -> Endpoint:
+def _udp_socket(name: SocketName) -> Endpoint:
+    """Return a socket of the family of an address."""
+    family = socket.AF_INET if len(name) == 2 else socket.AF_INET6
+    return socket.socket(family, socket.SOCK_DGRAM)
+
+
+def listen(spec: LinkSpec, name: SocketName) -> Endpoint:
     """Return the socket that a link listens on.
 
     Raises:
         CallerError: the address cannot be bound.
     """
-    endpoint = socket.socket(place.family, socket.SOCK_DGRAM)
+    endpoint = _udp_socket(name)
     try:
-        endpoint.bind(place.address)
+        endpoint.bind(name)
     except OSError as error:
         endpoint.close()
         reason = {
@@ -80,23 +80,23 @@ def listen(spec: LinkSpec, place: ListenAddress) -> Endpoint:
     return endpoint
 
 
-def return_path(server: ListenAddress) -> Endpoint:
-    """Return a socket connected to the server; it receives the server's answers only.
+def return_path(server: SocketName) -> tuple[Endpoint | None, int]:
+    """Return a socket connected to the server, which receives the server's answers only, and 0.
 
-    Raises:
-        OSError: there is no route to the server, or no file descriptor left.
+    If there is no route to the server, or no file descriptor left: None and the errno.
     """
-    endpoint = socket.socket(server.family, socket.SOCK_DGRAM)
-    try:
-        endpoint.connect(server.address)
+    with ExitStack() as undo:
+        try:
+            endpoint = undo.enter_context(_udp_socket(server))
+            endpoint.connect(server)
+        except OSError as error:
+            return None, error.errno or errno.EIO
         _prepare(endpoint)
-    except BaseException:
-        endpoint.close()
-        raise
-    return endpoint
+        undo.pop_all()
+    return endpoint, 0
 
 
-def one_way_path(server: ListenAddress) -> Endpoint:
+def one_way_path(server: SocketName) -> Endpoint:
     """Return the sending socket of a link without a reverse direction.
 
     It receives nothing: the kernel drops answers at once; they are counted by
@@ -105,36 +105,34 @@ def one_way_path(server: ListenAddress) -> Endpoint:
     Raises:
         OSError: there is no file descriptor left.
     """
-    endpoint = socket.socket(server.family, socket.SOCK_DGRAM)
-    try:
-        _take_nothing(endpoint)
+    with ExitStack() as undo:
+        endpoint = undo.enter_context(_udp_socket(server))
+        _drop_received(endpoint)
         # Bind to the address that it will send from, if there is a route to the server.
-        with suppress(OSError), socket.socket(server.family, socket.SOCK_DGRAM) as scout:
-            scout.connect(server.address)
-            endpoint.bind((scout.getsockname()[0], 0, *scout.getsockname()[2:]))
+        with suppress(OSError), _udp_socket(server) as probe:
+            probe.connect(server)
+            endpoint.bind((probe.getsockname()[0], 0, *probe.getsockname()[2:]))
         if endpoint.getsockname()[1] == 0:
             endpoint.bind(("", 0))
         endpoint.setblocking(False)
         _prepare_to_send(endpoint)
-    except BaseException:
-        endpoint.close()
-        raise
+        undo.pop_all()
     return endpoint
 
 
-def leads_to(server: ListenAddress, here: ListenAddress) -> bool:
-    """Whether datagrams to the host of ``server`` reach a socket bound to ``here`` (any port).
+def leads_to(server: SocketName, bound_name: SocketName) -> bool:
+    """Whether datagrams to the host of ``server`` reach a socket bound to a name (any port).
 
     The system resolves source and destination, so that this machine's addresses are recognised,
     and the unspecified address is the loopback address.
     """
     try:
-        with socket.socket(server.family, socket.SOCK_DGRAM) as probe:
-            probe.connect(server.address)
+        with _udp_socket(server) as probe:
+            probe.connect(server)
             source, host = (_host(name) for name in (probe.getsockname(), probe.getpeername()))
     except OSError:
         return False
-    bound = _host(here.address)
+    bound = _host(bound_name)
     if bound.is_unspecified:
         return (host == source or host.is_loopback) and bound.version >= host.version
     return bound == host
@@ -151,15 +149,15 @@ def icmp_errors(endpoint: Endpoint) -> list[int]:
 
     The compiled engine has its own version (:mod:`netem.engine.pump.error_queue`).
     """
-    found: list[int] = []
+    errors: list[int] = []
     with suppress(OSError):
         while sys.platform == "linux":
             _, ancillary, _, _ = endpoint.recvmsg(0, _ERROR_BYTES, _MSG_ERRQUEUE)
             for level, kind, data in ancillary:
                 if (level, kind) in _RECVERR and len(data) >= _EXTENDED_ERROR.size:
                     error, origin = _EXTENDED_ERROR.unpack_from(data)
-                    found += [error] if origin in _ICMP_ORIGINS else []
-    return found
+                    errors += [error] if origin in _ICMP_ORIGINS else []
+    return errors
 
 
 def has_data(endpoint: Endpoint) -> bool:
@@ -184,6 +182,29 @@ def address_of(name: Sequence[Any]) -> Address:
     """Return a name from ``getsockname`` as an address; a scope follows the host after ``%``."""
     host, scope = str(name[0]).partition("%")[0], name[3] if len(name) > 3 else 0
     return (f"{host}%{scope}" if scope else host), int(name[1])
+
+
+def packed_name(name: SocketName) -> tuple[bytes, int]:
+    """Return a name as the kernel's struct sockaddr, padded to NAME_BYTES, and its length."""
+    host, port = name[:2]
+    if len(name) == 2:
+        packed = struct.pack("=H", socket.AF_INET) + struct.pack("!H", port)
+        packed += socket.inet_pton(socket.AF_INET, host) + bytes(8)
+    else:
+        packed = struct.pack("=H", socket.AF_INET6) + struct.pack("!HI", port, name[2])
+        packed += socket.inet_pton(socket.AF_INET6, host.partition("%")[0])
+        packed += struct.pack("=I", name[3])
+    return packed.ljust(NAME_BYTES, b"\0"), len(packed)
+
+
+def unpacked_address(packed: bytes) -> Address:
+    """Return a struct sockaddr as host and port; a scope follows the host after ``%``."""
+    (family,) = struct.unpack_from("=H", packed)
+    (port,) = struct.unpack_from("!H", packed, 2)
+    if family == socket.AF_INET:
+        return socket.inet_ntop(socket.AF_INET, packed[4:8]), port
+    (scope,) = struct.unpack_from("=I", packed, 24)
+    return address_of((socket.inet_ntop(socket.AF_INET6, packed[8:24]), port, 0, scope))
 
 
 def _host(name: Sequence[Any]) -> IPv4Address | IPv6Address:
@@ -214,7 +235,7 @@ def _prepare_to_send(endpoint: Endpoint) -> None:
             endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)
 
 
-def _take_nothing(endpoint: Endpoint) -> None:
+def _drop_received(endpoint: Endpoint) -> None:
     """Make the kernel drop received datagrams: by a filter, or else by a minimal buffer."""
     instruction = ctypes.create_string_buffer(struct.pack("=HBBI", _BPF_RETURN, 0, 0, 0))
     program = struct.pack("@HP", 1, ctypes.addressof(instruction))

@@ -25,13 +25,8 @@ _PATIENCE_S = 60.0
 def matrices_as_npz(content: bytes, most_entries: int) -> bytes:
     """Return the matrices of a ``.mat`` file as the content of a ``.npz`` file.
 
-    Args:
-        content: of the file.
-        most_entries: arrays with more entries are left out, as are arrays that are not numeric.
-
-    Raises:
-        NotImplementedError: the file has the format of MATLAB's v7.3.
-        ValueError: it cannot be read.
+    Arrays with more than ``most_entries``, and arrays that are not numeric, are left out. Raise
+    NotImplementedError for MATLAB's format v7.3, and ValueError for an unreadable file.
     """
     command = python_command("-m", __name__, most_entries)
     try:

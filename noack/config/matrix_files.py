@@ -31,15 +31,8 @@ def with_matrices(content: Mapping[str, Any], folder: Path, source: str) -> Mapp
     """Return a scenario's content with the matrices of the files that it names.
 
     ``model.file`` gives A, B and, unless the scenario has one, the gain; ``plant.file`` gives A and
-    B. Invalid content is returned unchanged.
-
-    Args:
-        content: of a scenario file.
-        folder: relative names are relative to it.
-        source: names the content in error messages.
-
-    Raises:
-        CallerError: one line; a file cannot be read, or lacks a matrix.
+    B. Names are relative to ``folder``. Invalid content is returned unchanged. If a file cannot be
+    read or lacks a matrix, CallerError has one line, which begins with ``source``.
     """
     read = dict(content)
     for table, keys in (("model", ("A", "B", GAIN)), ("plant", ("A", "B"))):
@@ -51,7 +44,7 @@ def with_matrices(content: Mapping[str, Any], folder: Path, source: str) -> Mapp
 
 
 def _can_be_read(section: Mapping[str, Any]) -> bool:
-    """Whether a section names a file correctly; incorrect entries are refused by the validation."""
+    """Whether a section names a file correctly; the validation refuses incorrect entries."""
     names = section.get("names", {})
     return (
         isinstance(section.get("file"), str)
@@ -73,11 +66,7 @@ def _replaced(
 
 
 def read_matrices(file: NamedFile, names: Mapping[str, str] | None = None) -> dict[str, Matrix]:
-    """Read A, B and, if there is one, the gain.
-
-    Args:
-        file: has the arrays A, B, and gain or K.
-        names: names of the arrays that differ from these.
+    """Read A, B and, if there is one, the gain (named gain or K, or as ``names`` says).
 
     Raises:
         CallerError: the file cannot be read or lacks a matrix; or C is not the identity, D is not
@@ -105,13 +94,9 @@ def read_matrices(file: NamedFile, names: Mapping[str, str] | None = None) -> di
 
 
 def unfit(C: Any, D: Any, dt: Any, n: int) -> str | None:
-    """Return why the loop cannot use a state-space model's C, D or dt; None if it can.
+    """Return why the loop cannot use a state-space model of n states; None if it can.
 
-    Args:
-        C: output matrix, or None.
-        D: feedthrough, or None.
-        dt: sampling time; 0 and None are continuous time.
-        n: number of states.
+    C, D and the sampling time dt may be None; dt = 0 is continuous time.
     """
     if dt is not None and np.any(np.asarray(dt) != 0):
         return (
@@ -129,11 +114,7 @@ def unfit(C: Any, D: Any, dt: Any, n: int) -> str | None:
 
 
 def write_matrices(path: Path, matrices: Mapping[str, Matrix]) -> None:
-    """Write matrices to a file that :func:`read_matrices` reads.
-
-    Raises:
-        ValueError: the name ends neither in ``.npz`` nor in ``.mat``.
-    """
+    """Write matrices to an ``.npz`` or ``.mat`` file; raise ValueError for another suffix."""
     if path.suffix == NPZ:
         np.savez(path, allow_pickle=False, **matrices)
     elif path.suffix == MAT:

@@ -24,7 +24,7 @@ class MessageSizes:
     def inputs_reported(self) -> int:
         """Number of applied inputs in a measurement: m per plant step since the last measurement.
 
-        An observer needs them; without an observer it is 0.
+        Only an observer needs them; without an observer it is 0.
         """
         if self.scenario.observer is None:
             return 0

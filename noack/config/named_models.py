@@ -38,14 +38,12 @@ def lane_following(parameters: Mapping[str, float]) -> NamedModel:
     p = {**LANE_FOLLOWING_DEFAULTS, **parameters}
     if p["look_ahead"] == 0:
         raise ValueError("parameters.look_ahead: the look-ahead distance cannot be 0")
-    A = np.array(
-        [
-            [p["a11"], p["a12"], 0.0, 0.0],
-            [p["a21"], p["a22"], 0.0, 0.0],
-            [0.0, 1.0, 0.0, 0.0],
-            [1.0, 0.0, p["speed"], 0.0],
-        ]
-    )
+    A = np.array([
+        [p["a11"], p["a12"], 0.0, 0.0],
+        [p["a21"], p["a22"], 0.0, 0.0],
+        [0.0, 1.0, 0.0, 0.0],
+        [1.0, 0.0, p["speed"], 0.0],
+    ])  # fmt: skip
     B = np.array([[p["b1"], 0.0], [0.0, p["b2"]], [0.0, 0.0], [0.0, 0.0]])
     row = [0.0, 0.0, -p["gain"], p["gain"] / p["look_ahead"]]
     return NamedModel(A, B, np.array([row, row]), ("V", "r", "psi", "Y_g"), ("u_1", "u_2"))
@@ -83,14 +81,12 @@ def single_track_lane(parameters: Mapping[str, float]) -> NamedModel:
     m, inertia, v = p["mass_kg"], p["inertia_kg_m2"], p["speed_m_per_s"]
     (a, b), (c_f, c_r) = (p["front_m"], p["rear_m"]), (p["front_n_per_rad"], p["rear_n_per_rad"])
     uneven = a * c_f - b * c_r
-    A = np.array(
-        [
-            [-(c_f + c_r) / (m * v), uneven / (m * v) + v, 0.0, 0.0],
-            [uneven / (inertia * v), -(a * a * c_f + b * b * c_r) / (inertia * v), 0.0, 0.0],
-            [0.0, 1.0, 0.0, 0.0],
-            [1.0, 0.0, -v, 0.0],
-        ]
-    )
+    A = np.array([
+        [-(c_f + c_r) / (m * v), uneven / (m * v) + v, 0.0, 0.0],
+        [uneven / (inertia * v), -(a * a * c_f + b * b * c_r) / (inertia * v), 0.0, 0.0],
+        [0.0, 1.0, 0.0, 0.0],
+        [1.0, 0.0, -v, 0.0],
+    ])  # fmt: skip
     B = np.array([[-c_f / m], [a * c_f / inertia], [0.0], [0.0]])
     K = np.array([[0.0, 0.0, -p["gain"], p["gain"] / p["look_ahead_m"]]])
     return NamedModel(A, B, K, ("V", "r", "psi", "Y_g"), ("steering",))

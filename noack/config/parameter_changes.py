@@ -39,17 +39,11 @@ class ParameterChange(NamedTuple):
     settings: Mapping[str, Any]
     """Values by keys of the scenario."""
 
-    @property
-    def data(self) -> bytes:
-        """The settings as stored in the record."""
-        return settings_bytes(self.settings)
-
 
 def settings_bytes(settings: Mapping[str, Any]) -> bytes:
     """Return settings as JSON, padded with zeros to the width of the record's column.
 
-    Raises:
-        CallerError: they are too long for the column.
+    Raise CallerError if they are too long for the column.
     """
     data = json.dumps(settings, sort_keys=True, separators=(",", ":")).encode()
     if len(data) > CHANGE_BYTES:
@@ -60,11 +54,7 @@ def settings_bytes(settings: Mapping[str, Any]) -> bytes:
 
 
 def settings_of(data: bytes) -> dict[str, Any]:
-    """Read settings from the record.
-
-    Raises:
-        ValueError: the data are not settings.
-    """
+    """Read settings from the record; raise ValueError if the data are not settings."""
     found = json.loads(data.rstrip(b"\0"))
     if not isinstance(found, dict):
         raise ValueError("a change is a table of keys and values")
@@ -74,12 +64,7 @@ def settings_of(data: bytes) -> dict[str, Any]:
 def changed(scenario: Scenario, settings: Mapping[str, Any]) -> Scenario:
     """Return a scenario with other settings, validated as a whole.
 
-    Args:
-        scenario: the scenario.
-        settings: values by keys.
-
-    Raises:
-        CallerError: one line per mistake.
+    Raise CallerError with one line per mistake.
     """
     settings_bytes(settings)
     try:
@@ -114,7 +99,7 @@ CHANGED = "change"
 """Level of the notice of a change."""
 
 
-def said_of(change: ParameterChange, more: str = "") -> Notice:
+def change_notice(change: ParameterChange, more: str = "") -> Notice:
     """Return the notice of a change for the run's log."""
     text = f"{text_of(change.settings)} from {change.t_ns / NS_PER_S:.3f} s on{more}"
     return Notice(change.t_ns, CHANGED, text)
@@ -126,8 +111,7 @@ class ReconfigurableMachine(Machine[T], Protocol[T]):
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
         """Process the announcement of a change; return one row and its notices.
 
-        Raises:
-            CallerError: the scenario with this change would be invalid; nothing is changed.
+        Raise CallerError, and change nothing, if the scenario would be invalid.
         """
         ...
 
@@ -136,11 +120,7 @@ class FixedMachine:
     """Base of machines with constant settings: those of the acknowledgement baseline."""
 
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
-        """Refuse the announcement of a change.
-
-        Raises:
-            CallerError: always.
-        """
+        """Refuse the announcement of a change by a CallerError."""
         raise CallerError(f"nothing can be changed here during a run: {text_of(change.settings)}")
 
 
@@ -159,9 +139,7 @@ class AppliedParameters(NamedTuple):
 class ChangeSchedule:
     """The scenarios of a run in the order of time, as announced to a machine.
 
-    Args:
-        scenario: the resolved scenario at the start of the run.
-        prepare: computes the data that the machine needs of a scenario, before it is in force.
+    ``prepare`` computes the data that the machine needs of a scenario, before it is in force.
     """
 
     def __init__(
@@ -201,13 +179,20 @@ class ChangeSchedule:
             prepared = self._prepare(scenario)
             every[place] = every[place]._replace(scenario=scenario, prepared=prepared)
         self._all = every
-        self._look()
-        row = (number, change.number, change.t_ns, now_ns, since_ns, change.data)
+        self._update_next()
+        row = (
+            number,
+            change.number,
+            change.t_ns,
+            now_ns,
+            since_ns,
+            settings_bytes(change.settings),
+        )
         outputs: list[Record | Notice] = [Record(table, row)]
         if since_ns > change.t_ns:
             text = (
-                f"heard of a change too late: {text_of(change.settings)} was to be in force from "
-                f"{change.t_ns / NS_PER_S:.3f} s on, and is so from {since_ns / NS_PER_S:.3f} s on"
+                f"change received too late: {text_of(change.settings)}, due at "
+                f"{change.t_ns / NS_PER_S:.3f} s, applies from {since_ns / NS_PER_S:.3f} s on"
             )
             outputs.append(Notice(since_ns, LATE, text))
         return outputs
@@ -218,7 +203,7 @@ class ChangeSchedule:
             return None
         found = self._all[self._taken]
         self._taken += 1
-        self._look()
+        self._update_next()
         return found
 
     @property
@@ -233,6 +218,6 @@ class ChangeSchedule:
             if one.since_ns <= last_ns and not ended:
                 yield one.scenario
 
-    def _look(self) -> None:
+    def _update_next(self) -> None:
         waiting = self._all[self._taken :]
         self.next_ns = waiting[0].since_ns if waiting else None

@@ -9,8 +9,8 @@ from typing import Literal
 
 import numpy as np
 
+from noack.config.feature_kinds import AnyObserver
 from noack.config.named_models import NAMED_MODELS
-from noack.config.observers import AnyObserver
 from noack.config.scenario import Scenario
 from noack.config.sections.model_section import ModelSection
 from noack.config.setpoint import input_at
@@ -19,6 +19,7 @@ from noack.core.linear_systems import Matrix, Vector, discretise, transition
 from noack.core.random_streams import stream
 from noack.observers.observability import unobservable_mode
 from noack.protocol.record_tables import entry_names, tables
+from noack.settings.matrices import rows_of
 from noack.trigger.policy_settings import ModelMatrices
 from noack.trigger.trigger_policy import Policy
 
@@ -98,7 +99,7 @@ def resolve(scenario: Scenario) -> Scenario:
         "initial_state_halfwidth": None,
     }
     if scenario.coverage.is_linear:
-        drawn |= {"draw": "given", "A": _rows(A), "B": _rows(B)}
+        drawn |= {"draw": "given", "A": rows_of(A), "B": rows_of(B)}
     update = {"model": model, "plant": plant.model_copy(update=drawn)}
     return scenario.model_copy(update=update | {"observer": _observer(scenario, model)})
 
@@ -127,11 +128,7 @@ def loop_of(resolved: Scenario) -> LoopMatrices:
 
 
 def policy_of(resolved: Scenario) -> Policy:
-    """Return the trigger policy of a resolved scenario.
-
-    Raises:
-        CallerError: the policy cannot be used with the scenario's model.
-    """
+    """Return a resolved scenario's trigger policy; raise CallerError if its model excludes it."""
     model = resolved.model
     matrices = ModelMatrices(np.array(model.A), np.array(model.B), np.array(model.gain))
     return resolved.trigger.trigger_policy(matrices)
@@ -205,9 +202,9 @@ def _explicit_model(model: ModelSection) -> ModelSection:
     if model.name is not None:
         named = NAMED_MODELS[model.name](model.parameters)
         return ModelSection(
-            A=_rows(named.A),
-            B=_rows(named.B),
-            gain=model.gain or _rows(named.K),
+            A=rows_of(named.A),
+            B=rows_of(named.B),
+            gain=model.gain or rows_of(named.K),
             state_names=model.state_names or named.state_names,
             input_names=model.input_names or named.input_names,
             allow_unstable=model.allow_unstable,
@@ -233,7 +230,3 @@ def _perturbation(
     if draw == "vertex":
         unit = np.where(unit < 0, -1.0, 1.0)
     return np.zeros(shape) if halfwidth is None else np.array(halfwidth) * unit
-
-
-def _rows(matrix: Matrix) -> tuple[tuple[float, ...], ...]:
-    return tuple(tuple(row) for row in matrix.tolist())

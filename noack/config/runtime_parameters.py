@@ -42,15 +42,7 @@ def trigger_parameters(trigger: PolicySettings) -> tuple[str, ...]:
 
 
 def require_runtime_parameters(settings: Mapping[str, Any], trigger: PolicySettings) -> None:
-    """Check that all keys are runtime parameters.
-
-    Args:
-        settings: values by keys.
-        trigger: the run's.
-
-    Raises:
-        ValueError: a key is not; the message lists the runtime parameters.
-    """
+    """Raise ValueError unless all keys are runtime parameters; the message lists these."""
     known = (LOSS, MANSD, *trigger_parameters(trigger), SETPOINT)
     for key, value in settings.items():
         if key not in known and not key.startswith(f"{LOSS}."):
@@ -64,12 +56,7 @@ def require_runtime_parameters(settings: Mapping[str, Any], trigger: PolicySetti
 
 
 def put_settings(content: dict[str, Any], settings: Mapping[str, Any]) -> None:
-    """Write settings into the content of a scenario; a new loss model replaces all its keys.
-
-    Args:
-        content: of a scenario, as from JSON; changed in place.
-        settings: values by keys, as checked by :func:`require_runtime_parameters`.
-    """
+    """Write checked settings into a scenario's content; a new loss model replaces all its keys."""
     model = f"{LOSS}.model"
     if model in settings and settings[model] != content["network"]["loss"].get("model"):
         content["network"]["loss"] = {}

@@ -8,9 +8,8 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, FiniteFloat, model_validator
 
-from noack.config.controllers import AnyController
+from noack.config.feature_kinds import AnyController, AnyObserver, AnyTrigger
 from noack.config.message_sizes import MessageSizes
-from noack.config.observers import AnyObserver
 from noack.config.scenario_changes import check_changes
 from noack.config.scenario_checks import check_sections
 from noack.config.sections.model_section import ModelSection
@@ -26,7 +25,6 @@ from noack.config.sections.run_sections import (
 )
 from noack.config.theory_coverage import TheoryCoverage
 from noack.config.timing import Timing
-from noack.config.triggers import AnyTrigger
 from noack.controllers.linear_feedback import LinearFeedbackSettings
 from noack.core.errors import CallerError
 from noack.protocol.loop_protocol import PROTOCOLS, LoopProtocol
@@ -104,11 +102,7 @@ class Scenario(ScenarioSection):
 
     @property
     def decaying(self) -> DecayingSettings:
-        """Return the trigger, if it is the paper's.
-
-        Raises:
-            CallerError: it is another policy.
-        """
+        """Return the trigger, if it is the paper's; raise CallerError for another policy."""
         if not isinstance(self.trigger, DecayingSettings):
             raise CallerError(
                 f'trigger.policy: needs the paper\'s trigger, "decaying"; '

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from noack.config.controllers import AnyController
+from noack.config.feature_kinds import AnyController, AnyTrigger
 from noack.config.runtime_parameters import LOSS, MANSD, put_settings, require_runtime_parameters
 from noack.config.scenario_checks import check_setpoint, check_trigger
 from noack.config.sections.network_section import NetworkSection
-from noack.config.triggers import AnyTrigger
+from noack.config.validation_messages import brief
 from noack.impairments.link_settings import Mansd, require_scores
 from noack.impairments.loss_models import Loss
 from noack.impairments.loss_models.trace import TraceLoss
@@ -31,14 +31,8 @@ _CHANGEABLE: Mapping[str, TypeAdapter[Any]] = {
 def with_settings(scenario: "Scenario", settings: Mapping[str, Any]) -> "Scenario":
     """Return a scenario with other values of its runtime parameters.
 
-    Only the parts that change are validated: the processes of a run do this in their loop.
-
-    Args:
-        scenario: the scenario.
-        settings: values by keys.
-
-    Raises:
-        ValueError: a key is not a runtime parameter, or the scenario would be invalid.
+    Only the parts that change are validated: the processes of a run do this in their loop. Raise
+    ValueError if a key is not a runtime parameter, or the scenario would be invalid.
     """
     if scenario.protocol.acknowledges:
         raise ValueError('network.protocol: with "ack", nothing can be changed during a run')
@@ -66,14 +60,9 @@ def with_settings(scenario: "Scenario", settings: Mapping[str, Any]) -> "Scenari
 
 
 def content_with_settings(scenario: "Scenario", settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of a scenario with other values of its runtime parameters, unchecked.
+    """Return a scenario's content with other values of its runtime parameters, unchecked.
 
-    Args:
-        scenario: the scenario.
-        settings: values by keys.
-
-    Raises:
-        ValueError: a key is not a runtime parameter.
+    Raise ValueError if a key is not a runtime parameter.
     """
     require_runtime_parameters(settings, scenario.trigger)
     content = scenario.model_dump(mode="json", exclude_none=True, exclude={"changes"})
@@ -82,11 +71,7 @@ def content_with_settings(scenario: "Scenario", settings: Mapping[str, Any]) -> 
 
 
 def check_changes(scenario: "Scenario") -> None:
-    """Check the changes that a scenario schedules: their order, times and settings.
-
-    Raises:
-        ValueError: a change is not possible.
-    """
+    """Raise ValueError if a scheduled change is not possible, or the changes are not in order."""
     for (place, one), (_, other) in pairwise(enumerate(scenario.changes)):
         if other.at_s < one.at_s:
             raise ValueError(f"changes.{place + 1}.at_s: earlier than the change before it")
@@ -97,7 +82,7 @@ def check_changes(scenario: "Scenario") -> None:
         try:
             changed = with_settings(changed, change.set)
         except ValidationError as error:
-            raise ValueError(f"changes.{place}.set: {_first_mistake(error)}") from None
+            raise ValueError(f"changes.{place}.set: {brief(error)}") from None
         except ValueError as error:
             raise ValueError(f"changes.{place}.set: {error}") from None
 
@@ -122,9 +107,3 @@ def _changed_network(
 
 def _validated(part: str, content: Any) -> Any:
     return _CHANGEABLE[part].validate_json(json.dumps(content))
-
-
-def _first_mistake(error: ValidationError) -> str:
-    mistake = error.errors(include_url=False)[0]
-    place, message = ".".join(map(str, mistake["loc"])), mistake["msg"]
-    return f"{place}: {message}" if place else message.removeprefix("Value error, ")

@@ -4,7 +4,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from noack.config.disturbances import require_disturbances
 from noack.config.setpoint import input_at
 from noack.core.clock import NS_PER_S
 from noack.protocol.wire_format import MAX_DIMENSION
@@ -15,11 +14,7 @@ if TYPE_CHECKING:
 
 
 def check_sections(scenario: "Scenario") -> None:
-    """Check the sections of a scenario against each other.
-
-    Raises:
-        ValueError: two sections do not fit together; the message begins with the key.
-    """
+    """Raise ValueError if two sections do not fit together; the message begins with the key."""
     timing = scenario.timing
     if timing.horizon_ns < timing.plant_period_ns:
         raise ValueError(
@@ -35,21 +30,13 @@ def check_sections(scenario: "Scenario") -> None:
 
 
 def check_trigger(scenario: "Scenario") -> None:
-    """Check the trigger against the model's dimensions and the measurement period.
-
-    Raises:
-        ValueError: they do not fit together.
-    """
+    """Raise ValueError unless the trigger fits the model's dimensions and measurement period."""
     scenario.trigger.check(scenario.model.dimensions[0], _dimensions(scenario))
     scenario.trigger.check_period(scenario.timing.measurement_period_ns)
 
 
 def check_setpoint(scenario: "Scenario") -> None:
-    """Check that an input exists at which the model rests at the set point.
-
-    Raises:
-        ValueError: there is none, or another setting excludes a set point.
-    """
+    """Raise ValueError unless the model can rest at the set point and other settings allow one."""
     key, setpoint = "controller.setpoint", scenario.controller.setpoint
     require_length(setpoint, key, scenario.model.dimensions[0], "one per state")
     if setpoint is None:
@@ -78,9 +65,20 @@ def _check_plant(scenario: "Scenario") -> None:
     for key in ("initial_state", "initial_state_halfwidth"):
         require_length(getattr(plant, key), f"plant.{key}", n, "one per state")
     plant.system.check(n, m)
-    linear = scenario.coverage.is_linear
-    require_disturbances(plant.disturbances, n, m, linear=linear)
+    _check_disturbances(scenario)
     plant.measurement.check(n, why)
+
+
+def _check_disturbances(scenario: "Scenario") -> None:
+    n, m = scenario.model.dimensions
+    for number, one in enumerate(scenario.plant.disturbances):
+        place = f"plant.disturbances.{number}"
+        if one.at == "state" and not scenario.coverage.is_linear:
+            raise ValueError(
+                f'{place}.at: "state" needs a linear plant; this one can be disturbed at "input"'
+            )
+        size, why = (m, "one per input") if one.at == "input" else (n, "one per state")
+        require_length(one.entries, f"{place}.{one.entries_key}", size, f'at = "{one.at}": {why}')
 
 
 def _check_observer(scenario: "Scenario") -> None:

@@ -2,7 +2,8 @@
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import takewhile
+from contextlib import suppress
+from os.path import commonprefix
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from noack.config.matrix_files import with_matrices
 from noack.config.scenario import Scenario
 from noack.config.sections.network_section import AcknowledgementSection, NetworkSection
 from noack.core.errors import CallerError, printable, shortened
-from noack.settings.user_files import file_tables, located, with_tables
+from noack.settings.named_file import file_tables, located, with_tables
 
 _ENTRY = r"""[-+\w.]+|"[^"\\\n]*\""""
 _ROW = re.compile(rf"\[\n((?:\s*(?:{_ENTRY}),\n)+)\s*\]")
@@ -46,15 +47,10 @@ def load(
 
 
 def completed(content: Mapping[str, Any], path: Path, source: str | None = None) -> Scenario:
-    """Validate parsed content and read the files that it names.
+    """Validate parsed content and read the files that it names, relative to the scenario file.
 
-    Args:
-        content: of a scenario file.
-        path: of the scenario file; relative names in the content are relative to its folder.
-        source: names the content in error messages; by default the path.
-
-    Raises:
-        CallerError: one line per mistake.
+    ``source`` (by default the path) names the content in error messages: CallerError has one line
+    per mistake.
     """
     source = source or str(path)
     content = with_matrices(content, path.parent, source)
@@ -62,16 +58,11 @@ def completed(content: Mapping[str, Any], path: Path, source: str | None = None)
 
 
 def validate(content: Mapping[str, Any], source: str) -> Scenario:
-    """Validate parsed content; ``source`` names it in error messages.
-
-    Raises:
-        CallerError: one line per mistake.
-    """
+    """Validate parsed content; raise CallerError with one line per mistake, named by ``source``."""
     return toml_file.validated(Scenario, content, source)
 
 
 def _with_files(scenario: Scenario, path: Path, source: str) -> Scenario:
-    """Replace file names by the files' content; they are relative to the scenario file."""
     network, place = scenario.network, f"{source}: network"
     update: dict[str, Any] = _read(network, path.parent, place)
     if (back := network.acknowledgements) is not None:
@@ -101,50 +92,30 @@ def dumps(scenario: Scenario) -> str:
     return _ROW.sub(lambda row: f"[{', '.join(re.findall(_ENTRY, row[1]))}]", text)
 
 
-def json_schema() -> dict[str, Any]:
-    """Return the JSON Schema of scenario files, for editors."""
-    return toml_file.json_schema(Scenario)
-
-
 def _attributed(lines: str, path: Path, keys: Sequence[str]) -> str:
-    """Name ``--set`` if a key that was set is wrong, or if the file without it is valid.
-
-    Args:
-        lines: mistakes of a file with settings.
-        path: of the file.
-        keys: the keys that were set.
-    """
-    try:
+    """Name ``--set`` if a key that was set is wrong, or if the file without it is valid."""
+    is_valid_alone = False
+    with suppress(CallerError):
         completed(toml_file.read(path), path)
-        alone = True
-    except CallerError:
-        alone = False
-
+        is_valid_alone = True
     names = [shortened(key) for key in keys]
 
-    def said_of(line: re.Match[str]) -> str:
+    def attributed(line: re.Match[str]) -> str:
         if any(re.match(rf"{re.escape(name)}[.:=\s]", line["rest"]) for name in names):
             return f"--set {line['rest']}"
-        if not alone:
+        if not is_valid_alone:
             return line[0]
         place = re.split(r"[:\s]", line["rest"], maxsplit=1)[0].split(".")
-        shared = [_shared(place, key.split(".")) for key in keys]
+        # The number of equal parts at the beginning of two keys.
+        shared = [len(commonprefix([place, key.split(".")])) for key in keys]  # noqa: RUF071
         nearest = [name for name, parts in zip(names, shared, strict=True) if parts == max(shared)]
         return f"{line['file']} with --set {', '.join(nearest)}: {line['rest']}"
 
     file = re.escape(printable(str(path)))
-    return re.sub(rf"^(?P<file>{file}): (?P<rest>.*)", said_of, lines, flags=re.MULTILINE)
-
-
-def _shared(one: Sequence[str], other: Sequence[str]) -> int:
-    """Return the number of equal parts at the beginning of two keys."""
-    return sum(
-        1 for _ in takewhile(lambda parts: parts[0] == parts[1], zip(one, other, strict=False))
-    )
+    return re.sub(rf"^(?P<file>{file}): (?P<rest>.*)", attributed, lines, flags=re.MULTILINE)
 
 
 def _apply(content: dict[str, Any], override: str) -> str:
-    """Put ``key=value`` into the content; return the key."""
     key, equals, text = override.partition("=")
     if not equals or not key.strip():
         shown = shortened(printable(override))
@@ -156,8 +127,7 @@ def _apply(content: dict[str, Any], override: str) -> str:
 def value_of(text: str, source: str) -> Any:
     """Return the value of a text on the command line; a bare word is a string.
 
-    Raises:
-        CallerError: the text is not a TOML value; ``source`` names it.
+    Raise CallerError if the text is not a TOML value; ``source`` names it.
     """
     try:
         return toml_file.parsed(f"value = {text}", source)["value"]
@@ -168,13 +138,7 @@ def value_of(text: str, source: str) -> Any:
 
 
 def put(content: dict[str, Any], key: str, value: Any, source: str) -> None:
-    """Set the value of a key, whose parts are separated by dots; missing tables are created.
-
-    Args:
-        content: of a scenario file, changed in place.
-        key: e.g. ``trigger.beta``.
-        value: as parsed from TOML.
-        source: names the setting in error messages.
+    """Set the value of a key such as ``trigger.beta``; missing tables are created.
 
     Raises:
         CallerError: a part of the key is a value, not a table; or the key has too many parts.

@@ -16,8 +16,7 @@ _ROUNDING = 1e-9
 def input_at(A: Matrix, B: Matrix, x_r: Vector) -> Vector:
     """Return u_r, (m,), with which a model rests at x_r, (n,): the solution of smallest norm.
 
-    Raises:
-        ValueError: it cannot rest there; the message names the nearest state where it can.
+    Raise ValueError, which names the nearest equilibrium, if it cannot rest there.
     """
     drift = A @ x_r
     u_r = np.asarray(np.linalg.lstsq(B, -drift, rcond=None)[0], dtype=np.float64)

@@ -18,7 +18,7 @@ from noack.config.sections.model_section import ModelSection, instability
 from noack.config.validation_messages import brief
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
-from noack.settings.matrices import require_shape
+from noack.settings.matrices import require_shape, rows_of
 
 
 def model_of(
@@ -45,9 +45,9 @@ def model_of(
     matrices = matrices_of(system, gain)
     try:
         return ModelSection(
-            A=_rows(matrices["A"]),
-            B=_rows(matrices["B"]),
-            gain=_rows(matrices[GAIN]),
+            A=rows_of(matrices["A"]),
+            B=rows_of(matrices["B"]),
+            gain=rows_of(matrices[GAIN]),
             state_names=None if states is None else tuple(states),
             input_names=None if inputs is None else tuple(inputs),
         )
@@ -75,12 +75,7 @@ def save_model(path: str | Path, system: Any, gain: Any = None) -> None:
 def matrices_of(system: Any, gain: Any = None) -> dict[str, Matrix]:
     """Return the matrices of a system by name: A, (n, n), B, (n, m), and the gain if given, (m, n).
 
-    Args:
-        system: as in :func:`model_of`.
-        gain: K of u = K x, (m, n).
-
-    Raises:
-        CallerError: as in :func:`model_of`.
+    Arguments and errors are those of :func:`model_of`.
     """
     if isinstance(system, tuple):
         if len(system) not in (2, 4):
@@ -98,10 +93,10 @@ def matrices_of(system: Any, gain: Any = None) -> dict[str, Matrix]:
     found = {"A": _matrix("A", A), "B": _matrix("B", B)}
     n, m = found["B"].shape
     try:
-        require_shape(_rows(found["A"]), "A", (n, n), "B has a row for each state")
+        require_shape(rows_of(found["A"]), "A", (n, n), "B has a row for each state")
         if gain is not None:
             found[GAIN] = _matrix(GAIN, gain)
-            require_shape(_rows(found[GAIN]), GAIN, (m, n), "a row per input, a column per state")
+            require_shape(rows_of(found[GAIN]), GAIN, (m, n), "a row per input, a column per state")
     except ValueError as error:
         raise CallerError(f"the system: {error}") from None
     if (why := unfit(C, D, dt, n)) is not None:
@@ -121,10 +116,6 @@ def _matrix(name: str, value: Any) -> Matrix:
             f"{name}: a matrix of finite numbers is needed, by rows: [[1, 2], [3, 4]]"
         )
     return found
-
-
-def _rows(matrix: Matrix) -> tuple[tuple[float, ...], ...]:
-    return tuple(map(tuple, matrix.tolist()))
 
 
 def _labels(system: Any, key: str) -> Sequence[str] | None:

@@ -40,6 +40,13 @@ class TheoryCoverage:
     @property
     def beyond_theory(self) -> str | None:
         """The first setting that the theorems and certificates do not cover; None if all are."""
+        if (why := self._beyond_linear) is not None or self.is_decaying:
+            return why
+        return f'trigger.policy = "{self.scenario.trigger.policy}": not the paper\'s trigger'
+
+    @property
+    def _beyond_linear(self) -> str | None:
+        """The first setting besides the trigger with which the loop is not ẋ = A x + B K x_c."""
         scenario = self.scenario
         if scenario.protocol.acknowledges:
             return 'network.protocol = "ack": updates are acknowledged'
@@ -54,28 +61,10 @@ class TheoryCoverage:
             return f'observer.kind = "{scenario.observer.kind}": the state is estimated'
         if scenario.plant.measurement.is_noisy:
             return "plant.measurement: the state is measured with noise"
-        if not self.is_decaying:
-            return f'trigger.policy = "{scenario.trigger.policy}": not the paper\'s trigger'
         return None
 
-    def require_unacknowledged(self) -> None:
-        """Check that updates are not acknowledged.
-
-        Raises:
-            CallerError: this is the acknowledgement baseline.
-        """
-        if self.scenario.protocol.acknowledges:
-            raise CallerError(
-                'network.protocol: needs the loop without acknowledgements, "none"; '
-                'this scenario has "ack"'
-            )
-
     def require_unchanging(self) -> None:
-        """Check that the settings stay the same and the set point is 0.
-
-        Raises:
-            CallerError: the settings change, or the set point is not 0.
-        """
+        """Raise CallerError if the settings change, or the set point is not 0."""
         if self.scenario.changes:
             raise CallerError(
                 "changes: needs settings that stay the same during the run; "
@@ -84,45 +73,12 @@ class TheoryCoverage:
         if any(self.scenario.controller.setpoint or ()):
             raise CallerError("controller.setpoint: needs the set point 0")
 
-    def require_linear(self) -> None:
-        """Check that the plant is a linear system.
-
-        Raises:
-            CallerError: it is not.
-        """
-        if not self.is_linear:
-            raise CallerError(
-                'plant.system.kind: needs a linear plant, "linear"; '
-                f'this scenario has "{self.scenario.plant.system.kind}"'
-            )
-
     def require_exact(self) -> None:
-        """Check that exact simulation covers the plant, controller, measurement and trigger.
-
-        Raises:
-            CallerError: it does not cover one of these.
-        """
-        self.require_linear()
-        scenario = self.scenario
-        if not scenario.controller.is_linear:
+        """Raise CallerError if exact simulation does not cover the scenario."""
+        if (why := self._beyond_linear) is not None:
             raise CallerError(
-                'controller.kind: needs the controller u = K x_c, "linear"; '
-                f'this scenario has "{scenario.controller.kind}"'
+                f"{why}; this needs a linear plant with u = K x_c, without acknowledgements, "
+                "disturbances, noise and observer"
             )
-        if scenario.plant.disturbances:
-            kinds = ", ".join(f'"{one.kind}"' for one in scenario.plant.disturbances)
-            raise CallerError(
-                f"plant.disturbances: needs an undisturbed plant; this scenario has {kinds}"
-            )
-        if scenario.observer is not None:
-            raise CallerError(
-                "observer: needs a sensor that measures the state itself; "
-                f'this scenario has "{scenario.observer.kind}"'
-            )
-        if scenario.plant.measurement.is_noisy:
-            raise CallerError(
-                "plant.measurement: needs a sensor without noise; "
-                "this scenario has noise_std or noise_bound"
-            )
-        if (why := scenario.trigger.beyond_exact) is not None:
+        if (why := self.scenario.trigger.beyond_exact) is not None:
             raise CallerError(why)

@@ -9,13 +9,14 @@ from datetime import date, time
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from noack.config.validation_messages import explain
 from noack.core.errors import CallerError, printable
-from noack.core.regular_file import read_regular
+from noack.core.file_access import read_regular
+from noack.settings.section import ScenarioSection
 
-M = TypeVar("M", bound=BaseModel)
+M = TypeVar("M", bound=ScenarioSection)
 
 MOST_BYTES = 2**20
 """Largest size of a settings file."""
@@ -40,15 +41,11 @@ _LONG_KEY = re.compile(rf"(?<![\w-])(?:[\w-]++[ \t]*+\.[ \t]*+){{{MOST_LEVELS}}}
 
 
 def read(
-    path: Path, model: type[BaseModel] = BaseModel, most_bytes: int = MOST_BYTES
+    path: Path, model: type[ScenarioSection] = ScenarioSection, most_bytes: int = MOST_BYTES
 ) -> dict[str, Any]:
-    """Read a TOML file.
+    """Read a TOML file of at most ``most_bytes``.
 
-    Args:
-        path: of the file.
-        model: the type of the content; if the file does not exist, the message names files of this
-            type.
-        most_bytes: largest size of the file.
+    If the file does not exist, the message names files of the type ``model`` beside it.
 
     Raises:
         CallerError: the file does not exist, is too large, is not a regular file, or is not TOML.
@@ -85,11 +82,7 @@ def parsed(text: str, source: str) -> dict[str, Any]:
 
 
 def validated(model: type[M], content: Mapping[str, Any], source: str) -> M:
-    """Validate parsed content; ``source`` names it in error messages.
-
-    Raises:
-        CallerError: one line per mistake, each with file, key, value and remedy.
-    """
+    """Validate parsed content; raise CallerError with one line per mistake, named by ``source``."""
     if _is_deeper(content, MOST_LEVELS):
         raise CallerError(f"{source}: {_TOO_DEEP}")
     try:
@@ -105,21 +98,19 @@ def validated(model: type[M], content: Mapping[str, Any], source: str) -> M:
         raise CallerError("\n".join(explain(error, source, model))) from None
 
 
-def json_schema(model: type[BaseModel]) -> dict[str, Any]:
+def json_schema(model: type[ScenarioSection]) -> dict[str, Any]:
     """Return the JSON Schema of a file, for editors."""
     return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | model.model_json_schema()
 
 
 def _is_deeper(value: Any, levels: int) -> bool:
-    """Whether tables and lists are nested more than this number of levels deep."""
     if not isinstance(value, dict | list | tuple):
         return False
     inner = value.values() if isinstance(value, dict) else value
     return levels == 0 or any(_is_deeper(one, levels - 1) for one in inner)
 
 
-def _missing(path: Path, model: type[BaseModel]) -> str:
-    """Return a message that the file does not exist, with files of the same kind in its folder."""
+def _missing(path: Path, model: type[ScenarioSection]) -> str:
     needed = {name for name, field in model.model_fields.items() if field.is_required()}
     others = []
     for other in sorted(path.parent.glob("*.toml"))[:_MOST_LOOKED_AT]:
@@ -131,11 +122,7 @@ def _missing(path: Path, model: type[BaseModel]) -> str:
 
 
 def _unfit(value: object) -> None:
-    """Report that a value has no equivalent in JSON.
-
-    Raises:
-        TypeError: always.
-    """
+    """Raise TypeError: a value has no equivalent in JSON."""
     if isinstance(value, type):
         written = json.dumps({"kind": "python", "file": "my_plant.py", "name": value.__name__})
         raise TypeError(f"{value.__name__}: a class is given by its file and its name: {written}")

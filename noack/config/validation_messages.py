@@ -7,10 +7,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from types import UnionType
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from noack.core.errors import printable, shortened
+from noack.settings.section import ScenarioSection
 
 _PATTERNS = {
     r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$": "use letters, digits, _ and -, beginning with a letter "
@@ -32,13 +33,10 @@ _LISTS = {
 _PERCENT = re.compile(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*%\s*")
 
 
-def explain(error: ValidationError, source: str, root: type[BaseModel]) -> list[str]:
+def explain(error: ValidationError, source: str, root: type[ScenarioSection]) -> list[str]:
     """Return one line per mistake, and one line for all mistakes beyond the first fifty.
 
-    Args:
-        error: the error of the validation.
-        source: names the file.
-        root: the model for the validation of the whole file.
+    ``source`` names the file; ``root`` is the model of the whole file.
     """
     mistakes = error.errors(include_url=False)
     places = [mistake["loc"] for mistake in mistakes]
@@ -64,7 +62,7 @@ def _has_inner(place: Sequence[Any], places: Iterable[Sequence[Any]]) -> bool:
     return any(len(other) > len(place) and other[: len(place)] == place for other in places)
 
 
-def _explain(mistake: ErrorDetails, root: type[BaseModel]) -> str:
+def _explain(mistake: ErrorDetails, root: type[ScenarioSection]) -> str:
     at = _locate(mistake["loc"], root)
     key = shortened(".".join(map(str, at.path)))
     value, kind = mistake["input"], mistake["type"]
@@ -94,23 +92,18 @@ def _explain(mistake: ErrorDetails, root: type[BaseModel]) -> str:
 class _Place(NamedTuple):
     """The place of a mistake in a file."""
 
-    path: Sequence[Any]
-    """Path of the key."""
-    section: type[BaseModel] | None
-    """The section that contains the key."""
-    choices: Mapping[str, type[BaseModel]]
-    """The types of table that are possible at this place, by the value of the discriminator."""
-    discriminator: str
-    """The key that selects the type of table."""
-    kind: Any
-    """The annotation of the value."""
+    path: Sequence[Any]  # of the key
+    section: type[ScenarioSection] | None  # which contains the key
+    choices: Mapping[str, type[ScenarioSection]]  # possible tables, by the discriminator's value
+    discriminator: str  # the key that selects the table
+    kind: Any  # the annotation of the value
 
 
-def _locate(place: Sequence[Any], root: type[BaseModel]) -> _Place:
+def _locate(place: Sequence[Any], root: type[ScenarioSection]) -> _Place:
     """Find a place; pydantic's path also has the names of selected tables, which are not keys."""
     kind: Any = root
     path: list[Any] = []
-    section: type[BaseModel] | None = None
+    section: type[ScenarioSection] | None = None
     alternatives = _choices(kind)
     for part in place:
         choices, _ = _choices(kind)
@@ -123,7 +116,7 @@ def _locate(place: Sequence[Any], root: type[BaseModel]) -> _Place:
     return _Place(path, section, *alternatives, kind)
 
 
-def _within(kind: Any, part: Any) -> tuple[Any, type[BaseModel] | None]:
+def _within(kind: Any, part: Any) -> tuple[Any, type[ScenarioSection] | None]:
     """Return the annotation of an entry of ``kind``, and the section that contains the entry."""
     section = _section_of(kind)
     if section is not None:
@@ -170,19 +163,18 @@ def _alternatives(kind: Any) -> list[Any]:
     return [kind]
 
 
-def sections_of(kind: Any) -> list[type[BaseModel]]:
+def sections_of(kind: Any) -> list[type[ScenarioSection]]:
     """Return the tables that a value of an annotation may be."""
-    return [
-        one for one in _alternatives(kind) if isinstance(one, type) and issubclass(one, BaseModel)
-    ]
+    types = [one for one in _alternatives(kind) if isinstance(one, type)]
+    return [one for one in types if issubclass(one, ScenarioSection)]
 
 
-def _section_of(kind: Any) -> type[BaseModel] | None:
+def _section_of(kind: Any) -> type[ScenarioSection] | None:
     sections = sections_of(kind)
     return sections[0] if len(sections) == 1 else None
 
 
-def _choices(kind: Any) -> tuple[Mapping[str, type[BaseModel]], str]:
+def _choices(kind: Any) -> tuple[Mapping[str, type[ScenarioSection]], str]:
     """Return the possible tables of a value by their discriminator, and the discriminator."""
     sections = sections_of(kind)
     if len(sections) < 2:
@@ -240,18 +232,20 @@ def _table_example(value: Any, at: _Place) -> str:
     return "" if in_list else f", [{'.'.join(map(str, at.path))}]"
 
 
-def _purpose(section: type[BaseModel] | None, key: str) -> str:
-    """Return the purpose of a missing key."""
+def _purpose(section: type[ScenarioSection] | None, key: str) -> str:
     field = section.model_fields.get(key) if section is not None else None
     inner = _section_of(field.annotation) if field is not None else None
-    text = (inner.__doc__ if inner is not None else field.description if field else None) or ""
+    if inner is not None:
+        text = inner.__doc__ or ""
+    else:
+        text = section.key_descriptions().get(key, "") if section is not None else ""
     purpose = " ".join(text.split("\n\n")[0].split()).rstrip(".")
     if purpose[1:2].islower() or purpose.startswith("A "):  # a word, not M or UDP
         purpose = purpose[0].lower() + purpose[1:]
     return f" ({purpose})" if purpose else ""
 
 
-def _nearest(key: str, section: type[BaseModel] | None) -> str:
+def _nearest(key: str, section: type[ScenarioSection] | None) -> str:
     known = sorted(section.model_fields) if section is not None else []
     close = difflib.get_close_matches(key, known, n=1)
     return f"did you mean {close[0]}?" if close else f"the keys here are {', '.join(known)}"

@@ -15,7 +15,7 @@ class RunClock:
     Args:
         epoch_ns: monotonic clock reading at simulated time 0, common to all processes of a run.
         speed: simulated seconds per wall second, positive.
-        monotonic_ns: the wall clock; the system's monotonic clock by default, another one in tests.
+        monotonic_ns: the wall clock.
     """
 
     def __init__(

@@ -19,7 +19,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from noack.core.file_lock import locked
+from noack.core.file_access import locked
 
 _ROOM_BYTES = 16 * 1024 * 1024
 _KEPT_S = 30 * 24 * 3600
@@ -52,8 +52,7 @@ def cache_folder(name: str, sources: Iterable[Path]) -> Path | None:
 def _make_own(folder: Path) -> None:
     """Create a folder, and missing folders above it, with access for the user only.
 
-    Raises:
-        PermissionError: another user may change the folder or a folder above it.
+    Raise PermissionError if another user may change the folder or a folder above it.
     """
     for level in (*reversed(folder.parents), folder):
         with suppress(FileExistsError):
@@ -100,7 +99,6 @@ def while_compiling(what: str, kept: bool, about_s: float | None = None) -> str:
 
 
 def _forget_old(folder: Path, name: str) -> None:
-    """Delete the code of other sources if it has not been used for 30 days."""
     os.utime(folder)
     for other in folder.parent.glob(f"{name}-*"):
         if other.stat().st_mtime < time.time() - _KEPT_S:

@@ -45,13 +45,10 @@ def discretise(A: Matrix, B: Matrix, dt_ns: int) -> tuple[Matrix, Matrix]:
 
 
 class Propagator:
-    """Advances states of the autonomous system ``dz/dt = G z`` exactly.
+    """Advances states of the autonomous system ``dz/dt = G z`` exactly; G is (n, n), per second.
 
-    Transition matrices are cached by step; a loop on a time grid has few distinct steps.
-
-    Args:
-        generator: G, shape (n, n), per second.
-        steps_ns: steps to precompute, so that the first deadlines are not delayed.
+    Transition matrices are cached by step; a loop on a time grid has few distinct steps. The
+    matrices of ``steps_ns`` are computed at once, so that the first deadlines are not delayed.
     """
 
     def __init__(self, generator: Matrix, steps_ns: Iterable[int] = ()) -> None:

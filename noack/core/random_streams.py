@@ -11,34 +11,17 @@ from numpy.typing import NDArray
 
 
 def stream(seed: int, *name: str) -> "np.random.Generator":
-    """Return the random stream called ``name`` under ``seed``.
+    """Return the random stream of this path, e.g. ``("netem", "update", "loss")``, under a seed.
 
-    Args:
-        seed: non-negative integer of the scenario.
-        name: the stream's path, e.g. ``("netem", "update", "loss")``.
-
-    Raises:
-        ValueError: ``seed`` is negative or ``name`` is empty.
+    Raise ValueError if the seed is negative or the path is empty.
     """
     return np.random.Generator(np.random.PCG64DXSM(_sequence(seed, name)))
 
 
 def words(seed: int, *name: str, rows: range, width: int) -> NDArray[np.uint64]:
-    """Return rows of a random table; each row depends on its number only.
+    """Return ``rows`` of a random table as words of 64 bits, shape (k, width).
 
-    Philox4x64 is counter-based: any row is computed directly.
-
-    Args:
-        seed: non-negative integer.
-        name: the stream's path.
-        rows: numbers of successive rows, k of them.
-        width: words in a row.
-
-    Returns:
-        (k, width) random words of 64 bits.
-
-    Raises:
-        ValueError: ``seed`` is negative or ``name`` is empty.
+    Each row depends on its number only: Philox4x64 is counter-based and computes any row directly.
     """
     blocks = -(-width // 4)
     low, high = stream_key(seed, *name)
@@ -65,26 +48,13 @@ def normals(seed: int, *name: str, rows: range, width: int) -> NDArray[np.float6
 
 
 def stream_key(seed: int, *name: str) -> tuple[int, int]:
-    """Return the key of a counter-based random stream: two words of 32 bits.
-
-    Args:
-        seed: non-negative integer of the scenario.
-        name: the stream's path.
-
-    Raises:
-        ValueError: ``seed`` is negative or ``name`` is empty.
-    """
+    """Return the key of a counter-based random stream (:func:`stream`): two words of 32 bits."""
     low, high = _sequence(seed, name).generate_state(2).tolist()
     return low, high
 
 
 def stream_keys(seeds: NDArray[np.uint64], *name: str) -> NDArray[np.int64]:
-    """Return the keys of :func:`stream_key` under many seeds at once, shape (k, 2).
-
-    Args:
-        seeds: (k,), below 2⁶⁴.
-        name: the stream's path.
-    """
+    """Return the keys of :func:`stream_key` under k seeds below 2⁶⁴ at once, shape (k, 2)."""
     # numpy's SeedSequence for many seeds at once. A seed below 2¹²⁸ is four words of entropy.
     words = np.zeros((8, len(seeds)), np.uint32)
     words[0] = seeds & np.uint64(0xFFFFFFFF)

@@ -200,8 +200,8 @@ TABLES = (
     Table(CONTROLLER_STEP, "controller", "tick of the controller", (
         _MODEL_TIME,
         _state("x_c", "the model"),
-        _input("u", "K x_c, with a set-point K(x_c − x_r) + u_r; the safe input while the "
-               "controller has no state"),
+        _input("u", "the controller's output, by default K x_c, or K(x_c − x_r) + u_r with a set "
+               "point; the safe input while the controller has no state"),
     )),
     Table(NETEM_PACKET, "netem", "datagram received by the network emulator; `sequence` counts "
           "the datagrams of its flow", (
@@ -240,13 +240,7 @@ OWNER: Mapping[str, str] = {table.name: table.owner for table in TABLES}
 
 
 def tables(n: int, m: int, **more: int) -> Mapping[str, np.dtype[np.void]]:
-    """Return the row types of the tables of a run with ``n`` states and ``m`` inputs.
-
-    Args:
-        n: number of states.
-        m: number of inputs.
-        more: other sizes, as in :class:`RecordShape`.
-    """
+    """Return the row types of a run's tables; ``more`` has other sizes of :class:`RecordShape`."""
     shape = RecordShape(n, m, **more)  # type: ignore[arg-type]
     return {
         table.name: np.dtype([*_fields((*COMMON, *table.columns), shape)])

@@ -130,24 +130,14 @@ class _Tagger:
 
 
 class Encoder:
-    """Turns messages into datagrams of one run.
-
-    Args:
-        run_id: the run, 0 ≤ run_id < 2⁶⁴.
-        key: the run's secret key, 32 bytes.
-    """
+    """Turns messages into datagrams of one run, under its secret key of 32 bytes."""
 
     def __init__(self, run_id: int, key: bytes) -> None:
         self._run_id = run_id
         self._tag = _Tagger(key)
 
     def encode(self, message: Message) -> bytes:
-        """Return the datagram of a message.
-
-        Raises:
-            ValueError: the vector does not have 1 to 64 entries (of an acknowledgement none), or a
-                number does not fit.
-        """
+        """Return the datagram of a message; raise ValueError if a value does not fit."""
         vector = np.ascontiguousarray(message.vector, dtype="<f8")
         if message.flow is Flow.ACKNOWLEDGEMENT:
             if vector.size:
@@ -171,15 +161,8 @@ class Encoder:
 class Decoder:
     """Turns the datagrams of one flow into messages; all others are counted and rejected.
 
-    Only a datagram that is newer than every one accepted before is accepted.
-
-    Args:
-        flow: the flow that is expected.
-        dimension: entries of its vector.
-        run_id: the run.
-        key: the run's secret key, 32 bytes.
-        not_before_ns: older datagrams are stale: the process before a restart may have accepted
-            them.
+    Only a datagram that is newer than every one accepted before is accepted. A datagram from before
+    ``not_before_ns`` is stale: the process before a restart may have accepted it.
     """
 
     def __init__(
@@ -205,18 +188,15 @@ class Decoder:
     def decode(self, datagram: bytes, *, from_peer: bool = True) -> Message | None:
         """Return the message, or None when the datagram was rejected (see ``rejected``).
 
-        Args:
-            datagram: as received.
-            from_peer: whether it came from the peer's address; from any other source even an
-                authentic datagram is a replay.
+        From any source but the peer's address even an authentic datagram is a replay.
         """
-        verdict = self._examine(datagram, from_peer=from_peer)
-        if isinstance(verdict, Rejection):
-            self.rejected[verdict] += 1
+        examined = self._examine(datagram, from_peer=from_peer)
+        if isinstance(examined, Rejection):
+            self.rejected[examined] += 1
             return None
-        self._newest = verdict.sequence
+        self._newest = examined.sequence
         self.accepted += 1
-        return verdict
+        return examined
 
     def report(self) -> dict[str, object]:
         """Counters, for the run's summary."""

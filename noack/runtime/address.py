@@ -12,16 +12,12 @@ _FORM = re.compile(r"(?:\[(?P<six>[^\[\]]+)\]|(?P<host>[^\[\]:]*)):(?P<port>[0-9
 
 
 def parse_address(text: str, what: str, like: Address | None = None) -> Address:
-    """Parse an address. A host name is looked up; without a host it is the loopback.
+    """Parse an address such as ``127.0.0.1:9000``, ``[::1]:9000``, ``localhost:9000`` or ``:9000``.
 
-    Args:
-        text: ``127.0.0.1:9000``, ``[::1]:9000``, ``[fe80::1%eth0]:9000``, ``localhost:9000`` or
-            ``:9000``.
-        what: the option or key that it stands in, for messages.
-        like: prefer the family of this address; IPv4 without it.
+    Without a host it is the loopback, of the address family of ``like`` (by default IPv4).
 
     Raises:
-        CallerError: it is not of that form, or there is no such host.
+        CallerError: it has another form, or the host does not exist; ``what`` names the setting.
     """
     found = _FORM.fullmatch(text)
     if found is None or int(found["port"]) > 65_535:

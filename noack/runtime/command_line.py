@@ -13,11 +13,7 @@ class Parser(argparse.ArgumentParser):
     """A parser that raises errors instead of printing usage and exiting."""
 
     def error(self, message: str) -> NoReturn:
-        """Report wrong arguments.
-
-        Raises:
-            CallerError: always.
-        """
+        """Raise CallerError."""
         what = message.removeprefix("argument ")
         raise CallerError(f"{what}; see `{self.prog} --help`")
 
@@ -25,11 +21,8 @@ class Parser(argparse.ArgumentParser):
 def failed(message: str, status: ExitStatus, *, who: str, as_json: bool) -> ExitStatus:
     """Print why a command failed, one line per mistake, and return its exit status.
 
-    Args:
-        message: what is wrong and what would be right.
-        status: the exit status.
-        who: begins each line, such as ``noack netem``.
-        as_json: also print a JSON document to standard output.
+    Each line begins with ``who``, such as ``noack netem``. With ``as_json`` a JSON document is
+    also printed to standard output.
     """
     with suppress(OSError):  # standard output may be closed or full
         if as_json and sys.stdout is not None:

@@ -93,7 +93,6 @@ class ChangeRequest(ControlMessage):
     """A user requests a change of runtime parameters; without settings, their values."""
 
     settings: dict[str, JsonValue] = Field({})
-    """Values by scenario key."""
 
 
 class ChangeReply(ControlMessage):
@@ -102,7 +101,6 @@ class ChangeReply(ControlMessage):
     name: str
     run_dir: str
     t_s: FiniteFloat
-    """Simulated time."""
     from_s: FiniteFloat | None
     """Simulated time from which the change applies; None if none was requested."""
     runtime_parameters: dict[str, JsonValue]
@@ -115,7 +113,6 @@ class RunStart(ControlMessage):
     epoch_ns: Count
     """Monotonic clock reading at simulated time 0."""
     addresses: dict[str, SocketAddress]
-    """Receiving address of each process."""
     changes: tuple[ChangeAnnouncement, ...] = ()
     """The changes announced so far."""
 
@@ -133,14 +130,12 @@ class PersistedAck(ControlMessage):
 
     generation: Count
     rows: dict[str, Ranges]
-    """By table."""
 
 
 class MissingRows(ControlMessage):
     """The recorder answers a final report with the rows that it misses."""
 
     rows: dict[str, Ranges]
-    """By table."""
 
 
 class LogLine(ControlMessage):
@@ -152,10 +147,9 @@ class LogLine(ControlMessage):
 
 
 class ChannelCounters(ControlMessage):
-    """Counters of received datagrams."""
+    """Counters of received datagrams: rejected ones by reason."""
 
     rejected: dict[str, Count] = Field({})
-    """Datagrams by reason."""
     acknowledgements: "ChannelCounters | None" = None
 
 
@@ -163,13 +157,12 @@ class ProcessReport(ControlMessage):
     """Final report of a process."""
 
     ended: str
-    """Why it ended."""
+    """The reason."""
     channel: ChannelCounters
     rows: dict[str, Count]
-    """Number of rows that it recorded, by table."""
+    """Number of recorded rows, by table."""
     generation: Count = 0
     instance: str = ""
-    """Random name of the process."""
     realtime: dict[str, str] = Field({})
     """Whether each real-time setting was applied."""
     reached_ns: Nanoseconds | None = None
@@ -195,11 +188,7 @@ M = TypeVar("M", bound=ControlMessage)
 
 
 def parse_message(kind: type[M], payload: bytes | str) -> dict[str, Any]:
-    """Return the fields of a message.
-
-    Raises:
-        PeerError: the payload is not a message of this kind.
-    """
+    """Return the fields of a message; raise PeerError if the payload is not one of this kind."""
     try:
         return kind.model_validate_json(payload).model_dump(exclude_unset=True)
     except ValidationError as error:

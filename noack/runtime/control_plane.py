@@ -8,18 +8,21 @@ import hashlib
 import json
 import secrets
 import time
-from collections.abc import Callable
-from typing import Self
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from typing import Any, Self
 
 import zenoh
 from zenoh import CongestionControl, Priority
 from zenoh.handlers import FifoChannel, RingChannel
 
+from noack.config.parameter_changes import ParameterChange
 from noack.config.scenario import MOST_CHANGES
 from noack.core.errors import NoAnswerError, PeerError
 from noack.protocol.topology import COORDINATOR
+from noack.runtime.control_messages import ChangeAnnouncement, parse_message
 from noack.runtime.join_ticket import Ticket
-from noack.runtime.zenoh_session import SessionSecret, cause_of, open_session
+from noack.runtime.zenoh_session import SessionSecret, cause_of, first_reply, open_session
 
 _REQUEST_AGAIN_S = 5.0
 _POLL_S = 0.01
@@ -33,12 +36,9 @@ def secret_of(ticket: Ticket) -> SessionSecret:
 
 
 class ControlPlane:
-    """One process's connection to the control plane of a run.
+    """The connection of a process (``role``) to the control plane of a run.
 
-    Args:
-        ticket: the run's ticket; every key lies below ``noack/RUN``.
-        role: this process.
-        listen: this is the coordinator.
+    Every key lies below ``noack/RUN``. With ``listen`` the process is the coordinator.
 
     Raises:
         NoAnswerError: the coordinator cannot be reached, or the endpoint cannot be listened on.
@@ -96,11 +96,9 @@ class ControlPlane:
         return self._stop_reason
 
     def coordinator_gone(self, *, for_s: float = 0.0) -> bool:
-        """Whether the coordinator's liveliness token has vanished.
+        """Whether the coordinator's liveliness token has vanished, for at least ``for_s`` seconds.
 
-        Args:
-            for_s: for at least how long, in seconds. On a busy machine a connection may break
-                because one end got no CPU time; it comes back by itself.
+        On a busy machine a connection may break because one end got no CPU time; it comes back.
         """
         while (life := self._coordinator.try_recv()) is not None:
             gone = life.kind == zenoh.SampleKind.DELETE
@@ -184,17 +182,11 @@ class ControlPlane:
         timeout_s: float,
         give_up: Callable[[], bool] = lambda: False,
     ) -> bytes:
-        """Send a request to the queryable ``what/ROLE`` and return the answer.
+        """Send a request (as JSON) to the queryable ``what/ROLE`` and return the answer.
 
         The request is sent again while the queryable does not exist, and every five seconds: an
         interrupted connection may lose request or answer. So the answering side must accept a
-        request twice.
-
-        Args:
-            what: name of the queryable.
-            content: sent as JSON.
-            timeout_s: how long to wait for an answer.
-            give_up: ends the wait early when it returns true.
+        request twice. The wait ends early when ``give_up()`` is true.
 
         Raises:
             NoAnswerError: no answer came.
@@ -210,18 +202,37 @@ class ControlPlane:
                 payload=payload,
                 timeout=wait_s + _REQUEST_AGAIN_S,  # zenoh would report its own as an error answer
             )
-            again_s = time.monotonic() + wait_s
-            while not give_up() and time.monotonic() < again_s:
-                try:
-                    reply = replies.try_recv()
-                except zenoh.ZError:  # the query ended without an answer
-                    break
-                if reply is None:
-                    time.sleep(_POLL_S)
-                    continue
-                if reply.ok is not None:
-                    return reply.ok.payload.to_bytes()
-                if reply.err is not None:
-                    raise PeerError(reply.err.payload.to_bytes().decode(errors="replace"))
+            until_s = time.monotonic() + wait_s
+            reply = first_reply(replies, until_s, poll_s=_POLL_S, give_up=give_up)
+            if reply is not None and reply.ok is not None:
+                return reply.ok.payload.to_bytes()
+            if reply is not None and reply.err is not None:
+                raise PeerError(reply.err.payload.to_bytes().decode(errors="replace"))
             time.sleep(0.02)
         raise NoAnswerError(f"no answer to {what!r} within {timeout_s:g} s")
+
+
+class ParameterUpdates:
+    """Announced changes that the process has not taken yet, each once and in order."""
+
+    def __init__(self, plane: ControlPlane) -> None:
+        self._plane = plane
+        self._waiting: list[dict[str, Any]] = []
+        self._next_number = 0
+
+    def extend(self, announcements: Iterable[dict[str, Any]]) -> None:
+        """Add the changes that were announced before this process joined."""
+        self._waiting.extend(announcements)
+
+    def take(self, at_most: int | None = None) -> list[tuple[ParameterChange, Mapping[str, Any]]]:
+        """Return waiting changes, at most a number of them, each with its announcement."""
+        while (message := self._plane.next_change()) is not None:
+            with suppress(PeerError):  # not from the coordinator
+                self._waiting.append(parse_message(ChangeAnnouncement, message))
+        taken: list[tuple[ParameterChange, Mapping[str, Any]]] = []
+        while self._waiting and (at_most is None or len(taken) < at_most):
+            one = self._waiting.pop(0)
+            if one["number"] >= self._next_number:  # a late process receives some twice
+                self._next_number = one["number"] + 1
+                taken.append((ParameterChange(one["number"], one["t_ns"], one["settings"]), one))
+        return taken

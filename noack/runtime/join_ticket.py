@@ -5,16 +5,14 @@ launcher writes it to the standard input of launched processes. For processes st
 in a file of the user's runtime directory, which only its owner can read.
 """
 
-import contextlib
-import json
 import secrets
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated
 
-from pydantic import Field, ValidationError
+from pydantic import ConfigDict, Field, ValidationError
 
 from noack.config.scenario import Scenario
 from noack.config.validation_messages import brief
@@ -27,22 +25,13 @@ from noack.settings.section import ScenarioSection, Seed
 DEFAULT_SESSION = "default"
 
 
-class _Fields(ScenarioSection):
-    """A ticket as JSON."""
+class Ticket(ScenarioSection):
+    """What a process needs to join a run; its JSON has the key in hexadecimal."""
+
+    model_config = ConfigDict(val_json_bytes="hex", ser_json_bytes="hex")
 
     run_id: Seed
-    key: Annotated[str, Field(pattern=rf"^[0-9a-f]{{{2 * KEY_BYTES}}}$")]
-    endpoint: str
-    run_dir: str
-    launched: bool
-    scenario: Scenario
-
-
-class Ticket(NamedTuple):
-    """What a process needs to join a run."""
-
-    run_id: int
-    key: bytes
+    key: Annotated[bytes, Field(min_length=KEY_BYTES, max_length=KEY_BYTES)]
     endpoint: str
     """zenoh endpoint of the control plane, e.g. ``tcp/127.0.0.1:7447``."""
     run_dir: str
@@ -50,15 +39,6 @@ class Ticket(NamedTuple):
     """Whether a launcher holds the process's standard input open as its lifeline."""
     scenario: Scenario
     """Resolved."""
-
-    def fields(self) -> dict[str, Any]:
-        """The ticket's fields as JSON values."""
-        scenario = self.scenario.model_dump(mode="json")
-        return self._asdict() | {"key": self.key.hex(), "scenario": scenario}
-
-    def dumps(self) -> str:
-        """The ticket as one line of JSON."""
-        return json.dumps(self.fields())
 
 
 def new_ticket(scenario: Scenario, endpoint: str, run_dir: Path, *, launched: bool) -> Ticket:
@@ -74,41 +54,30 @@ def new_ticket(scenario: Scenario, endpoint: str, run_dir: Path, *, launched: bo
 
 
 def loads(text: str) -> Ticket:
-    """Parse a ticket.
-
-    Raises:
-        CallerError: the text is not a ticket.
-    """
+    """Parse a ticket; raise CallerError if the text is not one."""
     try:
-        fields = _Fields.model_validate_json(text)
+        return Ticket.model_validate_json(text)
     except ValidationError as error:
         raise CallerError(f"not a valid ticket: {brief(error)}") from None
-    return Ticket(**dict(fields) | {"key": bytes.fromhex(fields.key)})
 
 
 def ticket_path(session: str) -> Path:
-    """Path of the ticket of a session, for processes started by hand.
-
-    Raises:
-        CallerError: the name is not fit for a file.
-    """
+    """Return the path of a session's ticket; raise CallerError for an unfit name."""
     require_name(session, "session")
     return private_folder() / f"{session}.json"
 
 
 @contextmanager
 def published(ticket: Ticket, session: str) -> Iterator[Path]:
-    """Keep the ticket in its file, readable by its owner only, while the context lasts.
+    """Publish the ticket in a file that only its owner can read, while the context lasts.
 
-    The file is locked: of several runs of one session name, one succeeds.
-
-    Raises:
-        CallerError: the folder is not the user's own, or another run is open in the session.
+    The file is locked: if several runs use a session's name, one succeeds. Raise CallerError if
+    another run is open in the session, or the folder is not the user's own.
     """
     path = ticket_path(session)
     with ExitStack() as stack:
         try:
-            stack.enter_context(lock_file("", session, ticket.fields()))
+            stack.enter_context(lock_file("", session, ticket.model_dump(mode="json")))
         except FileExistsError:
             raise CallerError(
                 f"session {session!r}: another run is open in it; choose --session NAME"
@@ -121,15 +90,13 @@ def wait_for_ticket(
 ) -> Ticket:
     """Wait until a recorder or launcher has published the session's ticket, and return it.
 
-    Raises:
-        CallerError: the folder or the file is not the user's own.
-        PeerError: there was none in time.
+    Raise PeerError if there was none in time.
     """
     path = ticket_path(session)
     deadline_s = time.monotonic() + timeout_s
     waiting = False
     while True:
-        with contextlib.suppress(FileNotFoundError), open_private() as folder:
+        with suppress(FileNotFoundError), open_private() as folder:
             return loads(folder.read_text(path.name))
         if stop() or time.monotonic() > deadline_s:
             raise PeerError(

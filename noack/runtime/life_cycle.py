@@ -58,76 +58,34 @@ class Event(Enum):
 
 
 _S, _E = State, Event
+# fmt: off
 TRANSITIONS: Mapping[State, Mapping[Event, State]] = {
-    _S.REQUESTED: {
-        _E.ADMIT: _S.ADMITTED,
-        _E.STOP: _S.STOPPING,
-        _E.END: _S.GONE,
-        _E.DISCONNECT: _S.REQUESTED,
-        _E.RECONNECT: _S.REQUESTED,
-    },
-    _S.ADMITTED: {
-        _E.JOIN: _S.AT_BARRIER,
-        _E.STOP: _S.STOPPING,
-        _E.END: _S.GONE,
-        _E.DISCONNECT: _S.ADMITTED,
-        _E.RECONNECT: _S.ADMITTED,
-    },
-    _S.AT_BARRIER: {
-        _E.JOIN: _S.AT_BARRIER,  # it asks again while it waits
-        _E.START: _S.RUNNING,
-        _E.STOP: _S.STOPPING,
-        _E.END: _S.GONE,
-        _E.DISCONNECT: _S.ADMITTED,  # it joins again when its connection is back
-        _E.RECONNECT: _S.AT_BARRIER,
-    },
-    _S.RUNNING: {
-        _E.JOIN: _S.RUNNING,  # the answer to its request was lost
-        _E.STOP: _S.STOPPING,
-        _E.END: _S.GONE,
-        _E.DISCONNECT: _S.UNREACHABLE,
-        _E.RECONNECT: _S.RUNNING,
-    },
-    _S.STOPPING: {
-        _E.STOP: _S.STOPPING,
-        _E.END: _S.GONE,
-        _E.DISCONNECT: _S.UNREACHABLE,
-        _E.RECONNECT: _S.STOPPING,
-    },
-    _S.UNREACHABLE: {
-        _E.JOIN: _S.RUNNING,
-        _E.STOP: _S.UNREACHABLE,
-        _E.END: _S.GONE,
-        _E.DISCONNECT: _S.UNREACHABLE,
-        _E.RECONNECT: _S.RUNNING,
-        _E.TIME_OUT: _S.LOST,
-    },
-    _S.LOST: {
-        _E.JOIN: _S.RUNNING,
-        _E.STOP: _S.LOST,
-        _E.END: _S.GONE,
-        _E.DISCONNECT: _S.LOST,
-        _E.RECONNECT: _S.RUNNING,
-        _E.REPLACE: _S.GONE,
-    },
-    _S.GONE: {
-        _E.STOP: _S.GONE,
-        _E.END: _S.GONE,
-        _E.DISCONNECT: _S.GONE,
-        _E.RECONNECT: _S.GONE,
-        _E.REPLACE: _S.GONE,
-    },
+    _S.REQUESTED: {_E.ADMIT: _S.ADMITTED, _E.STOP: _S.STOPPING, _E.END: _S.GONE,
+                   _E.DISCONNECT: _S.REQUESTED, _E.RECONNECT: _S.REQUESTED},
+    _S.ADMITTED: {_E.JOIN: _S.AT_BARRIER, _E.STOP: _S.STOPPING, _E.END: _S.GONE,
+                  _E.DISCONNECT: _S.ADMITTED, _E.RECONNECT: _S.ADMITTED},
+    # It asks again while it waits, and joins again when its connection is back.
+    _S.AT_BARRIER: {_E.JOIN: _S.AT_BARRIER, _E.START: _S.RUNNING, _E.STOP: _S.STOPPING,
+                    _E.END: _S.GONE, _E.DISCONNECT: _S.ADMITTED, _E.RECONNECT: _S.AT_BARRIER},
+    # It joins again if the answer to its request was lost.
+    _S.RUNNING: {_E.JOIN: _S.RUNNING, _E.STOP: _S.STOPPING, _E.END: _S.GONE,
+                 _E.DISCONNECT: _S.UNREACHABLE, _E.RECONNECT: _S.RUNNING},
+    _S.STOPPING: {_E.STOP: _S.STOPPING, _E.END: _S.GONE,
+                  _E.DISCONNECT: _S.UNREACHABLE, _E.RECONNECT: _S.STOPPING},
+    _S.UNREACHABLE: {_E.JOIN: _S.RUNNING, _E.STOP: _S.UNREACHABLE, _E.END: _S.GONE,
+                     _E.DISCONNECT: _S.UNREACHABLE, _E.RECONNECT: _S.RUNNING,
+                     _E.TIME_OUT: _S.LOST},
+    _S.LOST: {_E.JOIN: _S.RUNNING, _E.STOP: _S.LOST, _E.END: _S.GONE,
+              _E.DISCONNECT: _S.LOST, _E.RECONNECT: _S.RUNNING, _E.REPLACE: _S.GONE},
+    _S.GONE: {_E.STOP: _S.GONE, _E.END: _S.GONE,
+              _E.DISCONNECT: _S.GONE, _E.RECONNECT: _S.GONE, _E.REPLACE: _S.GONE},
 }
+# fmt: on
 """The next state, by state and event. What is missing is not allowed."""
 
 
 class LifeCycle:
-    """State of one process, as one side of the control plane knows it.
-
-    Args:
-        role: the process.
-        side: which side keeps this object.
-    """
+    """State of one process (``role``), as one side of the control plane knows it."""
 
     def __init__(self, role: str, side: Side) -> None:
         self.role = role
@@ -139,11 +97,7 @@ class LifeCycle:
         """Why it stops or has ended; the first reason stays."""
 
     def apply(self, event: Event, reason: str | None = None) -> None:
-        """Enter the next state.
-
-        Args:
-            event: what happened.
-            reason: why, of STOP and END.
+        """Enter the next state; ``reason`` says why, for STOP and END.
 
         Raises:
             CallerError: this side caused an event that the state does not allow.

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from noack.core.file_lock import lock
+from noack.core.file_access import lock
 from noack.runtime.private_folder import PrivateFolder, open_private
 
 _SUFFIX = ".json"
@@ -28,12 +28,9 @@ class LockFile(NamedTuple):
 
 @contextmanager
 def lock_file(kind: str, name: str, content: Mapping[str, object]) -> Iterator[Path]:
-    """Keep a lock file while the context lasts.
+    """Keep a lock file with this content, as JSON, while the context lasts.
 
-    Args:
-        kind: folder in the runtime directory; "" for the directory itself.
-        name: of the file, without suffix.
-        content: the file's content, as JSON.
+    It is in the folder ``kind`` of the runtime directory; "" is the directory itself.
 
     Raises:
         CallerError: the folder cannot be made, or is not the user's own.
@@ -56,11 +53,7 @@ def lock_file(kind: str, name: str, content: Mapping[str, object]) -> Iterator[P
 
 
 def live_lock_files(kind: str) -> list[LockFile]:
-    """Return the lock files of a kind whose process runs, by name.
-
-    Raises:
-        CallerError: the folder, or a file in it, is not the user's own.
-    """
+    """Return the lock files of a kind whose process runs, by name."""
     try:
         with open_private(*_inside(kind)) as folder:
             names = sorted(name for name in folder.names() if name.endswith(_SUFFIX))
@@ -74,7 +67,6 @@ def _inside(kind: str) -> tuple[str, ...]:
 
 
 def _put(folder: PrivateFolder, scratch: str, name: str) -> None:
-    """Give the file its name, unless a running process has a file of this name."""
     for attempt in range(2):
         try:
             folder.link(scratch, name)

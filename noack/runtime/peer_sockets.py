@@ -12,10 +12,11 @@ other than Linux have no peer sockets.
 
 import socket
 import sys
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 
-from noack.runtime.address import Address
+from noack.runtime.address import Address, text_of
 
 IN_AN_INTERVAL = 256
 """Datagrams from unknown sources read between two turns of housekeeping, 50 ms: about 5,000 a
@@ -24,17 +25,15 @@ IN_A_FLOOD = 16
 """Datagrams of a flood that are read per interval, to see its sources and its end."""
 _CALM_INTERVALS = 20
 _MOST_CALM_INTERVALS = 1200
+_REPORTED_SOURCES = 16
+_KNOWN_SOURCES = 256
 
 
 def open_beside(endpoint: socket.socket, peers: Iterable[Address]) -> tuple[socket.socket, ...]:
     """Open a socket for each peer on the address of ``endpoint``, connected to the peer.
 
-    Args:
-        endpoint: a bound UDP socket; it still receives from all other sources.
-        peers: addresses of the peers.
-
-    Returns:
-        The sockets, non-blocking, in the order of the peers; none if the system cannot do that.
+    ``endpoint`` is a bound UDP socket; it still receives from all other sources. The sockets do not
+    block and have the order of the peers. There are none if the system does not support it.
     """
     if sys.platform != "linux":
         return ()
@@ -88,8 +87,7 @@ class FloodWatch:
     def next_interval(self, dropped: int) -> str | None:
         """Begin the next interval; return a log line about the last one, if there is any.
 
-        Args:
-            dropped: how many the kernel has dropped so far.
+        ``dropped`` is the number of datagrams that the kernel has dropped so far.
         """
         before, self._dropped = self._dropped, dropped
         came = self._allowed - self.left + dropped - before
@@ -117,3 +115,50 @@ class FloodWatch:
         self._needed = min(2 * self._needed, _MOST_CALM_INTERVALS)
         shed = self._dropped - self._begun_with
         return f"the flood is over: the kernel dropped {shed} datagrams from unknown sources"
+
+
+class SourceCount:
+    """Counts datagrams by source address, cheaply while the source stays the same.
+
+    Peers always have a count of their own; of the other sources only the most frequent have one.
+    """
+
+    def __init__(self, peers: Iterable[Address] = ()) -> None:
+        self._peers = dict.fromkeys(peers, 0)
+        self._others: Counter[Address] = Counter()
+        self._more = 0
+        self._last: Address | None = None
+        self._run = 0
+
+    def add(self, source: Address) -> None:
+        """Count one datagram."""
+        if source == self._last:
+            self._run += 1
+            return
+        self._fold()
+        self._last, self._run = source, 1
+
+    def report(self) -> dict[str, int]:
+        """Datagrams by source; the rare sources together are ``others``."""
+        self._fold()
+        self._forget(_REPORTED_SOURCES)
+        named = [*self._peers.items(), *self._others.most_common()]
+        found = {text_of(source): n for source, n in named if n}
+        return found | ({"others": self._more} if self._more else {})
+
+    def _fold(self) -> None:
+        if self._last is None:
+            return
+        if self._last in self._peers:
+            self._peers[self._last] += self._run
+        else:
+            self._others[self._last] += self._run
+            if len(self._others) > _KNOWN_SOURCES:
+                self._forget(_KNOWN_SOURCES // 2)
+        self._last, self._run = None, 0
+
+    def _forget(self, most: int) -> None:
+        """Keep the ``most`` frequent sources: forged ones must not fill the memory."""
+        kept = Counter(dict(self._others.most_common(most)))
+        self._more += self._others.total() - kept.total()
+        self._others = kept

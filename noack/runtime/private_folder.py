@@ -23,11 +23,7 @@ def private_folder() -> Path:
 
 
 def require_name(name: str, what: str) -> None:
-    """Check that a name is fit for a file.
-
-    Raises:
-        CallerError: it is not.
-    """
+    """Raise CallerError unless a name is fit for a file."""
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", name):
         raise CallerError(f"{what} {name!r}: use letters, digits, _ and -, at most 64")
 
@@ -35,9 +31,7 @@ def require_name(name: str, what: str) -> None:
 class PrivateFolder:
     """An open folder that belongs to the user and is closed to others.
 
-    Args:
-        path: of the folder, for messages.
-        descriptor: of the folder, to be given to functions of :mod:`os` as ``dir_fd``.
+    ``descriptor`` can be given to functions of :mod:`os` as ``dir_fd``.
     """
 
     def __init__(self, path: Path, descriptor: int) -> None:
@@ -80,23 +74,11 @@ class PrivateFolder:
         return os.listdir(self.descriptor)  # noqa: PTH208 - a Path has no descriptor
 
     def link(self, name: str, other: str) -> None:
-        """Give a file a second name.
-
-        Raises:
-            FileExistsError: there is a file of that name.
-        """
+        """Give a file a second name; raise FileExistsError if that exists."""
         os.link(name, other, src_dir_fd=self.descriptor, dst_dir_fd=self.descriptor)
 
-    def replace(self, name: str, other: str) -> None:
-        """Rename a file, replacing any of the other name."""
-        os.replace(name, other, src_dir_fd=self.descriptor, dst_dir_fd=self.descriptor)
-
     def remove(self, name: str) -> None:
-        """Remove a file.
-
-        Raises:
-            FileNotFoundError: there is none.
-        """
+        """Remove a file; raise FileNotFoundError if there is none."""
         os.unlink(name, dir_fd=self.descriptor)
 
     def remove_same(self, name: str, status: os.stat_result) -> None:
@@ -109,11 +91,7 @@ class PrivateFolder:
 
 @contextmanager
 def open_private(*inside: str, create: bool = False) -> Iterator[PrivateFolder]:
-    """Open the user's private folder, or one inside it, while the context lasts.
-
-    Args:
-        inside: names of nested folders.
-        create: create missing folders.
+    """Open the user's private folder, or nested folders ``inside`` it, while the context lasts.
 
     Raises:
         CallerError: a folder cannot be created, belongs to another user, is a link, or is open to

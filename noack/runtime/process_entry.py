@@ -113,13 +113,10 @@ def _ticket(role: str, session: str, signals: Signals) -> Ticket:
 
 
 def _admitted(role: str, ticket: Ticket, signals: Signals) -> RunProcess:
-    """Connect to a run and request admission.
+    """Connect to a run and request admission; raise PeerError without an admission.
 
     A launched process tries again while its launcher lives. On a busy machine a connection may
     fail, or zenoh may not learn of the coordinator's queryables: then no request is answered.
-
-    Raises:
-        PeerError: the coordinator refused or did not answer.
     """
     while True:
         try:

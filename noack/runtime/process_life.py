@@ -32,10 +32,9 @@ from noack.protocol.wire_format import Decoder, Encoder, Flow, Message
 from noack.runtime.address import Address
 from noack.runtime.command_line import print_to_stderr
 from noack.runtime.control_messages import Admission, ControlMessage, RunStart, parse_message
-from noack.runtime.control_plane import ControlPlane
+from noack.runtime.control_plane import ControlPlane, ParameterUpdates
 from noack.runtime.join_ticket import Ticket
 from noack.runtime.life_cycle import HORIZON, LAUNCHER_GONE, Event, LifeCycle, Side, State
-from noack.runtime.parameter_updates import ParameterUpdates
 from noack.runtime.real_time_loop import Channel, run_loop
 from noack.runtime.real_time_settings import realtime
 from noack.runtime.record_handover import deliver_report, persisted_rows, spool_rows
@@ -72,14 +71,7 @@ OpenChannel = Callable[[socket.socket, Mapping[str, Address]], ReportingChannel[
 
 
 class RunProcess:
-    """A process of a run.
-
-    Args:
-        role: which process.
-        ticket: the run's ticket.
-        plane: its connection to the control plane.
-        signals: the signals it has received.
-    """
+    """A process of a run."""
 
     def __init__(self, role: str, ticket: Ticket, plane: ControlPlane, signals: Signals) -> None:
         self.role = role
@@ -101,9 +93,7 @@ class RunProcess:
     def request_admission(self) -> None:
         """Ask the coordinator for admission to the run.
 
-        Raises:
-            NoAnswerError: no answer came within ten seconds.
-            PeerError: the coordinator refused.
+        Raise NoAnswerError without an answer within ten seconds, PeerError if it refuses.
         """
         admission = self._request("admit", {}, Admission, _ADMISSION_TIMEOUT_S)
         self.life.apply(Event.ADMIT)
@@ -115,11 +105,8 @@ class RunProcess:
     def join(self, address: Address | None) -> Mapping[str, Address]:
         """Wait at the start barrier; return all addresses. Sets the common epoch.
 
-        Args:
-            address: where this process receives; None for the recorder, which is not in the loop.
-
-        Raises:
-            PeerError: the run never started.
+        ``address`` is None for the recorder, which is not in the loop. Raise PeerError if the run
+        never started.
         """
         self.life.apply(Event.JOIN)
         begin = self._request("join", {"address": address}, RunStart, _JOIN_TIMEOUT_S)
@@ -182,13 +169,7 @@ class RunProcess:
     def run(self, machine: Machine[T], open_channel: OpenChannel[T]) -> None:
         """Join, drive the machine to the horizon, hand over the remaining rows, and report.
 
-        Args:
-            machine: the pure machine.
-            open_channel: makes the machine's channel from a bound socket and all addresses.
-
-        Raises:
-            CallerError: the process's port is taken.
-            PeerError: the run never started.
+        Raise CallerError if the process's port is taken, PeerError if the run never started.
         """
         settings, port = self.scenario.realtime, getattr(self.scenario.ports, self.role)
         port = port if self._address is None else self._address[1]
@@ -291,7 +272,6 @@ class RunProcess:
     def _announce(
         self, machine: ReconfigurableMachine[Any] | None, now_ns: int, at_most: int | None
     ) -> Sequence[Record | Notice]:
-        """Pass announced changes on to the machine, at most a number of them."""
         if machine is None:
             return ()
         outputs: list[Record | Notice] = []

@@ -33,10 +33,7 @@ class Channel(Protocol[T]):
         ...
 
     def receive(self, readable: int) -> T | None:
-        """Return one message from a file descriptor; None if there was none.
-
-        Work is bounded: at most a few datagrams that are no messages are read in one call.
-        """
+        """Return one message from a file descriptor; read at most a few datagrams that are none."""
         ...
 
     def send(self, message: T) -> None:
@@ -75,7 +72,7 @@ def run_loop(
     spin_us: float = 0.0,
     news: Callable[[int], Sequence[Record | Notice]] = lambda now_ns: (),
 ) -> int:
-    """Drive ``machine`` until simulated time ``end_ns``, or until ``stop()``.
+    """Drive ``machine`` until simulated time ``end_ns`` (None: no end), or until ``stop()``.
 
     Args:
         machine: the pure machine.

@@ -4,7 +4,6 @@ Measured effect on the wake-up lateness of a 1 kHz loop (p50/p99, µs): none 80/
 slack 30/145, SCHED_FIFO 38/106, no deep idle states 16/39.
 """
 
-import contextlib
 import ctypes
 import gc
 import os
@@ -12,8 +11,9 @@ import struct
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 _PR_SET_TIMERSLACK = 29
 _MCL_CURRENT = 1
@@ -25,45 +25,42 @@ _CPU_DMA_LATENCY = Path("/dev/cpu_dma_latency")
 def realtime(
     enabled: bool, fifo_priority: int, place: int | None = None
 ) -> Iterator[dict[str, str]]:
-    """Apply the real-time settings to the calling thread; undo them with the context.
+    """Apply the real-time settings to the calling thread, and undo them with the context.
 
-    Args:
-        enabled: whether to apply any.
-        fifo_priority: SCHED_FIFO priority.
-        place: the process's number along the loop; neighbours get different cores, so that a
-            process does not block the one that it wakes. None leaves the choice to the system.
+    Neighbours along the loop have consecutive numbers (``place``) and get different cores, so that
+    a process does not block the one that it wakes. None leaves the choice to the system.
 
     Yields:
         For each setting ``"applied"``, ``"not permitted: why"`` or ``"not requested"``.
     """
     settings = ("memory_lock", "timer_slack", "sched_fifo", "affinity", "cpu_dma_latency")
     applied = dict.fromkeys(settings, "not requested")
-    with contextlib.ExitStack() as undo:
+    with ExitStack() as undo:
         gc.collect()
         gc.freeze()
         gc.disable()
         undo.callback(gc.enable)
         if enabled:
             # Locking memory takes 0.1 s: at real-time priority it would block this core.
-            applied["memory_lock"] = _attempt(_memory_lock)
-            applied["timer_slack"] = _attempt(_timer_slack)
-            applied["sched_fifo"] = _attempt(lambda: _fifo(fifo_priority, undo))
+            applied["memory_lock"] = _attempt(_call_system, "mlockall", _MCL_CURRENT | _MCL_FUTURE)
+            applied["timer_slack"] = _attempt(_call_system, "prctl", _PR_SET_TIMERSLACK, 1, 0, 0, 0)
+            applied["sched_fifo"] = _attempt(_fifo, fifo_priority, undo)
             if place is not None and applied["sched_fifo"] == "applied":
-                applied["affinity"] = _attempt(lambda: _affinity(place, undo))
-            applied["cpu_dma_latency"] = _attempt(lambda: _cpu_dma_latency(undo))
+                applied["affinity"] = _attempt(_affinity, place, undo)
+            applied["cpu_dma_latency"] = _attempt(_cpu_dma_latency, undo)
         yield applied
 
 
-def _attempt(apply: Callable[[], None]) -> str:
+def _attempt(apply: Callable[..., None], *arguments: Any) -> str:
     try:
-        apply()
+        apply(*arguments)
     except (OSError, AttributeError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         return f"not permitted: {reason}"
     return "applied"
 
 
-def _fifo(priority: int, undo: contextlib.ExitStack) -> None:
+def _fifo(priority: int, undo: ExitStack) -> None:
     if sys.platform != "linux":
         raise OSError(0, "not available on this system")
     loop = threading.get_native_id()
@@ -72,14 +69,13 @@ def _fifo(priority: int, undo: contextlib.ExitStack) -> None:
     for task in Path("/proc/self/task").iterdir():
         thread = int(task.name)
         rank = priority if thread == loop else priority - 1
-        with (
-            contextlib.nullcontext() if thread == loop else contextlib.suppress(ProcessLookupError)
-        ):
+        ended = () if thread == loop else (ProcessLookupError,)
+        with suppress(*ended):
             os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(max(rank, 1)))
     undo.callback(os.sched_setscheduler, 0, os.SCHED_OTHER, os.sched_param(0))
 
 
-def _affinity(place: int, undo: contextlib.ExitStack) -> None:
+def _affinity(place: int, undo: ExitStack) -> None:
     cores = sorted(os.sched_getaffinity(0))
     if len(cores) < 2:
         raise OSError(0, "there is only one core")
@@ -87,27 +83,15 @@ def _affinity(place: int, undo: contextlib.ExitStack) -> None:
     undo.callback(os.sched_setaffinity, 0, set(cores))
 
 
-def _libc() -> ctypes.CDLL:
+def _call_system(function: str, *arguments: int) -> None:
     if sys.platform != "linux":
         raise OSError(0, "not available on this system")
-    return ctypes.CDLL(None, use_errno=True)
-
-
-def _check(result: int) -> None:
-    if result != 0:
+    if getattr(ctypes.CDLL(None, use_errno=True), function)(*arguments) != 0:
         number = ctypes.get_errno()
         raise OSError(number, os.strerror(number))
 
 
-def _timer_slack() -> None:
-    _check(_libc().prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0))
-
-
-def _memory_lock() -> None:
-    _check(_libc().mlockall(_MCL_CURRENT | _MCL_FUTURE))
-
-
-def _cpu_dma_latency(undo: contextlib.ExitStack) -> None:
+def _cpu_dma_latency(undo: ExitStack) -> None:
     # The kernel keeps the request for as long as the file stays open.
     descriptor = os.open(_CPU_DMA_LATENCY, os.O_WRONLY)
     undo.callback(os.close, descriptor)

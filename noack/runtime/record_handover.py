@@ -31,8 +31,7 @@ def deliver_report(
 ) -> bool:
     """Send the final report to the recorder, and again the rows that it misses.
 
-    Returns:
-        Whether the recorder has everything.
+    Return whether the recorder has everything.
     """
     try:
         for _ in range(_REPORT_ATTEMPTS):
@@ -47,17 +46,7 @@ def deliver_report(
 
 
 def spool_rows(run_dir: Path, role: str, writer: str, telemetry: TelemetryBuffer) -> None:
-    """Write all rows that the buffer still holds to the spool.
-
-    Args:
-        run_dir: the run's directory.
-        role: the process.
-        writer: names its files in the spool.
-        telemetry: holds the rows.
-
-    Raises:
-        MachineError: the spool cannot be written.
-    """
+    """Write all rows that the buffer still holds to the spool; ``writer`` names its files."""
     spool = SpoolWriter(run_dir / SPOOL, writer)
 
     def append(table: str, header: bytes, payload: bytes) -> None:

@@ -44,12 +44,7 @@ _OPEN_RUN = TypeAdapter(OpenRun)
 
 @contextmanager
 def published(ticket: Ticket, session: str | None) -> Iterator[Path]:
-    """Keep a run's lock file while the context lasts.
-
-    Raises:
-        CallerError: the folder is not the user's own.
-        OSError: the file cannot be written.
-    """
+    """Keep a run's lock file while the context lasts."""
     secret = secret_of(ticket)
     run_id = f"{ticket.run_id:016x}"
     run = OpenRun(run_id, ticket.run_dir, session, ticket.endpoint, secret.user, secret.password)
@@ -58,14 +53,9 @@ def published(ticket: Ticket, session: str | None) -> Iterator[Path]:
 
 
 def find(session: str | None = None, run_dir: Path | None = None) -> OpenRun:
-    """Return the newest active run of this user.
+    """Return the user's newest active run, of this session or with this run directory.
 
-    Args:
-        session: only a run of this session.
-        run_dir: only the run with this run directory.
-
-    Raises:
-        CallerError: no such run is active.
+    Raise CallerError if no such run is active.
     """
     newest_first = sorted(
         lock_file.live_lock_files(_KIND), key=lambda file: file.written_ns, reverse=True

@@ -20,14 +20,10 @@ _CHUNK = struct.Struct("<QQ")
 
 
 class SpoolWriter:
-    """Appends batches to the spool.
+    """Appends batches to files in ``folder``, which is created in the run directory.
 
-    Args:
-        folder: the spool's directory; it is created in the run directory.
-        writer: names this writer's files.
-
-    Raises:
-        MachineError: the folder cannot be made.
+    The files are named after the ``writer``. The methods raise MachineError if the disk is full or
+    a file cannot be written.
     """
 
     def __init__(self, folder: Path, writer: str) -> None:
@@ -38,20 +34,12 @@ class SpoolWriter:
             folder.mkdir(exist_ok=True)
 
     def append(self, table: str, first: int, payload: bytes) -> None:
-        """Write one batch through to the operating system.
-
-        Raises:
-            MachineError: the disk is full or the folder cannot be written.
-        """
+        """Write one batch through to the operating system."""
         with self._named():
             _write_complete(self._open(table), _CHUNK.pack(first, len(payload)) + payload)
 
     def prepare(self, tables: Iterable[str]) -> None:
-        """Open the files of tables before the first rows.
-
-        Raises:
-            MachineError: the folder cannot be written.
-        """
+        """Open the files of tables before the first rows."""
         with self._named():
             for table in tables:
                 self._open(table)
@@ -67,11 +55,7 @@ class SpoolWriter:
             ) from None
 
     def require_present(self) -> None:
-        """Check that the files are still in place: rows in deleted files are lost.
-
-        Raises:
-            MachineError: a file was deleted or moved.
-        """
+        """Raise MachineError if a file was deleted or moved: rows in deleted files are lost."""
         for table, file in self._files.items():
             path = self._path(table)
             try:
@@ -98,11 +82,7 @@ class SpoolWriter:
 
 
 def _write_complete(file: BinaryIO, chunk: bytes) -> None:
-    """Write a complete chunk or nothing: a partial chunk would be read as rows later.
-
-    Raises:
-        OSError: the system did not write all of it.
-    """
+    """Write a complete chunk or nothing: a partial chunk would be read as rows later."""
     written = 0
     try:
         while written < len(chunk):
@@ -116,47 +96,8 @@ def read_chunks(folder: Path, table: str) -> Iterator[tuple[int, bytes]]:
     """Yield ``(first row, rows)`` of each complete batch of a table, from all writers."""
     for path in sorted(folder.glob(f"{table}.*")):
         with path.open("rb") as file:
-            yield from _complete_chunks(file)
-
-
-class SpoolTail:
-    """Reads a spool while it is written, to the end even if its files are removed.
-
-    Args:
-        folder: the spool's directory; it need not exist yet.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._files: dict[str, BinaryIO] = {}
-
-    def read(self) -> Iterator[tuple[str, int, bytes]]:
-        """Yield ``(table, first row, rows)`` of each complete batch that was not read before."""
-        for path in sorted(self._folder.glob("*.*")):
-            if path.name not in self._files:
-                with contextlib.suppress(FileNotFoundError):  # just removed
-                    self._files[path.name] = path.open("rb")
-        for name, file in self._files.items():
-            for first, payload in _complete_chunks(file):
-                yield name.partition(".")[0], first, payload
-
-    def close(self) -> None:
-        """Close all files."""
-        for file in self._files.values():
-            file.close()
-        self._files.clear()
-
-
-def _complete_chunks(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
-    """Yield the complete batches; leave the file position after the last of them."""
-    size = os.fstat(file.fileno()).st_size
-    while True:
-        start = file.tell()
-        head = file.read(_CHUNK.size)
-        if len(head) == _CHUNK.size:
-            first, length = _CHUNK.unpack(head)
-            if file.tell() + length <= size:
-                yield first, file.read(length)
-                continue
-        file.seek(start)
-        return
+            while len(head := file.read(_CHUNK.size)) == _CHUNK.size:
+                first, length = _CHUNK.unpack(head)
+                if len(payload := file.read(length)) < length:
+                    break
+                yield first, payload

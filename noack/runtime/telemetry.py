@@ -118,15 +118,7 @@ class TelemetryBuffer:
         return dict(self._published)
 
     def resend(self, missing: Mapping[str, list[tuple[int, int]]], publish: Publish) -> int:
-        """Publish the held batches again that overlap missing row ranges.
-
-        Args:
-            missing: by table, half-open ranges of row numbers.
-            publish: publishes a batch; may block.
-
-        Returns:
-            How many batches were sent.
-        """
+        """Publish the held batches again that overlap missing row ranges; return their number."""
         sent = 0
         for table, first, rows, payload in self._held:
             if any(low < first + rows and first < high for low, high in missing.get(table, ())):
@@ -170,11 +162,7 @@ class TelemetryBuffer:
 
 
 def first_row(header: bytes) -> tuple[int, int]:
-    """Generation and number of a batch's first row, from its header.
-
-    Raises:
-        PeerError: it is not the header of a batch.
-    """
+    """Generation and number of a batch's first row, from its header; raise PeerError if invalid."""
     found = parse_message(BatchHeader, header)
     return found.get("generation", 0), found["first"]
 

@@ -13,8 +13,7 @@ from noack.core.errors import CallerError
 from noack.protocol.machine_interface import Notice
 from noack.protocol.wire_format import MAX_DATAGRAM_BYTES, Decoder, Encoder, Flow, Message, flow_of
 from noack.runtime.address import Address, text_of
-from noack.runtime.peer_sockets import FloodWatch, open_beside
-from noack.runtime.unknown_sources import SourceCount
+from noack.runtime.peer_sockets import FloodWatch, SourceCount, open_beside
 
 LOOPBACK = "127.0.0.1"
 
@@ -39,20 +38,14 @@ MAX_UDP_BYTES = 65_535
 T = TypeVar("T")
 
 
-def bind(port: int, key: str, host: str = LOOPBACK) -> socket.socket:
-    """Return a non-blocking UDP socket bound to ``host:port`` (port 0: any free one).
+def bind(port: int, key: str) -> socket.socket:
+    """Return a non-blocking UDP socket on loopback, bound to a port (0: any free one).
 
-    Args:
-        port: the port.
-        key: the scenario key or option that set the port, for the error message.
-        host: the local address.
-
-    Raises:
-        CallerError: the port is taken or not permitted.
+    Raise CallerError, which names the setting ``key``, if the port is taken or not permitted.
     """
     endpoint = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
-        endpoint.bind((host, port))
+        endpoint.bind((LOOPBACK, port))
     except OSError as error:
         endpoint.close()
         reason = {
@@ -60,7 +53,7 @@ def bind(port: int, key: str, host: str = LOOPBACK) -> socket.socket:
             errno.EACCES: "needs privileges that this user does not have",
         }.get(error.errno or 0, f"cannot be bound ({error.strerror})")
         raise CallerError(
-            f"UDP port {host}:{port} {reason}; set {key} to another port, or to 0 for any"
+            f"UDP port {LOOPBACK}:{port} {reason}; set {key} to another port, or to 0 for any"
         ) from None
     endpoint.setblocking(False)
     enlarge_buffer(endpoint)
@@ -77,22 +70,22 @@ def enlarge_buffer(endpoint: socket.socket) -> int:
     return endpoint.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
 
 
-def free_tcp_port(host: str = LOOPBACK) -> int:
+def free_tcp_port() -> int:
     """Return a TCP port that is free now."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
-        probe.bind((host, 0))
+        probe.bind((LOOPBACK, 0))
         return int(probe.getsockname()[1])
 
 
-def require_free_tcp_port(port: int, key: str, host: str = LOOPBACK) -> None:
+def require_free_tcp_port(port: int, key: str) -> None:
     """Raise CallerError if a TCP port cannot be listened on."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            probe.bind((host, port))
+            probe.bind((LOOPBACK, port))
         except OSError as error:
             raise CallerError(
-                f"control plane: TCP port {host}:{port} cannot be bound ({error.strerror}); "
+                f"control plane: TCP port {LOOPBACK}:{port} cannot be bound ({error.strerror}); "
                 f"set {key} to another port, or to 0 for any"
             ) from None
 
@@ -112,16 +105,11 @@ def drops_of(endpoint: socket.socket) -> int | None:
 
 
 class CountingSocket(ABC, Generic[T]):
-    """A bound socket with one destination, and counters.
+    """A bound socket (from :func:`bind`) with one destination, and counters.
 
     The sending socket stays unconnected: on a connected one, an ICMP error of an earlier datagram
-    would fail the next send, which in the emulator is an unintended loss.
-
-    Args:
-        endpoint: from :func:`bind`.
-        destination: where it sends.
-        peers: addresses that send to it; datagrams from unknown sources have a queue of their own
-            (:mod:`noack.runtime.peer_sockets`).
+    would fail the next send, which in the emulator is an unintended loss. Datagrams from other
+    sources than the peers have a queue of their own (:mod:`noack.runtime.peer_sockets`).
     """
 
     def __init__(
@@ -152,22 +140,16 @@ class CountingSocket(ABC, Generic[T]):
     def judge(self, data: bytes, source: Address) -> T | None:
         """Return the message of a datagram; None, counted as rejected, if it has none.
 
-        Args:
-            data: as received, cut at :attr:`most_bytes`.
-            source: sender's address.
+        ``data`` is cut at :attr:`most_bytes`.
         """
 
     most_bytes = MAX_DATAGRAM_BYTES + 1
     """A longer datagram is cut, and rejected by its length."""
 
     def receive(self, readable: int) -> T | None:
-        """Return the next message; skip a few rejected datagrams before it.
+        """Return the next message from a readable file descriptor.
 
-        Args:
-            readable: the file descriptor that is readable.
-
-        Returns:
-            None if there was no message among the next few datagrams.
+        A few rejected datagrams before it are skipped; None if the next few have no message.
         """
         endpoint, unknown = self._sockets[readable], readable == self._unknown_fd
         for _ in range(_READ_AT_ONCE):
@@ -247,19 +229,10 @@ class CountingSocket(ABC, Generic[T]):
 
 
 class MessageSocket(CountingSocket[Message]):
-    """A process's socket in the loop: receives one flow and sends another.
+    """A process's socket in the loop: receives one flow and sends another (``sends``).
 
-    In the acknowledgement baseline it also receives or sends acknowledgements.
-
-    Args:
-        endpoint: a bound socket, from :func:`bind`.
-        decoder: of the received flow.
-        encoder: of the sent flow.
-        sends: the flow that it sends.
-        source: the peer; datagrams from other sources are rejected.
-        destination: where it sends.
-        acknowledgements: decoder of acknowledgements, and their sender.
-        acknowledges_to: where it sends acknowledgements.
+    Datagrams from other sources than the peer (``source``) are rejected. In the acknowledgement
+    baseline it also receives acknowledgements, with a decoder from a sender, or sends them.
     """
 
     def __init__(

@@ -7,7 +7,7 @@ sent, and refuses all other connections.
 import json
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -33,15 +33,9 @@ class SessionSecret(NamedTuple):
 
 
 def open_session(endpoint: str, secret: SessionSecret, *, listen: bool) -> zenoh.Session:
-    """Open a session.
+    """Open a session that listens on the endpoint, or connects to it.
 
-    Args:
-        endpoint: the listening address, e.g. ``tcp/127.0.0.1:7447``.
-        secret: required from all that connect.
-        listen: listen on the endpoint instead of connecting to it.
-
-    Raises:
-        zenoh.ZError: the endpoint cannot be listened on, or reached; or the secret is wrong.
+    Raise zenoh.ZError if that fails, or the secret is wrong.
     """
     if not listen:
         shown = {f"transport/auth/usrpwd/{key}": value for key, value in secret._asdict().items()}
@@ -68,10 +62,7 @@ def session_config(
 ) -> zenoh.Config:
     """Return the zenoh configuration of a listening or of a connecting session.
 
-    Args:
-        endpoint: the listening address.
-        listen: listen on the endpoint instead of connecting to it.
-        more: further zenoh settings by key.
+    ``more`` has further zenoh settings by key.
     """
     config = zenoh.Config()
     side, other = ("listen", "connect") if listen else ("connect", "listen")
@@ -101,22 +92,27 @@ def session_config(
 def answer_to(session: zenoh.Session, key: str, question: str, timeout_s: float) -> str | None:
     """Send a request to the listening session and return its answer; None without one in time.
 
-    Raises:
-        CallerError: the request was refused as wrong.
+    Raise CallerError if the request was refused as wrong.
     """
     replies = session.get(key, FifoChannel(4), payload=question, timeout=timeout_s)
-    deadline_s = time.monotonic() + timeout_s
-    while time.monotonic() < deadline_s:
+    reply = first_reply(replies, time.monotonic() + timeout_s, poll_s=0.002)
+    if reply is not None and reply.err is not None:
+        raise CallerError(reply.err.payload.to_string())
+    return None if reply is None or reply.ok is None else reply.ok.payload.to_string()
+
+
+def first_reply(
+    replies: Any, until_s: float, *, poll_s: float, give_up: Callable[[], bool] = lambda: False
+) -> zenoh.Reply | None:
+    """Return the first reply before a reading of the monotonic clock; None without one."""
+    while time.monotonic() < until_s and not give_up():
         try:
-            reply = replies.try_recv()
+            reply: zenoh.Reply | None = replies.try_recv()
         except zenoh.ZError:  # the query ended without an answer
             return None
-        if reply is None:
-            time.sleep(0.002)
-        elif reply.ok is not None:
-            return reply.ok.payload.to_string()
-        elif reply.err is not None:
-            raise CallerError(reply.err.payload.to_string())
+        if reply is not None:
+            return reply
+        time.sleep(poll_s)
     return None
 
 

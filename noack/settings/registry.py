@@ -17,10 +17,8 @@ Settings = TypeVar("Settings", bound=ScenarioSection)
 def kinds_in(package: str, base: type[Settings], key: str = "kind") -> Mapping[str, type[Settings]]:
     """Return the settings classes that the modules of a package define, by their kind.
 
-    Args:
-        package: its dotted name; subpackages are not searched.
-        base: the base class of all of them.
-        key: the field that names the kind, a ``Literal`` of one value.
+    They are subclasses of ``base``. The field ``key``, a ``Literal`` of one value, names the kind.
+    Subpackages are not searched.
     """
     found: dict[str, type[Settings]] = {}
     for entry in iter_modules(import_module(package).__path__, f"{package}."):
@@ -38,10 +36,7 @@ def union_of(
 ) -> Any:
     """Return the type of a table that is one of these kinds, for pydantic.
 
-    Args:
-        kinds: settings classes by kind.
-        key: the field that names the kind.
-        default: the kind of a table that does not name one; None: the key is required.
+    The field ``key`` names the kind; it may be omitted in a table of the kind ``default``.
     """
     if default is None:
         return Annotated[reduce(or_, kinds.values()), Discriminator(key)]

@@ -74,7 +74,7 @@ def test_a_symbolic_link_instead_of_the_folder_is_refused(
     own = shared / "own"
     for folder in (own, own / "runs", own / "netem"):
         folder.mkdir(mode=0o700)
-    (own / "default.json").write_text(ticket.dumps())
+    (own / "default.json").write_text(ticket.model_dump_json())
     (shared / OWN).symlink_to(own)
     with pytest.raises(CallerError, match="closed to others"):
         use(ticket)
@@ -124,7 +124,9 @@ def test_a_ticket_is_not_read_from_a_folder_swapped_in_meanwhile(
     """Even if the other user swaps the folder back, noack does not use the planted ticket."""
     theirs, away = shared / "theirs", shared / "away"
     theirs.mkdir()
-    (theirs / "default.json").write_text(ticket._replace(run_dir="theirs").dumps())
+    (theirs / "default.json").write_text(
+        ticket.model_copy(update={"run_dir": "theirs"}).model_dump_json()
+    )
 
     def swap(_: str) -> None:
         (shared / OWN).rename(away)

@@ -95,7 +95,7 @@ def test_startup_has_a_row_for_the_goal_and_one_for_the_peer() -> None:
 
 
 def test_a_failed_program_is_reported_with_its_last_output() -> None:
-    with pytest.raises(MeasurementError, match=r"ended with 3, said 'sorry'"):
+    with pytest.raises(MeasurementError, match=r"ended with 3: sorry"):
         execute([sys.executable, "-c", "import sys; print('sorry', file=sys.stderr); sys.exit(3)"])
 
 

@@ -3,14 +3,14 @@
 import socket
 import subprocess
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
 
 import numpy as np
 import pytest
 
-from benchmarks import _flood
 from benchmarks._faulted_run import FaultedRun, recovery_s
-from benchmarks._flood import Flood, flood
+from benchmarks._flood import SEGMENTS, Flood, datagram, flood
 from benchmarks.flood import figures_of
 from cosim.cli import find_scenario
 from cosim.record.run_record import RunRecord
@@ -24,31 +24,42 @@ PERIOD_NS = 2_000_000
 
 
 def taken(ear: socket.socket) -> list[bytes]:
-    """Return all received datagrams and close the socket."""
+    """Return all received datagrams."""
     found = []
-    with ear, suppress(BlockingIOError):
+    with suppress(BlockingIOError):
         while True:
             found.append(ear.recv(2000))
     return found
 
 
-@pytest.mark.parametrize("at_once", [True, False])
+@pytest.fixture
+def ears() -> Iterator[list[socket.socket]]:
+    """Three receiving sockets."""
+    with ExitStack() as stack:
+        found = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(3)]
+        for ear in found:
+            stack.enter_context(ear)
+            ear.bind(("127.0.0.1", 0))
+            ear.setblocking(False)
+        yield found
+
+
 def test_a_flood_is_distributed_evenly_over_the_ports_and_counted(
-    monkeypatch: pytest.MonkeyPatch, at_once: bool
+    ears: list[socket.socket],
 ) -> None:
-    if at_once and sys.platform != "linux":
-        pytest.skip("sendmmsg is Linux's")
-    monkeypatch.setattr(_flood, "_AtOnce", _flood._AtOnce if at_once else _flood._OneByOne)
-    ears = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(3)]
-    for ear in ears:
-        ear.bind(("127.0.0.1", 0))
-        ear.setblocking(False)
     sent = flood([ear.getsockname()[1] for ear in ears], 0.3, 1000.0).sent
     decoder = Decoder(Flow.UPDATE, 4, 1, bytes(32))
     counts = [sum(decoder.decode(data) is None for data in taken(ear)) for ear in ears]
     assert sum(counts) == sent > 0
     assert max(counts) - min(counts) <= 1
     assert decoder.rejected[Rejection.RUN] == sent  # it looks like an update of another run
+
+
+def test_one_call_of_an_unlimited_flood_sends_separate_datagrams(ears: list[socket.socket]) -> None:
+    assert flood([ears[0].getsockname()[1]], 0.01, None).sent % SEGMENTS == 0
+    received = taken(ears[0])
+    assert len(received) >= SEGMENTS
+    assert {len(data) for data in received} == {len(datagram())}
 
 
 def test_the_flood_process_prints_the_number_sent() -> None:

@@ -14,9 +14,8 @@ import pytest
 from scipy.linalg import eigvals, solve_continuous_are
 
 from cosim.analysis.claims.run_evidence import scheduled_certificates
-from cosim.analysis.model_comparison import linearisation, said
+from cosim.analysis.model_comparison import linearisation, linearisation_rows
 from cosim.analysis.run_summary import summarise
-from cosim.output.certificate_report import with_weight
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import LoopMatrices, loop_of, resolve
@@ -240,7 +239,7 @@ def test_a_summary_compares_the_cars_linearisation_with_the_model() -> None:
     believed = loop("lane_vehicle")
     np.testing.assert_allclose(np.array(found["A"]) - found["off_A"], believed.A_model, atol=1e-12)
     np.testing.assert_allclose(np.array(found["B"]) - found["off_B"], believed.B_model, atol=1e-12)
-    assert said(found)[1][1].endswith("inside the box")
+    assert linearisation_rows(found)[1][1].endswith("inside the box")
 
 
 def test_another_car_is_reported_outside_the_box_with_its_entries() -> None:
@@ -248,7 +247,7 @@ def test_another_car_is_reported_outside_the_box_with_its_entries() -> None:
     assert found is not None
     assert found["in_box"] is False
     worst = np.abs(np.array(found["off_B"])).max()
-    assert said(found)[1][1] == f"B[2, 1], by {worst:.3g}, outside the box"
+    assert linearisation_rows(found)[1][1] == f"B[2, 1], by {worst:.3g}, outside the box"
 
 
 def test_a_plant_without_a_box_and_a_linear_plant_have_no_box_check() -> None:
@@ -262,9 +261,21 @@ def test_the_summary_reports_a_plant_without_a_linearisation() -> None:
     found = linearisation(shipped("lane_vehicle", "plant.system.model=kinematic"))
     assert found is not None
     assert set(found.values()) == {None}
-    assert said(found) == (
-        ("the plant, linearised", "none: x does not tell what follows, or not smoothly"),
+    assert linearisation_rows(found) == (
+        ("the plant, linearised", "none: x is not its whole state, or it is not smooth"),
     )
+
+
+F16_WEIGHT = [
+    [24.0, 5.4, 0.039, -0.3, -0.0053, 0.0024, 0.33],
+    [0.0, 10.0, 0.87, 3.0, -0.016, -0.0063, 0.4],
+    [0.0, 0.0, 2.2, 2.3, 0.011, 0.011, -0.13],
+    [0.0, 0.0, 0.0, 5.1, -0.011, -0.0017, -0.0044],
+    [0.0, 0.0, 0.0, 0.0, 0.094, -0.0043, 0.0057],
+    [0.0, 0.0, 0.0, 0.0, 0.0, 0.033, 0.0036],
+    [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.12],
+]
+"""From ``noack certify f16_lateral --weight chosen --late 0``, which takes half a minute."""
 
 
 def test_the_f16_scenarios_comment_on_its_certificates_is_correct() -> None:
@@ -280,7 +291,7 @@ def test_the_f16_scenarios_comment_on_its_certificates_is_correct() -> None:
     for one, loop_gain in ((own, "14"), (box, "55.7"), (scaled, "1.11")):
         assert one.void == f"the loop gain of the errors is {loop_gain}, not below 1"
         assert f"{loop_gain} for" in words
-    chosen, _ = with_weight(shipped("f16_lateral", "certificate.late_periods=0"), "chosen")
+    chosen = shipped("f16_lateral", "certificate.late_periods=0", f"trigger.weight={F16_WEIGHT}")
     assert scheduled_certificates(chosen)[0].constants is not None
     fast = shipped("f16_lateral", "plant.rate_hz=20000.0", "controller.rate_hz=20000.0")
     assert all(one.constants is not None for one in scheduled_certificates(fast))

@@ -1,5 +1,6 @@
 """Check the recording on a screenshot of the viewer in a browser."""
 
+import runpy
 import shutil
 import subprocess
 import sys
@@ -10,13 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import noack
 from cosim.output import palette
-from tests.integration.conftest import run_scenario, settings
 
-ROOT = Path(__file__).parents[2]
+TOOL = Path(__file__).parents[2] / "tools" / "screenshot_recording.py"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
-
-
 CAR, SENSOR, CONTROLLER = palette.PLANT, palette.SENSOR, palette.CONTROLLER
 
 
@@ -25,12 +24,12 @@ CAR, SENSOR, CONTROLLER = palette.PLANT, palette.SENSOR, palette.CONTROLLER
     not any(map(shutil.which, BROWSERS)), reason="there is no Chromium or Chrome on the PATH"
 )
 def test_a_recording_shows_the_car_and_the_position_in_each_model(tmp_path: Path) -> None:
-    finished = run_scenario(tmp_path, *settings(speed=5.0, horizon_s=8.0))
+    run = noack.simulate(noack.load("lane_following", {"horizon_s": 8.0}), runs=tmp_path)
     picture = tmp_path / "run.png"
     done = subprocess.run(
         [
-            sys.executable, str(ROOT / "tools" / "screenshot_recording.py"),
-            str(finished.run_dir / "recording.rrd"), str(picture),
+            sys.executable, str(TOOL),
+            str(run.directory / "recording.rrd"), str(picture),
             "--size", "1200x800", "--theme", "light",
         ],
         capture_output=True, text=True, timeout=330, check=False,
@@ -58,3 +57,22 @@ def near(image: Image.Image, colour: palette.Colour) -> Any:
     """Return the positions (k, 2) of pixels of this colour, with a tolerance for smoothed edges."""
     pixels = np.asarray(image, dtype=int)
     return np.argwhere(np.abs(pixels - colour).max(axis=2) < 20)
+
+
+@pytest.mark.parametrize("missing", ["recording", "browser"])
+def test_a_missing_file_or_program_gives_one_line(
+    missing: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = tmp_path / "recording.rrd"
+    if missing == "browser":
+        path.write_bytes(b"RRF2")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(sys, "argv", [str(TOOL), str(path), str(tmp_path / "picture.png")])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(TOOL), run_name="__main__")
+    assert ended.value.code == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert ("no such recording" if missing == "recording" else "no browser") in line

@@ -9,17 +9,8 @@ promise: the integral of the output's square over the next window, for the loop 
 
 import numpy as np
 
-from cosim.analysis.adversary.search_nodes import (
-    Best,
-    DecisionLog,
-    Indices,
-    Nodes,
-    Report,
-    WorstPatternFound,
-    branches,
-    root,
-    together,
-)
+from cosim.analysis.adversary.objective import weight_of
+from cosim.analysis.adversary.search_nodes import Indices, Nodes, PatternSearch, root, together
 from cosim.analysis.adversary.segments import SegmentFlow
 from noack.core.linear_systems import Matrix, Vector
 
@@ -29,51 +20,33 @@ _CROWD = 8
 _POINTS = 12
 
 
-def search_beam(
-    flow: SegmentFlow,
-    mansd: int,
-    width: int,
-    window_s: float,
-    *,
-    known: float = -np.inf,
-    report: Report = lambda nodes, value: None,
-) -> WorstPatternFound:
-    """Search for a large value among patterns with at most ``mansd`` consecutive losses.
+def search_beam(search: PatternSearch, width: int, window_s: float) -> None:
+    """Search for a large value; ``width`` runs continue from one window to the next.
 
-    Args:
-        flow: the loop with its objective.
-        mansd: M − 1.
-        width: number of runs that continue from one window to the next.
-        window_s: length of a window, about one inter-event time.
-        known: a value that some pattern reaches.
-        report: receives the progress.
+    A window has about the length of an inter-event time.
 
     Raises:
         TooManyEventsError: two events at the same time.
     """
-    log, best, choice = DecisionLog(), Best(flow, known), _Choice(flow, width, window_s)
-    waiting, visited, until_s = root(flow), 0, 0.0
-    while len(waiting.t_s) and best.value < np.inf:
+    search.step = "beam search"
+    choice = _Choice(search.flow, window_s)
+    waiting, until_s = root(search.flow), 0.0
+    while len(waiting.t_s) and search.value < np.inf:
         until_s = max(until_s, float(waiting.t_s.min())) + window_s
         now = waiting.t_s < until_s
         active, later = waiting.take(now), [waiting.take(~now)]
         while len(active.t_s):
-            segments = flow(active.t_s, active.z, best.value)
-            visited += len(active.t_s)
-            value = best.see(active, segments)
-            following = branches(active, segments, value, mansd, log)
+            following = search.successors(active)
             now = following.t_s < until_s
             later.append(following.take(~now))
             active = choice.thin(following.take(now), _CROWD * width)
         waiting = choice.thin(together(later), width)
-        report(visited, best.value)
-    return best.found(log, visited, complete=False)
 
 
 class _Choice:
     """The selection of the runs that continue."""
 
-    def __init__(self, flow: SegmentFlow, width: int, window_s: float) -> None:
+    def __init__(self, flow: SegmentFlow, window_s: float) -> None:
         self._measure, self._window_s = flow.measure, window_s
         self._gramian = _gramian(flow, window_s)
 
@@ -82,7 +55,8 @@ class _Choice:
         if len(nodes.t_s) <= width:
             return nodes
         nodes = nodes.take(self._distinct(nodes))
-        promise, kind = self._promise(nodes), self._kind(nodes)
+        z, kind = self._scaled(nodes), self._kind(nodes)
+        promise = np.einsum("ai,ij,aj->a", z, self._gramian, z)
         if self._measure.additive:
             return nodes.take(_turns(nodes.value + promise, kind)[:width])
         by_value = _turns(nodes.value, kind, promise)[: width // 2]
@@ -92,10 +66,6 @@ class _Choice:
 
     def _scaled(self, nodes: Nodes) -> Matrix:
         return np.asarray(nodes.z / self._measure.level(nodes.t_s)[:, None])
-
-    def _promise(self, nodes: Nodes) -> Vector:
-        z = self._scaled(nodes)
-        return np.asarray(np.einsum("ai,ij,aj->a", z, self._gramian, z))
 
     def _kind(self, nodes: Nodes) -> Indices:
         since_s = nodes.t_s - nodes.t_s.min()
@@ -127,8 +97,7 @@ def _gramian(flow: SegmentFlow, window_s: float) -> Matrix:
     system, measure = flow.system, flow.measure
     n = system.loop.n
     if measure.output is None:  # the initial speed of e_s
-        speed = system.generator[n : 2 * n]
-        speed = speed if system.trigger.weight is None else system.trigger.weight @ speed
+        speed = weight_of(system) @ system.generator[n : 2 * n]
         return np.asarray(speed.T @ speed)
     from scipy.linalg import expm
 

@@ -13,6 +13,7 @@ a second.
 
 import numpy as np
 
+from cosim.analysis.adversary.objective import weight_of
 from cosim.analysis.adversary.pattern_tree import Ceiling
 from cosim.analysis.adversary.search_nodes import Nodes
 from cosim.simulation.continuous.continuous_loop import ContinuousLoop
@@ -49,9 +50,8 @@ def cost_ceiling(system: ContinuousLoop, mansd: int, horizon_s: float) -> Ceilin
 
 def _models(system: ContinuousLoop) -> ErrorGains:
     """Return the gains at the threshold's rate if the models decay faster, otherwise at rate 0."""
-    loop, trigger = system.loop, system.decaying
-    weight = np.eye(loop.n) if trigger.weight is None else trigger.weight
-    gains = ErrorGains(loop.H, loop.K, weight, trigger.alpha_per_s)
+    loop, weight = system.loop, weight_of(system)
+    gains = ErrorGains(loop.H, loop.K, weight, system.decaying.alpha_per_s)
     try:
         gains.missing(Output.GAIN, 1, 0.0)
     except NotDecayingError:

@@ -6,7 +6,8 @@ import numpy as np
 
 from cosim.analysis.adversary.search_nodes import (
     DecisionLog,
-    WorstPatternFound,
+    Pattern,
+    PatternSearch,
     after_events,
     root,
     together,
@@ -15,10 +16,10 @@ from cosim.analysis.adversary.segments import SegmentFlow
 from cosim.simulation.continuous.continuous_run import MAX_EVENTS, TooManyEventsError
 from noack.core.linear_systems import Vector
 
-Pattern = tuple[bool, ...]
-"""Whether the update of each event is delivered; events after its end are delivered."""
-
 _RANDOM = 64
+_IMPROVED = 3
+_NODES_FOR_A_GUESS = 20_000
+_LONGEST = 1000
 
 
 class Outcomes(NamedTuple):
@@ -56,14 +57,20 @@ def follow(flow: SegmentFlow, mansd: int, patterns: list[Pattern]) -> Outcomes:
     raise TooManyEventsError(f"trigger: more than {MAX_EVENTS} events: they accumulate")
 
 
-def candidates(mansd: int, events: int, rng: np.random.Generator) -> list[Pattern]:
-    """Return initial patterns: no losses, as many as admissible, regular ones, random ones.
+def guess(search: PatternSearch, own: Pattern, rng: np.random.Generator) -> float:
+    """Try the pattern ``own``, regular and random patterns; return an inter-event time in s."""
+    search.step = "guesses"
+    flow, mansd = search.flow, search.mansd
+    events = len(follow(flow, mansd, [(False,) * _LONGEST]).patterns[0])
+    tried = follow(flow, mansd, [own, *_candidates(mansd, events, rng)])
+    search.nodes += events + sum(map(len, tried.patterns))
+    for i in np.argsort(-tried.value, kind="stable")[:_IMPROVED]:
+        improve(search, tried.patterns[i], float(tried.value[i]), _NODES_FOR_A_GUESS)
+    return flow.horizon_s / (events + 1)
 
-    Args:
-        mansd: M − 1.
-        events: number of decisions.
-        rng: generator for the random patterns.
-    """
+
+def _candidates(mansd: int, events: int, rng: np.random.Generator) -> list[Pattern]:
+    """Return patterns of that many events: without losses, regular ones, random ones."""
     if mansd == 0:
         return [()]
     regular = [
@@ -76,31 +83,23 @@ def candidates(mansd: int, events: int, rng: np.random.Generator) -> list[Patter
     return [(), *regular, *(tuple(row) for row in random.tolist())]
 
 
-def improve(
-    flow: SegmentFlow, mansd: int, pattern: Pattern, value: float, most_nodes: int
-) -> WorstPatternFound:
-    """Change single decisions of a pattern as long as this increases the objective.
+def improve(search: PatternSearch, pattern: Pattern, value: float, most_nodes: int) -> None:
+    """Change single decisions of a pattern of that value as long as this increases the objective.
 
-    Args:
-        flow: the loop with its objective.
-        mansd: M − 1.
-        pattern: the initial pattern.
-        value: its value.
-        most_nodes: largest number of nodes; the search stops there.
+    It stops after ``most_nodes`` nodes.
     """
+    flow, mansd = search.flow, search.mansd
     # A pattern may end at the time of its largest value; complete it up to the horizon.
-    pattern, visited = follow(flow, mansd, [pattern]).patterns[0], len(pattern)
-    while visited + len(pattern) ** 2 <= most_nodes:
-        changed = [_changed(pattern, i) for i in range(len(pattern))]
-        if not changed:
-            break
-        tried = follow(flow, mansd, changed)
+    pattern = follow(flow, mansd, [pattern]).patterns[0]
+    visited = len(pattern)
+    while pattern and visited + len(pattern) ** 2 <= most_nodes:
+        tried = follow(flow, mansd, [_changed(pattern, i) for i in range(len(pattern))])
         visited += sum(map(len, tried.patterns))
         top = int(tried.value.argmax())
         if not tried.value[top] > value:
             break
         value, pattern = float(tried.value[top]), tried.patterns[top]
-    return WorstPatternFound(value, pattern, visited, complete=False)
+    search.offer(value, pattern, visited)
 
 
 def _changed(pattern: Pattern, i: int) -> Pattern:

@@ -39,9 +39,9 @@ class Measure:
     """C of the evaluated output y = C z, (q, 3n); None if the objective uses event times only."""
     beta: float
     """The level at t = 0."""
-    rate_per_s: float
+    rate_per_s: float = 0.0
     """r, the level's decay rate; 0 for the cost."""
-    floor: float
+    floor: float = 0.0
     """The smallest value of the level."""
 
     @property
@@ -67,24 +67,23 @@ class Measure:
 def measure_of(
     system: ContinuousLoop, objective: Objective, rate_per_s: float | None = None
 ) -> Measure:
-    """Make a loop's measure.
-
-    Args:
-        system: the loop.
-        objective: the objective.
-        rate_per_s: r of the level; α unless given.
-    """
+    """Make a loop's measure; its level decays at α unless ``rate_per_s`` is given."""
     n, trigger = system.loop.n, system.decaying
+    if objective is Objective.INTER_EVENT:
+        return Measure(objective, None, trigger.beta)
+    output = np.zeros((n, 3 * n))
+    if objective is Objective.ERROR:
+        output[:, 2 * n :] = weight_of(system) / trigger.beta
+    else:
+        output[:, :n] = np.eye(n)
+    if objective is Objective.COST:
+        return Measure(objective, output, trigger.beta)
     rate_per_s = trigger.alpha_per_s if rate_per_s is None else rate_per_s
     floor = trigger.floor if rate_per_s == trigger.alpha_per_s else 0.0
-    output = np.zeros((n, 3 * n))
-    if objective is Objective.INTER_EVENT:
-        return Measure(objective, None, trigger.beta, 0.0, 0.0)
-    if objective is Objective.ERROR:
-        weight = np.eye(n) if trigger.weight is None else trigger.weight
-        output[:, 2 * n :] = weight / trigger.beta
-        return Measure(objective, output, trigger.beta, rate_per_s, floor)
-    output[:, :n] = np.eye(n)
-    if objective is Objective.COST:
-        return Measure(objective, output, trigger.beta, 0.0, 0.0)
     return Measure(objective, output, trigger.beta, rate_per_s, floor)
+
+
+def weight_of(system: ContinuousLoop) -> Matrix:
+    """Return the matrix W of the trigger's norm, (n, n)."""
+    weight = system.decaying.weight
+    return np.eye(system.loop.n) if weight is None else weight

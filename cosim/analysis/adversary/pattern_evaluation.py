@@ -13,7 +13,7 @@ import numpy as np
 
 from cosim.analysis.adversary.objective import Measure, Objective
 from cosim.analysis.adversary.polynomial_curves import curve_stack, powers
-from cosim.analysis.adversary.segment_objective import SquareIntegral
+from cosim.analysis.adversary.segments import SquareIntegral
 from cosim.simulation.continuous.continuous_run import ContinuousRun
 from cosim.simulation.continuous.exact_flow import DEGREE, taylor_terms
 from noack.core.linear_systems import Matrix, Vector
@@ -46,19 +46,9 @@ def evaluate(run: ContinuousRun, measure: Measure) -> Valued:
     if measure.objective is Objective.COST:
         return Valued(_integral(run, measure.output), None)
     best = Valued(0.0, 0.0)
-    for part in _parts(run, measure):
-        best = _highest(part, best)
+    for part in _parts(run, measure, measure.output):
+        best = _highest(*part, best)
     return best
-
-
-class _Part(NamedTuple):
-    """A part of a cell in which the level decays exponentially."""
-
-    begin_s: float
-    width_s: float
-    """Width of the part."""
-    taylor: Matrix
-    """Coefficients of the scaled output over the part, rescaled to [0, 1], (p + 1, q)."""
 
 
 def _cells(run: ContinuousRun, cuts_s: Vector) -> Iterator[tuple[float, float, Vector]]:
@@ -77,33 +67,34 @@ def _cells(run: ContinuousRun, cuts_s: Vector) -> Iterator[tuple[float, float, V
                 t_s = t_s + width_s if width_s == flow.width_s else stop_s
 
 
-def _parts(run: ContinuousRun, measure: Measure) -> Iterator[_Part]:
+def _parts(
+    run: ContinuousRun, measure: Measure, output: Matrix
+) -> Iterator[tuple[float, float, Vector]]:
+    """Yield start, width and Bernstein coefficients of |y|², scaled, over each part of a cell."""
     system, cuts_s = run.system, np.empty(0)
     identity = np.eye(len(system.generator))
-    width_s, output = system.flow.width_s, measure.output
-    assert output is not None
+    width_s = system.flow.width_s
     if measure.floor and measure.rate_per_s:
         cuts_s = np.array([math.log(measure.beta / measure.floor) / measure.rate_per_s])
     rates = (measure.rate_per_s, 0.0)
     terms = [output @ taylor_terms(system.generator + r * identity, width_s) for r in rates]
     for begin_s, part_s, z in _cells(run, cuts_s):
-        level = float(measure.level(np.array([begin_s]))[0])
         late = bool(len(cuts_s) and begin_s >= cuts_s[0])
-        taylor = (terms[late] @ z) / level
-        yield _Part(begin_s, part_s, taylor * powers(np.array([part_s / width_s]), DEGREE).T)
+        taylor = (terms[late] @ z) / float(measure.level(np.array([begin_s]))[0])
+        taylor = taylor * powers(np.array([part_s / width_s]), DEGREE).T
+        yield begin_s, part_s, curve_stack(DEGREE).squares(taylor[None])[0]
 
 
-def _highest(part: _Part, best: Valued) -> Valued:
+def _highest(begin_s: float, part_s: float, squares: Vector, best: Valued) -> Valued:
     """Return the larger of ``best`` and sup |y| over a part, to a relative accuracy of 1e-12."""
-    basis = curve_stack(DEGREE)
-    pending = [(0.0, 1.0, basis.squares(part.taylor[None])[0])]
+    pending = [(0.0, 1.0, squares)]
     while pending:
         start, width, squares = pending.pop()
         for u, square in ((start, squares[0]), (start + width, squares[-1])):
             if square > best.value**2:
-                best = Valued(math.sqrt(square), part.begin_s + u * part.width_s)
+                best = Valued(math.sqrt(square), begin_s + u * part_s)
         if squares.max() > best.value**2 * (1 + _RESOLUTION) and width > _FINEST:
-            left, right = basis.halves(squares)
+            left, right = curve_stack(DEGREE).halves(squares)
             pending += [(start, width / 2, left), (start + width / 2, width / 2, right)]
     return best
 
@@ -111,7 +102,5 @@ def _highest(part: _Part, best: Valued) -> Valued:
 def _integral(run: ContinuousRun, output: Matrix) -> float:
     flow = run.system.flow
     whole = SquareIntegral(output @ taylor_terms(run.system.generator, flow.width_s), flow.width_s)
-    cells = list(_cells(run, np.empty(0)))
-    z = np.array([cell[2] for cell in cells])
-    widths = np.array([cell[1] for cell in cells])
-    return float(whole(z, widths / flow.width_s, widths).sum())
+    _, widths_s, z = zip(*_cells(run, np.empty(0)), strict=True)
+    return float(whole(np.array(z), np.array(widths_s) / flow.width_s).sum())

@@ -2,19 +2,7 @@
 
 from collections.abc import Callable
 
-import numpy as np
-
-from cosim.analysis.adversary.search_nodes import (
-    Best,
-    DecisionLog,
-    Nodes,
-    Report,
-    WorstPatternFound,
-    branches,
-    root,
-    together,
-)
-from cosim.analysis.adversary.segments import SegmentFlow
+from cosim.analysis.adversary.search_nodes import Nodes, PatternSearch, root, together
 from noack.core.linear_systems import Vector
 
 Ceiling = Callable[[Nodes], Vector]
@@ -23,46 +11,25 @@ Ceiling = Callable[[Nodes], Vector]
 _BLOCK = 4096
 
 
-def search_tree(
-    flow: SegmentFlow,
-    mansd: int,
-    most_nodes: int,
-    *,
-    known: float = -np.inf,
-    ceiling: Ceiling | None = None,
-    report: Report = lambda nodes, value: None,
-) -> WorstPatternFound:
-    """Search for the largest value over all patterns with at most ``mansd`` consecutive losses.
+def search_tree(search: PatternSearch, most_nodes: int, ceiling: Ceiling | None = None) -> bool:
+    """Search all patterns; return whether every one was covered within ``most_nodes`` nodes.
 
-    Args:
-        flow: the loop with its objective.
-        mansd: M − 1.
-        most_nodes: largest number of nodes; the search stops there.
-        known: a value that some pattern reaches; branches that cannot exceed it are pruned.
-        ceiling: bound for pruning branches that cannot exceed the largest value so far.
-        report: receives the progress.
+    The ``ceiling`` prunes branches that cannot exceed the largest value so far.
 
     Raises:
         TooManyEventsError: two events at the same time.
     """
-    log, best, pile = DecisionLog(), Best(flow, known), [root(flow)]
-    visited = 0
-    while pile and best.value < np.inf:
+    search.step, most_nodes = "all patterns", most_nodes + search.nodes
+    pile = [root(search.flow)]
+    while pile and search.value < float("inf"):
         nodes = _top(pile)
         if ceiling is not None:
-            nodes = nodes.take(nodes.value + ceiling(nodes) > best.value)
-        if visited + len(nodes.t_s) > most_nodes:
-            return best.found(log, visited, complete=False)
-        if not len(nodes.t_s):
-            continue
-        segments = flow(nodes.t_s, nodes.z, best.value)
-        value = best.see(nodes, segments)
-        following = branches(nodes, segments, value, mansd, log)
-        if len(following.t_s):
-            pile.append(following)
-        visited += len(nodes.t_s)
-        report(visited, best.value)
-    return best.found(log, visited, complete=True)
+            nodes = nodes.take(nodes.value + ceiling(nodes) > search.value)
+        if search.nodes + len(nodes.t_s) > most_nodes:
+            return False
+        if len(nodes.t_s):
+            pile.append(search.successors(nodes))
+    return True
 
 
 def _top(pile: list[Nodes]) -> Nodes:

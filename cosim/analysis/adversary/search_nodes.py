@@ -1,7 +1,7 @@
-"""Runs of the loop that are computed together, with the loss decisions of each."""
+"""Runs of the loop that are computed together, the loss decisions of each, and the worst of all."""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +13,11 @@ from noack.core.linear_systems import Matrix, Vector
 Indices = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
-Report = Callable[[int, float], None]
-"""Receives the nodes visited and the best value so far."""
+Pattern = tuple[bool, ...]
+"""Whether the update of each event is delivered; events after its end are delivered."""
+
+SearchReport = Callable[[str, int, float], None]
+"""Receives the current search step, the segments computed so far, and the largest value so far."""
 
 START = -1
 """The entry of a run without any decision."""
@@ -36,22 +39,15 @@ class Nodes(NamedTuple):
 
     def take(self, which: Indices | Flags | slice) -> "Nodes":
         """Return a selection of the runs."""
-        return Nodes(
-            self.t_s[which],
-            self.z[which],
-            self.dropouts[which],
-            self.value[which],
-            self.entry[which],
-        )
+        columns: Sequence[Any] = self
+        return Nodes(*(column[which] for column in columns))
 
 
 def root(flow: SegmentFlow) -> Nodes:
     """Return the start: sensor and controller have x(0), by the first packet or the scenario."""
-    x0 = flow.system.loop.x0
+    x0, zero = flow.system.loop.x0, np.zeros(1, int)
     z = np.concatenate([x0, np.zeros(2 * len(x0))])[None]
-    return Nodes(
-        np.zeros(1), z, np.zeros(1, int), np.array([flow.measure.nothing]), np.array([START])
-    )
+    return Nodes(np.zeros(1), z, zero, np.array([flow.measure.nothing]), zero + START)
 
 
 def together(parts: Sequence[Nodes]) -> Nodes:
@@ -74,7 +70,7 @@ class DecisionLog:
         self._length += len(parents)
         return np.arange(self._length - len(parents), self._length)
 
-    def decisions(self, entry: int) -> tuple[bool, ...]:
+    def decisions(self, entry: int) -> Pattern:
         """Return whether the update of each event up to this entry was delivered."""
         starts = np.cumsum([0, *map(len, self._parents)])
         found: list[bool] = []
@@ -86,44 +82,60 @@ class DecisionLog:
         return tuple(reversed(found))
 
 
-class WorstPatternFound(NamedTuple):
-    """The result of a search."""
+class PatternSearch:
+    """A search through the patterns with at most ``mansd`` = M − 1 consecutive losses."""
 
-    value: float
-    """The largest value found, or the search's initial value if none was larger."""
-    decisions: tuple[bool, ...] | None
-    """Whether the update of each event arrives, up to the time of the value; None if no pattern
-    exceeded the initial value."""
-    nodes: int
-    """Segments between events that were computed."""
-    complete: bool
-    """Whether the search covered every pattern."""
+    def __init__(
+        self,
+        flow: SegmentFlow,
+        mansd: int,
+        report: SearchReport = lambda step, nodes, value: None,
+    ) -> None:
+        self.flow, self.mansd = flow, mansd
+        self.step = ""
+        """Name of the current step, for the report."""
+        self.value = -np.inf
+        """The largest value so far."""
+        self.nodes = 0
+        """Segments between events that were computed."""
+        self._report = report
+        self._log = DecisionLog()
+        self._entry: int | None = None
+        self._pattern: Pattern = ()
 
+    @property
+    def pattern(self) -> Pattern:
+        """A pattern that reaches the largest value, at least up to the time of that value."""
+        return self._pattern if self._entry is None else self._log.decisions(self._entry)
 
-class Best:
-    """The run with the largest objective so far."""
+    def offer(self, value: float, pattern: Pattern, nodes: int = 0) -> None:
+        """Take the value of a pattern that was computed elsewhere, from ``nodes`` segments."""
+        self.nodes += nodes
+        if value > self.value or not self.pattern:
+            self.value, self._pattern, self._entry = value, pattern, None
+        self._report(self.step, self.nodes, self.value)
 
-    def __init__(self, flow: SegmentFlow, value: float = -np.inf) -> None:
-        self._measure = flow.measure
-        self.value = value
-        self.entry: int | None = None
-        """Last decision of that run; None until a run exceeds the initial value."""
+    def successors(self, nodes: Nodes) -> Nodes:
+        """Follow runs to their next events; return each with a lost and a delivered update.
 
-    def see(self, nodes: Nodes, segments: Segments) -> Vector:
-        """Evaluate the segments that follow nodes; return the values of the runs, (N,)."""
-        value = self._measure.joined(nodes.value, segments.value)
+        Raises:
+            TooManyEventsError: two events at the same time.
+        """
+        measure = self.flow.measure
+        segments = self.flow(nodes.t_s, nodes.z, self.value)
+        value = measure.joined(nodes.value, segments.value)
         # A sum is compared only when the run is complete.
-        pending = segments.is_event & self._measure.additive
-        candidates = np.where(pending, -np.inf, value)
+        candidates = np.where(segments.is_event & measure.additive, -np.inf, value)
         top = int(candidates.argmax())
         if candidates[top] > self.value:
-            self.value, self.entry = float(candidates[top]), int(nodes.entry[top])
-        return value
-
-    def found(self, log: DecisionLog, nodes: int, *, complete: bool) -> WorstPatternFound:
-        """Return the result of the search."""
-        decisions = None if self.entry is None else log.decisions(self.entry)
-        return WorstPatternFound(self.value, decisions, nodes, complete)
+            self.value, self._entry = float(candidates[top]), int(nodes.entry[top])
+        self.nodes += len(nodes.t_s)
+        self._report(self.step, self.nodes, self.value)
+        events = np.flatnonzero(segments.is_event)
+        losable = events[nodes.dropouts[events] < self.mansd]
+        these = np.concatenate([losable, events])
+        delivered = np.repeat([False, True], [len(losable), len(events)])
+        return after_events(nodes, segments, value, these, delivered, self._log)
 
 
 def after_events(
@@ -154,20 +166,5 @@ def after_events(
     z, n = segments.z[these], segments.z.shape[1] // 3
     z[:, n : 2 * n] = 0.0
     z[delivered, 2 * n :] = 0.0
-    return Nodes(
-        t_s,
-        z,
-        np.where(delivered, 0, nodes.dropouts[these] + 1),
-        value[these],
-        log.add(nodes.entry[these], delivered),
-    )
-
-
-def branches(
-    nodes: Nodes, segments: Segments, value: Vector, mansd: int, log: DecisionLog
-) -> Nodes:
-    """Return all successors: each update lost (if ``mansd`` allows it) and delivered."""
-    events = np.flatnonzero(segments.is_event)
-    losable = events[nodes.dropouts[events] < mansd]
-    fates = np.repeat([False, True], [len(losable), len(events)])
-    return after_events(nodes, segments, value, np.concatenate([losable, events]), fates, log)
+    dropouts = np.where(delivered, 0, nodes.dropouts[these] + 1)
+    return Nodes(t_s, z, dropouts, value[these], log.add(nodes.entry[these], delivered))

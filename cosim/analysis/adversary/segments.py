@@ -2,6 +2,13 @@
 
 Cells, polynomials and crossings are those of :mod:`cosim.simulation.continuous.continuous_loop`;
 here they are computed for all states at once.
+
+Within a cell an output y of the loop is a polynomial of degree 18, up to rounding. The integral of
+|y|² is computed by a Gauss–Legendre rule that is exact for this degree. The supremum is searched at
+17 points. From every point that is higher than its neighbours and close to the maximum, Newton's
+method refines it to rounding. The supremum can be missed only if |y|² has two maxima within 1/16 of
+a cell. Then the slope has three zeros there, and |y|² varies by at most 1e-6 of its fourth
+derivative, per cell.
 """
 
 import math
@@ -10,20 +17,89 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.adversary.objective import Measure
-from cosim.analysis.adversary.polynomial_curves import curve_stack, powers
-from cosim.analysis.adversary.segment_objective import (
-    SegmentObjective,
-    SquareIntegral,
-    Supremum,
-    columns,
-)
+from cosim.analysis.adversary.objective import Measure, weight_of
+from cosim.analysis.adversary.polynomial_curves import Stack, curve_stack, peak_squares, powers
 from cosim.simulation.continuous.continuous_loop import ContinuousLoop
 from cosim.simulation.continuous.exact_flow import DEGREE, taylor_terms
 from noack.core.linear_systems import Matrix, Vector
 
 _LARGEST = 1e100
 _SLACK = 1e-13
+_POINTS = np.linspace(0.0, 1.0, 17)
+_CLOSE = 0.95
+"""A sampled |y|² next to a maximum is at least this share of it; lower points are not refined."""
+
+
+class OutputCurve:
+    """An output at fixed points of parts of cells.
+
+    Args:
+        taylor: Taylor coefficients of y over a cell, (p + 1, q, 3n).
+        points: the points, as shares of a part.
+    """
+
+    def __init__(self, taylor: Stack, points: Vector) -> None:
+        self._q, self._points = taylor.shape[1], len(points)
+        self._at_points = powers(points, DEGREE)
+        self._taylor = _columns(taylor)
+        self._whole = _columns(np.tensordot(self._at_points, taylor, 1))
+
+    def taylor(self, z: Matrix, u: Vector) -> Stack:
+        """Return y's coefficients over [0, u] of the cell, rescaled to [0, 1]; (N, p + 1, q)."""
+        whole = (z @ self._taylor).reshape(len(z), DEGREE + 1, self._q)
+        return np.asarray(whole * powers(u, DEGREE)[:, :, None])
+
+    def squares(self, z: Matrix, u: Vector) -> Stack:
+        """Return |y|² at the points, (N, points)."""
+        y = np.empty((len(z), self._points, self._q))
+        whole = u == 1.0
+        y[whole] = (z[whole] @ self._whole).reshape(-1, self._points, self._q)
+        y[~whole] = self._at_points @ self.taylor(z[~whole], u[~whole])
+        return np.asarray(np.einsum("aki,aki->ak", y, y))
+
+
+class Supremum(OutputCurve):
+    """The supremum of |y| over parts of cells."""
+
+    def __init__(self, taylor: Stack) -> None:
+        super().__init__(taylor, _POINTS)
+
+    def __call__(self, z: Matrix, u: Vector, known: Vector) -> Vector:
+        """Return the suprema over parts of cells, (N,).
+
+        Args:
+            z: scaled states at the start of cells, (N, 3n).
+            u: the share of each cell that is evaluated, from its start, in (0, 1], (N,).
+            known: results below these values may be inaccurate, (N,).
+        """
+        squares = self.squares(z, u)
+        highest = np.asarray(squares.max(axis=1))
+        lowest = _CLOSE * np.maximum(highest, np.maximum(known, 0.0) ** 2)
+        around = np.pad(squares, ((0, 0), (1, 1)))
+        peak = (squares >= around[:, :-2]) & (squares >= around[:, 2:])
+        rows, points = np.nonzero(peak & (squares >= lowest[:, None]))
+        if len(rows):
+            taylor = self.taylor(z[rows], u[rows])
+            np.maximum.at(highest, rows, peak_squares(taylor, _POINTS[points], _POINTS[1]))
+        return np.asarray(np.sqrt(highest))
+
+
+class SquareIntegral(OutputCurve):
+    """The integral of |y|² over parts of cells of a width in seconds."""
+
+    def __init__(self, taylor: Stack, width_s: float) -> None:
+        points, weights = np.polynomial.legendre.leggauss(DEGREE + 1)
+        super().__init__(taylor, (points + 1) / 2)
+        self._weights = width_s * weights / 2
+
+    def __call__(self, z: Matrix, u: Vector, known: Vector | None = None) -> Vector:
+        """Return the integrals, (N,); see :class:`Supremum` for the arguments."""
+        return np.asarray(u * (self.squares(z, u) @ self._weights))
+
+
+def _columns(terms: Stack) -> Matrix:
+    """Return terms (p, q, N) as a matrix (N, p q), the right factor for states in rows."""
+    return np.ascontiguousarray(terms.reshape(-1, terms.shape[2]).T)
 
 
 class Segments(NamedTuple):
@@ -50,21 +126,14 @@ class SegmentFlow:
     """
 
     def __init__(
-        self,
-        system: ContinuousLoop,
-        measure: Measure,
-        horizon_s: float,
-        *,
-        known_start: bool = False,
+        self, system: ContinuousLoop, measure: Measure, horizon_s: float, *, known_start: bool
     ) -> None:
         self.system, self.measure, self.horizon_s = system, measure, horizon_s
         self.known_start = known_start
         trigger = system.decaying
-        self._floor_from_s = (
-            math.log(trigger.beta / trigger.floor) / trigger.alpha_per_s
-            if trigger.floor > 0
-            else math.inf
-        )
+        self._floor_from_s = math.inf
+        if trigger.floor > 0:
+            self._floor_from_s = math.log(trigger.beta / trigger.floor) / trigger.alpha_per_s
         late_rate = 0.0 if measure.floor else measure.rate_per_s
         self._decaying = _Phase(system, measure, trigger.alpha_per_s, measure.rate_per_s)
         self._floored = _Phase(system, measure, 0.0, late_rate)
@@ -77,10 +146,8 @@ class SegmentFlow:
             z: (x, e_s, e_c), (N, 3n).
             known: results below this value may be inaccurate.
         """
-        count, measure = len(t_s), self.measure
-        found = Segments(
-            t_s.copy(), z.copy(), np.zeros(count, bool), np.full(count, measure.nothing)
-        )
+        measure, nothing = self.measure, np.full(len(t_s), self.measure.nothing)
+        found = Segments(t_s.copy(), z.copy(), np.zeros(len(t_s), bool), nothing)
         first_until_s = min(self._floor_from_s, self.horizon_s)
         for phase, from_s, until_s in (
             (self._decaying, -math.inf, first_until_s),
@@ -103,38 +170,34 @@ class _Phase:
     def __init__(
         self, system: ContinuousLoop, measure: Measure, alpha_per_s: float, rate_per_s: float
     ) -> None:
-        n, generator, trigger = system.loop.n, system.generator, system.decaying
+        n, generator = system.loop.n, system.generator
         self._system, self._measure = system, measure
         self._alpha_per_s, self._rate_per_s = alpha_per_s, rate_per_s
         self._width_s = system.flow.width_s
         self._across = system.flow.powers[1].T
         self._curves = curve_stack(DEGREE)
-        self._state = columns(taylor_terms(generator, self._width_s))
-        weight = np.eye(n) if trigger.weight is None else trigger.weight
+        self._state = _columns(taylor_terms(generator, self._width_s))
         identity = np.eye(3 * n)
         scaled = taylor_terms(generator + alpha_per_s * identity, self._width_s)
-        error = weight @ scaled[:, n : 2 * n]
-        self._error = columns(error)
-        self._control = columns(np.tensordot(self._curves.from_taylor, error, 1))
+        error = weight_of(system) @ scaled[:, n : 2 * n]
+        self._error = _columns(error)
+        self._control = _columns(np.tensordot(self._curves.from_taylor, error, 1))
         self._slack = _SLACK * max(float(np.abs(self._control).sum(axis=0).max()), 1.0)
-        self._worth: SegmentObjective | None = None
+        self._objective: Supremum | SquareIntegral | None = None
         if measure.output is not None:
             terms = taylor_terms(generator + rate_per_s * identity, self._width_s)
-            output = measure.output @ terms
-            self._worth = (
-                SquareIntegral(output, self._width_s) if measure.additive else Supremum(output)
-            )
+            output, width_s = measure.output @ terms, self._width_s
+            additive = measure.additive
+            self._objective = SquareIntegral(output, width_s) if additive else Supremum(output)
 
     def follow(self, t_s: Vector, z: Matrix, until_s: float, known: float) -> Segments:
         """Follow states at times below ``until_s``."""
         count, width_s, measure = len(t_s), self._width_s, self._measure
         nothing = np.full(count, measure.nothing)
         found = Segments(np.full(count, until_s), z.copy(), np.zeros(count, bool), nothing)
-        span = (until_s - t_s) / width_s
+        span, level = (until_s - t_s) / width_s, measure.level(t_s)
         trigger = self._system.decaying
-        decaying = trigger.beta * np.exp(-trigger.alpha_per_s * t_s)
-        threshold = np.maximum(decaying, trigger.floor)
-        level = measure.level(t_s)
+        threshold = np.maximum(trigger.beta * np.exp(-trigger.alpha_per_s * t_s), trigger.floor)
         going, cell = np.arange(count), 0
         while len(going):
             scale = math.exp(self._alpha_per_s * width_s * cell) / threshold[going]
@@ -150,11 +213,11 @@ class _Phase:
             these = going[crossed]
             found.is_event[these] = True
             found.end_s[these] = t_s[these] + (cell + until[crossed]) * width_s
-            if self._worth is not None:
-                fallen = math.exp(self._rate_per_s * width_s * cell) / level[going]
+            if self._objective is not None:
+                scale = math.exp(self._rate_per_s * width_s * cell) / level[going]
                 so_far = found.value[going]
-                worth = self._worth(z * fallen[:, None], until, np.maximum(so_far, known))
-                found.value[going] = measure.joined(so_far, worth)
+                value = self._objective(z * scale[:, None], until, np.maximum(so_far, known))
+                found.value[going] = measure.joined(so_far, value)
             ended = crossed | (span[going] <= cell + 1)
             found.z[going[ended]] = self._within(z[ended], until[ended])
             going, z = going[~ended], z[~ended] @ self._across

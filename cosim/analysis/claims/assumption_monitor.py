@@ -13,9 +13,7 @@ from cosim.analysis.claims.condition_reader import ConditionReader
 from cosim.analysis.claims.observed_conditions import (
     AssumptionViolation,
     ObservedConditions,
-    VoidFrom,
     causes_of,
-    earliest,
 )
 from cosim.record.run_record import Rows
 from noack.config.scenario import Scenario
@@ -36,9 +34,9 @@ class AssumptionMonitor:
     def __init__(self, scenario: Scenario) -> None:
         self._reader = ConditionReader(scenario)
         self._conditions = allowed_conditions(scenario)
-        self._causes = causes_of(scenario)
+        self._causes = {*causes_of(scenario)}
+        """The assumptions that the run has not violated yet."""
         self._lost = 0
-        self._found: dict[str, AssumptionViolation] = {}
         self._until_s = math.inf
         self.stopped: str | None = None
         """Reason why the monitor stopped; None while it is active."""
@@ -73,27 +71,15 @@ class AssumptionMonitor:
         return [] if self.stopped is not None else self._new_violations(self._reader.end())
 
     @property
-    def void_from(self) -> VoidFrom | None:
-        """The time at which the run first violated an assumption, as far as determined."""
-        return earliest(VoidFrom(one.t_s, one.text) for one in self._found.values())
-
-    @property
     def waiting(self) -> int:
         """The number of rows that wait for others."""
         return self._reader.waiting
 
     @np.errstate(all="ignore")  # a run may diverge
     def _new_violations(self, seen: ObservedConditions) -> list[AssumptionViolation]:
-        new = []
-        for one in seen.violations(self._conditions, self._causes, self._lost):
-            if one.t_s >= self._until_s:
-                continue
-            before = self._found.get(one.cause)
-            if before is None:
-                new.append(one)
-            self._found[one.cause] = (before or one)._replace(
-                worst=max(one.worst, before.worst) if before else one.worst
-            )
+        found = seen.violations(self._conditions, self._causes, self._lost)
+        new = [one for one in found if one.t_s < self._until_s]
+        self._causes -= {one.cause for one in new}
         counts = seen.losses.consecutive(self._conditions.delay_s, self._lost).value
         self._lost = int(counts[-1]) if len(counts) else self._lost
         return new

@@ -1,29 +1,30 @@
-"""The form of a claim in ``catalogue/``, and how a run is checked against it.
+"""The form of a claim in ``catalogue/``, and bounds that several claims share."""
 
-A file of the catalogue defines ``CLAIM``; :func:`run_claims` and :func:`certified_claims` collect
-the definitions in alphabetical order of the file names.
-"""
-
-import importlib
-import math
-import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
-from cosim.analysis.claims.claim import Claim, ClaimVerdict, Envelope, Reals
-from cosim.analysis.claims.observed_conditions import VoidFrom
+from cosim.analysis.claims.observed_conditions import Reals, VoidFrom, earliest
 from cosim.analysis.claims.run_evidence import RunEvidence
+from noack.core.linear_systems import row_norms
 from noack.theory.scenario_certificates import ScenarioCertificate
 
 ROUNDING = 1e-9
 """Relative rounding error of an exact computation over a run of 10,000 steps."""
 
-IDEAL_LOOP = (
-    "assumes a continuous trigger, and a network and input without delay, which no sampled loop has"
-)
+
+class Envelope(NamedTuple):
+    """A curve that bounds a measured one."""
+
+    label: str
+    quantity: Literal["e_c", "x", "inter_event"]
+    """``"e_c"`` for ‖e_c‖_W, ``"x"`` for ‖x‖, ``"inter_event"`` for a lower bound in seconds."""
+    t_s: Reals
+    values: Reals
+    kind: Literal["certified", "identity", "printed"] = "certified"
+    """The source: a certificate, identity (I1), or a formula of the paper."""
 
 
 class Bound(NamedTuple):
@@ -71,53 +72,29 @@ def upper_shares(observed: Reals, bound: Reals) -> Reals:
     return np.divide(observed, bound, out=shares, where=(observed != 0) | ~(bound >= 0))
 
 
-def check(
-    bound: Bound, statement: str, source: str, until_s: float = math.inf, unmet: str = ""
-) -> Claim:
-    """Check a run against a bound.
-
-    Args:
-        bound: the bound.
-        statement: the claim in words.
-        source: the claim's source.
-        until_s: end of the claim.
-        unmet: the assumption that this run cannot meet; empty if there is none.
-    """
-    void = bound.void if bound.void is not None and bound.void.t_s < until_s else None
-    end_s = until_s if void is None else void.t_s
-    t_s, shares = bound.t_s[bound.t_s < end_s], bound.shares[bound.t_s < end_s]
-    exceeded = np.flatnonzero(~(shares <= 1 + ROUNDING))
-    ratio = float(shares.max()) if len(shares) else None
-    why = unmet
-    if len(exceeded):
-        verdict = ClaimVerdict.NOT_APPLICABLE if unmet else ClaimVerdict.VIOLATED
-        since_s: float | None = float(t_s[exceeded[0]])
-    elif void is not None:
-        verdict, since_s = ClaimVerdict.VOID, void.t_s
-        why = "; ".join(filter(None, [unmet, void.why]))
-    else:
-        verdict, since_s = ClaimVerdict.HELD, None
-    observed, constant = None, bound.constant
-    if constant is not None and ratio is not None:
-        observed = constant * ratio
-        if bound.is_lower:
-            observed = constant / ratio if ratio else None
-    formula = bound.formula if constant is None else bound.formula.format(constant)
-    return Claim(statement, source, formula, constant, observed, ratio, verdict, since_s, why)
+def controller_error_bound(
+    run: RunEvidence,
+    formula: str,
+    values: Reals,
+    constant: float | None = None,
+    void: VoidFrom | None = None,
+) -> Bound:
+    """Return a bound of ‖e_c‖_W at the measurements, (k,); it is void from a record's first gap."""
+    here = run.in_common
+    # Allow for the rounding of x, which matters for a bound of that size.
+    slack = ROUNDING * row_norms(run.joined.x[here])
+    shares = upper_shares(run.joined.e_c_norm[here], values[here] + slack)
+    return Bound(formula, run.t_s[here], shares, earliest([void, run.first_gap]), constant)
 
 
-def _definitions() -> list[ClaimDefinition | CertifiedClaim]:
-    from cosim.analysis.claims import catalogue
-
-    names = sorted(found.name for found in pkgutil.iter_modules(catalogue.__path__))
-    return [importlib.import_module(f"{catalogue.__name__}.{name}").CLAIM for name in names]
-
-
-def run_claims() -> list[ClaimDefinition]:
-    """The claims that need no certificate."""
-    return [one for one in _definitions() if isinstance(one, ClaimDefinition)]
+def inter_event_bound(run: RunEvidence, least_s: float, void: VoidFrom | None) -> Bound:
+    """Return a lower bound of the inter-event time."""
+    t_s, passed_s = run.inter_event_s
+    formula = "t_(i+1) − t_i ≥ {:.4g} s"
+    return Bound(formula, t_s, least_s / passed_s, void, least_s, is_lower=True)
 
 
-def certified_claims() -> list[CertifiedClaim]:
-    """The claims of a certificate."""
-    return [one for one in _definitions() if isinstance(one, CertifiedClaim)]
+def inter_event_envelope(run: RunEvidence, label: str, least_s: float) -> Envelope:
+    """Return the same bound as a line over the run."""
+    ends_s = np.array([0.0, run.record.scenario.horizon_s])
+    return Envelope(label, "inter_event", ends_s, np.full(2, least_s))

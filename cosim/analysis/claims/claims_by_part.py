@@ -16,11 +16,12 @@ from functools import cached_property
 
 import numpy as np
 
-from cosim.analysis.claims.claim import Claim, Envelope, void_claim
-from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
+from cosim.analysis.claims.claim_definition import Envelope
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, void_claim
 from cosim.analysis.claims.common_time import common_end_ns, up_to_common_end
 from cosim.analysis.claims.observed_conditions import AssumptionViolation
 from cosim.analysis.claims.run_evidence import RunPart
+from cosim.analysis.summary_model import Claim
 from cosim.record.recorded_changes import NEVER_NS, RecordedChange, changes_of
 from cosim.record.run_record import Rows, RunRecord
 from noack.config.resolution import loop_of, setpoint_of
@@ -109,10 +110,12 @@ class RunClaims:
                 continue
             from_s, until_s = (0.0, math.inf) if one.part is None else one.part[1:3]
             found += [
-                claim._replace(
-                    since_s=None if claim.since_s is None else claim.since_s + from_s,
-                    from_s=from_s,
-                    until_s=from_s + until_s if math.isfinite(until_s) else None,
+                claim.model_copy(
+                    update={
+                        "since_s": None if claim.since_s is None else claim.since_s + from_s,
+                        "from_s": from_s,
+                        "until_s": from_s + until_s if math.isfinite(until_s) else None,
+                    }
                 )
                 for claim in one.judge()
             ]

@@ -46,23 +46,18 @@ _NO_TIMES: Times = np.zeros(0, np.int64)
 
 def read_conditions(record: RunRecord) -> ObservedConditions:
     """Read the conditions from the record of a run; missing updates and inputs count as late."""
-    observer = ConditionReader(record.scenario)
+    reader = ConditionReader(record.scenario)
     for table in record.tables:
-        observer.take(table, record[table])
-    return observer.end()
+        reader.take(table, record[table])
+    return reader.end()
 
 
 class ConditionReader:
-    """Determines the conditions under which a run takes place.
-
-    Args:
-        scenario: the resolved scenario.
-    """
+    """Determines the conditions under which a run of a resolved scenario takes place."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._timeout_s = scenario.timing.actuation_timeout_ns / NS_PER_S
-        self._gaps = _Gaps()
-        self._sensors = _Sensors()
+        self._measurements = _Measurements()
         self._ticks = _Ticks()
         self._inputs = _Inputs(scenario)
         self._updates = _Updates()
@@ -90,7 +85,7 @@ class ConditionReader:
 
     def end(self) -> ObservedConditions:
         """Return the conditions from the rows that were still waiting; no more rows follow."""
-        return self._observed(max(self._inputs.newest_ns, self._gaps.newest_ns))
+        return self._observed(max(self._inputs.newest_ns, self._measurements.newest_ns))
 
     @property
     def waiting(self) -> int:
@@ -98,15 +93,14 @@ class ConditionReader:
         return self._inputs.waiting + self._ticks.waiting + self._updates.waiting
 
     def _measured(self, rows: Rows) -> None:
-        self._gaps.measurements(rows["t_ns"])
-        self._sensors.measurements(rows["input"] // GENERATION, rows["t_ns"])
+        self._measurements.add(rows)
         events = rows[rows["event"] != NO_SEQUENCE]
         self._updates.events(events["event"], events["t_ns"])
 
     def _observed(self, end_ns: int | None) -> ObservedConditions:
         ended = end_ns is not None
-        receipts = self._ticks.receipts(ended=ended)
-        self._inputs.add_receipts(receipts, self._ticks.newest, ended=ended)
+        newest = _NEVER if ended else self._ticks.newest
+        self._inputs.add_receipts(self._ticks.receipts(ended=ended), newest)
         hold, watchdog, safe_input = self._inputs.classified(ended=ended)
         self._updates.add_applied(self._inputs.applied(ended=ended))
         start_s = self._inputs.start_ns * 1e-9 if self._inputs.started else np.inf
@@ -114,60 +108,50 @@ class ConditionReader:
         if not self._inputs.started and not ended:
             start_s = self._inputs.classified_ns * 1e-9
         return ObservedConditions(
-            losses, self._gaps.gaps(end_ns), delay, hold, start_s, watchdog, safe_input,
-            self._sensors.restarts(), self._timeout_s,
+            losses, self._measurements.gaps(end_ns), delay, hold, start_s, watchdog, safe_input,
+            self._measurements.restarts(), self._timeout_s,
         )  # fmt: skip
 
 
-class _Gaps:
-    """Times between measurements, including those after the start and before the end."""
+class _Measurements:
+    """Times between measurements, from the start of the run to its end; restarts of the sensor."""
 
     def __init__(self) -> None:
         self._times: list[Times] = []
+        self._restarts: _Batches = []
+        self._generation = 0
         self.newest_ns = 0
 
-    def measurements(self, t_ns: Times) -> None:
+    def add(self, rows: Rows) -> None:
+        t_ns, of = rows["t_ns"], rows["input"] // GENERATION
         self._times.append(np.append(self.newest_ns, t_ns))
         self.newest_ns = int(t_ns[-1])
+        first = np.diff(of, prepend=self._generation) > 0
+        self._generation = int(of[-1])
+        self._restarts.append((t_ns[first], of[first]))
 
     def gaps(self, end_ns: int | None) -> SampledSeries:
-        times = [*self._times]
+        times, self._times = self._times, []
         if end_ns is not None:
             times.append(np.array([self.newest_ns, end_ns]))
-        self._times = []
         since_ns = np.concatenate([_NO_TIMES, *(t_ns[:-1] for t_ns in times)])
         gaps_ns = np.concatenate([_NO_TIMES, *map(np.diff, times)])
         kept = gaps_ns > 0
         return SampledSeries(since_ns[kept] * 1e-9, gaps_ns[kept] * 1e-9)
 
-
-class _Sensors:
-    """The times at which a sensor was restarted."""
-
-    def __init__(self) -> None:
-        self._newest = 0
-        self._found: _Batches = []
-
-    def measurements(self, of: Times, t_ns: Times) -> None:
-        first = np.flatnonzero(np.diff(of, prepend=self._newest) > 0)
-        self._newest = int(of[-1])
-        if len(first):
-            self._found.append((t_ns[first], of[first]))
-
     def restarts(self) -> SampledSeries:
-        t_ns, of = _columns(self._found, 2)
-        self._found = []
+        t_ns, of = _columns(self._restarts, 2)
+        self._restarts = []
         return SampledSeries(t_ns * 1e-9, of * 1.0)
 
 
 class _Receipts(NamedTuple):
-    """Updates that the controller received."""
+    """Updates that the controller received, with the first tick computed with each."""
 
     sequence: Times
     model_ns: Times
     """Model time of the reset."""
     tick: Times
-    """The first tick computed with the update."""
 
 
 class _Ticks:
@@ -241,13 +225,13 @@ class _Inputs:
         held = (self._steps, self._latches, self._receipts)
         return sum(len(batch[0]) for batches in held for batch in batches)
 
-    def add_receipts(self, receipts: _Receipts, ticked: int, *, ended: bool) -> None:
+    def add_receipts(self, receipts: _Receipts, ticked: int) -> None:
         """Add updates that the controller received, and the number of its newest tick."""
         ticks = receipts.tick
         for tick in ticks[np.diff(ticks // GENERATION, prepend=-1) > 0].tolist():
             self._first_state.setdefault(tick // GENERATION, tick)
         self._receipts.append(receipts)
-        self._ticked = _NEVER if ended else ticked
+        self._ticked = ticked
 
     def classified(self, *, ended: bool) -> tuple[SampledSeries, SampledSeries, SampledSeries]:
         """Classify the steps with a known input.
@@ -317,8 +301,7 @@ class _Inputs:
         self._receipts = [(sequence[known:], model_ns[known:], tick[known:])]
         needed = latched > self._ticked  # steps with a later actuation than these ticks
         self._latches = [(latched[needed], t_ns[needed])]
-        numbers = zip(sequence[:known].tolist(), model_ns[:known].tolist(), applied_ns, strict=True)
-        return list(numbers)
+        return [*zip(sequence[:known].tolist(), model_ns[:known].tolist(), applied_ns, strict=True)]
 
 
 class _Updates:
@@ -336,9 +319,8 @@ class _Updates:
 
     def packets(self, rows: Rows) -> None:
         rows, sequences, _ = updates_in(rows)
-        for sequence, passed in zip(
-            sequences.tolist(), effective(rows["fate"]).tolist(), strict=True
-        ):
+        forwarded = effective(rows["fate"]).tolist()
+        for sequence, passed in zip(sequences.tolist(), forwarded, strict=True):
             self._passed[sequence] = self._passed.get(sequence, False) or passed
             self._newest_packet = max(self._newest_packet, sequence)
 

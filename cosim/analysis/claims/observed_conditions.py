@@ -56,11 +56,9 @@ class PacketLosses(NamedTuple):
     it was delivered or in flight, in between if it was delivered out of order (stale)."""
 
     def consecutive(self, delay_s: float, before: int = 0) -> SampledSeries:
-        """Consecutive losses up to every event.
+        """Consecutive losses up to every event, with ``before`` losses before the first of them.
 
-        Args:
-            delay_s: allowed delay; an update that was replaced within it is not lost.
-            before: consecutive losses before the first of these events.
+        An update that was replaced within the allowed delay is not lost.
         """
         counts, count = [], before
         for replaced_s in self.replaced_after_s.tolist():
@@ -111,12 +109,9 @@ class ObservedConditions(NamedTuple):
     def violations(
         self, conditions: NetworkConditions, causes: Collection[str] = tuple(CAUSES), lost: int = 0
     ) -> list[AssumptionViolation]:
-        """The conditions that the run violated.
+        """The conditions that the run violated, among the ``causes``.
 
-        Args:
-            conditions: the conditions.
-            causes: which of ``CAUSES`` to check.
-            lost: consecutive losses before the first event.
+        ``lost`` is the number of consecutive losses before the first event.
         """
         start = SampledSeries(np.zeros(1), np.array([self.start_s]))
         every: dict[str, tuple[SampledSeries, float]] = {

@@ -10,17 +10,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.claims.claim import Reals
 from cosim.analysis.claims.condition_reader import read_conditions
 from cosim.analysis.claims.observed_conditions import (
     AssumptionViolation,
     ObservedConditions,
+    Reals,
     SampledSeries,
     VoidFrom,
     causes_of,
     earliest,
 )
-from cosim.record.align import AlignedRun, in_common, join_all
+from cosim.record.align import AlignedRun, align_tables, in_common
 from cosim.record.run_record import RunRecord
 from noack.config.resolution import policy_of
 from noack.config.scenario import Scenario
@@ -66,7 +66,7 @@ class RunEvidence:
     @cached_property
     def joined(self) -> AlignedRun:
         """The run's samples on the measurement grid."""
-        return join_all(self.record)
+        return align_tables(self.record)
 
     @cached_property
     def t_s(self) -> Reals:

@@ -28,4 +28,4 @@ def replay(record: RunRecord) -> Replay:
         replayed = {role: replay_machine(role, record) for role in LOOP_ROLES}
         messages = check_messages(record, replayed)
     accounts = tuple(account for one in replayed.values() for account in one.accounts)
-    return Replay(accounts, messages)
+    return Replay(processes=accounts, messages=messages)

@@ -8,18 +8,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from controller_node.controller import controller_of
-from cosim.analysis.replay.replay_result import (
-    ProcessReplay,
-    ReplayDifference,
-    difference,
-    rows_differ,
-)
+from cosim.analysis.replay.replay_result import ProcessReplay, difference, rows_differ
+from cosim.analysis.summary_model import ReplayDifference
 from cosim.record.run_record import Life, Rows, RunRecord
 from netem.duplex_link import network_of
 from netem.link_machine import Datagram
 from noack.config.parameter_changes import ParameterChange, settings_of
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix
 from noack.protocol.machine_interface import GENERATION, Machine, Notice, Record, Start
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -30,9 +27,10 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
     SENSOR_ACKNOWLEDGEMENT,
     SETTINGS,
+    entry_names,
 )
 from noack.protocol.topology import ROUTES
-from noack.protocol.wire_format import NO_VECTOR, Flow, Message
+from noack.protocol.wire_format import Flow, Message
 from plant_server.plant import plant_of
 from sensor_node.sensor import sensor_of
 
@@ -60,14 +58,19 @@ class MachineReplay:
         return all(account.whole for account in self.accounts)
 
 
-def vector_columns(table: str, rows: Rows) -> tuple[str, ...]:
-    """Return the names of the columns that contain the vector of a received message."""
+def received_vectors(table: str, rows: Rows) -> tuple[Matrix, list[str]]:
+    """Return the vectors of the received messages, (k, n), and the names of their entries."""
+    names, columns = rows.dtype.names or (), ["x"]
     if table == SENSOR_ACKNOWLEDGEMENT:
-        return ()
-    names = rows.dtype.names or ()
-    if ROUTES[OWNER[table]].receives is Flow.ACTUATION:
-        return tuple(column for column in ("u", "x_c") if column in names)
-    return ("y", "u_applied") if "y" in names else ("x",)
+        columns = []
+    elif ROUTES[OWNER[table]].receives is Flow.ACTUATION:
+        columns = [column for column in ("u", "x_c") if column in names]
+    elif "y" in names:
+        columns = ["y", "u_applied"]
+    vectors = np.hstack([np.zeros((len(rows), 0)), *(rows[column] for column in columns)])
+    return vectors, [
+        entry for column in columns for entry in entry_names(column, rows[column].shape[1])
+    ]
 
 
 def replay_machine(role: str, record: RunRecord) -> MachineReplay:
@@ -92,12 +95,12 @@ def _replay_life(role: str, scenario: Scenario, life: Life, sent: list[Any]) -> 
     found = [one for one in (run.difference, inputs.damage) if one is not None]
     sent += run.sent
     return ProcessReplay(
-        f"{role} ({life.generation + 1})" if life.generation else role,
-        sum(map(len, owned.values())),
-        compared,
-        inputs.missing_from,
-        inputs.end_known,
-        min(found, key=lambda one: one.now_ns, default=None),
+        process=f"{role} ({life.generation + 1})" if life.generation else role,
+        inputs=sum(map(len, owned.values())),
+        compared=compared,
+        missing_from=inputs.missing_from,
+        end_known=life.report is not None,
+        difference=min(found, key=lambda one: one.now_ns, default=None),
     )
 
 
@@ -116,7 +119,6 @@ class _Inputs(NamedTuple):
     order: list[tuple[str, int]]
     """Table and row of each input, up to the first gap."""
     missing_from: int | None
-    end_known: bool
     damage: ReplayDifference | None
 
 
@@ -145,9 +147,7 @@ def _inputs(owned: Mapping[str, Rows], report: Mapping[str, Any] | None, first: 
                 table, row, int(owned[table]["now_ns"][row]), "the inputs are not numbered in turn",
                 "input", int(numbers[doubtful]), whole,
             )  # fmt: skip
-    return _Inputs(
-        [places[i] for i in order[:whole].tolist()], missing_from, report is not None, damage
-    )
+    return _Inputs([places[i] for i in order[:whole].tolist()], missing_from, damage)
 
 
 class _Run:
@@ -176,17 +176,13 @@ class _Run:
             elif message is None:
                 due_ns = self._machine.next_deadline_ns()
                 if due_ns is None or now_ns < due_ns:
-                    self._differs(table, row, "acted before it was due", "now_ns", now_ns, due_ns)
+                    self._differs(table, row, "acted before its deadline", "now_ns", now_ns, due_ns)
                 outputs = self._machine.on_timer(now_ns)
             else:
                 outputs = self._machine.handle(message, now_ns)
             self._compare(table, row, outputs)
-        except (
-            ArithmeticError,
-            LookupError,
-            ValueError,
-            CallerError,
-        ) as error:  # a damaged record has values that no run can have
+        except (ArithmeticError, LookupError, ValueError, CallerError) as error:
+            # A damaged record has values that no run can have.
             self._differs(table, row, f"the machine cannot take this input: {error}")
             return False
         return True
@@ -226,14 +222,9 @@ def _messages(table: str, rows: Rows) -> Iterator[Message | Datagram | Parameter
             size_bytes = min(max(size, 0), _MOST_BYTES)
             yield Datagram(flow, head.ljust(size_bytes, b"\0")[:size_bytes])
     else:
-        flow, columns = ROUTES[OWNER[table]].receives, vector_columns(table, rows)
-        if not columns:
-            for sequence, t_ns in zip(
-                rows["sequence"].tolist(), rows["t_ns"].tolist(), strict=True
-            ):
-                yield Message(Flow.ACKNOWLEDGEMENT, sequence, t_ns, NO_VECTOR)
-            return
-        vectors = np.hstack([rows[column] for column in columns])
+        acknowledges = table == SENSOR_ACKNOWLEDGEMENT
+        flow = Flow.ACKNOWLEDGEMENT if acknowledges else ROUTES[OWNER[table]].receives
+        vectors, _ = received_vectors(table, rows)
         for sequence, t_ns, vector in zip(
             rows["sequence"].tolist(), rows["t_ns"].tolist(), vectors, strict=True
         ):

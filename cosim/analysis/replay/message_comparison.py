@@ -5,14 +5,13 @@ are not compared.
 """
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from cosim.analysis.replay.machine_replay import MachineReplay, vector_columns
+from cosim.analysis.replay.machine_replay import MachineReplay, received_vectors
 from cosim.analysis.replay.replay_result import MessagesReplay, difference, first_entry
 from cosim.record.run_record import Rows, RunRecord
-from netem.link_machine import Datagram
 from noack.protocol.record_tables import (
     ACKNOWLEDGEMENTS,
     CONTROLLER_DELIVERY,
@@ -23,58 +22,61 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
     SETTINGS,
     UPDATES,
-    entry_names,
 )
-from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Header, Message, read_header
+from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Message, read_header
+
+_HOPS = (
+    ("plant → sensor", SENSOR_MEASUREMENT, "plant", Flow.MEASUREMENT),
+    ("sensor → netem", NETEM_PACKET, "sensor", Flow.UPDATE),
+    ("netem → controller", CONTROLLER_DELIVERY, "sensor", Flow.UPDATE),
+    ("controller → plant", PLANT_ACTUATION, "controller", Flow.ACTUATION),
+    ("controller → netem", NETEM_PACKET, "controller", Flow.ACKNOWLEDGEMENT),
+    ("netem → sensor", SENSOR_ACKNOWLEDGEMENT, "controller", Flow.ACKNOWLEDGEMENT),
+)
+"""Name, the receiver's table, the process that made the messages, and their kind."""
 
 
 def check_messages(
     record: RunRecord, replayed: Mapping[str, MachineReplay]
 ) -> tuple[MessagesReplay, ...]:
     """Compare the messages of every hop of the loop."""
-    plant, sensor, controller = (replayed[role] for role in ("plant", "sensor", "controller"))
-    measurements = _Received("plant → sensor", SENSOR_MEASUREMENT, record, plant, Flow.MEASUREMENT)
-    entering = _Received("sensor → netem", NETEM_PACKET, record, sensor, Flow.UPDATE)
-    updates = _Received("netem → controller", CONTROLLER_DELIVERY, record, sensor, Flow.UPDATE)
-    actuations = _Received(
-        "controller → plant", PLANT_ACTUATION, record, controller, Flow.ACTUATION
-    )
-    found = [measurements, entering, updates, actuations]
-    measurements.compare_vectors()
-    entering.compare_heads()
-    updates.compare_vectors()
-    updates.compare_with_survivors(replayed["netem"])
-    actuations.compare_vectors()
-    if SENSOR_ACKNOWLEDGEMENT in record.tables:
-        flow = Flow.ACKNOWLEDGEMENT
-        answers = _Received("controller → netem", NETEM_PACKET, record, controller, flow)
-        returned = _Received("netem → sensor", SENSOR_ACKNOWLEDGEMENT, record, controller, flow)
-        answers.compare_heads()
-        returned.compare_vectors()
-        returned.compare_with_survivors(replayed["netem"])
-        found += [answers, returned]
-    else:
-        entering.compare_flows()
-    changes = () if (compared := _compare_changes(record)) is None else (compared,)
-    return (*(one.result() for one in found), *changes)
+    acknowledges = SENSOR_ACKNOWLEDGEMENT in record.tables
+    found = []
+    for leg, table, sender, flow in _HOPS:
+        if flow is Flow.ACKNOWLEDGEMENT and not acknowledges:
+            continue
+        hop = _Received(leg, table, record, replayed[sender], flow)
+        if table == NETEM_PACKET:
+            hop.compare_heads()
+            if not acknowledges:
+                hop.compare_flows()
+        else:
+            hop.compare_vectors()
+        if table in (CONTROLLER_DELIVERY, SENSOR_ACKNOWLEDGEMENT):
+            hop.compare_with_survivors(replayed["netem"])
+        found.append(hop.result())
+    return (*found, *_compare_changes(record))
 
 
-def _compare_changes(record: RunRecord) -> MessagesReplay | None:
-    """Compare the changes that the processes received; None if there were none."""
+def _compare_changes(record: RunRecord) -> Iterator[MessagesReplay]:
+    """Compare the changes that the processes received, if there were any."""
     first: dict[int, tuple[object, ...]] = {}
     compared, found = 0, None
     for table in SETTINGS:
         for place, row in enumerate(record[table]):
             number = int(row["sequence"])
-            said = (int(row["t_ns"]), row["change"].tobytes())
+            change = (int(row["t_ns"]), row["change"].tobytes())
             compared += number in first
-            known = first.setdefault(number, said)
-            for column, one, other in zip(("t_ns", "change"), said, known, strict=True):
+            known = first.setdefault(number, change)
+            for column, one, other in zip(("t_ns", "change"), change, known, strict=True):
                 if one != other and found is None:
                     what = "another process received another change"
                     found = difference(table, place, int(row["now_ns"]), what, column, one, other)
     received = sum(len(record[table]) for table in SETTINGS)
-    return MessagesReplay("coordinator → all", received, compared, found) if received else None
+    if received:
+        yield MessagesReplay(
+            leg="coordinator → all", received=received, compared=compared, difference=found
+        )
 
 
 class _Received:
@@ -87,9 +89,9 @@ class _Received:
         self._table = table
         self._rows: Rows = record[table]
         self._at = np.arange(len(self._rows))
-        self._way = ACKNOWLEDGEMENTS if flow is Flow.ACKNOWLEDGEMENT else UPDATES
+        self._direction = ACKNOWLEDGEMENTS if flow is Flow.ACKNOWLEDGEMENT else UPDATES
         if table == NETEM_PACKET and record.scenario.protocol.acknowledges:
-            self._at = np.flatnonzero(self._rows["flow"] == self._way)
+            self._at = np.flatnonzero(self._rows["flow"] == self._direction)
             self._rows = self._rows[self._at]
         self._sent: dict[int, Message] = {
             message.sequence: message for message in sender.sent if message.flow is flow
@@ -104,32 +106,29 @@ class _Received:
             row, what, column, recorded, replayed = self._first
             now_ns, place = int(self._rows["now_ns"][row]), int(self._at[row])
             found = difference(self._table, place, now_ns, what, column, recorded, replayed)
-        return MessagesReplay(self._leg, len(self._rows), self._compared, found)
+        return MessagesReplay(
+            leg=self._leg, received=len(self._rows), compared=self._compared, difference=found
+        )
 
     def compare_vectors(self) -> None:
         """Compare sequence number, time and vector of the received messages."""
-        rows, columns, newest = self._rows, vector_columns(self._table, self._rows), -1
-        entries = [
-            entry for column in columns for entry in entry_names(column, rows[column].shape[1])
-        ]
-        vectors = (
-            np.hstack([rows[column] for column in columns]) if columns else np.zeros((len(rows), 0))
-        )
+        rows, newest = self._rows, -1
+        vectors, entries = received_vectors(self._table, rows)
         fields = (rows["sequence"].tolist(), rows["t_ns"].tolist(), vectors)
         for row, (sequence, t_ns, vector) in enumerate(zip(*fields, strict=True)):
             if sequence <= newest:
-                self._differs(row, "not newer than what came before", "sequence", sequence)
+                self._differs(row, "not newer than the message before", "sequence", sequence)
             newest = max(newest, sequence)
             message = self._find(row, sequence, "sequence", sequence)
             if message is None:
                 continue
             if t_ns != message.t_ns:
-                self._differs(row, "was not sent so", "t_ns", t_ns, message.t_ns)
-            elif vector.tobytes() != message.vector.tobytes():
-                entry = first_entry(vector, message.vector)
-                if entry is not None:
-                    place, *values = entry
-                    self._differs(row, "was not sent so", entries[place], *values)
+                self._differs(row, "differs from the message sent", "t_ns", t_ns, message.t_ns)
+            elif vector.tobytes() != message.vector.tobytes() and (
+                entry := first_entry(vector, message.vector)
+            ):
+                place, *values = entry
+                self._differs(row, "differs from the message sent", entries[place], *values)
 
     def compare_heads(self) -> None:
         """Compare the part of a datagram that netem records: its first bytes and its size."""
@@ -145,15 +144,15 @@ class _Received:
             data = encoder.encode(message)
             expected = data[:PACKET_HEAD_BYTES].ljust(PACKET_HEAD_BYTES, b"\0")
             if head != expected:
-                self._differs(row, "was not sent so", "head", head, expected)
+                self._differs(row, "differs from the message sent", "head", head, expected)
             elif size != len(data):
-                self._differs(row, "was not sent so", "size_bytes", size, len(data))
+                self._differs(row, "differs from the message sent", "size_bytes", size, len(data))
 
     def compare_flows(self) -> None:
         """Check that only the sensor's flow was forwarded."""
         for row, flow in enumerate(self._rows["flow"].tolist()):
             if flow != 0:
-                self._differs(row, "netem serves the sensor alone", "flow", flow, 0)
+                self._differs(row, "netem serves only the sensor's flow", "flow", flow, 0)
 
     def compare_with_survivors(self, network: MachineReplay) -> None:
         """Check that the network forwarded every received message."""
@@ -162,11 +161,11 @@ class _Received:
         survivors = {
             header.sequence
             for datagram in network.sent
-            if datagram.flow == self._way and (header := _header(datagram))
+            if datagram.flow == self._direction and (header := read_header(datagram.data))
         }
         for row, sequence in enumerate(self._rows["sequence"].tolist()):
             if sequence not in survivors:
-                self._differs(row, "netem does not let it through", "sequence", sequence)
+                self._differs(row, "netem did not forward it", "sequence", sequence)
 
     def _find(self, row: int, sequence: int, column: str, value: object) -> Message | None:
         """Return the message of a number if its sender was replayed that far and sent it."""
@@ -182,7 +181,3 @@ class _Received:
     ) -> None:
         if self._first is None or row < self._first[0]:
             self._first = (row, what, column, recorded, replayed)
-
-
-def _header(datagram: Datagram) -> Header | None:
-    return read_header(datagram.data)

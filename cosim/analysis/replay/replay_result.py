@@ -2,45 +2,14 @@
 
 import math
 import struct
-from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
+from cosim.analysis.summary_model import ReplayDifference, SummaryPart
 from noack.protocol.record_tables import entry_names
 
 Value = float | int | str | None
-
-
-@dataclass(frozen=True)
-class ReplayDifference:
-    """A value that differs between record and replay.
-
-    Floating-point values also have their ``float.hex()``, which shows every bit; a value that is
-    not finite has this form only.
-    """
-
-    table: str
-    row: int
-    """Index in the table, from 0."""
-    column: str
-    """Name as in the Parquet file, such as ``x_2``; empty if no single column differs."""
-    recorded: Value
-    recorded_hex: str | None
-    replayed: Value
-    replayed_hex: str | None
-    what: str
-    """The difference in words."""
-    now_ns: int
-    """The row's recorded time."""
-
-    def __str__(self) -> str:
-        column = f", {self.column}" if self.column else ""
-        values = ""
-        if self.recorded is not None or self.recorded_hex is not None:
-            recorded = _text(self.recorded, self.recorded_hex)
-            values = f": recorded {recorded}, replayed {_text(self.replayed, self.replayed_hex)}"
-        return f"{self.table} row {self.row}{column}: {self.what}{values}"
 
 
 def difference(
@@ -54,7 +23,10 @@ def difference(
 ) -> ReplayDifference:
     """Return a difference with its values formatted."""
     (first, first_hex), (second, second_hex) = _shown(recorded), _shown(replayed)
-    return ReplayDifference(table, row, column, first, first_hex, second, second_hex, what, now_ns)
+    return ReplayDifference(
+        table=table, row=row, column=column, recorded=first, recorded_hex=first_hex,
+        replayed=second, replayed_hex=second_hex, what=what, now_ns=now_ns,
+    )  # fmt: skip
 
 
 def rows_differ(table: str, row: int, recorded: np.void, replayed: np.void) -> ReplayDifference:
@@ -85,17 +57,12 @@ def _shown(value: object) -> tuple[Value, str | None]:
         return value if math.isfinite(value) else None, value.hex()
     if isinstance(value, bytes):
         return value.hex(), None
+    if isinstance(value, int) and not -(2**63) <= value < 2**63:  # of a damaged record
+        return None, hex(value)
     return (value if isinstance(value, int | str) else None), None
 
 
-def _text(value: Value, as_hex: str | None) -> str:
-    if value is None:
-        return as_hex or "nothing"
-    return f"{value} ({as_hex})" if as_hex else str(value)
-
-
-@dataclass(frozen=True)
-class ProcessReplay:
+class ProcessReplay(SummaryPart):
     """The result of one process's replay."""
 
     process: str
@@ -112,7 +79,7 @@ class ProcessReplay:
     @property
     def whole(self) -> bool:
         """Whether every input of the process was replayed."""
-        return self.end_known and self.compared == self.inputs and self.missing_from is None
+        return self.gap is None
 
     @property
     def gap(self) -> str | None:
@@ -126,8 +93,7 @@ class ProcessReplay:
         return None
 
 
-@dataclass(frozen=True)
-class MessagesReplay:
+class MessagesReplay(SummaryPart):
     """The comparison of one hop: messages sent in the replay, messages received in the run."""
 
     leg: str
@@ -138,8 +104,7 @@ class MessagesReplay:
     difference: ReplayDifference | None
 
 
-@dataclass(frozen=True)
-class Replay:
+class Replay(SummaryPart):
     """The result of a replay."""
 
     processes: tuple[ProcessReplay, ...]
@@ -155,8 +120,7 @@ class Replay:
         """The earliest difference by recorded time; at equal times messages come before rows."""
         found = [messages.difference for messages in self.messages]
         found += [process.difference for process in self.processes]
-        differences = [one for one in found if one is not None]
-        return min(differences, key=lambda difference: difference.now_ns, default=None)
+        return min(filter(None, found), key=lambda one: one.now_ns, default=None)
 
     @property
     def bit_exact(self) -> bool | None:
@@ -175,13 +139,9 @@ class Replay:
             "bit_exact": self.bit_exact,
             "complete": not self.gaps,
             "inputs": self.inputs,
-            "first_difference": None if found is None else asdict(found),
+            "first_difference": None if found is None else found.model_dump(),
         }
 
     def document(self) -> dict[str, Any]:
         """The complete result for JSON."""
-        return self.verdict() | {
-            "gaps": self.gaps,
-            "processes": [asdict(process) for process in self.processes],
-            "messages": [asdict(messages) for messages in self.messages],
-        }
+        return self.verdict() | {"gaps": self.gaps} | self.model_dump()

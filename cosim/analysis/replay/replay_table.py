@@ -6,55 +6,33 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cosim.analysis.replay.replay_result import Replay, ReplayDifference
+from cosim.analysis.replay.replay_result import Replay
+from cosim.analysis.summary_model import ReplayDifference
 
 
 def print_replay(console: Console, found: Replay, changed: Sequence[str]) -> None:
-    """Print the result of a replay.
-
-    Args:
-        console: the console.
-        found: the result.
-        changed: differences between the computer of the run and this one, in words.
-    """
+    """Print the result of a replay, and what ``changed`` since the run on its computer."""
     table = Table(title="replay, bit for bit")
-    table.add_column("process, leg")
-    for heading in ("recorded", "compared", "verdict"):
-        table.add_column(heading, justify="right")
-    for process in found.processes:
-        verdict = _verdict(process.compared, process.difference)
-        table.add_row(process.process, *_counts(process.inputs, process.compared), verdict)
-    for leg in found.messages:
-        verdict = _verdict(leg.compared, leg.difference)
-        table.add_row(leg.leg, *_counts(leg.received, leg.compared), verdict)
+    for heading in ("process, leg", "recorded", "compared", "verdict"):
+        table.add_column(heading, justify="left" if heading == "process, leg" else "right")
+    rows = [(one.process, one.inputs, one.compared, one.difference) for one in found.processes]
+    rows += [(one.leg, one.received, one.compared, one.difference) for one in found.messages]
+    for name, recorded, compared, difference in rows:
+        table.add_row(name, f"{recorded:,}", f"{compared:,}", _verdict(compared, difference))
     console.print(table)
-    for gap in found.gaps:
-        console.print(
-            f"[bold yellow]record incomplete:[/] {escape(gap)}", highlight=False, soft_wrap=True
-        )
-    first = found.first_difference
-    if first is None:
+    lines = [f"[bold yellow]record incomplete:[/] {escape(gap)}" for gap in found.gaps]
+    if (first := found.first_difference) is None:
         word = f"bit-exact: {found.inputs:,} inputs" if found.inputs else "nothing to compare"
-        console.print(
-            word + (" so far as the record goes" if found.gaps else ""),
-            highlight=False,
-            soft_wrap=True,
-        )
-        return
-    console.print(
-        f"[bold red]first difference:[/] {escape(str(first))}", highlight=False, soft_wrap=True
-    )
-    for change in changed:
-        console.print(
+        lines.append(word + (" so far as the record goes" if found.gaps else ""))
+    else:
+        lines.append(f"[bold red]first difference:[/] {escape(str(first))}")
+        lines += [
             f"[bold yellow]not the machine of the run:[/] {escape(change)}; "
-            "the last bits of a product may depend on it",
-            highlight=False,
-            soft_wrap=True,
-        )
-
-
-def _counts(recorded: int, compared: int) -> tuple[str, str]:
-    return f"{recorded:,}", f"{compared:,}"
+            "the last bits of a product may depend on it"
+            for change in changed
+        ]
+    for line in lines:
+        console.print(line, highlight=False, soft_wrap=True)
 
 
 def _verdict(compared: int, difference: ReplayDifference | None) -> str:

@@ -6,16 +6,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from cosim.cli.command import (
-    THEORY,
-    JsonOption,
-    ScenarioArgument,
-    SetOption,
-    command,
-    find_scenario,
-    print_json,
-)
-from noack.config.scenario_file import load
+from cosim.cli import command as cli
 from noack.core.errors import ExitStatus
 
 
@@ -29,13 +20,13 @@ class AdversaryAim(StrEnum):
     ALL = "all"
 
 
-@command(THEORY, 20, [
+@cli.command(cli.THEORY, 20, [
     ("noack adversary lane_following", "all objectives"),
     ("noack adversary lane_following --objective error --json", "the controller's error only"),
     ("noack adversary unstable_pendulum --horizon 2 --beam 64", "a faster search"),
 ])  # fmt: skip
 def adversary(
-    scenario: ScenarioArgument,
+    scenario: cli.ScenarioArgument,
     *,
     objective: Annotated[
         AdversaryAim,
@@ -50,26 +41,28 @@ def adversary(
     nodes: Annotated[
         int,
         typer.Option(
-            help="Search exhaustively while this many segments between events suffice.", min=0
+            help="Limit of the exhaustive search, in segments between events; beyond it, a beam "
+            "search is used.",
+            min=0,
         ),
     ] = 500_000,
     beam: Annotated[int, typer.Option(help="Width of the beam search, in runs.", min=0)] = 512,
-    settings: SetOption = None,
-    json: JsonOption = False,
+    settings: cli.SetOption = None,
+    json: cli.JsonOption = False,
 ) -> int:
     """Search for the worst losses that the network may cause; compare them with the bounds.
 
     Exit status 1: a certified bound was exceeded.
     """
     from cosim.analysis.adversary import Objective, find_worst
-    from cosim.analysis.adversary.adversary_report import document, print_worst
+    from cosim.analysis.adversary.worst_run import document, print_worst
     from cosim.live.progress import search_status
     from noack.config.resolution import resolve
     from noack.theory.run_conditions import ideal_conditions
     from noack.theory.scenario_certificates import certify
 
     given = [] if horizon is None else [f"horizon_s={horizon}"]
-    resolved = resolve(load(find_scenario(scenario), [*(settings or ()), *given]))
+    resolved = resolve(cli.load_scenario(scenario, [*(settings or ()), *given]))
     certificate = certify(resolved, ideal_conditions(resolved))
     aims = list(Objective) if objective is AdversaryAim.ALL else [Objective(objective.value)]
     with search_status() as report:
@@ -81,7 +74,7 @@ def adversary(
             for aim in aims
         ]  # fmt: skip
     if json:
-        print_json(document(found, resolved, certificate))
+        cli.print_json(document(found, resolved, certificate))
     else:
         print_worst(Console(), found, resolved, certificate)
     return ExitStatus.FAILED if any(worst.breaches for worst in found) else ExitStatus.OK

@@ -7,9 +7,8 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
+from cosim.cli import command as cli
 from cosim.cli import completion
-from cosim.cli.command import CAMPAIGNS, JsonOption, command, cores, print_json
-from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import CallerError, ExitStatus
 
 _PER_CORE = 4
@@ -32,7 +31,7 @@ Out = Annotated[
 ]
 
 
-@command(CAMPAIGNS, 10, [
+@cli.command(cli.CAMPAIGNS, 10, [
     ("noack campaign mb_vs_zoh", "compare a model with a hold"),
     ("noack campaign mansd_sweep --draws 200 --json", "fewer draws at each grid point"),
     ("noack campaign mb_vs_zoh --scheduler tcp://127.0.0.1:8786", "on a Dask cluster"),
@@ -50,7 +49,7 @@ def campaign(
     workers: Workers = None,
     scheduler: Scheduler = None,
     out: Out = None,
-    json: JsonOption = False,
+    json: cli.JsonOption = False,
 ) -> int:
     """Run a scenario over a grid of settings, with many random draws at each point.
 
@@ -67,7 +66,7 @@ def campaign(
     path = find_shipped(file, "campaigns")
     summary, made, files = _run(console, path, start, draws=draws, out=out)
     if json:
-        print_json(summary.document() | {"made": made, "files": [str(file) for file in files]})
+        cli.print_json(summary.document() | {"made": made, "files": [str(file) for file in files]})
     else:
         print_summary(Console(), summary)
         for written in files:
@@ -83,8 +82,8 @@ def _worker_pool(workers: int | None, scheduler: str | None) -> Callable[[Any], 
         if workers is not None:
             raise CallerError("--workers: with --scheduler the cluster's workers are used")
         return lambda say: cluster(scheduler, say)
-    number = workers or cores()
-    if number > (most := _PER_CORE * cores()):
+    number = workers or cli.cores()
+    if number > (most := _PER_CORE * cli.cores()):
         raise CallerError(f"--workers {number}: on this machine at most {most}")
     return lambda say: local(number)
 
@@ -109,7 +108,7 @@ def _run(
     with console.status("preparing the grid"):
         points = grid(plan, path)
     _, base = base_of(plan, path)
-    folder = out or DEFAULT_RUNS / "campaigns" / plan.name
+    folder = out or cli.DEFAULT_RUNS / "campaigns" / plan.name
     store = Store(folder, points, draws or plan.draws, plan.chunk)
     with terminations_raised(), opened(plan, base, store):
         with start(say) as runner, runs_bar(console) as progress:

@@ -5,28 +5,19 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from cosim.cli.command import (
-    THEORY,
-    JsonOption,
-    ScenarioArgument,
-    SetOption,
-    command,
-    find_scenario,
-    print_json,
-)
-from noack.config.scenario_file import load
+from cosim.cli import command as cli
 from noack.core.errors import ExitStatus
 
 
-@command(THEORY, 10, [
+@cli.command(cli.THEORY, 10, [
     ("noack certify lane_following", "its plant, and all plants of its uncertainty box"),
     ("noack certify lane_following --weight chosen", "with a norm that certifies more"),
     ("noack certify lane_weighted --late 6 --json", "allow 6 steps of lateness"),
 ])  # fmt: skip
 def certify(
-    scenario: ScenarioArgument,
+    scenario: cli.ScenarioArgument,
     *,
-    settings: SetOption = None,
+    settings: cli.SetOption = None,
     weight: Annotated[
         str,
         typer.Option(
@@ -41,21 +32,21 @@ def certify(
             max=1000,
         ),
     ] = None,
-    json: JsonOption = False,
+    json: cli.JsonOption = False,
 ) -> int:
     """Compute the bounds that are guaranteed for a scenario, and their conditions.
 
     Exit status 1: nothing can be certified.
     """
     from cosim.live.progress import work_bar
-    from cosim.output.certificate_report import print_study, study_scenario
+    from cosim.output.certificate_report import certificates_of, print_certificates
 
-    loaded = load(find_scenario(scenario), settings or ())
+    loaded = cli.load_scenario(scenario, settings)
     with work_bar("choosing the weight") as progress:
-        found = study_scenario(loaded, weight, late, progress)
+        found = certificates_of(loaded, weight, late, progress)
     if json:
-        print_json(found.to_json())
+        cli.print_json(found.to_json())
     else:
-        print_study(Console(), found)
-    certified = any(certificate.constants for _, certificate in found.certificates)
+        print_certificates(Console(), found)
+    certified = any(certificate.constants for _, certificate in found)
     return ExitStatus.OK if certified else ExitStatus.FAILED

@@ -4,30 +4,21 @@ from collections.abc import Iterator
 
 from rich.console import Console
 
-from cosim.cli.command import (
-    FILES,
-    JsonOption,
-    ScenarioArgument,
-    SetOption,
-    command,
-    find_scenario,
-    print_json,
-)
+from cosim.cli import command as cli
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import dumps as scenario_toml
-from noack.config.scenario_file import load
 from noack.core.clock import NS_PER_S
 from noack.core.errors import ExitStatus
 
 _COMMENT = "# "
 
 
-@command(FILES, 30, [
+@cli.command(cli.FILES, 30, [
     ("noack check lane_following", "print the scenario and its assumptions"),
     ("noack check lane_following --set mode=zoh --json", "as JSON"),
 ])  # fmt: skip
 def check(
-    scenario: ScenarioArgument, *, settings: SetOption = None, json: JsonOption = False
+    scenario: cli.ScenarioArgument, *, settings: cli.SetOption = None, json: cli.JsonOption = False
 ) -> int:
     """Check a scenario and print it with all defaults and random draws filled in.
 
@@ -40,7 +31,7 @@ def check(
     from noack.theory.assumptions import assumptions
     from noack.trigger.trigger_policy import new_trigger
 
-    resolved = resolve(load(find_scenario(scenario), settings or ()))
+    resolved = resolve(cli.load_scenario(scenario, settings))
     new_trigger(policy_of(resolved))  # some need a stable loop, others a user's class
     verdicts = [assumption._asdict() for assumption in assumptions(resolved)]
     console = Console()
@@ -50,7 +41,7 @@ def check(
         print_assumptions(console, verdicts)
         _print_plant(console, resolved)
     if json:
-        print_json(resolved.model_dump(mode="json"))
+        cli.print_json(resolved.model_dump(mode="json"))
         return ExitStatus.OK
     print(scenario_toml(resolved))
     for line in captured.get().splitlines():
@@ -61,7 +52,7 @@ def check(
 def _print_plant(console: Console, resolved: Scenario) -> None:
     """Print a nonlinear plant's linearisation, and the defaults that depend on other keys."""
     from controller_node.controller import law_of
-    from cosim.analysis.model_comparison import linearisation, said
+    from cosim.analysis.model_comparison import linearisation, linearisation_rows
     from plant_server.plant import system_of
 
     if not resolved.coverage.is_linear:
@@ -70,7 +61,7 @@ def _print_plant(console: Console, resolved: Scenario) -> None:
     if (law := getattr(law_of(resolved), "about", None)) is not None:
         console.print(f"the controller: {law}", highlight=False, markup=False)
     if (near := linearisation(resolved)) is not None:
-        for what, value in said(near):
+        for what, value in linearisation_rows(near):
             console.print(f"{what}: {value}", highlight=False, markup=False)
     for line in _dependent_defaults(resolved):
         console.print(line, highlight=False, markup=False)
@@ -90,11 +81,11 @@ def _dependent_defaults(resolved: Scenario) -> Iterator[str]:
         yield "controller.safe_input: 0, the input before the first update"
     if resolved.recovery.rejoin_within_s is None:
         yield (
-            "recovery.rejoin_within_s: 0: a process that dies ends the run; with `noack record` "
-            f"{RESTART_BY_HAND_S:g}: it may be restarted within {RESTART_BY_HAND_S:g} s"
+            "recovery.rejoin_within_s: 0, a process that dies ends the run; with `noack record`: "
+            f"{RESTART_BY_HAND_S:g} s to restart it"
         )
     if resolved.start_within_s is None:
         yield (
-            f"start_within_s: {DEFAULT_S:g}, longer on a busy machine; with `noack record` "
+            f"start_within_s: {DEFAULT_S:g}, longer on a busy machine; with `noack record`: "
             "unlimited"
         )

@@ -8,13 +8,12 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from cosim.cli import command as cli
 from cosim.cli import completion
-from cosim.cli.command import RUNS, JsonOption, command, print_json
-from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import ExitStatus
 
 
-@command(RUNS, 80, [
+@cli.command(cli.RUNS, 80, [
     ("noack compare runs/A runs/B", "key numbers, and a page with the curves overlaid"),
     ("noack compare runs/A runs/B runs/C --out overlay.png", "the overlay as a picture"),
     ("noack compare runs/A runs/B --json", "as JSON"),
@@ -32,8 +31,8 @@ def compare(
     out: Annotated[
         Path,
         typer.Option("--out", help="File of the overlay: a page (.html) or a figure (.svg, .png)."),
-    ] = DEFAULT_RUNS / "comparison.html",
-    json: JsonOption = False,
+    ] = cli.DEFAULT_RUNS / "comparison.html",
+    json: cli.JsonOption = False,
 ) -> int:
     """Compare runs: key numbers, settings that differ, curves overlaid."""
     from cosim.live.progress import PatientConsole
@@ -43,7 +42,7 @@ def compare(
         found = compare_runs(directories)
         found.save(out)
     if json:
-        print_json(found.to_json() | {"overlay": str(out)})
+        cli.print_json(found.to_json() | {"overlay": str(out)})
         return ExitStatus.OK
     console = Console()
     for run in found.runs:

@@ -4,24 +4,12 @@ from typing import Annotated
 
 import typer
 
-from cosim.cli.command import (
-    RUNS,
-    JsonOption,
-    LiveOption,
-    ReportOption,
-    RunsOption,
-    SetOption,
-    VerboseOption,
-    command,
-    find_scenario,
-)
+from cosim.cli import command as cli
 from cosim.cli.execute_run import RunOutput, run_processes
-from cosim.record.run_directory import DEFAULT_RUNS
-from noack.config.scenario_file import load
 from noack.protocol.topology import ROLES
 
 
-@command(RUNS, 10, [
+@cli.command(cli.RUNS, 10, [
     ("noack demo", "20 s; the record is in runs/latest"),
     ("noack demo --zoh --live", "zero-order hold, with the live viewer"),
     ("noack demo --set speed=4 --set horizon_s=8", "takes 2 s of wall time"),
@@ -31,14 +19,14 @@ def demo(
     zoh: Annotated[
         bool, typer.Option("--zoh", help="Hold the last update (ZOH) instead of using a model.")
     ] = False,
-    settings: SetOption = None,
-    runs: RunsOption = DEFAULT_RUNS,
-    live: LiveOption = False,
-    report: ReportOption = True,
-    verbose: VerboseOption = False,
-    json: JsonOption = False,
+    settings: cli.SetOption = None,
+    runs: cli.RunsOption = cli.DEFAULT_RUNS,
+    live: cli.LiveOption = False,
+    report: cli.ReportOption = True,
+    verbose: cli.VerboseOption = False,
+    json: cli.JsonOption = False,
 ) -> int:
     """Run the paper's lane-following example live."""
     mode = ['mode="zoh"'] if zoh else []
-    loaded = load(find_scenario("lane_following"), [*mode, *(settings or ())])
+    loaded = cli.load_scenario("lane_following", [*mode, *(settings or ())])
     return run_processes(loaded, runs, RunOutput(report, verbose, json), spawn=ROLES, live=live)

@@ -9,21 +9,12 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from cosim.cli.command import (
-    CAMPAIGNS,
-    JsonOption,
-    ScenarioArgument,
-    SetOption,
-    command,
-    find_scenario,
-    print_json,
-)
-from cosim.record.run_directory import DEFAULT_RUNS
+from cosim.cli import command as cli
 from noack.config.scenario import Scenario
-from noack.config.scenario_file import dumps, load, value_of
+from noack.config.scenario_file import dumps, value_of
 from noack.core.errors import CallerError, ExitStatus
+from noack.core.file_access import write_whole
 from noack.core.linear_systems import Matrix
-from noack.core.whole_file import write_whole
 
 if TYPE_CHECKING:
     from cosim.studies.design.candidate_measures import DesignLimits
@@ -59,7 +50,9 @@ StateCost = Annotated[
 InputCost = Annotated[str | None, typer.Option("--R", help="LQR input cost: rows, or a diagonal.")]
 Draws = Annotated[
     int,
-    typer.Option(help="Draws for the choice; as many fresh draws confirm it.", min=20),
+    typer.Option(
+        help="Draws that choose the trigger; the same number of new draws confirm it.", min=20
+    ),
 ]
 Seed = Annotated[int, typer.Option(help="Seed of the draws.", min=0, max=2**63 - 1)]
 Out = Annotated[
@@ -71,13 +64,13 @@ Page = Annotated[
 ]
 
 
-@command(CAMPAIGNS, 20, [
+@cli.command(cli.CAMPAIGNS, 20, [
     ("noack design lane_following --settling 14", "the fewest transmissions"),
     ("noack design lane_following --settling 14 --bound error=3 --out mine.toml", ""),
     ("noack design double_integrator --settling 8 --gain lqr --Q '[1, 1]' --json", ""),
 ])  # fmt: skip
 def design(
-    scenario: ScenarioArgument,
+    scenario: cli.ScenarioArgument,
     *,
     settling: Settling,
     quantile: Quantile = 0.95,
@@ -90,10 +83,10 @@ def design(
     R: InputCost = None,
     draws: Draws = 2000,
     seed: Seed = 0,
-    settings: SetOption = None,
+    settings: cli.SetOption = None,
     out: Out = None,
     page: Page = None,
-    json: JsonOption = False,
+    json: cli.JsonOption = False,
 ) -> int:
     """Choose α, β and the norm: the fewest transmissions that meet your limits.
 
@@ -101,10 +94,10 @@ def design(
     """
     from cosim.live.progress import work_bar
     from cosim.studies.design import design_page as pages
-    from cosim.studies.design.design_run import design as designed
+    from cosim.studies.design.design_search import design as designed
     from cosim.studies.design.loop_families import families_of
 
-    loaded = load(find_scenario(scenario), settings or ())
+    loaded = cli.load_scenario(scenario, settings)
     loaded.decaying  # noqa: B018 - raises for another policy
     limits = _limits(settling, quantile, settle, bound or [], under)
     if out is not None and not out.parent.is_dir():
@@ -115,12 +108,12 @@ def design(
     with work_bar("trying candidates") as progress:
         found = designed(families, limits, draws=draws, seed=seed, progress=progress)
     written = [
-        write_whole(page or DEFAULT_RUNS / "design" / f"{loaded.name}.html", pages.page(found))
+        write_whole(page or cli.DEFAULT_RUNS / "design" / f"{loaded.name}.html", pages.page(found))
     ]
     if out is not None and found.feasible:
         written.append(write_whole(out, dumps(found.scenario)))
     if json:
-        print_json(found.document() | {"files": [str(path) for path in written]})
+        cli.print_json(found.document() | {"files": [str(path) for path in written]})
     else:
         pages.print_found(Console(), found)
         for path in written:

@@ -5,22 +5,12 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from cosim.cli.command import (
-    FILES,
-    JsonOption,
-    RunsOption,
-    SetOption,
-    command,
-    find_scenario,
-    print_json,
-)
+from cosim.cli import command as cli
 from cosim.cli.completion import scenarios
-from cosim.record.run_directory import DEFAULT_RUNS
-from noack.config.scenario_file import load
 from noack.core.errors import ExitStatus
 
 
-@command(FILES, 10, [
+@cli.command(cli.FILES, 10, [
     ("noack doctor", "for the paper's example"),
     ("noack doctor lane_weighted --set speed=4", "for another scenario"),
     ("noack doctor --seconds 10 --json", "measure longer; all numbers as JSON"),
@@ -34,17 +24,17 @@ def doctor(
         ),
     ] = "lane_following",
     *,
-    settings: SetOption = None,
+    settings: cli.SetOption = None,
     seconds: Annotated[
         float,
         typer.Option(
-            help="Seconds to measure wake-ups, without and with real-time settings.",
+            help="Seconds of each measurement of wake-ups: without and with real-time settings.",
             min=0.1,
             max=3600,
         ),
     ] = 2.0,
-    runs: RunsOption = DEFAULT_RUNS,
-    json: JsonOption = False,
+    runs: cli.RunsOption = cli.DEFAULT_RUNS,
+    json: cli.JsonOption = False,
 ) -> int:
     """Check this machine: real-time settings, timers, ports, disk.
 
@@ -52,20 +42,19 @@ def doctor(
 
     Exit status 1: a finding is bad, so that no run is possible.
     """
-    from cosim.doctor.doctor_table import document, print_findings
-    from cosim.doctor.findings import FindingStatus, judge, worst
+    from cosim.doctor.findings import FindingStatus, document, judge, print_findings, worst
     from cosim.doctor.machine_facts import requirements_of
     from cosim.doctor.machine_measures import measure
     from cosim.live.progress import PatientConsole
     from noack.config.resolution import resolve
 
-    resolved = resolve(load(find_scenario(scenario), settings or ()))
+    resolved = resolve(cli.load_scenario(scenario, settings))
     wanted = requirements_of(resolved)
     with PatientConsole(stderr=True).status("measuring"):
         machine = measure(resolved, wanted, runs, seconds)
     findings = judge(machine, wanted)
     if json:
-        print_json(document(machine, wanted, findings))
+        cli.print_json(document(machine, wanted, findings))
     else:
         print_findings(Console(), wanted, findings)
     return ExitStatus.FAILED if worst(findings) is FindingStatus.BAD else ExitStatus.OK

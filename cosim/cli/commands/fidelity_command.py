@@ -6,25 +6,25 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from cosim.cli.command import RUNS, JsonOption, RunArgument, RunsOption, command, print_json
-from cosim.record.run_directory import DEFAULT_RUNS, chosen_run
+from cosim.cli import command as cli
+from cosim.record.run_directory import chosen_run
 from noack.core.errors import ExitStatus
 
 
-@command(RUNS, 60, [
+@cli.command(cli.RUNS, 60, [
     ("noack fidelity", "effects of sampling, delay and hold on the last run"),
     ("noack fidelity --out fidelity.png", "with a figure"),
     ("noack fidelity runs/latest --json", "as JSON"),
 ])  # fmt: skip
 def fidelity(
-    run_dir: RunArgument = None,
+    run_dir: cli.RunArgument = None,
     *,
-    runs: RunsOption = DEFAULT_RUNS,
+    runs: cli.RunsOption = cli.DEFAULT_RUNS,
     out: Annotated[
         Path | None,
         typer.Option("--out", help="Write a figure of the differences over time (.svg, .png)."),
     ] = None,
-    json: JsonOption = False,
+    json: cli.JsonOption = False,
 ) -> int:
     """Compare a run with the ideal loop in continuous time, effect by effect."""
     from cosim.analysis.fidelity import compute_fidelity
@@ -40,7 +40,7 @@ def fidelity(
         if out is not None:
             save_figure(fidelity_figure(found), out)
     if json:
-        print_json(found.as_json())
+        cli.print_json(found.as_json())
     else:
         print_fidelity(Console(), found)
     return ExitStatus.OK if found.explained else ExitStatus.FAILED

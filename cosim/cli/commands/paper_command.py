@@ -6,12 +6,11 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from cosim.cli.command import THEORY, JsonOption, command, cores, print_json
-from cosim.record.run_directory import DEFAULT_RUNS
+from cosim.cli import command as cli
 from noack.core.errors import ExitStatus
 
 
-@command(THEORY, 30, [
+@cli.command(cli.THEORY, 30, [
     ("noack paper", "1,000 draws into runs/paper; takes some minutes"),
     ("noack paper --draws 50 --out paper --json", "fewer draws, as JSON"),
 ])  # fmt: skip
@@ -22,20 +21,19 @@ def paper(
     ] = 1000,
     out: Annotated[
         Path, typer.Option("--out", help="Folder for paper.md and its figures.")
-    ] = DEFAULT_RUNS / "paper",
-    json: JsonOption = False,
+    ] = cli.DEFAULT_RUNS / "paper",
+    json: cli.JsonOption = False,
 ) -> int:
     """Reproduce the paper's Section V: a page with figures, tables and verdicts."""
     from cosim.live.progress import PatientConsole, draws_bar
-    from cosim.studies.paper.paper_run import document, make_folder, reproduce, write_page
-    from cosim.studies.paper.paper_table import print_claims
+    from cosim.studies.paper import paper_run
 
-    make_folder(out)
+    paper_run.make_folder(out)
     with draws_bar(PatientConsole(stderr=True)) as progress:
-        results = reproduce(draws, cores(), progress)
-    found = document(results, write_page(results, out))
+        results = paper_run.reproduce(draws, cli.cores(), progress)
+    found = paper_run.document(results, paper_run.write_page(results, out))
     if json:
-        print_json(found)
+        cli.print_json(found)
     else:
-        print_claims(Console(), found)
+        paper_run.print_claims(Console(), found)
     return ExitStatus.OK

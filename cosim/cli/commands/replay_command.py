@@ -2,17 +2,20 @@
 
 from rich.console import Console
 
-from cosim.cli.command import RUNS, JsonOption, RunArgument, RunsOption, command, print_json
-from cosim.record.run_directory import DEFAULT_RUNS, chosen_run
+from cosim.cli import command as cli
+from cosim.record.run_directory import chosen_run
 from noack.core.errors import ExitStatus
 
 
-@command(RUNS, 70, [
+@cli.command(cli.RUNS, 70, [
     ("noack replay", "the last run; exit status 1 if a bit differs"),
     ("noack replay runs/latest --json", "as JSON"),
 ])  # fmt: skip
 def replay(
-    run_dir: RunArgument = None, *, runs: RunsOption = DEFAULT_RUNS, json: JsonOption = False
+    run_dir: cli.RunArgument = None,
+    *,
+    runs: cli.RunsOption = cli.DEFAULT_RUNS,
+    json: cli.JsonOption = False,
 ) -> int:
     """Replay a run's recorded inputs; compare the outputs bit for bit."""
     from cosim.analysis.replay import replay as replay_record
@@ -26,7 +29,7 @@ def replay(
         found = replay_record(load_record(path))
     changed = changed_since(path)
     if json:
-        print_json(found.document() | {"changed_since": changed})
+        cli.print_json(found.document() | {"changed_since": changed})
     else:
         print_replay(Console(), found, changed)
     return ExitStatus.OK if found.bit_exact else ExitStatus.FAILED

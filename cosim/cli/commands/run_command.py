@@ -1,38 +1,25 @@
 """``noack run``: a live run."""
 
-from cosim.cli.command import (
-    RUNS,
-    JsonOption,
-    LiveOption,
-    ReportOption,
-    RunsOption,
-    ScenarioArgument,
-    SetOption,
-    VerboseOption,
-    command,
-    find_scenario,
-)
+from cosim.cli import command as cli
 from cosim.cli.execute_run import RunOutput, run_processes
-from cosim.record.run_directory import DEFAULT_RUNS
-from noack.config.scenario_file import load
 from noack.protocol.topology import ROLES
 
 
-@command(RUNS, 20, [
+@cli.command(cli.RUNS, 20, [
     ("noack run lane_following", "the paper's example, 20 s"),
     ("noack run unstable_pendulum --set horizon_s=5 --live", "5 s, with the live viewer"),
-    ("noack run lane_following --set network.mansd=9 --json", "print the summary as JSON"),
+    ("noack run lane_following --set network.mansd=9 --json", "M − 1 = 9; print JSON"),
 ])  # fmt: skip
 def run(
-    scenario: ScenarioArgument,
+    scenario: cli.ScenarioArgument,
     *,
-    settings: SetOption = None,
-    runs: RunsOption = DEFAULT_RUNS,
-    live: LiveOption = False,
-    report: ReportOption = True,
-    verbose: VerboseOption = False,
-    json: JsonOption = False,
+    settings: cli.SetOption = None,
+    runs: cli.RunsOption = cli.DEFAULT_RUNS,
+    live: cli.LiveOption = False,
+    report: cli.ReportOption = True,
+    verbose: cli.VerboseOption = False,
+    json: cli.JsonOption = False,
 ) -> int:
     """Run a scenario live: start all processes and record everything."""
-    loaded = load(find_scenario(scenario), settings or ())
+    loaded = cli.load_scenario(scenario, settings)
     return run_processes(loaded, runs, RunOutput(report, verbose, json), spawn=ROLES, live=live)

@@ -7,13 +7,13 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from cosim.cli import command as cli
 from cosim.cli import completion
-from cosim.cli.command import FILES, JsonOption, command, print_json
 from cosim.shipped_files import KINDS, ShippedFile, all_shipped, text_of
 from noack.core.errors import ExitStatus
 
 
-@command(FILES, 20, [
+@cli.command(cli.FILES, 20, [
     ("noack scenarios", "list them all"),
     ("noack scenarios unstable_pendulum > mine.toml", "copy one, to make it your own"),
     ("noack scenarios --json", "list them as JSON"),
@@ -24,16 +24,16 @@ def scenarios(
         typer.Argument(help="Print this scenario or campaign.", autocompletion=completion.shipped),
     ] = None,
     *,
-    json: JsonOption = False,
+    json: cli.JsonOption = False,
 ) -> int:
     """List the shipped scenarios and campaigns, or print one of them."""
     if name is not None:
         text = text_of(name)
-        print_json({"name": name, "toml": text}) if json else print(text, end="")
+        cli.print_json({"name": name, "toml": text}) if json else print(text, end="")
         return ExitStatus.OK
     shipped = {kind: all_shipped(kind) for kind in KINDS}
     if json:
-        print_json({
+        cli.print_json({
             kind: [one._asdict() | {"path": str(one.path)} for one in some]
             for kind, some in shipped.items()
         })  # fmt: skip

@@ -4,15 +4,16 @@ from typing import Annotated
 
 import typer
 
-from cosim.cli.command import FILES, JsonOption, command, print_json
-from noack.config.scenario_file import json_schema
+from cosim.cli import command as cli
+from noack.config.scenario import Scenario
+from noack.config.toml_file import json_schema
 from noack.core.errors import ExitStatus
 
 
-@command(FILES, 40, [
+@cli.command(cli.FILES, 40, [
     ("noack schema > scenario.schema.json", "for an editor that completes keys"),
-    ("noack schema --campaign", "of campaign files"),
-    ("noack schema --netem", "of the emulator's links files"),
+    ("noack schema --campaign", "the schema of campaign files"),
+    ("noack schema --netem", "the schema of the emulator's links files"),
 ])  # fmt: skip
 def schema(
     *,
@@ -22,17 +23,17 @@ def schema(
     campaign: Annotated[
         bool, typer.Option("--campaign", help="Print the schema of campaign files.")
     ] = False,
-    json: JsonOption = False,
+    json: cli.JsonOption = False,
 ) -> int:
     """Print the JSON Schema of scenario files, for editors."""
     if campaign:
         from cosim.studies.campaign.campaign_file import json_schema as campaign_schema
 
-        print_json(campaign_schema())
+        cli.print_json(campaign_schema())
     elif netem:
         from netem.words.links_file import json_schema as links_schema
 
-        print_json(links_schema())
+        cli.print_json(links_schema())
     else:
-        print_json(json_schema())
+        cli.print_json(json_schema(Scenario))
     return ExitStatus.OK

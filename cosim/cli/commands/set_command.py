@@ -8,15 +8,15 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from cosim.cli import command as cli
 from cosim.cli import completion
-from cosim.cli.command import RUNS, SESSION, JsonOption, command, print_json
 from noack.config.runtime_parameters import SHORT, full_key, text_of
 from noack.config.scenario_file import value_of
 from noack.core.errors import CallerError, ExitStatus
 
 
-@command(
-    RUNS, 45,
+@cli.command(
+    cli.RUNS, 45,
     [
         ("noack set", "list the runtime parameters and their values"),
         ("noack set loss.p 0.9", "lose nine in ten packets from now on"),
@@ -36,7 +36,7 @@ def set_(
         ),
     ] = None,
     *,
-    session: Annotated[str | None, SESSION] = None,
+    session: Annotated[str | None, cli.SESSION] = None,
     run: Annotated[
         Path | None,
         typer.Option(
@@ -45,7 +45,7 @@ def set_(
             autocompletion=completion.run_directories,
         ),
     ] = None,
-    json: JsonOption = False,
+    json: cli.JsonOption = False,
 ) -> int:
     """Change a live run: losses, M, trigger, set-point."""
     from noack.runtime.run_registry import find, request_change
@@ -53,7 +53,7 @@ def set_(
     wanted = parsed(settings or ())
     answer = request_change(find(session, run), wanted)
     if json:
-        print_json(answer)
+        cli.print_json(answer)
     elif wanted:
         console = Console()
         console.print(

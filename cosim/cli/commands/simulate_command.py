@@ -1,28 +1,25 @@
 """``noack simulate``: a run in virtual time."""
 
 from enum import StrEnum
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
-from cosim.cli.command import (
-    RUNS,
-    JsonOption,
-    ReportOption,
-    RunsOption,
-    ScenarioArgument,
-    SetOption,
-    VerboseOption,
-    command,
-    find_scenario,
-    print_json,
-)
+from cosim.cli import command as cli
 from cosim.cli.execute_run import RunOutput, finalize_run, warn_of_violations
-from cosim.record.run_directory import DEFAULT_RUNS
 from noack.config.scenario import Scenario
-from noack.config.scenario_file import load
 from noack.core.errors import ExitStatus
+from noack.core.number_format import number
+
+if TYPE_CHECKING:
+    from cosim.analysis.run_summary import Summary
+    from cosim.simulation.continuous.continuous_run import ContinuousRun
+
+_EVENTS_SHOWN = 40
 
 
 class TriggerMode(StrEnum):
@@ -32,15 +29,15 @@ class TriggerMode(StrEnum):
     CONTINUOUS = "continuous"
 
 
-@command(RUNS, 30, [
+@cli.command(cli.RUNS, 30, [
     ("noack simulate lane_following", "the processes of a live run, without sockets"),
     ("noack simulate lane_following --trigger continuous", "the paper's loop, exactly"),
     ("noack simulate reactor_petc --no-report --json", "print the summary as JSON"),
 ])  # fmt: skip
 def simulate(
-    scenario: ScenarioArgument,
+    scenario: cli.ScenarioArgument,
     *,
-    settings: SetOption = None,
+    settings: cli.SetOption = None,
     trigger: Annotated[
         TriggerMode,
         typer.Option(
@@ -48,16 +45,16 @@ def simulate(
             "continuous: at all times."
         ),
     ] = TriggerMode.SAMPLED,
-    runs: RunsOption = DEFAULT_RUNS,
-    report: ReportOption = True,
-    verbose: VerboseOption = False,
-    json: JsonOption = False,
+    runs: cli.RunsOption = cli.DEFAULT_RUNS,
+    report: cli.ReportOption = True,
+    verbose: cli.VerboseOption = False,
+    json: cli.JsonOption = False,
 ) -> int:
     """Run a scenario in virtual time: no sockets, no deadlines missed.
 
     The trigger, the losses and the controller are those of a live run.
     """
-    loaded = load(find_scenario(scenario), settings or ())
+    loaded = cli.load_scenario(scenario, settings)
     warn_of_violations(loaded)
     if trigger is TriggerMode.CONTINUOUS:
         return _simulate_continuously(loaded, json=json)
@@ -71,15 +68,47 @@ def simulate(
 
 def _simulate_continuously(scenario: Scenario, *, json: bool) -> int:
     from cosim.live.progress import PatientConsole
-    from cosim.output.continuous_table import print_run
     from cosim.simulation.continuous.continuous_report import document, run_continuous, summary
     from noack.config.resolution import resolve
 
     resolved = resolve(scenario)
     with PatientConsole(stderr=True).status("simulating"):
         run = run_continuous(resolved)
+    found = summary(run, resolved)
     if json:
-        print_json(document(run, resolved))
+        cli.print_json(document(run, resolved))
     else:
-        print_run(Console(), run, resolved)
-    return ExitStatus(summary(run, resolved)["exit"]["status"])
+        _print_run(Console(), run, found)
+    return ExitStatus(found["exit"]["status"])
+
+
+@np.errstate(all="ignore")  # a run may diverge
+def _print_run(console: Console, run: "ContinuousRun", found: "Summary") -> None:
+    """Print how the run ended, its key numbers, and its first 40 events."""
+    from cosim.output.run_tables import loss_and_interval_rows, number_table
+    from cosim.output.run_verdict import verdict
+
+    for line in verdict(found)[:2]:  # without claims
+        console.print(Text(line.text, line.style), soft_wrap=True)
+    rows = (
+        *loss_and_interval_rows(found),
+        ("‖x‖ at the start", number(found["initial_state_norm"])),
+        ("‖x‖ at the end", number(found["final_state_norm"])),
+    )
+    console.print(number_table(found, rows))
+    table = Table(title="events")
+    for heading in ("event", "t, s", "inter-event time, s", "fate", "‖x‖", "‖e_c‖ before"):
+        table.add_column(heading, justify="right")
+    since_s = np.diff(run.event_s, prepend=0.0)
+    for i, state in enumerate(run.before[:_EVENTS_SHOWN]):
+        table.add_row(
+            str(i),
+            f"{state.t_s:.9f}",
+            f"{since_s[i]:.9f}" if i else "",
+            "delivered" if run.delivered[i] else "[red]lost[/]",
+            number(float(np.linalg.norm(state.x)), 4),
+            number(float(run.system.norms(state.e_c[None])[0]), 4),
+        )
+    console.print(table)
+    if len(run.before) > _EVENTS_SHOWN:
+        console.print(f"and {len(run.before) - _EVENTS_SHOWN} more events: --json has them all")

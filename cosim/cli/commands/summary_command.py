@@ -2,30 +2,22 @@
 
 from rich.console import Console
 
-from cosim.cli.command import (
-    RUNS,
-    JsonOption,
-    RunArgument,
-    RunsOption,
-    VerboseOption,
-    command,
-    print_json,
-)
-from cosim.record.run_directory import DEFAULT_RUNS, chosen_run
+from cosim.cli import command as cli
+from cosim.record.run_directory import chosen_run
 from noack.core.errors import ExitStatus
 
 
-@command(RUNS, 50, [
+@cli.command(cli.RUNS, 50, [
     ("noack summary", "the last run"),
     ("noack summary --verbose", "with timing, assumptions and each claim"),
     ("noack summary runs/latest --json", "all numbers, as JSON"),
 ])  # fmt: skip
 def summary(
-    run_dir: RunArgument = None,
+    run_dir: cli.RunArgument = None,
     *,
-    runs: RunsOption = DEFAULT_RUNS,
-    verbose: VerboseOption = False,
-    json: JsonOption = False,
+    runs: cli.RunsOption = cli.DEFAULT_RUNS,
+    verbose: cli.VerboseOption = False,
+    json: cli.JsonOption = False,
 ) -> int:
     """Show a run's summary; finalise an interrupted run first.
 
@@ -36,7 +28,7 @@ def summary(
 
     outcome = reopen(chosen_run(run_dir, runs))
     if json:
-        print_json(outcome.summary)
+        cli.print_json(outcome.summary)
     else:
         print_outcome(Console(), outcome, verbose=verbose)
     return ExitStatus.OK

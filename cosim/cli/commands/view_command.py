@@ -5,13 +5,13 @@ from typing import Annotated
 
 import typer
 
+from cosim.cli import command as cli
 from cosim.cli import completion
-from cosim.cli.command import RUNS, JsonOption, RunsOption, command, print_json
-from cosim.record.run_directory import DEFAULT_RUNS, RECORDING_FILE, chosen_run
+from cosim.record.run_directory import RECORDING_FILE, chosen_run
 from noack.core.errors import ExitStatus
 
 
-@command(RUNS, 40, [
+@cli.command(cli.RUNS, 40, [
     ("noack view", "the last run, in a window if there is a display"),
     ("noack view runs/latest --web", "in a browser on this machine"),
 ])  # fmt: skip
@@ -24,11 +24,11 @@ def view(
         ),
     ] = None,
     *,
-    runs: RunsOption = DEFAULT_RUNS,
+    runs: cli.RunsOption = cli.DEFAULT_RUNS,
     web: Annotated[
         bool, typer.Option("--web", help="Show it in a browser on this machine.")
     ] = False,
-    json: JsonOption = False,
+    json: cli.JsonOption = False,
 ) -> int:
     """Show a run in the rerun viewer."""
     from cosim.output.viewer.live_viewer import view_recording
@@ -36,7 +36,7 @@ def view(
     path = chosen_run(recording, runs)
     path = path / RECORDING_FILE if path.is_dir() else path
     if json:
-        print_json({"recording": str(path), "exists": path.is_file()})
+        cli.print_json({"recording": str(path), "exists": path.is_file()})
         return ExitStatus.OK if path.is_file() else ExitStatus.CALLER
     view_recording(path, native=False if web else None)
     return ExitStatus.OK

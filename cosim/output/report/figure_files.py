@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from cosim.output.report.figure_style import GRID, INK, PAPER, settings
 from noack.core.errors import CallerError
-from noack.core.whole_file import write_whole
+from noack.core.file_access import write_whole
 
 _UNDATED: dict[str, dict[str, str | None]] = {
     "svg": {"Date": None, "Creator": None, "Format": None, "Type": None},

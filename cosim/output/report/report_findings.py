@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 from cosim.analysis.fidelity import is_against
-from cosim.analysis.replay.replay_result import ReplayDifference
+from cosim.analysis.summary_model import ReplayDifference
 from noack.core.number_format import percent
 
 FIDELITY, REPLAY = "Fidelity", "Replay"

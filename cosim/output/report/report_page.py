@@ -3,39 +3,65 @@
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from cosim.analysis.fidelity import is_against
+from cosim.analysis.summary_model import ReplayDifference
 from cosim.output.remarks import remarks
-from cosim.output.report.report_findings import findings
-from cosim.output.run_tables import interval_of, key_numbers
+from cosim.output.report.figure_files import inline
+from cosim.output.report.run_figures import Envelope, RunFigure, pictures
+from cosim.output.run_tables import TIMING_HEADINGS, interval_of, key_numbers, timing_rows
+from cosim.output.run_verdict import BAD, GOOD, NEUTRAL, verdict
+from cosim.record.run_directory import ENVIRONMENT_FILE, REPORT_FILE, SCENARIO_FILE, read_object
+from cosim.record.run_record import RunRecord
 from noack.config.scenario import Scenario
-from noack.core.number_format import whole
+from noack.core.file_access import write_whole
+from noack.core.number_format import number, percent
 
 _NONE = "–"
 _TONES = {
-    "held": "good", "holds": "good",
-    "violated": "bad",
+    "held": "good", "holds": "good", GOOD: "good",
+    "violated": "bad", BAD: "bad",
     "void": "doubt",
 }  # fmt: skip
-_QUANTILES = {"p50": "p50", "p99": "p99", "p999": "p99.9", "max": "max"}
 
 
-class Embedded(NamedTuple):
-    """A figure of the page."""
+def write_report(
+    record: RunRecord,
+    summary: Mapping[str, Any],
+    run_dir: Path,
+    envelopes: Sequence[Envelope] = (),
+) -> Path:
+    """Write the report of a run; replace an existing one.
 
-    name: str
-    markup: Markup
-    caption: str
+    Args:
+        record: the run's record.
+        summary: the run's summary.
+        run_dir: the run's directory.
+        envelopes: certified bounds, drawn with the quantities that they bound.
+
+    Returns:
+        The report's path.
+
+    Raises:
+        MachineError: the report cannot be written.
+    """
+    drawings = pictures(record, envelopes, timed=summary["kind"] == "live")
+    scenario_toml = (run_dir / SCENARIO_FILE).read_text(encoding="utf-8")
+    environment = read_object(run_dir / ENVIRONMENT_FILE)
+    figures = [draw() for draw in drawings.values()]
+    html = page(record.scenario, summary, figures, scenario_toml, environment)
+    return write_whole(run_dir / REPORT_FILE, html)
 
 
 def page(
     scenario: Scenario,
     summary: Mapping[str, Any],
-    figures: Sequence[Embedded],
+    figures: Sequence[RunFigure],
     scenario_toml: str,
     environment: Mapping[str, Any],
 ) -> str:
@@ -48,31 +74,29 @@ def page(
         scenario_toml: the resolved scenario, as stored in the run directory.
         environment: the content of ``environment.json``; empty if there is none.
     """
-    claims = _objects(summary.get("claims"))
-    remarks_shown = list(_remarks(summary, claims))
-    status = summary["exit"]["status"]
-    kind = "simulated run" if summary.get("kind") == "simulated" else "live run"
-    hold = "model-based" if scenario.mode == "model" else "zero-order hold"
+    content = dict(summary)
+    lines, remarks_shown = verdict(content), [remark.text for remark in remarks(content)]
+    styles = {line.style for line in lines} - {NEUTRAL}
+    tone = "bad" if BAD in styles else "good" if styles == {GOOD} and not remarks_shown else "doubt"
+    replay = summary.get("replay") or {}
     return templates().get_template("report.html.jinja").render(
-        title=scenario.name,
-        subtitle=", ".join(
-            filter(None, (kind, hold, f"M − 1 = {scenario.network.mansd}", _started(environment)))
-        ),
-        description=scenario.description,
-        ending=_ending(summary),
-        verdict_tone="bad" if status else "doubt" if remarks_shown else "good",
+        scenario=scenario,
+        summary=summary,
+        verdict_lines=[line.text for line in lines],
+        verdict_tone=tone,
         remarks=remarks_shown,
         # These have their own sections.
         key_numbers=key_numbers({**summary, "fidelity": None, "replay": None}),
         parameters=list(_parameters(scenario)),
         figures=figures,
-        claims=[_claim(claim) for claim in claims],
-        assumptions=_objects(summary.get("assumptions")),
-        timing=list(_timing(summary)),
-        timing_headings=[*_QUANTILES.values(), "count", "deadlines missed"],
-        findings=list(findings(summary)),
+        timing=list(timing_rows(content)),
+        timing_headings=TIMING_HEADINGS,
+        replay=replay,
+        replay_difference=replay.get("bit_exact") is False
+        and ReplayDifference(**replay["first_difference"]),
         scenario_toml=scenario_toml,
-        environment=[(_words(key), _line(value)) for key, value in environment.items()],
+        environment=environment,
+        environment_rows=[(_words(key), _line(value)) for key, value in environment.items()],
     )  # fmt: skip
 
 
@@ -86,27 +110,15 @@ def templates(folder: Path = Path(__file__).parent) -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    found.filters["tone"] = lambda word: _TONES.get(word, "")
+    filters: dict[str, Any] = {
+        "tone": lambda word: _TONES.get(word, ""),
+        "inline": lambda one: Markup(inline(one.figure, one.name, one.description)),
+        "interval": interval_of, "number": number, "percent": percent, "shown": _shown,
+        "words": _words,
+    }  # fmt: skip
+    found.filters |= filters
+    found.tests["is_against"] = is_against
     return found
-
-
-def _ending(summary: Mapping[str, Any]) -> str:
-    end = summary["exit"]
-    if not end["status"]:
-        return f"The run completed its {_shown(summary['horizon_s'])} s."
-    return (
-        f"The run failed (exit status {end['status']}): {end['reason']}. "
-        f"It reached {_shown(summary['reached_s'])} of {_shown(summary['horizon_s'])} s."
-    )
-
-
-def _remarks(summary: Mapping[str, Any], claims: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Yield the remarks that limit the validity of the rest."""
-    yield from (remark.text for remark in remarks(dict(summary)))
-    for verdict in ("violated", "void"):
-        count = sum(claim.get("verdict") == verdict for claim in claims)
-        if count:
-            yield f"{count} of {len(claims)} claims are {verdict}: see Claims"
 
 
 def _parameters(scenario: Scenario) -> Iterator[tuple[str, str]]:
@@ -137,42 +149,6 @@ def _parameters(scenario: Scenario) -> Iterator[tuple[str, str]]:
     yield "‖x(0)‖", f"{np.linalg.norm(x0):.4g}, {len(x0)} states"
     seeds = scenario.seeds
     yield "seeds", f"plant {seeds.plant}, initial state {seeds.initial_state}, loss {seeds.loss}"
-
-
-def _claim(claim: Mapping[str, Any]) -> dict[str, str]:
-    texts = {key: _text(claim, key) for key in ("what", "source", "bound", "verdict", "why")}
-    numbers = {key: _shown(claim.get(key)) for key in ("certified", "observed")}
-    ratio = claim.get("ratio")
-    numbers["ratio"] = f"{100 * ratio:.3g} %" if isinstance(ratio, float) else _shown(ratio)
-    since_s = claim.get("since_s")
-    since = "" if since_s is None else f"t = {_shown(since_s)} s"
-    return texts | numbers | {"since": since, "interval": interval_of(dict(claim))}
-
-
-def _text(mapping: Mapping[str, Any], key: str) -> str:
-    value = mapping.get(key)
-    return "" if value is None else str(value)
-
-
-def _timing(summary: Mapping[str, Any]) -> Iterator[tuple[str, list[str]]]:
-    if summary.get("kind") == "simulated":
-        return
-    for role, late in (summary.get("lateness_us") or {}).items():
-        counts = [str(late["steps"]), str(late["late_steps"])]
-        yield f"{role} lateness", [*(whole(late[key]) for key in _QUANTILES), *counts]
-    latency = summary.get("latency_us")
-    if latency:
-        quantiles = [whole(latency[key]) for key in _QUANTILES]
-        yield "sensor-to-controller latency", [*quantiles, str(latency["updates"]), ""]
-
-
-def _started(environment: Mapping[str, Any]) -> str:
-    started = environment.get("started")
-    return f"started {started}" if started else ""
-
-
-def _objects(value: Any) -> list[dict[str, Any]]:
-    return [entry for entry in value if isinstance(entry, dict)] if isinstance(value, list) else []
 
 
 def _words(key: str) -> str:

@@ -1,6 +1,6 @@
 """The figures of a run, drawn from its record."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Literal, NamedTuple
 
@@ -11,7 +11,7 @@ from cosim.analysis.timing_statistics import latency_us, lateness_us
 from cosim.output.report import signal_figures
 from cosim.output.report.axes import Bound, BoundKind
 from cosim.output.report.decimate import Reals
-from cosim.record.align import AlignedRun, join_all
+from cosim.record.align import AlignedRun, align_tables
 from cosim.record.estimation_error import true_states
 from cosim.record.packet_outcomes import packet_outcomes
 from cosim.record.run_record import RunRecord
@@ -45,13 +45,6 @@ BOUNDED = ("errors", "state-norm", "inter-event")
 """The figures that show certified bounds."""
 
 
-def run_figures(
-    record: RunRecord, envelopes: Sequence[Envelope] = (), *, timed: bool = True
-) -> Iterator[RunFigure]:
-    """Draw the figures of a run, as :func:`pictures` lists them."""
-    return (draw() for draw in pictures(record, envelopes, timed=timed).values())
-
-
 def pictures(
     record: RunRecord, envelopes: Sequence[Envelope] = (), *, timed: bool | None = None
 ) -> dict[str, Callable[[], RunFigure]]:
@@ -66,7 +59,7 @@ def pictures(
     @cache
     def joined() -> AlignedRun:
         with np.errstate(all="ignore"):  # a diverged run has figures, too
-            return join_all(record)
+            return align_tables(record)
 
     found = {
         "states": lambda: _states(record, joined()),

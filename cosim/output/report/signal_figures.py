@@ -17,30 +17,7 @@ from numpy.typing import NDArray
 
 from cosim.analysis.fidelity import Fidelity
 from cosim.output import palette
-from cosim.output.report.axes import (
-    BELOW_IN,
-    LEFT_IN,
-    RIGHT_IN,
-    TIME,
-    WIDTH_IN,
-    Bound,
-    Shown,
-    bound_styles,
-    bounds,
-    finish,
-    finite,
-    for_log_axis,
-    head_in,
-    legend,
-    limit_log_axis,
-    line,
-    logarithmic,
-    marks,
-    place,
-    plain,
-    single,
-    stems,
-)
+from cosim.output.report import axes as draw
 from cosim.output.report.decimate import Reals
 from cosim.output.report.figure_style import PAPER, NotebookFigure, printed, styled
 
@@ -97,8 +74,8 @@ def paper_figure(
     for i, axes in enumerate(panels):
         known = None if x_hat is None else x_hat[:, i]
         shown = _state(axes, t_s, x[:, i], x_s[:, i], x_c[:, i], known)
-        axes.set_ylabel(plain(state_names[i]))
-        finish(axes, t_s)
+        axes.set_ylabel(draw.plain(state_names[i]))
+        draw.finish(axes, t_s)
     _heading(figure, mode, title, f"{drawn} of {n} states" if drawn < n else "", shown)
     _broadcasts(above, broadcast_s, dropped)
     _receptions(below, received_s, forced, broadcast_s[dropped])
@@ -106,8 +83,8 @@ def paper_figure(
     for axes in (above, below):
         axes.set_ylabel("interval [s]")
         axes.set_ylim(bottom=0)
-        finish(axes, t_s)
-    below.set_xlabel(TIME)
+        draw.finish(axes, t_s)
+    below.set_xlabel(draw.TIME)
     figure.align_ylabels()
     return figure
 
@@ -116,76 +93,80 @@ def _paper_panels(states: int) -> tuple[Figure, list[Axes], Axes, Axes]:
     """Place the panels of the states, of the broadcasting and of the receiving intervals."""
     columns = states if states <= 3 else 2 if states == 4 else 3 if states <= 12 else 4
     rows = math.ceil(states / columns)
-    height_in, interval_in, head = (1.45 if rows <= 2 else 1.15), 1.2, head_in(())
-    width_in = (WIDTH_IN - RIGHT_IN) / columns - LEFT_IN
+    height_in, interval_in, head = (1.45 if rows <= 2 else 1.15), 1.2, draw.head_in(())
+    width_in = (draw.WIDTH_IN - draw.RIGHT_IN) / columns - draw.LEFT_IN
     # If the last row is not full, the time axes of the row above need room for their numbers.
-    gaps_in = [0.22] * (rows - 2) + [0.22 if states % columns == 0 else BELOW_IN] * (rows > 1)
+    gaps_in = [0.22] * (rows - 2) + [0.22 if states % columns == 0 else draw.BELOW_IN] * (rows > 1)
     tops_in = [head + i * height_in + sum(gaps_in[:i]) for i in range(rows)]
-    above_in = tops_in[-1] + height_in + BELOW_IN + head
+    above_in = tops_in[-1] + height_in + draw.BELOW_IN + head
     below_in = above_in + interval_in + head
-    figure = NotebookFigure(figsize=(WIDTH_IN, below_in + interval_in + BELOW_IN))
+    figure = NotebookFigure(figsize=(draw.WIDTH_IN, below_in + interval_in + draw.BELOW_IN))
     panels = []
     for i in range(states):
         row, column = divmod(i, columns)
-        left_in = LEFT_IN + column * (LEFT_IN + width_in)
-        axes = place(figure, left_in, tops_in[row], width_in, height_in)
+        left_in = draw.LEFT_IN + column * (draw.LEFT_IN + width_in)
+        axes = draw.place(figure, left_in, tops_in[row], width_in, height_in)
         axes.tick_params(labelbottom=i + columns >= states)
-        axes.set_xlabel(TIME if i + columns >= states else "")
+        axes.set_xlabel(draw.TIME if i + columns >= states else "")
         panels.append(axes)
-    whole_in = WIDTH_IN - LEFT_IN - RIGHT_IN
-    above = place(figure, LEFT_IN, above_in, whole_in, interval_in)
-    below = place(figure, LEFT_IN, below_in, whole_in, interval_in, sharex=above, sharey=above)
+    whole_in = draw.WIDTH_IN - draw.LEFT_IN - draw.RIGHT_IN
+    above = draw.place(figure, draw.LEFT_IN, above_in, whole_in, interval_in)
+    below = draw.place(
+        figure, draw.LEFT_IN, below_in, whole_in, interval_in, sharex=above, sharey=above
+    )
     return figure, panels, above, below
 
 
 def _state(
     axes: Axes, t_s: Reals, x: Reals, x_s: Reals, x_c: Reals, x_hat: Reals | None
-) -> list[Shown]:
+) -> list[draw.Shown]:
     """Draw one state; later curves are thinner, so that equal curves stay visible."""
-    plant = line(axes, t_s, finite(x), "$x$ plant", color=_PLANT, linewidth=4.2)
-    controller = line(axes, t_s, finite(x_c), "$x_c$ controller", color=_CONTROLLER, linewidth=2.4)
-    sensor = line(axes, t_s, finite(x_s), "$x_s$ sensor", color=_SENSOR, linewidth=1.3)
-    known: list[Shown] = []
+    plant = draw.line(axes, t_s, draw.finite(x), "$x$ plant", color=_PLANT, linewidth=4.2)
+    controller = draw.line(
+        axes, t_s, draw.finite(x_c), "$x_c$ controller", color=_CONTROLLER, linewidth=2.4
+    )
+    sensor = draw.line(axes, t_s, draw.finite(x_s), "$x_s$ sensor", color=_SENSOR, linewidth=1.3)
+    known: list[draw.Shown] = []
     if x_hat is not None:
         style: dict[str, Any] = {"color": _SENSOR, "linewidth": 1.0, "linestyle": (0, (1, 1))}
-        known = line(axes, t_s, finite(x_hat), r"$\hat{x}$ sensor", **style)
+        known = draw.line(axes, t_s, draw.finite(x_hat), r"$\hat{x}$ sensor", **style)
     return [*plant, *known, *sensor, *controller]
 
 
-def _heading(figure: Figure, mode: str, title: str, note: str, shown: Sequence[Shown]) -> None:
+def _heading(figure: Figure, mode: str, title: str, note: str, shown: Sequence[draw.Shown]) -> None:
     """Write title and legend above all states."""
     head = "MB-ET" if mode == "model" else "ZOH-ET"
-    text = ": ".join(filter(None, (head, plain(title, _LONGEST_TITLE)))) + (
+    text = ": ".join(filter(None, (head, draw.plain(title, _LONGEST_TITLE)))) + (
         f" ({note})" if note else ""
     )
     y = 1 - 0.09 / figure.get_figheight()
-    figure.text(LEFT_IN / WIDTH_IN, y, text, weight="bold", size=10.5, va="top")
+    figure.text(draw.LEFT_IN / draw.WIDTH_IN, y, text, weight="bold", size=10.5, va="top")
     handles, labels = zip(*shown, strict=True)
-    corner = (1 - RIGHT_IN / WIDTH_IN, 1 - 0.06 / figure.get_figheight())
+    corner = (1 - draw.RIGHT_IN / draw.WIDTH_IN, 1 - 0.06 / figure.get_figheight())
     figure.legend(handles, labels, loc="upper right", bbox_to_anchor=corner, ncols=len(labels))
 
 
 def _broadcasts(axes: Axes, t_s: Reals, dropped: Flags) -> None:
     interval_s = _intervals(t_s)
-    stems(axes, t_s, interval_s, color=_SENSOR)
+    draw.stems(axes, t_s, interval_s, color=_SENSOR)
     lost: dict[str, Any] = {"color": _LOST, "marker": "x", "size": 6.5, "markeredgewidth": 1.8}
-    shown = marks(axes, t_s[~dropped], interval_s[~dropped], "sent", color=_SENSOR, marker="o")
-    shown += marks(axes, t_s[dropped], interval_s[dropped], "sent, lost", **lost)
+    shown = draw.marks(axes, t_s[~dropped], interval_s[~dropped], "sent", color=_SENSOR, marker="o")
+    shown += draw.marks(axes, t_s[dropped], interval_s[dropped], "sent, lost", **lost)
     axes.set_title("Broadcasting intervals")
-    legend(axes, shown)
+    draw.legend(axes, shown)
 
 
 def _receptions(axes: Axes, t_s: Reals, forced: Flags, dropped_s: Reals) -> None:
     interval_s = _intervals(t_s)
-    stems(axes, t_s, interval_s, color=_CONTROLLER)
+    draw.stems(axes, t_s, interval_s, color=_CONTROLLER)
     diamond: dict[str, Any] = {"color": _FORCED, "marker": "D", "size": 6.0}
     lost: dict[str, Any] = {"color": _LOST, "marker": "x", "size": 5.0, "zorder": 3}
     free = ~forced
-    shown = marks(axes, t_s[free], interval_s[free], "received", color=_CONTROLLER, marker="o")
-    shown += marks(axes, t_s[forced], interval_s[forced], "received, forced", **diamond)
-    shown += marks(axes, dropped_s, np.zeros(len(dropped_s)), "lost", **lost)
+    shown = draw.marks(axes, t_s[free], interval_s[free], "received", color=_CONTROLLER, marker="o")
+    shown += draw.marks(axes, t_s[forced], interval_s[forced], "received, forced", **diamond)
+    shown += draw.marks(axes, dropped_s, np.zeros(len(dropped_s)), "lost", **lost)
     axes.set_title("Receiving intervals")
-    legend(axes, shown)
+    draw.legend(axes, shown)
 
 
 def _intervals(t_s: Reals) -> Reals:
@@ -199,7 +180,7 @@ def error_figure(
     e_s_norm: Reals,
     threshold: Reals,
     e_c_norm: Reals,
-    envelopes: Sequence[Bound] = (),
+    envelopes: Sequence[draw.Bound] = (),
 ) -> Figure:
     """‖e_s‖ with its threshold, and ‖e_c‖ with its bounds, on a logarithmic axis.
 
@@ -211,8 +192,8 @@ def error_figure(
         envelopes: certified bounds on ‖e_c‖.
     """
     labels = [*_ERRORS, *(label for label, *_ in envelopes)]
-    figure, (axes,) = single(2.7, labels)
-    logarithmic(axes, "y")
+    figure, (axes,) = draw.single(2.7, labels)
+    draw.logarithmic(axes, "y")
     shown = []
     for label, values, colour, width in zip(
         _ERRORS,
@@ -222,14 +203,14 @@ def error_figure(
         strict=True,
     ):
         style = {"color": colour, "linewidth": width}
-        shown += line(axes, t_s, for_log_axis(values), label, **style)
-    shown += bounds(axes, envelopes)
+        shown += draw.line(axes, t_s, draw.for_log_axis(values), label, **style)
+    shown += draw.bounds(axes, envelopes)
     measured = np.concatenate([e_s_norm, e_c_norm, threshold])
     return _norms(figure, axes, t_s, measured, "Error norms", shown)
 
 
 @styled
-def state_norm_figure(t_s: Reals, x_norm: Reals, envelopes: Sequence[Bound] = ()) -> Figure:
+def state_norm_figure(t_s: Reals, x_norm: Reals, envelopes: Sequence[draw.Bound] = ()) -> Figure:
     """‖x‖ with its bounds, on a logarithmic axis.
 
     Args:
@@ -237,11 +218,11 @@ def state_norm_figure(t_s: Reals, x_norm: Reals, envelopes: Sequence[Bound] = ()
         x_norm: (k,) ‖x‖.
         envelopes: certified bounds on ‖x‖.
     """
-    figure, (axes,) = single(2.1, [_STATE, *(label for label, *_ in envelopes)])
-    logarithmic(axes, "y")
+    figure, (axes,) = draw.single(2.1, [_STATE, *(label for label, *_ in envelopes)])
+    draw.logarithmic(axes, "y")
     style = {"color": _PLANT, "linewidth": 2.4}
-    shown = line(axes, t_s, for_log_axis(x_norm), _STATE, **style)
-    shown += bounds(axes, envelopes)
+    shown = draw.line(axes, t_s, draw.for_log_axis(x_norm), _STATE, **style)
+    shown += draw.bounds(axes, envelopes)
     return _norms(figure, axes, t_s, x_norm, "Norm of the state", shown)
 
 
@@ -249,10 +230,10 @@ def _norms(
     figure: Figure, axes: Axes, t_s: Reals, measured: Reals, title: str, shown: list[Any]
 ) -> Figure:
     """Label a figure of norms, and limit its axis: resets fall to rounding errors."""
-    legend(axes, shown)
-    axes.set(title=title, xlabel=TIME, ylabel="norm")
-    finish(axes, t_s)
-    limit_log_axis(axes, measured, _DECADES)
+    draw.legend(axes, shown)
+    axes.set(title=title, xlabel=draw.TIME, ylabel="norm")
+    draw.finish(axes, t_s)
+    draw.limit_log_axis(axes, measured, _DECADES)
     return figure
 
 
@@ -266,8 +247,8 @@ def input_figure(t_s: Reals, u: Reals, input_names: Sequence[str]) -> Figure:
         input_names: m names.
     """
     m = len(input_names)
-    names = [plain(name) for name in input_names]
-    figure, (axes,) = single(1.7, names)
+    names = [draw.plain(name) for name in input_names]
+    figure, (axes,) = draw.single(1.7, names)
     shown = []
     for i, name in enumerate(names):
         style = {
@@ -277,10 +258,10 @@ def input_figure(t_s: Reals, u: Reals, input_names: Sequence[str]) -> Figure:
             "linewidth": 1.3 + 2.6 * (m - 1 - i) / m,
             "drawstyle": "steps-post",
         }
-        shown += line(axes, t_s, finite(u[:, i]), name, **style)
-    legend(axes, shown)
-    axes.set(title=r"Control input $u = K x_c$", xlabel=TIME, ylabel="input")
-    finish(axes, t_s)
+        shown += draw.line(axes, t_s, draw.finite(u[:, i]), name, **style)
+    draw.legend(axes, shown)
+    axes.set(title=r"Control input $u = K x_c$", xlabel=draw.TIME, ylabel="input")
+    draw.finish(axes, t_s)
     return figure
 
 
@@ -292,20 +273,20 @@ def lateness_figure(lateness_us: Mapping[str, Reals], period_us: float | None = 
         lateness_us: by process, (k,) lateness of each of its steps in wall µs.
         period_us: the plant's period in wall µs, beyond which a step counts as late.
     """
-    figure, (axes,) = single(2.5, [*lateness_us, _PERIOD])
-    logarithmic(axes, "x")
-    logarithmic(axes, "y")
+    figure, (axes,) = draw.single(2.5, [*lateness_us, _PERIOD])
+    draw.logarithmic(axes, "x")
+    draw.logarithmic(axes, "y")
     shown = []
     for i, (process, late_us) in enumerate(lateness_us.items()):
         colour = palette.PROCESSES.get(process, palette.SERIES[i % len(palette.SERIES)])
         style = {"color": printed(colour), "linestyle": _DASHES[i % len(_DASHES)], "linewidth": 1.8}
         (drawn,) = axes.plot(*_later_than(late_us), drawstyle="steps-pre", **style)
-        shown.append((drawn, plain(process)))
-    finish(axes)
+        shown.append((drawn, draw.plain(process)))
+    draw.finish(axes)
     if period_us is not None:
         rule = axes.axvline(period_us, color=_THRESHOLD, linewidth=1.2, linestyle=(0, (4, 3)))
         shown.append((rule, _PERIOD))
-    legend(axes, shown)
+    draw.legend(axes, shown)
     axes.set(
         title="Lateness", xlabel="lateness [wall µs]", ylabel="share of steps at least as late"
     )
@@ -314,7 +295,7 @@ def lateness_figure(lateness_us: Mapping[str, Reals], period_us: float | None = 
 
 def _later_than(values: Reals) -> tuple[Reals, Reals]:
     """Return values in ascending order, and for each the share of values at least as large."""
-    values = finite(values)
+    values = draw.finite(values)
     values = np.maximum(np.sort(values[np.isfinite(values)]), _SHORTEST_US)
     k = len(values)
     if not k:
@@ -344,19 +325,19 @@ def latency_figure(t_s: Reals, latency_us: Reals, until_s: float | None = None) 
 def fidelity_figure(found: Fidelity) -> Figure:
     """Change of x by each effect, over time: ‖x_(with the effect) − x_(without)‖."""
     names = [stage.name for stage in found.stages]
-    figure, (axes,) = single(2.7, names)
-    logarithmic(axes, "y")
+    figure, (axes,) = draw.single(2.7, names)
+    draw.logarithmic(axes, "y")
     shown = []
     for i, (name, norms) in enumerate(zip(names, found.stage_norms, strict=True)):
         style = {"color": printed(palette.SERIES[i]), "linestyle": _DASHES[i], "linewidth": 1.6}
-        shown += line(axes, found.t_s, for_log_axis(norms), name, **style)
-    title = f"{plain(found.scenario, _LONGEST_TITLE)}: effects on x"
+        shown += draw.line(axes, found.t_s, draw.for_log_axis(norms), name, **style)
+    title = f"{draw.plain(found.scenario, _LONGEST_TITLE)}: effects on x"
     return _norms(figure, axes, found.t_s, found.stage_norms, title, shown)
 
 
 @styled
 def inter_event_figure(
-    broadcast_s: Reals, lower_bounds: Sequence[Bound] = (), until_s: float | None = None
+    broadcast_s: Reals, lower_bounds: Sequence[draw.Bound] = (), until_s: float | None = None
 ) -> Figure:
     """Inter-event times t_i − t_{i−1} over time, with a histogram.
 
@@ -375,28 +356,30 @@ def _over_time(
     t_s: Reals,
     values: Reals,
     colour: Any,
-    lower_bounds: Sequence[Bound],
+    lower_bounds: Sequence[draw.Bound],
     until_s: float | None,
 ) -> tuple[Figure, Axes]:
     """Draw values over time, and their histogram on the same logarithmic axis."""
-    values = finite(values, positive=True)
-    figure, (axes, beside) = single(2.1, [label for label, *_ in lower_bounds], beside_in=2.0)
-    logarithmic(axes, "y")
-    shown = bounds(axes, lower_bounds)
-    marks(axes, t_s, values, color=colour, marker="o", markeredgecolor=PAPER, markeredgewidth=0.5)
-    legend(axes, shown)
+    values = draw.finite(values, positive=True)
+    figure, (axes, beside) = draw.single(2.1, [label for label, *_ in lower_bounds], beside_in=2.0)
+    draw.logarithmic(axes, "y")
+    shown = draw.bounds(axes, lower_bounds)
+    draw.marks(
+        axes, t_s, values, color=colour, marker="o", markeredgecolor=PAPER, markeredgewidth=0.5
+    )
+    draw.legend(axes, shown)
     seen = values[np.isfinite(values)]
     if len(seen):
         low, high = math.log10(seen.min()), math.log10(seen.max())
         margin = max(0.05 * (high - low), 0.02)
         bins = np.logspace(low - margin, high + margin, 31).tolist()
         beside.hist(seen, bins, orientation="horizontal", color=colour, rwidth=0.9)
-    finish(axes, None if until_s is None else np.array([0.0, t_s.max(initial=until_s)]))
-    finish(beside)
-    for bound, style in zip(lower_bounds, bound_styles(lower_bounds), strict=True):
+    draw.finish(axes, None if until_s is None else np.array([0.0, t_s.max(initial=until_s)]))
+    draw.finish(beside)
+    for bound, style in zip(lower_bounds, draw.bound_styles(lower_bounds), strict=True):
         if len(bound.values):
             beside.axhline(float(np.min(bound.values)), **style)
-    axes.set_xlabel(TIME)
+    axes.set_xlabel(draw.TIME)
     beside.set_xlabel("count")
     beside.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=5))
     return figure, axes

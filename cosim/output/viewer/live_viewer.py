@@ -153,9 +153,9 @@ def _host(path: Path, *, native: bool, commands: Iterable[str]) -> None:
         print(_WINDOW if window is not None else server.start_page(), flush=True)
         keep = False
         for command in commands:
-            server.finish()
+            server.finished.set()
             keep = command.strip() == "keep"
-        server.finish()
+        server.finished.set()
         if keep:
             threading.Event().wait()
         server.drain()

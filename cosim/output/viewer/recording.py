@@ -73,7 +73,6 @@ class RunView(RecordingFile):
         super().__init__(path, run_id, layout, indexed=indexed)
         self._states = [bp.state_path(name) for name in state_names]
         self._lateness = {name: bp.lateness_path(name) for name in processes}
-        self._n, self._m = len(state_names), len(input_names)
         self._picture, self._diagram, self._live = picture, diagram, live
         self._frame = -1
         self._waiting: list[tuple[Nanoseconds, Frames]] = []
@@ -95,23 +94,16 @@ class RunView(RecordingFile):
             e_c_bounds: (k, 2) bounds of ‖e_c‖, from (I1) and certified; NaN for none.
             x_bound: (k,) certified bound of ‖x‖; NaN for none.
         """
-        t_ns, k = aligned.t_ns, len(aligned.t_ns)
-        states = [
-            _shaped(name, getattr(aligned, name), (k, self._n)) for name in ("x", "x_s", "x_c")
-        ]
-        triples = np.stack(states, axis=2)
+        t_ns = aligned.t_ns
+        triples = np.stack([aligned.x, aligned.x_s, aligned.x_c], axis=2)
         for i, entity in enumerate(self._states):
             self.send(entity, t_ns, triples[:, i, :])
-        measured = [
-            _shaped(name, getattr(aligned, name), (k,))
-            for name in ("e_s_norm", "threshold", "e_c_norm")
-        ]
-        bounds = _shaped("e_c_bounds", e_c_bounds, (k, 2))
-        norms = np.column_stack([bounds[:, 0], *measured, bounds[:, 1]])
+        measured = (aligned.e_s_norm, aligned.threshold, aligned.e_c_norm)
+        norms = np.column_stack([e_c_bounds[:, 0], *measured, e_c_bounds[:, 1]])
         # On a linear scale, a certified bound would flatten everything else.
         self.send(bp.ERROR, t_ns, norms[:, :4])
         self.send(bp.ERROR_LOG10, t_ns, _log10(norms, aligned.threshold))
-        sizes = [np.linalg.norm(aligned.x, axis=1), _shaped("x_bound", x_bound, (k,))]
+        sizes = [np.linalg.norm(aligned.x, axis=1), x_bound]
         self.send(bp.SIZE_LOG10, t_ns, _log10(np.column_stack(sizes), aligned.threshold))
 
     def move(self, t_ns: Nanoseconds, frames: Frames) -> None:
@@ -162,11 +154,11 @@ class RunView(RecordingFile):
 
     def inputs(self, t_ns: Nanoseconds, u: Floats) -> None:
         """Add the control input u (k, m) at times (k,)."""
-        self.send(bp.INPUT, t_ns, _shaped("u", u, (len(t_ns), self._m)))
+        self.send(bp.INPUT, t_ns, u)
 
     def broadcasts(self, t_ns: Nanoseconds, interval_s: Floats) -> None:
         """Add events: times t_i (k,) and t_i − t_{i−1} in seconds (k,), NaN (drawn 0) for none."""
-        interval_s = np.nan_to_num(_shaped("interval_s", interval_s, (len(t_ns),)))
+        interval_s = np.nan_to_num(interval_s)
         self.send_stems(bp.EVENT_STEM, t_ns, interval_s)
         self.send(bp.EVENT, t_ns, interval_s)
 
@@ -178,7 +170,7 @@ class RunView(RecordingFile):
         A delivery is forced if M − 1 consecutive updates were lost before it. An interval that is
         NaN is drawn as 0.
         """
-        interval_s = np.nan_to_num(_shaped("interval_s", interval_s, (len(t_ns),)))
+        interval_s = np.nan_to_num(interval_s)
         forced = np.asarray(forced, dtype=bool)
         self.send_stems(bp.RECEPTION_STEM, t_ns, interval_s)
         self.send(bp.RECEPTION, t_ns[~forced], interval_s[~forced])
@@ -191,8 +183,7 @@ class RunView(RecordingFile):
     def lateness(self, process: str, t_ns: Nanoseconds, lateness_us: Floats) -> None:
         """Add a process's lateness in µs (k,) at times (k,), if it is shown."""
         if process in self._lateness:
-            values = _shaped("lateness_us", lateness_us, (len(t_ns),))
-            self.send(self._lateness[process], t_ns, values)
+            self.send(self._lateness[process], t_ns, lateness_us)
 
     def log(self, t_ns: int, level: str, text: str) -> None:
         """Add one line to the log; ``level`` is one of rerun's, such as INFO or WARN."""
@@ -213,13 +204,6 @@ class RunView(RecordingFile):
             if self._live is not None:
                 self._live.finish()
                 self._live = None
-
-
-def _shaped(name: str, value: Floats, shape: tuple[int, ...]) -> Floats:
-    value = np.asarray(value, dtype=np.float64)
-    if value.shape != shape:
-        raise ValueError(f"{name}: expected shape {shape}, found {value.shape}")
-    return value
 
 
 def _log10(norms: Floats, threshold: Floats) -> Floats:

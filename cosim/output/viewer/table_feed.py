@@ -72,15 +72,12 @@ class ViewFeed:
         self._undrawn: list[Rows] = []
         self._forced: set[int] = set()
         self._monitor = ErrorMonitor(self._loop.H, policy_of(scenario))
-        own = dict(self._types[PLANT_STEP].fields or {}).get("z")
-        self._own = None if own is None else (np.zeros(0, np.int64), np.zeros((0, *own[0].shape)))
-        self._told = np.zeros(0, self._types[CONTROLLER_SETTING])
-        self._flow = model_flow(scenario, self._told)
+        # Plant steps whose x or z is shown with the measurements at their times.
+        self._steps = np.zeros(0, self._types[PLANT_STEP])
+        self._has_internal_state = "z" in (self._steps.dtype.names or ())
+        self._settings = np.zeros(0, self._types[CONTROLLER_SETTING])
+        self._flow = model_flow(scenario, self._settings)
         self._claimed_until_s = np.inf
-        # If the sensor does not measure x exactly, the plant's own x is shown.
-        self._plant: Rows | None = None
-        if not scenario.coverage.knows_state:
-            self._plant = np.zeros(0, self._types[PLANT_STEP])
         self._last_event_ns: int | None = None
         self._last_delivery_ns: int | None = None
 
@@ -98,10 +95,10 @@ class ViewFeed:
     @np.errstate(all="ignore")  # a run may diverge
     def advance(self, *, final: bool = False) -> None:
         """Pass on the complete batches; at the end, everything."""
-        if len(told := self._take(CONTROLLER_SETTING, None)):
-            self._told = np.concatenate([self._told, told])
-            self._flow = model_flow(self._scenario, self._told)
-            self._claimed_until_s = claimed_until_s(self._told)
+        if len(settings := self._take(CONTROLLER_SETTING, None)):
+            self._settings = np.concatenate([self._settings, settings])
+            self._flow = model_flow(self._scenario, self._settings)
+            self._claimed_until_s = claimed_until_s(self._settings)
         steps = self._take(CONTROLLER_STEP, None)
         deliveries = self._take(CONTROLLER_DELIVERY, None)
         if len(steps) or len(deliveries):
@@ -122,10 +119,9 @@ class ViewFeed:
         self._undrawn.append(deliveries)
         self._deliveries(until_ns)
         taken = self._take(PLANT_STEP, None)
-        if self._plant is not None:
-            self._plant = np.concatenate([self._plant, taken])
+        if self._has_internal_state or not self._scenario.coverage.knows_state:
+            self._steps = np.concatenate([self._steps, taken])
         self._lateness("plant", taken)
-        self._systems(taken)
         self._measurements(self._take(SENSOR_MEASUREMENT, until_ns), reach_ns)
         self._view.flush()
 
@@ -139,25 +135,6 @@ class ViewFeed:
         self._pending[table] = [rows[ready:]] if ready < len(rows) else []
         return rows[:ready]
 
-    def _systems(self, steps: Rows) -> None:
-        """Keep the system's internal states until the measurements at their times are shown."""
-        if self._own is not None and len(steps):
-            t_ns, z = self._own
-            self._own = np.concatenate([t_ns, steps["t_ns"]]), np.vstack([z, steps["z"]])
-
-    def _own_at(self, times_ns: Times) -> Reals | None:
-        """Return the system's internal state at ascending times (k,), NaN if unknown; (k, N)."""
-        if self._own is None:
-            return None
-        t_ns, z = self._own
-        found = np.full((len(times_ns), z.shape[1]), np.nan)
-        if len(t_ns):
-            at = np.minimum(np.searchsorted(t_ns, times_ns), len(t_ns) - 1)
-            known = t_ns[at] == times_ns
-            found[known] = z[at[known]]
-            self._own = t_ns[at[-1] :], z[at[-1] :]
-        return found
-
     def _measurements(self, rows: Rows, reach_ns: int) -> None:
         if not len(rows):
             return
@@ -165,9 +142,11 @@ class ViewFeed:
         joined = join(
             self._loop, rows, self._track, reach_ns, flow=self._flow, acknowledged=acknowledged
         )
-        if self._plant is not None:
-            joined = joined._replace(x=true_states(self._plant, joined.t_ns))
-            self._plant = self._plant[self._plant["t_ns"] > joined.t_ns[-1]]
+        # If the sensor does not measure x exactly, the plant's own x is shown.
+        if not self._scenario.coverage.knows_state:
+            joined = joined._replace(x=true_states(self._steps, joined.t_ns))
+        z = true_states(self._steps, joined.t_ns, "z") if self._has_internal_state else None
+        self._steps = self._steps[self._steps["t_ns"] > joined.t_ns[-1]]
         t_s = np.asarray(joined.t_ns * 1e-9)
         bounds = np.column_stack(
             [self._bounds(rows, joined), self._certified(t_s, "controller_error")]
@@ -175,7 +154,6 @@ class ViewFeed:
         if not self._scenario.protocol.acknowledges:
             bounds[~in_common(self._scenario, joined)] = np.nan
         self._view.samples(joined, bounds, self._certified(t_s, "state"))
-        z = self._own_at(joined.t_ns)
         self._view.move(joined.t_ns, Frames(t_s, joined.x, joined.x_s, joined.x_c, z))
         event_ns = rows["t_ns"][rows["event"] != NO_SEQUENCE]
         if len(event_ns):

@@ -22,9 +22,8 @@ from typing import Any, Self
 from urllib.parse import parse_qs, quote
 
 from cosim.output.viewer.opening_time import move_window_to, opening_time_ns, script_to_open_at
-from cosim.output.viewer.peer_user import peer_user
 from cosim.output.viewer.rerun_program import start_rerun
-from cosim.output.viewer.web_viewer import HOST, WebViewer
+from cosim.output.viewer.web_viewer import HOST, WebViewer, peer_user
 from noack.core.errors import MachineError, PeerError
 
 RECORDING = "recording.rrd"
@@ -46,7 +45,7 @@ class RecordingServer:
 
     Args:
         path: the recording.
-        follow: at the end of the file, wait for more until ``finish``.
+        follow: at the end of the file, wait for more until ``finished`` is set.
 
     Attributes:
         address: address of the page; the recording is ``recording.rrd`` below it. Everyone who has
@@ -108,10 +107,6 @@ class RecordingServer:
             if window.poll() is not None:
                 return None
         return window
-
-    def finish(self) -> None:
-        """Let downloads end at the end of the file."""
-        self.finished.set()
 
     def drain(self) -> None:
         """Wait a moment for downloads in progress to reach the end of the file."""

@@ -8,10 +8,12 @@ import contextlib
 import http.client
 import os
 import re
+import socket
+import sys
 import tempfile
 from collections.abc import Iterator
+from pathlib import Path
 
-from cosim.output.viewer.peer_user import peer_user
 from cosim.output.viewer.rerun_program import end_process, logged_port, start_rerun
 from noack.core.errors import MachineError, PeerError
 
@@ -19,6 +21,9 @@ HOST = "127.0.0.1"
 
 _START_S = 10.0
 _TIMEOUT_S = 10.0
+_SOCKETS = Path("/proc/net/tcp")
+_TRIES = 3
+"""Maximum tries: the kernel's list may miss a socket while others open and close."""
 _SERVED_AT = re.compile(rb"(?<!\+)http://127\.0\.0\.1:(\d+)")
 
 
@@ -67,3 +72,28 @@ class WebViewer:
     def close(self) -> None:
         """End the program."""
         end_process(self.process)
+
+
+def peer_user(connection: socket.socket) -> int | None:
+    """Return the user id of the process at the other end; None if there is none, or it is unknown.
+
+    Linux's list of sockets has the user of each. A connection that no process has accepted yet has
+    no user.
+    """
+    try:
+        wanted = [_written(connection.getpeername()), _written(connection.getsockname())]
+        for _ in range(_TRIES):
+            for line in _SOCKETS.read_text().splitlines()[1:]:
+                fields = line.split()
+                user, inode = fields[7], fields[9]
+                if fields[1:3] == wanted and inode != "0":
+                    return int(user)
+    except OSError:  # the connection is broken, or this is not Linux
+        pass
+    return None
+
+
+def _written(address: tuple[str, int]) -> str:
+    """Return an address in the list's format."""
+    host, port = address
+    return f"{int.from_bytes(socket.inet_aton(host), sys.byteorder):08X}:{port:04X}"

@@ -1,27 +1,17 @@
 """The figures of a campaign; intervals are 95 % confidence intervals of the means."""
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from cosim.output import palette
-from cosim.output.report.axes import (
-    BELOW_IN,
-    LEFT_IN,
-    WIDTH_IN,
-    Shown,
-    finish,
-    head_in,
-    legend,
-    logarithmic,
-    place,
-    plain,
-    single,
-)
+from cosim.output.report.axes import WIDTH_IN, finish, legend, logarithmic, plain, single
 from cosim.output.report.figure_style import printed, styled
 from cosim.studies.campaign import campaign_file
 from cosim.studies.campaign.campaign_summary import CampaignSummary, GridPointResult, runs_at
@@ -31,7 +21,7 @@ from cosim.studies.campaign.metrics import METRICS, Metric
 from noack.core.linear_systems import Matrix, Vector
 
 _HEIGHT_IN = 3.4
-_MAP_HEIGHT_IN, _MAPS_IN_A_ROW, _BAR_IN = 2.4, 3, 0.16
+_MAP_HEIGHT_IN, _MAPS_IN_A_ROW = 2.8, 3
 _QUANTILES = 400
 _NARROWEST_IN = 0.42
 """Narrowest cell of a map in which its number is written, in inches."""
@@ -42,17 +32,8 @@ _MARKERS = "os^Dv<>PXph*"
 _DASHES: tuple[Any, ...] = ("-", (0, (6, 1.5)), (0, (2, 1.2)), (0, (6, 1.5, 1.5, 1.5)))
 
 
-class Drawn(NamedTuple):
-    """A figure of the page."""
-
-    name: str
-    """Name of the figure, one word."""
-    figure: Figure
-    caption: str
-
-
-def figures(summary: CampaignSummary, store: Store) -> Iterator[Drawn]:
-    """Draw the figures that the campaign asks for."""
+def figures(summary: CampaignSummary, store: Store) -> Iterator[tuple[str, Figure, str]]:
+    """Draw the figures that the campaign asks for; return them with name and caption."""
     for i, wanted in enumerate(summary.campaign.figures):
         places = set(summary.campaign.selected(wanted.where))
         found = [one for one in summary.found if one.point.place in places]
@@ -68,7 +49,7 @@ def figures(summary: CampaignSummary, store: Store) -> Iterator[Drawn]:
                 figure, caption = _heat_map(summary, found, wanted)
             case campaign_file.Distribution():
                 figure, caption = _distribution(summary, found, wanted, store)
-        yield Drawn(f"{wanted.kind.replace('_', '-')}-{i + 1}", figure, f"{caption}{where}.")
+        yield f"{wanted.kind.replace('_', '-')}-{i + 1}", figure, f"{caption}{where}."
 
 
 @styled
@@ -76,31 +57,18 @@ def pareto_figure(
     series: Mapping[str, tuple[Sequence[Estimate], Sequence[Estimate]]], x: Metric, y: Metric
 ) -> Figure:
     """Draw means of y against means of x, with intervals; a line joins the non-dominated points."""
-    figure, (axes,) = single(_HEIGHT_IN, list(series))
-    shown: list[Shown] = []
-    for i, (label, pair) in enumerate(series.items()):
-        (xs, ys), (dx, dy) = (
-            [np.array([getattr(e, name) for e in es]) for es in pair]
-            for name in ("mean", "halfwidth")
-        )
-        style = _style(i)
-        kept = np.flatnonzero(np.isfinite(xs) & np.isfinite(ys))
-        xs, ys, dx, dy = (values[kept] for values in (xs, ys, dx, dy))
-        axes.errorbar(
-            xs, ys, np.where(np.isfinite(dy), dy, 0.0), np.where(np.isfinite(dx), dx, 0.0),
-            linestyle="none", marker=style["marker"], color=style["color"], elinewidth=1.0,
-            markersize=5,
-        )  # fmt: skip
+    figure, axes, styles = _panel(list(series))
+    for pair, style in zip(series.values(), styles, strict=True):
+        (xs, dx), (ys, dy) = map(_means, pair)
+        color, marker = style["color"], style["marker"]
+        axes.errorbar(xs, ys, dy, dx, color=color, marker=marker, linestyle="none", elinewidth=1.0)
+        finite = np.isfinite(xs) & np.isfinite(ys)
+        xs, ys = xs[finite], ys[finite]
         front = undominated(xs, ys)
-        axes.plot(
-            xs[front], ys[front], drawstyle="steps-post", color=style["color"],
-            linestyle=style["linestyle"],
-        )  # fmt: skip
-        shown.append((Line2D([], [], **style), plain(label, _LONGEST_LABEL)))
+        axes.plot(xs[front], ys[front], drawstyle="steps-post", **style | {"marker": ""})
     axes.set(xlabel=METRICS[x].label, ylabel=METRICS[y].label)
-    _scale(axes, "x", [e for xs, _ in series.values() for e in xs], x)
-    _scale(axes, "y", [e for _, ys in series.values() for e in ys], y)
-    legend(axes, shown)
+    _scale(axes, "x", [e.mean for xs, _ in series.values() for e in xs], x)
+    _scale(axes, "y", [e.mean for _, ys in series.values() for e in ys], y)
     finish(axes)
     return figure
 
@@ -124,34 +92,21 @@ def curve_figure(
 ) -> Figure:
     """Draw the means of a metric over an axis, with their intervals.
 
-    Args:
-        x: values of the axis, (k,); None if they are not numbers.
-        labels: k labels of these values.
-        series: k estimates by name of the series; None if there is no estimate.
-        axis: title of the axis.
-        metric: the metric.
+    The axis has k values ``x`` (None if they are not numbers) with k labels; each series has k
+    estimates, or None where there is no estimate.
     """
-    figure, (axes,) = single(_HEIGHT_IN, list(series))
+    figure, axes, styles = _panel(list(series))
     at = np.arange(len(labels), dtype=np.float64) if x is None else x
     order = np.argsort(at)
-    shown: list[Shown] = []
-    for i, (label, estimates) in enumerate(series.items()):
-        style = _style(i)
-        mean, half = (
-            np.array([getattr(estimates[j], name, np.nan) for j in order])
-            for name in ("mean", "halfwidth")
-        )
-        mean, half = np.where(np.isfinite(mean), mean, np.nan), np.where(np.isfinite(half), half, 0)
+    for estimates, style in zip(series.values(), styles, strict=True):
+        mean, half = (values[order] for values in _means(estimates))
         axes.plot(at[order], mean, markersize=4, **style)
-        axes.fill_between(
-            at[order], mean - half, mean + half, color=style["color"], alpha=0.25, linewidth=0
-        )
-        shown.append((Line2D([], [], **style), plain(label, _LONGEST_LABEL)))
+        low, high = mean - half, mean + half
+        axes.fill_between(at[order], low, high, color=style["color"], alpha=0.25, linewidth=0)
     if x is None:
         axes.set_xticks(at, [plain(label) for label in labels])
     axes.set(xlabel=plain(axis, _LONGEST_LABEL), ylabel=METRICS[metric].label)
-    _scale(axes, "y", [e for estimates in series.values() for e in estimates if e], metric)
-    legend(axes, shown)
+    _scale(axes, "y", [e.mean for estimates in series.values() for e in estimates if e], metric)
     finish(axes)
     return figure
 
@@ -165,69 +120,48 @@ def heat_map_figure(
 ) -> Figure:
     """Draw maps of a metric with a common scale.
 
-    Args:
-        maps: by title, (values of y, values of x); NaN is a missing value.
-        x: title and labels of the horizontal axis.
-        y: title and labels of the vertical axis.
-        metric: the metric.
+    Each map has the shape (values of y, values of x); NaN is a missing value. x and y are title and
+    labels of the axes.
     """
     columns = min(len(maps), _MAPS_IN_A_ROW)
     rows = -(-len(maps) // columns)
-    above_in, gap_in = head_in(()), 0.15
-    longest = max(len(plain(label)) for label in y[1])
-    left_in = max(LEFT_IN, 0.45 + 0.085 * longest)
-    width_in = (WIDTH_IN - left_in - 1.1 - gap_in * (columns - 1)) / columns
-    row_in = above_in + _MAP_HEIGHT_IN
-    figure = Figure(figsize=(WIDTH_IN, rows * row_in + BELOW_IN + 0.25))
-    norm, known = _norm(np.stack(list(maps.values())), metric)
+    figure = Figure(figsize=(WIDTH_IN, rows * _MAP_HEIGHT_IN), layout="constrained")
+    panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
+    known = np.stack(list(maps.values()))
+    known = known[np.isfinite(known)]
+    kind = LogNorm if METRICS[metric].logarithmic and _far(known) else Normalize
+    norm = kind(known.min(), known.max()) if len(known) else Normalize()
     for i, (title, values) in enumerate(maps.items()):
-        row, column = divmod(i, columns)
-        axes = place(
-            figure, left_in + column * (width_in + gap_in), row * row_in + above_in,
-            width_in, _MAP_HEIGHT_IN,
-        )  # fmt: skip
+        axes = panels[i]
         drawn = axes.pcolormesh(np.ma.masked_invalid(values), norm=norm, cmap="viridis")
-        if width_in >= _NARROWEST_IN * values.shape[1]:
+        if WIDTH_IN / columns >= _NARROWEST_IN * values.shape[1]:
             _numbers(axes, values, drawn)
+        axes.set_xticks(np.arange(len(x[1])) + 0.5, [plain(label) for label in x[1]])
+        axes.set_yticks(np.arange(len(y[1])) + 0.5, [plain(label) for label in y[1]])
+        axes.tick_params(length=0, labelbottom=i + columns >= len(maps))
         axes.grid(visible=False)
-        last = i + columns >= len(maps)
-        _ticks(axes, "x", x[1], labelled=last)
-        _ticks(axes, "y", y[1], labelled=column == 0)
-        axes.set(
-            title=plain(title, _LONGEST_LABEL),
-            xlabel=plain(x[0], _LONGEST_LABEL) if last else "",
-            ylabel=plain(y[0], _LONGEST_LABEL) if column == 0 else "",
-        )
-    if known:
-        bar = place(figure, WIDTH_IN - 1.0, above_in, _BAR_IN, _MAP_HEIGHT_IN)
-        figure.colorbar(drawn, cax=bar, label=METRICS[metric].label)
-        bar.grid(visible=False)
+        axes.set_title(plain(title, _LONGEST_LABEL))
+    for axes in panels[len(maps) :]:
+        axes.set_visible(False)
+    figure.supxlabel(plain(x[0], _LONGEST_LABEL), size="medium")
+    figure.supylabel(plain(y[0], _LONGEST_LABEL), size="medium")
+    if len(known):
+        bar = figure.colorbar(drawn, ax=panels, label=METRICS[metric].label, pad=0.01)
+        bar.ax.grid(visible=False)
     return figure
 
 
 @styled
 def distribution_figure(series: Mapping[str, Vector], metric: Metric) -> Figure:
-    """Draw the cumulative distribution of a metric; infinite values keep a curve below 1.
-
-    Args:
-        series: values of all runs by name of the series, (k,), without NaN.
-        metric: the metric.
-    """
-    figure, (axes,) = single(_HEIGHT_IN, list(series))
+    """Draw the cumulative distribution of a metric; infinite values keep a curve below 1."""
+    figure, axes, styles = _panel(list(series), markers=False)
     share = np.linspace(0.0, 1.0, _QUANTILES + 1)
-    shown: list[Shown] = []
-    finite = []
-    for i, (label, values) in enumerate(series.items()):
-        style = {key: value for key, value in _style(i).items() if key != "marker"}
+    for values, style in zip(series.values(), styles, strict=True):
         at = np.quantile(values, share, method="inverted_cdf")
         seen = np.isfinite(at)
-        finite.append(at[seen])
         axes.plot(at[seen], share[seen], drawstyle="steps-post", **style)
-        shown.append((Line2D([], [], **style), plain(label, _LONGEST_LABEL)))
     axes.set(xlabel=METRICS[metric].label, ylabel="share of runs", ylim=(0, 1.02))
-    if METRICS[metric].logarithmic and _far(np.concatenate(finite)):
-        logarithmic(axes, "x")
-    legend(axes, shown)
+    _scale(axes, "x", np.concatenate(list(series.values())), metric)
     finish(axes)
     return figure
 
@@ -252,22 +186,17 @@ def _curve(
     summary: CampaignSummary, found: Sequence[GridPointResult], wanted: campaign_file.Curve
 ) -> tuple[Figure, str]:
     axis = summary.campaign.by_name[wanted.x]
-    numbers = None if axis.numbers is None else np.array(axis.numbers)
-    place = summary.campaign.axes.index(axis)
-    kept = sorted({one.point.place[place] for one in found if wanted.metric in one.estimates})
-    series: dict[str, list[Estimate | None]] = {}
-    for label, group in _series(summary, found, (wanted.x, *wanted.where)):
-        known = {one.point.place[place]: one.estimates.get(wanted.metric) for one in group}
-        if any(known.values()):
-            series[label] = [known.get(i) for i in kept]
-    figure = curve_figure(
-        None if numbers is None else numbers[kept],
-        [axis.labels[i] for i in kept],
-        series,
-        axis.called,
-        wanted.metric,
-    )
-    return figure, (
+    known = {
+        name: {one.point.labels[axis.name]: one.estimates.get(wanted.metric) for one in group}
+        for name, group in _series(summary, found, (wanted.x, *wanted.where)).items()
+    }
+    places = [i for i, x in enumerate(axis.labels) if any(one.get(x) for one in known.values())]
+    labels = [axis.labels[i] for i in places]
+    series = {
+        name: [one.get(x) for x in labels] for name, one in known.items() if any(one.values())
+    }
+    numbers = None if axis.numbers is None else np.array(axis.numbers)[places]
+    return curve_figure(numbers, labels, series, axis.called, wanted.metric), (
         f"{_title(wanted.metric)} over {axis.called}: means and 95 % confidence intervals"
     )
 
@@ -275,32 +204,26 @@ def _curve(
 def _heat_map(
     summary: CampaignSummary, found: Sequence[GridPointResult], wanted: campaign_file.HeatMap
 ) -> tuple[Figure, str]:
-    axes = [summary.campaign.by_name[name] for name in (wanted.x, wanted.y)]
-    places = [summary.campaign.axes.index(axis) for axis in axes]
+    x, y = (summary.campaign.by_name[name] for name in (wanted.x, wanted.y))
     maps = {}
-    for label, group in _series(summary, found, (wanted.x, wanted.y, *wanted.where)):
-        values = np.full([len(axis.labels) for axis in reversed(axes)], np.nan)
+    spanned = (wanted.x, wanted.y, *wanted.where)
+    for label, group in _series(summary, found, spanned).items():
+        maps[label] = np.full((len(y.labels), len(x.labels)), np.nan)
         for one in group:
             if wanted.metric in one.estimates:
-                column, row = (one.point.place[place] for place in places)
-                mean = one.estimates[wanted.metric].mean
-                values[row, column] = mean if np.isfinite(mean) else np.nan
-        maps[label] = values
-    x, y = ((axis.called, axis.labels) for axis in axes)
-    return heat_map_figure(maps, x, y, wanted.metric), (
-        f"{_title(wanted.metric)} over {x[0]} and {y[0]}: means"
-    )
+                row, column = (axis.labels.index(one.point.labels[axis.name]) for axis in (y, x))
+                maps[label][row, column] = one.estimates[wanted.metric].mean
+    figure = heat_map_figure(maps, (x.called, x.labels), (y.called, y.labels), wanted.metric)
+    return figure, f"{_title(wanted.metric)} over {x.called} and {y.called}: means"
 
 
 def _distribution(
-    summary: CampaignSummary,
-    found: Sequence[GridPointResult],
-    wanted: campaign_file.Distribution,
-    store: Store,
-) -> tuple[Figure, str]:
+    summary: CampaignSummary, found: Sequence[GridPointResult],
+    wanted: campaign_file.Distribution, store: Store,
+) -> tuple[Figure, str]:  # fmt: skip
     series = {
         label: runs_at(one.point, store)[0][wanted.metric]
-        for label, group in _series(summary, found, tuple(wanted.where))
+        for label, group in _series(summary, found, tuple(wanted.where)).items()
         for one in group if wanted.metric in one.estimates
     }  # fmt: skip
     return distribution_figure(series, wanted.metric), (
@@ -310,7 +233,7 @@ def _distribution(
 
 def _series(
     summary: CampaignSummary, found: Sequence[GridPointResult], spanned: tuple[str, ...]
-) -> Iterator[tuple[str, list[GridPointResult]]]:
+) -> dict[str, list[GridPointResult]]:
     """Group grid points by the values of the axes that the figure does not show as coordinates."""
     rest = [axis for axis in summary.campaign.axes if axis.name not in spanned]
     groups: dict[str, list[GridPointResult]] = {}
@@ -321,15 +244,33 @@ def _series(
             for axis in rest
         )  # fmt: skip
         groups.setdefault(label, []).append(one)
-    yield from groups.items()
+    return groups
 
 
-def _style(i: int) -> dict[str, Any]:
-    return {
-        "color": printed(palette.SERIES[i % len(palette.SERIES)]),
-        "marker": _MARKERS[i % len(_MARKERS)],
-        "linestyle": _DASHES[i % len(_DASHES)],
-    }
+def _panel(
+    labels: Sequence[str], *, markers: bool = True
+) -> tuple[Figure, Axes, list[dict[str, Any]]]:
+    """Return a figure of one panel with the legend of its series, and the style of each series."""
+    figure, (axes,) = single(_HEIGHT_IN, labels)
+    styles = [
+        {
+            "color": printed(palette.SERIES[i % len(palette.SERIES)]),
+            "marker": _MARKERS[i % len(_MARKERS)] if markers else "",
+            "linestyle": _DASHES[i % len(_DASHES)],
+        }
+        for i in range(len(labels))
+    ]
+    handles = [Line2D([], [], **style) for style in styles]
+    names = [plain(label, _LONGEST_LABEL) for label in labels]
+    legend(axes, list(zip(handles, names, strict=True)))
+    return figure, axes, styles
+
+
+def _means(estimates: Sequence[Estimate | None]) -> tuple[Vector, Vector]:
+    """Return means and half-widths, (k,); NaN and 0 where there is none."""
+    mean = np.array([e.mean if e and math.isfinite(e.mean) else np.nan for e in estimates])
+    half = [e.halfwidth if e and math.isfinite(e.halfwidth) else 0.0 for e in estimates]
+    return mean, np.array(half)
 
 
 def _title(metric: Metric) -> str:
@@ -337,10 +278,12 @@ def _title(metric: Metric) -> str:
     return title[0].upper() + title[1:]
 
 
-def _scale(axes: Axes, which: Any, estimates: Sequence[Estimate], metric: Metric) -> None:
-    """Use a logarithmic axis if the values are positive and far apart."""
-    means = np.array([e.mean for e in estimates if np.isfinite(e.mean)])
-    if METRICS[metric].logarithmic and _far(means):
+def _scale(
+    axes: Axes, which: Literal["x", "y"], values: Sequence[float] | Vector, metric: Metric
+) -> None:
+    """Use a logarithmic axis if the finite values are positive and far apart."""
+    known = np.asarray(values)
+    if METRICS[metric].logarithmic and _far(known[np.isfinite(known)]):
         logarithmic(axes, which)
 
 
@@ -348,29 +291,11 @@ def _far(values: Vector) -> bool:
     return bool(len(values) and values.min() > 0 and values.max() > _FAR * values.min())
 
 
-def _norm(values: Matrix, metric: Metric) -> tuple[Any, bool]:
-    from matplotlib.colors import LogNorm, Normalize
-
-    known = values[np.isfinite(values)]
-    if not len(known):
-        return None, False
-    low, high = float(known.min()), float(known.max())
-    kind = LogNorm if METRICS[metric].logarithmic and _far(known) else Normalize
-    return kind(low, high), True
-
-
 def _numbers(axes: Axes, values: Matrix, drawn: Any) -> None:
     for (row, column), value in np.ndenumerate(values):
         if np.isfinite(value):
-            dark = float(drawn.norm(value)) < 0.6
+            colour = "#ffffff" if float(drawn.norm(value)) < 0.6 else "#000000"
+            text = f"{value:.3g}"
             axes.text(
-                column + 0.5, row + 0.5, f"{value:.3g}", ha="center", va="center", size=7.5,
-                color="#ffffff" if dark else "#000000",
-            )  # fmt: skip
-
-
-def _ticks(axes: Axes, which: Any, labels: Sequence[str], *, labelled: bool) -> None:
-    axis = axes.xaxis if which == "x" else axes.yaxis
-    written = [plain(label) if labelled else "" for label in labels]
-    axis.set_ticks(np.arange(len(labels)) + 0.5, written)
-    axes.tick_params(axis=which, length=0)
+                column + 0.5, row + 0.5, text, ha="center", va="center", size=7.5, color=colour
+            )

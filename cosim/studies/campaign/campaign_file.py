@@ -6,10 +6,10 @@ Settings have the keys of a scenario, as in ``--set``. A key with dots, in quote
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BeforeValidator, Field, FiniteFloat, JsonValue, model_validator
 
@@ -27,29 +27,16 @@ Identifier = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
 Settings = Annotated[dict[str, JsonValue], Field(min_length=1)]
 
 
-def _require_scalars(given: Any) -> Any:
-    """Check that a value, or each value of a list, is a number, a text, true or false.
-
-    Raises:
-        ValueError: a value is a list or a table.
-    """
-    values = given if isinstance(given, list | tuple) else (given,)
-    if any(isinstance(one, list | tuple | dict) for one in values):
-        raise ValueError(
-            "should be numbers, texts, true or false; for matrices and tables use variants, "
-            'e.g. variants = { "small" = { "trigger.weight" = [[1, 0], [0, 1]] } }'
-        )
-    return tuple(given) if isinstance(given, list) else given
-
-
 def _require_scalar(given: Any) -> Any:
     if isinstance(given, list | dict):
-        raise ValueError("should be a number, a text, true or false")
+        raise ValueError(
+            "should be a number, a text, true or false; for matrices and tables use variants, "
+            'e.g. variants = { "small" = { "trigger.weight" = [[1, 0], [0, 1]] } }'
+        )
     return given
 
 
 Value = Annotated[str | int | float | bool, BeforeValidator(_require_scalar)]
-Values = Annotated[tuple[Value, ...], Field(min_length=1), BeforeValidator(_require_scalars)]
 
 
 def label_of(value: JsonValue) -> str:
@@ -62,6 +49,11 @@ def label_of(value: JsonValue) -> str:
     return short if float(short) == value else repr(value)
 
 
+def _repeated(names: Sequence[str]) -> int | None:
+    """Return the index of the first name that an earlier entry has, too."""
+    return next((i for i, name in enumerate(names) if name in names[:i]), None)
+
+
 def replaced(before: Iterable[str], after: Iterable[str]) -> tuple[str, str] | None:
     """Return a key and a later key that replaces its value or its table; None if there is none."""
     pairs = itertools.product(before, after)
@@ -69,10 +61,9 @@ def replaced(before: Iterable[str], after: Iterable[str]) -> tuple[str, str] | N
 
 
 def _require_kept(place: str, settings: Mapping[str, JsonValue]) -> None:
-    keys = list(settings)
-    for i in range(1, len(keys)):
-        if (lost := replaced(keys[:i], keys[i : i + 1])) is not None:
-            raise ValueError(f"{place}: {lost[1]} replaces {lost[0]}, which is given before it")
+    for old, new in itertools.combinations(settings, 2):
+        if replaced([old], [new]):
+            raise ValueError(f"{place}: {new} replaces {old}, which is given before it")
 
 
 class Axis(ScenarioSection):
@@ -84,7 +75,7 @@ class Axis(ScenarioSection):
     """Name in figures and tables; by default the name of the axis."""
     key: str | None = None
     """A key of the scenario, e.g. network.mansd; needs values."""
-    values: Values | None = None
+    values: Annotated[tuple[Value, ...], Field(min_length=1)] | None = None
     """Values of the key."""
     variants: Annotated[dict[str, Settings], Field(min_length=1)] | None = None
     """Instead of key and values: names, each with its settings."""
@@ -100,10 +91,8 @@ class Axis(ScenarioSection):
             raise ValueError(f"name: {self.name} is a column already; use another name")
         for name, settings in (self.variants or {}).items():
             _require_kept(f"variants.{name}", settings)
-        labels = self.labels
-        twice = next((label for i, label in enumerate(labels) if label in labels[:i]), None)
-        if twice is not None:
-            raise ValueError(f"values: {twice} is given twice")
+        if (twice := _repeated(self.labels)) is not None:
+            raise ValueError(f"values: {self.labels[twice]} is given twice")
         return self
 
     @property
@@ -141,13 +130,9 @@ class Metrics(ScenarioSection):
     """How runs are measured, and the columns of the tables."""
 
     shown: Annotated[tuple[Metric, ...], Field(min_length=1)] = (
-        "transmissions",
-        "deliveries",
-        "inter_event_min_s",
-        "settling_s",
-        "cost",
+        "transmissions", "deliveries", "inter_event_min_s", "settling_s", "cost",
         "certificate_used",
-    )
+    )  # fmt: skip
     """Columns of the tables."""
     Q: Rows | None = None
     """Weight of the state in the cost ∫ xᵀQx + uᵀRu dt, by rows; by default the identity."""
@@ -169,6 +154,8 @@ class PairedComparison(ScenarioSection):
 
 
 class _Figure(ScenarioSection):
+    spanned: ClassVar[tuple[str, ...]] = ()
+    """The keys that name the axes which the figure shows as coordinates or series."""
     where: dict[str, Value] = Field({})
     """Only grid points with these values of these axes."""
 
@@ -176,6 +163,7 @@ class _Figure(ScenarioSection):
 class Pareto(_Figure):
     """Means of two metrics against each other, with the non-dominated points of each series."""
 
+    spanned = ("series",)
     kind: Literal["pareto"] = "pareto"
     """One metric against another; smaller is better for both."""
     series: Identifier
@@ -189,6 +177,7 @@ class Pareto(_Figure):
 class Curve(_Figure):
     """The mean of a metric over an axis; one curve per combination of the other axes."""
 
+    spanned = ("x",)
     kind: Literal["curve"] = "curve"
     """A metric over an axis."""
     x: Identifier
@@ -200,6 +189,7 @@ class Curve(_Figure):
 class HeatMap(_Figure):
     """The mean of a metric over two axes; one map per combination of the other axes."""
 
+    spanned = ("x", "y")
     kind: Literal["heat_map"] = "heat_map"
     """A metric over two axes."""
     x: Identifier
@@ -219,20 +209,8 @@ class Distribution(_Figure):
     """The metric."""
 
 
-Figure = Annotated[Pareto | Curve | HeatMap | Distribution, Field(discriminator="kind")]
-
-
-def spanned(figure: Pareto | Curve | HeatMap | Distribution) -> tuple[str, ...]:
-    """Return the axes that a figure shows as coordinates or series."""
-    match figure:
-        case Pareto():
-            return (figure.series,)
-        case Curve():
-            return (figure.x,)
-        case HeatMap():
-            return (figure.x, figure.y)
-        case Distribution():
-            return ()
+AnyFigure = Pareto | Curve | HeatMap | Distribution
+Figure = Annotated[AnyFigure, Field(discriminator="kind")]
 
 
 class Campaign(ScenarioSection):
@@ -271,9 +249,7 @@ class Campaign(ScenarioSection):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if len(self.by_name) < len(self.axes):
-            names = [axis.name for axis in self.axes]
-            twice = next(i for i, name in enumerate(names) if name in names[:i])
+        if (twice := _repeated([axis.name for axis in self.axes])) is not None:
             raise ValueError(f"axes.{twice}.name: another axis has this name")
         for i, axis in enumerate(self.axes):
             for other in self.axes[:i]:
@@ -294,21 +270,20 @@ class Campaign(ScenarioSection):
             self._check_figure(f"figures.{i}", figure)
         return self
 
-    def _check_figure(self, place: str, figure: Pareto | Curve | HeatMap | Distribution) -> None:
-        for key in ("series",) if isinstance(figure, Pareto) else ("x", "y"):
-            if (name := getattr(figure, key, None)) is not None:
-                self._require_axis(f"{place}.{key}", name)
+    def _check_figure(self, place: str, figure: AnyFigure) -> None:
+        own = [getattr(figure, key) for key in figure.spanned]
+        for key, name in zip(figure.spanned, own, strict=True):
+            self._require_axis(f"{place}.{key}", name)
         for name, value in figure.where.items():
             self._require_axis(f"{place}.where.{name}", name)
             self._require_value(f"{place}.where.{name}", name, value)
-        own, fixed = spanned(figure), set(figure.where)
         if len(set(own)) < len(own):
             raise ValueError(f"{place}.y: a map needs two different axes")
         if isinstance(figure, Pareto):
-            count = len(self.by_name[figure.series].labels)
+            series = [self.by_name[figure.series]]
         else:
-            rest = [axis for axis in self.axes if axis.name not in {*own, *fixed}]
-            count = math.prod(len(axis.labels) for axis in rest)
+            series = [axis for axis in self.axes if axis.name not in {*own, *figure.where}]
+        count = math.prod(len(axis.labels) for axis in series)
         if count > MOST_SERIES:
             raise ValueError(
                 f"{place}: {count} series are too many, at most {MOST_SERIES}; "

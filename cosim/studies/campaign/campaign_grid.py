@@ -86,11 +86,7 @@ def base_of(campaign: Campaign, path: Path) -> tuple[Path, dict[str, Any]]:
 
 
 def grid(campaign: Campaign, path: Path) -> list[Point]:
-    """Return all grid points, in order: the last axis varies fastest.
-
-    Args:
-        campaign: the campaign.
-        path: of its file.
+    """Return all grid points of the campaign in this file; the last axis varies fastest.
 
     Raises:
         CallerError: one line per mistake.
@@ -100,17 +96,17 @@ def grid(campaign: Campaign, path: Path) -> list[Point]:
     for number, place in enumerate(campaign.selected({})):
         content, chosen = copy.deepcopy(base), list(zip(campaign.axes, place, strict=True))
         labels = {axis.name: axis.labels[i] for axis, i in chosen}
-        where = ", ".join(f"{name} = {label}" for name, label in labels.items())
-        source = f"{path}: at {where}"
+        values = {axis.name: (axis.numbers or axis.labels)[i] for axis, i in chosen}
+        source = f"{path}: at {', '.join(f'{name} = {label}' for name, label in labels.items())}"
         for axis, i in chosen:
             for key, value in axis.settings[i].items():
                 put(content, key, value, source)
         scenario = completed(content, scenario_path, source)
-        values = {
-            axis.name: axis.labels[i] if axis.numbers is None else axis.numbers[i]
-            for axis, i in chosen
-        }
-        points.append(_point(campaign, number, place, labels, values, scenario, source))
+        try:
+            work, certified = _work(campaign, scenario)
+        except (CallerError, ValueError) as error:
+            raise CallerError(f"{source}: {error}") from None
+        points.append(Point(number, place, labels, values, scenario, certified, work))
     _require_effects(campaign, points, path)
     return points
 
@@ -133,60 +129,42 @@ def _require_effects(campaign: Campaign, points: Sequence[Point], path: Path) ->
                 )
 
 
-def _point(
-    campaign: Campaign,
-    number: int,
-    place: tuple[int, ...],
-    labels: Mapping[str, str],
-    values: Mapping[str, Value],
-    scenario: Scenario,
-    source: str,
-) -> Point:
-    metrics = campaign.metrics
-    n, m = scenario.model.dimensions
-    try:
-        resolved = resolve(scenario)
-        Q = _weight(metrics.Q, "metrics.Q", n, "one row per state")
-        R = _weight(metrics.R, "metrics.R", m, "one row per input")
-        work, certified = _work(campaign, scenario, resolved, Q, R)
-    except (CallerError, ValueError) as error:
-        raise CallerError(f"{source}: {error}") from None
-    return Point(number, place, labels, values, scenario, certified, work)
-
-
-def _work(
-    campaign: Campaign, scenario: Scenario, resolved: Scenario, Q: Matrix | None, R: Matrix | None
-) -> tuple[Work, float | None]:
+def _work(campaign: Campaign, scenario: Scenario) -> tuple[Work, float | None]:
     """Return the work, and the certified bound Δβ or None."""
-    settle, most_events = campaign.metrics.settle, campaign.metrics.most_events
+    metrics, resolved = campaign.metrics, resolve(scenario)
+    n, m = scenario.model.dimensions
+    Q = _weight(metrics.Q, "metrics.Q", n, "one row per state")
+    R = _weight(metrics.R, "metrics.R", m, "one row per input")
+    measured: dict[str, Any] = {
+        "Q": Q,
+        "R": R,
+        "settle": metrics.settle,
+        "most_events": metrics.most_events,
+    }
     if campaign.time == "sampled":
-        alone = in_virtual_time(scenario)
-        return SampledWork(alone, campaign.seed, Q, R, settle, most_events), None
+        return SampledWork(in_virtual_time(scenario), campaign.seed, **measured), None
     if resolved.protocol.acknowledges:
         raise CallerError(
             'network.protocol: continuous time needs the loop without acknowledgements, "none"; '
             'time = "sampled" takes both'
         )
-    _require_timeless(resolved)
-    setting = replace(setting_of(resolved), Q=Q, R=R, settle=settle, most_events=most_events)
-    return ContinuousWork(setting, box_of(scenario), campaign.seed), certified_error(resolved)
-
-
-def _require_timeless(scenario: Scenario) -> None:
-    network = scenario.network
-    kept = timeless(network.link).impairments
-    taking_time = [one.kind for one in network.link.impairments if one not in kept]
+    kept = timeless(resolved.network.link).impairments
+    taking_time = [one.kind for one in resolved.network.link.impairments if one not in kept]
     if taking_time:
         raise CallerError(
             f"network.impairments: {', '.join(taking_time)}: in continuous time the "
             'network has no delay; leave it out, e.g. settings = { "network.impairments" = [] }, '
             'or use time = "sampled"'
         )
+    setting = replace(setting_of(resolved), **measured)
+    return ContinuousWork(setting, box_of(scenario), campaign.seed), certified_error(resolved)
 
 
 def _weight(rows: Rows | None, key: str, size: int, why: str) -> Matrix | None:
     require_shape(rows, key, (size, size), why)
-    weight = None if rows is None else np.array(rows)
-    if weight is not None and not np.array_equal(weight, weight.T):
+    if rows is None:
+        return None
+    weight = np.array(rows)
+    if not np.array_equal(weight, weight.T):
         raise ValueError(f"{key}: must be symmetric")
     return weight

@@ -1,35 +1,41 @@
-"""Writes the results of a campaign into its folder and prints them."""
+"""The results of a campaign as a page, as JSON, and as tables for a terminal."""
 
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import tomli_w
+from markupsafe import Markup
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from cosim.output.report.figure_files import inline
+from cosim.output.report.report_page import templates
 from cosim.studies.campaign.campaign_figures import figures
-from cosim.studies.campaign.campaign_page import (
-    SummaryRow,
-    compared_row,
-    found_row,
-    page,
-    unfinished,
-    verdict,
-)
 from cosim.studies.campaign.campaign_summary import CampaignSummary
 from cosim.studies.campaign.chunk_store import RUNS, Store
+from cosim.studies.campaign.draw_statistics import Estimate
 from cosim.studies.campaign.metrics import METRICS
-from noack.core.whole_file import write_whole
+from noack.core.file_access import write_whole
+from noack.core.number_format import plus_minus
 
 PAGE, SUMMARY = "campaign.html", "summary.json"
+_NONE = "–"
 _MOST_ROWS = 40
 _APART = 3
 """Largest distance between columns, margins included."""
 _MOST_REMARKS = 5
+
+
+class SummaryRow(NamedTuple):
+    """A row of a table of grid points."""
+
+    labels: Sequence[str]
+    cells: Sequence[str]
 
 
 def write_report(summary: CampaignSummary, store: Store, base: Mapping[str, Any]) -> list[Path]:
@@ -38,29 +44,52 @@ def write_report(summary: CampaignSummary, store: Store, base: Mapping[str, Any]
     Raises:
         MachineError: they cannot be written.
     """
-    written = [store.folder / PAGE, store.folder / SUMMARY]
-    html = page(summary, list(figures(summary, store)), base)
     document = json.dumps(_known(summary.document()), indent=1, allow_nan=False)
-    for path, text in zip(written, (html, document + "\n"), strict=True):
-        write_whole(path, text)
-    return [*written, store.folder / RUNS]
+    return [
+        write_whole(store.folder / PAGE, page(summary, store, base)),
+        write_whole(store.folder / SUMMARY, document + "\n"),
+        store.folder / RUNS,
+    ]
+
+
+def page(summary: CampaignSummary, store: Store, base: Mapping[str, Any]) -> str:
+    """Return the page as HTML; all text except the figures is escaped.
+
+    ``base`` is the content of the scenario of all runs.
+    """
+    campaign = summary.campaign
+    content = campaign.model_dump(mode="json", exclude_none=True)
+    remarks = list(_unfinished(summary))
+    return templates(Path(__file__).parent).get_template("campaign.html.jinja").render(
+        title=campaign.name,
+        description=campaign.description,
+        subtitle=f"{len(summary.found):,} grid points, {summary.draws:,} draws at each, "
+        f"seed {campaign.seed}",
+        verdict=_verdict(summary),
+        tone="bad" if summary.breaches else "doubt" if remarks else "good",
+        remarks=remarks,
+        figures=[
+            (name, Markup(inline(figure, name, caption)), caption)
+            for name, figure, caption in figures(summary, store)
+        ],
+        axes=[axis.called for axis in campaign.axes],
+        metrics=[METRICS[name].heading for name in campaign.metrics.shown],
+        rows=_rows(summary),
+        reference=_reference(summary),
+        differences=_differences(summary, shares=True),
+        campaign_toml=tomli_w.dumps(content, indent=2),
+        scenario_toml=tomli_w.dumps(base, indent=2),
+    )  # fmt: skip
 
 
 def print_summary(console: Console, summary: CampaignSummary) -> None:
     """Print the tables of a summary."""
     campaign = summary.campaign
-    shown = campaign.metrics.shown
-    tables = [
-        (
-            f"{campaign.name}: {summary.draws:,} draws",
-            [found_row(one, shown) for one in summary.found],
-        )
-    ]
+    tables = [(f"{campaign.name}: {summary.draws:,} draws", _rows(summary))]
     if campaign.compare is not None:
-        title = f"paired difference to {campaign.compare.axis} = {campaign.compare.reference}"
-        tables.append((title, [compared_row(one, shown) for one in summary.compared]))
+        tables.append((f"paired difference to {_reference(summary)}", _differences(summary)))
     axes = [axis.called for axis in campaign.axes]
-    headings = [METRICS[metric].heading for metric in shown]
+    headings = [METRICS[metric].heading for metric in campaign.metrics.shown]
     for title, rows in tables:
         for table in tables_of(title, axes, headings, rows[:_MOST_ROWS], console.width):
             console.print(table)
@@ -73,12 +102,12 @@ def print_summary(console: Console, summary: CampaignSummary) -> None:
             style="dim",
             highlight=False,
         )
-    remarks = list(unfinished(summary))
+    remarks = list(_unfinished(summary))
     for remark in remarks[:_MOST_REMARKS]:
         console.print(remark, style="yellow", markup=False, highlight=False)
     if len(remarks) > _MOST_REMARKS:
         console.print(f"and at {len(remarks) - _MOST_REMARKS} more grid points: see the page")
-    console.print(verdict(summary), style="bold red" if summary.breaches else "bold")
+    console.print(_verdict(summary), style="bold red" if summary.breaches else "bold")
 
 
 def tables_of(
@@ -86,12 +115,7 @@ def tables_of(
 ) -> Iterator[Table]:
     """Split a table into as many tables as a terminal of this width needs; nothing is truncated.
 
-    Args:
-        title: of the first table.
-        axes: headings of the label columns, which each table repeats.
-        headings: headings of the other columns.
-        rows: rows of all tables.
-        width: in characters.
+    Each table repeats the label columns, whose headings are ``axes``.
     """
     labels = sum(_width(axis, [row.labels[i] for row in rows]) for i, axis in enumerate(axes))
     widths = [_width(words, [row.cells[i] for row in rows]) for i, words in enumerate(headings)]
@@ -114,9 +138,77 @@ def tables_of(
         begin = end
 
 
-def _width(heading: str, cells: Iterable[str]) -> int:
-    """Width of a column; its heading may break between words."""
+def _width(heading: str, cells: Sequence[str]) -> int:
+    """Return the width of a column; its heading may break between words."""
     return max(map(len, (*heading.split(), *cells))) + _APART
+
+
+def _verdict(summary: CampaignSummary) -> str:
+    runs = len(summary.found) * summary.draws
+    certified = sum(found.point.certified_error is not None for found in summary.found)
+    if summary.breaches:
+        return f"{summary.breaches:,} of {runs:,} runs exceed a certified bound."
+    if not certified:
+        return (
+            f"{runs:,} runs; no grid point has a certified bound "
+            "(a hold, a floor and other policies have none)."
+        )
+    where = "all" if certified == len(summary.found) else f"{certified} of {len(summary.found)}"
+    return f"{runs:,} runs; {where} grid points have a certified bound; none was exceeded."
+
+
+def _rows(summary: CampaignSummary) -> list[SummaryRow]:
+    """Return each grid point's means with their intervals."""
+    return [
+        SummaryRow(
+            list(found.point.labels.values()),
+            [written(found.estimates.get(metric)) for metric in summary.campaign.metrics.shown],
+        )
+        for found in summary.found
+    ]
+
+
+def _differences(summary: CampaignSummary, *, shares: bool = False) -> list[SummaryRow]:
+    """Return mean differences, optionally with the share of draws with a smaller metric."""
+    rows = []
+    for compared in summary.compared:
+        cells = []
+        for metric in summary.campaign.metrics.shown:
+            found = compared.differences.get(metric)
+            cells.append(written(found.estimate if found and found.estimate.finite else None))
+            if found and shares:
+                cells[-1] += f", smaller in {100 * found.smaller:.3g} %"
+        rows.append(SummaryRow(list(compared.point.labels.values()), cells))
+    return rows
+
+
+def _reference(summary: CampaignSummary) -> str | None:
+    campaign = summary.campaign
+    if campaign.compare is None:
+        return None
+    return f"{campaign.by_name[campaign.compare.axis].called} = {campaign.compare.reference}"
+
+
+def written(estimate: Estimate | None) -> str:
+    """Return mean ± half-width, with the share of finite runs if it is below 100 %."""
+    if estimate is None:
+        return _NONE
+    if not estimate.finite:
+        return "never"
+    text = plus_minus(estimate.mean, estimate.halfwidth)
+    if estimate.finite < estimate.draws:
+        text += f" ({100 * estimate.finite / estimate.draws:.4g} % of runs)"
+    return text
+
+
+def _unfinished(summary: CampaignSummary) -> Iterator[str]:
+    """Return a note for each grid point at which a run did not reach the horizon."""
+    for found in summary.found:
+        others = {how: count for how, count in found.ended.items() if how != "finished"}
+        if others:
+            where = ", ".join(f"{axis} {label}" for axis, label in found.point.labels.items())
+            counts = ", ".join(f"{n:,} {how.replace('_', ' ')}" for how, n in others.items())
+            yield f"At {where} not all runs reached the horizon: {counts}"
 
 
 def _known(value: Any) -> Any:

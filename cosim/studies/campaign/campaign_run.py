@@ -50,11 +50,6 @@ def terminations_raised() -> Iterator[None]:
 def run_campaign(store: Store, runner: Runner, progress: Progress | None = None) -> int:
     """Compute the missing runs; return their number.
 
-    Args:
-        store: the campaign's folder.
-        runner: computes the chunks.
-        progress: called after each chunk.
-
     Raises:
         InterruptedCampaignError: the user pressed Ctrl-C.
         TerminatedCampaignError: a signal was received within :func:`terminations_raised`.
@@ -64,10 +59,10 @@ def run_campaign(store: Store, runner: Runner, progress: Progress | None = None)
     missing = list(store.missing())
     total = len(store.points) * store.draws
     before = done = total - sum(len(chunk.draws) for chunk in missing)
-    tell = progress or (lambda done, total: None)
-    tell(done, total)
+    report = progress or (lambda done, total: None)
+    report(done, total)
 
-    def message(what: str) -> str:
+    def message(what: object) -> str:
         return (
             f"{what}; {done:,} of {total:,} runs are in {store.folder}; "
             "the same command continues the campaign"
@@ -75,17 +70,11 @@ def run_campaign(store: Store, runner: Runner, progress: Progress | None = None)
 
     try:
         for chunk, rows in runner([point.work for point in store.points], missing):
-            try:
-                store.write(chunk, rows)
-            except OSError as error:
-                reason = error.strerror or str(error)
-                raise MachineError(
-                    message(f"{store.folder}: cannot be written: {reason}")
-                ) from None
+            store.write(chunk, rows)
             done += len(chunk.draws)
-            tell(done, total)
+            report(done, total)
     except KeyboardInterrupt:
         raise InterruptedCampaignError(message("interrupted")) from None
-    except (LostWorkersError, OtherArithmeticError, TerminatedCampaignError) as error:
-        raise type(error)(message(str(error))) from None
+    except (LostWorkersError, OtherArithmeticError, TerminatedCampaignError, MachineError) as error:
+        raise type(error)(message(error)) from None
     return total - before

@@ -116,19 +116,18 @@ def _found(point: Point, store: Store) -> GridPointResult:
 def _compared(campaign: Campaign, store: Store) -> Iterator[ComparedResult]:
     if campaign.compare is None:
         return
-    axis = [axis.name for axis in campaign.axes].index(campaign.compare.axis)
-    reference_i = campaign.axes[axis].labels.index(label_of(campaign.compare.reference))
-    groups: dict[tuple[int, ...], list[Point]] = {}
+    axis, wanted = campaign.compare.axis, label_of(campaign.compare.reference)
+    groups: dict[tuple[str, ...], list[Point]] = {}
     for point in store.points:
-        groups.setdefault(point.place[:axis] + point.place[axis + 1 :], []).append(point)
+        others = tuple(label for name, label in point.labels.items() if name != axis)
+        groups.setdefault(others, []).append(point)
     for group in groups.values():
-        reference = next(point for point in group if point.place[axis] == reference_i)
+        reference = next(point for point in group if point.labels[axis] == wanted)
         own, _ = runs_at(reference, store)
         for point in group:
             if point is not reference:
-                others, _ = runs_at(point, store)
                 differences = {
                     name: difference(values, own[name])
-                    for name, values in others.items() if name in own
+                    for name, values in runs_at(point, store)[0].items() if name in own
                 }  # fmt: skip
                 yield ComparedResult(point, reference, differences)

@@ -49,10 +49,8 @@ Runner = Callable[[Sequence[Work], Iterable[Chunk]], Iterator[Finished]]
 
 _AHEAD = 2
 """Chunks in flight per worker: one is computed and one waits."""
-_LOOK_EVERY_S = 1.0
-_PATIENCE_S = 30.0
-_CONNECT_S = 10.0
-_CONNECT_TRIES = 3
+_LOOK_EVERY_S, _PATIENCE_S = 1.0, 30.0
+_CONNECT_S, _CONNECT_TRIES = 10.0, 3
 
 
 class OtherArithmeticError(PeerError):
@@ -67,11 +65,6 @@ def alone(works: Sequence[Work], chunks: Iterable[Chunk]) -> Iterator[Finished]:
     """Compute chunks in this process."""
     for chunk in chunks:
         yield chunk, works[chunk.point].run(chunk.draws)
-
-
-def run_draws(work: Work, draws: range) -> NDArray[Any]:
-    """Compute consecutive draws in another process of this machine."""
-    return work.run(draws)
 
 
 @contextmanager
@@ -104,24 +97,19 @@ def _require_address(address: str) -> None:
 
 def _client(connect: Any, address: str) -> Any:
     """Connect, with retries: on a busy machine Dask's thread may not start within ten seconds."""
-    for _ in range(_CONNECT_TRIES - 1):
+    for _ in range(_CONNECT_TRIES):
         with suppress(AssertionError):
             return connect(address, timeout=_CONNECT_S, set_as_default=False)
-    try:
-        return connect(address, timeout=_CONNECT_S, set_as_default=False)
-    except AssertionError:
-        raise PeerError(
-            f"--scheduler {address}: Dask's client does not start; the machine is too busy"
-        ) from None
+    raise PeerError(f"--scheduler {address}: Dask's client does not start; the machine is too busy")
 
 
-def run_alike(work: Work, draws: range, wanted: Mapping[str, str]) -> NDArray[Any]:
-    """Compute consecutive draws on another machine.
+def run_alike(work: Work, draws: range, wanted: Mapping[str, str] | None) -> NDArray[Any]:
+    """Compute consecutive draws in another process, or on another machine.
 
     Raises:
         OtherArithmeticError: its results would differ from those of the caller.
     """
-    if (other := difference(arithmetic(), wanted)) is not None:
+    if wanted is not None and (other := difference(arithmetic(), wanted)) is not None:
         raise OtherArithmeticError(
             f"a worker on {socket.gethostname()} would compute other results: {other}"
         )
@@ -156,10 +144,10 @@ def cluster(address: str, say: Callable[[str], None] = lambda line: None) -> Ite
         raise PeerError(f"--scheduler {address}: no Dask scheduler answers there") from None
 
     def run(works: Sequence[Work], chunks: Iterable[Chunk]) -> Iterator[Finished]:
-        watch = _Watch(client, address, say)
+        size = _ClusterSize(client, address, say)
         executor: Executor = client.get_executor(pure=False)
         try:
-            yield from _windowed(executor, works, chunks, watch, arithmetic())
+            yield from _windowed(executor, works, chunks, size, arithmetic())
         except OtherArithmeticError as error:
             raise OtherArithmeticError(f"{address}: {error}") from None
         except (ImportError, RuntimeError) as error:
@@ -179,18 +167,12 @@ def cluster(address: str, say: Callable[[str], None] = lambda line: None) -> Ite
         yield run
 
 
-class _Watch:
-    """The number of chunks that may be in flight on a cluster with a varying number of workers.
-
-    Args:
-        client: of the cluster.
-        address: of its scheduler.
-        say: called with a message when there is no worker.
-    """
+class _ClusterSize:
+    """The number of chunks that may be in flight on a cluster with a varying number of workers."""
 
     def __init__(self, client: Any, address: str, say: Callable[[str], None]) -> None:
         self._client, self._address, self._say = client, address, say
-        self._told = False
+        self._reported = False
         self._cores, self._looked_s, self._seen_s = 0, -math.inf, time.monotonic()
 
     def __call__(self) -> int:
@@ -207,9 +189,9 @@ class _Watch:
                 raise LostWorkersError(f"{self._address}: the scheduler has ended") from None
             self._looked_s = now_s
             if self._cores:
-                self._seen_s, self._told = now_s, False
-            elif not self._told:
-                self._told = True
+                self._seen_s, self._reported = now_s, False
+            elif not self._reported:
+                self._reported = True
                 self._say(f"{self._address}: no worker; waiting {_PATIENCE_S:g} s for one")
             elif now_s - self._seen_s > _PATIENCE_S:
                 raise LostWorkersError(
@@ -231,12 +213,8 @@ def _windowed(
     in_flight: dict[Future[NDArray[Any]], Chunk] = {}
     while True:
         for chunk in islice(rest, max(most() - len(in_flight), 0)):
-            task = (works[chunk.point], chunk.draws)
             with interrupts_held():
-                future = (
-                    executor.submit(run_draws, *task) if wanted is None
-                    else executor.submit(run_alike, *task, wanted)
-                )  # fmt: skip
+                future = executor.submit(run_alike, works[chunk.point], chunk.draws, wanted)
             in_flight[future] = chunk
         if not in_flight:
             return

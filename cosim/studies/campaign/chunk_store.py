@@ -5,7 +5,7 @@ point 3. Each row has the values of the axes and the metrics of one run. A chunk
 computed again.
 """
 
-import contextlib
+import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -23,24 +23,17 @@ from cosim.studies.campaign.campaign_file import Campaign
 from cosim.studies.campaign.campaign_grid import Point
 from cosim.studies.campaign.campaign_workers import Chunk
 from cosim.studies.campaign.worker_identity import arithmetic, difference
-from noack.core.errors import CallerError, MachineError
-from noack.core.file_lock import locked
+from noack.core.errors import CallerError, MachineError, shortened, why
+from noack.core.file_access import locked, write_whole
 
 RUNS, MANIFEST = "runs", "campaign.json"
 _LOCK = ".lock"
 _FORMAT = 1
-_PARTIAL = ".partial"
 MOST_FILES = 1_000_000
 
 
 class Store:
-    """The chunks of a campaign.
-
-    Args:
-        folder: the campaign's folder.
-        points: all points of the grid.
-        draws: number of runs at each point.
-        size: number of draws in a chunk.
+    """The chunks of a campaign: ``draws`` runs at each point, ``size`` draws per chunk.
 
     Raises:
         CallerError: there would be too many files.
@@ -54,17 +47,13 @@ class Store:
             )
         self.folder, self.points, self.draws = folder, points, draws
         self._size = size
-        self._schema = pa.schema(
-            [
-                *(
-                    (name, pa.dictionary(pa.int16(), pa.string()) if text else pa.float64())
-                    for name, value in points[0].values.items()
-                    for text in (isinstance(value, str),)
-                ),
-                ("draw", pa.int64()),
-                *((name, pa.from_numpy_dtype(ROW[name])) for name in ROW.names or ()),
-            ]
-        )
+        text, number = pa.dictionary(pa.int16(), pa.string()), pa.float64()
+        axes = points[0].values.items()
+        self._schema = pa.schema([
+            *((name, text if isinstance(value, str) else number) for name, value in axes),
+            ("draw", pa.int64()),
+            *((name, pa.from_numpy_dtype(ROW[name])) for name in ROW.names or ()),
+        ])  # fmt: skip
 
     def chunks(self, point: int) -> Iterator[Chunk]:
         """Return all chunks of a point."""
@@ -80,28 +69,18 @@ class Store:
         """Write a chunk completely or not at all.
 
         Raises:
-            OSError: the file cannot be written.
+            MachineError: the file cannot be written.
         """
-        values = self.points[chunk.point].values
         columns: dict[str, Any] = {
-            name: pa.array([value]).dictionary_encode().cast(self._schema.field(name).type)
-            .take(np.zeros(len(rows), np.int8))
-            if isinstance(value, str) else np.full(len(rows), float(value))
-            for name, value in values.items()
-        }  # fmt: skip
+            name: pa.array([value] * len(rows), self._schema.field(name).type)
+            for name, value in self.points[chunk.point].values.items()
+        }
         columns["draw"] = np.arange(chunk.start, chunk.stop)
         columns |= {name: np.ascontiguousarray(rows[name]) for name in ROW.names or ()}
-        path = self._path(chunk)
-        scratch = path.with_name(f".{path.name}{_PARTIAL}")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            table = pa.table(columns, self._schema)
-            pq.write_table(table, scratch, compression="zstd", write_page_checksum=True)
-            scratch.replace(path)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                scratch.unlink(missing_ok=True)
-            raise
+        buffer = io.BytesIO()
+        table = pa.table(columns, self._schema)
+        pq.write_table(table, buffer, compression="zstd", write_page_checksum=True)
+        write_whole(self._path(chunk), buffer.getvalue())
 
     def columns(self, point: int, names: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Return columns of all runs at a point, by draw, (draws,) each.
@@ -143,12 +122,7 @@ def opened(campaign: Campaign, base: Mapping[str, Any], store: Store) -> Iterato
     """Lock a campaign's folder: a new folder, or one of the same campaign.
 
     The number of draws and the figures may differ from earlier. If no run is missing, code and
-    libraries may differ, too.
-
-    Args:
-        campaign: the campaign.
-        base: content of the scenario of all runs.
-        store: the campaign's folder.
+    libraries may differ, too. ``base`` is the content of the scenario of all runs.
 
     Raises:
         CallerError: the folder has another campaign, or runs of other code or libraries, or another
@@ -174,11 +148,10 @@ def opened(campaign: Campaign, base: Mapping[str, Any], store: Store) -> Iterato
             if not stack.enter_context(locked(folder / _LOCK)):
                 raise CallerError(f"{folder}: another noack uses this folder")
             made_by = _claim(folder, manifest)
-            for scratch in (folder / RUNS).glob(f"*/.*{_PARTIAL}"):
+            for scratch in (folder / RUNS).glob("*/.*.partial"):
                 scratch.unlink(missing_ok=True)
         except OSError as error:
-            reason = error.strerror or error
-            raise MachineError(f"{folder}: cannot be written: {reason}") from None
+            raise MachineError(f"{folder}: cannot be written: {why(error)}") from None
         other = difference(made_by, arithmetic())
         if other is not None and next(store.missing(), None) is not None:
             raise CallerError(
@@ -198,10 +171,8 @@ def _claim(folder: Path, manifest: Mapping[str, Any]) -> Mapping[str, str]:
             raise CallerError(
                 f"{folder}: holds runs, but no {MANIFEST}; give another --out"
             ) from None
-        scratch = path.with_name(f".{path.name}{_PARTIAL}")
-        scratch.write_text(json.dumps(manifest, indent=1), encoding="utf-8")
-        scratch.replace(path)
-        return dict(manifest["arithmetic"])
+        write_whole(path, json.dumps(manifest, indent=1))
+        there = dict(manifest)
     except ValueError:
         there = None
     if not isinstance(there, dict) or not isinstance(there.get("arithmetic"), dict):
@@ -229,17 +200,13 @@ def _identity(campaign: Campaign) -> dict[str, Any]:
 def _difference(there: Any, here: Any, key: str = "") -> str | None:
     """Return the first difference as text; None if there is none."""
     if isinstance(there, dict) and isinstance(here, dict):
-        for name in sorted(there.keys() | here.keys()):
-            place = f"{key}.{name}" if key else name
-            if (found := _difference(there.get(name), here.get(name), place)) is not None:
-                return found
-        return None
-    if isinstance(there, list) and isinstance(here, list) and len(there) == len(here):
-        pairs = enumerate(zip(there, here, strict=True))
-        return next(filter(None, (_difference(a, b, f"{key}.{i}") for i, (a, b) in pairs)), None)
-    return None if there == here else f"{key} is {_short(there)} there, {_short(here)} here"
-
-
-def _short(value: Any) -> str:
-    text = json.dumps(value, ensure_ascii=False)
-    return text if len(text) <= 60 else text[:57] + "..."
+        names: list[Any] = sorted(there.keys() | here.keys())
+        pairs = [(there.get(name), here.get(name)) for name in names]
+    elif isinstance(there, list) and isinstance(here, list) and len(there) == len(here):
+        names, pairs = list(range(len(here))), list(zip(there, here, strict=True))
+    else:
+        texts = [shortened(json.dumps(one, ensure_ascii=False), 60) for one in (there, here)]
+        return None if there == here else f"{key} is {texts[0]} there, {texts[1]} here"
+    places = (f"{key}.{name}".removeprefix(".") for name in names)
+    found = (_difference(*pair, place) for pair, place in zip(pairs, places, strict=True))
+    return next(filter(None, found), None)

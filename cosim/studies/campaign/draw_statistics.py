@@ -40,11 +40,9 @@ class Estimate(NamedTuple):
 
 
 def estimate(values: Vector, finite: Vector | None = None) -> Estimate:
-    """Estimate a metric from its values in k ≥ 1 draws.
+    """Estimate a metric from its values in k ≥ 1 draws, (k,), without NaN.
 
-    Args:
-        values: (k,), without NaN.
-        finite: the values for the mean; by default all finite values.
+    Mean and interval use ``finite``, by default all finite values.
     """
     finite = values[np.isfinite(values)] if finite is None else finite
     mean, halfwidth = float(finite.mean()) if len(finite) else math.inf, math.inf
@@ -52,22 +50,11 @@ def estimate(values: Vector, finite: Vector | None = None) -> Estimate:
         with np.errstate(over="ignore"):  # the interval of numbers beyond 1e150 is infinite
             deviation = float(finite.std(ddof=1))
         halfwidth = _student(len(finite)) * deviation / math.sqrt(len(finite))
-    ordered = np.sort(values)
     q05, q25, median, q75, q95 = _quantiles(values, QUANTILES)
-    low, high = interval_ranks(len(values), 0.5)
+    low, high = quantile_interval(values, 0.5)
+    largest = float(values.max())
     return Estimate(
-        len(values),
-        len(finite),
-        mean,
-        halfwidth,
-        q05,
-        q25,
-        median,
-        q75,
-        q95,
-        float(ordered[low]) if low >= 0 else -math.inf,
-        float(ordered[high]) if high < len(ordered) else math.inf,
-        float(ordered[-1]),
+        len(values), len(finite), mean, halfwidth, q05, q25, median, q75, q95, low, high, largest
     )
 
 
@@ -126,15 +113,17 @@ def _quantiles(values: Vector, shares: Sequence[float]) -> list[float]:
     return [float(value) for value in np.quantile(values, shares, method="inverted_cdf")]
 
 
+def quantile_interval(values: Vector, share: float) -> tuple[float, float]:
+    """Return the ends of a quantile's 95 % confidence interval; ±inf if no draw bounds it."""
+    ordered = np.append(np.sort(values), math.inf)
+    low, high = interval_ranks(len(values), share)
+    return float(ordered[low]) if low >= 0 else -math.inf, float(ordered[high])
+
+
 def interval_ranks(count: int, share: float) -> tuple[int, int]:
     """Return the ranks, from 0, of the ends of a quantile's 95 % confidence interval.
 
-    Args:
-        count: number of draws.
-        share: of the quantile, in (0, 1).
-
-    Returns:
-        Lower and upper rank; −1 and ``count`` if no draw bounds the quantile.
+    They are −1 and ``count`` if no draw bounds the quantile.
     """
     from scipy.stats import binom
 

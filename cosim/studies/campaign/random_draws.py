@@ -8,6 +8,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cosim.simulation.batch.batch_interface import Population
 from noack.config.resolution import loop_of, resolve
@@ -45,9 +46,7 @@ class Box(NamedTuple):
             for name, centre, half in (("A", self.A, self.half_A), ("B", self.B, self.half_B))
         )
         x0 = self.x0 + self.half_x0 * _units(seed, "initial_state", draws, self.x0.size)
-        # 63 bits: the range of a TOML integer.
-        loss_seeds = words(seed, _STREAM, "loss", rows=draws, width=1)[:, 0] >> np.uint64(1)
-        return Population(A, B, x0, loss_seeds)
+        return Population(A, B, x0, _seeds(seed, "loss", draws))
 
 
 def box_of(scenario: Scenario) -> Box:
@@ -55,63 +54,42 @@ def box_of(scenario: Scenario) -> Box:
 
     The box of a nonlinear plant is around the model.
     """
-    loop = loop_of(
-        resolve(
-            scenario.model_copy(
-                update={
-                    "plant": scenario.plant.model_copy(
-                        update={
-                            "draw": "given" if scenario.plant.draw == "given" else "nominal",
-                            "initial_state_halfwidth": None,
-                        }
-                    )
-                }
-            )
-        )
-    )
-    A, B, x0 = loop.A, loop.B, loop.x0
-    drawn = scenario.plant.draw in ("uniform", "vertex")
+    plant = scenario.plant
+    draw = "given" if plant.draw == "given" else "nominal"
+    centre = plant.model_copy(update={"draw": draw, "initial_state_halfwidth": None})
+    loop = loop_of(resolve(scenario.model_copy(update={"plant": centre})))
+    drawn = plant.draw in ("uniform", "vertex")
 
     def half(given: tuple[object, ...] | None, like: Matrix) -> Matrix:
         return np.zeros_like(like) if given is None else np.array(given, dtype=np.float64)
 
     return Box(
-        A,
-        B,
-        x0,
-        half(scenario.plant.uncertainty_A if drawn else None, A),
-        half(scenario.plant.uncertainty_B if drawn else None, B),
-        half(scenario.plant.initial_state_halfwidth, x0),
-        scenario.plant.draw == "vertex",
+        loop.A,
+        loop.B,
+        loop.x0,
+        half(plant.uncertainty_A if drawn else None, loop.A),
+        half(plant.uncertainty_B if drawn else None, loop.B),
+        half(plant.initial_state_halfwidth, loop.x0),
+        plant.draw == "vertex",
     )
 
 
 def drawn_scenario(scenario: Scenario, seed: int, draw: int) -> Scenario:
     """Return one run of a campaign as a resolved scenario."""
-    A, B, x0, loss_seeds = (
-        drawn[0].tolist() for drawn in box_of(scenario).population(seed, range(draw, draw + 1))
-    )
-    plant = scenario.plant.model_copy(
-        update={
-            **(
-                {"draw": "given", "A": _rows(A), "B": _rows(B)}
-                if scenario.coverage.is_linear
-                else {}
-            ),
-            "initial_state": tuple(x0),
-            "initial_state_halfwidth": None,
-        }
-    )
-    disturbance, noise = (
-        int(words(seed, _STREAM, name, rows=range(draw, draw + 1), width=1)[0, 0] >> np.uint64(1))
-        for name in ("disturbance", "noise")
-    )
+    draws = range(draw, draw + 1)
+    A, B, x0, loss_seeds = (one[0].tolist() for one in box_of(scenario).population(seed, draws))
+    update: dict[str, object] = {"initial_state": tuple(x0), "initial_state_halfwidth": None}
+    if scenario.coverage.is_linear:
+        update |= {"draw": "given", "A": tuple(map(tuple, A)), "B": tuple(map(tuple, B))}
+    disturbance, noise = (int(_seeds(seed, name, draws)[0]) for name in ("disturbance", "noise"))
     seeds = SeedsSection(loss=loss_seeds, disturbance=disturbance, noise=noise)
+    plant = scenario.plant.model_copy(update=update)
     return resolve(scenario.model_copy(update={"plant": plant, "seeds": seeds}))
 
 
-def _rows(matrix: list[list[float]]) -> tuple[tuple[float, ...], ...]:
-    return tuple(map(tuple, matrix))
+def _seeds(seed: int, name: str, draws: range) -> NDArray[np.uint64]:
+    """Return seeds of 63 bits, the range of a TOML integer, (k,)."""
+    return words(seed, _STREAM, name, rows=draws, width=1)[:, 0] >> np.uint64(1)
 
 
 def _units(seed: int, name: str, draws: range, width: int) -> Matrix:

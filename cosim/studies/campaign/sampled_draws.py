@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from cosim.record.align import in_common, join_all
+from cosim.record.align import align_tables, in_common
 from cosim.record.run_record import RunRecord
 from cosim.simulation.batch.batch_interface import ROW
 from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS
@@ -93,7 +93,7 @@ class SampledWork:
             row["settling_s"] = t_s[above[-1]]
         row["final_norm"] = norms[-1]
         row["cost"] = self._cost(record)
-        joined = join_all(record)
+        joined = align_tables(record)
         decay_per_s = record.scenario.trigger.threshold_decay_per_s
         scaled = joined.e_c_norm * np.exp(decay_per_s * joined.t_ns / NS_PER_S)
         row["sup_e_c_scaled"] = scaled[in_common(record.scenario, joined)].max(initial=0.0)
@@ -103,40 +103,35 @@ class SampledWork:
         n, m = loop.n, loop.m
         if not record.scenario.coverage.is_linear:
             return self._trapezoid(record)
-        held = {"d": loop.B, "w": np.eye(n)}
-        added = [name for name in held if name in (steps.dtype.names or ())]
-        through = np.hstack([loop.B, *(held[name] for name in added)])
-        size = n + len(through.T)
+        inputs = {"u": loop.B, "d": loop.B, "w": np.eye(n)}
+        inputs = {name: B for name, B in inputs.items() if name in (steps.dtype.names or ())}
+        through = np.hstack(list(inputs.values()))
+        size = n + through.shape[1]
         weight = np.zeros((size, size))
-        weight[:n, :n] = np.eye(n) if self.Q is None else self.Q
-        weight[n : n + m, n : n + m] = np.eye(m) if self.R is None else self.R
+        weight[:n, :n], weight[n : n + m, n : n + m] = self._weights(n, m)
         drift = np.zeros((size, size))
         drift[:n, :n], drift[:n, n:] = loop.A, through
         block = np.block([[-drift.T, weight], [np.zeros((size, size)), drift]])
         block = expm(block * (record.scenario.timing.plant_period_ns / NS_PER_S))
         over_a_step = block[size:, size:].T @ block[:size, size:]
-        z = np.hstack([steps[name] for name in ("x", "u", *added)])[:-1]
+        z = np.hstack([steps[name] for name in ("x", *inputs)])[:-1]
         return float(np.einsum("ki,ij,kj->", z, over_a_step, z))
 
     def _trapezoid(self, record: RunRecord) -> float:
         x, u = record[PLANT_STEP]["x"], record[PLANT_STEP]["u"][:-1]
-        Q = np.eye(record.loop.n) if self.Q is None else self.Q
-        R = np.eye(record.loop.m) if self.R is None else self.R
-        of_x = np.einsum("ki,ij,kj->k", x, Q, x)
-        of_u = np.einsum("ki,ij,kj->k", u, R, u)
+        Q, R = self._weights(record.loop.n, record.loop.m)
         step_s = record.scenario.timing.plant_period_ns / NS_PER_S
-        return float(step_s * (0.5 * (of_x[1:] + of_x[:-1]) + of_u).sum())
+        of_x = np.trapezoid(np.einsum("ki,ij,kj->k", x, Q, x))
+        return float(step_s * (of_x + np.einsum("ki,ij,kj->", u, R, u)))
+
+    def _weights(self, n: int, m: int) -> tuple[Matrix, Matrix]:
+        Q, R = self.Q, self.R
+        return np.eye(n) if Q is None else Q, np.eye(m) if R is None else R
 
 
 def in_virtual_time(scenario: Scenario) -> Scenario:
     """Return the scenario without the settings that do not affect its simulation."""
+    sections = {"seeds": SeedsSection(), "ports": PortsSection(), "realtime": RealtimeSection()}
     return scenario.model_copy(
-        update={
-            "name": "campaign",
-            "description": "",
-            "speed": 1.0,
-            "seeds": SeedsSection(),
-            "ports": PortsSection(),
-            "realtime": RealtimeSection(),
-        }
+        update={"name": "campaign", "description": "", "speed": 1.0, **sections}
     )

@@ -11,7 +11,7 @@ import numpy as np
 from cosim.analysis.run_summary import Summary
 from cosim.live.finalize import reopen
 from cosim.record.run_record import RunRecord, load_record
-from noack.core.errors import CallerError
+from noack.core.errors import CallerError, shortened
 from noack.protocol.record_tables import PLANT_STEP
 
 if TYPE_CHECKING:
@@ -77,15 +77,13 @@ class RunComparison:
     @cached_property
     def numbers(self) -> list[KeyNumber]:
         """The key numbers that at least one of the runs has."""
-        found = [
-            KeyNumber(name, tuple(value(run.summary) for run in self.runs))
-            for name, value in _NUMBERS.items()
-        ]
-        rms, largest = zip(*(_distance(self.runs[0].record, run.record) for run in self.runs),
-                           strict=True)  # fmt: skip
-        found.append(KeyNumber("distance in x to A, RMS", rms))
-        found.append(KeyNumber("distance in x to A, maximum", largest))
-        return [one for one in found if any(value is not None for value in one.values)]
+        found = {
+            name: tuple(value(run.summary) for run in self.runs) for name, value in _NUMBERS.items()
+        }
+        apart = [_distance(self.runs[0].record, run.record) for run in self.runs]
+        found["distance in x to A, RMS"] = tuple(rms for rms, _ in apart)
+        found["distance in x to A, maximum"] = tuple(largest for _, largest in apart)
+        return [KeyNumber(*one) for one in found.items() if any(v is not None for v in one[1])]
 
     @cached_property
     def settings(self) -> dict[str, tuple[str, ...]]:
@@ -94,7 +92,7 @@ class RunComparison:
         keys = dict.fromkeys(key for one in flat for key in one)
         found = {key: tuple(one.get(key, "-") for one in flat) for key in keys}
         return {
-            key: tuple(map(_short, values))
+            key: tuple(shortened(value, _LONGEST_VALUE) for value in values)
             for key, values in found.items()
             if len(set(values)) > 1 and not key.startswith(_NAMES_ONLY)
         }
@@ -230,7 +228,3 @@ def _flat(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
             yield from _flat(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", str(value)
-
-
-def _short(text: str) -> str:
-    return text if len(text) <= _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 1]}…"

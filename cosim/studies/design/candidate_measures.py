@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from cosim.simulation.batch.batch_interface import Population, run_batch, setting_of
-from cosim.studies.campaign.draw_statistics import estimate, interval_ranks
+from cosim.studies.campaign.draw_statistics import estimate, interval_ranks, quantile_interval
+from cosim.studies.design.design_space import Candidate
 from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
@@ -68,6 +69,23 @@ class CandidateMeasures(NamedTuple):
     """The share of runs that settle within the limit."""
 
 
+@dataclass
+class Trial:
+    """A candidate with its measures and bounds."""
+
+    candidate: Candidate
+    measured: CandidateMeasures
+    full: bool = False
+    """Whether it was measured with all draws."""
+    bounds: Bounds = field(default_factory=dict)
+    """Certified bounds; empty until they are computed."""
+
+    def excess(self, limits: DesignLimits) -> float:
+        """Return by how much the candidate misses the limits, from the measures so far."""
+        settling_s = self.measured.settling_high_s if self.full else self.measured.settling_s
+        return limits.excess(settling_s, self.bounds)
+
+
 def measure(scenario: Scenario, limits: DesignLimits, population: Population) -> CandidateMeasures:
     """Run a scenario over draws; the settling time of a failed run is infinite.
 
@@ -78,16 +96,11 @@ def measure(scenario: Scenario, limits: DesignLimits, population: Population) ->
     rows = run_batch(setting, population)
     sent = estimate(rows["transmissions"].astype(np.float64))
     settling_s = np.where(np.isnan(rows["settling_s"]), math.inf, rows["settling_s"])
-    ordered = np.append(np.sort(settling_s), math.inf)
-    low, high = interval_ranks(len(rows), limits.quantile)
+    quantile_s = float(np.quantile(settling_s, limits.quantile, method="inverted_cdf"))
+    low_s, high_s = quantile_interval(settling_s, limits.quantile)
+    settled = float(np.mean(settling_s <= limits.settling_s))
     return CandidateMeasures(
-        len(rows),
-        sent.mean,
-        sent.halfwidth,
-        float(np.quantile(settling_s, limits.quantile, method="inverted_cdf")),
-        float(ordered[low]) if low >= 0 else 0.0,
-        float(ordered[high]),
-        float(np.mean(settling_s <= limits.settling_s)),
+        len(rows), sent.mean, sent.halfwidth, quantile_s, max(low_s, 0.0), high_s, settled
     )
 
 
@@ -97,14 +110,13 @@ def require_draws(draws: int, quantile: float) -> None:
     Raises:
         CallerError: there are too few draws.
     """
-    if interval_ranks(draws, quantile)[1] < draws:
-        return
     enough = draws
     while interval_ranks(enough, quantile)[1] == enough:
         enough += max(enough // 50, 1)
-    raise CallerError(
-        f"--draws: {draws} are too few for the quantile {quantile:g}; {enough} are enough"
-    )
+    if enough > draws:
+        raise CallerError(
+            f"--draws: {draws} are too few for the quantile {quantile:g}; {enough} are enough"
+        )
 
 
 def require_certifiable(scenario: Scenario) -> None:
@@ -135,8 +147,7 @@ def bounds_of(scenario: Scenario, limits: DesignLimits) -> Bounds:
     found = certificate_of(scenario, limits)
     if found.constants is None:
         return {"state": math.inf, "error": math.inf}
-    turns_s = found.floor_from_s if math.isfinite(found.floor_from_s) else 0.0
-    t_s = np.array([0.0, turns_s])
+    t_s = np.array([0.0, found.floor_from_s if math.isfinite(found.floor_from_s) else 0.0])
     weight = loop_of(resolve(scenario)).weight
     shrinks = 1.0 if weight is None else float(np.linalg.norm(np.linalg.inv(weight), 2))
     return {

@@ -1,15 +1,21 @@
-"""The page of a design: one HTML file with figure and tables, and the table for a terminal."""
+"""The output of a design: one page (HTML) with figure and tables, and a table for a terminal."""
 
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 from markupsafe import Markup
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+from cosim.output import palette
+from cosim.output.report.axes import finish, legend, logarithmic, plain, single
 from cosim.output.report.figure_files import inline
+from cosim.output.report.figure_style import printed, styled
 from cosim.output.report.report_page import templates
-from cosim.studies.design.design_figure import trade_off
 from cosim.studies.design.design_result import WORDS, DesignResult, certified, seconds
 from noack.config.scenario_file import dumps
 from noack.core.number_format import plus_minus
@@ -19,6 +25,8 @@ _CAPTION = (
     "same draws. Candidates that settle too rarely to have a quantile are left out. The star is "
     "the chosen candidate on new draws."
 )
+_HEIGHT_IN = 3.8
+_MARKERS = "os^Dv<>PX"
 _MOST_ROWS = 20
 HEADINGS = ("transmissions", "settling time", "α [1/s]", "β", "weight", "gain")
 
@@ -48,22 +56,63 @@ def page(found: DesignResult) -> str:
     )  # fmt: skip
 
 
+@styled
+def trade_off(found: DesignResult) -> Figure:
+    """Draw all tried candidates, the trade-off curve, the limit and the chosen candidate."""
+    names = [f"W {family.name}" for family in found.space.families]
+    star_name = "the choice" if found.feasible else "the closest"
+    figure, (axes,) = single(_HEIGHT_IN, [*names, "trade-off", "limit", star_name])
+    shown = []
+    for i, name in enumerate(names):
+        colour, marker = palette.SERIES[i % len(palette.SERIES)], _MARKERS[i % len(_MARKERS)]
+        style: dict[str, Any] = {"color": printed(colour), "linestyle": "none", "marker": marker}
+        own = [t.measured for t in found.trials if t.candidate.family == i]
+        own = [m for m in own if np.isfinite(m.settling_s)]
+        sent, settling_s = [m.transmissions for m in own], [m.settling_s for m in own]
+        axes.plot(sent, settling_s, markersize=3.5, alpha=0.5, **style)
+        shown.append((Line2D([], [], **style), plain(name, 24)))
+    (front,) = axes.plot(
+        [t.measured.transmissions for t in found.front],
+        [t.measured.settling_s for t in found.front],
+        drawstyle="steps-post", color=printed(palette.NETWORK), linewidth=1.4,
+    )  # fmt: skip
+    limit = axes.axhline(
+        found.limits.settling_s, color=printed(palette.CERTIFIED), linestyle=(0, (6, 2))
+    )
+    best = found.fresh
+    if np.isfinite(best.settling_s):
+        high_s = best.settling_high_s if np.isfinite(best.settling_high_s) else best.settling_s
+        axes.errorbar(
+            [best.transmissions], [best.settling_s],
+            yerr=[[best.settling_s - best.settling_low_s], [high_s - best.settling_s]],
+            xerr=[best.halfwidth], color=printed(palette.LOST), marker="*", markersize=12,
+        )  # fmt: skip
+    star = Line2D([], [], color=printed(palette.LOST), marker="*", linestyle="none")
+    shown += [(front, "trade-off"), (limit, "limit"), (star, star_name)]
+    axes.set(
+        xlabel="transmissions (mean)",
+        ylabel=f"settling time, {100 * found.limits.quantile:g} % quantile [s]",
+    )
+    if any(np.isfinite(trial.measured.settling_s) for trial in found.trials):
+        logarithmic(axes, "x")
+    legend(axes, shown)
+    finish(axes)
+    return figure
+
+
 def rows(found: DesignResult) -> list[tuple[str, ...]]:
     """Return the rows of the trade-off curve."""
-    found_rows: list[tuple[str, ...]] = []
-    for trial in found.front:
-        family = found.space.families[trial.candidate.family]
-        found_rows.append(
-            (
-                plus_minus(trial.measured.transmissions, trial.measured.halfwidth),
-                seconds(trial.measured),
-                f"{trial.candidate.alpha_per_s:.4g}",
-                f"{trial.candidate.beta:.4g}",
-                family.weight,
-                family.gain,
-            )
+    return [
+        (
+            plus_minus(trial.measured.transmissions, trial.measured.halfwidth),
+            seconds(trial.measured),
+            f"{trial.candidate.alpha_per_s:.4g}",
+            f"{trial.candidate.beta:.4g}",
+            found.space.families[trial.candidate.family].weight,
+            found.space.families[trial.candidate.family].gain,
         )
-    return found_rows
+        for trial in found.front
+    ]
 
 
 def print_found(console: Console, found: DesignResult) -> None:
@@ -81,15 +130,15 @@ def print_found(console: Console, found: DesignResult) -> None:
         table.add_row(*row)
     if every:
         console.print(table)
+    lines = []
     if found.feasible:
-        console.print(found.verdict(), highlight=False, markup=False, soft_wrap=True)
-        console.print(
+        lines = [
+            found.verdict(),
             f"chosen among {len(found.trials):,} candidates on {found.best.measured.draws:,} "
             f"draws; the numbers are from {found.fresh.draws:,} other draws",
-            highlight=False,
-            soft_wrap=True,
-        )
-    bounds = [certified(name, value) for name, value in (found.bounds or {}).items()]
-    if bounds:
-        text = f"certified {found.conditions}: {', '.join(bounds)}"
-        console.print(text, highlight=False, soft_wrap=True)
+        ]
+    if found.bounds:
+        bounds = [certified(name, value) for name, value in found.bounds.items()]
+        lines.append(f"certified {found.conditions}: {', '.join(bounds)}")
+    for line in lines:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)

@@ -2,11 +2,16 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
-from cosim.studies.design.candidate_measures import Bounded, Bounds, CandidateMeasures, DesignLimits
-from cosim.studies.design.design_search import Trial
+from cosim.studies.design.candidate_measures import (
+    Bounded,
+    Bounds,
+    CandidateMeasures,
+    DesignLimits,
+    Trial,
+)
 from cosim.studies.design.design_space import DesignSpace
 from noack.config.scenario import Scenario
 from noack.core.number_format import plus_minus
@@ -84,41 +89,29 @@ class DesignResult:
 
     def document(self) -> dict[str, Any]:
         """Return the result as JSON."""
-        limits, fresh = self.limits, self.fresh
-        chosen = self.scenario
+        limits = asdict(self.limits)
+        limits["under"] = "schedule" if limits.pop("schedule") else "paper"
+        bounds = None if self.bounds is None else dict(self.bounds)
+        matrices = {"W": self.scenario.decaying.weight, "K": self.scenario.model.gain}
+        best = {**self._row(self.best), **matrices, "fresh": self.fresh._asdict(), "bounds": bounds}
         return {
             "scenario": self.space.families[0].scenario.name,
-            "limits": {
-                "settling_s": limits.settling_s,
-                "quantile": limits.quantile,
-                "settle": limits.settle,
-                "bounds": dict(limits.bounds),
-                "under": "schedule" if limits.schedule else "paper",
-            },
+            "limits": limits,
             "seed": self.seed,
             "tried": len(self.trials),
             "feasible": self.feasible,
             "confirmed": self.confirmed,
             "verdict": self.verdict(),
-            "best": self._row(self.best)
-            | {
-                "W": chosen.decaying.weight,
-                "K": chosen.model.gain,
-                "fresh": fresh._asdict(),
-                "bounds": None if self.bounds is None else dict(self.bounds),
-            },
+            "best": best,
             "front": [self._row(trial) for trial in self.front],
         }
 
     def _row(self, trial: Trial) -> dict[str, Any]:
-        family = self.space.families[trial.candidate.family]
-        return {
-            "gain": family.gain,
-            "weight": family.weight,
-            "alpha_per_s": trial.candidate.alpha_per_s,
-            "beta": trial.candidate.beta,
-            **trial.measured._asdict(),
-        }
+        number, alpha_per_s, beta = trial.candidate
+        family = self.space.families[number]
+        trigger = {"alpha_per_s": alpha_per_s, "beta": beta}
+        names = {"gain": family.gain, "weight": family.weight}
+        return {**names, **trigger, **trial.measured._asdict()}
 
     def _at(self) -> str:
         one = self.best.candidate

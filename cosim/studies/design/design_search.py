@@ -6,61 +6,82 @@ has fewer transmissions than the chosen one. With few draws the quantile itself 
 with all draws the upper end of its interval.
 """
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 
 from cosim.simulation.batch.batch_interface import Population
 from cosim.studies.campaign.campaign_figures import undominated
-from cosim.studies.campaign.random_draws import Box
+from cosim.studies.campaign.random_draws import Box, box_of
 from cosim.studies.design.candidate_measures import (
-    Bounds,
     CandidateMeasures,
     DesignLimits,
+    Trial,
     bounds_of,
     measure,
+    require_certifiable,
+    require_draws,
 )
-from cosim.studies.design.design_space import Candidate, DesignSpace
+from cosim.studies.design.design_result import DesignResult
+from cosim.studies.design.design_space import Candidate, DesignSpace, space_of
+from noack.config.scenario import Scenario
+from noack.core.errors import CallerError
 
 _SMALLEST_STEP = 0.04
 """Smallest step of the refinement, as a share of the grid's steps."""
 _MOST_ROUNDS = 24
+_SCREENING = 4
+"""Screening uses the number of draws divided by this."""
 
 Progress = Callable[[float], None]
 """Called with the approximate share of the work that is done."""
 
 
-@dataclass
-class Trial:
-    """A candidate with its measures and bounds."""
+def design(
+    families: Mapping[tuple[str, str], Scenario],
+    limits: DesignLimits,
+    *,
+    draws: int,
+    seed: int,
+    progress: Progress = lambda share: None,
+) -> DesignResult:
+    """Choose among families; the result is deterministic.
 
-    candidate: Candidate
-    measured: CandidateMeasures
-    full: bool = False
-    """Whether it was measured with all draws."""
-    bounds: Bounds = field(default_factory=dict)
-    """Certified bounds; empty until they are computed."""
+    Args:
+        families: scenarios, not resolved, by the names of gain and norm.
+        limits: the limits that the design must meet.
+        draws: number of draws for the choice; the same number of new draws confirms it.
+        seed: of all draws.
+        progress: called with the approximate share of the work that is done.
 
-    def excess(self, limits: DesignLimits) -> float:
-        """Return by how much the candidate misses the limits, from the measures so far."""
-        settling_s = self.measured.settling_high_s if self.full else self.measured.settling_s
-        return limits.excess(settling_s, self.bounds)
+    Raises:
+        CallerError: the limits or the scenario do not permit a design.
+    """
+    first = next(iter(families.values()))
+    first.coverage.require_exact()
+    if limits.settling_s > first.horizon_s:
+        raise CallerError(
+            f"--settling: {limits.settling_s:g} s lie beyond horizon_s = {first.horizon_s:g}"
+        )
+    require_draws(draws, limits.quantile)
+    if limits.bounds:
+        require_certifiable(first)
+    space = space_of(families)
+    search = Search(space, limits, box_of(first), seed, draws, progress)
+    best = search.run()
+    scenario = space.families[best.candidate.family].with_trigger(best.candidate)
+    try:
+        require_certifiable(scenario)
+        bounds = best.bounds or bounds_of(scenario, limits)
+    except CallerError:  # a bound is not required here
+        bounds = None
+    return DesignResult(
+        space, limits, search.trials, search.front(), best, search.confirm(best), bounds, seed
+    )
 
 
 class Search:
-    """All trials of a space on common draws.
-
-    Args:
-        space: the available candidates.
-        limits: the limits that the design must meet.
-        box: the box from which plants and initial states are drawn.
-        seed: of the draws.
-        screening: number of draws for all candidates.
-        draws: number of draws for the best candidates; the same number of new draws confirms the
-            choice.
-        progress: called with the approximate share of the work that is done.
-    """
+    """All trials of a space on common draws; the draws after them confirm the choice."""
 
     def __init__(
         self,
@@ -68,13 +89,11 @@ class Search:
         limits: DesignLimits,
         box: Box,
         seed: int,
-        *,
-        screening: int,
         draws: int,
-        progress: Progress = lambda share: None,
+        progress: Progress,
     ) -> None:
         self.space, self.limits = space, limits
-        self._few = box.population(seed, range(screening))
+        self._few = box.population(seed, range(max(draws // _SCREENING, 1)))
         self._all = box.population(seed, range(draws))
         self._fresh = box.population(seed, range(draws, 2 * draws))
         self._trials: dict[Candidate, Trial] = {}

@@ -1,5 +1,6 @@
 """The candidates of a design: families of loops with a gain and a norm, each with α and β."""
 
+import itertools
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -31,17 +32,14 @@ class Candidate(NamedTuple):
 
 @dataclass(frozen=True)
 class Family:
-    """Candidates that differ in α and β only.
-
-    Args:
-        gain: name of the gain.
-        weight: name of the norm.
-        scenario: the scenario with this gain and norm, not resolved.
-    """
+    """Candidates that differ in α and β only."""
 
     gain: str
+    """Name of the gain."""
     weight: str
+    """Name of the norm."""
     scenario: Scenario
+    """The scenario with this gain and norm, not resolved."""
 
     @property
     def name(self) -> str:
@@ -58,43 +56,34 @@ class Family:
 
 @dataclass(frozen=True)
 class DesignSpace:
-    """All families with their ranges of α and β.
-
-    Args:
-        families: at least one.
-        decay_per_s: the decay rate of each family; α must be below it.
-        initial_norm: ‖x(0)‖.
-        floor: floor of the trigger; β must be above it.
-    """
+    """All families with their ranges of α and β."""
 
     families: tuple[Family, ...]
     decay_per_s: tuple[float, ...]
+    """The decay rate of each family; α must be below it."""
     initial_norm: float
+    """‖x(0)‖."""
     floor: float
+    """Floor of the trigger; β must be above it."""
 
     def grid(self) -> Iterator[Candidate]:
         """Return the first candidates of the search."""
         for family, decay_per_s in enumerate(self.decay_per_s):
-            for step in range(RATE_STEPS):
-                for level in LEVELS:
-                    alpha_per_s = MOST_RATE * decay_per_s / RATE_STEP**step
-                    one = Candidate(family, alpha_per_s, float(level) * self.initial_norm)
-                    if self.holds(one):
-                        yield one
+            for step, level in itertools.product(range(RATE_STEPS), LEVELS):
+                alpha_per_s = MOST_RATE * decay_per_s / RATE_STEP**step
+                one = Candidate(family, alpha_per_s, float(level) * self.initial_norm)
+                if self.contains(one):
+                    yield one
 
     def around(self, centre: Candidate, share: float) -> Iterator[Candidate]:
         """Return a candidate's neighbours, at a distance of this share of the grid's steps."""
-        for i in (-1, 0, 1):
-            for j in (-1, 0, 1):
-                one = Candidate(
-                    centre.family,
-                    centre.alpha_per_s * RATE_STEP ** (i * share),
-                    centre.beta * LEVEL_STEP ** (j * share),
-                )
-                if (i or j) and self.holds(one):
-                    yield one
+        family, alpha_per_s, beta = centre
+        for i, j in itertools.product((-share, 0, share), repeat=2):
+            one = Candidate(family, alpha_per_s * RATE_STEP**i, beta * LEVEL_STEP**j)
+            if (i or j) and self.contains(one):
+                yield one
 
-    def holds(self, one: Candidate) -> bool:
+    def contains(self, one: Candidate) -> bool:
         """Whether a candidate is within the ranges."""
         low = max(LEVELS[0] * self.initial_norm / _WIDEST, self.floor)
         high = LEVELS[-1] * self.initial_norm * _WIDEST
@@ -103,14 +92,13 @@ class DesignSpace:
 
 def with_gain(scenario: Scenario, K: Matrix) -> Scenario:
     """Return the scenario with another gain, (m, n)."""
-    rows = tuple(tuple(row) for row in K.tolist())
-    model = scenario.model.model_copy(update={"gain": rows})
+    model = scenario.model.model_copy(update={"gain": tuple(map(tuple, K.tolist()))})
     return scenario.model_copy(update={"model": model})
 
 
 def with_norm(scenario: Scenario, weight: Matrix | None) -> Scenario:
     """Return the scenario with another norm in the trigger, W or the identity."""
-    rows = None if weight is None else tuple(tuple(row) for row in weight.tolist())
+    rows = None if weight is None else tuple(map(tuple, weight.tolist()))
     trigger = scenario.decaying.model_copy(update={"weight": rows})
     return scenario.model_copy(update={"trigger": trigger})
 

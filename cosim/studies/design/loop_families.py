@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 
 from cosim.studies.design.design_space import MOST_RATE, RATE_STEP, decay_rate, with_gain, with_norm
-from cosim.studies.design.lqr import lqr_gain
 from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
@@ -44,11 +43,11 @@ def families_of(
     found = {}
     for i, (gain, one) in enumerate(gains.items()):
 
-        def told(share: float, done: int = i) -> None:
+        def report(share: float, done: int = i) -> None:
             progress((done + share) / len(gains))
 
         for norm in norms:
-            found[gain, norm] = _normed(one, norm, told)
+            found[gain, norm] = _normed(one, norm, report)
     return found
 
 
@@ -64,6 +63,30 @@ def _regulated(scenario: Scenario, Q: Matrix, R: Matrix) -> list[tuple[str, Scen
         K = lqr_gain(loop.A_model, loop.B_model, Q, cost * R)
         found.append((f"lqr R × {cost:g}", with_gain(scenario, K)))
     return found
+
+
+def lqr_gain(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
+    """Return K of u = K x, (m, n): K = −R⁻¹BᵀP, AᵀP + PA − PBR⁻¹BᵀP + Q = 0.
+
+    Raises:
+        CallerError: Q or R is not a valid weight, or no P makes the loop stable.
+    """
+    from scipy.linalg import solve_continuous_are
+
+    for name, matrix, least in (("--Q", Q, "semidefinite"), ("--R", R, "definite")):
+        if not np.allclose(matrix, matrix.T, rtol=1e-12, atol=0.0):
+            raise CallerError(f"{name}: must be symmetric")
+        smallest = np.linalg.eigvalsh(matrix)[0]
+        if smallest < -1e-12 * np.abs(matrix).max() or (least == "definite" and smallest <= 0):
+            raise CallerError(f"{name}: must be positive {least}")
+    try:
+        P = solve_continuous_are(A, B, Q, R)
+    except np.linalg.LinAlgError:
+        raise CallerError(
+            "--gain lqr: the Riccati equation of this model has no stabilising solution; "
+            "every unstable mode must be within the inputs' reach and weighed by Q"
+        ) from None
+    return np.asarray(-np.linalg.solve(R, B.T @ P), dtype=np.float64)
 
 
 def _normed(scenario: Scenario, norm: str, progress: Callable[[float], None]) -> Scenario:

@@ -6,18 +6,17 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from cosim.simulation.continuous.continuous_loop import continuous_loop_of
-from cosim.simulation.continuous.continuous_run import (
-    ContinuousRun,
-    TooManyEventsError,
-    simulate_continuous,
-)
+from cosim.simulation.continuous.continuous_report import run_continuous
+from cosim.simulation.continuous.continuous_run import TooManyEventsError
 from cosim.simulation.continuous.exact_flow import ExactFlow, growth_rate
-from cosim.simulation.continuous.network_fates import network_fates
-from noack.config.resolution import LoopMatrices, loop_of, resolve
+from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.config.sections.run_sections import SeedsSection
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
+from noack.theory.certificate import Constants
+from noack.theory.paper_bounds import theorem_2
+from noack.theory.run_conditions import ideal_conditions
+from noack.theory.scenario_certificates import certify
 
 Mode = Literal["model", "zoh"]
 MODES: Mapping[Mode, str] = {"model": "MB-ET", "zoh": "ZOH-ET"}
@@ -26,7 +25,6 @@ STEP_S = 0.01
 """Sampling period of the norms; the loops' fastest mode is slower than 5 /s."""
 LEVELS = (0.05, 0.01)
 """Shares of ‖x(0)‖ below which a run counts as settled."""
-_MAX_EVENTS = 10_000
 _NEVER = math.inf
 
 
@@ -74,6 +72,33 @@ class Draw(NamedTuple):
     zoh: Measures
 
 
+class Certified(NamedTuple):
+    """Certified constants of a draw's MB-ET loop, in the paper's setting."""
+
+    inter_event_s: float
+    """δ: a lower bound of the inter-event times."""
+    delta: float
+    """Δ: ‖e_c‖ ≤ Δβe^{−αt}."""
+    state: float
+    """X: ‖x‖ ≤ Xe^{−αt}."""
+
+
+class Printed(NamedTuple):
+    """Theorem 2 for a draw's MB-ET loop, with the certified Δ in place of Theorem 1's."""
+
+    inter_event_s: float
+    """δ̲ of eq:tau for every t_i."""
+    first_s: float
+    """eq:tau at t_i = 0."""
+    late_s: float
+    """eq:tau as t_i → ∞."""
+    negative: float
+    """1 if F̄ < 0."""
+
+
+_NOT_APPLICABLE = Printed(0.0, 0.0, 0.0, 0.0)
+
+
 def resolved_draw(scenario: Scenario, draw: int, mode: Mode) -> Scenario:
     """Return a resolved draw of a scenario; its number is the seed of every random stream."""
     seeds = SeedsSection(plant=draw, initial_state=draw, loss=draw)
@@ -81,56 +106,66 @@ def resolved_draw(scenario: Scenario, draw: int, mode: Mode) -> Scenario:
 
 
 def measure_draw(scenario: Scenario, draw: int) -> Draw:
-    """Simulate both loops of a draw and measure them.
-
-    Args:
-        scenario: of a variation; its seeds and mode are replaced.
-        draw: number of the draw.
-    """
+    """Simulate both loops of a draw of a variation and measure them."""
     resolved = {mode: resolved_draw(scenario, draw, mode) for mode in MODES}
     loop = loop_of(resolved["model"])
     closed = loop.A + loop.B @ loop.K
-    ideal = _ideal_norms(closed, loop.x0, scenario.horizon_s)
-    settled = [_settling_s(*ideal, level * ideal[1][0]) for level in LEVELS]
-    measures = {mode: _measure(resolved[mode]) for mode in MODES}
+    t_s, norms = _ideal_norms(closed, loop.x0, scenario.horizon_s)
     return Draw(
-        float(np.linalg.norm(loop.x0)),
-        float(open_loop_eigenvalues(loop).real.max()),
+        float(norms[0]),
+        float(open_loop_eigenvalues(loop.A).real.max()),
         spectral_abscissa(closed),
-        settled[0],
-        settled[1],
-        **measures,
+        *_settling_times_s(t_s, norms),
+        _measure(resolved["model"]),
+        _measure(resolved["zoh"]),
     )
 
 
-def open_loop_eigenvalues(loop: LoopMatrices) -> Vector:
+def open_loop_eigenvalues(A: Matrix) -> Vector:
     """Return the eigenvalues of A, (n,); eigenvalues that are 0 up to rounding are set to 0.
 
     A defective double eigenvalue splits by about the square root of the rounding error.
     """
-    eigenvalues = np.linalg.eigvals(loop.A)
-    tolerance = math.sqrt(np.finfo(float).eps) * max(float(np.linalg.norm(loop.A, 2)), 1.0)
+    eigenvalues = np.linalg.eigvals(A)
+    tolerance = math.sqrt(np.finfo(float).eps) * max(float(np.linalg.norm(A, 2)), 1.0)
     return np.where(np.abs(eigenvalues) < tolerance, 0.0, eigenvalues)
 
 
-def simulate_draw(resolved: Scenario, max_events: int = _MAX_EVENTS) -> ContinuousRun:
-    """Simulate a resolved draw in the paper's own setting: continuous trigger, no delay.
+def certified(scenario: Scenario, draw: int) -> Certified:
+    """Return the certificate of a draw; zeros and infinities if there is none."""
+    constants = _constants(resolved_draw(scenario, draw, "model"))
+    if constants is None:
+        return Certified(0.0, math.inf, math.inf)
+    return Certified(constants.inter_event_s or 0.0, constants.delta, constants.state)
 
-    Raises:
-        TooManyEventsError: the events accumulate.
-    """
-    return simulate_continuous(
-        continuous_loop_of(resolved),
-        horizon_s=resolved.horizon_s,
-        delivered=network_fates(resolved),
-        known_start=resolved.network.initial_sync == "known_state",
-        max_events=max_events,
+
+def printed(scenario: Scenario, draw: int) -> Printed:
+    """Return Theorem 2 for a draw; zeros if it does not apply."""
+    resolved = resolved_draw(scenario, draw, "model")
+    trigger, constants = resolved.decaying, _constants(resolved)
+    if constants is None:
+        return _NOT_APPLICABLE
+    found = theorem_2(loop_of(resolved), trigger.beta, trigger.alpha_per_s, constants.delta)
+    if found is None:
+        return _NOT_APPLICABLE
+    start = found.a_tilde * (found.state_start - found.state_forced)  # F̄
+    gap = found.alpha_bar_per_s - trigger.alpha_per_s
+    forced = (gap / found.c + found.a_tilde) * found.state_forced  # F
+    rate, late = found.a_hat + found.alpha_bar_per_s, forced / (found.a_hat + trigger.alpha_per_s)
+    first_s, late_s = (
+        math.log1p(trigger.beta / F) / rate if F > 0 else math.inf
+        for F in (start / rate + late, late)
     )
+    return Printed(found.inter_event_s, first_s, late_s, float(start < 0))
+
+
+def _constants(resolved: Scenario) -> Constants | None:
+    return certify(resolved, ideal_conditions(resolved)).constants
 
 
 def _measure(resolved: Scenario) -> Measures:
     try:
-        run = simulate_draw(resolved)
+        run = run_continuous(resolved)
     except TooManyEventsError:
         return Measures(*[_NEVER] * len(Measures._fields))
     loop, trigger = run.system.loop, run.system.decaying
@@ -143,22 +178,18 @@ def _measure(resolved: Scenario) -> Measures:
     before = np.array([state.e_c for state in run.before[1:]]).reshape(-1, loop.n)
     at_events = run.system.norms(before) * np.exp(trigger.alpha_per_s * run.event_s[1:])
     between = run.e_c_norm(samples) * growth
-    largest = max(float(between.max()), float(at_events.max(initial=0.0)))
     gaps_s = np.diff(run.event_s)
-    arrivals_s = run.event_s[run.delivered]
     states = np.array([state.x for state in run.before])[run.delivered]
     arrival_norms = np.linalg.norm(states, axis=1)
-    finished = run.diverged_at_s is None
     return Measures(
         len(run.event_s),
         int(run.delivered.sum()),
-        _settling_s(t_s, norms, LEVELS[0] * norms[0]) if finished else _NEVER,
-        _settling_s(t_s, norms, LEVELS[1] * norms[0]) if finished else _NEVER,
+        *_settling_times_s(t_s, norms),
         float(gaps_s.min(initial=_NEVER)),
         _median(gaps_s),
-        _median(np.diff(arrivals_s)),
-        largest / trigger.beta,
-        float(norms[-1]) if finished else _NEVER,
+        _median(np.diff(run.event_s[run.delivered])),
+        max(between.max(), at_events.max(initial=0.0)) / trigger.beta,
+        float(norms[-1]) if run.diverged_at_s is None else _NEVER,
         float(norms.max() / norms[0]),
         float((norms * growth).max()),
         int((np.diff(arrival_norms) > 0).sum()),
@@ -176,12 +207,14 @@ def _ideal_norms(closed: Matrix, x0: Vector, horizon_s: float) -> tuple[Vector, 
     return t_s, np.asarray(np.linalg.norm(flow.sample(x0, t_s), axis=1))
 
 
+def _settling_times_s(t_s: Vector, norms: Vector) -> tuple[float, float]:
+    five, one = (_settling_s(t_s, norms, level * norms[0]) for level in LEVELS)
+    return five, one
+
+
 def _settling_s(t_s: Vector, norms: Vector, level: float) -> float:
     """Return the last time with ``norms`` above ``level``; infinite if it is above at the end."""
-    above = np.flatnonzero(norms > level)
-    if not len(above):
-        return 0.0
-    last = int(above[-1])
+    last = int(np.flatnonzero(norms > level)[-1])
     if last == len(norms) - 1:
         return _NEVER
     # Assumption: between two samples the norm falls exponentially.

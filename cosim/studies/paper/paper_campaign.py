@@ -7,7 +7,7 @@ and ZOH-ET have the same plant, the same initial state and the same stream of lo
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from functools import cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -15,9 +15,18 @@ import numpy as np
 from cosim.shipped_files import find_shipped
 from cosim.studies.campaign.campaign_file import Campaign, load
 from cosim.studies.campaign.campaign_grid import grid
+from cosim.studies.campaign.campaign_run import Progress
 from cosim.studies.campaign.campaign_workers import Chunk, Runner
-from cosim.studies.paper.draw_measures import MODES, Draw, Measures, measure_draw
-from cosim.studies.paper.paper_bounds_of_draws import Certified, Printed, certified, printed
+from cosim.studies.paper.draw_measures import (
+    MODES,
+    Certified,
+    Draw,
+    Measures,
+    Printed,
+    certified,
+    measure_draw,
+    printed,
+)
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix
 
@@ -25,16 +34,12 @@ BASE, EXACT_MODEL, WIDE_BOX = "base: Bernoulli 0.8", "box × 0: exact model", "b
 OTHER_EXAMPLES = ("nothing lost", WIDE_BOX, EXACT_MODEL)
 """Variations that change the paper's example. The others vary only unspecified settings."""
 
-Progress = Callable[[int, int], None]
-"""Called with the number of finished draws and the number of all draws."""
 Table = Literal["printed", "certified", "draws"]
 
 _CHUNK = 10
 _VARIED, _PRINTED = 10, 40
 """A variation has one draw per 10 draws of the base. Table ``printed``, the slowest, has one per
 40."""
-
-
 _COMMON = tuple(name for name in Draw._fields if name not in MODES)
 
 
@@ -49,10 +54,7 @@ _ROWS: Mapping[Table, Callable[[Scenario, int], tuple[float, ...]]] = {
 COLUMNS: Mapping[str, tuple[str, ...]] = {
     "printed": Printed._fields,
     "certified": Certified._fields,
-    "draws": (
-        *_COMMON,
-        *(f"{mode}.{name}" for mode in MODES for name in Measures._fields),
-    ),
+    "draws": (*_COMMON, *(f"{mode}.{name}" for mode in MODES for name in Measures._fields)),
 }
 """The columns of each table."""
 
@@ -77,21 +79,13 @@ class PaperWork:
         return np.array([_ROWS[self.table](self.scenario, draw) for draw in draws])
 
 
-def load_campaign() -> tuple[Campaign, dict[str, Scenario]]:
-    """Return the shipped campaign ``paper``, and the scenario of each of its variations.
-
-    Raises:
-        CallerError: the file has mistakes.
-    """
-    path = Path(find_shipped("paper", "campaigns"))
+@cache
+def load_campaign() -> tuple[Campaign, Mapping[str, Scenario]]:
+    """Return the shipped campaign ``paper``, and the scenario of each of its variations."""
+    path = find_shipped("paper", "campaigns")
     campaign = load(path)
     points = grid(campaign, path)
     return campaign, {point.labels["variation"]: point.scenario for point in points}
-
-
-def base_scenario() -> Scenario:
-    """Return the scenario of the base ensemble, without seeds."""
-    return load_campaign()[1][BASE]
 
 
 def settings_of(draw: int) -> list[str]:
@@ -111,16 +105,10 @@ def parts(draws: int, variations: tuple[str, ...]) -> list[EnsemblePart]:
 
 
 def run_parts(
-    scenarios: Mapping[str, Scenario], draws: int, runner: Runner, progress: Progress | None = None
+    draws: int, runner: Runner, progress: Progress | None = None
 ) -> list[tuple[EnsemblePart, Matrix]]:
-    """Compute every table.
-
-    Args:
-        scenarios: by variation.
-        draws: of the base ensemble.
-        runner: a campaign's runner of chunks.
-        progress: called after each chunk.
-    """
+    """Compute every table for a base ensemble of this number of draws."""
+    scenarios = load_campaign()[1]
     wanted = parts(draws, tuple(scenarios))
     works = [PaperWork(part.table, scenarios[part.variation]) for part in wanted]
     chunks = [

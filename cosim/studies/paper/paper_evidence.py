@@ -3,30 +3,25 @@
 Each function returns numbers for the page, from the exact simulator or from linear algebra.
 """
 
+import itertools
 import math
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import schur
 
-from cosim.record.align import join_all
-from cosim.simulation.continuous.continuous_loop import continuous_loop_of
+from cosim.record.align import align_tables
+from cosim.simulation.continuous.continuous_loop import ContinuousLoop, continuous_loop_of
+from cosim.simulation.continuous.continuous_report import run_continuous
 from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
-from cosim.simulation.continuous.network_fates import network_fates
 from cosim.simulation.virtual_time import simulate
-from cosim.studies.paper.draw_measures import (
-    MODES,
-    open_loop_eigenvalues,
-    resolved_draw,
-    simulate_draw,
-)
+from cosim.studies.paper.draw_measures import MODES, open_loop_eigenvalues, resolved_draw
 from noack.config.named_models import lane_following
 from noack.config.resolution import LoopMatrices, loop_of
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
-from noack.core.linear_systems import Matrix, spectral_abscissa
+from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.protocol.record_tables import SENSOR_MEASUREMENT, entry_names
 from noack.theory.paper_bounds import Interval, longest_interval_s, theorem_1
 from noack.trigger.decaying import DecayingTrigger
@@ -73,7 +68,7 @@ def _eigenvalues() -> Numbers:
         eigenvalues = np.linalg.eigvals(model.A + model.B @ model.K)
         found[name] = _complex(eigenvalues[np.lexsort((eigenvalues.imag, eigenvalues.real))])
     A = lane_following({}).A
-    found["open"] = sorted(open_loop_eigenvalues(_loop(A)).real.tolist())
+    found["open"] = sorted(open_loop_eigenvalues(A).real.tolist())
     found["rank"] = int(np.linalg.matrix_rank(A))
     found["rank_squared"] = int(np.linalg.matrix_rank(A @ A))
     return found
@@ -84,9 +79,7 @@ def _loss(M: int) -> Numbers:
 
     On average a delivery needs 1 + p + … + p^(M−1) transmissions.
     """
-    polynomial = np.ones(M)
-    polynomial[-1] -= 2.0
-    roots = np.roots(polynomial)
+    roots = np.roots([*[1.0] * (M - 1), -1.0])
     (half,) = roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)].real
     return {
         "half": float(half),
@@ -98,12 +91,7 @@ def _loss(M: int) -> Numbers:
 def _exact_model(scenario: Scenario) -> Numbers:
     """Proposition 1 fails for an exact model: the nominal lane, only the first packet delivered."""
     resolved = resolved_draw(_nominal(scenario, _LONG_S), 0, "model")
-    run = simulate_continuous(
-        continuous_loop_of(resolved),
-        horizon_s=_LONG_S,
-        delivered=lambda event: event == 0,
-        known_start=False,
-    )
+    run = _only_first_arrives(resolved)
     loop = loop_of(resolved)
     eigenvalues, vectors = np.linalg.eig(loop.H)
     BK, identity = loop.B @ loop.K, np.eye(loop.n)
@@ -126,12 +114,10 @@ def _trapped(scenario: Scenario) -> Numbers:
 
     "model" and "zoh" count eigenvalues 0 as stable (no exponential growth), "strictly" does not.
     """
-    draw = 0
-    while True:
+    for draw in itertools.count():
         loop = loop_of(resolved_draw(scenario, draw, "model"))
-        if (unstable := int((open_loop_eigenvalues(loop).real > _ZERO).sum())) > 0:
+        if unstable := int((open_loop_eigenvalues(loop.A).real > _ZERO).sum()):
             break
-        draw += 1
     return {
         "draw": draw,
         "n": loop.n,
@@ -165,21 +151,23 @@ def _slow_model(M: int) -> Numbers:
     is −0.1 and the plant's pole is −1. α = 0.5 is below A + BK's decay rate 1. A has the distinct
     eigenvalues 1 and −1, as the paper requires.
     """
-    A, model, B, K = np.diag([1.0, -1.0]), np.diag([1.0, -0.1]), np.eye(2)[:, :1], [[-3.0, 0.0]]
+    A, model = np.diag([1.0, -1.0]), np.diag([1.0, -0.1])
+    B, K = np.eye(2)[:, :1], np.array([[-3.0, 0.0]])
     trigger = DecayingTrigger(1.0, 0.5, 0.0, None)
-    loop = _loop(A, B, np.array(K), model, np.array([1.0, 5.0]))
-    horizon_s = 250.0
+    loop = LoopMatrices(
+        A_model=model, B_model=B, K=K, H=model + B @ K, A=A, B=B, x0=np.array([1.0, 5.0]),
+        weight=None, state_names=entry_names("x", 2), input_names=entry_names("u", 1),
+    )  # fmt: skip
     run = simulate_continuous(
-        loop,
-        trigger,
-        horizon_s=horizon_s,
+        ContinuousLoop(loop, trigger),
+        horizon_s=250.0,
         delivered=lambda event: event % M == 0,
         known_start=False,
     )
     ends = [state for i, state in enumerate(run.before) if i % M == 0 and i > 0]
     return {
         "alpha_per_s": trigger.alpha_per_s,
-        "closed_per_s": -spectral_abscissa(A + B @ np.array(K)),
+        "closed_per_s": -spectral_abscissa(A + B @ K),
         "model_per_s": -spectral_abscissa(loop.H),
         "deliveries_s": [state.t_s for state in ends],
         "thresholds": [
@@ -203,13 +191,7 @@ def _standstill(scenario: Scenario) -> Numbers:
     lateral = -0.3 * lateral / lateral[0]
     yaw = lateral[1] / rate  # ψ(∞) = ψ(0) − r(0)/λ = 0
     x0 = np.array([*lateral, yaw, -yaw * loop.K[0, 2] / loop.K[0, 3]])
-    run = simulate_continuous(
-        continuous_loop_of(resolved),
-        horizon_s=resolved.horizon_s,
-        delivered=lambda event: event == 0,
-        known_start=False,
-        x0=x0,
-    )
+    run = _only_first_arrives(resolved, x0)
     last = run.before[-1]
     threshold = run.system.threshold(last.t_s)
     times_s = [0.0, 2.0, 10.0, 20.0, 30.0]
@@ -231,29 +213,23 @@ def _overshoot(scenario: Scenario, representative: int) -> Numbers:
     found: Numbers = {"scales": list(scales)}
     for mode in MODES:
         resolved = resolved_draw(scenario, representative, mode)
-        system = continuous_loop_of(resolved)
-        peaks = []
+        found[mode] = []
         for scale in scales:
-            run = simulate_continuous(
-                system,
-                horizon_s=scenario.horizon_s,
-                delivered=network_fates(resolved),
-                known_start=False,
-                x0=scale * system.loop.x0,
-            )
-            norms = np.linalg.norm(run.at(np.linspace(0, scenario.horizon_s, 2001)).x, axis=1)
-            peaks.append(float(norms.max() / norms[0]))
-        found[mode] = peaks
+            start = tuple(scale * value for value in resolved.plant.initial_state)
+            plant = resolved.plant.model_copy(update={"initial_state": start})
+            run = run_continuous(resolved.model_copy(update={"plant": plant}))
+            norms = np.linalg.norm(run.at(np.linspace(0, run.reached_s, 2001)).x, axis=1)
+            found[mode].append(float(norms.max() / norms[0]))
     return found
 
 
 def _theorem_1(scenario: Scenario, representative: int) -> Numbers:
     """Return Theorem 1's Δ of each interval between deliveries, with the best γ and η_j."""
-    run = simulate_draw(resolved_draw(scenario, representative, "model"))
+    run = run_continuous(resolved_draw(scenario, representative, "model"))
     trigger, H = run.system.decaying, run.system.loop.H
     arrived = np.flatnonzero(run.delivered)
     deltas, closest = [], []
-    for first, following in pairwise(arrived.tolist()):
+    for first, following in itertools.pairwise(arrived.tolist()):
         longest = [_longest_s(run, j) for j in range(first + 1, following)]
         deltas.append(theorem_1(H, trigger.alpha_per_s, longest))
         closest += (np.array(longest) / np.diff(run.event_s[first + 1 : following + 1])).tolist()
@@ -275,9 +251,9 @@ def _theorem_3(scenario: Scenario, representative: int) -> Numbers:
     """
     from scipy.optimize import brentq
 
-    run = simulate_draw(resolved_draw(scenario, representative, "zoh"))
+    run = run_continuous(resolved_draw(scenario, representative, "zoh"))
     beta, alpha_per_s = run.system.decaying.beta, run.system.decaying.alpha_per_s
-    gamma = float(open_loop_eigenvalues(_loop(lane_following({}).A)).real.max())
+    gamma = float(open_loop_eigenvalues(lane_following({}).A).real.max())
 
     def solved_s(eta: float, level: float) -> float:
         def excess(delta_s: float) -> float:
@@ -304,9 +280,9 @@ def _sampled(scenario: Scenario, representative: int) -> Numbers:
     """Return the same draw with a trigger that is evaluated at sampling times only."""
     scenario = scenario.model_copy(update={"horizon_s": _SAMPLED_S})
     resolved = resolved_draw(scenario, representative, "model")
-    continuous = simulate_draw(resolved)
+    continuous = run_continuous(resolved)
     record = simulate(resolved)
-    joined = join_all(record)
+    joined = align_tables(record)
     tested = record[SENSOR_MEASUREMENT]["event"] > 0  # event 0 happens without a test
     beyond = joined.e_s_norm[tested] / joined.threshold[tested]
     exact = continuous.at(joined.t_ns / NS_PER_S)
@@ -320,35 +296,17 @@ def _sampled(scenario: Scenario, representative: int) -> Numbers:
     }
 
 
+def _only_first_arrives(resolved: Scenario, x0: Vector | None = None) -> ContinuousRun:
+    return simulate_continuous(
+        continuous_loop_of(resolved), horizon_s=resolved.horizon_s,
+        delivered=lambda event: event == 0, known_start=False, x0=x0,
+    )  # fmt: skip
+
+
 def _nominal(scenario: Scenario, horizon_s: float) -> Scenario:
     """Return the scenario with the nominal plant and its nominal initial state."""
     plant = scenario.plant.model_copy(update={"draw": "nominal", "initial_state_halfwidth": None})
     return scenario.model_copy(update={"plant": plant, "horizon_s": horizon_s})
-
-
-def _loop(
-    A: Matrix,
-    B: Matrix | None = None,
-    K: Matrix | None = None,
-    A_model: Matrix | None = None,
-    x0: Matrix | None = None,
-) -> LoopMatrices:
-    n = len(A)
-    B = np.zeros((n, 1)) if B is None else B
-    K = np.zeros((1, n)) if K is None else K
-    A_model = A if A_model is None else A_model
-    return LoopMatrices(
-        A_model=A_model,
-        B_model=B,
-        K=K,
-        H=A_model + B @ K,
-        A=A,
-        B=B,
-        x0=np.zeros(n) if x0 is None else x0,
-        weight=None,
-        state_names=entry_names("x", n),
-        input_names=entry_names("u", B.shape[1]),
-    )
 
 
 def _complex(values: NDArray[Any]) -> list[list[float]]:

@@ -11,7 +11,7 @@ from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 from numpy.typing import NDArray
 
 from cosim.output import palette
-from cosim.output.report.axes import BELOW_IN, RIGHT_IN, WIDTH_IN, Shown, finish, place
+from cosim.output.report.axes import WIDTH_IN, Shown, finish
 from cosim.output.report.figure_style import INK, printed, styled
 from cosim.output.report.signal_figures import paper_figure
 from cosim.simulation.continuous.continuous_run import ContinuousRun
@@ -33,7 +33,7 @@ _PANELS = (
     ("settled_5_s", "settling to 5 %", "time [s]", False),
     ("gap_min_s", "shortest interval", "time [s]", True),
 )
-_LEFT_IN, _HEAD_IN, _ABOVE_IN, _GAP_IN, _BELOW_IN = 0.78, 0.62, 1.5, 0.75, 1.85
+_HEIGHT_IN = 5.3
 _COLOURS: Mapping[Mode, Any] = {
     "model": printed(palette.SERIES[2]),
     "zoh": printed(palette.SERIES[3]),
@@ -79,24 +79,22 @@ def _fates(resolved: Scenario, events: int) -> NDArray[np.int64]:
 @styled
 def ensemble_figure(results: Results) -> Figure:
     """Draw the distributions over the draws, and below them both loops of each draw as points."""
-    figure = Figure(figsize=(WIDTH_IN, _HEAD_IN + _ABOVE_IN + _GAP_IN + _BELOW_IN + BELOW_IN))
-    width_in = (WIDTH_IN - RIGHT_IN) / len(_PANELS) - _LEFT_IN
+    figure = Figure(figsize=(WIDTH_IN, _HEIGHT_IN), layout="constrained")
+    panels = figure.subplots(2, len(_PANELS), height_ratios=(4, 5))
     shown: list[Shown] = []
-    for i, (name, title, unit, logarithm) in enumerate(_PANELS):
-        left_in = _LEFT_IN + i * (width_in + _LEFT_IN)
+    for (above, below), (name, title, unit, logarithm) in zip(panels.T, _PANELS, strict=True):
         both: dict[Mode, Vector] = {mode: results.column(f"{mode}.{name}") for mode in MODES}
-        above = place(figure, left_in, _HEAD_IN, width_in, _ABOVE_IN)
         shown = _histogram(above, both, logarithm=logarithm)
-        above.set(title=title, xlabel=unit, ylabel="draws" if i == 0 else "")
-        below = place(figure, left_in, _HEAD_IN + _ABOVE_IN + _GAP_IN, width_in, _BELOW_IN)
+        above.set(title=title, xlabel=unit)
         _against(below, both["model"], both["zoh"], logarithm=logarithm)
         below.set(xlabel=f"MB-ET, {unit}", ylabel=f"ZOH-ET, {unit}")
+    panels[0, 0].set(ylabel="draws")
     handles, labels = zip(*shown, strict=True)
-    corner = (1 - RIGHT_IN / WIDTH_IN, 1 - 0.04 / figure.get_figheight())
-    figure.legend(handles, labels, loc="upper right", bbox_to_anchor=corner, ncols=len(labels))
-    text = f"{results.count():,} draws, each with MB-ET and ZOH-ET"
-    y = 1 - 0.07 / figure.get_figheight()
-    figure.text(_LEFT_IN / WIDTH_IN, y, text, weight="bold", size=10.5, va="top")
+    figure.legend(handles, labels, loc="outside upper right", ncols=len(labels))
+    figure.suptitle(
+        f"{results.count():,} draws, each with MB-ET and ZOH-ET",
+        x=0.005, ha="left", weight="bold", size=10.5,
+    )  # fmt: skip
     return figure
 
 

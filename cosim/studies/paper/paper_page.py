@@ -2,10 +2,10 @@
 
 import re
 import textwrap
-from collections.abc import Iterator
-from functools import cache
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -14,8 +14,7 @@ from cosim.studies.campaign.draw_statistics import paired, quartiles
 from cosim.studies.paper.draw_measures import MODES, STEP_S
 from cosim.studies.paper.paper_campaign import BASE, OTHER_EXAMPLES, settings_of
 from cosim.studies.paper.paper_claims import CONFIRMED_FROM, PARTLY_FROM, claims
-from cosim.studies.paper.paper_numbers import HORIZON_S, number, percent, spread
-from cosim.studies.paper.paper_results import Results
+from cosim.studies.paper.paper_results import HORIZON_S, Results, number, percent, spread
 from noack.core.linear_systems import Vector
 
 _COLUMNS, _GLUE = 100, "\N{NO-BREAK SPACE}"
@@ -37,52 +36,31 @@ _MEASURES = (
 )
 
 
-class _Compared(NamedTuple):
-    """A row of the page's main table: a measure of both loops."""
-
-    what: str
-    model: str
-    zoh: str
-    difference: str
-    larger: str
-
-
-class _Varied(NamedTuple):
-    """A row of the page's table of variations."""
-
-    what: str
-    draws: str
-    events: str
-    lost: str
-    gap_min: str
-    settled: str
-    more: str
-    later: str
-
-
 def render(results: Results) -> str:
     """Return the page in Markdown."""
-    return _wrapped(
-        _templates()
-        .get_template("paper.md.jinja")
-        .render(
-            draws=results.count(),
-            representative=results.representative,
-            settings=settings_of(results.representative),
-            horizon_s=HORIZON_S,
-            step_s=STEP_S,
-            confirmed_from=CONFIRMED_FROM,
-            partly_from=PARTLY_FROM,
-            claims=list(claims(results)),
-            compared=list(_compared(results)),
-            varied=list(_varied(results)),
-            column=results.column,
-            certified=lambda name: results.column(name, table="certified"),
-            printed=lambda name: results.column(name, table="printed"),
-            **_shares(results),
-            **results.evidence,
-        )
+    templates = Environment(
+        loader=FileSystemLoader(Path(__file__).parent), undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
+    )  # fmt: skip
+    templates.filters |= {"n": number, "percent": percent, "spread": spread}
+    text = templates.get_template("paper.md.jinja").render(
+        draws=results.count(),
+        representative=results.representative,
+        settings=settings_of(results.representative),
+        horizon_s=HORIZON_S,
+        step_s=STEP_S,
+        confirmed_from=CONFIRMED_FROM,
+        partly_from=PARTLY_FROM,
+        claims=list(claims(results)),
+        compared=list(_compared(results)),
+        varied=list(_varied(results)),
+        column=results.column,
+        certified=partial(results.column, table="certified"),
+        printed=partial(results.column, table="printed"),
+        **_shares(results),
+        **results.evidence,
     )
+    return _wrapped(text)
 
 
 def _wrapped(text: str) -> str:
@@ -111,59 +89,58 @@ def _filled(paragraph: str) -> list[str]:
     # No line may begin with an operator that Markdown reads as a list mark.
     glued = paragraph[:begin] + re.sub(r" (?=[-+>=*] )", _GLUE, paragraph[begin:])
     lines = textwrap.wrap(
-        glued,
-        _COLUMNS,
-        subsequent_indent=" " * begin,
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
+        glued, _COLUMNS, subsequent_indent=" " * begin,
+        break_long_words=False, break_on_hyphens=False,
+    )  # fmt: skip
     return [line.replace(_GLUE, " ") for line in lines]
 
 
 def _shares(results: Results) -> dict[str, Any]:
     column = results.column
     events, settled = _both(results, "events"), _both(results, "settled_5_s")
-    finest = _both(results, "settled_1_s")
+    margin_per_s = results.evidence["example"]["alpha_per_s"]
     return {
         "fewer": (events[0] < events[1]).mean(),
         "times": quartiles(events[1] / events[0]).median,
         "later": (settled[1] > settled[0]).mean(),
-        "settle": np.isfinite(finest).all(axis=0).mean(),
-        "unstabilised": int(
-            (column("slowest_closed") > -results.evidence["example"]["alpha_per_s"]).sum()
-        ),
+        "settle": np.isfinite(_both(results, "settled_1_s")).all(axis=0).mean(),
+        "unstabilised": int((column("slowest_closed") > -margin_per_s).sum()),
         "not_unstable": (column("fastest_open") <= 0).mean(),
         "stretches": {m: float((column(f"{m}.deliveries") - 1).sum()) for m in MODES},
         "growing": {m: float(column(f"{m}.growing").sum()) for m in MODES},
     }
 
 
-def _compared(results: Results) -> Iterator[_Compared]:
+def _compared(results: Results) -> Iterator[dict[str, str]]:
+    """Return the rows of the main table: a measure of both loops."""
     for what, name in _MEASURES:
         model, zoh = _both(results, name)
-        yield _Compared(
-            what,
-            spread(model),
-            spread(zoh),
-            spread(paired(zoh, model)),
-            percent((zoh > model).mean()),
-        )
+        yield {
+            "what": what,
+            "model": spread(model),
+            "zoh": spread(zoh),
+            "difference": spread(paired(zoh, model)),
+            "larger": percent((zoh > model).mean()),
+        }
 
 
-def _varied(results: Results) -> Iterator[_Varied]:
+def _varied(results: Results) -> Iterator[dict[str, str]]:
+    """Return the rows of the table of variations."""
     for name in results.variations:
-        events, settled = _both(results, "events", name), _both(results, "settled_5_s", name)
-        lost = [percent(quartiles(values).median) for values in _both(results, _LOST, name)]
-        yield _Varied(
-            name + (" *" if name in OTHER_EXAMPLES else ""),
-            number(results.count(name)),
-            _medians(events),
-            " / ".join(lost),
-            _medians(_both(results, "gap_min_s", name)),
-            _medians(settled),
-            percent((events[1] > events[0]).mean()),
-            percent((settled[1] > settled[0]).mean()),
+        events, settled, gap_min, lost = (
+            _both(results, measure, name)
+            for measure in ("events", "settled_5_s", "gap_min_s", _LOST)
         )
+        yield {
+            "what": name + (" *" if name in OTHER_EXAMPLES else ""),
+            "draws": number(results.count(name)),
+            "events": _medians(events),
+            "lost": _medians(lost, percent),
+            "gap_min": _medians(gap_min),
+            "settled": _medians(settled),
+            "more": percent((events[1] > events[0]).mean()),
+            "later": percent((settled[1] > settled[0]).mean()),
+        }
 
 
 def _both(results: Results, name: str, variation: str = BASE) -> list[Vector]:
@@ -173,18 +150,5 @@ def _both(results: Results, name: str, variation: str = BASE) -> list[Vector]:
     return [results.column(f"{mode}.{name}", variation) for mode in MODES]
 
 
-def _medians(both: list[Vector]) -> str:
-    return " / ".join(number(quartiles(values).median) for values in both)
-
-
-@cache
-def _templates() -> Environment:
-    templates = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    templates.filters |= {"n": number, "percent": percent, "spread": spread}
-    return templates
+def _medians(both: list[Vector], written: Callable[[float], str] = number) -> str:
+    return " / ".join(written(quartiles(values).median) for values in both)

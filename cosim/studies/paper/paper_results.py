@@ -1,4 +1,4 @@
-"""The page's data: all draws, as in ``paper.json``."""
+"""The page's data: all draws, as in ``paper.json``, and the format of their numbers."""
 
 import json
 import math
@@ -16,6 +16,12 @@ from noack.core.linear_systems import Matrix, Vector
 
 DIGITS = 5
 """Number of significant digits in the file."""
+
+HORIZON_S = 40.0
+"""Horizon of the campaign ``paper``; a time beyond it is written as "> 40"."""
+_SMALL, _LARGE = 1e-3, 1e6
+"""Numbers outside these limits are written with a power of ten."""
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 REPRESENTED = tuple(
     f"{mode}.{name}"
@@ -40,10 +46,8 @@ class Results:
 
     def lost(self, mode: str, variation: str = BASE) -> Vector:
         """Return the share of the transmissions that the network lost, one entry per draw."""
-        deliveries, events = (
-            self.column(f"{mode}.{name}", variation) for name in ("deliveries", "events")
-        )
-        return 1 - deliveries / events
+        deliveries = self.column(f"{mode}.deliveries", variation)
+        return 1 - deliveries / self.column(f"{mode}.events", variation)
 
     @property
     def variations(self) -> list[str]:
@@ -122,3 +126,32 @@ def _rounded(value: Any) -> Any:
         return None
     short = float(f"{value:.{DIGITS}g}")
     return int(short) if short == round(short) and abs(short) < 10**DIGITS else short
+
+
+def number(value: float, digits: int = 3) -> str:
+    """Return a number as text: 0.0123, 517, 2.8 · 10³³."""
+    if not math.isfinite(value):
+        return f"> {HORIZON_S:g}"
+    if value == round(value) and abs(value) < _LARGE:
+        text = f"{value:,.0f}"
+    elif _SMALL <= abs(value) < _LARGE:
+        short = float(f"{value:.{digits}g}")
+        text = f"{short:,.0f}" if abs(short) >= 10**digits else f"{short:g}"
+    else:
+        mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+        power = f"10{str(int(exponent)).translate(_RAISED)}"
+        text = power if float(mantissa) == 1 else f"{float(mantissa):g} · {power}"
+    return text.replace("-", "−")
+
+
+def percent(value: float) -> str:
+    """Return a share in percent; only exactly all or none is written as 100 % or 0 %."""
+    text = f"{100 * value:.0f}"
+    rounded = text in ("0", "100") and value not in (0.0, 1.0)
+    return f"{100 * value:.1f} %" if rounded else f"{text} %"
+
+
+def spread(values: Vector) -> str:
+    """Return median and quartiles: 517 (493 … 547)."""
+    low, middle, high = map(number, quartiles(values))
+    return f"{middle} ({low} … {high})"

@@ -1,49 +1,48 @@
-"""Simulates the ensemble and writes the page, its figures and its numbers."""
+"""Simulates the ensemble; writes the page, its figures and its numbers; prints the claims."""
 
 import math
 from pathlib import Path
 from typing import Any
 
+from rich.console import Console
+from rich.table import Table
+
 from cosim.output.report.figure_files import save_figure
+from cosim.simulation.continuous.continuous_report import run_continuous
+from cosim.studies.campaign.campaign_run import Progress
 from cosim.studies.campaign.campaign_workers import local
 from cosim.studies.campaign.draw_statistics import quartiles
-from cosim.studies.paper.draw_measures import MODES, resolved_draw, simulate_draw
-from cosim.studies.paper.paper_campaign import (
-    BASE,
-    Progress,
-    base_scenario,
-    load_campaign,
-    run_parts,
-)
-from cosim.studies.paper.paper_claims import claims
+from cosim.studies.paper.draw_measures import MODES, resolved_draw
+from cosim.studies.paper.paper_campaign import BASE, load_campaign, run_parts
+from cosim.studies.paper.paper_claims import PaperVerdict, claims
 from cosim.studies.paper.paper_evidence import evidence
 from cosim.studies.paper.paper_figures import draw_figure, ensemble_figure
 from cosim.studies.paper.paper_page import render
 from cosim.studies.paper.paper_results import REPRESENTED, Results, dumps, results_of
 from noack.core.errors import CallerError, MachineError, why
+from noack.core.file_access import write_whole
 
 PAGE, FIGURES, RESULTS = "paper.md", "figures", "paper.json"
 FEWEST_DRAWS = 4
+_STYLES = {
+    PaperVerdict.CONFIRMED: "green",
+    PaperVerdict.PARTLY: "yellow",
+    PaperVerdict.NOT_CONFIRMED: "bold red",
+}
 
 
 def reproduce(draws: int, workers: int, progress: Progress | None = None) -> Results:
-    """Compute all results of the page.
-
-    Args:
-        draws: of the base ensemble.
-        workers: number of processes.
-        progress: called after each chunk of draws.
+    """Compute all results of the page for a base ensemble of this number of draws.
 
     Raises:
         CallerError: there are too few draws.
     """
     if draws < FEWEST_DRAWS:
         raise CallerError(f"--draws {draws}: quartiles need at least {FEWEST_DRAWS} draws")
-    _, scenarios = load_campaign()
     with local(workers) as runner:
-        parts = run_parts(scenarios, draws, runner, progress)
+        parts = run_parts(draws, runner, progress)
     representative = results_of(parts, {}).representative
-    return results_of(parts, evidence(scenarios[BASE], representative))
+    return results_of(parts, evidence(load_campaign()[1][BASE], representative))
 
 
 def make_folder(folder: Path) -> None:
@@ -65,36 +64,44 @@ def write_page(results: Results, folder: Path) -> list[Path]:
         MachineError: they cannot be written.
     """
     figures = folder / FIGURES
-    written = [folder / PAGE, figures / RESULTS]
-    try:
-        written[0].write_text(render(results), encoding="utf-8")
-        written[1].write_text(dumps(results), encoding="utf-8")
-        scenario = base_scenario()
-        for mode, name in MODES.items():
-            resolved = resolved_draw(scenario, results.representative, mode)
-            figure = draw_figure(simulate_draw(resolved), resolved, results.representative)
-            written.append(figures / f"paper-{name.lower()}.svg")
-            save_figure(figure, written[-1])
-        written.append(figures / "paper-ensemble.png")
-        save_figure(ensemble_figure(results), written[-1])
-    except OSError as error:
-        raise MachineError(f"{folder}: the page cannot be written: {why(error)}") from None
+    written = [
+        write_whole(folder / PAGE, render(results)),
+        write_whole(figures / RESULTS, dumps(results)),
+    ]
+    drawn = {"ensemble.png": ensemble_figure(results)}
+    for mode, name in MODES.items():
+        resolved = resolved_draw(load_campaign()[1][BASE], results.representative, mode)
+        run = run_continuous(resolved)
+        drawn[f"{name.lower()}.svg"] = draw_figure(run, resolved, results.representative)
+    for name, figure in drawn.items():
+        written.append(figures / f"paper-{name}")
+        save_figure(figure, written[-1])
     return written
 
 
 def document(results: Results, written: list[Path]) -> dict[str, Any]:
     """Return the results as JSON: quartiles of the base ensemble, claims, files."""
-    found = {
-        name: {
-            key: value if math.isfinite(value) else None
-            for key, value in quartiles(results.column(name))._asdict().items()
-        }
-        for name in REPRESENTED
-    }
+    found = {name: quartiles(results.column(name))._asdict() for name in REPRESENTED}
     return {
         "draws": results.count(),
         "representative": results.representative,
-        "quartiles": found,
+        "quartiles": {
+            name: {key: value if math.isfinite(value) else None for key, value in one.items()}
+            for name, one in found.items()
+        },
         "claims": [claim._asdict() for claim in claims(results)],
         "files": [str(path) for path in written],
     }
+
+
+def print_claims(console: Console, found: dict[str, Any]) -> None:
+    """Print the claims and the paths of a :func:`document`."""
+    table = Table(title=f"Section V over {found['draws']:,} draws", show_lines=True)
+    for heading in ("the paper says", "verdict", "numbers"):
+        table.add_column(heading)
+    for claim in found["claims"]:
+        style = _STYLES[claim["verdict"]]
+        table.add_row(claim["gist"], f"[{style}]{claim['verdict']}[/]", claim["why"])
+    console.print(table)
+    for file in found["files"]:
+        console.print(file, highlight=False, soft_wrap=True, markup=False)

@@ -9,11 +9,9 @@ _GOLDEN = -7046029254386353131
 
 
 def key_of(name: Array, link: int) -> tuple[int, int, int, int]:
-    """Return a client's key: family, port, host, scope and link, in four words.
+    """Return a client's key in four words: family, port, host, scope and link.
 
-    Args:
-        name: (4,) int64, socket address of the client.
-        link: number of the link.
+    ``name`` is the client's socket address, (4,) int64.
     """
     if name[0] & 0xFFFF == _AF_INET:
         return name[0], 0, 0, link << 32
@@ -38,14 +36,7 @@ def find(table: Array, clients: Array, key0: int, key1: int, key2: int, key3: in
 
 
 def insert(table: Array, clients: Array, row: int, name: Array) -> None:
-    """Insert a client into the table; the table must have room.
-
-    Args:
-        table: the table.
-        clients: the clients.
-        row: row of the client.
-        name: (4,) int64, socket address of the client.
-    """
+    """Insert a client with a socket address, (4,) int64; the table must have room."""
     client = clients[row]
     key0, key1, key2, key3 = key_of(name, client.link)
     client.key0 = key0

@@ -20,13 +20,9 @@ _HEADER_BYTES = HEADER.itemsize
 
 
 def take_errors(memory: Memory, socket: int) -> int:
-    """Empty a socket's error queue; return how many ICMP errors there were.
+    """Empty a socket's error queue; return the number of ICMP errors.
 
     Port-unreachable errors of the server are counted.
-
-    Args:
-        memory: the pump's memory.
-        socket: number of the socket.
     """
     pump, headers = memory.pump[0], memory.error_headers
     found, taken = 0, len(headers)

@@ -44,15 +44,7 @@ SYS_EPOLL_PWAIT2 = 441
 
 
 def _array_at(typing_context: Any, like: Any, address: Any, rows: Any, columns: Any) -> Any:
-    """Return an array of ``like``'s type over the memory at an address.
-
-    Args:
-        typing_context: numba's typing context.
-        like: an array of one or two dimensions, contiguous.
-        address: address of the first element.
-        rows: length of the first dimension.
-        columns: length of the second, if there is one.
-    """
+    """Return an array of the type of ``like`` (contiguous, one or two dimensions) at an address."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         kind = signature.return_type

@@ -15,16 +15,9 @@ def block_address(chunks: Array, block: int) -> int:
 
 
 def keep(memory: Memory, address: int, size_bytes: int, bit: int) -> int:
-    """Copy a payload into a slot and flip a bit of it; there must be room.
+    """Copy a payload into a slot, flip a bit of it (−1 none), and return the slot's number.
 
-    Args:
-        memory: the pump's memory.
-        address: address of the payload.
-        size_bytes: size of the payload.
-        bit: number of the bit to be flipped; −1 none.
-
-    Returns:
-        The number of the slot.
+    There must be room.
     """
     pump = memory.pump[0]
     number = pump.free_slot
@@ -50,6 +43,18 @@ def keep(memory: Memory, address: int, size_bytes: int, bit: int) -> int:
         block = memory.block_next[block]
     pump.free_blocks -= count
     return number
+
+
+def copy_payload(memory: Memory, number: int, place: int) -> None:
+    """Copy the payload in a slot to an address."""
+    slot = memory.slots[number]
+    block, left_bytes = slot.block, slot.size_bytes
+    while left_bytes > 0:
+        length = min(left_bytes, BLOCK_BYTES)
+        memcpy(place, block_address(memory.chunks, block), length)
+        place += length
+        left_bytes -= length
+        block = memory.block_next[block]
 
 
 def drop(memory: Memory, number: int) -> None:

@@ -2,21 +2,12 @@
 
 from typing import Any
 
+from netem.engine.pump import pump_layout as layout
 from netem.engine.pump.client_table import find, key_of
 from netem.engine.pump.libc_calls import ENOMEM, array_at
 from netem.engine.pump.payload_store import blocks_for, keep, pop, push
-from netem.engine.pump.pump_events import has_room, tell_arrival
-from netem.engine.pump.pump_layout import (
-    CARRY_ON,
-    EVENTS_FULL,
-    LEAVING_FULL,
-    NAME_BYTES,
-    NEW_CLIENT,
-    NO_NAME,
-    SERVER_NAME,
-    STORE_FULL,
-    Memory,
-)
+from netem.engine.pump.pump_events import has_room, report_arrival
+from netem.engine.pump.pump_layout import Memory
 from netem.rules.link_rules import admit, leave
 from noack.impairments.link_records import NEVER_NS, LinkMemory, LinkProgram, PacketDecision
 
@@ -27,24 +18,19 @@ _STAMP = 1 | 35 << 32
 _NS = 1_000_000_000
 _NO_CLIENT = -1
 _REFUSED = -2
+_NO_ROOM = -3
 
 
-def let_out_due(memory: Memory, state_like: LinkMemory, until_ns: int) -> int:
-    """Queue the packets that are due for sending; return CARRY_ON, or which buffer is full.
-
-    Args:
-        memory: the pump's memory.
-        state_like: any state; only its types matter.
-        until_ns: packets with a release time up to this time are released.
-    """
+def release_due(memory: Memory, state_like: LinkMemory, until_ns: int) -> int:
+    """Queue the packets that are due for sending; return CARRY_ON, or which buffer is full."""
     pump = memory.pump[0]
     while pump.heap > 0 and memory.heap[0].release_ns <= until_ns:
         entry = memory.heap[0]
         slot = memory.slots[entry.slot]
         if pump.leaving == len(memory.leaving):
-            return LEAVING_FULL
+            return layout.LEAVING_FULL
         if not has_room(memory, slot.size_bytes):
-            return EVENTS_FULL
+            return layout.EVENTS_FULL
         leaving = memory.leaving[pump.leaving]
         leaving.slot = entry.slot
         leaving.release_ns = entry.release_ns
@@ -63,77 +49,61 @@ def let_out_due(memory: Memory, state_like: LinkMemory, until_ns: int) -> int:
         leaving.fate = slot.fate
         leaving.counts = slot.counts
         _line_up(memory, state_like)
-    return CARRY_ON
+    return layout.CARRY_ON
 
 
 def decide(
     memory: Memory, program_like: LinkProgram, state_like: LinkMemory, decision: PacketDecision
 ) -> int:
-    """Decide for the packets received from one socket; return CARRY_ON, or why this ended.
-
-    Args:
-        memory: the pump's memory.
-        program_like: any program; only its types matter.
-        state_like: any state; only its types matter.
-        decision: a row that is overwritten.
-    """
+    """Decide for the packets received from one socket; return CARRY_ON, or why this ended."""
     pump = memory.pump[0]
     reverse = pump.batch_socket >= pump.first_path
-    path = pump.batch_socket - pump.first_path
-    link = memory.clients[path].link if reverse else pump.batch_socket
+    link = pump.batch_socket
+    if reverse:
+        link = memory.clients[pump.batch_socket - pump.first_path].link
     number = 2 * link + reverse
     direction = memory.directions[number]
     program = _program_at(program_like, direction)
-    # Not in a function: compiled code cannot return records.
+    flows, stages, recent_ns, queues, departures_ns = _arrays_at(state_like, direction)
     state = LinkMemory(
-        array_at(state_like.flows, direction.flows, direction.rows, 0),
-        array_at(state_like.memory, direction.memory, direction.rows, direction.stages_rows),
-        array_at(state_like.recent_ns, direction.recent_ns, direction.rows, direction.width),
-        array_at(state_like.queues, direction.queues, direction.stages_rows, 0),
-        array_at(state_like.departures_ns, direction.departures_ns, direction.departure_rows, 0),
-        memory.link_states[number],
-        memory.counters[number],
-    )
+        flows, stages, recent_ns, queues, departures_ns,
+        memory.link_states[number], memory.counters[number],
+    )  # fmt: skip
     while pump.batch_next < pump.batch_end:
         header = memory.in_headers[pump.batch_next]
         _read_arrival(memory)
         # Decision times ascend, so that a packet that is due between two arrivals leaves
         # between them.
         now_ns = max(pump.now_ns, min(pump.arrival_ns, pump.read_ns))
-        reason = let_out_due(memory, state_like, now_ns)
-        if reason != CARRY_ON:
+        reason = release_due(memory, state_like, now_ns)
+        if reason != layout.CARRY_ON:
             return reason
         pump.now_ns = now_ns
         size_bytes = header.size_bytes
         if pump.leaving + 2 > len(memory.leaving):
-            return LEAVING_FULL
+            return layout.LEAVING_FULL
         if not has_room(memory, size_bytes):
-            return EVENTS_FULL
-        client_row = path
-        if direction.keeps != 0 and _store_is_full(memory, size_bytes):
-            if pump.no_memory == 0:
-                return STORE_FULL
-            memory.errors[number, ENOMEM] += 1
-            client_row = _REFUSED
-        elif not reverse:
-            client_row = _client_at_hand(memory, direction, link)
-            if client_row == _NO_CLIENT:
-                return NEW_CLIENT
+            return layout.EVENTS_FULL
+        client_row = _client_of(memory, number, size_bytes)
+        if client_row == _NO_CLIENT:
+            return layout.NEW_CLIENT
+        if client_row == _NO_ROOM:
+            return layout.STORE_FULL
         if client_row >= 0:
             client = memory.clients[client_row]
             client.last_ns = now_ns
             admit(program, state, client.place, size_bytes, now_ns, decision)
             address = memory.in_vectors[pump.batch_next].base
             if pump.taps != 0:
-                tell_arrival(memory, number, client_row, address, decision)
+                report_arrival(memory, number, client_row, address, decision)
             if decision.release_ns != NEVER_NS:
                 _release(memory, state_like, number, client_row, address, decision, 0)
             if decision.copy_ns != NEVER_NS:
                 _release(memory, state_like, number, client_row, address, decision, 1)
-        header.name_bytes = NAME_BYTES
+        header.name_bytes = layout.NAME_BYTES
         header.control_bytes = pump.control_bytes
         pump.batch_next += 1
-    return CARRY_ON
+    return layout.CARRY_ON
 
 
 def _program_at(like: LinkProgram, direction: Any) -> LinkProgram:
@@ -152,15 +122,34 @@ def _program_at(like: LinkProgram, direction: Any) -> LinkProgram:
     )
 
 
-def _store_is_full(memory: Memory, size_bytes: int) -> bool:
-    """Whether a packet of this size and its copy might not fit into the store."""
-    pump = memory.pump[0]
-    return pump.free_slots < 2 or pump.free_blocks < 2 * blocks_for(size_bytes)
+def _arrays_at(like: LinkMemory, direction: Any) -> tuple[Any, Any, Any, Any, Any]:
+    """Return the arrays of a direction's state; compiled code cannot return its records."""
+    return (
+        array_at(like.flows, direction.flows, direction.rows, 0),
+        array_at(like.memory, direction.memory, direction.rows, direction.stages_rows),
+        array_at(like.recent_ns, direction.recent_ns, direction.rows, direction.width),
+        array_at(like.queues, direction.queues, direction.stages_rows, 0),
+        array_at(like.departures_ns, direction.departures_ns, direction.departure_rows, 0),
+    )
 
 
-def _client_at_hand(memory: Memory, direction: Any, link: int) -> int:
-    """Return the row of the client that sent the current packet; count a refused packet."""
-    key0, key1, key2, key3 = key_of(memory.in_names[memory.pump[0].batch_next], link)
+def _client_of(memory: Memory, number: int, size_bytes: int) -> int:
+    """Return the row of the current packet's client, or why there is none; count a refused packet.
+
+    A packet is refused if it and its copy might not fit into the store, or if it comes from a
+    client beyond the maximum number.
+    """
+    pump, direction = memory.pump[0], memory.directions[number]
+    if direction.keeps != 0 and (
+        pump.free_slots < 2 or pump.free_blocks < 2 * blocks_for(size_bytes)
+    ):
+        if pump.no_memory == 0:
+            return _NO_ROOM
+        memory.errors[number, ENOMEM] += 1
+        return _REFUSED
+    if number & 1:
+        return pump.batch_socket - pump.first_path
+    key0, key1, key2, key3 = key_of(memory.in_names[pump.batch_next], number >> 1)
     row = find(memory.table, memory.clients, key0, key1, key2, key3)
     if row < 0:
         if direction.full == 0:
@@ -238,31 +227,22 @@ def _line_up(memory: Memory, state_like: LinkMemory) -> None:
     pump = memory.pump[0]
     leaving = memory.leaving[pump.leaving]
     number = leaving.direction
-    direction = memory.directions[number]
+    direction, link = memory.directions[number], number >> 1
+    flows, stages, recent_ns, queues, departures_ns = _arrays_at(state_like, direction)
     state = LinkMemory(
-        array_at(state_like.flows, direction.flows, direction.rows, 0),
-        array_at(state_like.memory, direction.memory, direction.rows, direction.stages_rows),
-        array_at(state_like.recent_ns, direction.recent_ns, direction.rows, direction.width),
-        array_at(state_like.queues, direction.queues, direction.stages_rows, 0),
-        array_at(state_like.departures_ns, direction.departures_ns, direction.departure_rows, 0),
-        memory.link_states[number],
-        memory.counters[number],
-    )
+        flows, stages, recent_ns, queues, departures_ns,
+        memory.link_states[number], memory.counters[number],
+    )  # fmt: skip
     leaving.stale = leave(
-        state,
-        memory.clients[leaving.client].place,
-        leaving.packet,
-        leaving.size_bytes,
-        leaving.delayed != 0,
-        leaving.counts != 0,
-    )
+        state, memory.clients[leaving.client].place, leaving.packet, leaving.size_bytes,
+        leaving.delayed != 0, leaving.counts != 0,
+    )  # fmt: skip
     leaving.error = 0
     pump.leaving += 1
     pump.leaving_bytes += leaving.size_bytes
-    direction, link = memory.directions[number], number >> 1
-    if direction.sends == NO_NAME:
+    if direction.sends == layout.NO_NAME:
         leaving.socket = pump.first_path + leaving.client
-    elif direction.sends == SERVER_NAME:
+    elif direction.sends == layout.SERVER_NAME:
         leaving.socket = len(memory.directions) // 2 + link
     else:
         leaving.socket = link

@@ -3,8 +3,8 @@
 from typing import Any
 
 from netem.engine.pump.libc_calls import address_of, array_at, memcpy
-from netem.engine.pump.payload_store import block_address
-from netem.engine.pump.pump_layout import BLOCK_BYTES, CLIENT, DIRECTION, Memory
+from netem.engine.pump.payload_store import copy_payload
+from netem.engine.pump.pump_layout import CLIENT, DIRECTION, Memory
 from netem.relay_events import EVENT
 from noack.impairments.link_records import NEVER_NS, PacketDecision
 
@@ -30,21 +30,13 @@ def has_room(memory: Memory, size_bytes: int) -> bool:
     return pump.taps == 1 or pump.data + pump.leaving_bytes + 3 * size_bytes <= len(memory.data)
 
 
-def tell_arrival(
-    memory: Memory, way: int, client: int, address: int, decision: PacketDecision
+def report_arrival(
+    memory: Memory, direction: int, client: int, payload: int, decision: PacketDecision
 ) -> None:
-    """Report the arrival of a datagram and the decision.
-
-    Args:
-        memory: the pump's memory.
-        way: number of the direction.
-        client: row of the client.
-        address: address of the payload.
-        decision: the decision.
-    """
+    """Report the arrival of a datagram, with the address of its payload, and the decision."""
     pump, size_bytes = memory.pump[0], decision.size_bytes
     event = memory.events[pump.events]
-    _fill(memory, event, way, client, pump.now_ns, decision.packet, decision.fate, size_bytes)
+    _fill(memory, event, direction, client, pump.now_ns, decision.packet, decision.fate, size_bytes)
     event.consecutive_losses = decision.consecutive_losses
     event.delay_ns = -1
     event.copy_delay_ns = -1
@@ -58,21 +50,15 @@ def tell_arrival(
     event.departure = 0
     event.copy = 0
     event.stale = 0
-    _tell_addresses(memory, event, way, client, way & 1)
+    _put_addresses(memory, event, direction, client, direction & 1)
     if pump.taps == 2:
-        memcpy(address_of(memory.data) + pump.data, address, size_bytes)
+        memcpy(address_of(memory.data) + pump.data, payload, size_bytes)
         pump.data += size_bytes
     pump.events += 1
 
 
-def tell_departure(memory: Memory, number: int, now_ns: int) -> None:
-    """Report the departure of a datagram.
-
-    Args:
-        memory: the pump's memory.
-        number: its row in ``leaving``.
-        now_ns: time of departure.
-    """
+def report_departure(memory: Memory, number: int, now_ns: int) -> None:
+    """Report the departure of the datagram in a row of ``leaving``."""
     pump, leaving = memory.pump[0], memory.leaving[number]
     event = memory.events[pump.events]
     _fill(
@@ -88,19 +74,13 @@ def tell_departure(memory: Memory, number: int, now_ns: int) -> None:
     event.departure = 1
     event.copy = leaving.copy
     event.stale = leaving.stale
-    _tell_addresses(memory, event, leaving.direction, leaving.client, 1 - (leaving.direction & 1))
+    _put_addresses(memory, event, leaving.direction, leaving.client, 1 - (leaving.direction & 1))
     if pump.taps == 2:
         place = address_of(memory.data) + pump.data
         if leaving.slot < 0:
             memcpy(place, leaving.address, leaving.size_bytes)
         else:
-            block, left_bytes = memory.slots[leaving.slot].block, leaving.size_bytes
-            while left_bytes > 0:
-                length = min(left_bytes, BLOCK_BYTES)
-                memcpy(place, block_address(memory.chunks, block), length)
-                place += length
-                left_bytes -= length
-                block = memory.block_next[block]
+            copy_payload(memory, leaving.slot, place)
         pump.data += leaving.size_bytes
     pump.events += 1
 
@@ -108,7 +88,7 @@ def tell_departure(memory: Memory, number: int, now_ns: int) -> None:
 def _fill(
     memory: Memory,
     event: Any,
-    way: int,
+    direction: int,
     client: int,
     now_ns: int,
     packet: int,
@@ -119,31 +99,33 @@ def _fill(
     event.t_ns = pump.unix_ns + now_ns
     event.flow = memory.clients[client].number
     event.packet = packet
-    event.mansd = memory.directions[way].mansd
+    event.mansd = memory.directions[direction].mansd
     event.offset = pump.data
     event.size_bytes = size_bytes
-    event.link = way >> 1
-    event.direction = way & 1
+    event.link = direction >> 1
+    event.direction = direction & 1
     event.fate = fate
 
 
-def _tell_addresses(memory: Memory, event: Any, way: int, client: int, server_side: int) -> None:
+def _put_addresses(
+    memory: Memory, event: Any, direction: int, client: int, server_side: int
+) -> None:
     """Write source and destination address of a datagram on one side of a link."""
     pump = memory.pump[0]
     here = address_of(memory.clients) + client * _CLIENT_BYTES
-    link = address_of(memory.directions) + (way - (way & 1)) * _DIRECTION_BYTES
+    link = address_of(memory.directions) + (direction & ~1) * _DIRECTION_BYTES
     near, far = here + _CLIENT_NAME, link + _LISTEN
     if server_side:
         near, far = here + _CLIENT_LOCAL, link + _SERVER
-    if way & 1:
+    if direction & 1:
         near, far = far, near
     place = address_of(memory.events) + pump.events * _EVENT_BYTES
-    event.interface = way - (way & 1) + server_side
-    event.family, event.source_port = _tell_host(memory, near, place + _SOURCE)
-    _, event.destination_port = _tell_host(memory, far, place + _DESTINATION)
+    event.interface = (direction & ~1) + server_side
+    event.family, event.source_port = _put_host(memory, near, place + _SOURCE)
+    _, event.destination_port = _put_host(memory, far, place + _DESTINATION)
 
 
-def _tell_host(memory: Memory, name: int, place: int) -> tuple[int, int]:
+def _put_host(memory: Memory, name: int, place: int) -> tuple[int, int]:
     """Copy a socket address's host to ``place``; return the IP version and the port."""
     head = array_at(memory.data, name, 4, 1)
     port = (int(head[2]) << 8) | int(head[3])

@@ -99,7 +99,8 @@ CLIENT = np.dtype(
     ]
 )
 TABLES = ("stages", "integers", "reals", "decisions", "decisions_begin")
-STATES = ("flows", "memory", "recent_ns", "queues", "departures_ns")
+PER_FLOW = ("flows", "memory", "recent_ns")
+STATES = (*PER_FLOW, "queues", "departures_ns")
 DIRECTION = np.dtype(
     [
         *((name, "<i8") for name in TABLES),

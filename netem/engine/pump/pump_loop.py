@@ -1,32 +1,14 @@
 """The pump's loop: wait, receive, decide, send, and release delayed datagrams."""
 
+from netem.engine.pump import libc_calls as libc
+from netem.engine.pump import pump_layout as layout
 from netem.engine.pump.error_queue import take_errors
-from netem.engine.pump.libc_calls import (
-    CLOCK_MONOTONIC,
-    CLOCK_REALTIME,
-    MSG_DONTWAIT,
-    POLLIN,
-    SYS_EPOLL_PWAIT2,
-    address_of,
-    clock_ns,
-    epoll_wait,
-    ppoll,
-    recvmmsg,
-    syscall,
-)
-from netem.engine.pump.pump_decisions import decide, let_out_due
-from netem.engine.pump.pump_layout import (
-    CARRY_ON,
-    HEADER,
-    HOUSEKEEPING,
-    LEAVING_FULL,
-    READY_WORDS,
-    Memory,
-)
+from netem.engine.pump.pump_decisions import decide, release_due
+from netem.engine.pump.pump_layout import READY_WORDS, Memory
 from netem.engine.pump.pump_send import send
 from noack.impairments.link_records import LinkMemory, LinkProgram, PacketDecision
 
-_HEADER_BYTES = HEADER.itemsize
+_HEADER_BYTES = layout.HEADER.itemsize
 _EPOLLERR = 8
 _NS = 1_000_000_000
 _FEW_BUFFERS = 16
@@ -39,46 +21,46 @@ def run_pump(
     memory: Memory,
     program_like: LinkProgram,
     state_like: LinkMemory,
-    verdicts: list[PacketDecision],
+    decisions: list[PacketDecision],
     until_ns: int,
 ) -> int:
-    """Relay until Python is needed; return the reason.
+    """Relay until Python is needed, or until a time since the relay's start; return the reason.
 
     Args:
         memory: the pump's memory.
-        program_like: any program; only its types matter.
-        state_like: any state; only its types matter.
-        verdicts: buffer for one decision.
-        until_ns: latest time to return, since the relay's start.
+        program_like: any program; here and in the other functions, only its types matter.
+        state_like: likewise, any state.
+        decisions: buffer for one decision.
+        until_ns: latest time to return.
     """
     pump = memory.pump[0]
     while True:
-        reason = CARRY_ON
+        reason = layout.CARRY_ON
         if pump.batch_next < pump.batch_end:
-            reason = decide(memory, program_like, state_like, verdicts[0])
-        if reason == CARRY_ON:
-            reason = let_out_due(memory, state_like, pump.read_ns)
+            reason = decide(memory, program_like, state_like, decisions[0])
+        if reason == layout.CARRY_ON:
+            reason = release_due(memory, state_like, pump.read_ns)
         all_taken = pump.ready_next >= pump.ready
-        if reason != CARRY_ON or all_taken or pump.slots_in - pump.batch_end < _FEW_BUFFERS:
+        if reason != layout.CARRY_ON or all_taken or pump.slots_in - pump.batch_end < _FEW_BUFFERS:
             if pump.leaving > 0:
                 send(memory)
-            if reason == LEAVING_FULL:
+            if reason == layout.LEAVING_FULL:
                 continue
-            if reason != CARRY_ON:
+            if reason != layout.CARRY_ON:
                 return reason
             pump.batch_next = 0
             pump.batch_end = 0
         if all_taken:
-            pump.read_ns = clock_ns(CLOCK_MONOTONIC, memory.time) - pump.epoch_ns
+            pump.read_ns = libc.clock_ns(libc.CLOCK_MONOTONIC, memory.time) - pump.epoch_ns
             wait_until_ns = until_ns
             if pump.read_ns >= until_ns:
                 if not _is_soon_due(memory, until_ns):
                     pump.ready = 0
                     pump.ready_next = 0
-                    return HOUSEKEEPING
+                    return layout.HOUSEKEEPING
                 wait_until_ns = pump.read_ns + _HOUSEKEEPING_NS
             if not _wait(memory, wait_until_ns):
-                return HOUSEKEEPING
+                return layout.HOUSEKEEPING
         if pump.ready_next < pump.ready:
             _receive(memory)
 
@@ -100,23 +82,23 @@ def _wait(memory: Memory, until_ns: int) -> bool:
     if pump.heap > 0:
         wait_ns = max(min(wait_ns, memory.heap[0].release_ns - pump.spin_ns - pump.read_ns), 0)
     events = len(memory.ready) // READY_WORDS
-    address = address_of(memory.ready)
+    address = libc.address_of(memory.ready)
     memory.time[0] = wait_ns // _NS
     memory.time[1] = wait_ns % _NS
     if pump.sleeps == 0:
-        found = syscall(
-            SYS_EPOLL_PWAIT2, pump.epoll, address, events, address_of(memory.time), 0, 0
+        found = libc.syscall(
+            libc.SYS_EPOLL_PWAIT2, pump.epoll, address, events, libc.address_of(memory.time), 0, 0
         )
     else:
         memory.poll[0] = pump.epoll
-        memory.poll[1] = POLLIN
-        found = ppoll(address_of(memory.poll), 1, address_of(memory.time), 0)
+        memory.poll[1] = libc.POLLIN
+        found = libc.ppoll(libc.address_of(memory.poll), 1, libc.address_of(memory.time), 0)
         if found > 0:
-            found = epoll_wait(pump.epoll, address, events, 0)
+            found = libc.epoll_wait(pump.epoll, address, events, 0)
     pump.ready = max(found, 0)
     pump.ready_next = 0
     if pump.ready == 0:
-        pump.read_ns = clock_ns(CLOCK_MONOTONIC, memory.time) - pump.epoch_ns
+        pump.read_ns = libc.clock_ns(libc.CLOCK_MONOTONIC, memory.time) - pump.epoch_ns
     return found >= 0
 
 
@@ -129,12 +111,12 @@ def _receive(memory: Memory) -> None:
     if memory.ready[event] & _EPOLLERR:
         take_errors(memory, socket)
     begin = pump.batch_end
-    headers = address_of(memory.in_headers) + begin * _HEADER_BYTES
+    headers = libc.address_of(memory.in_headers) + begin * _HEADER_BYTES
     fd = memory.sockets[socket].fd
-    taken = recvmmsg(fd, headers, pump.slots_in - begin, MSG_DONTWAIT, 0)
-    pump.read_ns = clock_ns(CLOCK_MONOTONIC, memory.time) - pump.epoch_ns
+    taken = libc.recvmmsg(fd, headers, pump.slots_in - begin, libc.MSG_DONTWAIT, 0)
+    pump.read_ns = libc.clock_ns(libc.CLOCK_MONOTONIC, memory.time) - pump.epoch_ns
     if pump.stamps != 0:
-        pump.real_ns = clock_ns(CLOCK_REALTIME, memory.time) - pump.read_ns
+        pump.real_ns = libc.clock_ns(libc.CLOCK_REALTIME, memory.time) - pump.read_ns
     if taken > 0:
         pump.batch_socket = socket
         pump.batch_next = begin

@@ -1,42 +1,24 @@
 """Sends the queued datagrams: one call per socket, each flow in its order."""
 
 from netem.engine.histogram import bucket_of
+from netem.engine.pump import libc_calls as libc
+from netem.engine.pump import pump_layout as layout
 from netem.engine.pump.error_queue import take_errors
-from netem.engine.pump.libc_calls import (
-    CLOCK_MONOTONIC,
-    MSG_DONTWAIT,
-    POLLOUT,
-    address_of,
-    clock_ns,
-    errno,
-    poll,
-    sendmmsg,
-    sendto,
-)
 from netem.engine.pump.payload_store import block_address, blocks_for, drop
-from netem.engine.pump.pump_events import tell_departure
-from netem.engine.pump.pump_layout import (
-    BLOCK_BYTES,
-    CLIENT,
-    CLIENT_NAME,
-    CONTROL,
-    DIRECTION,
-    HEADER,
-    NO_NAME,
-    VECTOR,
-    Memory,
-)
+from netem.engine.pump.pump_events import report_departure
+from netem.engine.pump.pump_layout import Memory
 
+_NO_WAIT = libc.MSG_DONTWAIT
 _EINTR = 4
 _EAGAIN = 11
 _ENOBUFS = 105
-_HEADER_BYTES = HEADER.itemsize
-_VECTOR_BYTES = VECTOR.itemsize
-_CONTROL_BYTES = CONTROL.itemsize
-_CLIENT_BYTES = CLIENT.itemsize
-_CLIENT_NAME = CLIENT.fields["name"][1]  # type: ignore[index]
-_DIRECTION_BYTES = DIRECTION.itemsize
-_DIRECTION_NAME = DIRECTION.fields["name"][1]  # type: ignore[index]
+_HEADER_BYTES = layout.HEADER.itemsize
+_VECTOR_BYTES = layout.VECTOR.itemsize
+_CONTROL_BYTES = layout.CONTROL.itemsize
+_CLIENT_BYTES = layout.CLIENT.itemsize
+_CLIENT_NAME = layout.CLIENT.fields["name"][1]  # type: ignore[index]
+_DIRECTION_BYTES = layout.DIRECTION.itemsize
+_DIRECTION_NAME = layout.DIRECTION.fields["name"][1]  # type: ignore[index]
 _UDP = 17
 _UDP_SEGMENT = 103
 _SEGMENT_CONTROL_BYTES = 18
@@ -81,7 +63,7 @@ def send(memory: Memory) -> None:
                     memory.leaving[memory.out_first[k]].error = socket.error
             if done < headers:
                 following = memory.out_first[done]
-            now_ns = clock_ns(CLOCK_MONOTONIC, memory.time) - pump.epoch_ns
+            now_ns = libc.clock_ns(libc.CLOCK_MONOTONIC, memory.time) - pump.epoch_ns
             while number != following:
                 _account(memory, number, now_ns)
                 number = memory.leaving[number].next
@@ -93,7 +75,7 @@ def _fill(memory: Memory, number: int) -> tuple[int, int]:
     """Fill headers from datagram ``number`` on; return their number and the next datagram."""
     pump = memory.pump[0]
     headers, vectors = 0, 0
-    base = address_of(memory.out_vectors)
+    base = libc.address_of(memory.out_vectors)
     while number >= 0 and headers < len(memory.out_headers):
         leaving = memory.leaving[number]
         size_bytes = leaving.size_bytes
@@ -132,7 +114,7 @@ def _fill(memory: Memory, number: int) -> tuple[int, int]:
                 control.level = _UDP
                 control.kind = _UDP_SEGMENT
                 control.size_bytes = size_bytes
-                header.control = address_of(memory.out_controls) + headers * _CONTROL_BYTES
+                header.control = libc.address_of(memory.out_controls) + headers * _CONTROL_BYTES
                 header.control_bytes = _CONTROL_BYTES
         header.n_vectors = vectors - first_vector
         _address(memory, headers, leaving.direction, leaving.client)
@@ -141,18 +123,18 @@ def _fill(memory: Memory, number: int) -> tuple[int, int]:
 
 
 def _by_client(memory: Memory, number: int) -> bool:
-    return memory.directions[memory.leaving[number].direction].sends == CLIENT_NAME
+    return memory.directions[memory.leaving[number].direction].sends == layout.CLIENT_NAME
 
 
 def _address(memory: Memory, header: int, way: int, client: int) -> None:
     """Write the destination of a message."""
     direction = memory.directions[way]
     name, name_bytes = 0, 0
-    if direction.sends == CLIENT_NAME:
-        name = address_of(memory.clients) + client * _CLIENT_BYTES + _CLIENT_NAME
+    if direction.sends == layout.CLIENT_NAME:
+        name = libc.address_of(memory.clients) + client * _CLIENT_BYTES + _CLIENT_NAME
         name_bytes = memory.clients[client].name_bytes
-    elif direction.sends != NO_NAME:
-        name = address_of(memory.directions) + way * _DIRECTION_BYTES + _DIRECTION_NAME
+    elif direction.sends != layout.NO_NAME:
+        name = libc.address_of(memory.directions) + way * _DIRECTION_BYTES + _DIRECTION_NAME
         name_bytes = direction.name_bytes
     memory.out_headers[header].name = name
     memory.out_headers[header].name_bytes = name_bytes
@@ -170,43 +152,38 @@ def _add_vectors(memory: Memory, vectors: int, number: int) -> int:
     for k in range(blocks_for(left_bytes)):
         vector = memory.out_vectors[vectors + k]
         vector.base = block_address(memory.chunks, block)
-        vector.size_bytes = min(left_bytes, BLOCK_BYTES)
-        left_bytes -= BLOCK_BYTES
+        vector.size_bytes = min(left_bytes, layout.BLOCK_BYTES)
+        left_bytes -= layout.BLOCK_BYTES
         block = memory.block_next[block]
     return vectors + blocks_for(leaving.size_bytes)
 
 
 def _transmit(memory: Memory, socket: int, headers: int, following: int) -> int:
-    """Send messages; return the number of messages that were sent or failed.
+    """Send a number of messages; return the number of messages that were sent or failed.
 
     If it is smaller than ``headers``, the kernel does not segment the next message: the headers of
-    the remaining datagrams must be filled again.
-
-    Args:
-        memory: the pump's memory.
-        socket: number of the socket.
-        headers: number of messages.
-        following: the datagram after the last message; −1 none.
+    the remaining datagrams must be filled again. ``following`` is the datagram after the last
+    message; −1 none.
     """
     pump, fd = memory.pump[0], memory.sockets[socket].fd
     done, tries, waited_ns = 0, 0, 0
-    base, vectors = address_of(memory.out_headers), address_of(memory.out_vectors)
+    base, vectors = libc.address_of(memory.out_headers), libc.address_of(memory.out_vectors)
     while done < headers:
         header = memory.out_headers[done]
         if headers - done == 1 and header.n_vectors == 1 and header.control_bytes == 0:
             # For a single datagram, sendto is cheaper.
             vector = memory.out_vectors[(header.vectors - vectors) // _VECTOR_BYTES]
-            sent = sendto(
-                fd, vector.base, vector.size_bytes, MSG_DONTWAIT, header.name, header.name_bytes
+            sent = libc.sendto(
+                fd, vector.base, vector.size_bytes, _NO_WAIT, header.name, header.name_bytes
             )
             sent = min(sent + 1, 1)
         else:
-            sent = sendmmsg(fd, base + done * _HEADER_BYTES, headers - done, MSG_DONTWAIT)
+            sent = libc.sendmmsg(fd, base + done * _HEADER_BYTES, headers - done, _NO_WAIT)
         if sent > 0:
             done += sent
             tries = 0
             continue
-        error = errno(memory.integers)
+        error = libc.errno(memory.integers)
         if error == _EINTR:
             continue
         if error == _EAGAIN and waited_ns < _PATIENCE_NS:
@@ -232,11 +209,11 @@ def _transmit(memory: Memory, socket: int, headers: int, following: int) -> int:
 
 def _wait_for_room(memory: Memory, fd: int) -> int:
     """Wait at most 1 ms until a socket is writable; return the waiting time in ns."""
-    begun_ns = clock_ns(CLOCK_MONOTONIC, memory.time)
+    begun_ns = libc.clock_ns(libc.CLOCK_MONOTONIC, memory.time)
     memory.poll[0] = fd
-    memory.poll[1] = POLLOUT
-    poll(address_of(memory.poll), 1, 1)
-    return max(clock_ns(CLOCK_MONOTONIC, memory.time) - begun_ns, 1000)
+    memory.poll[1] = libc.POLLOUT
+    libc.poll(libc.address_of(memory.poll), 1, 1)
+    return max(libc.clock_ns(libc.CLOCK_MONOTONIC, memory.time) - begun_ns, 1000)
 
 
 def _account(memory: Memory, number: int, now_ns: int) -> None:
@@ -247,7 +224,7 @@ def _account(memory: Memory, number: int, now_ns: int) -> None:
         if leaving.delayed != 0:
             memory.lateness[leaving.direction, bucket_of(now_ns - leaving.release_ns)] += 1
         if pump.taps != 0:
-            tell_departure(memory, number, now_ns)
+            report_departure(memory, number, now_ns)
     else:
         memory.errors[leaving.direction, leaving.error & 255] += 1
     if leaving.slot >= 0:

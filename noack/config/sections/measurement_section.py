@@ -49,11 +49,7 @@ class MeasurementSection(ScenarioSection):
         return variance if self.noise_bound is None else variance + np.square(self.noise_bound) / 3
 
     def check(self, n: int, why: str) -> None:
-        """Require shapes that fit a model of n states.
-
-        Raises:
-            ValueError: a shape does not fit; the message begins with the key.
-        """
+        """Raise ValueError, with the key, unless the shapes fit a model of n states."""
         place, p = "plant.measurement", self.outputs(n)
         require_shape(self.C, f"{place}.C", (p, n), f"{why}; one row per output")
         for key in ("noise_std", "noise_bound"):

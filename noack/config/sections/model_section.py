@@ -1,12 +1,12 @@
 """The model of the plant that sensor and controller use."""
 
-from typing import Literal, Self
+from collections.abc import Mapping
+from typing import Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
 from noack.config.named_models import MODEL_PARAMETERS, NAMED_MODELS
-from noack.config.sections.matrix_file_section import require_read
 from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.settings.matrices import Rows, require_length, require_shape, shape
 from noack.settings.section import ScenarioSection
@@ -112,14 +112,16 @@ class ModelSection(ScenarioSection):
         return np.array(self.A), np.array(self.B)
 
 
-def instability(A: Matrix, B: Matrix, K: Matrix) -> str | None:
-    """Return why u = K x does not stabilise ẋ = A x + B u, with a remedy; None if it does.
+def require_read(file: str | None, names: Mapping[Any, str] | None) -> None:
+    """Raise ValueError if a section still names a file: loading a scenario replaces the name."""
+    if file is not None:
+        raise ValueError("file: it is read where a scenario file is loaded; give matrices here")
+    if names is not None:
+        raise ValueError("names: they are of arrays in a file; give file, too")
 
-    Args:
-        A: (n, n), per second.
-        B: (n, m).
-        K: (m, n).
-    """
+
+def instability(A: Matrix, B: Matrix, K: Matrix) -> str | None:
+    """Return why u = K x does not stabilise ẋ = A x + B u, with a remedy; None if it does."""
     loops = (_closed_loop(A, B, K), _closed_loop(A, B, -K))
     growth_per_s, opposite_per_s = (
         spectral_abscissa(loop) if np.isfinite(loop).all() else np.inf for loop in loops

@@ -2,17 +2,18 @@
 
 from typing import Annotated, Literal, Self
 
+import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
-from noack.config.disturbances import AnyDisturbance, variance_at
-from noack.config.plants import AnyPlant
-from noack.config.sections.matrix_file_section import require_read
+from noack.config.feature_kinds import AnyDisturbance, AnyPlant
 from noack.config.sections.measurement_section import MeasurementSection
+from noack.config.sections.model_section import require_read
+from noack.core.linear_systems import Vector
+from noack.disturbances.disturbance_settings import Place
 from noack.observers.estimation_model import NoiseVariances
 from noack.plants.linear import LinearSettings
 from noack.settings.matrices import Row, Rows, require_non_negative
-from noack.settings.rates import RateHz, require_whole_period
-from noack.settings.section import ScenarioSection
+from noack.settings.section import RateHz, ScenarioSection, require_whole_period
 
 
 class WatchdogSection(ScenarioSection):
@@ -86,8 +87,9 @@ class PlantSection(ScenarioSection):
 
     def noise_variances(self, n: int, m: int) -> NoiseVariances:
         """Variances of the random disturbances and of the measurement noise."""
-        return NoiseVariances(
-            at_state=variance_at("state", self.disturbances, n),
-            at_input=variance_at("input", self.disturbances, m),
-            output=self.measurement.variance(n),
-        )
+
+        def at(place: Place, size: int) -> Vector:
+            variances = [one.variance for one in self.disturbances if one.at == place]
+            return np.asarray(np.sum([np.zeros(size), *variances], axis=0))
+
+        return NoiseVariances(at("state", n), at("input", m), self.measurement.variance(n))

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from noack.core.file_lock import lock
+from noack.core.file_access import lock
 
 _PREFIX = "noack-native-"
 _STREAMS = (1, 2)

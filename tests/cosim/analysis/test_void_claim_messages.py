@@ -32,16 +32,16 @@ def run() -> RunRecord:
     return with_outage(resolve(load(SCENARIOS / "lane_following.toml", ["horizon_s=1"])), 0.5, 0.7)
 
 
-class Told(FakePlane):
+class RecordingPlane(FakePlane):
     """A control plane that stores the recorder's reports."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.accounts: list[dict[str, Any]] = []
+        self.reports: list[dict[str, Any]] = []
 
     def put(self, key: str, content: Any) -> None:
         if isinstance(content, str):
-            self.accounts.append(parse_message(RunProgress, content))
+            self.reports.append(parse_message(RunProgress, content))
         super().put(key, content)
 
 
@@ -64,7 +64,7 @@ def send(plane: FakePlane, record: RunRecord, until_ns: int, sent: dict[str, int
 def test_the_recorder_reports_a_violation_once_and_records_it(
     run: RunRecord, tmp_path: Path
 ) -> None:
-    plane, sent = Told(), {}  # type: ignore[var-annotated]
+    plane, sent = RecordingPlane(), {}  # type: ignore[var-annotated]
     recorder = recorder_of(run.scenario, tmp_path, plane)
     for until_ns in range(100_000_000, 1_200_000_000, 100_000_000):
         send(plane, run, until_ns, sent)
@@ -72,7 +72,7 @@ def test_the_recorder_reports_a_violation_once_and_records_it(
         recorder.show()
     cause = "an input was 0.101 s old, 0.007 s allowed"
     line = f"void (assumption violated) from 0.506 s on: {cause}"
-    void = [account["void"] for account in plane.accounts]
+    void = [report["void"] for report in plane.reports]
     assert void == [[]] * 5 + [[line]] * 6
     notices = recorder.finish().notices
     assert notices == [{"t_ns": 506_000_000, "level": "void", "text": line, "process": "recorder"}]
@@ -90,16 +90,16 @@ def test_the_summary_lists_every_violated_assumption(run: RunRecord) -> None:
 
 
 def test_a_violation_found_at_the_end_is_reported(run: RunRecord, tmp_path: Path) -> None:
-    plane = Told()
+    plane = RecordingPlane()
     recorder = recorder_of(run.scenario, tmp_path, plane)
     send(plane, run, 1_200_000_000, {})
     recorder.poll()
     (notice,) = recorder.finish().notices
-    assert [account["void"] for account in plane.accounts] == [[notice["text"]]]
+    assert [report["void"] for report in plane.reports] == [[notice["text"]]]
 
 
 def test_missing_rows_are_reported_as_an_unknown_result(run: RunRecord, tmp_path: Path) -> None:
-    plane, sent = Told(), {}  # type: ignore[var-annotated]
+    plane, sent = RecordingPlane(), {}  # type: ignore[var-annotated]
     recorder = recorder_of(run.scenario, tmp_path, plane)
     send(plane, run, 300_000_000, sent)
     sent["sensor_measurement"] += 10  # a batch is lost and sent again at the end
@@ -107,7 +107,7 @@ def test_missing_rows_are_reported_as_an_unknown_result(run: RunRecord, tmp_path
     recorder.poll()
     recorder.show()
     recorder.show()
-    assert plane.accounts[-1]["void"] == [
+    assert plane.reports[-1]["void"] == [
         "claims are checked after the run only: telemetry is missing or arrived out of order"
     ]
     assert recorder.finish().notices == []
@@ -116,22 +116,22 @@ def test_missing_rows_are_reported_as_an_unknown_result(run: RunRecord, tmp_path
 @pytest.mark.parametrize("terminal", [True, False])
 def test_the_terminal_reports_each_cause_once(run: RunRecord, terminal: bool) -> None:
     shown = io.StringIO()
-    account: dict[str, Any] = {
+    report: dict[str, Any] = {
         "t_s": 0.5, "events": 3, "deliveries": 2, "longest_loss_burst": 1, "x_norm": 1.0,
         "live": None,
     }  # fmt: skip
     console = Console(file=shown, force_terminal=terminal, width=200)
     with progress_line(console, run.scenario) as watcher:
         watcher.started(Path())
-        watcher.progress(account)
+        watcher.progress(report)
         for void in ([], ["one [cause]"], ["one [cause]"], ["one [cause]", "another"]):
-            watcher.progress(account | {"void": void})
+            watcher.progress(report | {"void": void})
     assert shown.getvalue().count("one [cause]") == 1
     assert shown.getvalue().count("another") == 1
 
 
 def test_rows_whose_file_is_deleted_are_not_confirmed(run: RunRecord, tmp_path: Path) -> None:
-    plane = Told()
+    plane = RecordingPlane()
     recorder = recorder_of(run.scenario, tmp_path, plane)
     send(plane, run, 1_200_000_000, {})
     recorder.poll()
@@ -146,7 +146,7 @@ def test_rows_whose_file_is_deleted_are_not_confirmed(run: RunRecord, tmp_path: 
 
 
 def test_nothing_is_reported_after_the_stop(run: RunRecord, tmp_path: Path) -> None:
-    plane = Told()
+    plane = RecordingPlane()
     recorder = recorder_of(run.scenario, tmp_path, plane)
     recorder.end_monitoring()
     send(plane, run, 1_200_000_000, {})

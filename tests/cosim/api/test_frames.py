@@ -10,7 +10,7 @@ import pytest
 
 import noack
 from cosim.analysis.replay.replay_result import rows_differ
-from cosim.record.align import join_all
+from cosim.record.align import align_tables
 from cosim.record.packet_outcomes import packet_outcomes
 from cosim.record.run_record import load_record
 
@@ -26,7 +26,7 @@ def test_a_table_is_the_file_with_a_column_of_seconds_first(simulated: noack.Run
 
 
 def test_samples_are_the_aligned_record(simulated: noack.Run) -> None:
-    joined = join_all(load_record(simulated.directory))
+    joined = align_tables(load_record(simulated.directory))
     samples = simulated.samples()
     for name, states in (("x", joined.x), ("x_s", joined.x_s), ("x_c", joined.x_c)):
         for i in range(2):
@@ -54,7 +54,9 @@ def test_event_counts_agree_with_the_summary(simulated: noack.Run) -> None:
 def test_stale_and_in_flight_updates_are_marked(scenario: noack.Scenario) -> None:
     """Delays of up to half a second: some updates arrive out of order, some after the end."""
     jitter = {"kind": "delay", "delay_s": 0.3, "jitter_s": 0.25}
-    run = noack.simulate(noack.with_settings(scenario, {"network.impairments": [jitter]}))
+    run = noack.simulate(
+        noack.with_settings(scenario, {"network.impairments": [jitter], "horizon_s": 2.0})
+    )
     crossed = packet_outcomes(load_record(run.directory))
     fates = Counter(run.events()["fate"].to_pylist())
     assert (
@@ -78,14 +80,9 @@ def test_pandas_takes_every_table(simulated: noack.Run) -> None:
     frame = simulated.samples().to_pandas()
     assert list(frame.columns)[:3] == ["t_s", "t_ns", "x_1"]
     assert frame["t_s"].is_monotonic_increasing
+    assert simulated.table("plant_step").to_pandas().columns[0] == "t_s"
     events = simulated.events().to_pandas()
     assert events.loc[events.fate == "forced", "received"].all()
-
-
-def test_polars_takes_every_table(simulated: noack.Run) -> None:
-    polars = pytest.importorskip("polars", reason="polars is not installed")
-    frame = polars.from_arrow(simulated.table("plant_step"))
-    assert frame.columns[0] == "t_s"
 
 
 def test_states_have_the_same_name_everywhere(simulated: noack.Run) -> None:

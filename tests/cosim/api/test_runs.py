@@ -34,7 +34,7 @@ def test_a_run_is_replayed(simulated: noack.Run) -> None:
 
 
 def test_a_temporary_run_exists_as_long_as_its_object() -> None:
-    run = noack.simulate("double_integrator")
+    run = noack.simulate(noack.load("double_integrator", {"horizon_s": 0.1}))
     folder = run.directory
     assert folder.is_dir()
     assert not (folder / "recording.rrd").exists()

@@ -6,21 +6,18 @@ import sys
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from cosim.cli import app
 from cosim.cli.completion import keys, run_directories
 from noack.config.scenario import Scenario
 
-ROOT = Path(__file__).parents[3]
 
-
-def completed(line: str, cwd: Path) -> list[str]:
+def completed(line: str) -> list[str]:
     """The completions that bash offers for the last word of a line."""
-    words = line.split(" ")
-    asked = {"_NOACK_COMPLETE": "complete_bash", "COMP_WORDS": line, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(
-        [sys.executable, "-m", "cosim.cli"], cwd=cwd, capture_output=True, text=True, check=True,
-        env=os.environ | asked | {"COMP_CWORD": str(len(words) - 1)},
-    )  # fmt: skip
+    place = str(len(line.split(" ")) - 1)
+    asked = {"_NOACK_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": place}
+    done = CliRunner().invoke(app, env=asked, prog_name="noack")
     assert done.stderr == ""
     return done.stdout.split()
 
@@ -38,13 +35,16 @@ def completed(line: str, cwd: Path) -> list[str]:
     ("noack simulate lane_following --tri", ["--trigger"]),
     ("noack simulate lane_following --trigger c", ["continuous"]),
 ])  # fmt: skip
-def test_words_are_completed(line: str, offered: list[str], tmp_path: Path) -> None:
+def test_words_are_completed(
+    line: str, offered: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     for name in ("20260101-000000-a", "20260102-000000-b"):
         (tmp_path / "runs" / name).mkdir(parents=True)
         (tmp_path / "runs" / name / "scenario.toml").touch()
     (tmp_path / "runs" / "campaigns").mkdir()
     (tmp_path / "runs" / "latest").symlink_to("20260102-000000-b")
-    assert completed(line, tmp_path) == offered
+    assert completed(line) == offered
 
 
 def test_the_completion_script_of_a_shell_is_printed() -> None:

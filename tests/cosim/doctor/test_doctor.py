@@ -12,18 +12,26 @@ from cosim.doctor.machine_facts import requirements_of
 from noack.config.resolution import resolve
 from noack.config.scenario_file import load
 
-SHORT = ("--seconds", "0.2", "--set", "ports={}")
-
 
 def doctor(*arguments: str) -> Result:
     return CliRunner().invoke(app, ["doctor", *arguments])
 
 
-def test_every_check_gives_a_finding(tmp_path: Path) -> None:
-    done = doctor(*SHORT, "--json", "--runs", str(tmp_path))
-    said = json.loads(done.stdout)
-    assert done.exit_code == (1 if said["verdict"] == "bad" else 0)
-    measured = said["measured"]
+def test_every_check_gives_a_finding_and_a_taken_port_makes_a_run_impossible(
+    tmp_path: Path,
+) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        port = taken.getsockname()[1]
+        ports = ("--set", f"ports={{plant={port}}}")
+        done = doctor("--seconds", "0.1", *ports, "--json", "--runs", str(tmp_path))
+    document = json.loads(done.stdout)
+    assert (done.exit_code, document["verdict"]) == (1, "bad")
+    (finding,) = [one for one in document["findings"] if one["what"].startswith("ports of")]
+    assert finding["verdict"] == "bad"
+    assert str(port) in finding["found"]
+    assert "already taken" in finding["found"]
+    measured = document["measured"]
     for name in ("plain", "realtime"):
         assert measured[name]["wakes"] > 0, measured[name]
         assert measured[name]["p50_us"] <= measured[name]["max_us"]
@@ -32,18 +40,8 @@ def test_every_check_gives_a_finding(tmp_path: Path) -> None:
     assert measured["control"] > 0
     assert measured["disk"]["write_bytes_per_s"] > 0
     assert set(measured["granted"]) >= {"sched_fifo", "memory_lock"}
-    assert {one["verdict"] for one in said["findings"]} <= {"good", "limited", "bad"}
+    assert {one["verdict"] for one in document["findings"]} <= {"good", "limited", "bad"}
     assert not list(tmp_path.iterdir())
-
-
-def test_a_taken_port_makes_a_run_impossible() -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
-        taken.bind(("127.0.0.1", 0))
-        port = taken.getsockname()[1]
-        done = doctor("--seconds", "0.1", "--set", f"ports={{plant={port}}}")
-    assert done.exit_code == 1
-    assert str(port) in done.stdout
-    assert "already taken" in " ".join(done.stdout.split())
 
 
 def test_the_requirements_of_a_scenario_are_in_wall_time() -> None:

@@ -10,15 +10,15 @@ from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
 from cosim.analysis.step_schedule import live_run
-from cosim.output.certificate_report import study
-from cosim.record.align import join_all
+from cosim.output.certificate_report import Certificates
+from cosim.record.align import align_tables
 from cosim.record.estimation_error import estimation_error, expected_rms, true_states
 from cosim.record.run_record import RunRecord
 from cosim.simulation.batch.batch_interface import setting_of
 from cosim.simulation.continuous.continuous_loop import continuous_loop_of
 from cosim.simulation.virtual_time import simulate
 from cosim.studies.design.candidate_measures import DesignLimits
-from cosim.studies.design.design_run import design
+from cosim.studies.design.design_search import design
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import dumps, validate
@@ -177,7 +177,7 @@ def test_only_i1_and_its_consequences_are_claimed_of_the_estimate(
     assert claims.certificates == []
     assert [one.label for one in claims.envelopes()] == ["bound from (I1)"]
     # Relative to the plant's own state the second claim would not hold, so it is not claimed.
-    joined = join_all(record)
+    joined = align_tables(record)
     e_c = row_norms(joined.x_c - true_states(record[PLANT_STEP], joined.t_ns))
     assert (e_c > joined.e_c_norm + 1e-6).any()
     assert (e_c <= joined.e_c_norm + row_norms(estimation_error(record)) + 1e-12).all()
@@ -238,7 +238,7 @@ def test_exact_simulation_and_certificates_are_refused_in_one_line(
     observed["plant"]["measurement"] = {"noise_std": [0.1, 0.0]}
     noisy = resolved(observed)
     assert [one.coverage.is_certifiable for one in (scenario, estimated, noisy)] == [False] * 3
-    for take in (continuous_loop_of, setting_of, lambda one: study(one, 0)):
+    for take in (continuous_loop_of, setting_of, lambda one: Certificates(one, 0)):
         for one, key in (
             (scenario, "plant.disturbances: "),
             (estimated, "observer: "),

@@ -14,8 +14,7 @@ import pyarrow.parquet as pq
 from rich.console import Console
 
 from cosim.analysis.replay import replay
-from cosim.analysis.run_outcome import Outcome
-from cosim.analysis.run_summary import summarise
+from cosim.analysis.run_summary import Outcome, summarise
 from cosim.live.finalize import reopen
 from cosim.output.run_verdict import print_outcome
 from cosim.record.environment import changed_since, environment

@@ -7,12 +7,13 @@ import tomli_w
 
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
-from noack.config.scenario_file import dumps, json_schema, load, validate
+from noack.config.scenario_file import dumps, load, validate
+from noack.config.toml_file import json_schema
 from tests.fuzz.choices import EDITS, Choices
 from tests.fuzz.edits import bases, edited, key, quoted, value, vocabulary, write_named
 from tests.fuzz.harness import FOLDER, refusal, workspace
 
-KNOWN = vocabulary(json_schema(), dates=True)
+KNOWN = vocabulary(json_schema(Scenario), dates=True)
 SEEDS = [
     *EDITS,
     *(path.read_bytes() for path in sorted((FOLDER.parents[1] / "scenarios").glob("*.toml"))),

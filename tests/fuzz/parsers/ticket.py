@@ -9,7 +9,9 @@ from unittest.mock import patch
 
 from netem.control import emulator_session
 from noack.config.resolution import resolve
-from noack.config.scenario_file import json_schema, validate
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import validate
+from noack.config.toml_file import json_schema
 from noack.runtime import join_ticket
 from noack.runtime.private_folder import open_private
 from tests.fuzz.choices import EDITS, Choices
@@ -19,10 +21,10 @@ from tests.fuzz.harness import refusal, workspace
 _TICKET = join_ticket.new_ticket(
     resolve(validate(bases("scenarios")[0], "base")), "tcp/127.0.0.1:7447", Path("run"),
     launched=True,
-)._replace(run_id=7, key=bytes(32))  # fmt: skip
-TICKET: dict[str, Any] = json.loads(_TICKET.dumps())
+).model_copy(update={"run_id": 7, "key": bytes(32)})  # fmt: skip
+TICKET: dict[str, Any] = json.loads(_TICKET.model_dump_json())
 SESSION = {"name": "up", "endpoint": "tcp/127.0.0.1:7447", "token": "00" * 32}
-_SCENARIO = vocabulary(json_schema())
+_SCENARIO = vocabulary(json_schema(Scenario))
 KNOWN = Vocabulary(
     (*TICKET, *SESSION, *_SCENARIO.keys), (*_SCENARIO.words, "00" * 31, "0g", "tcp/", "tcp/x:y")
 )
@@ -37,7 +39,7 @@ def one_input(data: bytes) -> None:
         data = json.dumps(content).encode()
     with refusal("not a valid ticket"):
         found = join_ticket.loads(data.decode("utf-8", "replace"))
-        assert join_ticket.loads(found.dumps()) == found
+        assert join_ticket.loads(found.model_dump_json()) == found
         assert len(found.key) == 32
         assert 0 <= found.run_id < 2**64
         assert isinstance(found.endpoint, str)

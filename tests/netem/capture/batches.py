@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from netem.capture.packet_blocks import Bytes, Events
-from netem.capture.pcapng import PcapngInterface, PcapngSection
+from netem.capture.pcapng import PcapngSection
 from netem.engine.relay_interface import LinkSpec
 from netem.relay_events import EVENT
 from noack.impairments.link_settings import LinkSettings
@@ -17,11 +17,8 @@ T_NS = 1_767_225_600_123_456_789
 SPECS = [
     LinkSpec("link0", ("127.0.0.1", 1), ("127.0.0.1", 2), LinkSettings(), LinkSettings())
 ]  # fmt: skip
-INTERFACES = (
-    PcapngInterface("link0 client", "127.0.0.1:1"),
-    PcapngInterface("link0 server", "127.0.0.1:2"),
-)
-USUAL = {
+INTERFACES = (("link0 client", "127.0.0.1:1"), ("link0 server", "127.0.0.1:2"))
+USUAL: dict[str, Any] = {
     "t_ns": T_NS, "family": 4, "source_port": 40_001, "destination_port": 40_002,
     "source": "192.0.2.1", "destination": "198.51.100.7", "flow": 3, "packet": 17,
     "mansd": -1, "bit": -1, "payload": b"payload",

@@ -1,7 +1,7 @@
 """A relay without sockets; a test sets its reports."""
 
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from netem.control.command_queue import CommandQueue
 from netem.engine import histogram
+from netem.engine.plain_engine import PlainRelay
+from netem.engine.relay_base import Relay
 from netem.engine.relay_interface import (
     DIRECTIONS,
     Address,
@@ -18,7 +20,6 @@ from netem.engine.relay_interface import (
     FlowReport,
     LinkReport,
     LinkSpec,
-    Relay,
 )
 from netem.words.words_to_settings import settings_of
 from noack.impairments.link_records import Counters
@@ -40,10 +41,8 @@ def times(*t_ns: int) -> NDArray[np.int64]:
     return counts
 
 
-class FakeRelay:
-    """A relay with links and counters that a test sets."""
-
-    engine = "plain"
+class FakeRelay(PlainRelay):
+    """A relay without sockets; a test sets its links and counters."""
 
     def __init__(self, *names: str) -> None:
         self.specs: Sequence[LinkSpec] = [spec_of(name) for name in names]
@@ -58,9 +57,6 @@ class FakeRelay:
         self.changes = 0
         self.threads: set[int] = set()
         """The threads that have read or changed the relay."""
-
-    def addresses(self) -> Mapping[str, Address]:
-        return {spec.name: spec.listen for spec in self.specs}
 
     def run(self, stop: Callable[[], bool], housekeeping: Callable[[], None]) -> None:
         pause = threading.Event()
@@ -83,18 +79,12 @@ class FakeRelay:
             for spec in self.specs
         ]  # fmt: skip
 
-    def close(self) -> None:
-        pass
-
     def _direction(self, link: str, direction: Direction) -> DirectionReport:
         counters = replace(self.counters[link, direction])
         return DirectionReport(
             self.settings[link, direction], counters, dict(self.unintended), 5,
             list(self.flows), self.delays.copy(), self.lateness.copy(),
         )  # fmt: skip
-
-
-_: Relay = FakeRelay()
 
 
 @contextmanager

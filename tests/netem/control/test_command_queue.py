@@ -8,7 +8,7 @@ from netem.link_machine import Datagram
 from netem.words.words_to_settings import settings_of
 from noack.core.errors import CallerError, PeerError
 from noack.impairments.link_records import Counters
-from tests.netem.control.relays import SETTINGS, FakeRelay, spec_of
+from tests.netem.control.relays import FakeRelay, spec_of
 
 
 def test_the_relay_is_accessed_from_its_own_thread_only(
@@ -78,7 +78,7 @@ def test_a_command_to_a_stuck_relay_times_out(
 
 def test_a_report_of_the_plain_engine_does_not_change_afterwards() -> None:
     """Rates are differences of two reports."""
-    direction = PlainDirection(spec_of("up"), "forward", SETTINGS)
-    before = direction.report(()).counters
+    direction = PlainDirection(spec_of("up"), "forward")
+    before = direction.report((), {}).counters
     direction.link.handle(Datagram(0, b"x"), 0)
-    assert (before.received, direction.report(()).counters.received) == (0, 1)
+    assert (before.received, direction.report((), {}).counters.received) == (0, 1)

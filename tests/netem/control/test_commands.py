@@ -2,23 +2,21 @@
 
 import json
 import os
-import pty
-import subprocess
 import sys
-import termios
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
-from netem.control import emulator_commands
+from netem.control import control_client, emulator_commands
 from netem.control.command_queue import CommandQueue
 from netem.control.control_server import ControlServer
+from netem.control.live_screen import Screen
 from netem.words.words_to_settings import settings_of
 from noack.core.errors import ExitStatus
-from tests.netem.control.processes import read_until
-from tests.netem.control.relays import SETTINGS, FakeRelay, running
+from tests.netem.control.processes import press_q, read_until, terminal
+from tests.netem.control.relays import FakeRelay, running
 
 LEAVE = "\x1b[?1049l"
 """The escape sequence that leaves a terminal's alternate screen."""
@@ -44,28 +42,23 @@ def test_show_prints_the_statistics(
 @pytest.mark.parametrize(
     ("arguments", "changed"),
     [
-        ("set lab --link up loss 5% mansd 4", ["forward"]),
-        ("set --link up loss 5% mansd 4", ["forward"]),
-        ("set loss 5% --link up mansd 4", ["forward"]),
-        ("set lab loss 5% mansd 4 --direction reverse --link up", ["reverse"]),
-        ("set --control lab --link up --direction both loss 5% mansd 4", ["forward", "reverse"]),
+        ("lab --link up loss 5% mansd 4", ["forward"]),
+        ("--link up loss 5% mansd 4", ["forward"]),
+        ("loss 5% --link up mansd 4", ["forward"]),
+        ("lab loss 5% mansd 4 --direction reverse --link up", ["reverse"]),
+        ("--control lab --link up --direction both loss 5% mansd 4", ["forward", "reverse"]),
     ],
 )
+@pytest.mark.usefixtures("server")
 def test_a_link_is_set_in_words(
-    relay: FakeRelay,
-    server: ControlServer,
-    capsys: pytest.CaptureFixture[str],
-    arguments: str,
-    changed: Sequence[str],
+    relay: FakeRelay, capsys: pytest.CaptureFixture[str], arguments: str, changed: Sequence[str]
 ) -> None:
-    assert run(arguments) == ExitStatus.OK
+    assert run(f"set {arguments}") == ExitStatus.OK
     assert relay.changes == len(changed)
     wanted = settings_of("loss 5% mansd 4")
-    assert {way for (_, way), now in relay.settings.items() if now == wanted} == {*changed}
+    assert {name for (_, name), now in relay.settings.items() if now == wanted} == {*changed}
     out = capsys.readouterr().out.splitlines()
-    assert len(out) == 4
-    for way in changed:
-        assert f"up {way}: loss 5% mansd 4" in out
+    assert {f"up {name}: loss 5% mansd 4" for name in changed} <= {*out[:2]}
     assert out[2:] == ["down forward: loss 10% delay 10ms mansd 2", "down reverse: no impairment"]
 
 
@@ -85,35 +78,29 @@ def test_files_are_read_where_the_command_is_given(
     assert relay.changes == 1
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("set", "words are missing, for example: loss 5% mansd 4; or: loss none"),
-        ("set lab", "words are missing"),
-        ("set --link up lozz 5%", "lozz: "),
-        ("set lba --link up loss 5%", "no emulator 'lba'; running: lab"),
-        ("set lab loss 5%", "which link? Links: up, down"),
-        ("set --link left loss 5%", "no link 'left'; links: up, down"),
-        ("show lba", "no emulator 'lba'; running: lab"),
-        ("show --control lba", "no emulator 'lba'; running: lab"),
-        ("show lab --control lba", "--control lba: NAME is lab already"),
-        ("watch lba", "no emulator 'lba'; running: lab"),
-    ],
-)
-def test_a_mistake_gets_one_line(
-    relay: FakeRelay,
-    server: ControlServer,
-    capsys: pytest.CaptureFixture[str],
-    arguments: str,
-    message: str,
-) -> None:
-    assert run(arguments) == ExitStatus.CALLER
-    error = capsys.readouterr().err
-    assert error.startswith(f"noack netem {arguments.split()[0]}: ")
-    assert error.count("\n") == 1
-    assert message in error
+MISTAKES = [
+    ("set", "words are missing, for example: loss 5% mansd 4; or: loss none"),
+    ("set lab", "words are missing"),
+    ("set --link up lozz 5%", "lozz: "),
+    ("set lba --link up loss 5%", "no emulator 'lba'; running: lab"),
+    ("set lab loss 5%", "which link? Links: up, down"),
+    ("set --link left loss 5%", "no link 'left'; links: up, down"),
+    ("show lba", "no emulator 'lba'; running: lab"),
+    ("show --control lba", "no emulator 'lba'; running: lab"),
+    ("show lab --control lba", "--control lba: NAME is lab already"),
+    ("watch lba", "no emulator 'lba'; running: lab"),
+]
+
+
+@pytest.mark.usefixtures("server")
+def test_a_mistake_gets_one_line(relay: FakeRelay, capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments, message in MISTAKES:
+        assert run(arguments) == ExitStatus.CALLER
+        error = capsys.readouterr().err
+        assert error.startswith(f"noack netem {arguments.split()[0]}: ")
+        assert error.count("\n") == 1
+        assert message in error
     assert relay.changes == 0
-    assert relay.settings["up", "forward"] == SETTINGS
 
 
 def test_with_several_emulators_a_name_is_required(
@@ -127,59 +114,48 @@ def test_with_several_emulators_a_name_is_required(
     assert other.settings["x", "forward"] == settings_of("loss 5%")
 
 
-@contextmanager
-def watching(stdout: int, stdin: int) -> Iterator[subprocess.Popen[bytes]]:
-    with subprocess.Popen(
-        [sys.executable, "-m", "netem", "watch", "lab"],
-        env=os.environ | {"TERM": "xterm-256color"},
-        stdin=stdin,
-        stdout=stdout,
-        stderr=subprocess.PIPE,
-    ) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
-
-
 def test_watch_prints_lines_to_a_pipe_until_its_reader_closes_it(
-    relay: FakeRelay, server: ControlServer
+    relay: FakeRelay, server: ControlServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     relay.counters["up", "forward"].received = 7
-    with watching(subprocess.PIPE, subprocess.DEVNULL) as process:
-        assert process.stdout is not None
-        assert process.stderr is not None
-        assert all("  up forward  " in process.stdout.readline().decode() for _ in range(2))
-        process.stdout.close()
-        assert process.wait(60) == ExitStatus.OK
-        assert process.stderr.read() == b""
+    end, pipe = os.pipe()
+    lines: list[str] = []
+
+    def read_two() -> None:
+        with os.fdopen(end) as reader:
+            lines.extend(reader.readline() for _ in range(2))
+
+    with os.fdopen(pipe, "w") as stdout, ThreadPoolExecutor() as threads:
+        monkeypatch.setattr(sys, "stdout", stdout)
+        reading = threads.submit(read_two)
+        assert run("watch lab") == ExitStatus.OK
+        reading.result()
+    assert all("  up forward  " in line for line in lines)
 
 
-def test_watch_fails_when_the_emulator_ends(relay: FakeRelay, commands: CommandQueue) -> None:
+def test_watch_fails_when_the_emulator_ends(
+    relay: FakeRelay,
+    commands: CommandQueue,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(control_client, "_SILENCE_S", 0.1)
     relay.counters["up", "forward"].received = 7
-    with ExitStack() as emulator:
-        emulator.enter_context(ControlServer("lab", commands))
-        with watching(subprocess.PIPE, subprocess.DEVNULL) as process:
-            assert process.stdout is not None
-            assert process.stderr is not None
-            process.stdout.readline()
-            emulator.close()
-            assert process.wait(60) == ExitStatus.FAILED
-            assert process.stderr.read() == b"noack netem watch: emulator 'lab' has ended\n"
+    emulator = ControlServer("lab", commands).__enter__()
+    monkeypatch.setattr(Screen, "show", lambda *_: emulator.__exit__())
+    assert run("watch lab") == ExitStatus.FAILED
+    assert capsys.readouterr().err == "noack netem watch: emulator 'lab' has ended\n"
 
 
-def test_watch_redraws_on_a_terminal_until_q(relay: FakeRelay, server: ControlServer) -> None:
+@pytest.mark.usefixtures("server")
+def test_watch_redraws_on_a_terminal_until_q(
+    relay: FakeRelay, monkeypatch: pytest.MonkeyPatch
+) -> None:
     relay.counters["up", "forward"].received = 7
-    terminal, end = pty.openpty()
-    termios.tcsetwinsize(end, (24, 80))
-    before = termios.tcgetattr(end)
-    with watching(end, end) as process:
-        drawn = read_until(terminal, lambda text: "q ends" in text and "→ up" in text)
-        assert LEAVE not in drawn
-        os.write(terminal, b"q")
+    with terminal(monkeypatch) as user:
+        with ThreadPoolExecutor() as threads:
+            drawn = threads.submit(press_q, user, "q ends", "→ up")
+            assert run("watch") == ExitStatus.OK
+        assert LEAVE not in drawn.result()
         # The last screen stays visible.
-        read_until(terminal, lambda text: "╯" in text.partition(LEAVE)[2])
-        assert process.wait(60) == ExitStatus.OK
-    assert termios.tcgetattr(end) == before
-    os.close(terminal)
-    os.close(end)
+        read_until(user, lambda text: "╯" in text.partition(LEAVE)[2])

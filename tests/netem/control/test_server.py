@@ -9,10 +9,12 @@ import pytest
 import zenoh
 from zenoh.handlers import FifoChannel
 
+from netem.control import control_server
 from netem.control.command_queue import CommandQueue
 from netem.control.control_client import Client
 from netem.control.control_server import ControlServer, secret_of
 from netem.control.emulator_session import Session, find, running
+from netem.engine.relay_interface import DIRECTIONS
 from netem.words.words_to_settings import settings_of
 from noack.core.errors import CallerError
 from noack.impairments.link_records import Counters
@@ -35,49 +37,45 @@ def test_statistics_can_be_queried(relay: FakeRelay, client: Client) -> None:
     assert document["links"][1]["reverse"]["received"] == 12
 
 
-def test_statistics_are_published(relay: FakeRelay, client: Client) -> None:
+def test_statistics_are_published(
+    relay: FakeRelay, commands: CommandQueue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(control_server, "_PUBLISH_S", 0.2)
     relay.counters["up", "forward"].received = 1
-    heard = client.follow(lambda: False)
-    first = next(heard)
-    relay.counters["up", "forward"].received = 1001
-    second = next(heard)
-    before, after = (document["links"][0]["forward"] for document in (first, second))
-    assert after["received"] - before["received"] in (
-        0,
-        1000,
-    )  # the server may have sampled the counters just before the change
-    third = next(heard)["links"][0]["forward"]["recent"]
-    assert third is not None
-    assert third["seconds"] > 0
+    with ControlServer("lab", commands), Client(find("lab")) as client:
+        published = (document["links"][0]["forward"] for document in client.follow(lambda: False))
+        first = next(published)["received"]
+        relay.counters["up", "forward"].received = 1001
+        # The server may have sampled the counters just before the change.
+        assert next(published)["received"] - first in (0, 1000)
+        recent = next(published)["recent"]
+        assert recent is not None
+        assert recent["seconds"] > 0
 
 
 def test_settings_are_reported_in_words_and_as_an_object(client: Client) -> None:
     up, down = client.ask("settings")["links"]
     assert (up["name"], down["name"]) == ("up", "down")
     assert up["forward"]["words"] == "loss 10% delay 10ms mansd 2"
-    told = LinkSettings.model_validate_json(json.dumps(up["forward"]["settings"]))
-    assert told == SETTINGS
+    assert LinkSettings.model_validate_json(json.dumps(up["forward"]["settings"])) == SETTINGS
     assert up["reverse"]["words"] == ""
 
 
 @pytest.mark.parametrize(
     ("direction", "changed"),
-    [("forward", {"forward"}), ("reverse", {"reverse"}), ("both", {"forward", "reverse"})],
+    [("forward", ["forward"]), ("reverse", ["reverse"]), ("both", ["forward", "reverse"])],
 )
 def test_a_direction_is_changed(
-    relay: FakeRelay, client: Client, direction: str, changed: set[str]
+    relay: FakeRelay, client: Client, direction: str, changed: list[str]
 ) -> None:
     before = dict(relay.settings)
     answer = client.ask("change", link="down", direction=direction, words="loss 100% mansd 2")
-    for (link, way), settings in relay.settings.items():
-        is_changed = link == "down" and way in changed
-        assert settings == (
-            settings_of("loss 100% mansd 2") if is_changed else before[link, way]
-        )  # fmt: skip
-    told = {
-        way for way in ("forward", "reverse") if "loss 100%" in answer["links"][1][way]["words"]
-    }
-    assert told == changed
+    for (link, name), settings in relay.settings.items():
+        is_changed = link == "down" and name in changed
+        expected = settings_of("loss 100% mansd 2") if is_changed else before[link, name]
+        assert settings == expected
+    down = answer["links"][1]
+    assert [name for name in DIRECTIONS if "loss 100%" in down[name]["words"]] == changed
 
 
 def test_words_may_be_a_list_and_settings_an_object(relay: FakeRelay, client: Client) -> None:
@@ -97,31 +95,33 @@ def test_the_link_may_be_left_out_if_there_is_one() -> None:
     assert relay.settings["only", "forward"] == settings_of("loss 5%")
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ({"link": "up", "words": "lozz 5%"}, "lozz: .*loss"),
-        ({"link": "up", "words": "loss 500%"}, "loss 500%"),
-        ({"link": "up", "words": "loss 5% seed 3"}, "seed 3: belongs to the link"),
-        ({"link": "up", "words": "loss trace /etc/passwd"}, "/etc/passwd: read the file first"),
-        ({"words": "loss 5%"}, "which link. Links: up, down"),
-        ({"link": "left", "words": "loss 5%"}, "no link 'left'; links: up, down"),
-        ({"link": "up"}, "give words, or settings"),
-        ({"link": "up", "words": "loss 5%", "settings": {}}, "give words, or settings"),
-        ({"link": "up", "words": "loss 5%", "direction": "left"}, "direction: should be 'forward'"),
-        ({"link": "up", "settings": {"mansd": -1}}, "settings.mansd: should be greater than"),
-        ({"link": "up", "settings": {"mansd": "2"}}, "settings.mansd: should be a valid integer"),
-        ({"link": "up", "settings": {"seed": 1}}, "settings.seed: Extra inputs"),
-        ({"link": "up", "words": 5}, "words"),
-        ({"link": "up", "words": "loss 5%", "wordz": 1}, "wordz"),
-    ],
-)
-def test_a_mistake_gets_one_line_and_changes_nothing(
-    relay: FakeRelay, client: Client, content: dict[str, Any], message: str
-) -> None:
-    with pytest.raises(CallerError, match=message) as caught:
-        client.ask("change", **content)
-    assert "\n" not in str(caught.value)
+MISTAKES = [
+    ({"link": "up", "words": "lozz 5%"}, "lozz: .*loss"),
+    ({"link": "up", "words": "loss 500%"}, "loss 500%"),
+    ({"link": "up", "words": "loss 5% seed 3"}, "seed 3: belongs to the link"),
+    ({"link": "up", "words": "loss trace /etc/passwd"}, "/etc/passwd: read the file first"),
+    (
+        {"link": "up", "words": "delay 1ms 1ms distribution /etc/passwd"},
+        "/etc/passwd: read the file first",
+    ),
+    ({"words": "loss 5%"}, "which link. Links: up, down"),
+    ({"link": "left", "words": "loss 5%"}, "no link 'left'; links: up, down"),
+    ({"link": "up"}, "give words, or settings"),
+    ({"link": "up", "words": "loss 5%", "settings": {}}, "give words, or settings"),
+    ({"link": "up", "words": "loss 5%", "direction": "left"}, "direction: should be 'forward'"),
+    ({"link": "up", "settings": {"mansd": -1}}, "settings.mansd: should be greater than"),
+    ({"link": "up", "settings": {"mansd": "2"}}, "settings.mansd: should be a valid integer"),
+    ({"link": "up", "settings": {"seed": 1}}, "settings.seed: Extra inputs"),
+    ({"link": "up", "words": 5}, "words"),
+    ({"link": "up", "words": "loss 5%", "wordz": 1}, "wordz"),
+]
+
+
+def test_a_mistake_gets_one_line_and_changes_nothing(relay: FakeRelay, client: Client) -> None:
+    for content, message in MISTAKES:
+        with pytest.raises(CallerError, match=message) as caught:
+            client.ask("change", **content)
+        assert "\n" not in str(caught.value)
     assert relay.changes == 0
 
 
@@ -135,45 +135,30 @@ def ask_with(session: Session, payload: str | bytes | None, what: str = "change"
         return error.payload.to_string()
 
 
-@pytest.mark.parametrize(
-    ("what", "token"),
-    [
-        ("report", "0" * 64),
-        ("settings", "0" * 64),
-        *(("change", t) for t in ("", "é", None, ["a"])),
-    ],
-)
-def test_a_wrong_token_is_refused(
-    relay: FakeRelay, server: ControlServer, what: str, token: object
-) -> None:
-    content = {"token": token, "link": "up", "words": "loss 5%"}
-    assert "token" in ask_with(find("lab"), json.dumps(content), what)
-    assert relay.changes == 0
-
-
-@pytest.mark.parametrize("payload", [None, "{", "[]", "{}", b"\xff\xfe"])
-def test_an_invalid_query_is_refused(
-    relay: FakeRelay, server: ControlServer, payload: str | bytes | None
-) -> None:
-    expected = 'a query is a JSON object with "token", the secret'
-    assert ask_with(find("lab"), payload) == expected
-    assert relay.changes == 0
-
-
-@pytest.mark.parametrize(
-    "secret",
-    [{}, {"user": "netem", "password": "0" * 64}, {"user": "root"}],
-    ids=["none", "wrong", "other user"],
-)
-def test_a_client_without_the_secret_cannot_connect(
-    server: ControlServer, secret: dict[str, str]
-) -> None:
+def test_a_query_without_the_token_is_refused(relay: FakeRelay, server: ControlServer) -> None:
     session = find("lab")
-    secret = {"password": session.token, **secret} if "user" in secret else secret
-    more: dict[str, Any] = {f"transport/auth/usrpwd/{key}": value for key, value in secret.items()}
-    more["connect/timeout_ms"] = 500
-    with pytest.raises(zenoh.ZError, match="Unable to connect"):
-        zenoh.open(session_config(session.endpoint, listen=False, more=more))
+    queries = [("report", "0" * 64), ("settings", "0" * 64)]
+    queries += [("change", token) for token in ("", "é", None, ["a"])]
+    for what, token in queries:
+        content = {"token": token, "link": "up", "words": "loss 5%"}
+        assert "the token is not this emulator's" in ask_with(session, json.dumps(content), what)
+    for payload in (None, "{", "[]", "{}", b"\xff\xfe"):
+        expected = 'a query is a JSON object with "token", the secret'
+        assert ask_with(session, payload) == expected
+    assert relay.changes == 0
+
+
+def test_a_client_without_the_secret_cannot_connect(server: ControlServer) -> None:
+    session = find("lab")
+    for secret in (
+        {}, {"user": "netem", "password": "0" * 64}, {"user": "root", "password": session.token},
+    ):  # fmt: skip
+        more = {f"transport/auth/usrpwd/{key}": value for key, value in secret.items()}
+        config = session_config(
+            session.endpoint, listen=False, more=more | {"connect/timeout_ms": 200}
+        )
+        with pytest.raises(zenoh.ZError, match="Unable to connect"):
+            zenoh.open(config)
 
 
 def test_the_control_server_listens_on_loopback_only(server: ControlServer) -> None:
@@ -195,14 +180,14 @@ def test_the_secret_is_nowhere_but_in_the_session_file(server: ControlServer) ->
 def test_a_client_that_blocks_the_server_does_not_block_the_relay(
     commands: CommandQueue, server: ControlServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    held, free = threading.Event(), threading.Event()
+    blocked, free = threading.Event(), threading.Event()
 
     def slow(*_: Any) -> None:
-        held.set()
+        blocked.set()
         assert free.wait(60)
 
     monkeypatch.setattr("netem.control.statistics_thread.statistics", slow)
-    assert held.wait(60)
+    assert blocked.wait(60)
     try:
         for _ in range(10):
             commands.snapshot()  # runs in the relay's thread
@@ -214,6 +199,5 @@ def test_the_server_leaves_nothing_behind_at_its_end(commands: CommandQueue) -> 
     with ControlServer("lab", commands):
         session = find("lab")
     assert running() == []
-    more = {"connect/timeout_ms": 500}
     with pytest.raises(zenoh.ZError):
-        zenoh.open(session_config(session.endpoint, listen=False, more=more))
+        zenoh.open(session_config(session.endpoint, listen=False, more={"connect/timeout_ms": 200}))

@@ -1,7 +1,7 @@
 from typing import Any, cast
 
 from netem.control.emulator_statistics import Statistics
-from netem.control.statistics_history import History
+from netem.control.statistics_view import History
 
 
 def statistics(elapsed_s: float, rate: float | None, seconds: float = 1.0) -> Statistics:

@@ -8,8 +8,7 @@ from rich.console import Console
 
 from netem.control.command_queue import CommandQueue
 from netem.control.emulator_statistics import Statistics, statistics
-from netem.control.statistics_history import History
-from netem.control.statistics_view import plain_lines, render
+from netem.control.statistics_view import History, plain_lines, render
 from netem.engine.relay_interface import LinkSpec
 from netem.words.words_to_settings import settings_of
 from noack.core.clock import NS_PER_S

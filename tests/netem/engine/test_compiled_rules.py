@@ -48,10 +48,10 @@ class Compiled:
         for flow in set(flows.tolist()) - self._seen:
             self._seen.add(flow)
             set_flow(self.state, row_of(flow), flow, self._first_delivered)
-        verdicts = np.zeros(len(batch), dtype_of(PacketDecision))
+        decisions = np.zeros(len(batch), dtype_of(PacketDecision))
         rows = np.array([row_of(flow) for flow in range(FLOWS)])[flows]
-        compile_rule(admit_many)(self.program, self.state, rows, sizes, times, verdicts)
-        return [tuple(verdict) for verdict in verdicts.tolist()]
+        compile_rule(admit_many)(self.program, self.state, rows, sizes, times, decisions)
+        return [tuple(decision) for decision in decisions.tolist()]
 
     def change(self, own: LinkSettings) -> None:
         self._first_delivered = own.first_delivered
@@ -116,9 +116,9 @@ def test_recorded_decisions_are_repeated_by_flow_not_by_row(mansd: int | None) -
     own = LinkSettings(mansd=mansd)
     recorded = [[RecordedDecision(0, 5 * flow, -1, -1, -1)] * 3 for flow in range(FLOWS)]
     compiled = Compiled(own, decisions=recorded)
-    verdicts = compiled.decide([(flow, 10, 1000) for flow in range(FLOWS)])
+    decisions = compiled.decide([(flow, 10, 1000) for flow in range(FLOWS)])
     names = list(PacketDecision.__slots__)
-    releases = [verdict[names.index("release_ns")] for verdict in verdicts]
+    releases = [decision[names.index("release_ns")] for decision in decisions]
     assert releases == [1000 + 5 * flow for flow in range(FLOWS)]
 
 

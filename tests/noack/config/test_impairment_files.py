@@ -7,8 +7,6 @@ from typing import Any
 
 import pytest
 import tomli_w
-from hypothesis import given
-from hypothesis import strategies as st
 
 from netem.link_machine import Link
 from noack.config.resolution import resolve
@@ -23,10 +21,11 @@ from noack.impairments.loss_models.trace import TraceLoss
 from noack.protocol.record_tables import Fate
 
 
-def the_delay(settings: LinkSettings) -> Delay:
-    (delay,) = settings.impairments
-    assert isinstance(delay, Delay)
-    return delay
+def read_delay(folder: Path, **settings: Any) -> Delay:
+    delay = Delay(distribution="empirical", **settings)
+    (read,) = read_files(LinkSettings(impairments=(delay,)), folder).impairments
+    assert isinstance(read, Delay)
+    return read
 
 
 @pytest.mark.parametrize("repeat", [True, False])
@@ -40,22 +39,9 @@ def test_a_trace_drops_the_packets_it_marks(repeat: bool, tmp_path: Path) -> Non
     assert Fate.DROPPED == 1
 
 
-@given(st.lists(st.booleans(), min_size=1, max_size=200))
-def test_any_trace(tmp_path_factory: pytest.TempPathFactory, lost: list[bool]) -> None:
-    path = tmp_path_factory.getbasetemp() / "any.txt"
-    path.write_text("\n".join("01"[flag] for flag in lost))
-    script = TraceLoss(file=str(path)).without_files(Path("/"), "")
-    assert isinstance(script, ScriptedLoss)
-    assert script.repeat_every == len(lost)
-    assert [number in script.lost for number in range(len(lost))] == lost
-
-
 def test_observed_delays_have_units_comments_and_signs(tmp_path: Path) -> None:
     (tmp_path / "delays.txt").write_text("# from a ping\n0.01\n12.5ms\n\n300 us\n-5ns\n1e-3\n")
-    settings = LinkSettings(
-        impairments=(Delay(delay_s=0.02, distribution="empirical", file="delays.txt"),)
-    )
-    delay = the_delay(read_files(settings, tmp_path))
+    delay = read_delay(tmp_path, delay_s=0.02, file="delays.txt")
     assert delay.samples_s == pytest.approx((0.01, 0.0125, 3e-4, -5e-9, 1e-3), rel=1e-15)
     assert delay.file is None
     assert delay.delay_s == 0.02
@@ -63,12 +49,7 @@ def test_observed_delays_have_units_comments_and_signs(tmp_path: Path) -> None:
 
 def test_a_tc_distribution_table_is_scaled_by_the_jitter(tmp_path: Path) -> None:
     (tmp_path / "some.dist").write_text("# a table\n -8192 -4096 0\n 8192 16384\n")
-    settings = LinkSettings(
-        impairments=(
-            Delay(delay_s=0.02, jitter_s=0.002, distribution="empirical", file="some.dist"),
-        )
-    )
-    delay = the_delay(read_files(settings, tmp_path))
+    delay = read_delay(tmp_path, delay_s=0.02, jitter_s=0.002, file="some.dist")
     assert delay.samples_s == pytest.approx((-0.002, -0.001, 0, 0.002, 0.004), rel=1e-15)
     # The quantiles are those of the table, shifted by the constant delay.
     link = Link(LinkSettings(impairments=(delay,)), 0, "test")
@@ -80,18 +61,12 @@ def test_a_tc_distribution_table_is_scaled_by_the_jitter(tmp_path: Path) -> None
         assert abs(drawn[quantile] * 1e-9 - expected_s) < max(error_s, 2e-5)
 
 
-TABLES = Path("/usr/lib/x86_64-linux-gnu/tc")
+TABLE = Path("/usr/lib/x86_64-linux-gnu/tc/paretonormal.dist")
 
 
-@pytest.mark.skipif(not TABLES.is_dir(), reason="tc's tables are not installed")
-@pytest.mark.parametrize("name", ["normal", "pareto", "paretonormal", "experimental"])
-def test_distribution_tables_shipped_with_tc_are_read(name: str) -> None:
-    settings = LinkSettings(
-        impairments=(
-            Delay(jitter_s=8.192, distribution="empirical", file=str(TABLES / f"{name}.dist")),
-        )
-    )
-    samples_s = the_delay(read_files(settings, Path())).samples_s
+@pytest.mark.skipif(not TABLE.exists(), reason="tc's tables are not installed")
+def test_a_distribution_table_shipped_with_tc_is_read() -> None:
+    samples_s = read_delay(Path(), jitter_s=8.192, file=str(TABLE)).samples_s
     assert samples_s is not None
     assert len(samples_s) == 4096
     assert all(abs(t_s * 1000 - round(t_s * 1000)) < 1e-9 for t_s in samples_s)
@@ -145,9 +120,8 @@ def test_a_mistake_in_a_delay_file_gets_one_line(
 ) -> None:
     if content is not None:
         (tmp_path / name).write_text(content)
-    delay = Delay(jitter_s=jitter_s, distribution="empirical", file=name)
     with pytest.raises(CallerError) as caught:
-        read_files(LinkSettings(impairments=(delay,)), tmp_path)
+        read_delay(tmp_path, jitter_s=jitter_s, file=name)
     assert str(caught.value).startswith(f"{name}: {says}")
 
 

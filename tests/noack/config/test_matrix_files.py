@@ -16,50 +16,31 @@ from noack.core.errors import CallerError
 A = np.array([[0.0, 1.0], [4.0, -0.25]])
 B = np.array([[0.0], [1.0]])
 K = np.array([[-8.0, -4.0]])
-REST = """
-[trigger]
-beta = 0.05
-alpha_per_s = 0.5
-
-[network]
-mansd = 3
-loss = { model = "lossless" }
-"""
-
-
-def scenario(folder: Path, model: str, plant: str = "") -> Scenario:
-    text = f"""
+TEXT = """
 name = "filed"
 horizon_s = 1.0
+trigger = {{ beta = 0.05, alpha_per_s = 0.5 }}
+network = {{ mansd = 3, loss = {{ model = "lossless" }} }}
 [model]
 {model}
 [plant]
 initial_state = [1.0, 0.0]
 {plant}
-{REST}"""
+"""
+
+
+def scenario(folder: Path, model: str, plant: str = "") -> Scenario:
     path = folder / "filed.toml"
-    path.write_text(text)
+    path.write_text(TEXT.format(model=model, plant=plant))
     return load(path)
 
 
-def save(path: Path, **arrays: Any) -> None:
-    if path.suffix == ".npz":
-        np.savez(path, **arrays)
-    else:
-        savemat(path, arrays)
-
-
-SUFFIXES = pytest.mark.parametrize("suffix", [".npz", ".mat"])
-
-
-@SUFFIXES
 @pytest.mark.parametrize("gain", ["gain", "K"])
-def test_model_and_plant_may_come_from_two_files(suffix: str, gain: str, tmp_path: Path) -> None:
-    save(tmp_path / f"model{suffix}", A=A, B=B, C=np.eye(2), D=np.zeros((2, 1)), **{gain: K})
-    save(tmp_path / f"true{suffix}", A=A + 0.1, B=B + 0.1, unrelated="text")
-    loaded = scenario(
-        tmp_path, f'file = "model{suffix}"', f'file = "true{suffix}"\ndraw = "given"'
-    )  # fmt: skip
+def test_model_and_plant_may_come_from_two_files(gain: str, tmp_path: Path) -> None:
+    C, D = np.eye(2), np.zeros((2, 1))
+    np.savez(tmp_path / "model.npz", A=A, B=B, C=C, D=D, **{gain: K})  # type: ignore[arg-type]
+    np.savez(tmp_path / "true.npz", A=A + 0.1, B=B + 0.1, unrelated="text")
+    loaded = scenario(tmp_path, 'file = "model.npz"', 'file = "true.npz"\ndraw = "given"')
     assert loaded.model.file is None
     resolved = resolve(loaded)
     for key, expected in (("A", A), ("B", B), ("gain", K)):
@@ -70,22 +51,22 @@ def test_model_and_plant_may_come_from_two_files(suffix: str, gain: str, tmp_pat
     assert load(tmp_path / "again.toml") == resolved
 
 
-@SUFFIXES
 def test_the_scenarios_gain_overrides_the_files_and_array_names_may_be_set(
-    suffix: str, tmp_path: Path
+    tmp_path: Path,
 ) -> None:
-    save(tmp_path / f"two{suffix}", A=0 * A, B=0 * B, A_lat=A, B_lat=B, K=K)
+    np.savez(tmp_path / "two.npz", A=0 * A, B=0 * B, A_lat=A, B_lat=B, K=K)
     names = 'names = { A = "A_lat", B = "B_lat" }'
-    loaded = scenario(tmp_path, f'file = "two{suffix}"\n{names}\ngain = [[-9.0, -5.0]]')
+    loaded = scenario(tmp_path, f'file = "two.npz"\n{names}\ngain = [[-9.0, -5.0]]')
     assert loaded.model.gain == ((-9.0, -5.0),)
     assert np.array_equal(np.array(loaded.model.A), A)
 
 
-def test_sparse_matrices_and_integers_are_accepted(tmp_path: Path) -> None:
-    save(tmp_path / "m.mat", A=csc_matrix(A), B=B.astype(np.int8), K=K)
+def test_a_mat_file_may_have_sparse_matrices_integers_and_text(tmp_path: Path) -> None:
+    content = {"A": csc_matrix(A), "B": B.astype(np.int8), "K": K, "unrelated": "text"}
+    savemat(tmp_path / "m.mat", content)
     loaded = scenario(tmp_path, 'file = "m.mat"')
     assert np.array_equal(np.array(loaded.model.A), A)
-    assert loaded.model.B == ((0.0,), (1.0,))
+    assert (loaded.model.B, loaded.model.gain) == (((0.0,), (1.0,)), ((-8.0, -4.0),))
 
 
 @pytest.mark.parametrize(
@@ -95,20 +76,18 @@ def test_sparse_matrices_and_integers_are_accepted(tmp_path: Path) -> None:
         ({"A": np.zeros((65, 65)), "B": B}, "has no matrix A of numbers, at most 64 x 64"),
         ({"A": A, "B": B, "K": K, "dt": 0.01}, "dt is 0.01, so it is a system in discrete time"),
         ({"A": A, "B": B, "K": K, "C": np.eye(2)[:1]}, "C is not the identity"),
-        ({"A": A, "B": B, "K": K, "C": 2 * np.eye(2)}, "C is not the identity"),
         ({"A": A, "B": B, "K": K, "D": np.ones((2, 1))}, "D is not zero"),
         ({"A": A * 1j, "B": B}, "A is not of real numbers"),
         ({"A": A, "B": B + np.inf}, "B has entries that are not finite"),
         ({"A": A, "B": B}, "gain: give a model by name"),
         ({"A": A, "B": B, "gain": K, "K": 2 * K}, "has gain and K; say which by names = { gain"),
         ({"A": A, "B": B, "K": K.T}, "gain = [[-8.0], [-4.0]]: expected 1 x 2"),
-        ({"A": A, "B": np.zeros((3, 1)), "K": K}, "B = [[0.0], [0.0], [0.0]]: expected 2 x 1"),
     ],
 )
 def test_a_file_without_a_valid_system_is_refused_in_one_line(
     arrays: dict[str, Any], expected: str, tmp_path: Path
 ) -> None:
-    save(tmp_path / "m.npz", **arrays)
+    np.savez(tmp_path / "m.npz", **arrays)
     with pytest.raises(CallerError) as refused:
         scenario(tmp_path, 'file = "m.npz"')
     assert expected in str(refused.value)
@@ -122,25 +101,22 @@ def test_a_file_without_a_valid_system_is_refused_in_one_line(
         ('file = "gone.npz"', 'model.file = "gone.npz": cannot be read: No such file'),
         ('file = "m.csv"', "must end in .npz (NumPy) or .mat (MATLAB)"),
         ('file = "bad.npz"', "is no .npz file, or a damaged one"),
-        ('file = "bad.mat"', "is no .mat file, or a damaged one"),
         ('file = "hdf.mat"', "is of MATLAB's v7.3, which is HDF5; save it as v7"),
         ('file = "pickled.npz"', "has no matrix A of numbers, at most 64 x 64; it has B"),
         ('file = "flat.npz"', "B has 2 entries; a matrix is needed, with rows and columns"),
         ('file = "m.npz"\nA = [[1.0]]', "the file has A, and so has the scenario"),
         ('file = "m.npz"\nnames = { gain = "G" }', "has no matrix G"),
         ('file = "m.npz"\nnames = { C = "G" }', "should be 'A', 'B' or 'gain'"),
-        ("file = 3", "should be a valid string"),
         ('names = { A = "G" }\nA = [[1.0]]\nB = [[1.0]]\ngain = [[-2.0]]', "give file, too"),
     ],
 )
 def test_a_wrong_file_or_key_is_refused_with_the_reason(
     model: str, expected: str, tmp_path: Path
 ) -> None:
-    save(tmp_path / "m.npz", A=A, B=B, K=K)
-    save(tmp_path / "flat.npz", A=A, B=B[:, 0], K=K)
-    save(tmp_path / "pickled.npz", A=np.array([[object()]], dtype=object), B=B)
+    np.savez(tmp_path / "m.npz", A=A, B=B, K=K)
+    np.savez(tmp_path / "flat.npz", A=A, B=B[:, 0], K=K)
+    np.savez(tmp_path / "pickled.npz", A=np.array([[object()]], dtype=object), B=B)
     (tmp_path / "bad.npz").write_bytes(b"PK\x03\x04nothing")
-    (tmp_path / "bad.mat").write_bytes(bytes(range(256)))
     header = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
     (tmp_path / "hdf.mat").write_bytes(header + bytes(512))
     with pytest.raises(CallerError) as refused:
@@ -149,12 +125,9 @@ def test_a_wrong_file_or_key_is_refused_with_the_reason(
 
 
 def test_an_array_with_a_huge_declared_size_takes_no_memory(tmp_path: Path) -> None:
-    save(tmp_path / "m.npz", A=A, B=B, K=K)
+    np.savez(tmp_path / "m.npz", A=A, B=B, K=K)
     content = (tmp_path / "m.npz").read_bytes()
-    huge = content.replace(b"'shape': (2, 2), }          ", b"'shape': (99999999, 99999), ")
-    huge = (
-        huge if huge != content else content.replace(b"(2, 2), }" + 8 * b" ", b"(99999, 99999), }")
-    )
+    huge = content.replace(b"(2, 2), }" + 8 * b" ", b"(99999, 99999), }")
     assert huge != content
     (tmp_path / "m.npz").write_bytes(huge)
     with pytest.raises(CallerError, match=r"is no \.npz file|has no matrix A"):
@@ -163,7 +136,7 @@ def test_an_array_with_a_huge_declared_size_takes_no_memory(tmp_path: Path) -> N
 
 def test_a_file_on_which_scipy_crashes_is_refused(tmp_path: Path) -> None:
     """An array type that the format does not define crashes SciPy 1.17's reader with SIGSEGV."""
-    save(tmp_path / "m.mat", A=A, B=B, K=K)
+    savemat(tmp_path / "m.mat", {"A": A, "B": B, "K": K})
     content = bytearray((tmp_path / "m.mat").read_bytes())
     place = content.index(b"\x09\x00\x00\x00\x20\x00\x00\x00")  # 32 bytes of doubles: A
     content[place + 1] = 2

@@ -1,5 +1,6 @@
 """Changes of runtime parameters: the keys, their notation, and each machine's schedule."""
 
+import tomllib
 from typing import Any
 
 import pytest
@@ -16,7 +17,7 @@ from noack.config.resolution import resolve
 from noack.config.runtime_parameters import full_key, is_of_loss_alone, text_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_changes import content_with_settings
-from noack.config.scenario_file import dumps, load, validate
+from noack.config.scenario_file import dumps, validate
 from noack.core.errors import CallerError
 from noack.impairments.loss_models.bernoulli import BernoulliLoss
 from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
@@ -33,14 +34,11 @@ def scenario(content: dict[str, Any]) -> Scenario:
     ("settings", "why"),
     [
         ({"speed": 2.0}, "speed: cannot be changed during a run; what can is network.loss, "),
-        ({"trigger.policy": "periodic"}, "trigger.policy: cannot be changed"),
-        ({"trigger.weight": [[1.0]]}, "trigger.weight: cannot be changed"),
         ({"network.loss.probability": 1.5}, "network.loss.probability = 1.5: should be less than"),
         ({"network.loss.p": 0.5}, "network.loss.p = 0.5: unknown key; the keys here are"),
         ({"network.loss.model": "gilbert"}, "must be one of .* did you mean gilbert_elliott"),
         ({"network.loss.model": "trace", "network.loss.file": "x"}, "read before a run begins"),
         ({"network.mansd": -1}, "network.mansd = -1: should be greater than or equal to 0"),
-        ({"network.mansd": 1.5}, "network.mansd = 1.5"),
         ({"trigger.beta": 0.0}, "trigger.beta = 0.0: should be greater than 0"),
         ({"trigger.beta": None}, "trigger.beta: needs a value"),
         ({"controller.setpoint": [1.0, 1.0]}, "controller.setpoint.*no equilibrium of the model"),
@@ -50,10 +48,8 @@ def scenario(content: dict[str, Any]) -> Scenario:
 def test_an_invalid_change_is_refused_in_one_line(
     scenario: Scenario, settings: dict[str, Any], why: str
 ) -> None:
-    with pytest.raises(CallerError, match=why) as raised:
+    with pytest.raises(CallerError, match=rf"^[^\n]*{why}[^\n]*$"):
         changed(scenario, settings)
-    assert "\n" not in str(raised.value)
-    assert raised.value.exit_status == 2
 
 
 def test_a_change_leaves_all_other_settings_unchanged(scenario: Scenario) -> None:
@@ -63,23 +59,16 @@ def test_a_change_leaves_all_other_settings_unchanged(scenario: Scenario) -> Non
     assert (found.network.mansd, found.decaying.beta) == (1, 0.25)
     back = {"network.loss.probability": 0.5, "network.mansd": 2, "trigger.beta": 0.5}
     assert changed(found, back) == scenario
+    setpoint = {"controller.setpoint": [3.0, 0.0]}
+    as_a_whole = validate(content_with_settings(scenario, setpoint), "x")
+    assert changed(scenario, setpoint) == as_a_whole
 
 
 def test_a_new_loss_model_does_not_inherit_the_old_models_keys(scenario: Scenario) -> None:
-    settings = {
-        "network.loss.model": "gilbert_elliott",
-        "network.loss.mean_loss": 0.5,
-        "network.loss.mean_burst": 3.0,
-    }
+    values = {"model": "gilbert_elliott", "mean_loss": 0.5, "mean_burst": 3.0}
+    settings = {f"network.loss.{key}": value for key, value in values.items()}
     loss = changed(scenario, settings).network.loss
     assert loss == GilbertElliottLoss(mean_loss=0.5, mean_burst=3.0)
-
-
-def test_a_change_is_valid_if_the_whole_scenario_is(scenario: Scenario) -> None:
-    for settings in ({"network.loss.probability": 0.2}, {"controller.setpoint": [3.0, 0.0]}):
-        assert changed(scenario, settings) == validate(
-            content_with_settings(scenario, settings), "x"
-        )
 
 
 def test_changes_are_refused_with_acknowledgements(content: dict[str, Any]) -> None:
@@ -88,39 +77,32 @@ def test_changes_are_refused_with_acknowledgements(content: dict[str, Any]) -> N
         changed(resolve(validate(content, "here")), {"network.mansd": 1})
 
 
-def test_a_scenario_with_changes_is_written_and_read_back(
-    content: dict[str, Any], tmp_path: Any
-) -> None:
+def test_a_scenario_with_changes_is_written_and_read_back(content: dict[str, Any]) -> None:
     content["changes"] = [
         {"at_s": 0.25, "set": {"network.loss.probability": 0.9}},
         {"at_s": 0.5, "set": {"network.loss": {"model": "lossless"}, "trigger.beta": 0.1}},
     ]
     scenario = validate(content, "here")
-    path = tmp_path / "s.toml"
-    path.write_text(dumps(scenario))
-    assert load(path) == scenario
+    assert validate(tomllib.loads(dumps(scenario)), "again") == scenario
 
 
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
         ([{"at_s": 2.0, "set": {"network.mansd": 1}}], "changes.0.at_s.*the run ends at 1 s"),
-        (
-            [{"at_s": 0.5, "set": {"network.mansd": 1}}, {"at_s": 0.4, "set": {"trigger.beta": 1}}],
-            "changes.1.at_s.*earlier than the change before it",
-        ),
+        ([{"at_s": 0.5, "set": {"network.mansd": 1}}, {"at_s": 0.4, "set": {"trigger.beta": 1}}],
+         "changes.1.at_s.*earlier than the change before it"),
         ([{"at_s": 0.5, "set": {"network.mansd": -1}}], "changes.0.set.*greater than or equal"),
         ([{"at_s": 0.5, "set": {"horizon_s": 1}}], "changes.0.set.*cannot be changed"),
         ([{"at_s": 0.5, "set": {}}], "changes.0.set.*needs at least|changes.0.set"),
     ],
-)
+)  # fmt: skip
 def test_an_invalid_table_of_changes_is_refused_in_one_line(
     content: dict[str, Any], changes: list[dict[str, Any]], why: str
 ) -> None:
     content["changes"] = changes
-    with pytest.raises(CallerError, match=why) as raised:
+    with pytest.raises(CallerError, match=rf"^[^\n]*({why})[^\n]*$"):
         validate(content, "here")
-    assert "\n" not in str(raised.value)
 
 
 def test_short_names_refer_to_runtime_parameters(scenario: Scenario) -> None:
@@ -132,16 +114,13 @@ def test_short_names_refer_to_runtime_parameters(scenario: Scenario) -> None:
     assert full_key("trigger.beta") == "trigger.beta"
 
 
-def test_a_change_of_the_loss_alone_is_recognised() -> None:
-    assert is_of_loss_alone({"network.loss.probability": 0.1, "network.loss.model": "x"})
-    assert not is_of_loss_alone({"network.loss.probability": 0.1, "network.mansd": 1})
-
-
 def test_settings_are_recorded_in_full() -> None:
     settings = {"network.loss": {"model": "lossless"}, "trigger.beta": 0.1 + 0.2}
     data = settings_bytes(settings)
     assert len(data) == CHANGE_BYTES
     assert settings_of(data) == settings
+    assert not is_of_loss_alone(settings)
+    assert is_of_loss_alone({"network.loss.probability": 0.1, "network.loss.model": "x"})
     assert text_of(settings) == 'network.loss = { model = "lossless" }, trigger.beta = 0.3'
 
 
@@ -154,10 +133,9 @@ def test_changes_announced_out_of_order_are_applied_in_order_of_time(scenario: S
     first, second = schedule.take(250), schedule.take(250)
     assert first is not None
     assert second is not None
-    assert (first.since_ns, first.scenario.network.mansd, first.scenario.decaying.beta) == (
-        100, 5, 0.5,
-    )  # fmt: skip
-    assert (second.scenario.network.mansd, second.scenario.decaying.beta) == (5, 0.1)
+    assert (first.since_ns, second.since_ns) == (100, 200)
+    scenarios = [one.scenario for one in (first, second)]
+    assert [(one.network.mansd, one.decaying.beta) for one in scenarios] == [(5, 0.5), (5, 0.1)]
     assert schedule.take(10**9) is None
     assert schedule.next_ns is None
     caps = [one.network.mansd for one in schedule.between(0, 150)]

@@ -11,7 +11,7 @@ from noack.config.scenario import Scenario
 from noack.config.scenario_file import load, validate
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
-SEEDS = range(200)
+SEEDS = range(60)
 WIDTH_A = np.array([[0.1, 0.2], [0.0, 1e-9]])
 WIDTH_B = np.array([[0.05], [0.0]])
 
@@ -33,23 +33,19 @@ def resolved(content: dict[str, Any], **seeds: int) -> Scenario:
     return resolve(validate(content | {"seeds": seeds}, "here"))
 
 
-def deviations(content: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """A − Â and B − B̂ of one draw per seed, (seeds, rows, columns)."""
-    loops = [loop_of(resolved(content, plant=seed)) for seed in SEEDS]
-    A = np.array([loop.A - loop.A_model for loop in loops])
-    B = np.array([loop.B - loop.B_model for loop in loops])
-    return A, B
-
-
 def test_uniform_draws_fill_their_box_and_stay_inside(box: dict[str, Any]) -> None:
-    for deviation, width in zip(deviations(box), (WIDTH_A, WIDTH_B), strict=True):
+    loops = [loop_of(resolved(box, plant=seed, initial_state=seed)) for seed in SEEDS]
+    for deviation, width in (
+        (np.array([loop.A - loop.A_model for loop in loops]), WIDTH_A),
+        (np.array([loop.B - loop.B_model for loop in loops]), WIDTH_B),
+        (np.array([loop.x0 - [1.0, -2.0] for loop in loops]), np.array([0.5, 0.0])),
+    ):
         # |Â| is at most 1 here: Â + d and the difference from Â are each rounded to 2⁻⁵³.
         assert (np.abs(deviation) <= width + 2.3e-16).all()
         spread = width > 1e-6
-        # The extreme of 200 draws misses the outer 5 % at an end with probability at most 2 ·
-        # 0.975^200.
-        assert (deviation.max(axis=0)[spread] > 0.95 * width[spread]).all()
-        assert (deviation.min(axis=0)[spread] < -0.95 * width[spread]).all()
+        # The extreme of 60 draws misses the outer 20 % at an end with probability 0.9^60 = 0.002.
+        assert (deviation.max(axis=0)[spread] > 0.8 * width[spread]).all()
+        assert (deviation.min(axis=0)[spread] < -0.8 * width[spread]).all()
         assert (deviation[:, width == 0] == 0).all()
 
 
@@ -64,24 +60,13 @@ def test_vertex_draws_are_corners_and_all_of_them_occur(box: dict[str, Any]) -> 
         ):
             assert ((true == model + width) | (true == model - width)).all()
         corners.add((*(np.sign(loop.A - loop.A_model)[0]), np.sign(loop.B - loop.B_model)[0, 0]))
-    # Eight corners in 200 draws: the probability of missing one is below 8 · (7/8)^200 = 2e-11.
+    # Eight corners in 60 draws: the probability of missing one is below 8 · (7/8)^60 = 0.003.
     assert len(corners) == 8
-
-
-def test_initial_states_fill_their_interval(box: dict[str, Any]) -> None:
-    x0 = np.array([loop_of(resolved(box, initial_state=seed)).x0 for seed in SEEDS])
-    assert (np.abs(x0[:, 0] - 1.0) <= 0.5).all()
-    assert x0[:, 0].max() > 1.475
-    assert x0[:, 0].min() < 0.525
-    assert (x0[:, 1] == -2.0).all()
-
-
-def test_the_same_seeds_give_the_same_scenario(box: dict[str, Any]) -> None:
-    assert resolved(box, plant=3, initial_state=4) == resolved(box, plant=3, initial_state=4)
 
 
 def test_seeds_are_independent_of_each_other(box: dict[str, Any]) -> None:
     base = resolved(box, plant=3, initial_state=4, loss=5)
+    assert resolved(box, plant=3, initial_state=4, loss=5) == base
     for other, plant_stays, state_stays in (
         (resolved(box, plant=9, initial_state=4, loss=5), False, True),
         (resolved(box, plant=3, initial_state=9, loss=5), True, False),

@@ -49,6 +49,12 @@ network = { mansd = 2, loss = { model = "worst_case" } }
 """
 
 
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    (tmp_path / "some.toml").write_text(LANE)
+    return tmp_path / "some.toml"
+
+
 def mistakes(text: str, folder: Path, lines: Sequence[str] = ()) -> list[str]:
     """The error message for a scenario file with these ``key=value`` settings added."""
     content = tomllib.loads(text)
@@ -76,240 +82,91 @@ def test_the_scenarios_are_valid_before_mistakes_are_added(text: str, tmp_path: 
 
 # One setting each that makes LANE invalid: how its line begins after the file name, and what the
 # remedy must contain.
+# fmt: off
 LANE_MISTAKES = [
     # Unknown keys, at every level.
     ("sped=2", "sped = 2: unknown key; ", "did you mean speed?"),
     ("xyzzy=2", "xyzzy = 2: unknown key; ", "the keys here are certificate, .*, trigger"),
     ("pland.rate_hz=9", 'pland = {"rate_hz": 9}: unknown key; ', "did you mean plant?"),
-    ("model.param.a11=2", 'model.param = {"a11": 2}: unknown key; ', "did you mean parameters?"),
-    ("plant.rate=100", "plant.rate = 100: unknown key; ", "did you mean rate_hz?"),
-    ("trigger.bta=1", "trigger.bta = 1: unknown key; ", "did you mean beta?"),
-    ("trigger.alpha=1", "trigger.alpha = 1: unknown key; ", "did you mean alpha_per_s?"),
-    ("network.mandsd=1", "network.mandsd = 1: unknown key; ", "did you mean mansd?"),
-    ("network.lossless=true", "network.lossless = true: unknown key; ", "loss"),
-    ("network.bernoulli=0.5", "network.bernoulli = 0.5: unknown key; ", "loss"),
     ("network.loss.p=0.5", "network.loss.p = 0.5: unknown key; ", "model, probability"),
-    ("network.loss.prob=0.5", "network.loss.prob = 0.5: unknown key; ", "probability"),
-    ("controller.rate=9", "controller.rate = 9: unknown key; ", "did you mean rate_hz?"),
-    ("seeds.losses=9", "seeds.losses = 9: unknown key; ", "did you mean loss?"),
     ("ports.recorder=9", "ports.recorder = 9: unknown key; ", "control, controller, netem"),
-    ("realtime.spin=9", "realtime.spin = 9: unknown key; ", "did you mean spin_us?"),
     ("model.parameters.a13=1", "model.parameters.a13 = 1: ", "a11, a12, a21, a22, b1, b2"),
-    ("plant.watchdog.timeout=1", "plant.watchdog.timeout = 1: unknown key; ", "timeout_s"),
-    ("plant.watchdog.policy=off", 'plant.watchdog.policy = "off": ', "hold.*zero.*model"),
-    ("plant.watchdog.timeout_s=0", "plant.watchdog.timeout_s = 0: ", "greater than 0"),
-    (
-        "plant.watchdog.timeout_s=0.001",
-        "plant.watchdog.timeout_s = 0.001: ",
-        "shorter than a period of the controller .0.002 s.",
-    ),
-    (
-        "controller.safe_input=[1.0]",
-        "controller.safe_input = [1.0]: ",
-        "expected 2 entries .one per input., found 1",
-    ),
     # Types.
     ("horizon_s=20 s", 'horizon_s = "20 s": ', "should be a valid number"),
-    ("trigger.beta=true", "trigger.beta = true: ", "should be a valid number"),
-    ('trigger.beta="0.3"', 'trigger.beta = "0.3": ', "should be a valid number"),
     ("trigger.beta=[1]", "trigger.beta = [1]: ", "should be a valid number"),
-    ("trigger.beta=", 'trigger.beta = "": ', "should be a valid number"),
     ("network.mansd=4.0", "network.mansd = 4.0: ", "should be a valid integer"),
-    ("network.mansd=true", "network.mansd = true: ", "should be a valid integer"),
-    ("network.mansd=four", 'network.mansd = "four": ', "should be a valid integer"),
     ("network.enforce_mansd=0", "network.enforce_mansd = 0: ", "should be a valid boolean"),
-    ("seeds.loss=1.5", "seeds.loss = 1.5: ", "should be a valid integer"),
-    ("name=3", "name = 3: ", "should be a valid string"),
-    ("plant.initial_state=3", "plant.initial_state = 3: ", "should be a list"),
-    (
-        'plant.initial_state=[1,2,"x",4]',
-        'plant.initial_state.2 = "x": ',
-        "should be a valid number",
-    ),
+    ('plant.initial_state=[1,2,"x",4]', 'plant.initial_state.2 = "x": ', "a valid number"),
     ("plant.initial_state=[1,2,3,true]", "plant.initial_state.3 = true: ", "valid number"),
     ('model.parameters.a11="x"', 'model.parameters.a11 = "x": ', "should be a valid number"),
     ("trigger=3", "trigger = 3: ", "table|object"),
-    ("trigger=[1,2]", "trigger = [1, 2]: ", "table|object"),
     ("network.loss=bernoulli", 'network.loss = "bernoulli": ', "table|object"),
-    ("trigger.weight=3", "trigger.weight = 3: ", "should be a list"),
-    ("trigger.weight=[3]", "trigger.weight.0 = 3: ", "should be a list"),
     ("trigger.weight=[]", "trigger.weight = []: ", "at least (1|one)"),
-    ("trigger.weight=[[]]", "trigger.weight.0 = []: ", "at least (1|one)"),
     ("trigger.weight=[[1],[true]]", "trigger.weight.1.0 = true: ", "should be a valid number"),
     # Choices.
     ("mode=modl", 'mode = "modl": ', "should be 'model' or 'zoh'"),
-    ("mode=ZOH", 'mode = "ZOH": ', "should be 'model' or 'zoh'"),
-    ("plant.draw=corner", 'plant.draw = "corner": ', "'nominal', 'uniform', 'vertex' or 'given'"),
     ("trigger.policy=decayin", 'trigger.policy = "decayin": ', "did you mean decaying?"),
-    ("network.initial_sync=0", "network.initial_sync = 0: ", "'first_packet' or 'known_state'"),
-    ("model.name=lane", 'model.name = "lane": ', "'single_track_lane' or 'double_integrator'"),
     ("network.loss.model=bernouli", 'network.loss.model = "bernouli": ', "did you mean bernoulli?"),
-    ("network.loss.model=3", "network.loss.model = 3: ", "one of .*bernoulli"),
     ("network.loss={}", "network.loss.model: missing; ", "one of .*bernoulli"),
-    ("network.loss={probability=1}", "network.loss.model: missing; ", "one of .*bernoulli"),
     # Impairments are a list of tables, each chosen by its kind, with a loss model within a loss.
-    ("network.impairments=3", "network.impairments = 3: ", "should be a list"),
     ("network.impairments=[3]", "network.impairments.0 = 3: ", 'e.g. { kind = "blackout", '),
-    (
-        "network.impairments=[{}]",
-        "network.impairments.0.kind: missing; ",
-        "one of blackout, corrupt",
-    ),
-    (
-        'network.impairments=[{kind="dely"}]',
-        'network.impairments.0.kind = "dely": must be one of blackout, ',
-        "did you mean delay?",
-    ),
-    (
-        'network.impairments=[{kind="delay",delay_ms=5}]',
-        "network.impairments.0.delay_ms = 5: unknown key; ",
-        "did you mean delay_s?",
-    ),
-    (
-        'network.impairments=[{kind="delay",delay_s=-1}]',
-        "network.impairments.0.delay_s = -1: ",
-        "should be greater than or equal to 0",
-    ),
-    (
-        'network.impairments=[{kind="delay",distribution="empirical"}]',
-        "network.impairments.0.samples_s: ",
-        "an empirical distribution needs samples_s, or a file",
-    ),
-    (
-        'network.impairments=[{kind="delay",distribution="empirical",samples_s=[0.1]}]',
-        "network.impairments.0.samples_s = [0.1]: ",
-        "needs at least 2 entries",
-    ),
-    (
-        'network.impairments=[{kind="rate"}]',
-        "network.impairments.0.rate_bps: missing ",
-        r"\(bits per second\)",
-    ),
+    ("network.impairments=[{}]", "network.impairments.0.kind: missing; ",
+     "one of blackout, corrupt"),
+    ('network.impairments=[{kind="dely"}]',
+     'network.impairments.0.kind = "dely": must be one of blackout, ', "did you mean delay?"),
+    ('network.impairments=[{kind="delay",delay_ms=5}]',
+     "network.impairments.0.delay_ms = 5: unknown key; ", "did you mean delay_s?"),
+    ('network.impairments=[{kind="delay",distribution="empirical",samples_s=[0.1]}]',
+     "network.impairments.0.samples_s = [0.1]: ", "needs at least 2 entries"),
+    ('network.impairments=[{kind="rate"}]', "network.impairments.0.rate_bps: missing ",
+     r"\(bits per second\)"),
     ('network.impairments=[{kind="loss"}]', "network.impairments.0.loss: missing ", "loss model"),
-    (
-        'network.impairments=[{kind="loss",loss="x"}]',
-        'network.impairments.0.loss = "x": should be a table, ',
-        'e.g. { model = "bernoulli", probability = ... }',
-    ),
-    (
-        'network.impairments=[{kind="duplicate",probability=0},{kind="loss",loss={model="x"}}]',
-        'network.impairments.1.loss.model = "x": ',
-        "must be one of bernoulli, four_state",
-    ),
-    (
-        'network.impairments=[{kind="loss",loss={model="bernoulli",probability=2}}]',
-        "network.impairments.0.loss.probability = 2: ",
-        "less than or equal to 1",
-    ),
-    (
-        'network.impairments=[{kind="loss",loss={model="bernoulli",prob=0.5,probability=0}}]',
-        "network.impairments.0.loss.prob = 0.5: unknown key; ",
-        "correlation, model, probability",
-    ),
-    (
-        'network.impairments=[{kind="loss",loss={model="periodic",period=2,burst=3}}]',
-        "network.impairments.0.loss.burst = 3: ",
-        "must not exceed the period, 2",
-    ),
-    (
-        'network.impairments=[{kind="blackout",intervals_s=[[3.0,2.0]]}]',
-        "network.impairments.0.intervals_s = [[3.0, 2.0]]: ",
-        "each must end after it begins",
-    ),
-    (
-        'network={mansd=1,loss={model="worst_case"},impairments=[{kind="delay",loss_correlation=1}]}',
-        "network.impairments.0.loss_correlation = 1: ",
-        "needs a loss before it, by model bernoulli or gilbert_elliott",
-    ),
-    ("network.limit=0", "network.limit = 0: ", "greater than or equal to 1"),
-    ("name=lane following", 'name = "lane following": ', "A-Za-z0-9|letters"),
-    ("name=../../etc", 'name = "../../etc": ', "A-Za-z0-9|letters"),
-    ("name=", 'name = "": ', "A-Za-z0-9|letters"),
+    ('network.impairments=[{kind="loss",loss="x"}]',
+     'network.impairments.0.loss = "x": should be a table, ',
+     'e.g. { model = "bernoulli", probability = ... }'),
+    ('network.impairments=[{kind="duplicate",probability=0},{kind="loss",loss={model="x"}}]',
+     'network.impairments.1.loss.model = "x": ', "must be one of bernoulli, four_state"),
+    ('network={mansd=1,loss={model="worst_case"},impairments=[{kind="delay",loss_correlation=1}]}',
+     "network.impairments.0.loss_correlation = 1: ",
+     "needs a loss before it, by model bernoulli or gilbert_elliott"),
+    ("name=../../etc", 'name = "../../etc": ', "letters"),
     # Ranges.
     ("horizon_s=0", "horizon_s = 0: ", "should be greater than 0"),
-    ("horizon_s=-1", "horizon_s = -1: ", "should be greater than 0"),
     ("horizon_s=0.001", "horizon_s = 0.001: ", r"one plant step \(0.002 s\)"),
     ("horizon_s=1e8", "horizon_s = 100000000.0: ", "less than or equal to 1e7|10000000"),
-    ("speed=0", "speed = 0: ", "should be greater than 0"),
-    ("speed=1e9", "speed = 1000000000.0: ", "less than or equal to 1000"),
-    ("trigger.beta=-1", "trigger.beta = -1: ", "should be greater than 0"),
-    ("trigger.beta=0", "trigger.beta = 0: ", "should be greater than 0"),
-    ("trigger.alpha_per_s=0", "trigger.alpha_per_s = 0: ", "should be greater than 0"),
-    ("trigger.floor=-0.1", "trigger.floor = -0.1: ", "greater than or equal to 0"),
     ("network.mansd=-1", "network.mansd = -1: ", "greater than or equal to 0"),
-    ("network.loss.probability=1.5", "network.loss.probability = 1.5: ", "less than or equal to 1"),
-    ("network.loss.probability=-0.5", "network.loss.probability = -0.5: ", "or equal to 0"),
-    ("plant.measure_every=0", "plant.measure_every = 0: ", "greater than or equal to 1"),
-    ("plant.rate_hz=0", "plant.rate_hz = 0: ", "should be greater than 0"),
     ("plant.rate_hz=5e-324", "plant.rate_hz = 5e-324: ", "must be at least 1e-09"),
-    ("controller.rate_hz=1e-10", "controller.rate_hz = 1e-10: ", "must be at least 1e-09"),
-    ("plant.rate_hz=1e6", "plant.rate_hz = 1000000.0: ", "less than or equal to 100000"),
+    ("plant.watchdog.timeout_s=0.001", "plant.watchdog.timeout_s = 0.001: ",
+     "shorter than a period of the controller .0.002 s."),
     ("controller.phase=1", "controller.phase = 1: ", "should be less than 1"),
-    ("seeds.plant=-1", "seeds.plant = -1: ", "greater than or equal to 0"),
+    ("controller.safe_input=[1.0]", "controller.safe_input = [1.0]: ",
+     "expected 2 entries .one per input., found 1"),
     ("seeds.loss=18446744073709551616", "seeds.loss = 18446744073709551616: ", "less than"),
-    ("ports.netem=70000", "ports.netem = 70000: ", "less than or equal to 65535"),
     ("ports.netem=47001", "ports.netem = 47001: ", "already given to plant"),
-    ("realtime.fifo_priority=99", "realtime.fifo_priority = 99: ", "less than or equal to 98"),
-    ("realtime.spin_us=-1", "realtime.spin_us = -1: ", "greater than or equal to 0"),
     # Values that are not finite numbers.
     ("horizon_s=nan", "horizon_s = NaN: ", "finite|greater than 0"),
-    ("horizon_s=inf", "horizon_s = Infinity: ", "finite"),
-    ("trigger.beta=nan", "trigger.beta = NaN: ", "finite|greater than 0"),
-    ("trigger.beta=inf", "trigger.beta = Infinity: ", "finite"),
-    ("trigger.alpha_per_s=inf", "trigger.alpha_per_s = Infinity: ", "finite"),
-    ("trigger.floor=inf", "trigger.floor = Infinity: ", "finite"),
     ("plant.initial_state=[1,2,3,inf]", "plant.initial_state.3 = Infinity: ", "finite"),
-    ("model.parameters.a11=nan", "model.parameters.a11 = NaN: ", "finite"),
     ("trigger.weight=[[nan]]", "trigger.weight.0.0 = NaN: ", "finite"),
     # Rates with a period that is not a whole number of nanoseconds; the remedy is a valid rate.
     ("plant.rate_hz=300", "plant.rate_hz = 300: ", r"whole .* 300\.000030000003"),
     ("controller.rate_hz=60", "controller.rate_hz = 60: ", r"whole .* 59\.9999988"),
     # Shapes that depend on both model and plant.
     ("plant.initial_state=[1,2,3]", "plant.initial_state = [1, 2, 3]: ", "4 entries.*found 3"),
-    (
-        "plant.initial_state_halfwidth=[1,2]",
-        "plant.initial_state_halfwidth = [1, 2]: ",
-        "4 entries.*found 2",
-    ),
-    (
-        "plant.initial_state_halfwidth=[1,2,3,-1]",
-        "plant.initial_state_halfwidth = [1, 2, 3, -1]: ",
-        "half-widths cannot be negative",
-    ),
-    (
-        "plant.uncertainty_A=[[1,2],[3,4]]",
-        "plant.uncertainty_A = [[1, 2], [3, 4]]: ",
-        "expected 4 x 4 .*found 2 x 2",
-    ),
-    (
-        "plant.uncertainty_A=[[1,2],[3]]",
-        "plant.uncertainty_A = [[1, 2], [3]]: ",
-        "all rows need the same length, found lengths",
-    ),
-    (
-        "plant.uncertainty_B=[[1],[2],[3],[4]]",
-        "plant.uncertainty_B = [[1], [2], [3], [4]]: ",
-        "expected 4 x 2 .*found 4 x 1",
-    ),
-    (
-        "plant.uncertainty_B=[[-1,0]]",
-        "plant.uncertainty_B = [[-1, 0]]: ",
-        "half-widths cannot be negative",
-    ),
-    (
-        "trigger.weight=[[1,0],[0,1]]",
-        "trigger.weight = [[1, 0], [0, 1]]: ",
-        "expected 4 x 4 .*found 2 x 2",
-    ),
-    (
-        "trigger.weight=[[1,0,0,0],[0,1,0,0],[0,0,1,0],[1,1,1,0]]",
-        "trigger.weight = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 1, 1, 0]]: ",
-        "W must be invertible",
-    ),
+    ("plant.initial_state_halfwidth=[1,2]", "plant.initial_state_halfwidth = [1, 2]: ",
+     "4 entries.*found 2"),
+    ("plant.initial_state_halfwidth=[1,2,3,-1]", "plant.initial_state_halfwidth = [1, 2, 3, -1]: ",
+     "half-widths cannot be negative"),
+    ("plant.uncertainty_A=[[1,2],[3,4]]", "plant.uncertainty_A = [[1, 2], [3, 4]]: ",
+     "expected 4 x 4 .*found 2 x 2"),
+    ("plant.uncertainty_B=[[1],[2],[3],[4]]", "plant.uncertainty_B = [[1], [2], [3], [4]]: ",
+     "expected 4 x 2 .*found 4 x 1"),
+    ("trigger.weight=[[1,0],[0,1]]", "trigger.weight = [[1, 0], [0, 1]]: ",
+     "expected 4 x 4 .*found 2 x 2"),
+    ("trigger.weight=[[1,0,0,0],[0,1,0,0],[0,0,1,0],[1,1,1,0]]",
+     "trigger.weight = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 1, 1, 0]]: ",
+     "W must be invertible"),
     ("model.gain=[[1,2,3,4]]", "model.gain = [[1, 2, 3, 4]]: ", "expected 2 x 4 .*found 1 x 4"),
-    ("model.gain=[[1,2],[3]]", "model.gain = [[1, 2], [3]]: ", "all rows need the same length"),
     ('model.state_names=["a"]', 'model.state_names = ["a"]: ', "expected 4 entries .*, found 1"),
-    ('model.input_names=["a"]', 'model.input_names = ["a"]: ', "expected 2 entries .*, found 1"),
     # Combinations of settings.
     ("plant.draw=given", "plant.A: ", 'draw = "given" needs both matrices A and B'),
     ("plant.A=[[1]]", "plant.A = [[1]]: ", 'matrices are for draw = "given", not .*"uniform"'),
@@ -320,142 +177,77 @@ LANE_MISTAKES = [
     # Values that the named model cannot use.
     ("model.parameters.look_ahead=0", "model.parameters.look_ahead = 0: ", "zero|0"),
 ]
-
-
-def assert_told(lines: list[str], begins: str, remedy: str) -> None:
-    (line,) = lines
-    assert line.startswith(f"FILE: {begins}"), line
-    assert re.search(remedy, line.removeprefix(f"FILE: {begins}")), line
-
-
-@pytest.mark.parametrize(
-    ("setting", "begins", "remedy"), LANE_MISTAKES, ids=[mistake[0] for mistake in LANE_MISTAKES]
-)
-def test_a_mistake_gets_one_line(setting: str, begins: str, remedy: str, tmp_path: Path) -> None:
-    assert_told(mistakes(LANE, tmp_path, [setting]), begins, remedy)
-
-
 # The same for DOUBLE, which gives its model by matrices.
 DOUBLE_MISTAKES = [
     ("model.A=[[0,1]]", "model.A = [[0, 1]]: ", "1 x 1 .*square.*found 1 x 2"),
     ("model.A=[[0,1],[0]]", "model.A = [[0, 1], [0]]: ", r"same length, found lengths \[1, 2\]"),
     ("model.B=[[0]]", "model.B = [[0]]: ", r"expected 2 x 1 \(one row per state\), found 1 x 1"),
     ("model.gain=[[1],[1]]", "model.gain = [[1], [1]]: ", "expected 1 x 2 .*found 2 x 1"),
-    ('model.state_names=["p"]', 'model.state_names = ["p"]: ', "expected 2 entries .*, found 1"),
-    (
-        'model.input_names=["f","g"]',
-        'model.input_names = ["f", "g"]: ',
-        "expected 1 entries .*, found 2",
-    ),
-    (
-        "model.gain=[[1,1.5]]",
-        "model.gain = [[1, 1.5]]: ",
-        "real part 2 /s; u = -K x does: give -K",
-    ),
-    (
-        "model.gain=[[0,-1.5]]",
-        "model.gain = [[0, -1.5]]: ",
-        "real part 0 /s.*allow_unstable = true",
-    ),
-    (
-        "model={A=[[-1,0],[0,-1]],B=[[1e200],[1]],gain=[[1e200,0]]}",
-        "model.gain = [[1e+200, 0]]: ",
-        "infinite entries; check the units",
-    ),
+    ("model.gain=[[1,1.5]]", "model.gain = [[1, 1.5]]: ",
+     "real part 2 /s; u = -K x does: give -K"),
+    ("model.gain=[[0,-1.5]]", "model.gain = [[0, -1.5]]: ",
+     "real part 0 /s.*allow_unstable = true"),
+    ("model={A=[[-1,0],[0,-1]],B=[[1e200],[1]],gain=[[1e200,0]]}",
+     "model.gain = [[1e+200, 0]]: ", "infinite entries; check the units"),
     ("model.parameters.a=1", 'model.parameters = {"a": 1}: ', "only a named model has parameters"),
     ("model={}", "model.A: ", r"missing: A, B, gain"),
     ("model={A=[[0]],B=[[1]]}", "model.gain: ", r"missing: gain"),
     ("plant.draw=uniform", "plant.uncertainty_A: ", "needs uncertainty_A or uncertainty_B"),
-    ("plant.draw=vertex", "plant.uncertainty_A: ", "needs uncertainty_A or uncertainty_B"),
-    (
-        'plant={draw="given",A=[[1]],B=[[1],[1]],initial_state=[1,0]}',
-        "plant.A = [[1]]: ",
-        "expected 2 x 2 .*found 1 x 1",
-    ),
-    (
-        'plant={draw="given",A=[[1,0],[0,1]],B=[[1]],initial_state=[1,0]}',
-        "plant.B = [[1]]: ",
-        "expected 2 x 1 .*found 1 x 1",
-    ),
+    ('plant={draw="given",A=[[1]],B=[[1],[1]],initial_state=[1,0]}', "plant.A = [[1]]: ",
+     "expected 2 x 2 .*found 1 x 1"),
+    ('plant={draw="given",A=[[1,0],[0,1]],B=[[1]],initial_state=[1,0]}', "plant.B = [[1]]: ",
+     "expected 2 x 1 .*found 1 x 1"),
 ]
+# Only the keys of the chosen loss model are suggested.
+LOSS_MISTAKES = [
+    ('network.loss={model="bernoulli",probability=0.3,good_to_bad=0.1}',
+     "network.loss.good_to_bad = 0.1: unknown key; ", "^[^_]*$"),
+    ('network.loss={model="lossless",probability=0.3}',
+     "network.loss.probability = 0.3: unknown key; ", "^the keys here are model$"),
+    ('network.loss={model="worst_case",x=1}', "network.loss.x = 1: unknown key; ",
+     "^the keys here are model$"),
+    ('network.loss={model="bernoulli"}', "network.loss.probability: missing ", r"^\([^_]*$"),
+]
+# fmt: on
+
+
+def assert_line(lines: list[str], begins: str, remedy: str) -> None:
+    (line,) = lines
+    assert line.startswith(f"FILE: {begins}"), line
+    assert re.search(remedy, line.removeprefix(f"FILE: {begins}")), line
 
 
 @pytest.mark.parametrize(
-    ("setting", "begins", "remedy"),
-    DOUBLE_MISTAKES,
-    ids=[mistake[0] for mistake in DOUBLE_MISTAKES],
-)
-def test_a_mistake_in_given_matrices_gets_one_line(
-    setting: str, begins: str, remedy: str, tmp_path: Path
-) -> None:
-    assert_told(mistakes(DOUBLE, tmp_path, [setting]), begins, remedy)
-
-
-@pytest.mark.parametrize(
-    ("loss", "begins", "others"),
+    ("text", "setting", "begins", "remedy"),
     [
-        (
-            '{model="bernoulli",probability=0.3,good_to_bad=0.1}',
-            "good_to_bad = 0.1: unknown key; ",
-            ["good_to_bad", "loss_in_bad"],
-        ),
-        (
-            '{model="lossless",probability=0.3}',
-            "probability = 0.3: unknown key; ",
-            ["probability", "good_to_bad"],
-        ),
-        ('{model="worst_case",x=1}', "x = 1: unknown key; ", ["probability", "good_to_bad"]),
-        ('{model="bernoulli"}', "probability: missing ", ["good_to_bad", "loss_in_bad"]),
+        *((LANE, *mistake) for mistake in LANE_MISTAKES + LOSS_MISTAKES),
+        *((DOUBLE, *mistake) for mistake in DOUBLE_MISTAKES),
     ],
+    ids=[mistake[0] for mistake in LANE_MISTAKES + LOSS_MISTAKES + DOUBLE_MISTAKES],
 )
-def test_only_keys_of_the_chosen_loss_model_are_suggested(
-    loss: str, begins: str, others: list[str], tmp_path: Path
+def test_a_mistake_gets_one_line(
+    text: str, setting: str, begins: str, remedy: str, tmp_path: Path
 ) -> None:
-    begins = f"network.loss.{begins}"
-    lines = mistakes(LANE, tmp_path, [f"network.loss={loss}"])
-    assert_told(lines, begins, "model|probability")
-    remedy = lines[0].removeprefix(f"FILE: {begins}")
-    assert [other for other in others if re.search(rf"\b{other}\b", remedy)] == []
-
-
-@pytest.mark.parametrize(
-    "key",
-    [
-        "name",
-        "horizon_s",
-        "model",
-        "plant",
-        "trigger",
-        "network",
-        "plant.initial_state",
-        "trigger.beta",
-        "trigger.alpha_per_s",
-        "network.mansd",
-        "network.loss",
-    ],
-)
-def test_a_missing_key_is_named(content: Content, key: str, tmp_path: Path) -> None:
-    *path, last = key.split(".")
-    section = content
-    for part in path:
-        section = section[part]
-    del section[last]
-    (line,) = mistakes(tomli_w.dumps(content), tmp_path)
-    # the purpose of the key
-    assert re.fullmatch(rf"FILE: {re.escape(key)}: missing \(.{{10,}}\)", line)
+    assert_line(mistakes(text, tmp_path, [setting]), begins, remedy)
 
 
 @pytest.mark.parametrize(
     ("key", "begins"),
-    [("network.mansd", "M − 1, the "), ("network.loss", "loss of updates, ")],
+    [
+        ("name", "names the run's directory"),
+        ("model", "the model that"),
+        ("trigger.beta", ""),
+        ("network.mansd", "M − 1, the "),
+        ("network.loss", "loss of updates, "),
+    ],
 )
-def test_the_description_of_a_missing_key_begins_in_lower_case(
+def test_a_missing_key_is_named_with_its_purpose(
     content: Content, key: str, begins: str, tmp_path: Path
 ) -> None:
-    section, last = key.split(".")
-    del content[section][last]
+    section, _, last = key.rpartition(".")
+    del (content[section] if section else content)[last]
     (line,) = mistakes(tomli_w.dumps(content), tmp_path)
-    assert line.partition("(")[2].startswith(begins), line
+    assert re.fullmatch(rf"FILE: {re.escape(key)}: missing \({begins}.{{10,}}\)", line)
 
 
 def test_every_mistake_gets_its_own_line(tmp_path: Path) -> None:
@@ -499,15 +291,8 @@ def test_an_error_in_a_setting_is_not_attributed_to_the_file(
 
 
 def test_an_empty_file_reports_every_required_key(tmp_path: Path) -> None:
-    lines = mistakes("", tmp_path)
-    assert [line.split(": ")[1] for line in lines] == [
-        "name",
-        "horizon_s",
-        "model",
-        "plant",
-        "trigger",
-        "network",
-    ]
+    required = ["name", "horizon_s", "model", "plant", "trigger", "network"]
+    assert [line.split(": ")[1] for line in mistakes("", tmp_path)] == required
 
 
 def test_a_long_value_is_shortened(tmp_path: Path) -> None:
@@ -554,11 +339,9 @@ def test_an_unreadable_file_is_reported(tmp_path: Path) -> None:
     [
         ("trigger.beta=0.3", lambda s: s.trigger.beta == 0.3),
         (" trigger.beta = 0.3 ", lambda s: s.trigger.beta == 0.3),
-        ("trigger.beta=1", lambda s: s.trigger.beta == 1.0),
         ("mode=zoh", lambda s: s.mode == "zoh"),
         ('mode="zoh"', lambda s: s.mode == "zoh"),
         ("description=a = b", lambda s: s.description == "a = b"),
-        ("network.enforce_mansd=false", lambda s: s.network.enforce_mansd is False),
         ("plant.initial_state=[1, 2, 3, 4]", lambda s: s.plant.initial_state == (1, 2, 3, 4)),
         ('network.loss={model="worst_case"}', lambda s: s.network.loss.model == "worst_case"),
         ("seeds.loss=7", lambda s: s.seeds.loss == 7),  # in a table that is missing from the file
@@ -566,19 +349,15 @@ def test_an_unreadable_file_is_reported(tmp_path: Path) -> None:
     ],
 )
 def test_settings_replace_values_of_the_file(
-    setting: str, read: Callable[[Scenario], bool], tmp_path: Path
+    setting: str, read: Callable[[Scenario], bool], path: Path
 ) -> None:
-    path = tmp_path / "some.toml"
-    path.write_text(LANE)
     assert not read(load(path))
     changed = load(path, [setting])
     assert read(changed)
     assert changed.ports == load(path).ports  # all other settings are unchanged
 
 
-def test_the_last_setting_of_a_key_wins(tmp_path: Path) -> None:
-    path = tmp_path / "some.toml"
-    path.write_text(LANE)
+def test_the_last_setting_of_a_key_wins(path: Path) -> None:
     assert load(path, ["speed=2", "speed=3"]).speed == 3
 
 
@@ -586,13 +365,10 @@ def test_the_last_setting_of_a_key_wins(tmp_path: Path) -> None:
     ("setting", "says"),
     [
         ("trigger.beta", "--set trigger.beta: write it as key=value, e.g. trigger.beta=0.3"),
-        ("=3", "--set =3: write it as key=value, e.g. trigger.beta=0.3"),
         (" =3", "--set  =3: write it as key=value, e.g. trigger.beta=0.3"),
         ("trigger.beta.x=1", "--set trigger.beta.x=1: beta is not a table"),
-        (
-            "plant.initial_state=[1,2",
-            "--set plant.initial_state: not valid TOML: Unclosed array (at end of document)",
-        ),
+        ("plant.initial_state=[1,2",
+         "--set plant.initial_state: not valid TOML: Unclosed array (at end of document)"),
         ('mode="zoh', "--set mode: not valid TOML: Unterminated string (at end of document)"),
         (
             "plant.initial_state.0=1",
@@ -600,7 +376,7 @@ def test_the_last_setting_of_a_key_wins(tmp_path: Path) -> None:
             "(a list is set as a whole)",
         ),
     ],
-)
+)  # fmt: skip
 def test_a_setting_that_cannot_be_applied_is_reported(
     setting: str, says: str, tmp_path: Path
 ) -> None:
@@ -623,6 +399,11 @@ def test_shipped_scenarios_are_unchanged_by_writing_and_reading(path: Path, tmp_
     assert resolve(load(copy)) == resolved
 
 
+LOSSES = [
+    {"model": "worst_case"},
+    {"model": "bernoulli", "probability": 1 / 3},
+    {"model": "gilbert_elliott", "good_to_bad": 0.1, "bad_to_good": 0.7},
+]
 numbers = st.floats(-1e3, 1e3)  # a step with larger values may overflow to infinity
 
 
@@ -664,16 +445,7 @@ def contents(draw: st.DrawFn) -> Content:
         },
         "network": {
             "mansd": draw(st.integers(0, 1_000_000)),
-            "loss": draw(
-                st.sampled_from(
-                    [
-                        {"model": "lossless"},
-                        {"model": "worst_case"},
-                        {"model": "bernoulli", "probability": 1 / 3},
-                        {"model": "gilbert_elliott", "good_to_bad": 0.1, "bad_to_good": 0.7},
-                    ]
-                )
-            ),
+            "loss": draw(st.sampled_from(LOSSES)),
         },
         "seeds": {"plant": draw(st.integers(0, 2**64 - 1))},
     }

@@ -10,55 +10,35 @@ EPOCH_NS = 123_456_789_012_345
 speeds = st.sampled_from([0.01, 0.5, 1.0, 2.0, 3.0, 10.0, 1000.0])
 
 
-class Wall:
-    """A wall clock that the test sets."""
-
-    def __init__(self) -> None:
-        self.now_ns = EPOCH_NS
-
-    def __call__(self) -> int:
-        return self.now_ns
+def clock_at(speed: float, wall_ns: int) -> RunClock:
+    """A clock with this reading of the wall clock since the epoch."""
+    return RunClock(EPOCH_NS, speed, lambda: EPOCH_NS + wall_ns)
 
 
 @given(st.integers(-(10**12), 10**15))
 def test_at_speed_one_no_nanosecond_is_lost(wall_ns: int) -> None:
-    wall = Wall()
-    clock = RunClock(EPOCH_NS, monotonic_ns=wall)
-    wall.now_ns = EPOCH_NS + wall_ns
-    assert clock.now_ns() == wall_ns
+    assert clock_at(1.0, wall_ns).now_ns() == wall_ns
 
 
 @given(speeds, st.integers(0, 10**14))
 def test_simulated_time_is_wall_time_times_speed(speed: float, wall_ns: int) -> None:
-    wall = Wall()
-    clock = RunClock(EPOCH_NS, speed, wall)
-    wall.now_ns = EPOCH_NS + wall_ns
     exact = Fraction(speed) * wall_ns
     # Rounded down to a nanosecond, after one product with a relative error of 2⁻⁵³.
-    assert abs(clock.now_ns() - exact) <= 1 + exact / 2**53
+    assert abs(clock_at(speed, wall_ns).now_ns() - exact) <= 1 + exact / 2**53
 
 
 @given(speeds, st.lists(st.integers(-(10**12), 10**14), min_size=2))
 def test_time_never_runs_back(speed: float, walls: list[int]) -> None:
-    wall = Wall()
-    clock = RunClock(EPOCH_NS, speed, wall)
-    seen = []
-    for wall_ns in sorted(walls):
-        wall.now_ns = EPOCH_NS + wall_ns
-        seen.append(clock.now_ns())
-    assert seen == sorted(seen)
+    times = [clock_at(speed, wall_ns).now_ns() for wall_ns in sorted(walls)]
+    assert times == sorted(times)
 
 
 @given(speeds, st.integers(0, 10**12), st.integers(0, 10**13))
 def test_the_computed_wait_ends_at_the_deadline(speed: float, wall_ns: int, t_ns: int) -> None:
-    wall = Wall()
-    clock = RunClock(EPOCH_NS, speed, wall)
-    wall.now_ns = EPOCH_NS + wall_ns
-    wait_s = clock.wall_s_until(t_ns)
+    wait_s = clock_at(speed, wall_ns).wall_s_until(t_ns)
     assert (wait_s > 0) == (t_ns > wall_ns * Fraction(speed)) or abs(wait_s) < 1e-9
-    wall.now_ns += round(wait_s * 1e9)
     # Within half a nanosecond of wall time plus the rounding of times of up to 10¹⁵ ns.
-    assert abs(clock.now_ns() - t_ns) <= 2 + speed
+    assert abs(clock_at(speed, wall_ns + round(wait_s * 1e9)).now_ns() - t_ns) <= 2 + speed
 
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, float("nan")])

@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.integrate import solve_ivp
 
-from noack.config.named_models import double_integrator
 from noack.core.linear_systems import (
     HeldInputPropagator,
     Matrix,
@@ -22,7 +21,7 @@ from noack.core.linear_systems import (
 ROUNDING = 1e-13
 """A few hundred operations, each with a relative error of 2⁻⁵³."""
 
-STEPS_NS = [1, 1_000, 2_000_000, 333_333_333, 1_000_000_000, 60_000_000_000]
+STEPS_NS = [1, 1_000, 2_000_000, 333_333_333, 1_000_000_000]
 
 
 def square(n: int) -> st.SearchStrategy[Matrix]:
@@ -40,30 +39,12 @@ def systems(draw: st.DrawFn) -> tuple[Matrix, Matrix]:
 
 
 @pytest.mark.parametrize("dt_ns", STEPS_NS)
-def test_the_double_integrator_is_discretised_as_its_closed_form(dt_ns: int) -> None:
-    dt = dt_ns * 1e-9
-    model = double_integrator({})
-    Ad, Bd = discretise(model.A, model.B, dt_ns)
-    np.testing.assert_allclose(Ad, [[1, dt], [0, 1]], rtol=ROUNDING)
-    np.testing.assert_allclose(Bd, [[dt**2 / 2], [dt]], rtol=ROUNDING)
-
-
-@pytest.mark.parametrize("dt_ns", STEPS_NS[:-1])
 @pytest.mark.parametrize("a", [-30.0, -1.0, -1e-9, 0.0, 0.5, 20.0])
 def test_a_scalar_system_is_discretised_as_its_closed_form(a: float, dt_ns: int) -> None:
     dt, b = dt_ns * 1e-9, 3.0
     Ad, Bd = discretise(np.array([[a]]), np.array([[b]]), dt_ns)
     assert Ad.item() == pytest.approx(math.exp(a * dt), rel=ROUNDING)
     assert Bd.item() == pytest.approx(b * (math.expm1(a * dt) / a if a else dt), rel=ROUNDING)
-
-
-@pytest.mark.parametrize("dt_ns", STEPS_NS[:-1])
-def test_an_oscillator_turns_by_its_angle(dt_ns: int) -> None:
-    w = 2.5
-    c, s = math.cos(w * dt_ns * 1e-9), math.sin(w * dt_ns * 1e-9)
-    np.testing.assert_allclose(
-        transition(np.array([[0, w], [-w, 0]]), dt_ns), [[c, s], [-s, c]], atol=ROUNDING
-    )
 
 
 def test_a_singular_matrix_that_is_not_nilpotent_is_discretised_as_its_closed_form() -> None:
@@ -85,13 +66,9 @@ def test_a_held_input_gives_what_an_integrator_gives(
     x0, u = np.split(np.random.default_rng(seed).uniform(-1, 1, sum(B.shape)), [len(A)])
     Ad, Bd = discretise(A, B, dt_ns)
     solution = solve_ivp(
-        lambda t, x: A @ x + B @ u,
-        (0.0, dt_ns * 1e-9),
-        x0,
-        method="DOP853",
-        rtol=1e-12,
-        atol=1e-12,
-    )
+        lambda t, x: A @ x + B @ u, (0.0, dt_ns * 1e-9), x0,
+        method="DOP853", rtol=1e-12, atol=1e-12,
+    )  # fmt: skip
     # The integrator's local errors of 1e-12 grow by at most e^{‖A‖ dt} ≤ e^2.5 over its few steps.
     np.testing.assert_allclose(Ad @ x0 + Bd @ u, solution.y[:, -1], atol=1e-9)
     advanced = HeldInputPropagator(A, B)(x0, u, dt_ns)
@@ -103,18 +80,6 @@ def test_transitions_form_a_group(G: Matrix, s_ns: int, t_ns: int) -> None:
     first, second = transition(G, s_ns), transition(G, t_ns)
     scale = np.linalg.norm(first) * np.linalg.norm(second)
     np.testing.assert_allclose(second @ first, transition(G, s_ns + t_ns), atol=1e-13 * scale)
-    back = transition(G, -s_ns)
-    scale = np.linalg.norm(first) * np.linalg.norm(back)
-    np.testing.assert_allclose(back @ first, np.eye(len(G)), atol=1e-13 * scale)
-
-
-@given(generators, st.integers(0, 1_000_000_000))
-def test_volumes_grow_with_the_trace(G: Matrix, dt_ns: int) -> None:
-    """Liouville's formula: det e^{Gt} = e^{t tr G}."""
-    Phi = transition(G, dt_ns)
-    scale = np.linalg.norm(Phi) ** len(G)  # relative to the terms that make up the determinant
-    grown = math.exp(float(np.trace(G)) * dt_ns * 1e-9)
-    assert np.linalg.det(Phi) == pytest.approx(grown, abs=1e-13 * scale)
 
 
 @given(systems(), st.lists(st.integers(1, 10**9), min_size=1, max_size=5))
@@ -130,9 +95,8 @@ def test_cached_and_fresh_matrices_are_the_same_bits(
             part.tobytes() for part in discretise(A, B, dt_ns)
         ]
         assert free(state, dt_ns).tobytes() == Propagator(A)(state, dt_ns).tobytes()
-        assert (
-            held(state, u, dt_ns).tobytes() == HeldInputPropagator(A, B)(state, u, dt_ns).tobytes()
-        )
+        fresh = HeldInputPropagator(A, B)
+        assert held(state, u, dt_ns).tobytes() == fresh(state, u, dt_ns).tobytes()
 
 
 def test_propagators_keep_their_own_matrices() -> None:
@@ -162,16 +126,14 @@ def test_the_abscissa_is_the_largest_real_part() -> None:
     assert spectral_abscissa(matrix) == pytest.approx(-0.5, rel=ROUNDING)
 
 
-def test_row_norms_equal_numpys_where_squares_do_not_overflow() -> None:
-    rows = np.random.default_rng(1).normal(size=(100, 5)) * np.logspace(-130, 130, 100)[:, None]
-    assert row_norms(rows).tobytes() == np.linalg.norm(rows, axis=1).tobytes()
-
-
 @pytest.mark.parametrize("size", [1e300, 1e160, 1e-160, 1e-300, 5e-324])
 def test_row_norms_neither_overflow_nor_vanish(size: float) -> None:
     rows = np.array([[3.0, 4.0], [0.0, -2.0], [0.0, 0.0]]) * size
     expected = [norm(row) for row in rows]
     np.testing.assert_allclose(row_norms(rows), expected, rtol=1e-12)
+    # They equal numpy's where the squares do not overflow.
+    safe = np.random.default_rng(1).normal(size=(100, 5)) * np.logspace(-130, 130, 100)[:, None]
+    assert row_norms(safe).tobytes() == np.linalg.norm(safe, axis=1).tobytes()
 
 
 def test_row_norms_of_non_finite_rows_are_not_finite() -> None:

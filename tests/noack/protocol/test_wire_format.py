@@ -5,8 +5,9 @@ import itertools
 import math
 import re
 import struct
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -90,32 +91,24 @@ class Vector(NamedTuple):
     data: bytes
 
 
-def published_vectors() -> list[Vector]:
-    found = []
-    for block in re.findall(r"```vector\n(.*?)```", PAGE, re.DOTALL):
-        fields = dict(
-            re.findall(r"^([a-z_ ]+): +(.*?)(?=^[a-z]|\Z)", block, re.DOTALL | re.MULTILINE)
-        )
-        found.append(
-            Vector(
-                fields["flow"].strip(),
-                int(fields["run id"], 16),
-                int(fields["sequence"]),
-                int(fields["t_ns"]),
-                [float(value) for value in fields["vector"].split() if value != "none"],
-                bytes.fromhex(fields["datagram"]),
-            )
-        )
-    return found
+def published_vector(block: str) -> Vector:
+    fields = dict(re.findall(r"^([a-z_ ]+): +(.*?)(?=^[a-z]|\Z)", block, re.DOTALL | re.MULTILINE))
+    run_id, sequence, t_ns = int(fields["run id"], 16), int(fields["sequence"]), int(fields["t_ns"])
+    values = [float(value) for value in fields["vector"].split() if value != "none"]
+    data = bytes.fromhex(fields["datagram"])
+    return Vector(fields["flow"].strip(), run_id, sequence, t_ns, values, data)
+
+
+VECTORS = [published_vector(block) for block in re.findall(r"```vector\n(.*?)```", PAGE, re.DOTALL)]
 
 
 def test_the_page_has_a_vector_for_every_flow_and_names_its_key() -> None:
-    assert {vector.flow for vector in published_vectors()} == set(FLOWS)
+    assert {vector.flow for vector in VECTORS} == set(FLOWS)
     assert {flow.name.lower(): flow.value for flow in Flow} == FLOWS
     assert f"The key of all vectors is `{KEY.hex()}`" in PAGE
 
 
-@pytest.mark.parametrize("vector", published_vectors(), ids=lambda v: f"{v.flow}-{v.sequence}")
+@pytest.mark.parametrize("vector", VECTORS, ids=lambda v: f"{v.flow}-{v.sequence}")
 def test_published_vectors_hold_in_both_directions(vector: Vector) -> None:
     flow, run_id, sequence, t_ns, values, data = vector
     by_hand = datagram(
@@ -129,6 +122,7 @@ def test_published_vectors_hold_in_both_directions(vector: Vector) -> None:
     assert decoded[:3] == message[:3]
     assert decoded.vector.tobytes() == struct.pack(f"<{len(values)}d", *values)
     assert read_header(data) == Header(1, FLOWS[flow], len(values), run_id, sequence, t_ns)
+    assert read_header(data[:31]) is read_header(b"x" + data) is None
 
 
 def test_the_page_gives_the_reasons_in_the_order_of_the_tests() -> None:
@@ -173,7 +167,7 @@ def reason_by_offset(offset: int) -> Rejection:
 def test_any_flipped_bit_is_rejected(values: list[float], sequence: int, t_ns: int) -> None:
     decoder = new_decoder(dimension=len(values))
     data = datagram(values, sequence=sequence, t_ns=t_ns)
-    stride = 1 if len(values) <= 3 else 7  # every seventh bit of the longer ones
+    stride = 1 if len(values) <= 3 else 13  # some bits of the longer ones
     for bit in range(0, 8 * len(data), stride):
         damaged = bytearray(data)
         damaged[bit // 8] ^= 1 << bit % 8
@@ -181,42 +175,18 @@ def test_any_flipped_bit_is_rejected(values: list[float], sequence: int, t_ns: i
     assert decoder.decode(data) is not None
 
 
-@given(vectors, st.binary(min_size=1, max_size=64))
-def test_any_other_length_is_rejected(values: list[float], more: bytes) -> None:
-    decoder = new_decoder(dimension=len(values))
-    data = datagram(values)
-    for size in range(len(data)):
-        assert_rejected(decoder, data[:size], Rejection.LENGTH)
-    assert_rejected(decoder, data + more, Rejection.LENGTH)
-    assert decoder.decode(data) is not None
-
-
 @given(vectors, vectors)
-def test_a_vector_of_another_dimension_is_rejected(
-    expected: list[float], sent: list[float]
-) -> None:
+def test_another_length_or_dimension_is_rejected(expected: list[float], sent: list[float]) -> None:
     decoder = new_decoder(dimension=len(expected))
+    data = datagram(expected)
+    for size in range(0, len(data), 7):
+        assert_rejected(decoder, data[:size], Rejection.LENGTH)
+    assert_rejected(decoder, data + b"x", Rejection.LENGTH)
     if len(sent) != len(expected):
         assert_rejected(decoder, datagram(sent), Rejection.LENGTH)
         # The size is right; the header states another dimension.
         assert_rejected(decoder, datagram(expected, dimension=len(sent)), Rejection.LENGTH)
-    assert decoder.decode(datagram(expected)) is not None
-
-
-@given(st.binary(min_size=32, max_size=32), run_ids, st.integers(0, 255), st.integers(0, 255))
-def test_other_keys_runs_flows_and_versions_are_rejected(
-    key: bytes, run_id: int, flow: int, version: int
-) -> None:
-    decoder, values = new_decoder(), [1.0, 2.0, 3.0]
-    if key != KEY:
-        assert_rejected(decoder, datagram(values, key=key), Rejection.TAG)
-    if run_id != RUN:
-        assert_rejected(decoder, datagram(values, run_id=run_id), Rejection.RUN)
-    if flow != Flow.UPDATE:
-        assert_rejected(decoder, datagram(values, flow=flow), Rejection.FLOW)
-    if version != 1:
-        assert_rejected(decoder, datagram(values, version=version), Rejection.VERSION)
-    assert decoder.decode(datagram(values)) is not None
+    assert decoder.decode(data) is not None
 
 
 @given(st.lists(st.integers(0, 30), min_size=1, max_size=40))
@@ -247,34 +217,25 @@ def test_infinities_and_nans_are_rejected(
 
 
 @pytest.mark.parametrize(
-    ("number", "accepted"), [(2**40, True), (2**63 - 1, True), (2**63, False), (2**64 - 1, False)]
-)
-def test_a_sequence_number_beyond_the_records_range_is_rejected(
-    number: int, accepted: bool
+    ("field", "value", "accepted"),
+    [
+        ("sequence", 2**63 - 1, True), ("sequence", 2**63, False), ("sequence", 2**64 - 1, False),
+        ("t_ns", 2**62 - 1, True), ("t_ns", 2**62, False), ("t_ns", -1, False),
+    ],
+)  # fmt: skip
+def test_a_number_beyond_the_records_range_is_rejected(
+    field: str, value: int, accepted: bool
 ) -> None:
     decoder = new_decoder()
-    data = datagram([0.0, 0.0, 0.0], sequence=number)
+    data = datagram([0.0, 0.0, 0.0], **{field: value})  # type: ignore[arg-type]
     if not accepted:
         assert_rejected(decoder, data, Rejection.RANGE)
         return
     message = decoder.decode(data)
     assert message is not None
-    assert np.int64(message.sequence) == number
+    assert np.int64(getattr(message, field)) == value
     # The number does not wrap: everything after the last number is old.
     assert_rejected(decoder, datagram([0.0, 0.0, 0.0], sequence=0), Rejection.STALE)
-
-
-@pytest.mark.parametrize(
-    ("t_ns", "accepted"),
-    [(0, True), (10**16, True), (2**62 - 1, True), (2**62, False), (-1, False), (-(2**63), False)],
-)
-def test_a_time_outside_the_range_of_runs_is_rejected(t_ns: int, accepted: bool) -> None:
-    decoder = new_decoder()
-    data = datagram([0.0, 0.0, 0.0], t_ns=t_ns)
-    if accepted:
-        assert decoder.decode(data) is not None
-    else:
-        assert_rejected(decoder, data, Rejection.RANGE)
 
 
 FAULTS = [
@@ -304,32 +265,6 @@ def test_only_the_first_of_several_faults_is_counted(first: int) -> None:
     assert decoder.decode(datagram([0.0, 0.0, 0.0], sequence=9)) is not None
 
 
-@given(st.data())
-def test_random_bytes_never_raise_and_are_never_accepted(data: st.DataObject) -> None:
-    decoder = new_decoder()
-    junk = data.draw(
-        st.binary(max_size=700)
-        | st.binary(min_size=72, max_size=72)  # of the right size
-        | st.binary(max_size=700).map(lambda tail: b"NA\1\2\3\0\0\0" + tail)
-        # A valid header, then random bytes.
-        | st.binary(min_size=40, max_size=40).map(lambda tail: datagram([0.0] * 3)[:32] + tail)
-    )
-    assert decoder.decode(junk) is None
-    assert sum(decoder.rejected.values()) == 1
-    assert decoder.accepted == 0
-    header = read_header(junk)
-    assert header is None or junk.startswith(b"NA")
-
-
-@given(st.binary(max_size=40))
-def test_a_header_is_read_from_whatever_begins_like_one(head: bytes) -> None:
-    """The network emulator records the first 32 bytes of each datagram, of any program."""
-    header = read_header(b"NA" + head)
-    assert (header is None) == (len(head) < 30)
-    if not head.startswith(b"NA"):
-        assert read_header(head) is None
-
-
 @pytest.mark.parametrize("shape", [(0,), (65,), (2, 2), (1, 3)])
 def test_only_vectors_of_1_to_64_entries_can_be_sent(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=r"1 to 64 entries, not shape"):
@@ -347,23 +282,14 @@ def test_an_acknowledgement_carries_no_vector() -> None:
     assert (*message[:3], message.vector.size) == (Flow.ACKNOWLEDGEMENT, 7, 5, 0)
 
 
-@pytest.mark.parametrize("size", [0, 16, 31, 33, 64])
-def test_a_key_has_32_bytes(size: int) -> None:
+@pytest.mark.parametrize("size", [0, 31, 33])
+@pytest.mark.parametrize("made", [Encoder, partial(Decoder, Flow.UPDATE, 3)])
+def test_a_key_has_32_bytes(made: Any, size: int) -> None:
     with pytest.raises(ValueError, match=f"32 bytes, not {size}"):
-        Encoder(RUN, bytes(size))
-    with pytest.raises(ValueError, match=f"32 bytes, not {size}"):
-        Decoder(Flow.UPDATE, 3, RUN, bytes(size))
+        made(RUN, bytes(size))
 
 
 def test_the_reserved_bytes_are_covered_by_the_tag_and_otherwise_ignored() -> None:
     data = datagram([1.0, 2.0, 3.0], reserved=0xFFFF)
     assert_rejected(new_decoder(), data[:6] + b"\0\0" + data[8:], Rejection.TAG)
     assert new_decoder().decode(data) is not None
-
-
-def test_a_decoded_vector_does_not_share_memory_with_the_datagram() -> None:
-    data = datagram([1.0, 2.0, 3.0])
-    message = new_decoder().decode(data)
-    assert message is not None
-    message.vector[0] = 9.0
-    assert data == datagram([1.0, 2.0, 3.0])

@@ -2,11 +2,12 @@
 
 import hashlib
 import json
-import re
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any, cast
 
@@ -50,6 +51,10 @@ def coordinator(ticket: Ticket) -> Iterator[Coordinator]:
     coordinator.close()
 
 
+def changed(ticket: Ticket, **update: Any) -> Ticket:
+    return ticket.model_copy(update=update)
+
+
 def shown_by(stranger: str, ticket: Ticket) -> dict[str, str]:
     """The credentials that a connection without the key presents."""
     own = secret_of(ticket)
@@ -57,21 +62,25 @@ def shown_by(stranger: str, ticket: Ticket) -> dict[str, str]:
         "wrong password": SessionSecret(own.user, "0" * len(own.password)),
         "wrong user": SessionSecret("root", own.password),
         "no password": SessionSecret(own.user, ""),
-        "another run's": secret_of(ticket._replace(key=bytes(32), run_id=ticket.run_id ^ 1)),
+        "another run's": secret_of(changed(ticket, key=bytes(32), run_id=ticket.run_id ^ 1)),
     }
     if stranger not in secrets:
         return {}
     return {f"transport/auth/usrpwd/{k}": v for k, v in secrets[stranger]._asdict().items()}
 
 
-@pytest.mark.parametrize("stranger", STRANGERS)
 def test_a_connection_without_the_secret_is_refused(
-    coordinator: Coordinator, ticket: Ticket, stranger: str
+    coordinator: Coordinator, ticket: Ticket
 ) -> None:
-    for mode in ("client", "peer", "router"):
+    def connect(attempt: tuple[str, str]) -> None:
+        stranger, mode = attempt
         more = {"mode": mode, "connect/timeout_ms": 200, **shown_by(stranger, ticket)}
         with pytest.raises(zenoh.ZError, match="Unable to connect"):
             zenoh.open(session_config(ticket.endpoint, listen=False, more=more))
+
+    attempts = list(product(STRANGERS, ("client", "peer", "router")))
+    with ThreadPoolExecutor(len(attempts)) as pool:
+        list(pool.map(connect, attempts))
 
 
 def test_a_refused_session_neither_sends_nor_receives(
@@ -98,13 +107,8 @@ def test_a_refused_session_neither_sends_nor_receives(
         ]
         asked = []
         for session in strangers:
-            for key in (
-                "stop",
-                f"ended/plant/{plant.instance}",
-                "progress",
-                "telemetry/plant/plant_step",
-                "persisted/plant",
-            ):
+            for key in ("stop", f"ended/plant/{plant.instance}", "progress",
+                        "telemetry/plant/plant_step", "persisted/plant"):  # fmt: skip
                 session.put(plant.key(*key.split("/")), "evil")
             session.liveliness().declare_token(plant.key("alive", "sensor", "evil"))
             for what in ("admit", "join", "report"):
@@ -150,19 +154,12 @@ def test_a_process_refuses_an_endpoint_without_authentication(ticket: Ticket) ->
 
 
 def test_the_secret_is_derived_as_documented(ticket: Ticket) -> None:
-    known = ticket._replace(run_id=0x0123456789ABCDEF, key=bytes(range(32)))
+    known = changed(ticket, run_id=0x0123456789ABCDEF, key=bytes(range(32)))
     password = hashlib.blake2b(
         b"the control plane's password", key=bytes(range(32)), digest_size=32
     ).hexdigest()
     assert secret_of(known) == ("0123456789abcdef", password)
-
-
-def test_the_secret_is_derived_from_the_key_and_does_not_reveal_it(ticket: Ticket) -> None:
-    secret = secret_of(ticket)
-    assert secret == secret_of(ticket)
-    assert ticket.key.hex() not in secret.password
-    assert re.fullmatch("[0-9a-f]{64}", secret.password)
-    assert secret_of(ticket._replace(key=bytes(32))).password != secret.password
+    assert known.key.hex() not in password
 
 
 def test_the_coordinator_listens_on_loopback_only(coordinator: Coordinator, ticket: Ticket) -> None:
@@ -181,20 +178,17 @@ def test_every_zenoh_session_needs_a_secret() -> None:
 
 
 def test_the_password_is_not_stored_on_disk_and_no_pipe_stays_open(ticket: Ticket) -> None:
-    own = psutil.Process()
-    before = [file.path for file in own.open_files()], pipes()
+    own, before = psutil.Process(), pipes()
     with open_session(ticket.endpoint, secret_of(ticket), listen=True):
         assert not [f for f in own.open_files() if "password" in f.path]
-        assert pipes() == before[1]
+        assert pipes() == before
 
 
 def pipes() -> set[str]:
     links = []
     for descriptor in Path("/proc/self/fd").iterdir():
-        try:
+        with suppress(FileNotFoundError):
             links.append(str(descriptor.readlink()))
-        except FileNotFoundError:
-            continue
     return {link for link in links if link.startswith("pipe:")}
 
 
@@ -202,70 +196,47 @@ def pipes() -> set[str]:
     ("answer", "kind", "line"),
     [
         ("", Admission, "not a valid admission: "),
-        ("{", Admission, "not a valid admission: "),
         (b"\xff\xfe", Admission, "not a valid admission: "),
         ("[" * 100_000, Admission, "not a valid admission: "),
-        ("{}", RunStart, "epoch_ns: "),
         ('{"epoch_ns": -1, "addresses": {}}', RunStart, "epoch_ns: "),
-        ('{"epoch_ns": 1.5, "addresses": {}}', RunStart, "epoch_ns: "),
         ('{"epoch_ns": 1, "addresses": {"plant": ["127.0.0.1", 0]}}', RunStart, "plant"),
         ('{"epoch_ns": 1, "addresses": {"plant": ["plant.lan", 5]}}', RunStart, "plant"),
         ("null", MissingRows, "not a valid missing rows: "),
-        ("[]", MissingRows, "not a valid missing rows: "),
-        ('{"rows": {"plant_step": 5}}', MissingRows, "plant_step: "),
         ('{"rows": {"plant_step": [[0]]}}', MissingRows, "plant_step"),
         ('{"rows": {"plant_step": [[0, -5]]}}', MissingRows, "plant_step"),
     ],
 )
-def test_an_invalid_answer_gives_one_line(
-    coordinator: Coordinator, ticket: Ticket, answer: str | bytes, kind: Any, line: str
-) -> None:
-    queries = coordinator.plane.session.declare_queryable(
-        coordinator.plane.key("ask", "*"), FifoChannel(4)
-    )
-
-    def serve() -> None:
-        with queries.recv() as query:
-            query.reply(query.key_expr, answer)
-
-    threading.Thread(target=serve, daemon=True).start()
-    with ControlPlane(ticket, "plant") as plant, pytest.raises(PeerError) as caught:
-        parse_message(kind, plant.request("ask", {}, timeout_s=30))
+def test_an_invalid_message_gives_one_line(answer: str | bytes, kind: Any, line: str) -> None:
+    with pytest.raises(PeerError) as caught:
+        parse_message(kind, answer)
     assert line in str(caught.value)
     assert str(caught.value).isprintable()
     assert len(str(caught.value)) < 500
 
 
-def test_an_answer_arrives_unchanged(coordinator: Coordinator, ticket: Ticket) -> None:
-    address = ["127.0.0.1", 5]
-    said = {"epoch_ns": 7, "addresses": dict.fromkeys(LOOP_ROLES, address), "more": [1]}
-    queries = coordinator.plane.session.declare_queryable(
-        coordinator.plane.key("ask", "*"), FifoChannel(4)
-    )
-    threading.Thread(target=lambda: ControlPlane.answer(queries.recv(), said), daemon=True).start()
-    with ControlPlane(ticket, "plant") as plant:
-        told = parse_message(RunStart, plant.request("ask", {}, timeout_s=30))
-    assert told["epoch_ns"] == 7
-    assert told["addresses"] == dict.fromkeys(LOOP_ROLES, ("127.0.0.1", 5))
-
-
-def test_a_request_is_sent_again_when_its_answer_was_lost(
+def test_a_request_is_sent_again_when_its_answer_was_lost_and_its_answer_arrives_unchanged(
     coordinator: Coordinator, ticket: Ticket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(noack.runtime.control_plane, "_REQUEST_AGAIN_S", 0.2)
+    answer = {"epoch_ns": 7, "addresses": dict.fromkeys(LOOP_ROLES, ("127.0.0.1", 5)), "more": [1]}
     queries = coordinator.plane.session.declare_queryable(
         coordinator.plane.key("ask", "*"), FifoChannel(4)
     )
-    kept = []
+    unanswered = []
 
     def serve() -> None:
-        kept.append(queries.recv())
-        ControlPlane.answer(queries.recv(), "answer")
+        unanswered.append(queries.recv())
+        ControlPlane.answer(queries.recv(), answer)
 
     threading.Thread(target=serve, daemon=True).start()
     with ControlPlane(ticket, "plant") as plant:
-        assert json.loads(plant.request("ask", {}, timeout_s=30)) == "answer"
-    kept.clear()
+        received = parse_message(RunStart, plant.request("ask", {}, timeout_s=30))
+        assert received["epoch_ns"] == 7
+        assert received["addresses"] == dict.fromkeys(LOOP_ROLES, ("127.0.0.1", 5))
+        # The message must not read ``noack plant: plant: no answer``.
+        with pytest.raises(PeerError, match=r"^no answer to 'nothing'"):
+            plant.request("nothing", {}, timeout_s=0.05)
+    unanswered.clear()
 
 
 @pytest.mark.parametrize("launched", [True, False])
@@ -290,7 +261,7 @@ def test_a_launched_process_connects_again_until_it_is_admitted(
 
     monkeypatch.setattr(noack.runtime.process_entry, "ControlPlane", Silent)
     monkeypatch.setattr(noack.runtime.process_entry, "lifeline_cut", lambda: False)
-    asking = partial(_admitted, "plant", ticket._replace(launched=launched), Signals())
+    asking = partial(_admitted, "plant", changed(ticket, launched=launched), Signals())
     if launched:
         assert asking().plane is cast(Any, tries[2])
         assert [one.is_closed for one in tries] == [False, True, False]
@@ -307,42 +278,21 @@ def meet(plane: ControlPlane) -> None:
 
 def test_a_short_loss_of_the_coordinator_is_tolerated(ticket: Ticket) -> None:
     """The machine did not run one end of the connection for longer than a lease."""
-    first = Coordinator(ticket)
-    with ControlPlane(ticket, "plant") as plant:
-        meet(plant)
-        assert not plant.coordinator_gone()
-        first.close()
-        wait_for(plant.coordinator_gone)
-        assert not plant.coordinator_gone(for_s=3600)
-        second = Coordinator(ticket)
-        wait_for(lambda: not plant.coordinator_gone())
-        second.close()
-        wait_for(lambda: plant.coordinator_gone(for_s=0.2))
-        assert not plant.coordinator_gone(for_s=3600)
-
-
-def test_an_admission_request_waits_for_a_coordinator_to_come_back(ticket: Ticket) -> None:
-    ticket = ticket._replace(launched=False)
+    ticket = changed(ticket, launched=False)
     first = Coordinator(ticket)
     with ControlPlane(ticket, "plant") as plane, ThreadPoolExecutor() as pool:
-        node = RunProcess("plant", ticket, plane, Signals())
+        process = RunProcess("plant", ticket, plane, Signals())
         meet(plane)
+        assert not plane.coordinator_gone()
         first.close()
         wait_for(plane.coordinator_gone)
-        knocking = pool.submit(node.request_admission)
+        assert not plane.coordinator_gone(for_s=3600)
+        admission = pool.submit(process.request_admission)  # waits for the coordinator
         second = Coordinator(ticket)
-        while not knocking.done():
+        while not admission.done():
             second.poll()
+        admission.result()
+        wait_for(lambda: not plane.coordinator_gone())
         second.close()
-        knocking.result()
-
-
-def test_a_missing_answer_does_not_name_the_process_twice(
-    ticket: Ticket, coordinator: Coordinator
-) -> None:
-    """The message must not read ``noack sensor: sensor: no answer``."""
-    with (
-        ControlPlane(ticket, "sensor") as plane,
-        pytest.raises(PeerError, match=r"^no answer to 'nothing'"),
-    ):
-        plane.request("nothing", {}, timeout_s=0.05)
+        wait_for(lambda: plane.coordinator_gone(for_s=0.2))
+        assert not plane.coordinator_gone(for_s=3600)

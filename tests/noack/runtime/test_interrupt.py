@@ -24,9 +24,8 @@ runpy.run_module(module, run_name="__main__", alter_sys=True)
     "words",
     [
         ["cosim.cli", "typer", "--version"],
-        ["cosim.cli", "noack.config.scenario", "check", "lane_following"],
-        ["netem", "netem.run_relay", "--help"],
-        ["plant_server", "noack.runtime.process_life", "--help"],
+        ["netem", "netem.duplex_link", "--help"],
+        ["plant_server", "noack.runtime.process_entry", "--help"],
     ],
 )
 def test_interrupt_during_imports_leaves_no_traceback(words: list[str]) -> None:

@@ -21,14 +21,13 @@ KEY = "ab" * 32
 def fields(content: dict[str, Any]) -> dict[str, Any]:
     scenario = resolve(validate(content, "small"))
     ticket = new_ticket(scenario, "tcp/127.0.0.1:7447", Path("run"), launched=True)
-    told: dict[str, Any] = json.loads(ticket._replace(key=bytes.fromhex(KEY)).dumps())
-    return told
+    return ticket.model_copy(update={"key": bytes.fromhex(KEY)}).model_dump(mode="json")
 
 
 def test_a_ticket_is_read_back(fields: dict[str, Any]) -> None:
     ticket = loads(json.dumps(fields))
     assert ticket.key.hex() == KEY
-    assert json.loads(ticket.dumps()) == fields
+    assert json.loads(ticket.model_dump_json()) == fields
 
 
 @pytest.mark.parametrize(
@@ -73,7 +72,7 @@ def test_exactly_one_of_many_concurrent_runs_opens_a_session(
     def opened(number: int, stack: ExitStack) -> str:
         together.wait()
         try:
-            stack.enter_context(published(ticket._replace(run_id=number), "lab"))
+            stack.enter_context(published(ticket.model_copy(update={"run_id": number}), "lab"))
         except CallerError as error:
             return str(error)
         return ""

@@ -1,18 +1,73 @@
 """Datagrams from unknown sources: separated by the kernel, read within bounds, counted."""
 
+import select
 import socket
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 
+import numpy as np
 import pytest
 
-from noack.protocol.wire_format import Encoder, Rejection
+from noack.protocol.machine_interface import Notice
+from noack.protocol.wire_format import Decoder, Encoder, Flow, Message, Rejection
 from noack.runtime import udp_sockets
-from noack.runtime.peer_sockets import IN_A_FLOOD, IN_AN_INTERVAL, FloodWatch, open_beside
-from noack.runtime.udp_sockets import LOOPBACK, SHED, bind, drops_of
-from noack.runtime.unknown_sources import SourceCount
-from tests.noack.runtime.any_socket import KEY, RUN_ID, Ear, opened, sent_to
+from noack.runtime.peer_sockets import (
+    IN_A_FLOOD,
+    IN_AN_INTERVAL,
+    FloodWatch,
+    SourceCount,
+    open_beside,
+)
+from noack.runtime.udp_sockets import LOOPBACK, SHED, MessageSocket, bind
+
+RUN_ID, KEY = 7, bytes(range(32))
+
+
+def opened() -> socket.socket:
+    endpoint = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    endpoint.bind((LOOPBACK, 0))
+    endpoint.setblocking(False)
+    return endpoint
+
+
+class Ear:
+    """A sensor's socket, which receives measurements of two entries from ``peer``."""
+
+    def __init__(self, peer: socket.socket, endpoint: socket.socket | None = None) -> None:
+        self._endpoint = bind(0, "port") if endpoint is None else endpoint
+        self.decoder = Decoder(Flow.MEASUREMENT, 2, RUN_ID, KEY)
+        self.encoder = Encoder(RUN_ID, KEY)
+        self.address = self._endpoint.getsockname()
+        self.channel = MessageSocket(
+            self._endpoint, self.decoder, self.encoder, Flow.UPDATE,
+            source=peer.getsockname(), destination=peer.getsockname(),
+        )  # fmt: skip
+        self.lines: list[Notice] = []
+
+    @staticmethod
+    def message(sequence: int) -> Message:
+        return Message(Flow.MEASUREMENT, sequence, sequence, np.array([1.0, 2.0]))
+
+    def turns(self, most: int) -> list[int]:
+        """Call the socket as the loop does, at most ``most`` times; return the sequence numbers."""
+        received = []
+        for _ in range(most):
+            readable, _, _ = select.select(self.channel.watched, (), (), 0)
+            if not readable:
+                break
+            message = self.channel.receive(readable[0])
+            if message is not None:
+                received.append(message.sequence)
+        return received
+
+    def tend(self) -> None:
+        self.lines += self.channel.tend(0)
+
+    def close(self) -> None:
+        self.channel.close()
+        self._endpoint.close()
+
 
 BEGUN, OVER = "flood:", "the flood is over:"
 
@@ -53,18 +108,13 @@ def test_a_flood_is_logged_once_and_its_end_with_the_drops() -> None:
     assert watch.left == IN_AN_INTERVAL
 
 
-def test_a_pause_does_not_end_a_flood() -> None:
+def test_a_pause_does_not_end_a_flood_and_moderate_traffic_does_not_prolong_it() -> None:
     watch, dropped = FloodWatch(), 0
     for interval in range(200):
         dropped += 2 * IN_AN_INTERVAL if interval % 10 == 0 else 0
         line = watch.next_interval(dropped)
         assert line is None or line.startswith(BEGUN)
     assert watch.is_flood
-
-
-def test_moderate_traffic_does_not_prolong_a_flood() -> None:
-    watch, dropped = FloodWatch(), 5000
-    assert watch.next_interval(dropped) is not None
     for _ in range(100):
         dropped += looked_at(watch, IN_AN_INTERVAL // 2)
         if (line := watch.next_interval(dropped)) is not None:
@@ -75,18 +125,33 @@ def test_moderate_traffic_does_not_prolong_a_flood() -> None:
 
 
 def test_repeated_floods_log_a_bounded_number_of_lines() -> None:
-    """A flood that pauses just long enough to end, repeated for a day."""
+    """A flood that pauses just long enough to end, repeated for two hours."""
     watch, dropped, lines = FloodWatch(), 0, 0
-    for _ in range(24 * 3600 * 20):
+    for _ in range(2 * 3600 * 20):
         dropped += 0 if watch.is_flood else 1000
         lines += watch.next_interval(dropped) is not None
-    assert 100 < lines < 24 * 60 * 3
+    assert 100 < lines < 2 * 60 * 3
 
 
 @pytest.fixture
 def stack() -> Iterator[ExitStack]:
     with ExitStack() as stack:
         yield stack
+
+
+@pytest.fixture
+def peer(stack: ExitStack) -> socket.socket:
+    return stack.enter_context(opened())
+
+
+@pytest.fixture
+def stranger(stack: ExitStack) -> socket.socket:
+    return stack.enter_context(opened())
+
+
+@pytest.fixture
+def ear(stack: ExitStack, peer: socket.socket) -> Ear:
+    return stack.enter_context(closing(Ear(peer)))
 
 
 needs_linux = pytest.mark.skipif(
@@ -116,14 +181,14 @@ def test_each_socket_receives_its_peer_and_the_port_cannot_be_bound_again(stack:
 
 
 @needs_linux
-def test_a_flood_displaces_no_peer_datagram_and_all_are_counted(stack: ExitStack) -> None:
-    peer, stranger = stack.enter_context(opened()), stack.enter_context(opened())
-    ear = stack.enter_context(closing(Ear(peer)))
+def test_a_flood_displaces_no_peer_datagram_and_all_are_counted(
+    ear: Ear, peer: socket.socket, stranger: socket.socket
+) -> None:
     stranger_sent = 0
     for round_ in range(10):
         for _ in range(1000):
-            sent_to(ear, stranger, b"x" * 80)
-        sent_to(ear, peer, ear.encoder.encode(ear.message(round_)))
+            stranger.sendto(b"x" * 80, ear.address)
+        peer.sendto(ear.encoder.encode(ear.message(round_)), ear.address)
         stranger_sent += 1000
         assert ear.turns(300) == [round_]
         ear.tend()
@@ -139,50 +204,51 @@ def test_a_flood_displaces_no_peer_datagram_and_all_are_counted(stack: ExitStack
 
 
 @needs_linux
-def test_a_peer_is_read_before_unknown_sources(stack: ExitStack) -> None:
-    peer, stranger = stack.enter_context(opened()), stack.enter_context(opened())
-    ear = stack.enter_context(closing(Ear(peer)))
+def test_a_peer_is_read_before_unknown_sources(
+    ear: Ear, peer: socket.socket, stranger: socket.socket
+) -> None:
     ear.tend()
     for _ in range(50):
-        sent_to(ear, stranger, b"")
-    sent_to(ear, peer, ear.encoder.encode(ear.message(0)))
+        stranger.sendto(b"", ear.address)
+    peer.sendto(ear.encoder.encode(ear.message(0)), ear.address)
     assert ear.turns(1) == [0]
 
 
 @needs_linux
-def test_work_between_two_clock_readings_is_bounded(stack: ExitStack) -> None:
+def test_work_between_two_clock_readings_is_bounded(ear: Ear, peer: socket.socket) -> None:
     """Forged sources put junk into the peer's socket; here the peer itself sends the junk."""
-    peer = stack.enter_context(opened())
-    ear = stack.enter_context(closing(Ear(peer)))
     for _ in range(100):
-        sent_to(ear, peer, b"x")
+        peer.sendto(b"x", ear.address)
     assert ear.turns(1) == []
     assert 0 < ear.decoder.rejected[Rejection.LENGTH] <= 16
 
 
-def test_datagrams_before_the_peer_sockets_are_read_first(stack: ExitStack) -> None:
+def test_datagrams_before_the_peer_sockets_are_read_first(
+    stack: ExitStack, peer: socket.socket
+) -> None:
     """A restarted process receives datagrams before it has a socket per peer."""
-    peer = stack.enter_context(opened())
     endpoint = stack.enter_context(bind(0, "port"))
     encoder, early = Encoder(RUN_ID, KEY), 2 * IN_AN_INTERVAL
     for sequence in range(early):
         peer.sendto(encoder.encode(Ear.message(sequence)), endpoint.getsockname())
     ear = stack.enter_context(closing(Ear(peer, endpoint)))
-    sent_to(ear, peer, encoder.encode(ear.message(early)))
+    peer.sendto(encoder.encode(ear.message(early)), ear.address)
     assert ear.turns(2 * early) == list(range(early + 1))
     ear.tend()
     assert ear.lines == []
 
 
 def test_the_loop_receives_without_peer_sockets(
-    stack: ExitStack, monkeypatch: pytest.MonkeyPatch
+    stack: ExitStack,
+    peer: socket.socket,
+    stranger: socket.socket,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(udp_sockets, "open_beside", lambda endpoint, peers: ())
-    peer, stranger = stack.enter_context(opened()), stack.enter_context(opened())
     ear = stack.enter_context(closing(Ear(peer)))
     for _ in range(100):
-        sent_to(ear, stranger, ear.encoder.encode(ear.message(7)))
-    sent_to(ear, peer, ear.encoder.encode(ear.message(0)))
+        stranger.sendto(ear.encoder.encode(ear.message(7)), ear.address)
+    peer.sendto(ear.encoder.encode(ear.message(0)), ear.address)
     assert ear.turns(30) == [0]
     ear.tend()
     report = ear.channel.report()
@@ -197,31 +263,14 @@ def test_many_sources_take_bounded_memory_and_a_short_report() -> None:
     count = SourceCount([peer, rare])
     count.add(rare)
     total = 1
-    for number in range(100_000):
+    for number in range(10_000):
         for source in (peer, (f"127.0.1.{number % 251}", number % 65_521)):
             count.add(source)
             total += 1
     assert len(count._others) <= 256
     report = count.report()
-    assert report["127.0.0.1:1"] == 100_000
+    assert report["127.0.0.1:1"] == 10_000
     assert report["127.0.0.1:2"] == 1
     assert len(report) <= 20
     assert sum(report.values()) == total
     assert count.report() == report
-
-
-def test_the_kernel_drop_counter_is_exact(stack: ExitStack) -> None:
-    endpoint, sender = stack.enter_context(opened()), stack.enter_context(opened())
-    for _ in range(2000):
-        sender.sendto(b"x", endpoint.getsockname())
-    dropped = drops_of(endpoint)
-    if dropped is None:
-        pytest.skip("this system does not say what it dropped")
-    taken = 0
-    try:
-        while endpoint.recv(9):
-            taken += 1
-    except BlockingIOError:
-        pass
-    assert dropped > 0
-    assert taken + dropped == 2000

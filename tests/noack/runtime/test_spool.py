@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from cosim.record.run_record import merge_rows
 from noack.core.errors import MachineError
-from noack.runtime.spool import SpoolTail, SpoolWriter, read_chunks
+from noack.runtime.spool import SpoolWriter, read_chunks
 
 ROW = np.dtype([("input", "<i8")])
 
@@ -37,14 +37,6 @@ def test_the_file_is_the_documented_sequence_of_chunks(tmp_path: Path) -> None:
     path = spool(tmp_path, "recorder", "plant_step", (7, b"abc"), (8, b"de"))
     expected = struct.pack("<QQ", 7, 3) + b"abc" + struct.pack("<QQ", 8, 2) + b"de"
     assert path.read_bytes() == expected
-
-
-def test_a_batch_is_on_disk_as_soon_as_it_is_appended(tmp_path: Path) -> None:
-    writer = SpoolWriter(tmp_path, "recorder")
-    for k in range(3):
-        writer.append("plant_step", k, b"x")
-        assert [first for first, _ in read_chunks(tmp_path, "plant_step")] == list(range(k + 1))
-    writer.close()
 
 
 def test_an_incomplete_chunk_is_ignored(tmp_path: Path) -> None:
@@ -80,11 +72,14 @@ def test_rows_spooled_twice_are_merged(
     assert rows["input"].tolist() == list(range(20))
 
 
-def test_a_folder_that_cannot_be_written_is_an_environment_error(tmp_path: Path) -> None:
+def test_a_removed_folder_is_a_machine_error_and_not_created_again(tmp_path: Path) -> None:
     writer = SpoolWriter(tmp_path / "spool", "recorder")
     (tmp_path / "spool").rmdir()
     with pytest.raises(MachineError, match=r"spool: the record cannot be written: .*No such file"):
         writer.append("step", 0, b"a")
+    with pytest.raises(MachineError, match=r"/gone/spool: the record cannot be written"):
+        SpoolWriter(tmp_path / "gone" / "spool", "recorder")
+    assert not (tmp_path / "gone").exists()
 
 
 def test_a_full_disk_is_reported_by_the_batch_that_does_not_fit(tmp_path: Path) -> None:
@@ -101,31 +96,6 @@ def test_a_full_disk_is_reported_by_the_batch_that_does_not_fit(tmp_path: Path) 
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         writer.close()
     assert [first for first, _ in read_chunks(tmp_path, "step")] == [0]
-
-
-def test_a_spool_is_read_while_it_is_written(tmp_path: Path) -> None:
-    tail = SpoolTail(tmp_path / "spool")
-    assert list(tail.read()) == []
-    writer = SpoolWriter(tmp_path / "spool", "recorder")
-    writer.append("plant_step", 0, numbers(0, 2))
-    assert list(tail.read()) == [("plant_step", 0, numbers(0, 2))]
-    assert list(tail.read()) == []
-    writer.append("plant_step", 2, numbers(2, 3))
-    writer.append("notices_plant", 0, b"{}")
-    assert sorted(tail.read()) == [("notices_plant", 0, b"{}"), ("plant_step", 2, numbers(2, 3))]
-    writer.close()
-    tail.close()
-
-
-def test_a_deleted_spool_is_read_to_its_end(tmp_path: Path) -> None:
-    path = spool(tmp_path, "recorder", "plant_step", (0, b"abc"))
-    tail = SpoolTail(tmp_path)
-    next(tail.read())
-    with path.open("ab") as file:
-        file.write(struct.pack("<QQ", 3, 2) + b"de")
-    path.unlink()
-    assert list(tail.read()) == [("plant_step", 3, b"de")]
-    tail.close()
 
 
 @pytest.mark.parametrize("what", ["deleted", "moved", "replaced", "folder"])
@@ -148,9 +118,3 @@ def test_files_that_are_deleted_meanwhile_are_noticed(tmp_path: Path, what: str)
     with pytest.raises(MachineError, match=r"/step\.recorder: was deleted or moved"):
         writer.require_present()
     writer.close()
-
-
-def test_a_deleted_run_directory_is_not_created_again(tmp_path: Path) -> None:
-    with pytest.raises(MachineError, match=r"/gone/spool: the record cannot be written"):
-        SpoolWriter(tmp_path / "gone" / "spool", "recorder")
-    assert not (tmp_path / "gone").exists()

@@ -1,9 +1,12 @@
 """A certificate's bound of ‖e_c‖: Δ times the threshold."""
 
-from cosim.analysis.claims.claim import Envelope
-from cosim.analysis.claims.claim_definition import Bound, CertifiedClaim
+from cosim.analysis.claims.claim_definition import (
+    Bound,
+    CertifiedClaim,
+    Envelope,
+    controller_error_bound,
+)
 from cosim.analysis.claims.run_evidence import RunEvidence
-from cosim.analysis.claims.shared_bounds import controller_error_bound
 from noack.theory.scenario_certificates import ScenarioCertificate
 
 

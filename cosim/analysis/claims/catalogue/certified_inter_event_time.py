@@ -1,9 +1,13 @@
 """A certificate's lower bound of the inter-event time."""
 
-from cosim.analysis.claims.claim import Envelope
-from cosim.analysis.claims.claim_definition import Bound, CertifiedClaim
+from cosim.analysis.claims.claim_definition import (
+    Bound,
+    CertifiedClaim,
+    Envelope,
+    inter_event_bound,
+    inter_event_envelope,
+)
 from cosim.analysis.claims.run_evidence import RunEvidence
-from cosim.analysis.claims.shared_bounds import inter_event_bound, inter_event_envelope
 from noack.theory.scenario_certificates import ScenarioCertificate
 
 

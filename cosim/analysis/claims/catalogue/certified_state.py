@@ -1,7 +1,6 @@
 """A certificate's bound of ‖x‖: X e^{−rt}, and a constant from the time of the floor on."""
 
-from cosim.analysis.claims.claim import Envelope
-from cosim.analysis.claims.claim_definition import Bound, CertifiedClaim, upper_shares
+from cosim.analysis.claims.claim_definition import Bound, CertifiedClaim, Envelope, upper_shares
 from cosim.analysis.claims.run_evidence import RunEvidence
 from noack.core.linear_systems import row_norms
 from noack.theory.scenario_certificates import ScenarioCertificate

@@ -3,10 +3,13 @@
 It holds for every plant, trigger and network. If the sensor estimates x, the error is x_c − x̂.
 """
 
-from cosim.analysis.claims.claim import Envelope
-from cosim.analysis.claims.claim_definition import Bound, ClaimDefinition
+from cosim.analysis.claims.claim_definition import (
+    Bound,
+    ClaimDefinition,
+    Envelope,
+    controller_error_bound,
+)
 from cosim.analysis.claims.run_evidence import RunEvidence
-from cosim.analysis.claims.shared_bounds import controller_error_bound
 
 
 def _bound(run: RunEvidence) -> Bound:

@@ -3,9 +3,8 @@
 The paper assumes a continuous trigger, so that ‖e_s‖ ≤ βe^{−αt} at all times.
 """
 
-from cosim.analysis.claims.claim_definition import Bound, ClaimDefinition
+from cosim.analysis.claims.claim_definition import Bound, ClaimDefinition, controller_error_bound
 from cosim.analysis.claims.run_evidence import RunEvidence
-from cosim.analysis.claims.shared_bounds import controller_error_bound
 
 
 def _bound(run: RunEvidence) -> Bound | None:

@@ -10,9 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.claims.claim_definition import Bound, ClaimDefinition
+from cosim.analysis.claims.claim_definition import Bound, ClaimDefinition, controller_error_bound
 from cosim.analysis.claims.run_evidence import RunEvidence
-from cosim.analysis.claims.shared_bounds import controller_error_bound
 from cosim.record.align import AlignedRun
 from cosim.record.run_record import RunRecord
 from noack.core.linear_systems import Propagator, spectral_abscissa
@@ -27,10 +26,7 @@ def trajectory_delta(
 ) -> float | None:
     """Return Theorem 1's Δ from a recorded trajectory; None if there is none, or if W ≠ I.
 
-    Args:
-        record: the run's record.
-        joined: its samples.
-        until_s: time from which an assumption of the theorem was violated.
+    The theorem's assumptions hold until ``until_s``.
     """
     loop, trigger = record.loop, record.scenario.decaying
     if loop.weight is not None:

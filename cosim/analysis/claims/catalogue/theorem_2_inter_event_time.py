@@ -1,9 +1,13 @@
 """Theorem 2, eq:tau of the paper: a lower bound of the inter-event time."""
 
-from cosim.analysis.claims.claim import Envelope
-from cosim.analysis.claims.claim_definition import Bound, ClaimDefinition
+from cosim.analysis.claims.claim_definition import (
+    Bound,
+    ClaimDefinition,
+    Envelope,
+    inter_event_bound,
+    inter_event_envelope,
+)
 from cosim.analysis.claims.run_evidence import RunEvidence
-from cosim.analysis.claims.shared_bounds import inter_event_bound, inter_event_envelope
 
 
 def _bound(run: RunEvidence) -> Bound | None:

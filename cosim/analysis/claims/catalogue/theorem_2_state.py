@@ -1,7 +1,6 @@
 """Theorem 2, eq:normXt of the paper: ‖x‖ ≤ c x₀ e^{−ᾱt} + g (e^{−αt} − e^{−ᾱt})."""
 
-from cosim.analysis.claims.claim import Envelope
-from cosim.analysis.claims.claim_definition import Bound, ClaimDefinition, upper_shares
+from cosim.analysis.claims.claim_definition import Bound, ClaimDefinition, Envelope, upper_shares
 from cosim.analysis.claims.run_evidence import RunEvidence
 from noack.core.linear_systems import row_norms
 

@@ -4,7 +4,6 @@ The picture moves with the car: the lane's markings pass by.
 """
 
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
 
@@ -13,8 +12,11 @@ from cosim.output.viewer.pictures.picture import (
     STILL,
     WHO,
     Columns,
+    DrawnPlant,
     Frames,
+    Picture,
     Shape,
+    body,
     legend,
     lines,
     outline,
@@ -29,47 +31,40 @@ _BEHIND_M, _AHEAD_M, _HIGH_M = 9.0, 15.0, 5.7
 _GLASS: Colour = (58, 62, 70)
 
 
-class VehiclePose(NamedTuple):
-    """Indices in a vehicle's own state z of the quantities that the picture shows."""
-
-    x_position: int
-    """Position along the lane, m."""
-    y_position: int
-    """Position across the lane, m; 0 in the middle of the lane."""
-    steering_angle: int
-    """Steering angle of the front wheels, rad."""
-    yaw: int
-    """Heading, rad."""
-
-
-class LanePicture:
+class LanePicture(Picture):
     """A car on a straight lane, drawn from its lateral offset and yaw.
 
     Args:
         lateral, yaw: index of the lateral offset (m) and of the yaw (rad) in x.
         forward_mps: U of the model's dY_g/dt = V + U ψ. If it is negative, as in the paper, the
             picture is mirrored, so that the car moves to the right and a positive Y_g is up.
-        place: indices in the state of a vehicle with its own state, which contains more than x; the
-            vehicle is turned anticlockwise by its yaw, and mirrored with the rest.
+        vehicle: the plant is a vehicle whose own state z contains more than x; it is turned
+            anticlockwise by its yaw, and mirrored with the rest.
     """
 
+    kinds = ("vehicle",)
     title = "The car on its lane"
-    rate_hz = 60.0
-    trails: tuple[str, ...] = ()
 
     def __init__(
-        self, lateral: int, yaw: int, *, forward_mps: float = 0.0, place: VehiclePose | None = None
+        self, lateral: int, yaw: int, *, forward_mps: float = 0.0, vehicle: bool = False
     ) -> None:
         self._lateral, self._yaw = lateral, yaw
-        self._forward_mps, self._place = forward_mps, place
+        self._forward_mps, self._vehicle = forward_mps, vehicle
         self._hand = -1.0 if forward_mps < 0 else 1.0
 
+    @classmethod
+    def of(cls, plant: DrawnPlant) -> "LanePicture | None":
+        if plant.scenario.plant.system.kind in cls.kinds:
+            # x is the state of the lane models: V, r, psi, Y_g.
+            return cls(3, 2, forward_mps=float(plant.loop.A_model[3, 2]), vehicle=True)
+        at = plant.places("Y_g", "psi")
+        # The paper's dY_g/dt = V + U ψ.
+        return cls(*at, forward_mps=float(plant.loop.A_model[at])) if at else None
+
     def bounds(self) -> tuple[float, float, float, float]:
-        """Return the visible area: the lane and its neighbours, more ahead than behind."""
         return -_BEHIND_M, _AHEAD_M, -_HIGH_M, _HIGH_M
 
     def scenery(self) -> Mapping[str, Shape]:
-        """Return the road, three cars, and the legend."""
         edge, between = 1.5 * _LANE_M, 0.5 * _LANE_M
         left, right = -_BEHIND_M - _POSTS_EVERY_M, _AHEAD_M + 2 * _POSTS_EVERY_M
         marks = np.arange(round(left / _MARKS_EVERY_M), round(right / _MARKS_EVERY_M))
@@ -94,14 +89,11 @@ class LanePicture:
                 0.15,
             ),
             **self._car(),
-            "sensor/outline": lines(outline(_corners(0.1)), WHO["sensor"], 0.13, order=4.0),
-            "controller/outline": lines(
-                outline(_corners(0.28), 0.3), WHO["controller"], 0.2, order=3.0
-            ),
+            "sensor/outline": body("sensor", outline(_corners(0.1)), 0.13),
+            "controller/outline": body("controller", outline(_corners(0.28), 0.3), 0.2),
         } | legend(_AHEAD_M - 3.9, _HIGH_M - 0.6, 1.1)
 
     def frames(self, frames: Frames) -> Mapping[str, Columns]:
-        """Return the poses of cars and markings."""
         k = len(frames.t_s)
         zero = np.zeros(k)
         found: dict[str, Columns] = {}
@@ -109,35 +101,36 @@ class LanePicture:
             x = frames.of(who)
             found[who] = poses(zero, x[:, self._lateral], self._hand * x[:, self._yaw])
         along = abs(self._forward_mps) * frames.t_s
-        if self._place is not None and frames.z is not None:
-            z, place = frames.z, self._place
-            along = z[:, place.x_position]
-            yaw, steering = self._hand * z[:, place.yaw], self._hand * z[:, place.steering_angle]
-            found["plant"] = poses(zero, self._hand * z[:, place.y_position], yaw)
+        if self._vehicle and frames.z is not None:
+            # The first states of every vehicle model; the fourth is the speed.
+            along, across, steering, _, yaw = frames.z[:, :5].T
+            found["plant"] = poses(zero, self._hand * across, self._hand * yaw)
             for side, y in (("left", _TRACK_M), ("right", -_TRACK_M)):
-                found[f"plant/steered/{side}"] = poses(np.full(k, _AXLE_M), np.full(k, y), steering)
+                found[f"plant/steered/{side}"] = poses(
+                    np.full(k, _AXLE_M), np.full(k, y), self._hand * steering
+                )
         found["road/passing"] = poses(-np.remainder(along, _POSTS_EVERY_M), zero)
         return found
 
     def _car(self) -> dict[str, Shape]:
-        colour, half = WHO["plant"], _LENGTH_M / 2
+        half = _LENGTH_M / 2
         wheels = [(-_AXLE_M, _TRACK_M), (-_AXLE_M, -_TRACK_M)]
         steered: dict[str, Shape] = {}
-        if self._place is None:
+        if not self._vehicle:
             wheels += [(_AXLE_M, _TRACK_M), (_AXLE_M, -_TRACK_M)]
         else:
             for side in ("left", "right"):
                 steered[f"plant/steered/{side}"] = lines([_wheel(0.0, 0.0)], _GLASS, 0.3, order=1.0)
         round_m = 0.35
         inner, across = half - round_m, _WIDTH_M / 2 - round_m
-        body = [[(-inner, y), (inner, y)] for y in np.linspace(-across, across, 4).tolist()]
+        panels = [[(-inner, y), (inner, y)] for y in np.linspace(-across, across, 4).tolist()]
         glass = [
             [(0.75, -0.55), (0.95, 0.0), (0.75, 0.55)],
             [(-1.35, -0.5), (-1.35, 0.5)],
         ]
         return steered | {
             "plant/wheels": lines([_wheel(x, y) for x, y in wheels], _GLASS, 0.3, order=1.0),
-            "plant/body": lines(body, colour, 2 * round_m, order=2.0),
+            "plant/body": body("plant", panels, 2 * round_m),
             "plant/glass": lines(glass, _GLASS, 0.3, order=2.5),
         }
 

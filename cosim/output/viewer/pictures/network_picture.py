@@ -47,29 +47,9 @@ class Moving(NamedTuple):
     columns: Columns
 
 
-class _InFlight(NamedTuple):
-    """Packets that are in flight in the drawing, (p,)."""
-
-    t_ns: Times
-    out_ns: Times
-    """Time at which they leave the network; for lost packets, time at which they start to fall."""
-    fate: NDArray[np.int64]
-    reverse: NDArray[np.bool_]
-    """Whether they are sent from the controller to the sensor."""
-
-    @property
-    def end_ns(self) -> Times:
-        """Time from which they are no longer visible."""
-        return self.out_ns + np.where(effective(self.fate), _LEG_NS, _FALL_NS)
-
-    def of(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> "_InFlight":
-        """Return a subset."""
-        return _InFlight(
-            self.t_ns[which], self.out_ns[which], self.fate[which], self.reverse[which]
-        )
-
-
-_NONE = np.zeros(0, np.int64)
+_PACKET = np.dtype([("t_ns", "i8"), ("out_ns", "i8"), ("fate", "i8"), ("reverse", "?")])
+"""A packet in the drawing: time of its broadcast; time at which it leaves the network, or, if it is
+lost, starts to fall; its fate; whether it is sent from the controller to the sensor."""
 
 
 class NetworkDiagram:
@@ -81,7 +61,7 @@ class NetworkDiagram:
 
     def __init__(self, *, acknowledged: bool = False) -> None:
         self._acknowledged = acknowledged
-        self._in_flight = _InFlight(_NONE, _NONE, _NONE, np.zeros(0, np.bool_))
+        self._in_flight = np.zeros(0, _PACKET)
         self._drawn_ns = -1
         self._last_ns = {False: -_APART_NS, True: -_APART_NS}
         self._shown: dict[str, int] = {}
@@ -151,16 +131,12 @@ class NetworkDiagram:
             if sent_ns - self._last_ns[reverse] >= _APART_NS:
                 drawn[i] = True
                 self._last_ns[reverse] = sent_ns
-        t_ns, release_ns, fate = t_ns[drawn], release_ns[drawn], fate[drawn]
-        arrived_ns = t_ns + _LEG_NS
-        out_ns = np.where(effective(fate), np.maximum(arrived_ns, release_ns), arrived_ns)
-        before = self._in_flight
-        self._in_flight = _InFlight(
-            np.concatenate([before.t_ns, t_ns]),
-            np.concatenate([before.out_ns, out_ns]),
-            np.concatenate([before.fate, fate]),
-            np.concatenate([before.reverse, np.full(len(t_ns), reverse)]),
-        )
+        packets = np.zeros(int(drawn.sum()), _PACKET)
+        packets["t_ns"], packets["fate"], packets["reverse"] = t_ns[drawn], fate[drawn], reverse
+        arrived_ns = packets["t_ns"] + _LEG_NS
+        out_ns = np.maximum(arrived_ns, release_ns[drawn])
+        packets["out_ns"] = np.where(effective(packets["fate"]), out_ns, arrived_ns)
+        self._in_flight = np.concatenate([self._in_flight, packets])
 
     def advance(self, until_ns: int) -> Mapping[str, Moving]:
         """Return the rows up to a time by which all packets were added."""
@@ -169,42 +145,45 @@ class NetworkDiagram:
             return {}
         self._drawn_ns = last * _FRAME_NS
         flying = self._in_flight
-        begin = np.maximum(-(-flying.t_ns // _FRAME_NS), first)
-        end = np.minimum(-(-flying.end_ns // _FRAME_NS), last + 1)
+        shown_ns = np.where(effective(flying["fate"]), _LEG_NS, _FALL_NS)
+        end_ns = flying["out_ns"] + shown_ns
+        begin = np.maximum(-(-flying["t_ns"] // _FRAME_NS), first)
+        end = np.minimum(-(-end_ns // _FRAME_NS), last + 1)
         counts = np.maximum(end - begin, 0)
         packet = np.repeat(np.arange(len(counts)), counts)
         frame = (
             begin[packet] + np.arange(len(packet)) - np.repeat(np.cumsum(counts) - counts, counts)
         )
         order = np.argsort(frame, kind="stable")
-        pairs, frame = flying.of(packet[order]), frame[order]
-        self._in_flight = flying.of(flying.end_ns > self._drawn_ns)
+        pairs, frame = flying[packet[order]], frame[order]
+        self._in_flight = flying[end_ns > self._drawn_ns]
         return self._moving(pairs, frame, first, last)
 
     def _moving(
-        self, pairs: _InFlight, frame: Times, first: int, last: int
+        self, pairs: NDArray[np.void], frame: Times, first: int, last: int
     ) -> Mapping[str, Moving]:
         """Return the rows of all entities; ``pairs`` (q,) are packets at frames, by frame."""
         now_ns = frame * _FRAME_NS
-        survives, leaves = effective(pairs.fate), now_ns >= pairs.out_ns
-        there = np.clip((now_ns - pairs.t_ns) / _LEG_NS, 0.0, 1.0)
-        onward = (now_ns - pairs.out_ns) / _LEG_NS
+        t_ns, out_ns, reverse = pairs["t_ns"], pairs["out_ns"], pairs["reverse"]
+        survives, leaves = effective(pairs["fate"]), now_ns >= out_ns
+        there = np.clip((now_ns - t_ns) / _LEG_NS, 0.0, 1.0)
+        onward = (now_ns - out_ns) / _LEG_NS
         gap = _APART - 2 * _HALF_WIDE
         x = _NETWORK - _HALF_WIDE - gap * (1.0 - there)
         # A waiting packet is drawn inside the network; a released one at its other side.
         x = np.where(there >= 1.0, _NETWORK, x)
         x = np.where(leaves & survives, _NETWORK + _HALF_WIDE + gap * onward, x)
-        fall = (now_ns - pairs.out_ns) / _FALL_NS
+        fall = (now_ns - out_ns) / _FALL_NS
         y = np.where(leaves & ~survives, -_HALF_HIGH - 0.2 - 1.3 * fall, 0.0)
-        forced = pairs.fate == Fate.FORCED
-        x = np.where(pairs.reverse, 2 * _NETWORK - x, x)
-        y = np.where(pairs.reverse & (survives | ~leaves), _REVERSE_Y, y)
+        forced = pairs["fate"] == Fate.FORCED
+        x = np.where(reverse, 2 * _NETWORK - x, x)
+        y = np.where(reverse & (survives | ~leaves), _REVERSE_Y, y)
         places = upright(np.column_stack([x, y]))
         what = {
-            "broadcast": ~leaves & ~pairs.reverse,
-            "delivered": leaves & survives & ~forced & ~pairs.reverse,
-            "acknowledgement": (survives | ~leaves) & pairs.reverse,
-            "forced": leaves & forced & ~pairs.reverse,
+            "broadcast": ~leaves & ~reverse,
+            "delivered": leaves & survives & ~forced & ~reverse,
+            "acknowledgement": (survives | ~leaves) & reverse,
+            "forced": leaves & forced & ~reverse,
             "lost": leaves & ~survives,
         }
         found: dict[str, Moving] = {}

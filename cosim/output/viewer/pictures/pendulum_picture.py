@@ -7,26 +7,28 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from cosim.output.palette import Colour
 from cosim.output.viewer.pictures.picture import (
     STILL,
     WHO,
     Columns,
+    DrawnPlant,
     Frames,
+    Picture,
     Reals,
     Shape,
+    body,
     legend,
     lines,
     outline,
     poses,
 )
+from noack.plants.cart_pole import CartPoleSettings
 
 _CART, _CART_HIGH = 0.5, 0.22
 _WIDTHS: Mapping[str, float] = {"plant": 0.075, "sensor": 0.022, "controller": 0.03}
-_ORDERS: Mapping[str, float] = {"plant": 2.0, "sensor": 4.0, "controller": 3.0}
 
 
-class PendulumPicture:
+class PendulumPicture(Picture):
     """Poles and carts: plant solid, sensor's model outlined, controller's model dashed.
 
     Args:
@@ -36,8 +38,7 @@ class PendulumPicture:
         pole_m: length of the pole; if the cart moves far, cart and pole are drawn larger.
     """
 
-    rate_hz = 60.0
-    trails: tuple[str, ...] = ()
+    kinds = ("cart_pole",)
 
     def __init__(
         self,
@@ -57,14 +58,25 @@ class PendulumPicture:
         self._scale = max(reach_m / 1.8, pole_m)
         self._wide = (2.3 if position is not None else 1.6) * self._scale
 
+    @classmethod
+    def of(cls, plant: DrawnPlant) -> "PendulumPicture | None":
+        system = plant.scenario.plant.system
+        if isinstance(system, CartPoleSettings):
+            return cls(0, 2, reach_m=float(plant.reach[0]), pole_m=2 * system.length_m)
+        if at := plant.places("position", "angle"):
+            return cls(*at, reach_m=float(plant.reach[at[0]]))
+        if at := plant.places("angle"):
+            return cls(None, at[0])
+        if at := plant.places("position", "velocity"):
+            return cls(at[0], None, reach_m=float(plant.reach[at[0]]))
+        return None
+
     def bounds(self) -> tuple[float, float, float, float]:
-        """Return the visible area: the cart's expected range, and the pole's circle."""
         high = 1.35 * self._scale
         low = (-0.55 if self._position is not None else -0.4) * self._scale
         return -self._wide, self._wide, low, high
 
     def scenery(self) -> Mapping[str, Shape]:
-        """Return the rail or the pivot, three moving bodies, and the legend."""
         scale = self._scale
         found: dict[str, Shape] = {}
         if self._position is None:
@@ -83,16 +95,15 @@ class PendulumPicture:
             found["rail/zero"] = lines(
                 [[(0.0, ground), (0.0, ground - 0.2 * scale)]], STILL, 0.03 * scale
             )
-        for who, colour in WHO.items():
+        for who in WHO:
             if self._position is not None:
-                found[f"{who}/cart"] = self._cart(who, colour)
+                found[f"{who}/cart"] = self._cart(who)
             if self._angle is not None:
-                found[f"{who}/pole"] = self._pole(who, colour)
+                found[f"{who}/pole"] = self._pole(who)
         left, _, _, top = self.bounds()
         return found | legend(left + 0.7 * scale, top - 0.05 * scale, 0.22 * scale)
 
     def frames(self, frames: Frames) -> Mapping[str, Columns]:
-        """Return the poses of carts and poles."""
         found: dict[str, Columns] = {}
         for who in WHO:
             x = frames.of(who)
@@ -103,22 +114,22 @@ class PendulumPicture:
                 found[f"{who}/pole"] = poses(zero, zero, -x[:, self._angle])
         return found
 
-    def _cart(self, who: str, colour: Colour) -> Shape:
+    def _cart(self, who: str) -> Shape:
         x, y = _CART / 2 * self._scale, _CART_HIGH / 2 * self._scale
         if who == "plant":
             inner = y * 0.5
             rows = [[(-x + inner, at), (x - inner, at)] for at in (-inner, 0.0, inner)]
-            return lines(rows, colour, 2 * inner, order=_ORDERS[who])
+            return body(who, rows, 2 * inner)
         corners = [(-x, -y), (x, -y), (x, y), (-x, y)]
         dash = None if who == "sensor" else 0.05 * self._scale
-        return lines(outline(corners, dash), colour, _WIDTHS[who] * self._scale, order=_ORDERS[who])
+        return body(who, outline(corners, dash), _WIDTHS[who] * self._scale)
 
-    def _pole(self, who: str, colour: Colour) -> Shape:
+    def _pole(self, who: str) -> Shape:
         high, width = self._scale, _WIDTHS[who] * self._scale
         pole = [(0.0, 0.0), (0.0, high)]
         bob = [(0.07 * self._scale * np.cos(a), high + 0.07 * self._scale * np.sin(a))
                for a in np.linspace(0, 2 * np.pi, 13).tolist()]  # fmt: skip
         if who == "controller":
             pieces = [[(0.0, high * a), (0.0, high * (a + 0.06))] for a in np.arange(0, 0.95, 0.1)]
-            return lines([*pieces, bob], colour, 1.4 * width, order=_ORDERS[who])
-        return lines([pole, bob], colour, width, order=_ORDERS[who])
+            return body(who, [*pieces, bob], 1.4 * width)
+        return body(who, [pole, bob], width)

@@ -12,9 +12,13 @@ from cosim.output.viewer.pictures.picture import (
     STILL,
     WHO,
     Columns,
+    DrawnPlant,
     Frames,
+    Picture,
     Reals,
     Shape,
+    body,
+    circle,
     label,
     legend,
     lines,
@@ -25,19 +29,16 @@ from cosim.output.viewer.pictures.picture import (
 )
 
 _RING = 0.035
-_ORDERS: Mapping[str, float] = {"plant": 2.0, "sensor": 4.0, "controller": 3.0}
 _WIDTHS: Mapping[str, float] = {"plant": 0.022, "sensor": 0.009, "controller": 0.014}
 
 
-class PhasePicture:
+class PhasePicture(Picture):
     """The first state on the horizontal axis, the second on the vertical, with a trail.
 
     Args:
         names: names of the states.
         reach: (n,) expected maximum of each |x_i|, above 0.
     """
-
-    rate_hz = 60.0
 
     def __init__(self, names: Sequence[str], reach: Reals) -> None:
         self._names = list(names[:2])
@@ -48,12 +49,14 @@ class PhasePicture:
         self.trails = tuple(f"{who}/trail" for who in WHO) if len(self._names) == 2 else ()
         self._last: dict[str, Reals] = {}
 
+    @classmethod
+    def of(cls, plant: DrawnPlant) -> "PhasePicture":
+        return cls(plant.loop.state_names, plant.reach)
+
     def bounds(self) -> tuple[float, float, float, float]:
-        """Return the visible area: both axes, and room for labels on the right."""
         return -1.25, 2.8, -1.5, 1.25
 
     def scenery(self) -> Mapping[str, Shape]:
-        """Return axes with the values at their ends, three points, and the legend."""
         square = outline([(-1, -1), (1, -1), (1, 1), (-1, 1)])
         found: dict[str, Shape] = {
             "axes": lines([*square, [(-1, 0), (1, 0)], [(0, -1), (0, 1)]], STILL, 0.006)
@@ -66,23 +69,18 @@ class PhasePicture:
         for i, (name, reach, at) in enumerate(ends):
             found[f"axes/{i}"] = label(f"{name} = {reach:.3g}", at, STILL)
         for who, colour in WHO.items():
-            width, order = _WIDTHS[who], _ORDERS[who]
+            width = _WIDTHS[who]
             if who == "plant":  # filled by its line width
-                found[f"{who}/point"] = lines([[(-1e-3, 0), (1e-3, 0)]], colour, 0.06, order=order)
+                found[f"{who}/point"] = body(who, [[(-1e-3, 0), (1e-3, 0)]], 0.06)
             else:
-                around = np.linspace(0, 2 * np.pi, 17)[:-1]
-                radius = _RING if who == "sensor" else 1.6 * _RING
-                ring = np.column_stack([radius * np.cos(around), radius * np.sin(around)])
-                dash = None if who == "sensor" else 0.01
-                found[f"{who}/point"] = lines(
-                    outline(ring.tolist(), dash), colour, 1.4 * width, order=order
-                )
+                radius, dash = (_RING, None) if who == "sensor" else (1.6 * _RING, 0.01)
+                ring = outline(circle(radius, 16), dash)
+                found[f"{who}/point"] = body(who, ring, 1.4 * width)
             if self.trails:
-                found[f"{who}/trail"] = style(colour, width, order=order - 2)
+                found[f"{who}/trail"] = style(colour, width)
         return found | legend(1.95, 1.0, 0.3)
 
     def frames(self, frames: Frames) -> Mapping[str, Columns]:
-        """Return the three points, and the new part of each trail."""
         found: dict[str, Columns] = {}
         for i, who in enumerate(WHO):
             points = self._scaled(frames.of(who), 0.3 - 0.3 * i)

@@ -5,9 +5,10 @@ cheap for a viewer without a graphics processor. A picture has the plant's lengt
 in the viewer, +y is down, so that every shape and pose is flipped (:func:`upright`, :func:`poses`).
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -15,6 +16,8 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from cosim.output.palette import CONTROLLER, PLANT, SENSOR, Colour
+from noack.config.resolution import LoopMatrices
+from noack.config.scenario import Scenario
 
 Reals = NDArray[np.float64]
 
@@ -23,11 +26,8 @@ PICTURE = "picture"
 """Parent of all entities of a picture."""
 WHO: Mapping[str, Colour] = {"plant": PLANT, "sensor": SENSOR, "controller": CONTROLLER}
 """The bodies of a picture and their colours: the state of the plant, and of the two models."""
-NAMES: Mapping[str, str] = {
-    "plant": "x plant",
-    "sensor": "x_s sensor model",
-    "controller": "x_c controller model",
-}
+_NAMES = {"plant": "x plant", "sensor": "x_s sensor model", "controller": "x_c controller model"}
+_ORDERS = {"plant": 2.0, "sensor": 4.0, "controller": 3.0}
 STILL: Colour = (128, 132, 138)
 """Colour of static shapes: roads, rails, axes."""
 
@@ -76,27 +76,49 @@ def joined(batches: Sequence[Frames]) -> Frames:
     )
 
 
-class Picture(Protocol):
+class DrawnPlant(NamedTuple):
+    """A plant that is to be drawn."""
+
+    scenario: Scenario
+    """The resolved scenario."""
+    loop: LoopMatrices
+    reach: Reals
+    """(n,) expected maximum of each |x_i|, above 0."""
+
+    def places(self, *names: str) -> tuple[int, ...]:
+        """Return the indices in x of the named states; empty if one of them does not exist."""
+        states = self.loop.state_names
+        return tuple(map(states.index, names)) if set(names) <= set(states) else ()
+
+
+class Picture(ABC):
     """One plant's picture; entities are named below ``PICTURE``."""
 
+    kinds: tuple[str, ...] = ()
+    """Plant kinds that it draws; others may have states with the names that it draws."""
     title: str
     """Title of its panel."""
-    rate_hz: float
+    rate_hz = 60.0
     """Frames per second of simulated time."""
-    trails: tuple[str, ...]
+    trails: tuple[str, ...] = ()
     """Entities for which the last ``TRAIL_S`` are visible, not only the newest row."""
 
-    def bounds(self) -> tuple[float, float, float, float]:
-        """The visible area: left, right, bottom, top."""
-        ...
+    @classmethod
+    @abstractmethod
+    def of(cls, plant: DrawnPlant) -> "Picture | None":
+        """Return the picture of a plant; None if this class does not draw such plants."""
 
+    @abstractmethod
+    def bounds(self) -> tuple[float, float, float, float]:
+        """Return the visible area: left, right, bottom, top."""
+
+    @abstractmethod
     def scenery(self) -> Mapping[str, Shape]:
         """Return the static shapes, by entity; each is recorded once."""
-        ...
 
+    @abstractmethod
     def frames(self, frames: Frames) -> Mapping[str, Columns]:
         """Return the motion of the shapes: columns of k rows, by entity."""
-        ...
 
 
 def panel(picture: Picture) -> rrb.Spatial2DView:
@@ -135,6 +157,11 @@ def lines(
     )
 
 
+def body(who: str, strips: Sequence[Sequence[Sequence[float]]], width: float) -> rr.LineStrips2D:
+    """Return lines of one of ``WHO``; the plant is behind its models."""
+    return lines(strips, WHO[who], width, order=_ORDERS[who])
+
+
 def style(colour: Colour, width: float, *, order: float = 0.0) -> rr.LineStrips2D:
     """Return the style of lines that each frame redraws (:func:`strips`)."""
     return rr.LineStrips2D.from_fields(radii=width / 2, colors=colour, draw_order=order)
@@ -152,7 +179,7 @@ def label(
 def legend(left: float, top: float, step: float) -> dict[str, Shape]:
     """Return the legend of the bodies, one below the other, centred on the given place."""
     return {
-        f"legend/{who}": label(NAMES[who], (left, top - i * step), colour)
+        f"legend/{who}": label(_NAMES[who], (left, top - i * step), colour)
         for i, (who, colour) in enumerate(WHO.items())
     }
 
@@ -180,6 +207,15 @@ def strips(points: Reals) -> Columns:
 def clipped(points: Reals) -> NDArray[np.float32]:
     """Return points in the recording's format; invalid ones get a place that is never visible."""
     return np.clip(np.nan_to_num(points, nan=_FAR), -_FAR, _FAR).astype(np.float32)
+
+
+def circle(
+    radius: float, corners: int, centre: tuple[float, float] = (0.0, 0.0)
+) -> list[list[float]]:
+    """Return the corners of a regular polygon."""
+    around = np.linspace(0, 2 * np.pi, corners, endpoint=False)
+    points = np.column_stack([np.cos(around), np.sin(around)])
+    return (radius * points + centre).tolist()  # type: ignore[no-any-return]
 
 
 def outline(

@@ -1,6 +1,6 @@
 """Four tanks, two of which drain into the others: the levels of plant and models."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -8,7 +8,9 @@ from cosim.output.viewer.pictures.picture import (
     STILL,
     WHO,
     Columns,
+    DrawnPlant,
     Frames,
+    Picture,
     Reals,
     Shape,
     label,
@@ -27,27 +29,21 @@ _STYLES: Mapping[str, tuple[float, float]] = {
 }  # fmt: skip
 
 
-class TanksPicture:
-    """Levels as bars; each model's level is a line, which protrudes from the tank on one side.
+class TanksPicture(Picture):
+    """Levels as bars; each model's level is a line, which protrudes from the tank on one side."""
 
-    Args:
-        levels: indices in x of the four levels' deviations from the operating point, in cm.
-        own: indices in z of the four levels, in centimetres.
-    """
-
+    kinds = ("four_tank",)
     title = "The tanks"
     rate_hz = 10.0
-    trails: tuple[str, ...] = ()
 
-    def __init__(self, levels: Sequence[int], own: Sequence[int]) -> None:
-        self._levels, self._own = list(levels), list(own)
+    @classmethod
+    def of(cls, plant: DrawnPlant) -> "TanksPicture | None":
+        return cls() if plant.scenario.plant.system.kind in cls.kinds else None
 
     def bounds(self) -> tuple[float, float, float, float]:
-        """Return the visible area: all four tanks, and room for labels on the left."""
         return -3.6, 2.6, -0.35, 4.25
 
     def scenery(self) -> Mapping[str, Shape]:
-        """Return walls, spouts, and the styles of levels."""
         walls = [
             [(left, low + _HIGH), (left, low), (left + _WIDE, low), (left + _WIDE, low + _HIGH)]
             for left, low in _PLACES
@@ -66,13 +62,13 @@ class TanksPicture:
         return found | legend(-2.6, 4.1, 0.45)
 
     def frames(self, frames: Frames) -> Mapping[str, Columns]:
-        """Return the levels of the plant and of the two models."""
         found: dict[str, Columns] = {}
         if frames.z is None:
             return found
-        at_rest = frames.z[:, self._own] - frames.x[:, self._levels]
+        # x is the deviation of the levels z from the operating point, in cm.
+        at_rest = frames.z - frames.x
         for who in WHO:
-            levels_cm = frames.of(who)[:, self._levels] + at_rest
+            levels_cm = frames.of(who) + at_rest
             for i, (left, low) in enumerate(_PLACES):
                 height = low + np.maximum(levels_cm[:, i], 0.0) / _TALLEST_CM * _HIGH
                 found[f"{who}/{i + 1}"] = strips(_level(who, left, low, height))

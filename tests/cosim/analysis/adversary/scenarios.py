@@ -7,15 +7,14 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from cosim.analysis.adversary.loss_patterns import Pattern
-from cosim.analysis.adversary.objective import Measure, Objective, measure_of
+from cosim.analysis.adversary.objective import Objective, measure_of
+from cosim.analysis.adversary.search_nodes import Pattern
 from cosim.analysis.adversary.segments import SegmentFlow
-from cosim.simulation.continuous.continuous_loop import ContinuousLoop, continuous_loop_of
+from cosim.simulation.continuous.continuous_loop import continuous_loop_of
 from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
-from noack.core.linear_systems import Matrix
 from tests.noack.theory.loops import System, systems
 
 ALL_LOST = (False,) * 1000
@@ -24,47 +23,28 @@ _ATTEMPTS = 6
 _PROBES = (ALL_LOST, (), (False, True) * 500)
 
 
-def scenario_of(
-    system: System, horizon_s: float, mode: str = "model", floor: float = 0.0
-) -> Scenario:
+def scenario_of(system: System, horizon_s: float, mode: str, floor: float) -> Scenario:
     """The scenario of a random loop with the loop's H in its models."""
-    return resolve(
-        validate(
-            {
-                "name": "random",
-                "mode": mode,
-                "horizon_s": round(horizon_s, 3),
-                "model": {
-                    "A": rows(system.H - system.B @ system.K),
-                    "B": rows(system.B),
-                    "gain": rows(system.K),
-                    "allow_unstable": True,
-                },
-                "plant": {
-                    "draw": "given",
-                    "A": rows(system.A),
-                    "B": rows(system.B),
-                    "initial_state": system.x0.tolist(),
-                },
-                "trigger": {
-                    "beta": system.beta,
-                    "alpha_per_s": system.alpha,
-                    "floor": floor,
-                    "weight": rows(system.weight),
-                },
-                "network": {
-                    "mansd": system.mansd,
-                    "loss": {"model": "bernoulli", "probability": 0.5},
-                    "initial_sync": "known_state" if system.known_start else "first_packet",
-                },
-            },
-            "random",
-        )
-    )
-
-
-def rows(matrix: Matrix) -> list[list[float]]:
-    return [[float(value) for value in row] for row in matrix]
+    content = {
+        "name": "random", "mode": mode, "horizon_s": round(horizon_s, 3),
+        "model": {
+            "A": (system.H - system.B @ system.K).tolist(), "B": system.B.tolist(),
+            "gain": system.K.tolist(), "allow_unstable": True,
+        },
+        "plant": {
+            "draw": "given", "A": system.A.tolist(), "B": system.B.tolist(),
+            "initial_state": system.x0.tolist(),
+        },
+        "trigger": {
+            "beta": system.beta, "alpha_per_s": system.alpha, "floor": floor,
+            "weight": system.weight.tolist(),
+        },
+        "network": {
+            "mansd": system.mansd, "loss": {"model": "bernoulli", "probability": 0.5},
+            "initial_sync": "known_state" if system.known_start else "first_packet",
+        },
+    }  # fmt: skip
+    return resolve(validate(content, "random"))
 
 
 @st.composite
@@ -76,8 +56,7 @@ def scenarios(draw: st.DrawFn, most_events: int, **fixed: Any) -> Scenario:
     floor_share = draw(st.sampled_from([0.0, 0.0, 0.5]))
     for _ in range(_ATTEMPTS):
         resolved = scenario_of(system, horizon_s, mode, floor_share * system.beta)
-        probes = [simulate(resolved, pattern).event_s for pattern in _PROBES]
-        event_s = max(probes, key=len)
+        event_s = max((simulate(resolved, pattern).event_s for pattern in _PROBES), key=len)
         if len(event_s) >= most_events / 2:
             break
         system = replace(system, beta=system.beta / 4)
@@ -125,10 +104,9 @@ def every_run(resolved: Scenario) -> Iterator[ContinuousRun]:
 
 
 def flow_of(
-    resolved: Scenario, objective: Objective
-) -> tuple[ContinuousLoop, Measure, SegmentFlow]:
+    resolved: Scenario, objective: Objective, rate_per_s: float | None = None
+) -> SegmentFlow:
     system = continuous_loop_of(resolved)
-    measure = measure_of(system, objective)
     known_start = resolved.network.initial_sync == "known_state"
-    flow = SegmentFlow(system, measure, resolved.horizon_s, known_start=known_start)
-    return system, measure, flow
+    measure = measure_of(system, objective, rate_per_s)
+    return SegmentFlow(system, measure, resolved.horizon_s, known_start=known_start)

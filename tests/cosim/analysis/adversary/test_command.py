@@ -9,18 +9,16 @@ from typer.testing import CliRunner
 from cosim.cli import app
 from noack.core.errors import ExitStatus
 
-SCENARIOS = Path(__file__).parents[4] / "scenarios"
-SHORT = ["--horizon", "6"]
+SCENARIO = Path(__file__).parents[4] / "scenarios" / "lane_following.toml"
 
 
 def run(*arguments: str) -> tuple[int, str, str]:
-    scenario = str(SCENARIOS / "lane_following.toml")
-    result = CliRunner().invoke(app, ["adversary", scenario, *arguments])
+    result = CliRunner().invoke(app, ["adversary", str(SCENARIO), "--horizon", "6", *arguments])
     return result.exit_code, result.stdout, result.stderr
 
 
 def test_json_contains_all_results() -> None:
-    status, stdout, stderr = run("--json", *SHORT)
+    status, stdout, stderr = run("--json")
     assert status == ExitStatus.OK, stderr
     document = json.loads(stdout)
     assert document["horizon_s"] == 6.0
@@ -37,7 +35,7 @@ def test_json_contains_all_results() -> None:
 
 
 def test_the_text_output_shows_the_patterns_of_one_objective() -> None:
-    status, stdout, _ = run("--objective", "error", "--nodes", "0", "--beam", "8", *SHORT)
+    status, stdout, _ = run("--objective", "error", "--nodes", "0", "--beam", "8")
     assert status == ExitStatus.OK
     assert "not all patterns searched" in stdout
     assert "D····" in stdout
@@ -45,12 +43,12 @@ def test_the_text_output_shows_the_patterns_of_one_objective() -> None:
 
 
 def test_settings_replace_values_of_the_scenario() -> None:
-    status, stdout, _ = run("--objective", "error", "--set", "network.mansd=0", "--json", *SHORT)
+    status, stdout, _ = run("--objective", "error", "--set", "network.mansd=0", "--json")
     assert status == ExitStatus.OK
     assert json.loads(stdout)["worst"]["error"]["value"] == pytest.approx(1.0, rel=1e-6)
 
 
-def test_a_mistake_in_the_arguments_gives_one_line() -> None:
+def test_an_error_in_the_arguments_gives_one_line() -> None:
     status, _, stderr = run("--horizon", "-1")
     assert status == ExitStatus.CALLER
     assert stderr.startswith("noack: ")

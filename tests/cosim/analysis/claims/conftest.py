@@ -11,6 +11,7 @@ from cosim.simulation.virtual_time import Network, simulate
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
+from noack.protocol.record_tables import OWNER, SENSOR_MEASUREMENT
 from noack.protocol.wire_format import read_header
 
 MS = 1_000_000
@@ -42,7 +43,19 @@ def network_of(decide: Callable[[int], int | None]) -> Network:
     return network
 
 
-@pytest.fixture
+def without(record: RunRecord, *processes: str) -> RunRecord:
+    """The record without the rows of some processes."""
+    gone = {table: record[table][:0] for table in record.tables if OWNER[table] in processes}
+    return changed(record, **gone)
+
+
+def event_s(record: RunRecord, number: int) -> float:
+    """The time of an event."""
+    rows = record[SENSOR_MEASUREMENT]
+    return float(rows["t_ns"][rows["event"] == number][0] * 1e-9)
+
+
+@pytest.fixture(scope="session")
 def make() -> Make:
     """A double integrator with a separate plant, 100 Hz; ``changes`` by section."""
 
@@ -60,18 +73,18 @@ def make() -> Make:
             "certificate": {"late_periods": 0},
         }  # fmt: skip
         for section, values in changes.items():
-            if isinstance(values, dict):
-                content[section] = content[section] | values
-            else:
-                content[section] = values
+            inner = isinstance(values, dict)
+            content[section] = content[section] | values if inner else values
         return resolve(validate(content, "test"))
 
     return scenario
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def run(make: Make) -> RunRecord:
-    """A run that meets its timing conditions, with about 50 events."""
+    """A run that meets its timing conditions, with about 50 events; its rows are read-only."""
     record = simulate(make())
     assert np.isfinite(record["plant_step"]["x"]).all()
+    for table in record.tables:
+        record[table].setflags(write=False)
     return record

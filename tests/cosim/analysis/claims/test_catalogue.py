@@ -3,15 +3,16 @@
 from pathlib import Path
 
 from cosim.analysis.claims import catalogue
-from cosim.analysis.claims.claim_definition import certified_claims, run_claims
+from cosim.analysis.claims.claim_definition import CertifiedClaim, ClaimDefinition
+from cosim.analysis.claims.claim_evaluation import definitions
 
 DOCS = Path(__file__).parents[4] / "docs" / "record.md"
 
 
 def test_every_file_of_the_catalogue_is_a_claim_that_the_docs_list() -> None:
     files = {path.stem for path in Path(catalogue.__path__[0]).glob("*.py")} - {"__init__"}
-    rows = {(one.statement, one.source, one.assumes) for one in run_claims()}
-    rows |= {(one.statement, "certificate", one.assumes) for one in certified_claims()}
+    rows = {(one.statement, one.source, one.assumes) for one in definitions(ClaimDefinition)}
+    rows |= {(one.statement, "certificate", one.assumes) for one in definitions(CertifiedClaim)}
     assert len(rows) == len(files)
     text = DOCS.read_text(encoding="utf-8")
     section = text[text.index("\n## Claims") : text.index("\n## The summary")]

@@ -5,10 +5,10 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from cosim.analysis.claims.claim import ClaimVerdict
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.claims.claims_by_part import RunClaims
 from cosim.analysis.claims.common_time import common_end_ns, up_to_common_end
+from cosim.analysis.summary_model import ClaimVerdict
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.protocol.record_tables import OWNER, SENSOR_MEASUREMENT

@@ -5,10 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.analysis.claims.assumption_monitor import AssumptionMonitor
-from cosim.analysis.claims.claim import ClaimVerdict
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.claims.claims_by_part import RunClaims, _start_error
+from cosim.analysis.summary_model import ClaimVerdict
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
@@ -140,14 +139,3 @@ def test_the_input_error_at_the_start_is_that_of_the_plants_steps() -> None:
     )  # fmt: skip
     found = _start_error(record, 0.2)
     assert worst <= found <= 1.01 * worst
-
-
-def test_the_monitor_reports_nothing_after_its_end_time() -> None:
-    record = run_with(network=CONTENT["network"] | {"enforce_mansd": False, "mansd": 0})
-    free, ended = AssumptionMonitor(record.scenario), AssumptionMonitor(record.scenario)
-    ended.end_at(0.0)
-    for table in record.tables:
-        free.take(table, record[table])
-        ended.take(table, record[table])
-    assert free.end()
-    assert ended.end() == []

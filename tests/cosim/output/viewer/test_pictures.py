@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cosim.output.viewer.pictures.lane_picture import LanePicture, VehiclePose
+from cosim.output.viewer.pictures.lane_picture import LanePicture
 from cosim.output.viewer.pictures.network_picture import LEG_S, NetworkDiagram
 from cosim.output.viewer.pictures.pendulum_picture import PendulumPicture
 from cosim.output.viewer.pictures.phase_picture import PhasePicture
@@ -25,12 +25,12 @@ ROOT = Path(__file__).parents[4]
 S = 1_000_000_000
 PICTURES: dict[str, tuple[Picture, int, int]] = {
     "lane": (LanePicture(3, 2, forward_mps=-12.0), 4, 0),
-    "vehicle": (LanePicture(3, 2, forward_mps=-15.0, place=VehiclePose(0, 1, 2, 4)), 4, 7),
+    "vehicle": (LanePicture(3, 2, forward_mps=-15.0, vehicle=True), 4, 7),
     "cart and pole": (PendulumPicture(0, 2, reach_m=1.0, pole_m=0.6), 4, 0),
     "pendulum": (PendulumPicture(None, 0), 2, 0),
     "cart": (PendulumPicture(0, None, reach_m=30.0), 2, 0),
-    "quadrotor": (QuadrotorPicture(range(6), 1.0), 12, 12),
-    "tanks": (TanksPicture(range(4), range(4)), 4, 4),
+    "quadrotor": (QuadrotorPicture(1.0), 12, 12),
+    "tanks": (TanksPicture(), 4, 4),
     "phase": (PhasePicture(["a", "b", "c"], np.ones(3)), 3, 0),
     "one state": (PhasePicture(["a"], np.ones(1)), 1, 0),
 }
@@ -144,7 +144,7 @@ def test_a_pole_is_drawn_at_the_side_of_its_angle() -> None:
 def test_tank_levels_are_drawn_to_scale() -> None:
     frames = frames_of(4, 4)
     z = np.full((7, 4), 10.0)
-    moved = TanksPicture(range(4), range(4)).frames(frames._replace(z=z))
+    moved = TanksPicture().frames(frames._replace(z=z))
     drawn = np.array(arrays(moved["sensor/1"])["strips"], dtype=float)[:, 0, 0, 1]
     (low,) = {0.0}
     expected = low + (10.0 + frames.x_s[:, 0] - frames.x[:, 0]) / 20.0 * 1.6

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from cosim.cli import app
 from cosim.output.report.figure_files import inline
 from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS
-from cosim.studies.campaign import campaign_figures as figures_module
+from cosim.studies.campaign import campaign_grid
 from cosim.studies.campaign.campaign_figures import (
     curve_figure,
     distribution_figure,
@@ -25,10 +25,9 @@ from cosim.studies.campaign.campaign_figures import (
     pareto_figure,
     undominated,
 )
-from cosim.studies.campaign.campaign_file import Campaign, load
-from cosim.studies.campaign.campaign_grid import Point, base_of, grid
-from cosim.studies.campaign.campaign_page import SummaryRow, page, written
-from cosim.studies.campaign.campaign_report import tables_of, write_report
+from cosim.studies.campaign.campaign_file import load
+from cosim.studies.campaign.campaign_grid import base_of
+from cosim.studies.campaign.campaign_report import SummaryRow, tables_of, write_report, written
 from cosim.studies.campaign.campaign_run import run_campaign
 from cosim.studies.campaign.campaign_summary import summarise
 from cosim.studies.campaign.campaign_workers import alone
@@ -41,19 +40,10 @@ from noack.config.scenario_file import load as load_scenario
 from noack.config.scenario_file import validate
 from noack.theory.run_conditions import ideal_conditions
 from noack.theory.scenario_certificates import certify
-from tests.cosim.studies.campaign.conftest import Write
+from tests.cosim.studies.campaign.conftest import Command, Few, Write, few_of
 
 ROOT = Path(__file__).parents[4]
 HOSTILE = "</title></svg><script>alert('x')</script> & \"$\\frac{1}{2}$\""
-Few = tuple[Campaign, list[Point]]
-
-
-@pytest.fixture
-def full(tmp_path: Path, campaign: Few) -> Store:
-    plan, points = campaign
-    store = Store(tmp_path / "out", points, plan.draws, plan.chunk)
-    run_campaign(store, alone)
-    return store
 
 
 def scalar(content: dict[str, Any], **changed: Any) -> Scenario:
@@ -95,36 +85,25 @@ def test_the_certified_error_bounds_that_of_a_plants_own_certificate() -> None:
         assert name != "lane_weighted" or bound == pytest.approx(5 * 0.5, rel=1e-6)  # Δ = M
 
 
-def test_metrics_without_a_value_are_infinite_and_shares_are_derived() -> None:
+@pytest.mark.parametrize("failure", [DIVERGED, TOO_MANY_EVENTS])
+def test_metrics_without_a_value_and_of_failed_runs_are_infinite(failure: int) -> None:
     columns = {
-        "transmissions": np.array([10, 1]),
-        "deliveries": np.array([4, 1]),
-        "settling_s": np.array([1.5, math.nan]),
-        "sup_e_c_scaled": np.array([0.5, 0.25]),
-        "status": np.array([OK, OK]),
+        "transmissions": np.array([10, 1, 1]),
+        "deliveries": np.array([4, 1, 0]),
+        "settling_s": np.array([1.5, math.nan, 0.1]),
+        "sup_e_c_scaled": np.array([0.5, 0.25, 0.1]),
+        "status": np.array([OK, OK, failure]),
     }
     found = measured(columns, 2.0)
-    assert found["lost_share"].tolist() == [0.6, 0.0]
-    assert found["settling_s"].tolist() == [1.5, math.inf]
-    assert found["certificate_used"].tolist() == [0.25, 0.125]
+    assert found["transmissions"].tolist() == [10.0, 1.0, math.inf]
+    assert found["lost_share"].tolist() == [0.6, 0.0, math.inf]
+    assert found["settling_s"].tolist() == [1.5, math.inf, math.inf]
+    assert found["certificate_used"].tolist() == [0.25, 0.125, math.inf]
     assert "certificate_used" not in measured(columns, None)
 
 
-@pytest.mark.parametrize("status", [DIVERGED, TOO_MANY_EVENTS])
-def test_a_failed_run_is_not_counted_as_one_with_few_transmissions(status: int) -> None:
-    columns = {
-        "transmissions": np.array([10, 1]),
-        "deliveries": np.array([5, 0]),
-        "status": np.array([OK, status]),
-    }
-    found = measured(columns, None)
-    assert found["transmissions"].tolist() == [10.0, math.inf]
-    assert found["lost_share"].tolist() == [0.5, math.inf]
-    assert estimate(found["transmissions"]).mean == 10.0
-
-
 def test_a_curve_has_gaps_where_a_metric_is_unknown(
-    write: Write, plan: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    write: Write, plan: dict[str, Any], tmp_path: Path
 ) -> None:
     """Each of the two models has a certificate for other values of α."""
     plan["axes"] = [
@@ -132,21 +111,13 @@ def test_a_curve_has_gaps_where_a_metric_is_unknown(
                                       "strong": {"model.gain": [[-9.0, -6.0]]}}},
         {"name": "alpha", "key": "trigger.alpha_per_s", "values": [4.0, 0.25, 2.0]},
     ]  # fmt: skip
-    figure = {"kind": "curve", "x": "alpha", "metric": "certificate_used"}
-    path = write(plan | {"compare": None}, figures=[figure], draws=2)
-    campaign = load(path)
-    store = Store(tmp_path / "out", grid(campaign, path), 2, 3)
+    curve = {"kind": "curve", "x": "alpha", "metric": "certificate_used"}
+    campaign, points = few_of(write(plan, compare=None, figures=[curve], draws=2))
+    store = Store(tmp_path / "out", points, 2, 3)
     run_campaign(store, alone)
-    drawn: list[Any] = []
-    monkeypatch.setattr(figures_module, "curve_figure", lambda *given: drawn.append(given))
-    list(figures(summarise(campaign, store), store))
-    ((x, labels, series, *_),) = drawn
-    assert (x.tolist(), labels) == ([0.25, 2.0], ["0.25", "2"])
-    assert [e is None for e in series["weak"]] == [False, True]
-    assert [e is None for e in series["strong"]] == [False, False]
-    monkeypatch.undo()
-    (one,) = figures(summarise(campaign, store), store)
-    lines = [line.get_xydata() for line in one.figure.axes[0].lines]
+    ((_, figure, _),) = figures(summarise(campaign, store), store)
+    lines = [np.asarray(line.get_xydata()) for line in figure.axes[0].lines]
+    assert [line[:, 0].tolist() for line in lines] == 2 * [[0.25, 2.0]]
     assert [np.isfinite(line[:, 1]).tolist() for line in lines] == [[True, False], [True, True]]
 
 
@@ -167,32 +138,27 @@ def test_a_summary_covers_all_draws_and_pairs_them(full: Store, campaign: Few) -
 
 
 def test_an_exceeded_certificate_is_reported_in_every_output(
-    write: Write, plan: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(
-        "cosim.studies.campaign.campaign_grid.certified_error", lambda resolved: 1e-3
-    )
-    out = tmp_path / "out"
-    arguments = ["campaign", str(write(plan)), "--workers", "1", "--out", str(out)]
-    done = CliRunner().invoke(app, arguments)
+    write: Write, plan: dict[str, Any], tmp_path: Path, run_command: Command,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(campaign_grid, "certified_error", lambda resolved: 1e-3)
+    done = run_command(write(plan, figures=[]))
     assert done.exit_code == 1
     assert "28 of 28 runs exceed a certified bound." in done.output
-    assert 'class="verdict bad"' in (out / "campaign.html").read_text()
+    assert 'class="verdict bad"' in (tmp_path / "out" / "campaign.html").read_text()
 
 
 def test_the_command_writes_the_reported_files_and_keeps_complete_chunks(
-    write: Write, plan: dict[str, Any], tmp_path: Path
+    write: Write, plan: dict[str, Any], tmp_path: Path, run_command: Command
 ) -> None:
-    out = tmp_path / "out"
-    arguments = ["campaign", str(write(plan)), "--workers", "1", "--out", str(out), "--json"]
-    done = CliRunner().invoke(app, [*arguments, "--draws", "4"])
+    path = write(plan, figures=[])
+    done = run_command(path, "--json", "--draws", "4")
     assert done.exit_code == 0, done.output
-    said = json.loads(done.stdout)
-    assert said["made"] == 16
-    assert all(Path(file).exists() for file in said["files"])
-    kept = json.loads((out / "summary.json").read_text())
-    assert kept == {key: value for key, value in said.items() if key not in ("made", "files")}
-    assert json.loads(CliRunner().invoke(app, arguments).stdout)["made"] == 4 * (7 - 3)
+    report = json.loads(done.stdout)
+    assert report.pop("made") == 16
+    assert all(Path(file).exists() for file in report.pop("files"))
+    assert json.loads((tmp_path / "out" / "summary.json").read_text()) == report
+    assert json.loads(run_command(path, "--json").stdout)["made"] == 4 * (7 - 3)
 
 
 def test_a_missing_campaign_gives_one_line() -> None:
@@ -211,8 +177,7 @@ def test_the_page_is_one_file_and_escapes_user_text(
     path = write(plan, description=HOSTILE)
     campaign = load(path)
     summary = summarise(campaign, full)
-    base = base_of(campaign, path)[1]
-    write_report(summary, full, base)
+    write_report(summary, full, base_of(campaign, path)[1])
     html = (full.folder / "campaign.html").read_text(encoding="utf-8")
     assert "<script" not in html
     assert "http" not in html.replace('"http-equiv', "").replace("http-equiv=", "")
@@ -220,8 +185,6 @@ def test_the_page_is_one_file_and_escapes_user_text(
     assert "(normal)" not in html
     assert html.count("<figure id=") == len(campaign.figures)
     assert html.count("<svg") == len(campaign.figures)
-    again = list(figures_module.figures(summary, full))
-    assert page(summary, again, base) == html
 
 
 points = st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), min_size=1, max_size=12)
@@ -243,22 +206,23 @@ def test_the_front_is_what_nothing_dominates(drawn: list[tuple[int, int]]) -> No
 def test_figures_accept_infinite_single_and_many_values() -> None:
     never, one = estimate(np.full(4, math.inf)), estimate(np.array([2.0]))
     many = estimate(np.geomspace(1e-9, 1e9, 50))
-    for values in ([never], [one], [never, one, many]):
+    drawn = []
+    for values in ([never], [never, one, many]):
         labels = [str(i) for i in range(len(values))]
         series = {f"series {i}": values for i in range(12)}
         pairs = {name: (values, list(reversed(values))) for name in series}
-        for figure in (
+        drawn += [
             pareto_figure(pairs, "transmissions", "cost"),
             curve_figure(None, labels, series, HOSTILE, "cost"),
-            curve_figure(np.arange(len(values)) + 1.0, labels, series, "x", "settling_s"),
-        ):
-            assert inline(figure, "f", "what").startswith("<svg")
-    for matrix in (np.full((2, 3), np.nan), np.array([[1.0, np.nan, 1e9]]), np.ones((1, 1))):
-        labels = (("x", ["a", "b", "c"][: matrix.shape[1]]), ("y", ["d", "e"][: matrix.shape[0]]))
-        maps = {f"map {i}": matrix for i in range(4)}
-        assert inline(heat_map_figure(maps, *labels, "cost"), "f", "what").startswith("<svg")
+        ]
+    drawn.append(curve_figure(np.array([1.0]), ["1"], {"a": [one]}, "x", "settling_s"))
+    for matrix in (np.full((2, 3), np.nan), np.array([[1.0, np.nan, 1e9]])):
+        rows = (("x", ["a", "b", "c"]), ("y", ["d", "e"][: len(matrix)]))
+        drawn.append(heat_map_figure({f"map {i}": matrix for i in range(4)}, *rows, "cost"))
     values = {"a": np.full(3, math.inf), "b": np.array([1.0]), "c": np.geomspace(1e-3, 1e3, 9)}
-    assert inline(distribution_figure(values, "cost"), "f", "what").startswith("<svg")
+    drawn.append(distribution_figure(values, "cost"))
+    for figure in drawn:
+        assert inline(figure, "f", "what").startswith("<svg")
 
 
 def test_a_distribution_ends_at_the_share_of_finite_values() -> None:
@@ -278,23 +242,21 @@ def test_numbers_are_written_with_their_interval() -> None:
 
 
 def test_terminal_tables_print_names_literally_and_list_failed_runs(
-    write: Write, plan: dict[str, Any], tmp_path: Path
+    write: Write, plan: dict[str, Any], run_command: Command
 ) -> None:
     name = "[/x] [red]"
     plan["axes"][0]["variants"] = {name: {"mode": "model"}, "ZOH": {"mode": "zoh"}}
     plan["axes"][1]["title"] = "[/b]"
-    path = write(plan, figures=[], draws=2, metrics={"most_events": 1})
-    out = str(tmp_path / "out")
-    result = CliRunner().invoke(app, ["campaign", str(path), "--out", out, "--workers", "1"])
+    result = run_command(write(plan, figures=[], draws=2, metrics={"most_events": 1}))
     assert result.exit_code == 0, result.output
     assert name in result.stdout
     assert "[/b]" in result.stdout
-    told = " ".join(result.stdout.split())
-    assert f"At policy {name}, beta 0.1 not all runs reached the horizon: 2 too many" in told
-    assert "continuous time: the trigger acts at once and the network has no delay" in told
+    text = " ".join(result.stdout.split())
+    assert f"At policy {name}, beta 0.1 not all runs reached the horizon: 2 too many" in text
+    assert "continuous time: the trigger acts at once and the network has no delay" in text
 
 
-@pytest.mark.parametrize("width", range(45, 120))
+@pytest.mark.parametrize("width", [45, 60, 88, 89, 119])
 def test_the_tables_fit_narrow_terminals(width: int) -> None:
     headings = ["transmissions", "shortest interval [s]", "cost", "settling time [s]"]
     rows = [

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from cosim.studies.campaign.draw_statistics import difference, estimate
+from cosim.studies.campaign.draw_statistics import difference, estimate, interval_ranks
 
 
 def test_the_interval_of_a_mean_is_the_textbooks() -> None:
@@ -20,25 +20,25 @@ def test_the_interval_of_a_mean_is_the_textbooks() -> None:
 
 def test_intervals_have_their_nominal_coverage() -> None:
     rng = np.random.default_rng(0)
-    trials, of_mean, of_median = 2000, 0, 0
+    trials, of_mean, of_median = 1000, 0, 0
     for _ in range(trials):
         found = estimate(rng.exponential(1.0, 101))
         of_mean += abs(found.mean - 1.0) <= found.halfwidth
         of_median += found.median_low <= math.log(2) <= found.median_high
-    # Standard deviation of a share: 0.005. A normal interval of a skewed law covers slightly less.
+    # Standard deviation of a share: 0.007. A normal interval of a skewed law covers slightly less.
     assert 0.92 < of_mean / trials < 0.97
     assert 0.94 < of_median / trials < 0.98
 
 
-@pytest.mark.parametrize("draws", [2, 3, 10])
+@pytest.mark.parametrize("draws", [2, 10])
 def test_intervals_of_few_draws_have_their_nominal_coverage(draws: int) -> None:
     """A normal interval of two draws covers the true value in only 70 % of the cases."""
-    values = np.random.default_rng(draws).normal(3.0, 2.0, (4000, draws))
+    values = np.random.default_rng(draws).normal(3.0, 2.0, (2000, draws))
     hits = 0
     for row in values:
         found = estimate(row)
         hits += abs(found.mean - 3.0) <= found.halfwidth
-    assert abs(hits / len(values) - 0.95) < 0.014  # four standard deviations of a share
+    assert abs(hits / len(values) - 0.95) < 0.0195  # four standard deviations of a share
 
 
 def test_infinite_values_count_for_quantiles_and_not_for_the_mean() -> None:
@@ -74,3 +74,18 @@ def test_pairing_narrows_the_interval() -> None:
     paired = difference(common + noise, common).estimate
     assert paired.halfwidth < 0.02 < estimate(common).halfwidth
     assert abs(paired.mean - 0.5) < 3 * paired.halfwidth
+
+
+def at_most(j: int, count: int, share: float) -> float:
+    """P(Bin(count, share) ≤ j), term by term."""
+    return math.fsum(
+        math.comb(count, i) * share**i * (1 - share) ** (count - i) for i in range(j + 1)
+    )
+
+
+@pytest.mark.parametrize(("count", "quantile"), [(100, 0.5), (200, 0.9), (400, 0.95)])
+def test_ranks_are_the_tightest_with_the_required_confidence(count: int, quantile: float) -> None:
+    low, high = interval_ranks(count, quantile)
+    # The value of rank r (from 0) is above the quantile if at most r values are below it.
+    assert at_most(high, count, quantile) >= 0.975 > at_most(high - 1, count, quantile)
+    assert at_most(low, count, quantile) <= 0.025 < at_most(low + 1, count, quantile)

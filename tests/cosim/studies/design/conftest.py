@@ -6,7 +6,7 @@ import pytest
 
 from cosim.studies.design.candidate_measures import DesignLimits
 from cosim.studies.design.design_result import DesignResult
-from cosim.studies.design.design_run import design
+from cosim.studies.design.design_search import design
 from cosim.studies.design.loop_families import families_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load

@@ -9,14 +9,13 @@ from scipy.linalg import expm
 from cosim.simulation.continuous.continuous_report import run_continuous, summary
 from cosim.studies.paper.draw_measures import (
     MODES,
-    _ideal_norms,
-    _settling_s,
+    Draw,
+    certified,
     measure_draw,
     open_loop_eigenvalues,
+    printed,
     resolved_draw,
-    simulate_draw,
 )
-from cosim.studies.paper.paper_bounds_of_draws import certified, printed
 from cosim.studies.paper.paper_campaign import BASE, EXACT_MODEL, load_campaign
 from noack.config.resolution import loop_of
 
@@ -25,33 +24,24 @@ SCENARIO = SCENARIOS[BASE]
 DRAW = 3
 
 
-def test_the_settling_time_of_an_exponential_is_its_closed_form() -> None:
-    t_s = np.linspace(0.0, 10.0, 101)
-    assert _settling_s(t_s, np.exp(-t_s), 0.05) == pytest.approx(math.log(20), rel=1e-12)
+@pytest.fixture(scope="module")
+def found() -> Draw:
+    return measure_draw(SCENARIO, DRAW)
 
 
-def test_settling_counts_from_the_last_time_above_the_level() -> None:
-    t_s = np.arange(5.0)
-    assert _settling_s(t_s, np.array([1.0, 0.01, 1.0, 0.01, 0.01]), 0.1) == pytest.approx(2.5)
-    assert _settling_s(t_s, np.full(5, 0.01), 0.1) == 0.0
-    assert _settling_s(t_s, np.array([1.0, 0.0, 0.0, 0.0, 1.0]), 0.1) == math.inf
-
-
-def test_the_loop_without_a_network_is_the_matrix_exponential() -> None:
+def test_the_loop_without_a_network_settles_when_its_matrix_exponential_does(found: Draw) -> None:
     loop = loop_of(resolved_draw(SCENARIO, DRAW, "model"))
     closed = loop.A + loop.B @ loop.K
-    t_s, norms = _ideal_norms(closed, loop.x0, 20.0)
-    for k in (0, 137, 2000):
-        assert norms[k] == pytest.approx(np.linalg.norm(expm(closed * t_s[k]) @ loop.x0), rel=1e-10)
+    for share, settled_s in ((0.05, found.ideal_settled_5_s), (0.01, found.ideal_settled_1_s)):
+        times_s = np.linspace(settled_s, 40.0, 200)
+        norms = [np.linalg.norm(expm(closed * t_s) @ loop.x0) for t_s in times_s]
+        assert norms[0] == pytest.approx(share * found.start_norm, rel=1e-4)
+        assert max(norms[1:]) < norms[0]
 
 
-def test_both_loops_of_a_draw_have_the_same_plant_start_and_losses() -> None:
-    model, zoh = (resolved_draw(SCENARIO, DRAW, mode) for mode in MODES)
-    assert model.model_copy(update={"mode": "zoh"}) == zoh
-    fates = [simulate_draw(resolved).delivered for resolved in (model, zoh)]
-    common = min(map(len, fates))
-    assert (fates[0][:common] == fates[1][:common]).all()
-    assert not fates[0].all()
+def test_a_loop_that_does_not_settle_within_the_horizon_never_settles() -> None:
+    short = measure_draw(SCENARIO.model_copy(update={"horizon_s": 1.0}), DRAW)
+    assert short.model.settled_5_s == short.zoh.settled_1_s == short.ideal_settled_5_s == math.inf
 
 
 def test_other_draws_have_other_plants_starts_and_losses() -> None:
@@ -61,23 +51,29 @@ def test_other_draws_have_other_plants_starts_and_losses() -> None:
     assert first.seeds.loss != second.seeds.loss
 
 
-def test_measures_agree_with_the_simulators_summary() -> None:
-    found = measure_draw(SCENARIO, DRAW)
-    for mode, measures in (("model", found.model), ("zoh", found.zoh)):
-        resolved = resolved_draw(SCENARIO, DRAW, mode)  # type: ignore[arg-type]
-        told = summary(run_continuous(resolved), resolved)
-        assert measures.events == told["events"]
-        assert measures.deliveries == told["deliveries"]
-        assert measures.gap_min_s == told["inter_event_min_s"]
-        assert measures.gap_median_s == told["inter_event_median_s"]
-        assert measures.reception_median_s == told["inter_delivery_median_s"]
-        assert measures.final_norm == pytest.approx(told["final_state_norm"], rel=1e-9)
-        assert found.start_norm == pytest.approx(told["initial_state_norm"], rel=1e-9)
+def test_measures_agree_with_the_simulators_summary(found: Draw) -> None:
+    model, zoh = (resolved_draw(SCENARIO, DRAW, mode) for mode in MODES)
+    assert model.model_copy(update={"mode": "zoh"}) == zoh
+    fates = []
+    for measures, resolved in ((found.model, model), (found.zoh, zoh)):
+        run = run_continuous(resolved)
+        fates.append(run.delivered)
+        expected = summary(run, resolved)
+        assert measures.events == expected["events"]
+        assert measures.deliveries == expected["deliveries"]
+        assert measures.gap_min_s == expected["inter_event_min_s"]
+        assert measures.gap_median_s == expected["inter_event_median_s"]
+        assert measures.reception_median_s == expected["inter_delivery_median_s"]
+        assert measures.final_norm == pytest.approx(expected["final_state_norm"], rel=1e-9)
+        assert found.start_norm == pytest.approx(expected["initial_state_norm"], rel=1e-9)
         assert measures.peak >= 1
+    common = min(map(len, fates))
+    assert (fates[0][:common] == fates[1][:common]).all()
+    assert not fates[0].all()
 
 
-def test_measured_values_are_within_the_certified_and_printed_bounds() -> None:
-    found, bound, theorem = (f(SCENARIO, DRAW) for f in (measure_draw, certified, printed))
+def test_measured_values_are_within_the_certified_and_printed_bounds(found: Draw) -> None:
+    bound, theorem = (f(SCENARIO, DRAW) for f in (certified, printed))
     assert 1 < found.model.controller_error <= bound.delta
     assert found.start_norm <= found.model.envelope <= bound.state
     assert theorem.inter_event_s < bound.inter_event_s < found.model.gap_min_s
@@ -88,10 +84,10 @@ def test_measured_values_are_within_the_certified_and_printed_bounds() -> None:
 def test_the_double_eigenvalue_at_zero_is_recognised_in_every_plant() -> None:
     for draw in range(20):
         loop = loop_of(resolved_draw(SCENARIO, draw, "model"))
-        assert (open_loop_eigenvalues(loop) == 0).sum() == 2
+        assert (open_loop_eigenvalues(loop.A) == 0).sum() == 2
         assert np.linalg.matrix_rank(loop.A) == 3
         lateral = np.sort(np.linalg.eigvals(loop.A[:2, :2]).real)
-        others = np.sort(open_loop_eigenvalues(loop).real)[[0, -1]]
+        others = np.sort(open_loop_eigenvalues(loop.A).real)[[0, -1]]
         np.testing.assert_allclose(others, [lateral[0], max(lateral[1], 0.0)], atol=1e-9)
 
 

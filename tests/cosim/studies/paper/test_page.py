@@ -2,8 +2,6 @@
 
 import json
 import math
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,31 +9,30 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from cosim.cli import app
-from cosim.studies.campaign.campaign_workers import alone
+from cosim.cli import app, command
 from cosim.studies.campaign.draw_statistics import paired, quartiles
-from cosim.studies.paper.paper_campaign import (
-    BASE,
-    COLUMNS,
-    EnsemblePart,
-    PaperWork,
-    load_campaign,
-    parts,
-    run_parts,
-)
+from cosim.studies.paper import paper_run
+from cosim.studies.paper.paper_campaign import BASE, COLUMNS, load_campaign, parts
 from cosim.studies.paper.paper_claims import PaperVerdict, claims, judge
-from cosim.studies.paper.paper_evidence import evidence
 from cosim.studies.paper.paper_figures import ensemble_figure
-from cosim.studies.paper.paper_numbers import HORIZON_S, number, percent, spread
 from cosim.studies.paper.paper_page import render
-from cosim.studies.paper.paper_results import REPRESENTED, Results, dumps, load_results, results_of
+from cosim.studies.paper.paper_results import (
+    HORIZON_S,
+    REPRESENTED,
+    Results,
+    dumps,
+    load_results,
+    number,
+    percent,
+    spread,
+)
+from noack.config.scenario import Scenario
 
 ROOT = Path(__file__).parents[4]
-CAMPAIGN, SCENARIOS = load_campaign()
-VARIATIONS = tuple(SCENARIOS)
 COMMITTED = ROOT / "docs" / "figures" / "paper.json"
 DIGITS = 2e-4
 """Five digits are stored; rounding, which a loop may amplify by 1e5, is far below."""
+DRAWS = 4
 
 
 @pytest.fixture(scope="module")
@@ -44,49 +41,43 @@ def results() -> Results:
 
 
 def test_the_page_is_the_template_with_the_committed_numbers(results: Results) -> None:
-    assert (ROOT / "docs" / "paper.md").read_text(encoding="utf-8") == render(results)
+    text = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
+    assert text == render(results)
     assert dumps(results) == COMMITTED.read_text(encoding="utf-8")
+    for name in ("paper-mb-et.svg", "paper-zoh-et.svg", "paper-ensemble.png", "paper.json"):
+        assert f"figures/{name}" in text
+        assert (ROOT / "docs" / "figures" / name).stat().st_size > 1000
 
 
 def test_the_ensemble_is_complete(results: Results) -> None:
     assert results.count() >= 1000
     found = {key: len(rows) for key, rows in results.tables.items()}
-    assert found == {(p.table, p.variation): p.draws for p in parts(results.count(), VARIATIONS)}
+    wanted = parts(results.count(), tuple(load_campaign()[1]))
+    assert found == {(part.table, part.variation): part.draws for part in wanted}
 
 
-@pytest.mark.parametrize("part", parts(1000, VARIATIONS), ids=lambda p: f"{p.table}-{p.variation}")
-def test_the_committed_draws_are_what_the_code_computes(
-    results: Results, part: EnsemblePart
+def test_the_command_computes_the_committed_draws_and_writes_the_page(
+    results: Results, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    last = results.count(part.variation, part.table) - 1
-    computed = PaperWork(part.table, SCENARIOS[part.variation]).run(range(last, last + 1))
-    rows = results.tables[part.table, part.variation]
-    np.testing.assert_allclose(rows[[last]], computed, rtol=DIGITS, atol=1e-12)
+    def evidence(scenario: Scenario, representative: int) -> Any:
+        assert scenario == load_campaign()[1][BASE]
+        assert 0 <= representative < DRAWS
+        return results.evidence  # test_evidence.py computes it
 
-
-def test_the_committed_evidence_is_what_the_code_computes(results: Results) -> None:
-    computed = results_of([], evidence(SCENARIOS[BASE], results.representative)).evidence
-    assert_close(computed, results.evidence)
-
-
-def assert_close(first: Any, second: Any) -> None:
-    if isinstance(first, dict):
-        assert first.keys() == second.keys()
-        for key in first:
-            assert_close(first[key], second[key])
-    elif isinstance(first, list):
-        assert len(first) == len(second)
-        for one, other in zip(first, second, strict=True):
-            assert_close(one, other)
-    else:
-        assert first == pytest.approx(second, rel=DIGITS, abs=1e-9)
-
-
-def test_the_page_shows_files_that_exist(results: Results) -> None:
-    text = render(results)
-    for name in ("paper-mb-et.svg", "paper-zoh-et.svg", "paper-ensemble.png", "paper.json"):
-        assert f"figures/{name}" in text
-        assert (ROOT / "docs" / "figures" / name).stat().st_size > 1000
+    monkeypatch.setattr(command, "cores", lambda: 1)
+    monkeypatch.setattr(paper_run, "evidence", evidence)
+    words = ["paper", "--draws", str(DRAWS), "--out", str(tmp_path), "--json"]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    report = json.loads(done.stdout)
+    assert report["draws"] == DRAWS
+    assert len(report["files"]) == 5
+    assert all(Path(file).is_file() for file in report["files"])
+    written = load_results(tmp_path / "figures" / "paper.json")
+    assert (tmp_path / "paper.md").read_text(encoding="utf-8") == render(written)
+    for key, rows in results.tables.items():
+        found = written.tables[key]
+        np.testing.assert_allclose(found, rows[: len(found)], rtol=DIGITS, atol=1e-12)
 
 
 def with_column(results: Results, name: str, values: Any, variation: str = BASE) -> Results:
@@ -95,35 +86,33 @@ def with_column(results: Results, name: str, values: Any, variation: str = BASE)
     return Results({**results.tables, ("draws", variation): table}, results.evidence)
 
 
-def test_verdicts_follow_from_the_draws(results: Results) -> None:
-    """A claim that the draws contradict is not confirmed; one that most draws confirm is partly."""
-    gist = "With ZOH the number of updates increases."
-
-    def verdict(changed: Results) -> PaperVerdict:
-        return next(claim.verdict for claim in claims(changed) if claim.gist == gist)
-
-    events, some = results.column("zoh.events"), np.arange(results.count()) % 10
-    assert verdict(results) == PaperVerdict.CONFIRMED
-    assert verdict(with_column(results, "zoh.events", 1)) == PaperVerdict.NOT_CONFIRMED
-    most = np.where(some < 6, events, 1)
-    assert verdict(with_column(results, "zoh.events", most)) == PaperVerdict.PARTLY
-    # A variation of an unspecified detail counts; one that departs from the paper's example does
-    # not.
-    assert verdict(with_column(results, "zoh.events", 1, "x(0) × 10")) == PaperVerdict.PARTLY
-    assert verdict(with_column(results, "zoh.events", 1, "box × 5")) == PaperVerdict.CONFIRMED
-
-
-def test_a_loop_that_never_settles_confirms_no_claim(results: Results) -> None:
-    never = with_column(results, "model.settled_1_s", math.inf)
-    (claim,) = [c for c in claims(never) if c.gist == "MB-ET stabilises the uncertain system."]
-    assert claim.verdict == PaperVerdict.NOT_CONFIRMED
-    assert "> 40" in render(never)
-
-
-def test_an_inter_event_time_below_the_certified_one_is_reported(results: Results) -> None:
-    short = with_column(results, "model.gap_min_s", 1e-3)
-    (claim,) = [c for c in claims(short) if "minimum inter-event" in c.gist]
-    assert claim.verdict == PaperVerdict.NOT_CONFIRMED
+@pytest.mark.parametrize(
+    ("column", "values", "variation", "verdict"),
+    [
+        ("zoh.events", None, BASE, PaperVerdict.CONFIRMED),
+        ("zoh.events", 1, BASE, PaperVerdict.NOT_CONFIRMED),
+        ("zoh.events", "some", BASE, PaperVerdict.PARTLY),
+        # A variation of an unspecified detail counts; another example does not.
+        ("zoh.events", 1, "x(0) × 10", PaperVerdict.PARTLY),
+        ("zoh.events", 1, "box × 5", PaperVerdict.CONFIRMED),
+        ("model.settled_1_s", math.inf, BASE, PaperVerdict.NOT_CONFIRMED),
+        ("model.gap_min_s", 1e-3, BASE, PaperVerdict.NOT_CONFIRMED),  # below the certified one
+    ],
+)
+def test_verdicts_follow_from_the_draws(
+    results: Results, column: str, values: Any, variation: str, verdict: PaperVerdict
+) -> None:
+    gist = {
+        "zoh.events": "With ZOH the number of updates increases.",
+        "model.settled_1_s": "MB-ET stabilises the uncertain system.",
+        "model.gap_min_s": "A positive minimum inter-event time exists.",
+    }
+    before = results.column(column, variation)
+    if values == "some":
+        values = np.where(np.arange(len(before)) % 10 < 6, before, 1)
+    changed = with_column(results, column, before if values is None else values, variation)
+    assert [c.verdict for c in claims(changed) if c.gist == gist[column]] == [verdict]
+    assert values is not math.inf or "> 40" in render(changed)
 
 
 def test_the_least_favourable_variation_is_named(results: Results) -> None:
@@ -148,7 +137,7 @@ def test_the_representative_draw_is_nearest_to_the_medians(results: Results) -> 
 )  # fmt: skip
 def test_numbers_are_rounded_for_reading(value: float, text: str) -> None:
     assert number(value) == text
-    assert SCENARIOS[BASE].horizon_s == HORIZON_S
+    assert load_campaign()[1][BASE].horizon_s == HORIZON_S
 
 
 def test_a_share_is_100_percent_only_if_it_is_complete() -> None:
@@ -168,25 +157,6 @@ def test_quartiles_are_values_of_draws_and_may_be_infinite() -> None:
 def test_a_figure_with_draws_that_never_settle_can_be_drawn(results: Results) -> None:
     some = np.where(np.arange(results.count()) % 2, math.inf, 10.0)
     assert ensemble_figure(with_column(results, "zoh.settled_5_s", some)).axes
-
-
-def test_the_command_writes_the_page_that_the_code_computes(tmp_path: Path) -> None:
-    # In its own process, which starts others.
-    done = subprocess.run(
-        [sys.executable, "-m", "cosim.cli", "paper", "--draws", "4", "--out", tmp_path, "--json"],
-        capture_output=True, text=True, check=False, timeout=600, cwd=ROOT,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
-    assert told["draws"] == 4
-    assert all(Path(file).is_file() for file in told["files"])
-    written = load_results(tmp_path / "figures" / "paper.json")
-    assert (tmp_path / "paper.md").read_text(encoding="utf-8") == render(written)
-    # Computed in other processes, with the same numbers.
-    here = results_of(run_parts({BASE: SCENARIOS[BASE]}, 4, alone), {})
-    for part in parts(4, (BASE,)):
-        key = (part.table, part.variation)
-        np.testing.assert_array_equal(written.tables[key], here.tables[key])
 
 
 def test_mistakes_give_one_line_before_any_simulation(tmp_path: Path) -> None:

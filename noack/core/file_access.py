@@ -1,0 +1,69 @@
+"""Files: atomic writing, reading of limited size, and advisory locks."""
+
+import fcntl
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO, Any
+
+from noack.core.errors import MachineError, why
+
+
+def write_whole(path: Path, content: str | bytes) -> Path:
+    """Write a file, or replace it, in one step; return its path. Missing folders are created.
+
+    Text is written as UTF-8. Raise MachineError if the file cannot be written.
+    """
+    scratch = path.with_name(f".{path.name}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        scratch.write_bytes(content.encode() if isinstance(content, str) else content)
+        scratch.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            scratch.unlink(missing_ok=True)
+        raise MachineError(f"{path}: cannot be written: {why(error)}") from None
+    return path
+
+
+def read_regular(path: Path, most_bytes: int) -> bytes:
+    """Return the bytes of a regular file.
+
+    Raises:
+        OSError: the file cannot be opened or read.
+        ValueError: it is a device, a FIFO or a directory, or it is larger than ``most_bytes``.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # so that a FIFO does not block
+    try:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise ValueError("not a regular file")
+        with open(descriptor, "rb", closefd=False) as file:
+            content = file.read(most_bytes + 1)
+    finally:
+        os.close(descriptor)
+    if len(content) > most_bytes:
+        raise ValueError(f"larger than {most_bytes // 2**20} MiB")
+    return content
+
+
+def lock(file: int | IO[Any], *, shared: bool = False, wait: bool = False) -> bool:
+    """Lock an open file or folder until it is closed; return False if another process has the lock.
+
+    ``shared`` locks exclude only exclusive ones. With ``wait`` it waits for the other processes.
+    Raise OSError if the file system does not support locks.
+    """
+    kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
+    try:
+        fcntl.flock(file, kind if wait else kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+@contextmanager
+def locked(path: Path, *, shared: bool = False, wait: bool = False) -> Iterator[bool]:
+    """Lock a file, which is created if missing, while the context lasts; yields :func:`lock`."""
+    with path.open("a") as file:
+        yield lock(file, shared=shared, wait=wait)

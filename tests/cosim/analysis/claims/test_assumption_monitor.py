@@ -1,0 +1,315 @@
+"""The live assumption monitor reports the same violations as the evaluation after the run."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from controller_node.controller import controller_of
+from cosim.analysis.claims.assumption_monitor import AssumptionMonitor
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
+from cosim.analysis.claims.condition_reader import ConditionReader, read_conditions
+from cosim.analysis.claims.observed_conditions import AssumptionViolation, ObservedConditions
+from cosim.analysis.summary_model import ClaimVerdict
+from cosim.record.run_record import Rows, RunRecord
+from cosim.simulation.virtual_time import simulate
+from noack.config.scenario import Scenario
+from noack.protocol.machine_interface import Start
+from noack.protocol.record_tables import (
+    CONTROLLER_DELIVERY,
+    OWNER,
+    PLANT_ACTUATION,
+    SENSOR_MEASUREMENT,
+)
+from noack.protocol.topology import LOOP_ROLES
+from noack.theory.run_conditions import allowed_conditions
+from noack.trigger.absolute import AbsoluteSettings
+from sensor_node.sensor import sensor_of
+from tests.cosim.analysis.claims.conftest import Make, changed, event_s, network_of
+from tests.cosim.live.outage import Deaf, Reborn, simulate_with, with_outage
+
+Batches = Iterator[tuple[str, Rows] | None]
+"""A table and some of its rows; None where the result so far is queried."""
+NO_DELAY = network_of(lambda n: 0)
+SERIES = ("losses", "sampling", "delay", "hold", "watchdog", "safe_input", "restarts")
+
+
+def batches(record: RunRecord, seed: int) -> Batches:
+    """The record as the processes send it: each in its own order, the processes in any order."""
+    rng = np.random.default_rng(seed)
+    taken = dict.fromkeys(record.tables, 0)
+    while waiting := [table for table in taken if taken[table] < len(record[table])]:
+        role = rng.choice([role for role in LOOP_ROLES if any(OWNER[t] == role for t in waiting)])
+        own = [table for table in record.tables if OWNER[table] == role]
+        first = min(int(record[t]["input"][taken[t]]) for t in own if t in waiting)
+        until = first + int(rng.integers(1, 200))
+        for table in own:
+            end = int(np.searchsorted(record[table]["input"], until))
+            yield table, record[table][taken[table] : end]
+            taken[table] = end
+            if rng.uniform() < 0.2:
+                yield None
+        if rng.uniform() < 0.5:
+            yield None
+
+
+def reported(record: RunRecord, seed: int = 0) -> list[AssumptionViolation]:
+    """The violations that a monitor reports if it receives the run in batches."""
+    monitor, found = AssumptionMonitor(record.scenario), []
+    for batch in batches(record, seed):
+        if batch is None:
+            found += monitor.advance()
+        else:
+            monitor.take(*batch)
+    found += monitor.end()
+    assert monitor.stopped is None
+    assert len({one.cause for one in found}) == len(found)
+    return found
+
+
+def hostile(seed: int) -> Any:
+    rng = np.random.default_rng(seed)
+    lost, late_ms, often = rng.uniform(0, 0.7), int(rng.choice([0, 10, 80, 400])), rng.uniform()
+
+    def decide(number: int) -> int | None:
+        if rng.uniform() < lost:
+            return None
+        return int(rng.integers(0, late_ms + 1)) if rng.uniform() < often else 0
+
+    return network_of(decide)
+
+
+@st.composite
+def scenarios(draw: st.DrawFn, make: Make) -> Scenario:
+    watchdog = {"policy": draw(st.sampled_from(["hold", "zero", "model"])), "timeout_s": 0.01}
+    rate_hz = draw(st.sampled_from([100.0, 200.0]))
+    return make(
+        horizon_s=1.0, trigger={"beta": draw(st.sampled_from([1e-6, 1e-3]))},
+        plant={"rate_hz": rate_hz, "watchdog": watchdog},
+        controller={"phase": draw(st.sampled_from([0.0, 0.5])), "safe_input": [0.1]},
+        network={"initial_sync": draw(st.sampled_from(["first_packet", "known_state"]))},
+    )  # fmt: skip
+
+
+def damaged(record: RunRecord, seed: int) -> RunRecord:
+    """A record with missing rows, or of a process that died."""
+    rng = np.random.default_rng(seed)
+    match int(rng.integers(0, 3)):
+        case 1:
+            role, end_ns = rng.choice(LOOP_ROLES), rng.uniform(0.2, 1) * 1e9
+            own = [table for table in record.tables if OWNER[table] == role]
+            return changed(record, **{t: record[t][record[t]["now_ns"] < end_ns] for t in own})
+        case 2:
+            table = str(rng.choice([CONTROLLER_DELIVERY, SENSOR_MEASUREMENT, PLANT_ACTUATION]))
+            there = rng.uniform(size=len(record[table])) > 0.1
+            return changed(record, **{table: record[table][there]})
+    return record
+
+
+def test_batches_in_any_order_show_what_the_whole_record_shows(make: Make) -> None:
+    causes: set[str] = set()
+
+    @settings(max_examples=60)
+    @given(scenarios(make), st.integers(0, 2**32))
+    def check(resolved: Scenario, seed: int) -> None:
+        record = damaged(simulate(resolved, hostile(seed)), seed)
+        reader = ConditionReader(resolved)
+        parts: list[ObservedConditions] = []
+        for batch in batches(record, seed):
+            if batch is None:
+                parts.append(reader.observed())
+            else:
+                reader.take(*batch)
+        whole = read_conditions(record)
+        parts.append(reader.end())
+        for name in SERIES:
+            found = np.concatenate([getattr(part, name) for part in parts], axis=1)
+            np.testing.assert_array_equal(found, getattr(whole, name))
+        assert parts[-1].start_s == whole.start_s
+        assert all(part.start_s <= whole.start_s for part in parts)
+        violations = {one[:2] for one in reported(record, seed)}
+        assert violations == {one[:2] for one in whole.violations(allowed_conditions(resolved))}
+        causes.update(cause for _, cause in violations)
+
+    check()
+    assert causes == {"dropouts", "sampling", "delay", "hold", "start", "watchdog", "safe input"}
+
+
+# --- violation of each condition: the live report, and the evaluation after the run ---------------
+
+
+def deaf(role: str, first: int, last: int) -> Callable[[Make], RunRecord]:
+    """A run in which a process does not receive the messages ``first`` to ``last`` − 1."""
+    return lambda make: simulate_with(
+        make(), role, lambda one: Deaf(one, lambda n: not first <= n < last), NO_DELAY
+    )
+
+
+def delayed(decide: Callable[[int], int | None]) -> Callable[[Make], RunRecord]:
+    return lambda make: simulate(make(), network_of(decide))
+
+
+def watchdog(policy: str) -> Callable[[Make], RunRecord]:
+    """An input may be 35 ms old; the watchdog acts after 20 ms."""
+    settings = {"watchdog": {"policy": policy, "timeout_s": 0.02}}
+    return lambda make: with_outage(make(plant=settings, certificate={"late_periods": 2}), 2.0, 2.3)
+
+
+def safe_input(make: Make) -> RunRecord:
+    """The start may take as long as the network's delay, and there must be no input until then."""
+    late = {"impairments": [{"kind": "delay", "delay_s": 0.1}]}
+    return simulate(make(controller={"safe_input": [0.5]}, network=late))
+
+
+def restarted_controller(make: Make) -> RunRecord:
+    """A controller that is restarted at once without a known state, in steps of 10 ms."""
+    resolved, at_ns = make(network={"initial_sync": "known_state"}), 2_000_000_000
+    successor = controller_of(resolved, Start(1, at_ns))
+    record = simulate_with(resolved, "controller", lambda one: Reborn(one, successor, at_ns))
+    knows_ns = record[CONTROLLER_DELIVERY]["model_t_ns"]
+    assert (knows_ns >= at_ns + 10_000_000).any()
+    assert not ((knows_ns >= at_ns) & (knows_ns < at_ns + 10_000_000)).any()
+    return record
+
+
+def restarted_sensor(make: Make) -> RunRecord:
+    """A sensor that is restarted between two measurements, soon after an event."""
+    resolved, at_ns = make(), 50_000_000
+    successor = sensor_of(resolved, Start(1, at_ns))
+    record = simulate_with(resolved, "sensor", lambda one: Reborn(one, successor, at_ns))
+    period_ns = resolved.timing.measurement_period_ns
+    assert (np.diff(record[SENSOR_MEASUREMENT]["t_ns"]) == period_ns).all()
+    return record
+
+
+@pytest.mark.parametrize(
+    ("violate", "at", "why"),
+    [
+        (deaf("controller", 10, 14), 12, "4 consecutive updates lost, 2 allowed"),
+        (deaf("network", 10, 14), 12, "4 consecutive updates lost, 2 allowed"),
+        (delayed(lambda n: 33 if n == 7 else 0), 7, "an update took effect after 0.04 s, 0.01 s"),
+        (deaf("sensor", 100, 103), 0.99, "no measurement for 0.04 s, 0.01 s allowed"),
+        (lambda make: with_outage(make(), 2.0, 2.3), 2.01, "an input was 0.315 s old, 0.015 s"),
+        (delayed(lambda n: 500 if n < 3 else 0), 0.0, "the plant applied no input until "),
+        (watchdog("zero"), 2.02, "the watchdog replaced the input: the newest actuation was "),
+        (watchdog("model"), 2.02, "the watchdog replaced the input: the newest actuation was "),
+        (safe_input, 0.01, "the controller had no state and sent its safe input, largest entry "),
+        (restarted_controller, 2.01, "the controller had no state and sent its safe input"),
+        (restarted_sensor, 0.05, "the sensor was restarted"),
+    ],
+)  # fmt: skip
+def test_claims_are_void_from_the_time_and_for_the_reason_that_the_monitor_reports(
+    violate: Callable[[Make], RunRecord], at: float, why: str, make: Make
+) -> None:
+    """``at`` is a time, or the number of an event."""
+    record = violate(make)
+    when_s = event_s(record, at) if isinstance(at, int) else at
+    judged = [claim for claim in ClaimEvaluation(record).judge() if claim.source == "certificate"]
+    assert {claim.verdict for claim in judged} == {ClaimVerdict.VOID}
+    # Nothing is recorded of ‖e_c‖ while there is no controller.
+    claims = [claim for claim in judged if "e_c" not in claim.bound]
+    assert claims
+    for claim in claims:
+        assert claim.since_s == pytest.approx(when_s)
+        assert claim.why.startswith(why)
+    first = min(reported(record))
+    assert first.t_s == pytest.approx(when_s)
+    assert first.text[:20] == why[:20]
+
+
+def test_a_non_finite_value_is_not_a_measurement(make: Make) -> None:
+    """At 2000 /s the state is finite for 0.36 s; its norm and that of an error overflow earlier."""
+    record = simulate(
+        make(
+            horizon_s=1.0, model={"A": [[-1.0]], "B": [[1.0]], "gain": [[0.0]]},
+            plant={"initial_state": [1.0], "A": [[2000.0]], "B": [[1.0]]},
+        )
+    )  # fmt: skip
+    last_s = float(record[SENSOR_MEASUREMENT]["t_ns"][-1] * 1e-9)
+    assert last_s == pytest.approx(0.35)
+    assert ("sampling", pytest.approx(last_s)) in [(one.cause, one.t_s) for one in reported(record)]
+    with np.errstate(all="ignore"):
+        judged = [claim for claim in ClaimEvaluation(record).judge() if claim.source == "(I1)"]
+    for claim in judged:
+        assert claim.verdict is ClaimVerdict.VOID
+        assert claim.since_s is not None
+        assert claim.since_s <= last_s
+
+
+def test_no_violation_is_reported_in_a_run_that_meets_its_conditions(run: RunRecord) -> None:
+    assert reported(run) == []
+
+
+def test_only_assumptions_of_existing_claims_are_reported(make: Make) -> None:
+    """With another trigger, only (I1) and its consequences are claimed; with acks, nothing."""
+    network = network_of(lambda n: None if 10 <= n < 20 else 33)
+    trigger = AbsoluteSettings(policy="absolute", delta=0.02)
+    absolute = make().model_copy(update={"trigger": trigger})
+    for resolved in (make(network={"protocol": "ack"}), absolute):
+        assert reported(simulate(resolved, network)) == []
+    gap = deaf("sensor", 100, 103)(lambda: absolute)
+    assert [one.cause for one in reported(gap)] == ["sampling"]
+
+
+# --- reports are timely and cost little memory ----------------------------------------------------
+
+
+def reported_until(record: RunRecord, until_s: float, **other: float) -> list[AssumptionViolation]:
+    """Report the violations of the rows up to a time, or to another time for some processes."""
+    monitor = AssumptionMonitor(record.scenario)
+    for table in record.tables:
+        end_ns = other.get(OWNER[table], until_s) * 1e9
+        monitor.take(table, record[table][record[table]["now_ns"] < end_ns])
+    return monitor.advance()
+
+
+def test_an_input_that_is_too_old_is_reported_during_the_outage(make: Make) -> None:
+    """The report does not need the controller's own rows."""
+    (one,) = reported_until(with_outage(make(), 2.0, 3.0), 2.1, controller=2.0)
+    assert (one.t_s, one.cause) == (pytest.approx(2.01), "hold")
+
+
+def test_losses_are_reported_once_the_networks_rows_arrive(make: Make) -> None:
+    record = simulate(make(), network_of(lambda n: None if n >= 10 else 0))
+    (one,) = reported_until(record, event_s(record, 13))
+    assert (one.cause, one.t_s) == ("dropouts", pytest.approx(event_s(record, 12)))
+
+
+def test_only_rows_that_are_still_needed_are_stored(make: Make) -> None:
+    """The memory does not grow with the run; here all processes send every 0.5 s."""
+    record = simulate(make(horizon_s=10.0, trigger={"beta": 1e-9}), hostile(1))
+    monitor, waiting = AssumptionMonitor(record.scenario), []
+    for end_ns in range(500_000_000, 10_500_000_000, 500_000_000):
+        for table in record.tables:
+            t_ns = record[table]["now_ns"]
+            monitor.take(table, record[table][(t_ns >= end_ns - 500_000_000) & (t_ns < end_ns)])
+        monitor.advance()
+        waiting.append(monitor.waiting)
+    assert max(waiting) < 150
+
+
+def test_the_monitor_stops_instead_of_storing_everything(make: Make) -> None:
+    """No rows of the controller arrive for a quarter of an hour."""
+    record = simulate(make(trigger={"beta": 1e-9}, network={"initial_sync": "known_state"}))
+    monitor, rows = AssumptionMonitor(record.scenario), record[SENSOR_MEASUREMENT].copy()
+    rows["event"] = np.arange(len(rows))
+    for _ in range(200):
+        monitor.take(SENSOR_MEASUREMENT, rows)
+        monitor.advance()
+        rows["t_ns"] += 6_010_000_000
+        rows["event"] += len(rows)
+    assert monitor.stopped == "a process has sent no rows for too long"
+    assert monitor.end() == []
+
+
+def test_the_monitor_reports_nothing_after_its_end_time(make: Make) -> None:
+    record = simulate(make(network={"enforce_mansd": False, "mansd": 0}))
+    monitor = AssumptionMonitor(record.scenario)
+    monitor.end_at(0.0)
+    for table in record.tables:
+        monitor.take(table, record[table])
+    assert reported(record)
+    assert monitor.end() == []

@@ -1,0 +1,204 @@
+"""Numerical limits: defined behaviour at each, and no false violation."""
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
+from cosim.analysis.replay import replay
+from cosim.analysis.run_summary import summarise
+from cosim.analysis.summary_model import ClaimVerdict
+from cosim.record.run_record import RunRecord
+from cosim.simulation.virtual_time import simulate
+from noack.config.resolution import resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import validate
+from noack.core.errors import CallerError, ExitStatus
+
+
+def scenario(content: dict[str, Any], rate_hz: float = 100.0, **settings: Any) -> Scenario:
+    """The small scenario; a double underscore stands for the dot of a key."""
+    content["plant"]["rate_hz"] = rate_hz
+    content["controller"] = {"rate_hz": rate_hz}
+    for key, value in settings.items():
+        section = content
+        *path, last = key.split("__")
+        for part in path:
+            section = section.setdefault(part, {})
+        section[last] = value
+    return resolve(validate(content, "here"))
+
+
+def plant(A: Any, B: Any, gain: Any, factor: float = 1.02) -> dict[str, Any]:
+    """A model, and a slightly faster plant."""
+    A, B = np.array(A, dtype=float), np.array(B, dtype=float)
+    return {
+        "model": {"A": A.tolist(), "B": B.tolist(), "gain": gain, "allow_unstable": True},
+        "plant__initial_state": [1.0] * len(A),
+        "plant__draw": "given",
+        "plant__A": (factor * A).tolist(),
+        "plant__B": B.tolist(),
+    }
+
+
+def require_sound(record: RunRecord, status: ExitStatus = ExitStatus.OK) -> dict[str, Any]:
+    """Replay, summary and claims of a run: bit-exact, valid JSON, and no false violation."""
+    found = summarise(record, 0, "horizon").to_json()
+    json.dumps(found, allow_nan=False)
+    assert found["exit"]["status"] == status, found["exit"]
+    assert replay(record).bit_exact is True
+    with np.errstate(all="ignore"):
+        claims = ClaimEvaluation(record).judge()
+    assert claims
+    assert [c for c in claims if c.verdict is ClaimVerdict.VIOLATED] == []
+    return found
+
+
+@pytest.mark.parametrize(
+    "trigger",
+    [
+        {"beta": 1e-310, "alpha_per_s": 0.25},
+        {"beta": 0.5, "alpha_per_s": 1e300},
+        {"beta": 5e-324, "alpha_per_s": 5e-324},
+    ],
+)
+def test_a_threshold_that_underflows_makes_every_error_an_event(
+    content: dict[str, Any], trigger: dict[str, float]
+) -> None:
+    settings = plant([[0.0, 1.0], [0.0, 0.0]], [[0], [1]], [[-1.0, -1.7]], 1.1)
+    record = simulate(scenario(content, trigger=trigger, horizon_s=3.0, **settings))
+    require_sound(record)
+    rows = record["sensor_measurement"][1:]
+    late = rows[rows["threshold"] < 1e-300]
+    assert len(late) > 100
+    np.testing.assert_array_equal(late["event"] >= 0, late["compared"] > late["threshold"])
+    # An error of exactly 0 is not an event: it never exceeds a threshold of exactly 0.
+    assert not (late["event"] >= 0)[late["compared"] == 0].any()
+
+
+def test_a_floor_prevents_events_after_an_underflow(content: dict[str, Any]) -> None:
+    trigger = {"beta": 0.5, "alpha_per_s": 400.0, "floor": 0.05}
+    record = simulate(
+        scenario(content, trigger=trigger, horizon_s=3.0, **plant([[-1.0]], [[1.0]], [[-1.0]], 1.1))
+    )
+    rows = record["sensor_measurement"]
+    assert rows["threshold"][-1] == 0.05
+    assert (rows["event"] >= 0).sum() < 20
+    require_sound(record)
+
+
+def test_a_run_with_the_longest_horizon_is_possible(content: dict[str, Any]) -> None:
+    resolved = scenario(
+        content, rate_hz=1e-4, horizon_s=1e7, trigger={"beta": 0.1, "alpha_per_s": 1e-6},
+        **plant([[-1e-5]], [[1e-5]], [[-0.5]]),
+    )  # fmt: skip
+    found = require_sound(simulate(resolved))
+    assert found["reached_s"] == 1e7
+
+
+@pytest.mark.parametrize("size", [1e300, 1e150, 1e-160, 5e-324])
+def test_states_of_any_magnitude_are_judged_alike(content: dict[str, Any], size: float) -> None:
+    resolved = scenario(
+        content,
+        **plant([[0.0, 1.0], [0.1, 0.0]], [[0], [1]], [[-1.0, -1.7]], 1.1)
+        | {"plant__initial_state": [size, 0.0]},
+        trigger={"beta": max(0.1 * size, 5e-324), "alpha_per_s": 0.25},
+    )
+    require_sound(simulate(resolved))
+
+
+STIFF = np.diag([-1e6, -1e3, -1.0, -1e-3])
+PLANTS = {
+    "stiff": plant(STIFF, [[1.0]] * 4, [[0.0, 0.0, -0.1, 0.0]]),
+    "defective": plant(-np.eye(3) + np.eye(3, k=1), [[0], [0], [1]], [[0.0, 0.0, 0.0]]),
+    "badly_scaled": plant([[-1.0, 1e12], [0.0, -2.0]], [[0], [1e-12]], [[0.0, -1.0]]),
+    "far_from_normal": plant(
+        -np.eye(20) + 10 * np.eye(20, k=1), [[0.0]] * 19 + [[1.0]], [[0.0] * 20]
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_unusual_plants_run_and_replay(content: dict[str, Any], name: str) -> None:
+    trigger = {"beta": 1e-3, "alpha_per_s": 0.25}
+    record = simulate(scenario(content, horizon_s=0.2, trigger=trigger, **PLANTS[name]))
+    require_sound(record)
+
+
+def test_as_many_inputs_as_states_are_replayed(content: dict[str, Any]) -> None:
+    many = -np.eye(64) + 0.01 * np.random.default_rng(0).normal(size=(64, 64))
+    settings = plant(many, np.eye(64), (-0.1 * np.eye(64)).tolist())
+    record = simulate(scenario(content, horizon_s=0.2, **settings))
+    assert record["plant_step"]["u"].shape == (21, 64)
+    assert replay(record).bit_exact is True
+    summarise(record, 0, "horizon").model_dump_json()
+
+
+@pytest.mark.parametrize("x", [[-0.0, 5e-324], [-5e-324, -1e-310]])
+def test_signs_of_zero_and_subnormal_numbers_are_replayed(
+    content: dict[str, Any], x: list[float]
+) -> None:
+    record = simulate(scenario(content, plant__initial_state=x))
+    assert record["sensor_measurement"]["x"][0].tobytes() == np.array(x).tobytes()
+    require_sound(record)
+
+
+def test_a_diverged_run_reports_the_time_of_divergence(content: dict[str, Any]) -> None:
+    resolved = scenario(content, 20.0, horizon_s=20.0, **plant([[50.0]], [[1.0]], [[-0.1]]))
+    found = require_sound(simulate(resolved), ExitStatus.FAILED)
+    assert 10 < found["diverged_at_s"] < 20
+    assert found["exit"]["reason"].startswith("diverged: x is not finite at")
+
+
+def test_a_non_finite_input_is_not_applied(content: dict[str, Any]) -> None:
+    resolved = scenario(
+        content,
+        **plant([[-1.0]], [[0.0]], [[-1e300]]) | {"plant__initial_state": [1e10]},
+        trigger={"beta": 1e9, "alpha_per_s": 0.25},
+    )
+    record = simulate(resolved)
+    sent = ~np.isfinite(record["controller_step"]["u"]).all(axis=1)
+    assert sent.sum() > 50
+    # The plant rejects non-finite inputs and holds the applied one; here there is none.
+    assert np.isfinite(record["plant_step"]["u"]).all()
+    assert np.isfinite(record["plant_step"]["x"]).all()
+    found = summarise(record, 0, "horizon").to_json()
+    assert found["rejected_datagrams"]["plant"]["not_finite"] == sent.sum()
+
+
+def test_a_model_that_overflows_in_one_step_is_refused(content: dict[str, Any]) -> None:
+    with pytest.raises(CallerError, match="take one step to infinity"):
+        simulate(scenario(content, **plant([[-1.0]], [[1.0]], [[-1e308]])))
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "value"),
+    [
+        ("plant_step", "x", np.nan),
+        ("plant_step", "x", np.inf),
+        ("sensor_measurement", "x_s", np.nan),
+        ("sensor_measurement", "e_s_norm", np.inf),
+        ("controller_step", "x_c", np.nan),
+        ("controller_delivery", "x_c", -1e308),
+        ("controller_step", "model_t_ns", 2**63 - 1),
+        ("sensor_measurement", "event", 2**63 - 1),
+        ("netem_packet", "release_ns", -(2**63)),
+    ],
+)
+def test_a_damaged_value_in_a_record_is_located(
+    content: dict[str, Any], table: str, column: str, value: float
+) -> None:
+    record = simulate(
+        scenario(content, **plant([[0.0, 1.0], [0.0, 0.0]], [[0], [1]], [[-1.0, -1.7]]))
+    )
+    rows = {name: record[name].copy() for name in record.tables}
+    rows[table][column][len(rows[table]) // 2] = value
+    damaged = RunRecord(record.scenario, rows, [], record.reports)
+    found = replay(damaged).first_difference
+    assert found is not None
+    assert (found.table, found.column.rstrip("0123456789[]_")) == (table, column.rstrip("_"))
+    summarise(damaged, 0, "horizon").model_dump_json()
+    with np.errstate(all="ignore"):
+        assert ClaimEvaluation(damaged).judge()

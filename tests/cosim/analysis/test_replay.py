@@ -1,0 +1,314 @@
+"""Replay finds no difference in a good record, and every flipped bit in a damaged one.
+
+The record is a simulated one; live records are replayed in tests/integration.
+"""
+
+import json
+import math
+import struct
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from controller_node.controller import controller_of
+from cosim.analysis.replay import replay
+from cosim.analysis.replay.replay_result import difference
+from cosim.record.run_record import Rows, RunRecord
+from cosim.simulation.virtual_time import simulate
+from noack.config.resolution import resolve
+from noack.config.scenario_file import load, validate
+from noack.core.linear_systems import HeldInputPropagator
+from noack.protocol.machine_interface import GENERATION, RESTART, Start
+from noack.protocol.record_tables import (
+    CONTROLLER_DELIVERY,
+    CONTROLLER_STEP,
+    NETEM_PACKET,
+    OWNER,
+    PLANT_ACTUATION,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+    SETTINGS,
+)
+from noack.protocol.topology import LOOP_ROLES
+from tests.cosim.live.outage import Reborn, simulate_with
+
+ROOT = Path(__file__).parents[3]
+SHORT = (
+    "horizon_s=1.0", "plant.rate_hz=50", "controller.rate_hz=50",
+    "trigger.beta=0.01", "network.loss.probability=0.4",
+    'network.impairments=[{kind="delay", delay_s=0.01, jitter_s=0.01},'
+    ' {kind="duplicate", probability=0.3}]',
+)  # fmt: skip
+RECORD = simulate(resolve(load(ROOT / "scenarios" / "lane_following.toml", SHORT)))
+
+FILLED = [table for table in RECORD.tables if len(RECORD[table]) or table not in SETTINGS]
+"""No parameter changes in this run."""
+FROM_OUTSIDE = ("input", "now_ns")
+"""Columns with separate tests: they record the process's clock and input order."""
+
+
+def changed(rows: Mapping[str, Rows], reports: Any = RECORD.reports) -> RunRecord:
+    every = {table: RECORD[table] for table in RECORD.tables} | dict(rows)
+    return RunRecord(RECORD.scenario, every, RECORD.notices, reports, "simulated")
+
+
+def flipped(table: str, row: int, column: str, byte: int, bit: int) -> RunRecord:
+    rows = RECORD[table].copy()
+    raw = bytearray(rows[column][row].tobytes())
+    raw[byte] ^= 1 << bit
+    rows[column][row] = np.frombuffer(raw, rows.dtype[column].base).reshape(
+        rows.dtype[column].shape
+    )
+    return changed({table: rows})
+
+
+def columns() -> Iterator[tuple[str, str]]:
+    for table in FILLED:
+        for column in RECORD[table].dtype.names or ():
+            if column not in FROM_OUTSIDE:
+                yield table, column
+
+
+def test_a_run_is_replayed_bit_for_bit() -> None:
+    found = replay(RECORD)
+    assert found.bit_exact
+    assert found.gaps == []
+    assert found.first_difference is None
+    assert found.inputs == sum(len(RECORD[table]) for table in RECORD.tables)
+    assert {leg.leg: leg.compared for leg in found.messages} == {
+        "plant → sensor": len(RECORD[SENSOR_MEASUREMENT]),
+        "sensor → netem": len(RECORD[NETEM_PACKET]),
+        "netem → controller": len(RECORD[CONTROLLER_DELIVERY]),
+        "controller → plant": len(RECORD[PLANT_ACTUATION]),
+    }
+    assert min(leg.compared for leg in found.messages) > 0
+
+
+@pytest.mark.parametrize(("table", "column"), list(columns()))
+@settings(max_examples=4)  # for each of about forty columns
+@given(st.data())
+def test_a_flipped_bit_is_found_and_named(table: str, column: str, data: st.DataObject) -> None:
+    rows = RECORD[table]
+    row = data.draw(st.integers(0, len(rows) - 1))
+    byte = data.draw(st.integers(0, rows.dtype[column].itemsize - 1))
+    found = replay(flipped(table, row, column, byte, data.draw(st.integers(0, 7))))
+    first = found.first_difference
+    assert found.bit_exact is False
+    assert first is not None
+    assert first.table == table
+    name = f"{column}_{byte // 8 + 1}" if rows.dtype[column].shape else column
+    if column == "sequence":
+        # With another message's number, the rest of the row differs; with the next one's, the next
+        # row may be the repeated one.
+        assert first.row - row in (0, 1)
+        assert first.column in ("sequence", "t_ns")
+    else:
+        assert (first.row, first.column) == (row, name)
+    assert first.recorded != first.replayed or first.recorded_hex != first.replayed_hex
+
+
+@pytest.mark.parametrize("table", FILLED)
+@settings(max_examples=6)
+@given(st.data())
+def test_a_wrong_input_number_is_found(table: str, data: st.DataObject) -> None:
+    row = data.draw(st.integers(0, len(RECORD[table]) - 1))
+    byte, bit = data.draw(st.integers(0, 7)), data.draw(st.integers(0, 7))
+    found = replay(flipped(table, row, "input", byte, bit))
+    first = found.first_difference
+    assert first is not None
+    # Either of two rows with the same number may be the wrong one.
+    assert OWNER[first.table] == OWNER[table]
+    assert first.column == "input"
+    assert [gap.partition(":")[0] for gap in found.gaps] == [OWNER[table]]
+
+
+@pytest.mark.parametrize("table", FILLED)
+def test_a_time_that_decreases_is_found(table: str) -> None:
+    found = replay(flipped(table, len(RECORD[table]) - 1, "now_ns", 7, 7))
+    assert found.first_difference is not None
+    assert found.first_difference.column in ("now_ns", "t_ns")  # netem's t_ns is its now_ns
+
+
+def test_a_timer_before_its_deadline_is_found() -> None:
+    rows = RECORD[PLANT_STEP].copy()
+    rows["now_ns"][7] -= 1
+    first = replay(changed({PLANT_STEP: rows})).first_difference
+    assert first is not None
+    assert (first.table, first.row, first.column) == (PLANT_STEP, 7, "now_ns")
+
+
+@pytest.mark.parametrize("table", FILLED)
+def test_missing_rows_are_reported(table: str) -> None:
+    rows = RECORD[table]
+    cut = len(rows) // 2
+    found = replay(changed({table: np.delete(rows, [cut])}))
+    number = int(rows["input"][cut])
+    process = OWNER[table]
+    assert found.bit_exact  # up to the gap
+    assert found.gaps == [f"{process}: rows are missing from input {number} on"]
+    assert found.verdict()["complete"] is False
+    accounts = {account.process: account for account in found.processes}
+    assert accounts[process].missing_from == accounts[process].compared == number
+    assert all(account.whole for name, account in accounts.items() if name != process)
+
+
+@pytest.mark.parametrize("role", LOOP_ROLES)
+def test_rows_missing_at_the_end_are_reported(role: str) -> None:
+    owned = {table: RECORD[table] for table in RECORD.tables if OWNER[table] == role}
+    last = max(int(rows["input"][-1]) for rows in owned.values() if len(rows))
+    found = replay(changed({table: rows[rows["input"] < last] for table, rows in owned.items()}))
+    assert found.bit_exact
+    assert found.gaps == [f"{role}: rows are missing from input {last} on"]
+
+
+def test_a_difference_before_a_gap_is_still_found() -> None:
+    rows = RECORD[PLANT_STEP].copy()
+    rows["x"][3, 1] = math.nextafter(rows["x"][3, 1], math.inf)
+    found = replay(changed({PLANT_STEP: np.delete(rows, [30])}))
+    assert found.first_difference is not None
+    assert found.first_difference.row == 3
+    assert len(found.gaps) == 1
+
+
+@pytest.mark.parametrize("process", LOOP_ROLES)
+def test_a_process_without_a_report_is_named(process: str) -> None:
+    reports = {role: report for role, report in RECORD.reports.items() if role != process}
+    found = replay(changed({}, reports=reports))
+    assert found.bit_exact
+    assert found.gaps == [
+        f"{process}: left no report; whether its last rows are missing is not known"
+    ]
+
+
+def test_a_message_that_no_process_sent_is_found() -> None:
+    """The plant applies a forged actuation, so only the sender's rows reveal it."""
+    rows = RECORD[PLANT_ACTUATION].copy()
+    last = len(rows) - 1
+    rows["sequence"][last] += 1
+    steps = RECORD[PLANT_STEP].copy()
+    steps["actuation"][steps["actuation"] == last] += 1
+    first = replay(changed({PLANT_ACTUATION: rows, PLANT_STEP: steps})).first_difference
+    assert first is not None
+    assert (first.table, first.row, first.column) == (PLANT_ACTUATION, last, "sequence")
+    assert first.what == "was never sent"
+
+
+def test_a_delivery_of_a_dropped_update_is_found() -> None:
+    """The record shows the arrival of an update that was sent and then dropped."""
+    events = RECORD[SENSOR_MEASUREMENT][RECORD[SENSOR_MEASUREMENT]["event"] >= 0]
+    deliveries = RECORD[CONTROLLER_DELIVERY].copy()
+    delivered = set(deliveries["sequence"].tolist())
+    lost = next(i for i in range(len(events)) if i not in delivered and i + 1 in delivered)
+    row = int(np.flatnonzero(deliveries["sequence"] == lost + 1)[0])
+    for column in ("t_ns", "x"):
+        deliveries[column][row] = events[column][lost]
+    deliveries["sequence"][row] = lost
+    found = replay(changed({CONTROLLER_DELIVERY: deliveries}))
+    differences = {leg.leg: leg.difference for leg in found.messages}
+    delivery = differences["netem → controller"]
+    assert delivery is not None
+    assert delivery.what == "netem did not forward it"
+    assert (delivery.table, delivery.row) == (CONTROLLER_DELIVERY, row)
+    assert differences["sensor → netem"] is None
+
+
+def test_a_changed_machine_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The plant's arithmetic in another order: only the last bits differ."""
+
+    def reordered(self: HeldInputPropagator, x: Any, u: Any, dt_ns: int) -> Any:
+        Ad, Bd = self.step(dt_ns)
+        return Bd @ u + (Ad * (1 + 1e-16)) @ (x * (1 + 2.3e-16))
+
+    monkeypatch.setattr(HeldInputPropagator, "__call__", reordered)
+    found = replay(RECORD)
+    accounts = {account.process: account for account in found.processes}
+    assert accounts["plant"].difference is not None
+    assert accounts["plant"].difference.table == PLANT_STEP
+    assert accounts["sensor"].difference is None
+    assert accounts["controller"].difference is None
+
+
+def test_values_that_a_machine_refuses_are_a_difference() -> None:
+    rows = RECORD[SENSOR_MEASUREMENT].copy()
+    rows["t_ns"][20] = -(2**62)  # e^(−αt) overflows
+    found = replay(changed({SENSOR_MEASUREMENT: rows}))
+    sensor = next(account for account in found.processes if account.process == "sensor")
+    assert sensor.difference is not None
+    assert "cannot take this input" in sensor.difference.what
+    assert sensor.compared == 20
+    assert "sensor: replayed up to input 20" in found.gaps
+
+
+def test_an_empty_record_is_not_reported_as_exact() -> None:
+    found = replay(changed({table: RECORD[table][:0] for table in RECORD.tables}, reports={}))
+    assert found.bit_exact is None
+    assert found.inputs == 0
+
+
+def test_a_run_that_diverged_is_replayed() -> None:
+    gain = "model.gain=[[900.0,900.0,900.0,900.0],[0.0,0.0,0.0,0.0]]"
+    settings = [*SHORT, gain, "model.allow_unstable=true", "mode=zoh"]
+    path = ROOT / "scenarios" / "lane_following.toml"
+    diverged = simulate(resolve(load(path, [*settings, "horizon_s=60.0"])))
+    assert not np.isfinite(diverged[PLANT_STEP]["x"]).all()
+    found = replay(diverged)
+    assert found.bit_exact
+    assert found.gaps == []
+
+
+def test_every_bit_of_a_value_is_shown() -> None:
+    for value in (0.1, math.nextafter(0.1, 1), -0.0, 5e-324):
+        shown = difference(CONTROLLER_STEP, 0, 0, "", "u_1", value, 0.0)
+        assert shown.recorded_hex is not None
+        assert struct.pack("d", float.fromhex(shown.recorded_hex)) == struct.pack("d", value)
+        assert shown.recorded_hex in str(shown)
+    nans = [struct.unpack("<d", struct.pack("<Q", 0x7FF8 << 48 | i))[0] for i in (0, 1)]
+    shown = difference(CONTROLLER_STEP, 0, 0, "", "u_1", nans[0], nans[1])
+    assert shown.recorded_hex != shown.replayed_hex
+    json.dumps(replay(flipped(PLANT_STEP, 1, "x", 7, 6)).document(), allow_nan=False)
+
+
+def test_the_document_is_json() -> None:
+    rows = RECORD[PLANT_STEP].copy()
+    rows["x"][3, 1] = math.nan
+    rows["u"][5] = math.inf
+    found = replay(changed({PLANT_STEP: rows}))
+    document = json.loads(json.dumps(found.document(), allow_nan=False, ensure_ascii=False))
+    assert document["bit_exact"] is False
+    first = document["first_difference"]
+    assert (first["table"], first["row"], first["column"]) == (PLANT_STEP, 3, "x_2")
+    assert first["recorded"] is None
+    assert first["recorded_hex"].startswith("nan")
+    assert float.fromhex(first["replayed_hex"]) == first["replayed"]
+    assert found.verdict().items() <= document.items()
+
+
+@pytest.mark.parametrize("ticks", [True, False])
+def test_an_update_before_the_first_tick_of_a_restarted_controller_is_replayed(
+    content: dict[str, Any], ticks: bool
+) -> None:
+    """Only the rows of the second generation are recorded."""
+    content |= {"trigger": {"policy": "periodic", "period_s": 0.002}}
+    resolved = resolve(
+        validate(content | {"network": {"mansd": 0, "loss": {"model": "lossless"}}}, "")
+    )
+    at_ns = 500_000_000 - 300_000  # between ticks, just before an update
+    successor = controller_of(resolved, Start(1, at_ns))
+    record = simulate_with(resolved, "controller", lambda one: Reborn(one, successor, at_ns))
+    rows = {table: record[table] for table in record.tables}
+    taken, again = rows[CONTROLLER_DELIVERY], rows[CONTROLLER_STEP]["input"] >= GENERATION
+    first = taken[taken["input"] == GENERATION]
+    assert len(first) == 1
+    assert first["now_ns"][0] < rows[CONTROLLER_STEP]["t_ns"][again][0]
+    if not ticks:  # the process died before it had one
+        rows[CONTROLLER_STEP] = rows[CONTROLLER_STEP][~again]
+        rows[CONTROLLER_DELIVERY] = taken[taken["input"] <= GENERATION]
+    notice = {"process": "controller", "level": RESTART, "t_ns": 0, "text": "restarted"}
+    found = replay(RunRecord(resolved, rows, [notice], {}, "live"))
+    assert found.bit_exact, found.verdict()
+    assert found.verdict()["inputs"] == sum(map(len, rows.values()))

@@ -1,0 +1,161 @@
+"""The bounds of ‖e_c‖ along a run, against explicit sums and against e_c itself."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+
+from noack.core.linear_systems import Matrix, Vector
+from noack.theory.error_bounds import ErrorBounds, ErrorMonitor
+from noack.trigger.decaying import DecayingTrigger
+from tests.noack.theory.exact_loops import observe
+from tests.noack.theory.loops import SEARCH, System, seeds, systems
+
+NS = 1e-9
+
+
+class Moment(NamedTuple):
+    """A measurement: the monitor's arguments, and the true e_c."""
+
+    t_ns: int
+    e_s: Vector
+    event: int
+    received: int
+    e_c: Vector
+
+
+class History(NamedTuple):
+    """A run of the two models with an arbitrary plant trajectory."""
+
+    H: Matrix
+    weight: Matrix
+    moments: list[Moment]
+
+
+@st.composite
+def histories(draw: st.DrawFn) -> History:
+    """Random motion of x, random events, updates that arrive late, out of order or never.
+
+    The models follow their own update laws here; (I1) is not used.
+    """
+    n, rng = draw(st.integers(1, 4)), np.random.default_rng(draw(seeds))
+    H = rng.normal(size=(n, n)) if draw(st.booleans()) else np.zeros((n, n))
+    H -= rng.uniform(0, 1) * np.eye(n) * H.any()
+    weight = np.eye(n) if draw(st.booleans()) else rng.normal(size=(n, n)) + 2 * np.eye(n)
+    x = rng.normal(size=n)
+    x_s, x_c = x.copy(), x.copy()
+    t_ns, received, moments = 0, -1, []
+    in_flight: list[tuple[int, int, Vector]] = []
+    sent = 0
+    for _ in range(draw(st.integers(1, 25))):
+        step_ns = int(rng.integers(0, 300_000_000))
+        t_ns += step_ns
+        moved = expm(H * step_ns * NS)
+        x, x_s, x_c = x + rng.normal(size=n), moved @ x_s, moved @ x_c
+        e_s, event = x_s - x, -1
+        if rng.uniform() < 0.5:
+            event, x_s = sent, x.copy()
+            sent += 1
+            if rng.uniform() < 0.6:  # the others are lost
+                in_flight.append((event, t_ns, x.copy()))
+        for update in [u for u in in_flight if rng.uniform() < 0.5]:
+            in_flight.remove(update)
+            sequence, then_ns, state = update
+            if sequence > received:
+                received, x_c = sequence, expm(H * (t_ns - then_ns) * NS) @ state
+        moments.append(Moment(t_ns, e_s, event, received, x_c - x))
+    return History(H, weight, moments)
+
+
+def follow(history: History, trigger: DecayingTrigger) -> list[ErrorBounds]:
+    monitor = ErrorMonitor(history.H, trigger)
+    return [monitor.sample(*moment[:-1]) for moment in history.moments]
+
+
+def explicit(history: History, trigger: DecayingTrigger, upto: int) -> ErrorBounds:
+    """Both sums, term by term, from the first event on."""
+
+    def threshold(t_ns: int) -> float:
+        return max(trigger.beta * math.exp(-trigger.alpha_per_s * t_ns * NS), trigger.floor)
+
+    H, W, now = history.H, history.weight, history.moments[upto]
+    identity = 0.0 if now.event >= 0 else float(np.linalg.norm(W @ now.e_s))
+    printed = threshold(now.t_ns)
+    for moment in history.moments[: upto + 1]:
+        if moment.event > now.received:
+            moved = expm(H * (now.t_ns - moment.t_ns) * NS)
+            identity += float(np.linalg.norm(W @ moved @ moment.e_s))
+            growth = np.linalg.norm(W @ moved @ np.linalg.inv(W), 2)
+            printed += threshold(moment.t_ns) * float(growth)
+    return ErrorBounds(identity, printed)
+
+
+@settings(max_examples=15)
+@given(histories(), st.floats(0.01, 2.0), st.sampled_from([0.0, 0.3]))
+def test_both_bounds_are_the_explicit_sums(history: History, alpha: float, floor: float) -> None:
+    trigger = DecayingTrigger(0.5, alpha, floor, history.weight)
+    for upto, found in enumerate(follow(history, trigger)):
+        expected = explicit(history, trigger, upto)
+        assert found == pytest.approx(expected, rel=1e-9, abs=1e-12)
+
+
+@settings(max_examples=15)
+@given(histories())
+def test_the_identity_bounds_the_error_for_every_trigger_plant_and_network(
+    history: History,
+) -> None:
+    """No assumption on trigger, plant or network."""
+    trigger = DecayingTrigger(1e-3, 1.0, 0.0, history.weight)
+    largest = 0.0
+    for moment, found in zip(history.moments, follow(history, trigger), strict=True):
+        error = float(np.linalg.norm(history.weight @ moment.e_c))
+        largest = max(largest, error)
+        assert error <= found.identity + 1e-12 * max(largest, 1.0)
+
+
+def in_continuous_time(system: System, seed: int, forgotten: int) -> float:
+    """The largest share of eq:LossEv3 that ‖e_c‖ uses; the first missing events are left out."""
+    H, alpha, beta, W = system.H, system.alpha, system.beta, system.weight
+    trigger = DecayingTrigger(beta, alpha, 0.0, W)
+    largest = 0.0
+    for run, _ in observe(system, 6.0, seed, samples=2):
+        monitor, received = ErrorMonitor(H, trigger), -1
+        moments = [
+            *((state.t_s, k, state) for k, state in enumerate(run.before)),
+            *((float(t_s), -1, None) for t_s in np.linspace(0, run.reached_s, 40)),
+        ]
+        left_out = 0
+        for t_s, event, state in sorted(moments, key=lambda h: (h[0], h[1])):
+            t_ns = round(t_s * 1e9)
+            if state is None:
+                now = run.at([t_s])
+                e_s, e_c = now.e_s[0], now.e_c[0]
+            else:
+                e_s, e_c = state.e_s, run.after[event].e_c
+                if run.delivered[event]:
+                    received = event
+                elif left_out < forgotten:
+                    left_out += 1
+                    continue
+            # The sample at an event shows the values after the reset.
+            bounds = monitor.sample(t_ns, e_s, event, received)
+            if system.known_start or received >= 0:
+                share = float(np.linalg.norm(W @ e_c)) / bounds.printed
+                assert bounds.identity <= bounds.printed * (1 + 1e-6)
+                largest = max(largest, share)
+    return largest
+
+
+# Times are rounded to whole nanoseconds: 1e-9 s at rates of up to some 10 /s.
+TO_THE_NANOSECOND = 1 + 1e-6
+
+
+@settings(SEARCH, max_examples=6)
+@given(systems(), seeds)
+def test_the_papers_formula_holds_in_its_loop(system: System, seed: int) -> None:
+    """eq:LossEv3, for a continuous trigger; there, the bound of the identity is the smaller one."""
+    assert in_continuous_time(system, seed, 0) <= TO_THE_NANOSECOND
