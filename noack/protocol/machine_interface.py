@@ -17,8 +17,7 @@ class Start(NamedTuple):
 
     generation: int = 0
     """How often its process was restarted in this run; a restarted process knows no state."""
-    from_ns: int = 0
-    """No timer is due before."""
+    from_ns: int = 0  # no timer is due before
 
     @property
     def first_number(self) -> int:

@@ -76,30 +76,23 @@ def entry_names(vector: str, entries: int) -> tuple[str, ...]:
 class RecordShape:
     """The sizes of a run's vectors; a column of size 0 is not in the record."""
 
-    n: int
-    """States."""
-    m: int
-    """Inputs."""
-    acknowledged: bool = False
-    """Whether updates are acknowledged."""
-    predictive: bool = False
-    """Whether actuations carry the controller's model state."""
-    internal: int = 0
-    """Entries of the plant's own state z."""
+    n: int  # states
+    m: int  # inputs
+    acknowledged: bool = False  # whether updates are acknowledged
+    predictive: bool = False  # whether actuations carry the controller's model state
+    internal: int = 0  # entries of the plant's own state z
     disturbed_input: bool = False
     disturbed_state: bool = False
     outputs: int = 0
     """Measured outputs from which an observer estimates the state; 0 without an observer."""
-    inputs_reported: int = 0
-    """Numbers of a measurement that are inputs."""
+    inputs_reported: int = 0  # numbers of a measurement that are inputs
 
 
 class Column(NamedTuple):
     """A column of a table."""
 
     name: str
-    unit: str
-    """Empty: a number without unit."""
+    unit: str  # empty: a number without unit
     meaning: str
     entries: Callable[[RecordShape], int] | None = None
     """Length of a vector; None for a single number."""
@@ -130,12 +123,9 @@ class Table(NamedTuple):
     """A table of the record."""
 
     name: str
-    owner: str
-    """The process that fills it."""
-    row: str
-    """What one row stands for."""
-    columns: tuple[Column, ...]
-    """Besides ``COMMON``."""
+    owner: str  # the process that fills it
+    row: str  # what one row stands for
+    columns: tuple[Column, ...]  # besides ``COMMON``
     exists: Callable[[RecordShape], bool] = lambda shape: True
 
 

@@ -62,13 +62,9 @@ class ReceivedRows:
 
 
 class TelemetryBuffer:
-    """Collects rows by table.
+    """Collects rows by table and passes them to ``publish``, which does not block.
 
-    Args:
-        tables: row type of each table that the process fills.
-        publish: publishes a batch without blocking.
-        generation: the process's generation.
-        persisted: returns ranges of rows that are newly confirmed to be on disk, by table.
+    ``persisted`` returns ranges of rows that are newly confirmed to be on disk, by table.
     """
 
     def __init__(
