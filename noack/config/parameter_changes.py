@@ -25,8 +25,7 @@ from noack.protocol.record_tables import CHANGE_BYTES
 
 T = TypeVar("T")
 
-LATE = "violation"
-"""Level of the notice of a process that applies a change late."""
+LATE = "violation"  # level of the notice of a process that applies a change late
 
 
 class ParameterChange(NamedTuple):
@@ -92,8 +91,7 @@ def scheduled(scenario: Scenario) -> list[ParameterChange]:
     ]
 
 
-CHANGED = "change"
-"""Level of the notice of a change."""
+CHANGED = "change"  # level of the notice of a change
 
 
 def change_notice(change: ParameterChange, more: str = "") -> Notice:

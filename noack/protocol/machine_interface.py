@@ -30,8 +30,7 @@ class Start(NamedTuple):
         return self.generation > 0
 
 
-BEGINNING = Start()
-"""The start of the run."""
+BEGINNING = Start()  # the start of the run
 
 
 class Record(NamedTuple):
@@ -41,10 +40,8 @@ class Record(NamedTuple):
     row: tuple[Any, ...]
 
 
-RESTART = "restart"
-"""Level of the notice of a restarted process."""
-FAILED = "failed"
-"""Level of the notice of a plant or controller that cannot continue."""
+RESTART = "restart"  # level of the notice of a restarted process
+FAILED = "failed"  # level of the notice of a plant or controller that cannot continue
 
 
 class Notice(NamedTuple):

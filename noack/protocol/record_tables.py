@@ -29,14 +29,12 @@ CONTROLLER_SETTING = "controller_setting"
 
 SETTINGS = (SENSOR_SETTING, NETEM_SETTING, CONTROLLER_SETTING)
 """Tables of the changes of settings that each process received during the run."""
-CHANGE_BYTES = 1024
-"""Width of a change in the record: JSON, padded with zero bytes."""
+CHANGE_BYTES = 1024  # width of a change in the record: JSON, padded with zero bytes
 
 PACKET_HEAD_BYTES = 32
 """Leading bytes of each datagram that the network emulator records without interpreting them."""
 
-NO_SEQUENCE = -1
-"""Stands for "none" in a column of sequence numbers."""
+NO_SEQUENCE = -1  # stands for "none" in a column of sequence numbers
 
 
 class Fate(IntEnum):

@@ -18,8 +18,7 @@ T = TypeVar("T")
 
 _HOUSEKEEPING_S = 0.05
 _OVERLOAD_PAUSE_S = 0.002
-_QUIET_S = 0.0005
-"""Housekeeping takes 0.1 ms; it waits when the next deadline is nearer than this."""
+_QUIET_S = 0.0005  # housekeeping takes 0.1 ms; it waits when the next deadline is nearer than this
 _yield_core: Callable[[], None] = getattr(os, "sched_yield", lambda: None)
 """After a rejected datagram: lets other threads of the same real-time priority run first."""
 
