@@ -10,7 +10,6 @@ from scipy.stats import kstest
 from noack.config.resolution import resolve, tables_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
-from noack.core.random_streams import normals
 from noack.disturbances.gaussian import GaussianDisturbance
 from noack.disturbances.step import StepDisturbance
 from noack.disturbances.uniform import UniformDisturbance
@@ -168,12 +167,6 @@ def test_noise_has_its_distribution() -> None:
 def test_measurements_without_noise_equal_the_state(content: dict[str, Any]) -> None:
     content["plant"]["measurement"] = {"C": [[1.0, 0.0], [0.0, 1.0]], "noise_std": [0.0, 0.0]}
     assert measurement_model_of(resolved(content)) is None
-
-
-def test_normal_numbers_are_finite_and_any_row_is_computed_directly() -> None:
-    table = normals(3, "test", rows=range(1000), width=3)
-    assert np.isfinite(table).all()
-    assert normals(3, "test", rows=range(500, 503), width=3).tolist() == table[500:503].tolist()
 
 
 def test_variances_are_those_of_the_distributions() -> None:
