@@ -14,8 +14,7 @@ from typing import BinaryIO
 
 from noack.core.errors import MachineError, why
 
-SPOOL = "spool"
-"""The spool's folder in the run directory."""
+SPOOL = "spool"  # the spool's folder in the run directory
 _CHUNK = struct.Struct("<QQ")
 
 
