@@ -100,11 +100,7 @@ def live_run(record: RunRecord) -> LiveRun:
 
 
 def _require_times(record: RunRecord) -> None:
-    """Require possible times: with others, as in a damaged record, a simulation would not end.
-
-    Raises:
-        IncomparableError: a time is impossible.
-    """
+    """Require possible times: with others, as in a damaged record, a simulation would not end."""
     horizon_ns = record.scenario.timing.horizon_ns
     for table, column in (
         (SENSOR_MEASUREMENT, "t_ns"),

@@ -136,8 +136,8 @@ class _Measurements:
             times.append(np.array([self.newest_ns, end_ns]))
         since_ns = np.concatenate([_NO_TIMES, *(t_ns[:-1] for t_ns in times)])
         gaps_ns = np.concatenate([_NO_TIMES, *map(np.diff, times)])
-        kept = gaps_ns > 0
-        return SampledSeries(since_ns[kept] * 1e-9, gaps_ns[kept] * 1e-9)
+        longer = gaps_ns > 0
+        return SampledSeries(since_ns[longer] * 1e-9, gaps_ns[longer] * 1e-9)
 
     def restarts(self) -> SampledSeries:
         t_ns, of = _columns(self._restarts, 2)
@@ -184,8 +184,8 @@ class _Ticks:
         tick = np.append(ticks, _NEVER)[first[:known]]
         # If the controller died before its next tick, the restarted one does not have the update.
         of = taken[:known] // GENERATION
-        kept = (tick == _NEVER) | (tick // GENERATION == of)
-        return _Receipts(sequence[:known][kept], model_ns[:known][kept], tick[kept])
+        same = (tick == _NEVER) | (tick // GENERATION == of)
+        return _Receipts(sequence[:known][same], model_ns[:known][same], tick[same])
 
 
 class _Inputs:
@@ -222,8 +222,8 @@ class _Inputs:
 
     @property
     def waiting(self) -> int:
-        held = (self._steps, self._latches, self._receipts)
-        return sum(len(batch[0]) for batches in held for batch in batches)
+        stored = (self._steps, self._latches, self._receipts)
+        return sum(len(batch[0]) for batches in stored for batch in batches)
 
     def add_receipts(self, receipts: _Receipts, ticked: int) -> None:
         """Add updates that the controller received, and the number of its newest tick."""
@@ -262,9 +262,9 @@ class _Inputs:
         replaced = controlled & self._replaces & too_old(t_ns, model_ns, self._timeout_ns)
         # Until the first input with a state, the certificates assume that the input is 0.
         safe = there & ~controlled & (began | ~(sizes == 0))
-        step_s, kept = t_ns * 1e-9, controlled & ~replaced
+        step_s, held = t_ns * 1e-9, controlled & ~replaced
         return (
-            SampledSeries(step_s[kept], age_ns[kept] * 1e-9),
+            SampledSeries(step_s[held], age_ns[held] * 1e-9),
             SampledSeries(step_s[replaced], (t_ns - model_ns)[replaced] * 1e-9),
             SampledSeries(step_s[safe], sizes[safe]),
         )

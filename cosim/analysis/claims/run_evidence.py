@@ -55,9 +55,7 @@ class RunPart(NamedTuple):
 class RunEvidence:
     """The data of a run for checking claims; each property is computed once, when first used.
 
-    Args:
-        record: the record of the run, or of a part of it in the form of a separate run.
-        part: the part; None: the whole run.
+    The record is that of the whole run, or of the ``part`` in the form of a separate run.
     """
 
     record: RunRecord
@@ -105,10 +103,10 @@ class RunEvidence:
             return found
         # The certificate's start error covers the inputs before the part's first one.
         safe, restarts = found.safe_input, found.restarts
-        kept, again = safe.t_s >= found.start_s, restarts.t_s > 0
+        later, again = safe.t_s >= found.start_s, restarts.t_s > 0
         return found._replace(
             start_s=0.0 if np.isfinite(found.start_s) else found.start_s,
-            safe_input=SampledSeries(safe.t_s[kept], safe.value[kept]),
+            safe_input=SampledSeries(safe.t_s[later], safe.value[later]),
             restarts=SampledSeries(restarts.t_s[again], restarts.value[again]),
         )
 
@@ -210,10 +208,7 @@ def scheduled_certificates(
 ) -> list[ScenarioCertificate]:
     """Return the certificates of a resolved scenario under its schedule, if it can have any.
 
-    Args:
-        scenario: the scenario.
-        start_error: for a part that starts with an input of the part before; see
-            :class:`noack.theory.scenario_certificates.CertificateScope`.
+    A part that starts with an input of the part before has a ``start_error``.
     """
     if not scenario.coverage.is_certifiable:
         return []

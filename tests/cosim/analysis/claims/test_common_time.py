@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
-from cosim.analysis.claims.claims_by_part import RunClaims
-from cosim.analysis.claims.common_time import common_end_ns, up_to_common_end
+from cosim.analysis.claims.claims_by_part import RunClaims, common_end_ns, up_to_common_end
 from cosim.analysis.summary_model import ClaimVerdict
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
@@ -33,7 +32,7 @@ def stopped(record: RunRecord, reached_ns: dict[str, int]) -> RunRecord:
     return RunRecord(record.scenario, rows, record.notices, reports, "live")
 
 
-@pytest.mark.parametrize("order", list(permutations(LOOP_ROLES)), ids="-".join)
+@pytest.mark.parametrize("order", [*permutations(LOOP_ROLES)][::5], ids="-".join)
 def test_processes_that_stop_at_different_times_void_no_claim(
     run: RunRecord, order: tuple[str, ...]
 ) -> None:

@@ -75,14 +75,6 @@ def test_the_observed_value_is_the_smallest_bound_that_would_hold(run: RunRecord
     assert claims[CERTIFIED[3]].observed == pytest.approx(np.diff(event_s).min(), rel=1e-6)
 
 
-def test_the_claims_of_the_identity_hold_in_every_run(make: Make) -> None:
-    """With any losses, delays and reordering, even if all other claims are void."""
-    network = network_of(lambda n: None if n % 7 else 13 * (n % 5))
-    for mode in ("model", "zoh"):
-        record = simulate(make(mode=mode), network)
-        assert [claim.verdict for claim in from_I1(record)] == [HELD, HELD]
-
-
 def test_a_claim_without_data_is_held_without_an_observed_value(make: Make) -> None:
     """One event, at t = 0, gives no inter-event time."""
     record = simulate(make(trigger={"beta": 100.0}))
@@ -186,6 +178,7 @@ def test_claims_of_a_diverging_run_without_a_certificate_are_void(make: Make) ->
     with np.errstate(all="ignore"):
         claims = ClaimEvaluation(record)
         judged, envelopes = claims.judge(), claims.envelopes()
+    assert all(claim.verdict is not HELD for claim in judged), judged
     assert {claim.verdict for claim in judged if claim.source == "certificate"} == {VOID}
     assert [envelope.label for envelope in envelopes] == ["bound from (I1)"]
 
@@ -390,14 +383,3 @@ def test_a_claim_is_not_held_where_the_record_has_no_rows(run: RunRecord) -> Non
         assert claim.verdict is not HELD
         assert claim.since_s is not None
         assert claim.since_s <= 2.02
-
-
-def test_a_claim_is_not_held_if_the_state_overflows(make: Make) -> None:
-    unstable = make(
-        model={"A": [[400.0, 0.0], [0.0, 0.0]], "gain": [[0.0, 0.0]], "allow_unstable": True},
-        plant={"A": [[400.0, 0.0], [0.0, 0.0]]}, horizon_s=2.0,
-    )  # fmt: skip
-    with np.errstate(all="ignore"):
-        claims = ClaimEvaluation(simulate(unstable)).judge()
-    assert claims
-    assert all(claim.verdict is not HELD for claim in claims), claims
