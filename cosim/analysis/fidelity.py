@@ -105,8 +105,7 @@ class Fidelity:
     max_event_difference_s: float | None
     """Largest time difference between ideal loop and live run, over the events that both have."""
     first_different_event: int | None
-    """First event that is more than ten measurements apart, or that only one of the two has. From
-    there on the same packet fates apply to different events."""
+    """As in :class:`FidelityStage`. From there on the packet fates apply to different events."""
     t_s: Vector
     """(samples,) times of the measurements."""
     stage_norms: Matrix

@@ -77,19 +77,17 @@ class RunClaims:
         return None if end_ns is None else end_ns / NS_PER_S
 
     @cached_property
-    def _changes(self) -> list[RecordedChange]:
-        return [made for made in changes_of(self._judged) if made.touches_claims]
+    def _setpoint(self) -> tuple[Vector, Vector] | None:
+        return setpoint_of(self._judged.scenario)
 
     @cached_property
     def parts(self) -> list[ClaimEvaluation | Claim]:
         """The claims of each part; for a part without claims, the reason as a void claim."""
-        record, changes = self._judged, self._changes
-        at_0 = setpoint_of(record.scenario)
-        if not changes and at_0 is None:
-            return [ClaimEvaluation(record)]
+        record = self._judged
+        changes = [made for made in changes_of(record) if made.touches_claims]
         first_ns = changes[0].first_ns if changes else NEVER_NS
         part = RunPart(record, 0.0, _seconds(first_ns), None, _void(record, record.scenario))
-        own = record if at_0 is None else _part_of(record, record.scenario, 0, None)
+        own = record if self._setpoint is None else _part_of(record, record.scenario, 0, None)
         found: list[ClaimEvaluation | Claim] = [ClaimEvaluation(own, part)]
         for made, after in zip(changes, [*changes[1:], None], strict=True):
             until_ns = NEVER_NS if after is None else after.first_ns
@@ -106,7 +104,7 @@ class RunClaims:
         found = []
         for one in self.parts:
             if not isinstance(one, Claim):
-                from_s = 0.0 if one.part is None else one.part.from_s
+                from_s = one.part.from_s
                 found += [each._replace(t_s=each.t_s + from_s) for each in one.violations()]
         return sorted(found, key=lambda one: one.t_s)
 
@@ -117,7 +115,7 @@ class RunClaims:
             if isinstance(one, Claim):
                 found.append(one)
                 continue
-            from_s, until_s = (0.0, math.inf) if one.part is None else one.part[1:3]
+            from_s, until_s = one.part.from_s, one.part.until_s
             found += [
                 claim.model_copy(
                     update={
@@ -134,14 +132,9 @@ class RunClaims:
         """The curves of all bounds, each over its own part of the run."""
         found: list[Envelope] = []
         for one in self.parts:
-            if isinstance(one, Claim):
-                continue
-            if one.part is None:
-                return one.envelopes()
-            if setpoint_of(self._judged.scenario) is not None or one.part.from_s > 0:
-                # These bounds hold for deviations from another set-point, or start later.
-                continue
-            found += [_until(envelope, one.part.until_s) for envelope in one.envelopes()]
+            # Other bounds hold for deviations from another set-point, or start later.
+            if not isinstance(one, Claim) and one.part.from_s == 0 and self._setpoint is None:
+                found += [_until(envelope, one.part.until_s) for envelope in one.envelopes()]
         return found
 
     def _after(self, made: RecordedChange, until_ns: int) -> ClaimEvaluation | Claim:

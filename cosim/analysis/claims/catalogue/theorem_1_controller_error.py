@@ -111,7 +111,7 @@ def _bound(run: RunEvidence) -> Bound | None:
     ):
         return None
     void = run.paper_violation
-    until_s = run.until_s if void is None else min(run.until_s, void.t_s)
+    until_s = run.part.until_s if void is None else min(run.part.until_s, void.t_s)
     delta = trajectory_delta(run.record, run.joined, until_s)
     if delta is None:
         return None
