@@ -204,8 +204,8 @@ def _why_failed(
             at_s = notice["t_ns"] * 1e-9
             return f"the {notice['process']} failed at {at_s:g} s: {notice['text']}"
     # Missing last rows of a killed process are no failure: a restarted process replaced it.
-    lacking = [f"{missing[table]:,} of {table}" for table in record.tables if missing[table] > 0]
-    return f"rows are missing from the record: {', '.join(lacking)}" if lacking else None
+    incomplete = [f"{missing[table]:,} of {table}" for table in record.tables if missing[table] > 0]
+    return f"rows are missing from the record: {', '.join(incomplete)}" if incomplete else None
 
 
 def _divergence(record: RunRecord) -> Divergence | None:

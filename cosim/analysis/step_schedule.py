@@ -50,12 +50,13 @@ def live_run(record: RunRecord) -> LiveRun:
         CallerError: exact simulation does not support the scenario.
     """
     changed = bool(changes_of(record))
-    _require(not changed, "no ideal loop is like it: its settings were changed during the run")
+    _require(not changed, "the ideal loop has no changes of settings, as this run has")
     record.scenario.coverage.require_unchanging()
     record.scenario.coverage.require_exact()
     steps, sensor = record[PLANT_STEP], record[SENSOR_MEASUREMENT]
-    again, count = record.restarted(), len(sensor)
-    _require(again is None, f"the ideal loop has no restarts: {again} was restarted during the run")
+    restarted, count = record.restarted(), len(sensor)
+    why = f"the ideal loop has no restarts: {restarted} was restarted during the run"
+    _require(restarted is None, why)
     _require(
         count >= _LEAST_MEASUREMENTS,
         f"the record holds {count} measurements; {_LEAST_MEASUREMENTS} are needed",
@@ -71,12 +72,12 @@ def live_run(record: RunRecord) -> LiveRun:
     _require(bool(np.abs(steps["x"]).max() < _LARGEST), "the run diverged")  # also for NaN
     measured = np.zeros(last + 1, dtype=np.bool_)
     measured[sensor["t_ns"] // period_ns] = True
-    ticks, taken = _ticks(record[CONTROLLER_STEP], record[CONTROLLER_DELIVERY])
+    ticks, accepted = _ticks(record[CONTROLLER_STEP], record[CONTROLLER_DELIVERY])
     latched = _latched(steps["actuation"], ticks)
     seen = read_conditions(record)
     _require(
         not (len(seen.watchdog.t_s) or len(seen.safe_input.t_s)),
-        "for a time the input was the watchdog's, or a safe one, which no ideal loop has",
+        "the ideal loop has no watchdog and no safe input, which this run applied for a time",
     )
     events = sensor[sensor["event"] != NO_SEQUENCE]
     numbers, event_ns = np.arange(len(events)), events["t_ns"]
@@ -87,9 +88,9 @@ def live_run(record: RunRecord) -> LiveRun:
     schedule = StepSchedule(
         period_ns=period_ns,
         measured=measured,
-        delivered=lambda event: event in taken if event < len(events) else network(event),
-        delay_ns=_delays(taken, act_ns - event_ns, act_ns < _NEVER_NS),
-        delay_steps=_delays(taken, acts_at_step - event_ns // period_ns, acts_at_step <= last),
+        delivered=lambda event: event in accepted if event < len(events) else network(event),
+        delay_ns=_delays(accepted, act_ns - event_ns, act_ns < _NEVER_NS),
+        delay_steps=_delays(accepted, acts_at_step - event_ns // period_ns, acts_at_step <= last),
         model_ns=latched.model_ns,
     )
     return LiveRun(schedule, steps["x"][measured], event_ns * 1e-9)
@@ -144,9 +145,9 @@ def _latched(actuations: NDArray[np.int64], ticks: _Ticks) -> _Ticks:
 
 
 def _delays(
-    taken: set[int], delays: NDArray[np.int64], acted: NDArray[np.bool_]
+    accepted: set[int], delays: NDArray[np.int64], acted: NDArray[np.bool_]
 ) -> Callable[[int], int]:
     """Return the recorded delays; for events that the run did not have, their median."""
-    usable = [int(delays[event]) for event in taken if event < len(delays) and acted[event]]
+    usable = [int(delays[event]) for event in accepted if event < len(delays) and acted[event]]
     usual = int(np.median(usable)) if usable else 0
     return lambda event: int(delays[event]) if event < len(delays) else usual

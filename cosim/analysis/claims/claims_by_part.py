@@ -89,7 +89,7 @@ class RunClaims:
         part = RunPart(record, 0.0, _seconds(first_ns), None, _void(record, record.scenario))
         own = record if self._setpoint is None else _part_of(record, record.scenario, 0, None)
         found: list[ClaimEvaluation | Claim] = [ClaimEvaluation(own, part)]
-        for made, after in zip(changes, [*changes[1:], None], strict=True):
+        for made, after in zip(changes, [*changes[1:], None], strict=False):
             until_ns = NEVER_NS if after is None else after.first_ns
             found.append(self._after(made, until_ns))
         return found

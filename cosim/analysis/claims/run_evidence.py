@@ -96,11 +96,11 @@ class RunEvidence:
             return found
         # The certificate's start error covers the inputs before the part's first one.
         safe, restarts = found.safe_input, found.restarts
-        later, again = safe.t_s >= found.start_s, restarts.t_s > 0
+        later, restarted = safe.t_s >= found.start_s, restarts.t_s > 0
         return found._replace(
             start_s=0.0 if np.isfinite(found.start_s) else found.start_s,
             safe_input=SampledSeries(safe.t_s[later], safe.value[later]),
-            restarts=SampledSeries(restarts.t_s[again], restarts.value[again]),
+            restarts=SampledSeries(restarts.t_s[restarted], restarts.value[restarted]),
         )
 
     @property

@@ -208,12 +208,6 @@ def test_a_late_first_update_violates_only_the_start_condition(make: Make) -> No
 # --- incomplete records ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("process", ["plant", "sensor", "controller"])
-def test_conditions_are_unknown_without_the_rows_of_a_process(run: RunRecord, process: str) -> None:
-    when_s, _ = violation_of(without(run, process))
-    assert when_s == 0.0
-
-
 def test_losses_are_derived_from_the_controller_without_network_rows(
     run: RunRecord,
 ) -> None:
