@@ -17,12 +17,7 @@ Signal = Callable[[range], Matrix]
 
 
 class Disturbance:
-    """The sum of all disturbances at the input, and of all at the state.
-
-    Args:
-        at_input: the disturbances at the input.
-        at_state: the disturbances at the state.
-    """
+    """The sum of all disturbances at the input, and of all at the state."""
 
     def __init__(self, at_input: list[Signal], at_state: list[Signal]) -> None:
         self._parts = at_input, at_state

@@ -13,11 +13,8 @@ _BLOCK = 256
 class MeasurementModel:
     """Measures the state, with noise.
 
-    Args:
-        C: shape (p, n); None is the identity, with exactly y = x + v.
-        std: standard deviation of the normally distributed part of v, shape (p,).
-        bound: bound of the uniformly distributed part of v, shape (p,).
-        seed: of the noise.
+    C has the shape (p, n); None is the identity, with exactly y = x + v. ``std`` is the standard
+    deviation of a normally distributed part of v, ``bound`` the bound of a uniform part, (p,) each.
     """
 
     def __init__(self, C: Matrix | None, std: Vector, bound: Vector, seed: int) -> None:

@@ -176,5 +176,5 @@ def _watchdog_of(resolved: Scenario) -> Watchdog:
         "zero": (zero, "0"),
         "model": (PredictedInput(loop.H, loop.K, resolved.timing.plant_period_ns), "the model's"),
     }
-    fallback, said = fallbacks[resolved.plant.watchdog.policy]
-    return Watchdog(loop.m, resolved.timing.actuation_timeout_ns, fallback, said)
+    fallback = fallbacks[resolved.plant.watchdog.policy]
+    return Watchdog(loop.m, resolved.timing.actuation_timeout_ns, *fallback)

@@ -13,10 +13,9 @@ determines the input:
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, overload
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, Propagator, Vector
@@ -54,12 +53,9 @@ def zero(newest: Actuation, t_ns: int) -> Vector:
 
 
 class PredictedInput:
-    """The input of the controller's model, propagated from the last model state received.
+    """The input of the controller's model H, propagated from the last model state received.
 
-    Args:
-        H: the matrix that the controller's model integrates, shape (n, n), per second.
-        K: gain, shape (m, n).
-        period_ns: the plant's step, over which the state is advanced each time.
+    The state is advanced over the plant's step each time.
     """
 
     def __init__(self, H: Matrix, K: Matrix, period_ns: int) -> None:
@@ -81,25 +77,16 @@ class PredictedInput:
         return predicted
 
 
-@overload
-def too_old(t_ns: int, newest_ns: int, timeout_ns: int) -> bool: ...
-@overload
-def too_old(
-    t_ns: NDArray[np.int64], newest_ns: NDArray[np.int64], timeout_ns: int
-) -> NDArray[np.bool_]: ...
 def too_old(t_ns: Any, newest_ns: Any, timeout_ns: int) -> Any:
-    """Whether an actuation of time ``newest_ns`` is too old at ``t_ns``."""
+    """Whether an actuation of time ``newest_ns`` is too old at ``t_ns``; also of arrays."""
     return t_ns - newest_ns > timeout_ns
 
 
 class Watchdog:
     """Chooses the plant's input at each step, and reports when the newest actuation is too old.
 
-    Args:
-        inputs: m.
-        timeout_ns: largest permitted age of an actuation.
-        fallback: chooses the input if the newest actuation is older.
-        said: describes that input in notices.
+    The fallback chooses the input if the newest actuation is older than the timeout;
+    ``input_name`` describes that input in notices.
     """
 
     def __init__(
@@ -107,12 +94,12 @@ class Watchdog:
         inputs: int,
         timeout_ns: int = NEVER_NS,
         fallback: Fallback = hold,
-        said: str = "held",
+        input_name: str = "held",
     ) -> None:
         self._inputs = inputs
         self._timeout_ns = timeout_ns
         self._fallback = fallback
-        self._said = said
+        self._input_name = input_name
         self._tripped_ns: int | None = None
         self.newest = Actuation(np.zeros(inputs), NO_VECTOR, 0, NO_SEQUENCE)
 
@@ -124,18 +111,14 @@ class Watchdog:
         return self.newest
 
     def input(self, t_ns: int) -> tuple[Vector, tuple[Notice, ...]]:
-        """Return the input that is applied from ``t_ns`` on, shape (m,), and notices.
-
-        Args:
-            t_ns: time of the step; not before that of the last call.
-        """
+        """Return the input that is applied from ``t_ns`` on, shape (m,), and notices."""
         newest, tripped_ns = self.newest, self._tripped_ns
         if not too_old(t_ns, newest.t_ns, self._timeout_ns):
             if tripped_ns is None:
                 return newest.u, ()
             self._tripped_ns = None
             lasted_s = (t_ns - tripped_ns) / NS_PER_S
-            text = f"actuations are back; there was none in time for {lasted_s:.4g} s"
+            text = f"actuations arrive again; there was none in time for {lasted_s:.4g} s"
             return newest.u, (Notice(t_ns, "watchdog", text),)
         u = self._fallback(newest, t_ns)
         if tripped_ns is not None:
@@ -143,6 +126,6 @@ class Watchdog:
         self._tripped_ns = t_ns
         age_s, timeout_s = ((ns / NS_PER_S) for ns in (t_ns - newest.t_ns, self._timeout_ns))
         none = newest.sequence == NO_SEQUENCE
-        what = "there has been no actuation for" if none else "the newest actuation is as old as"
-        text = f"{what} {age_s:.4g} s, {timeout_s:.4g} s allowed: the input is {self._said}"
+        what = "no actuation for" if none else "the newest actuation is too old:"
+        text = f"{what} {age_s:.4g} s, {timeout_s:.4g} s allowed; the input is {self._input_name}"
         return u, (Notice(t_ns, "watchdog", text),)

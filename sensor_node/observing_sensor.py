@@ -12,6 +12,7 @@ measurements are missing, the inputs of their steps are unknown, and the first k
 """
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -26,58 +27,44 @@ from noack.protocol.record_tables import SENSOR_MEASUREMENT
 from noack.protocol.wire_format import Flow, Message
 
 
+@dataclass
 class AppliedInputTracker:
-    """Advances an observer from measurement to measurement, under the applied inputs.
+    """Advances an observer from measurement to measurement, under the applied inputs."""
 
-    Args:
-        observer: at its first estimate.
-        inputs: m.
-        outputs: p.
-        period_ns: the plant's step.
-        since_ns: time of the first estimate; None: the time of the first measurement.
-    """
-
-    def __init__(
-        self,
-        observer: StateObserver,
-        inputs: int,
-        outputs: int,
-        period_ns: int,
-        since_ns: int | None,
-    ) -> None:
-        self._observer = observer
-        self._inputs = inputs
-        self._outputs = outputs
-        self._period_ns = period_ns
-        self._t_ns = since_ns
+    observer: StateObserver
+    inputs: int
+    """m."""
+    outputs: int
+    """p."""
+    period_ns: int
+    """The plant's step."""
+    t_ns: int | None
+    """Time of the estimate; at first None: the time of the first measurement."""
 
     def split(self, vector: Vector) -> tuple[Vector, Vector]:
         """Split the vector of a measurement into y and the inputs since the last measurement."""
         # Slices are copied: a slice may have another memory layout than the vectors of a replay.
-        return vector[: self._outputs].copy(), vector[self._outputs :].copy()
+        return vector[: self.outputs].copy(), vector[self.outputs :].copy()
 
     def take(self, t_ns: int, y: Vector, inputs: Vector) -> Vector:
         """Return x̂ at the time of a measurement, shape (n,)."""
-        since_ns = t_ns if self._t_ns is None else self._t_ns
-        for u in self._applied_inputs((t_ns - since_ns) // self._period_ns, inputs):
-            self._observer.predict(u)
-        self._observer.correct(y)
-        self._t_ns = t_ns
-        return self._observer.x
+        since_ns = t_ns if self.t_ns is None else self.t_ns
+        for u in self._applied_inputs((t_ns - since_ns) // self.period_ns, inputs):
+            self.observer.predict(u)
+        self.observer.correct(y)
+        self.t_ns = t_ns
+        return self.observer.x
 
     def _applied_inputs(self, steps: int, inputs: Vector) -> Iterable[Vector]:
-        known = inputs.reshape(-1, self._inputs)
+        known = inputs.reshape(-1, self.inputs)
         for before in range(steps, 0, -1):
             yield known[max(len(known) - before, 0)].copy()
 
 
 class ObservingSensor:
-    """The machine of a sensor with an observer.
+    """The machine of a sensor with an observer: ``sensor`` receives x̂ in place of x.
 
-    Args:
-        tracker: estimates x.
-        sensor: models and trigger; it receives x̂ in place of x.
-        restarted: whether it replaces a sensor that died; the estimate of that sensor is lost.
+    A restarted sensor does not know the estimate of the sensor that it replaces.
     """
 
     def __init__(
@@ -125,9 +112,7 @@ class ObservingSensor:
 def observer_of(resolved: Scenario, *, restarted: bool) -> AppliedInputTracker | None:
     """Return the observer of a resolved scenario; None if it has none.
 
-    Args:
-        resolved: the scenario.
-        restarted: whether the sensor restarts during the run; x(0) is then not used.
+    If the sensor restarts during the run, x(0) is not used.
     """
     settings, loop = resolved.observer, loop_of(resolved)
     if settings is None:

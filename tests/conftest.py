@@ -16,8 +16,6 @@ import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis.internal.conjecture import providers
 
-from tests.distribution import LongestFirst, in_order
-
 settings.register_profile(
     "noack",
     max_examples=25,
@@ -35,17 +33,11 @@ settings.register_profile(
 settings.load_profile("noack")
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    items[:] = in_order(items)
+def pytest_collection_finish() -> None:
     if settings().derandomize:
         # Hypothesis would also try constants of the loaded modules, which depend on the tests that
         # this worker has run before.
         providers._get_local_constants = providers.Constants
-
-
-@pytest.hookimpl(optionalhook=True)  # xdist may be absent or unused
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LongestFirst | None:
-    return LongestFirst(config, log) if config.getvalue("dist") == "loadfile" else None
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -12,6 +12,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from typer.testing import CliRunner
+
+from cosim.cli import app
 
 ROOT = Path(__file__).parents[1]
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```", re.DOTALL | re.MULTILINE)
@@ -91,17 +94,20 @@ def test_make_targets_of_the_tutorial_exist(step: Step) -> None:
 
 
 @pytest.mark.parametrize("step", STILL, ids=lambda step: step.command)
-def test_commands_of_the_tutorial_print_the_shown_output(step: Step, folder: Path) -> None:
-    done = subprocess.run(noack(step), cwd=folder, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    output = (done.stdout + done.stderr).splitlines()
+def test_commands_of_the_tutorial_print_the_shown_output(
+    step: Step, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    done = CliRunner().invoke(app, shlex.split(step.command)[1:])
+    assert done.exit_code == 0, done.output
+    output = done.output.splitlines()
     for line in filter("...".__ne__, step.shown):
-        assert any(alike(line, said) for said in output), line
+        assert any(alike(line, printed) for printed in output), line
 
 
 def test_the_runtime_parameter_of_the_tutorial_can_be_changed(folder: Path) -> None:
     """One terminal runs the loop; another changes a runtime parameter and then sends SIGINT."""
-    run, turn = LIVE
+    run, change = LIVE
     with subprocess.Popen(
         noack(run), cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
@@ -111,7 +117,7 @@ def test_the_runtime_parameter_of_the_tutorial_can_be_changed(folder: Path) -> N
                     time.sleep(0.1)
                     continue
                 done = subprocess.run(
-                    [*noack(turn), "--run", "runs/latest"],
+                    [*noack(change), "--run", "runs/latest"],
                     cwd=folder, capture_output=True, text=True, check=False,
                 )  # fmt: skip
                 if done.returncode == 0:
@@ -120,9 +126,9 @@ def test_the_runtime_parameter_of_the_tutorial_can_be_changed(folder: Path) -> N
             process.send_signal(signal.SIGINT)
             _, stderr = process.communicate(timeout=120)
     assert process.returncode == 130, stderr
-    assert [shape(line) for line in turn.shown] == [
+    assert [shape(line) for line in change.shown] == [
         shape(line) for line in done.stdout.splitlines()
     ]
     summary = json.loads((folder / "runs/latest/summary.json").read_text())
-    (change,) = summary["changes"]
-    assert change["settings"] == {"network.loss.probability": 0.9}
+    (recorded,) = summary["changes"]
+    assert recorded["settings"] == {"network.loss.probability": 0.9}

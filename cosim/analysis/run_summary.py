@@ -28,7 +28,7 @@ from cosim.analysis.summary_model import (
     WatchdogPart,
 )
 from cosim.analysis.timing_statistics import latency, lateness
-from cosim.record.align import AlignedRun, identity_residual, join_all
+from cosim.record.align import AlignedRun, align_tables, identity_residual
 from cosim.record.divergence import Divergence, divergence
 from cosim.record.estimation_error import disturbance_summary, estimation_summary, true_states
 from cosim.record.packet_outcomes import packet_outcomes
@@ -78,7 +78,7 @@ def summarise(
     missing, lost, diverged = missing_rows(record), unintended_losses(record), _divergence(record)
     if exit_status == ExitStatus.OK and (why := _why_failed(record, missing, diverged)):
         exit_status, reason = ExitStatus.FAILED, why
-    joined = join_all(record)
+    joined = align_tables(record)
     return RunSummary(
         kind=record.kind,
         startup_s=startup_s,

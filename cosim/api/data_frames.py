@@ -4,7 +4,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from cosim.record.align import join_all
+from cosim.record.align import align_tables
 from cosim.record.packet_outcomes import packet_outcomes
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S
@@ -30,7 +30,7 @@ def with_seconds(table: pa.Table) -> pa.Table:
 @np.errstate(all="ignore")  # a run may diverge
 def samples(record: RunRecord) -> pa.Table:
     """Return plant, sensor and controller on the measurements' grid; :meth:`noack.Run.samples`."""
-    joined = join_all(record)
+    joined = align_tables(record)
     columns: dict[str, NDArray[np.generic]] = {"t_s": _seconds(joined.t_ns), "t_ns": joined.t_ns}
     for name, states in (("x", joined.x), ("x_s", joined.x_s), ("x_c", joined.x_c)):
         columns |= dict(zip(entry_names(name, states.shape[1]), states.T, strict=True))

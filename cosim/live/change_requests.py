@@ -22,12 +22,7 @@ _MILLISECOND_NS = 1_000_000
 
 
 class ChangeRequests:
-    """The changes of a run.
-
-    Args:
-        ticket: the run's ticket; the changes in its scenario are taken first.
-        plane: where changes are announced.
-    """
+    """The changes of a run."""
 
     def __init__(self, ticket: Ticket, plane: ControlPlane) -> None:
         self._scenario, self._run_dir = ticket.scenario, ticket.run_dir

@@ -39,11 +39,6 @@ class ParameterChange(NamedTuple):
     settings: Mapping[str, Any]
     """Values by keys of the scenario."""
 
-    @property
-    def data(self) -> bytes:
-        """The settings as stored in the record."""
-        return settings_bytes(self.settings)
-
 
 def settings_bytes(settings: Mapping[str, Any]) -> bytes:
     """Return settings as JSON, padded with zeros to the width of the record's column.
@@ -185,7 +180,14 @@ class ChangeSchedule:
             every[place] = every[place]._replace(scenario=scenario, prepared=prepared)
         self._all = every
         self._update_next()
-        row = (number, change.number, change.t_ns, now_ns, since_ns, change.data)
+        row = (
+            number,
+            change.number,
+            change.t_ns,
+            now_ns,
+            since_ns,
+            settings_bytes(change.settings),
+        )
         outputs: list[Record | Notice] = [Record(table, row)]
         if since_ns > change.t_ns:
             text = (

@@ -11,6 +11,7 @@ from noack.config.feature_kinds import AnyController, AnyTrigger
 from noack.config.runtime_parameters import LOSS, MANSD, put_settings, require_runtime_parameters
 from noack.config.scenario_checks import check_setpoint, check_trigger
 from noack.config.sections.network_section import NetworkSection
+from noack.config.validation_messages import brief
 from noack.impairments.link_settings import Mansd, require_scores
 from noack.impairments.loss_models import Loss
 from noack.impairments.loss_models.trace import TraceLoss
@@ -81,7 +82,7 @@ def check_changes(scenario: "Scenario") -> None:
         try:
             changed = with_settings(changed, change.set)
         except ValidationError as error:
-            raise ValueError(f"changes.{place}.set: {_first_mistake(error)}") from None
+            raise ValueError(f"changes.{place}.set: {brief(error)}") from None
         except ValueError as error:
             raise ValueError(f"changes.{place}.set: {error}") from None
 
@@ -106,9 +107,3 @@ def _changed_network(
 
 def _validated(part: str, content: Any) -> Any:
     return _CHANGEABLE[part].validate_json(json.dumps(content))
-
-
-def _first_mistake(error: ValidationError) -> str:
-    mistake = error.errors(include_url=False)[0]
-    place, message = ".".join(map(str, mistake["loc"])), mistake["msg"]
-    return f"{place}: {message}" if place else message.removeprefix("Value error, ")

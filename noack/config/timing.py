@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from noack.core.clock import NS_PER_S
-from noack.settings.rates import period_ns
+from noack.settings.section import period_ns
 
 if TYPE_CHECKING:
     from noack.config.scenario import Scenario

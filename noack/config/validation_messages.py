@@ -92,16 +92,11 @@ def _explain(mistake: ErrorDetails, root: type[ScenarioSection]) -> str:
 class _Place(NamedTuple):
     """The place of a mistake in a file."""
 
-    path: Sequence[Any]
-    """Path of the key."""
-    section: type[ScenarioSection] | None
-    """The section that contains the key."""
-    choices: Mapping[str, type[ScenarioSection]]
-    """The types of table that are possible at this place, by the value of the discriminator."""
-    discriminator: str
-    """The key that selects the type of table."""
-    kind: Any
-    """The annotation of the value."""
+    path: Sequence[Any]  # of the key
+    section: type[ScenarioSection] | None  # which contains the key
+    choices: Mapping[str, type[ScenarioSection]]  # possible tables, by the discriminator's value
+    discriminator: str  # the key that selects the table
+    kind: Any  # the annotation of the value
 
 
 def _locate(place: Sequence[Any], root: type[ScenarioSection]) -> _Place:

@@ -7,8 +7,7 @@ from pydantic import Field, FiniteFloat, model_validator
 from noack.core.errors import NoackError
 from noack.core.linear_systems import Matrix, Vector
 from noack.settings.matrices import Row
-from noack.settings.rates import RateHz, require_whole_period
-from noack.settings.section import ScenarioSection
+from noack.settings.section import RateHz, ScenarioSection, require_whole_period
 
 
 class ControlModel(NamedTuple):

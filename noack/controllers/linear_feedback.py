@@ -1,6 +1,9 @@
 """The paper's control law: state feedback of the model."""
 
+from dataclasses import dataclass
 from typing import ClassVar, Literal
+
+import numpy as np
 
 from noack.controllers.controller_settings import ControllerSettings, ControlModel
 from noack.core.linear_systems import Matrix, Vector
@@ -12,31 +15,22 @@ class LinearFeedbackSettings(ControllerSettings):
     is_linear: ClassVar = True
 
     kind: Literal["linear"] = "linear"
-    """The kind of controller."""
 
     def law(self, model: ControlModel) -> "LinearFeedback":
-        """Return the law with the scenario's gain."""
         return LinearFeedback(model.K)
 
 
+@dataclass(frozen=True)
 class LinearFeedback:
-    """u = K(x_c − x_r) + u_r.
+    """u = K(x_c − x_r) + u_r with a gain of shape (m, n)."""
 
-    Args:
-        K: gain, shape (m, n).
-    """
-
-    def __init__(self, K: Matrix) -> None:
-        self._K = K
+    K: Matrix
 
     def update(self, t_s: float, x: Vector) -> None:
         """The law depends on x_c alone."""
 
     def input(self, t_s: float, x_c: Vector, setpoint: tuple[Vector, Vector] | None) -> Vector:
-        """Return u, shape (m,)."""
         if setpoint is None:
-            u: Vector = self._K @ x_c
-            return u
+            return np.asarray(self.K @ x_c)
         x_r, u_r = setpoint
-        shifted: Vector = self._K @ (x_c - x_r) + u_r
-        return shifted
+        return np.asarray(self.K @ (x_c - x_r) + u_r)

@@ -6,15 +6,15 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Protocol
+from typing import IO, Any
 
 from noack.core.errors import MachineError, why
 
 
-def write_whole(path: Path, content: str | bytes, remedy: str = "") -> Path:
+def write_whole(path: Path, content: str | bytes) -> Path:
     """Write a file, or replace it, in one step; return its path. Missing folders are created.
 
-    Text is written as UTF-8. ``remedy`` ends the message of a MachineError.
+    Text is written as UTF-8. Raise MachineError if the file cannot be written.
     """
     scratch = path.with_name(f".{path.name}.partial")
     try:
@@ -24,7 +24,7 @@ def write_whole(path: Path, content: str | bytes, remedy: str = "") -> Path:
     except OSError as error:
         with suppress(OSError):
             scratch.unlink(missing_ok=True)
-        raise MachineError(f"{path}: cannot be written: {why(error)}{remedy}") from None
+        raise MachineError(f"{path}: cannot be written: {why(error)}") from None
     return path
 
 
@@ -48,11 +48,7 @@ def read_regular(path: Path, most_bytes: int) -> bytes:
     return content
 
 
-class _Descriptor(Protocol):
-    def fileno(self) -> int: ...
-
-
-def lock(file: int | _Descriptor, *, shared: bool = False, wait: bool = False) -> bool:
+def lock(file: int | IO[Any], *, shared: bool = False, wait: bool = False) -> bool:
     """Lock an open file or folder until it is closed; return False if another process has the lock.
 
     ``shared`` locks exclude only exclusive ones. With ``wait`` it waits for the other processes.

@@ -26,27 +26,23 @@ class ModelFlow:
         self.propagate = Propagator(H, steps_ns)
         self._since_ns: list[int] = []
         self._setpoints = [setpoint]
-        self._moved = setpoint is not None
+        self.moved = setpoint is not None
+        """Whether any set-point differs from 0."""
 
     def change(self, since_ns: int, setpoint: Vector | None) -> None:
         """Change the set-point from ``since_ns`` on; times must not decrease."""
         if not _same(self._setpoints[-1], setpoint):
             self._since_ns.append(since_ns)
             self._setpoints.append(setpoint)
-            self._moved = True
+            self.moved = True
 
     def setpoint(self, t_ns: int) -> Vector | None:
         """Return x_r at a time; None is 0."""
         return self._setpoints[bisect_right(self._since_ns, t_ns)]
 
-    @property
-    def moved(self) -> bool:
-        """Whether any set-point differs from 0."""
-        return self._moved
-
     def __call__(self, x: Vector, from_ns: int, to_ns: int) -> Vector:
         """Return the state at ``to_ns`` of a model with state ``x``, (n,), at ``from_ns``."""
-        if not self._moved:
+        if not self.moved:
             return self.propagate(x, to_ns - from_ns)
         place = bisect_right(self._since_ns, from_ns)
         while place < len(self._since_ns) and self._since_ns[place] < to_ns:

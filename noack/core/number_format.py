@@ -25,9 +25,9 @@ def whole(value: float | None) -> str:
     return NONE if value is None else f"{value:.0f}"
 
 
-def seconds(value_s: float | None, decimals: int = 3) -> str:
-    """Write a time in seconds with ``decimals`` decimals."""
-    return NONE if value_s is None else f"{value_s:.{decimals}f} s"
+def seconds(value_s: float | None) -> str:
+    """Write a time in seconds with three decimals."""
+    return NONE if value_s is None else f"{value_s:.3f} s"
 
 
 def duration(value_s: float) -> str:
@@ -45,9 +45,9 @@ def ratio(part: int, of: int) -> str:
     return f"{100 * part / of:.0f} %" if of else NONE
 
 
-def percent(share: float, decimals: int = 1) -> str:
-    """Write a share in percent; the smallest shares have no sign."""
-    return f"{round(100 * share, decimals) + 0.0:.{decimals}f} %"
+def percent(share: float) -> str:
+    """Write a share in percent with one decimal; the smallest shares have no sign."""
+    return f"{round(100 * share, 1) + 0.0:.1f} %"
 
 
 def _with_unit(value: float, units: tuple[str, str, str, str]) -> str:

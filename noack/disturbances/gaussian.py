@@ -18,7 +18,6 @@ class GaussianDisturbance(DisturbanceSettings):
     example: ClassVar = {"kind": "gaussian", "std": [0.2]}
 
     kind: Literal["gaussian"]
-    """The kind of disturbance."""
     std: Row
     """Standard deviation of the value of a step, entry by entry."""
 
@@ -29,10 +28,8 @@ class GaussianDisturbance(DisturbanceSettings):
 
     @property
     def variance(self) -> Vector:
-        """The standard deviation squared."""
         return np.square(self.std)
 
     def signal(self, steps: range, source: SignalSource) -> Matrix:
-        """Independent values with mean 0."""
         unit = normals(source.seed, *source.stream, rows=steps, width=len(self.std))
         return np.asarray(np.array(self.std) * unit)

@@ -18,7 +18,6 @@ class SineDisturbance(DisturbanceSettings):
     example: ClassVar = {"kind": "sine", "amplitude": [0.5], "hz": 3.0, "phase_rad": 0.4}
 
     kind: Literal["sine"]
-    """The kind of disturbance."""
     amplitude: Row
     """Amplitude, entry by entry."""
     hz: Positive

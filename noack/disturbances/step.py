@@ -19,7 +19,6 @@ class StepDisturbance(DisturbanceSettings):
     example: ClassVar = {"kind": "step", "amplitude": [1.5], "from_s": 0.1, "until_s": 0.3}
 
     kind: Literal["step"]
-    """The kind of disturbance."""
     amplitude: Row
     """The constant, entry by entry."""
     from_s: NonNegative = 0.0

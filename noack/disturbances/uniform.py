@@ -18,7 +18,6 @@ class UniformDisturbance(DisturbanceSettings):
     example: ClassVar = {"kind": "uniform", "bound": [0.3]}
 
     kind: Literal["uniform"]
-    """The kind of disturbance."""
     bound: Row
     """Largest absolute value, entry by entry."""
 
@@ -29,10 +28,8 @@ class UniformDisturbance(DisturbanceSettings):
 
     @property
     def variance(self) -> Vector:
-        """A third of the bound squared."""
         return np.square(self.bound) / 3
 
     def signal(self, steps: range, source: SignalSource) -> Matrix:
-        """Independent values, uniform in [-bound, bound]."""
         unit = uniforms(source.seed, *source.stream, rows=steps, width=len(self.bound))
         return np.asarray(np.array(self.bound) * (2.0 * unit - 1.0))

@@ -5,6 +5,7 @@ At every step of the plant x̂ ← Âd x̂ + B̂d u, P ← Âd P Âdᵀ + Q. At 
 symmetric and positive semidefinite for any rounding error of L.
 """
 
+from dataclasses import dataclass
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -24,7 +25,6 @@ class KalmanSettings(ObserverSettings):
     }  # fmt: skip
 
     kind: Literal["kalman"]
-    """The kind of observer."""
     process_std: Row | None = None
     """Standard deviation of w in ẋ = Âx + B̂u + w, constant over a step of the plant, n entries; by
     default that of the random disturbances at = "state"."""
@@ -52,7 +52,6 @@ class KalmanSettings(ObserverSettings):
         return self
 
     def check(self, n: int, m: int, p: int, noise: NoiseVariances) -> None:
-        """Require shapes that fit, valid covariances, and noise in all outputs and the process."""
         super().check(n, m, p, noise)
         for key, expected, what in (
             ("process_std", n, "state"), ("input_std", m, "input"), ("noise_std", p, "output"),
@@ -78,7 +77,6 @@ class KalmanSettings(ObserverSettings):
             )
 
     def assumed_model(self, model: EstimationModel, noise: NoiseVariances) -> EstimationModel:
-        """Return the model with the filter's own covariances, if they are given."""
         Q, R = model.Q, model.R
         if self.Q is not None:
             Q = np.array(self.Q)
@@ -105,7 +103,6 @@ class KalmanSettings(ObserverSettings):
         return np.asarray(np.linalg.solve(C @ predicted @ C.T + R, C @ predicted).T)
 
     def estimator(self, assumed: EstimationModel, x: Vector) -> "KalmanObserver":
-        """Return the filter."""
         return KalmanObserver(assumed, x, np.diag(np.square(self.initial_std)))
 
 
@@ -123,29 +120,21 @@ def _require_covariance(key: str, rows: Rows | None, *, definite: bool) -> None:
         raise ValueError(f"observer.{key}: must be positive semidefinite")
 
 
+@dataclass
 class KalmanObserver:
-    """The filter.
+    """The filter, at x̂ and P before the first measurement."""
 
-    Args:
-        model: the model and the covariances that the filter assumes.
-        x: x̂ before the first measurement, shape (n,).
-        covariance: P before it, shape (n, n).
-    """
-
-    def __init__(self, model: EstimationModel, x: Vector, covariance: Matrix) -> None:
-        self._model = model
-        self.x = x
-        self.covariance = covariance
+    model: EstimationModel
+    x: Vector
+    covariance: Matrix
 
     def predict(self, u: Vector) -> None:
-        """Advance x̂ and P by a step of the plant."""
-        Ad, Bd, Q = self._model.Ad, self._model.Bd, self._model.Q
+        Ad, Bd, Q = self.model.Ad, self.model.Bd, self.model.Q
         self.x = Ad @ self.x + Bd @ u
         self.covariance = Ad @ self.covariance @ Ad.T + Q
 
     def correct(self, y: Vector) -> None:
-        """Correct x̂ and P by a measurement."""
-        C, R, P = self._model.C, self._model.R, self.covariance
+        C, R, P = self.model.C, self.model.R, self.covariance
         L = np.linalg.solve(C @ P @ C.T + R, C @ P).T
         rest = np.eye(len(P)) - L @ C
         self.x = self.x + L @ (y - C @ self.x)

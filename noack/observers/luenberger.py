@@ -4,6 +4,7 @@ x̂(t_k) = x̂⁻ + L (y − C x̂⁻), where x̂⁻ ← Âd x̂ + B̂d u at eve
 the model, the error follows e(t_k) = (I − L C) Â^(T) e(t_(k−1)).
 """
 
+from dataclasses import dataclass
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -25,7 +26,6 @@ class LuenbergerSettings(ObserverSettings):
     example: ClassVar = {"kind": "luenberger", "poles_per_s": [-20.0, -25.0]}
 
     kind: Literal["luenberger"]
-    """The kind of observer."""
     gain: Rows | None = None
     """L by rows, n x p."""
     poles_per_s: tuple[Pole, ...] | None = None
@@ -49,7 +49,6 @@ class LuenbergerSettings(ObserverSettings):
         return self
 
     def check(self, n: int, m: int, p: int, noise: NoiseVariances) -> None:
-        """Require a gain n x p, or n poles."""
         super().check(n, m, p, noise)
         require_shape(self.gain, "observer.gain", (n, p), "one row per state, a column per output")
         if self.poles_per_s is not None and len(self.poles) != n:
@@ -70,7 +69,6 @@ class LuenbergerSettings(ObserverSettings):
         return tuple(poles)
 
     def resolved(self, A: Matrix, C: Matrix, period_ns: int) -> Self:
-        """Return settings with the gain that places the poles."""
         if self.poles_per_s is None:
             return self
         try:
@@ -82,32 +80,22 @@ class LuenbergerSettings(ObserverSettings):
         return self.model_copy(update={"gain": rows, "poles_per_s": None})
 
     def steady_gain(self, assumed: EstimationModel) -> Matrix:
-        """Return L."""
         return np.array(self.gain)
 
     def estimator(self, assumed: EstimationModel, x: Vector) -> "LuenbergerObserver":
-        """Return the observer with the gain of resolved settings."""
         return LuenbergerObserver(assumed, np.array(self.gain), x)
 
 
+@dataclass
 class LuenbergerObserver:
-    """The observer.
+    """The observer with the gain L, (n, p), at x̂ before the first measurement."""
 
-    Args:
-        model: the model that predicts x̂.
-        gain: L, shape (n, p).
-        x: x̂ before the first measurement, shape (n,).
-    """
-
-    def __init__(self, model: EstimationModel, gain: Matrix, x: Vector) -> None:
-        self._model = model
-        self._gain = gain
-        self.x = x
+    model: EstimationModel
+    gain: Matrix
+    x: Vector
 
     def predict(self, u: Vector) -> None:
-        """x̂ ← Âd x̂ + B̂d u."""
-        self.x = self._model.Ad @ self.x + self._model.Bd @ u
+        self.x = self.model.Ad @ self.x + self.model.Bd @ u
 
     def correct(self, y: Vector) -> None:
-        """x̂ ← x̂ + L (y − C x̂)."""
-        self.x = self.x + self._gain @ (y - self._model.C @ self.x)
+        self.x = self.x + self.gain @ (y - self.model.C @ self.x)

@@ -11,13 +11,9 @@ _POLE_TOLERANCE = 1e-6
 def unobservable_mode(A: Matrix, C: Matrix, *, stable_too: bool = False) -> complex | None:
     """Return an eigenvalue of A whose mode does not appear in y = C x; None if there is none.
 
-    The test of Popov, Belevitch and Hautus: the columns of [λI − A; C] are independent.
-
-    Args:
-        A: shape (n, n).
-        C: shape (p, n).
-        stable_too: if true, test all modes (observability); else only modes that do not decay
-            (detectability).
+    The test of Popov, Belevitch and Hautus: the columns of [λI − A; C] are independent. By default
+    only modes that do not decay are tested (detectability), with ``stable_too`` all modes
+    (observability).
     """
     n = len(A)
     scale = max(float(np.linalg.norm(A, 2)), 1.0)
@@ -35,12 +31,8 @@ def observer_gain(A: Matrix, C: Matrix, poles: tuple[complex, ...]) -> Matrix:
     """Return L, shape (n, p), for which (I − L C) A has these eigenvalues.
 
     L is the state feedback of the dual pair (Aᵀ, (CA)ᵀ), by the method of Tits and Yang, which is
-    robust if there is more than one output.
-
-    Args:
-        A: shape (n, n).
-        C: shape (p, n).
-        poles: n eigenvalues, each complex one with its conjugate.
+    robust if there is more than one output. The poles are n eigenvalues, each complex one with its
+    conjugate.
 
     Raises:
         ValueError: the eigenvalues cannot be placed.

@@ -46,10 +46,7 @@ class ObserverSettings(ScenarioSection):
     def resolved(self, A: Matrix, C: Matrix, period_ns: int) -> Self:
         """Return settings with an explicit gain, in place of data from which the gain is computed.
 
-        Args:
-            A: Â^(T) between two measurements, shape (n, n).
-            C: shape (p, n).
-            period_ns: T.
+        A is Â^(T) between two measurements, T the period.
 
         Raises:
             CallerError: there is no such gain.
@@ -65,10 +62,5 @@ class ObserverSettings(ScenarioSection):
         raise NotImplementedError
 
     def estimator(self, assumed: EstimationModel, x: Vector) -> StateObserver:
-        """Return the observer.
-
-        Args:
-            assumed: the model with the covariances that the observer assumes.
-            x: x̂ before the first measurement, shape (n,).
-        """
+        """Return the observer, at x̂ before the first measurement."""
         raise NotImplementedError

@@ -20,7 +20,6 @@ class CartPoleSettings(EquationSettings):
     scenario: ClassVar = "cart_pole"
 
     kind: Literal["cart_pole"]
-    """The kind of plant."""
     cart_kg: Positive = 0.5
     """Mass of the cart."""
     pole_kg: Positive = 0.2

@@ -39,7 +39,6 @@ class DcMotorSettings(PlantSettings):
     scenario: ClassVar = "dc_motor"
 
     kind: Literal["dc_motor"]
-    """The kind of plant."""
     resistance_ohm: Positive = 4.0
     """R of the armature."""
     inductance_h: Positive = 2.75e-6
@@ -72,17 +71,11 @@ class DcMotorSettings(PlantSettings):
         return np.array(rows), np.array([0.0, 1 / L])
 
     def system(self, start: PlantStart) -> "DcMotor":
-        """Return the motor at x(0)."""
         return DcMotor(self, start.x0)
 
 
 class DcMotor:
-    """The motor; z is empty.
-
-    Args:
-        settings: its parameters.
-        x0: shaft angle, speed, current, shape (3,).
-    """
+    """The motor; x is shaft angle, speed and current, and z is empty."""
 
     def __init__(self, settings: DcMotorSettings, x0: Vector) -> None:
         self._settings = settings

@@ -11,7 +11,7 @@ from noack.settings.named_file import FileSettings
 
 
 class FmuSettings(FileSettings, PlantSettings):
-    """A Functional Mock-up Unit for co-simulation, FMI 2 or 3: an exported model of another tool.
+    """A Functional Mock-up Unit for co-simulation, FMI 2 or 3: a model from another tool.
 
     It is native code that runs in the plant's process; see docs/plants.md.
     """
@@ -19,7 +19,6 @@ class FmuSettings(FileSettings, PlantSettings):
     needs: ClassVar = ("fmpy", "fmi")
 
     kind: Literal["fmu"]
-    """The kind of plant."""
     file: str
     """The FMU; a relative name is relative to the scenario file."""
     state_variables: Annotated[Names, Field(min_length=1)]
@@ -41,7 +40,6 @@ class FmuSettings(FileSettings, PlantSettings):
 
     @property
     def internal_names(self) -> tuple[str, ...]:
-        """Names of the variables that are recorded in addition to x."""
         return self.on_record
 
     def check(self, n: int, m: int) -> None:
@@ -58,7 +56,6 @@ class FmuSettings(FileSettings, PlantSettings):
         require_length(self.operating_input, "plant.system.operating_input", m, why)
 
     def system(self, start: PlantStart) -> PlantSystem:
-        """Return an instance of the FMU at x(0)."""
         from noack.plants.systems.fmu_system import FmuSystem
 
         return FmuSystem(self, start.x0)

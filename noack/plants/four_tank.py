@@ -14,7 +14,7 @@ Share = Annotated[FiniteFloat, Field(gt=0, lt=1)]
 
 
 class FourTankSettings(EquationSettings):
-    """Two tanks that two pumps fill, each pump also through a tank above the other one.
+    """Four tanks: each of two pumps fills one lower tank and the tank above the other lower one.
 
     Johansson, "The Quadruple-Tank Process", IEEE Trans. Control Systems Technology 8(3), 2000; the
     default parameters are its minimum-phase P₋. u is the deviation from the operating voltages, x
@@ -26,7 +26,6 @@ class FourTankSettings(EquationSettings):
     scenario: ClassVar = "four_tank"
 
     kind: Literal["four_tank"]
-    """The kind of plant."""
     areas_cm2: tuple[Positive, Positive, Positive, Positive] = (28.0, 32.0, 28.0, 32.0)
     """Cross-sections of the tanks; tanks 1 and 2 are below tanks 3 and 4."""
     holes_cm2: tuple[Positive, Positive, Positive, Positive] = (0.071, 0.057, 0.071, 0.057)

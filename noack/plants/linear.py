@@ -11,25 +11,20 @@ _EMPTY = np.zeros(0)
 
 
 class LinearSettings(PlantSettings):
-    """ẋ = A x + B u, with A and B as the plant's other keys draw them."""
+    """ẋ = A x + B u; the plant's other keys define A and B."""
 
     scenario: ClassVar = "lane_following"
 
     kind: Literal["linear"] = "linear"
-    """The kind of plant."""
 
     def system(self, start: PlantStart) -> "LinearSystem":
-        """Return the system at x(0)."""
         return LinearSystem(start.A, start.B, start.x0, step_ns=start.step_ns)
 
 
 class LinearSystem:
     """``dx/dt = A x + B u``; z is empty.
 
-    Args:
-        A, B: shapes (n, n) and (n, m), per second.
-        x0: x(0), shape (n,).
-        step_ns: the expected step; its matrices are computed before the first deadline.
+    The matrices of the expected step are computed before the first deadline.
     """
 
     def __init__(self, A: Matrix, B: Matrix, x0: Vector, *, step_ns: int) -> None:

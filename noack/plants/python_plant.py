@@ -4,7 +4,7 @@ The class's code runs in the plant's process. An exception in this code stops th
 but not the run.
 """
 
-from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -15,10 +15,10 @@ from noack.plants.plant_settings import Names, PlantEquations, PlantSettings, Pl
 from noack.plants.systems.plant_system import PlantSystem, SystemFailedError
 from noack.settings.user_class import (
     ClassSettings,
-    failure_text,
     new_instance,
     read_only,
     real_vector,
+    user_code,
 )
 
 _PLACE = "plant.system"
@@ -27,7 +27,7 @@ _START_TOLERANCE = 1e-6
 
 
 class PythonPlantSettings(ClassSettings, PlantSettings):
-    """A class of the user's own, from an installed package or from a file.
+    """A user's class, from an installed package or a file.
 
     Its code runs in the plant's process; docs/plants.md lists the methods that it must have.
     """
@@ -35,17 +35,14 @@ class PythonPlantSettings(ClassSettings, PlantSettings):
     group: ClassVar = "noack.plants"
 
     kind: Literal["python"]
-    """The kind of plant."""
     on_record: Names = ()
     """Names of the entries of the class's own state z; if they are given, z is recorded."""
 
     @property
     def internal_names(self) -> tuple[str, ...]:
-        """Names of the entries of z."""
         return self.on_record
 
     def system(self, start: PlantStart) -> PlantSystem:
-        """Return an object of the class, at x(0)."""
         return PythonSystem(self, start.x0, start.B.shape[1])
 
 
@@ -57,29 +54,19 @@ class PythonSystem:
     The second is ``start(x0)``, ``advance(u, t_s, dt_s)`` and ``x``, with ``z`` if z is to be
     recorded. ``docs/plants.md`` has examples.
 
-    Args:
-        settings: of a loaded scenario.
-        x0: x(0), shape (n,).
-        m: number of inputs.
-
     Raises:
         CallerError: the class does not exist, raises, or lacks a required method.
     """
 
     def __init__(self, settings: PythonPlantSettings, x0: Vector, m: int) -> None:
-        self._settings = settings
         self._recorded = len(settings.on_record)
-        try:
+        self._user_code = partial(user_code, settings, _PLACE, CallerError)
+        with self._user_code():
             plant, self.about = new_instance(settings, _PLACE)
             self._system = self._system_of(plant, x0, m)
             self.x, self.z = x0, np.zeros(self._recorded)
             self._copy_state()
-        except CallerError:
-            raise
-        except SystemFailedError as error:
-            raise CallerError(str(error)) from None
-        except (Exception, SystemExit) as error:
-            raise CallerError(self._failure(error)) from None
+        self._user_code = partial(user_code, settings, _PLACE, SystemFailedError)
         if not np.all(np.abs(self.x - x0) <= _START_TOLERANCE * (np.abs(x0) + 1.0)):
             raise CallerError(
                 f'{_PLACE}.name = "{settings.name}": x is {self.x.tolist()} at the start; '
@@ -87,14 +74,9 @@ class PythonSystem:
             )
 
     def advance(self, u: Vector, t_ns: int, dt_ns: int) -> None:
-        """Advance by one step."""
-        try:
+        with self._user_code():
             self._system.advance(u, t_ns, dt_ns)
             self._copy_state()
-        except (Exception, SystemExit) as error:
-            if isinstance(error, SystemFailedError):
-                raise
-            raise SystemFailedError(self._failure(error)) from None
 
     def _copy_state(self) -> None:
         self.x = real_vector("x", self._system.x, len(self.x))
@@ -114,7 +96,12 @@ class PythonSystem:
             raise ValueError(
                 f"z has {len(z0)} entries; plant.system.on_record names {self._recorded}"
             )
-        derivative = self._derivative(plant, len(z0))
+
+        def derivative(t_s: float, z: Vector, u: Vector) -> Vector:
+            with self._user_code():
+                rates = plant.derivative(t_s, read_only(z), read_only(u))
+                return real_vector("derivative(t_s, z, u)", rates, len(z0))
+
         derivative(0.0, z0, np.zeros(m))  # report its errors before the run
         output = plant.output if hasattr(plant, "output") else np.copy
         from noack.plants.systems.ode_integrator import OdeSystem
@@ -123,19 +110,6 @@ class PythonSystem:
             derivative, lambda _: z0, output=output, is_recorded=bool(self._recorded)
         )
         return OdeSystem(equations, x0)
-
-    def _derivative(self, plant: Any, size: int) -> Callable[[float, Vector, Vector], Vector]:
-        def derivative(t_s: float, z: Vector, u: Vector) -> Vector:
-            try:
-                found = plant.derivative(t_s, read_only(z), read_only(u))
-                return real_vector("derivative(t_s, z, u)", found, size)
-            except (Exception, SystemExit) as error:
-                raise SystemFailedError(self._failure(error)) from None
-
-        return derivative
-
-    def _failure(self, error: BaseException) -> str:
-        return failure_text(self._settings, _PLACE, error)
 
 
 class _Stepping:

@@ -9,7 +9,7 @@ from noack.settings.section import NonNegative, Positive
 
 
 class QuadrotorSettings(EquationSettings):
-    """A hovering rigid body: thrust along its own axis, torques about its axes, drag in the air.
+    """A hovering rigid body: thrust along its own axis, torques about its axes, linear drag.
 
     The default parameters are those of Luukkonen, "Modelling and Control of Quadcopter", Aalto
     University, 2011. u is the thrust in excess of the weight, and the torques.
@@ -25,7 +25,6 @@ class QuadrotorSettings(EquationSettings):
     scenario: ClassVar = "quadrotor_hover"
 
     kind: Literal["quadrotor"]
-    """The kind of plant."""
     mass_kg: Positive = 0.468
     """Mass."""
     inertia_kg_m2: tuple[Positive, Positive, Positive] = (4.856e-3, 4.856e-3, 8.801e-3)

@@ -8,7 +8,7 @@ sign.
 
 import math
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
@@ -38,7 +38,7 @@ _PARAMETERS = {"ford_escort": 1, "bmw_320i": 2, "vw_vanagon": 3, "truck": 4}
 
 
 class VehicleSettings(EquationSettings):
-    """A road vehicle of CommonRoad's vehicle models, beside the lane that the x-axis is.
+    """A road vehicle of CommonRoad's vehicle models; the lane is the x-axis.
 
     Althoff and Würsching, "CommonRoad: Vehicle Models", 2020. x is the state of the lane models: V
     and Y_g have the opposite sign of the library's coordinates. u is the requested steering angle.
@@ -56,7 +56,6 @@ class VehicleSettings(EquationSettings):
     )  # fmt: skip
 
     kind: Literal["vehicle"]
-    """The kind of plant."""
     model: Literal["kinematic", "single_track", "drift", "multi_body"] = "single_track"
     """The library's model: ks (kst for the truck), st, std or mb, in order of their number of
     states."""
@@ -73,7 +72,6 @@ class VehicleSettings(EquationSettings):
 
     @property
     def settling_s(self) -> float:
-        """Eight time constants of the steering."""
         return 8 * self.steering_s
 
     @property
@@ -103,12 +101,11 @@ class VehicleSettings(EquationSettings):
             )
         if self.friction != 1 and self.model in ("kinematic", "single_track"):
             raise ValueError(
-                f'friction: the model "{self.model}" has none; "drift" and "multi_body" have'
+                f'friction: the model "{self.model}" has none; take "drift" or "multi_body"'
             )
         return self
 
     def prepare(self) -> None:
-        """Compile the equations, once per machine."""
         self.require_installed()
         if not vehicle_equations.is_compiled(self.library_model):
             vehicle_equations.compiled_dynamics(self.library_model)
@@ -140,7 +137,7 @@ class VehicleSettings(EquationSettings):
         return PlantEquations(
             derivative,
             initial=lambda x0: np.array(model.start(x0, speed, parameters), dtype=np.float64),
-            output=model.output(parameters),
+            output=lambda z: model.output(z, parameters),
             relative=model.relative,
             absolute=1e-3 * model.relative,
             is_recorded=True,
@@ -152,8 +149,8 @@ class _Model(NamedTuple):
 
     start: Callable[[Vector, float, Any], list[float]]
     """z(0) from x(0), the speed and the parameters."""
-    output: Callable[[Any], Callable[[Vector], Vector]]
-    """x as a function of z, given the parameters."""
+    output: Callable[[Vector, Any], Vector]
+    """x from z and the parameters."""
     relative: float = 1e-9
     """Relative tolerance of the integration."""
 
@@ -173,11 +170,8 @@ def _start(x0: Vector, speed: float, parameters: Any) -> list[float]:
     return [0.0, -lateral, 0.0, math.hypot(sideways, speed), yaw, rate, slip]
 
 
-def _output(parameters: Any) -> Callable[[Vector], Vector]:
-    def output(z: Vector) -> Vector:
-        return np.array([-z[3] * math.sin(z[6]), z[5], z[4], -z[1]])
-
-    return output
+def _output(z: Vector, parameters: Any) -> Vector:
+    return np.array([-z[3] * math.sin(z[6]), z[5], z[4], -z[1]])
 
 
 def _start_kinematic(x0: Vector, speed: float, parameters: Any) -> list[float]:
@@ -187,37 +181,25 @@ def _start_kinematic(x0: Vector, speed: float, parameters: Any) -> list[float]:
     return [0.0, -lateral - parameters.b * math.sin(yaw), steering, speed, yaw]
 
 
-def _output_kinematic(parameters: Any) -> Callable[[Vector], Vector]:
+def _output_kinematic(z: Vector, parameters: Any) -> Vector:
     behind, wheelbase = parameters.b, parameters.a + parameters.b
-
-    def output(z: Vector) -> Vector:
-        rate = z[3] * math.tan(z[2]) / wheelbase
-        return np.array([-behind * rate, rate, z[4], -z[1] - behind * math.sin(z[4])])
-
-    return output
+    rate = z[3] * math.tan(z[2]) / wheelbase
+    return np.array([-behind * rate, rate, z[4], -z[1] - behind * math.sin(z[4])])
 
 
-def _start_drift(x0: Vector, speed: float, parameters: Any) -> list[float]:
-    started: list[float] = library("init_std")(_start(x0, speed, parameters), parameters)
+def _start_by_library(name: str, x0: Vector, speed: float, parameters: Any) -> list[float]:
+    started: list[float] = library(name)(_start(x0, speed, parameters), parameters)
     return started
-
-
-def _start_multi_body(x0: Vector, speed: float, parameters: Any) -> list[float]:
-    started: list[float] = library("init_mb")(_start(x0, speed, parameters), parameters)
-    return started
-
-
-def _output_multi_body(parameters: Any) -> Callable[[Vector], Vector]:
-    def output(z: Vector) -> Vector:
-        return np.array([-z[10], z[5], z[4], -z[1]])
-
-    return output
 
 
 _MODELS = {
     "ks": _Model(_start_kinematic, _output_kinematic),
     "kst": _Model(lambda *args: [*_start_kinematic(*args), 0.0], _output_kinematic),
     "st": _Model(_start, _output),
-    "std": _Model(_start_drift, _output, relative=1e-7),
-    "mb": _Model(_start_multi_body, _output_multi_body, relative=1e-6),
+    "std": _Model(partial(_start_by_library, "init_std"), _output, relative=1e-7),
+    "mb": _Model(
+        partial(_start_by_library, "init_mb"),
+        lambda z, _: np.array([-z[10], z[5], z[4], -z[1]]),
+        relative=1e-6,
+    ),
 }

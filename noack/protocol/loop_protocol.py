@@ -6,17 +6,12 @@ Every process and every reader of a record asks the scenario's protocol for a pr
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Literal
-
-ProtocolName = Literal["none", "ack"]
 
 
 @dataclass(frozen=True)
 class LoopProtocol:
     """A protocol of the loop."""
 
-    name: ProtocolName
-    """``network.protocol``."""
     acknowledgement_routes: Mapping[str, str]
     """To whom each process sends acknowledgements."""
     states_caption: str
@@ -41,9 +36,8 @@ class LoopProtocol:
         return next((by for by, to in self.acknowledgement_routes.items() if to == role), None)
 
 
-PROTOCOLS: Mapping[ProtocolName, LoopProtocol] = {
+PROTOCOLS: Mapping[str, LoopProtocol] = {
     "none": LoopProtocol(
-        name="none",
         acknowledgement_routes=MappingProxyType({}),
         states_caption="At every event x_s jumps to {known}; x_c does so only when the update "
         "arrives. ",
@@ -54,7 +48,6 @@ PROTOCOLS: Mapping[ProtocolName, LoopProtocol] = {
         reset="at every event",
     ),
     "ack": LoopProtocol(
-        name="ack",
         acknowledgement_routes=MappingProxyType({"controller": "netem", "netem": "sensor"}),
         states_caption="x_c jumps to {known} when an update arrives, x_s when its acknowledgement "
         "arrives. ",

@@ -1,13 +1,7 @@
-"""Topology of the loop: which process sends which flow to which.
+"""Topology of the loop (see ARCHITECTURE.md): which process sends which flow to which.
 
-plant ──measurement──▶ sensor ──update──▶ netem ──delivered updates──▶ controller
-▲                                                                          │
-└───────────────────────────────── actuation ──────────────────────────────┘
-
-The acknowledgement baseline (``network.protocol = "ack"``) adds a reverse path, over the same
-sockets:
-
-sensor ◀──delivered acknowledgements── netem ◀──acknowledgement── controller
+The acknowledgement baseline (``network.protocol = "ack"``) adds a reverse path over the same
+sockets: controller, netem, sensor.
 """
 
 from collections.abc import Mapping

@@ -38,14 +38,14 @@ MAX_UDP_BYTES = 65_535
 T = TypeVar("T")
 
 
-def bind(port: int, key: str, host: str = LOOPBACK) -> socket.socket:
-    """Return a non-blocking UDP socket bound to ``host:port`` (port 0: any free one).
+def bind(port: int, key: str) -> socket.socket:
+    """Return a non-blocking UDP socket on loopback, bound to a port (0: any free one).
 
     Raise CallerError, which names the setting ``key``, if the port is taken or not permitted.
     """
     endpoint = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
-        endpoint.bind((host, port))
+        endpoint.bind((LOOPBACK, port))
     except OSError as error:
         endpoint.close()
         reason = {
@@ -53,7 +53,7 @@ def bind(port: int, key: str, host: str = LOOPBACK) -> socket.socket:
             errno.EACCES: "needs privileges that this user does not have",
         }.get(error.errno or 0, f"cannot be bound ({error.strerror})")
         raise CallerError(
-            f"UDP port {host}:{port} {reason}; set {key} to another port, or to 0 for any"
+            f"UDP port {LOOPBACK}:{port} {reason}; set {key} to another port, or to 0 for any"
         ) from None
     endpoint.setblocking(False)
     enlarge_buffer(endpoint)
@@ -70,22 +70,22 @@ def enlarge_buffer(endpoint: socket.socket) -> int:
     return endpoint.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
 
 
-def free_tcp_port(host: str = LOOPBACK) -> int:
+def free_tcp_port() -> int:
     """Return a TCP port that is free now."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
-        probe.bind((host, 0))
+        probe.bind((LOOPBACK, 0))
         return int(probe.getsockname()[1])
 
 
-def require_free_tcp_port(port: int, key: str, host: str = LOOPBACK) -> None:
+def require_free_tcp_port(port: int, key: str) -> None:
     """Raise CallerError if a TCP port cannot be listened on."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            probe.bind((host, port))
+            probe.bind((LOOPBACK, port))
         except OSError as error:
             raise CallerError(
-                f"control plane: TCP port {host}:{port} cannot be bound ({error.strerror}); "
+                f"control plane: TCP port {LOOPBACK}:{port} cannot be bound ({error.strerror}); "
                 f"set {key} to another port, or to 0 for any"
             ) from None
 

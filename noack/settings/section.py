@@ -1,4 +1,4 @@
-"""The base of every table in a settings file: frozen, and unknown keys are errors."""
+"""The base of every table in a settings file, and the types of its numbers."""
 
 import ast
 import inspect
@@ -10,11 +10,16 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, GetJsonSchemaHandler
 from pydantic_core import CoreSchema
 
+from noack.core.clock import NS_PER_S
+
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 NonNegative = Annotated[FiniteFloat, Field(ge=0)]
 Probability = Annotated[FiniteFloat, Field(ge=0, le=1)]
 Correlation = Annotated[FiniteFloat, Field(ge=0, lt=1)]
 Seed = Annotated[int, Field(ge=0, lt=2**64)]
+RateHz = Annotated[FiniteFloat, Field(gt=0, le=100_000)]
+_LEAST_RATE_HZ = 1e-9
+"""Lowest rate; its period in nanoseconds fits into 64 bits."""
 
 
 class ScenarioSection(BaseModel):
@@ -61,3 +66,20 @@ def _docstrings(module: str) -> dict[str, dict[str, str]]:
                 ):
                     found.setdefault(section.name, {})[key] = inspect.cleandoc(text)
     return found
+
+
+def period_ns(rate_hz: float) -> int:
+    """Return the period of a validated rate, a whole number of nanoseconds."""
+    return round(NS_PER_S / rate_hz)
+
+
+def require_whole_period(rate_hz: float, key: str) -> None:
+    """Raise ValueError unless the rate's period is a whole number of nanoseconds."""
+    if rate_hz < _LEAST_RATE_HZ:
+        raise ValueError(f"{key}: must be at least {_LEAST_RATE_HZ:g}")
+    whole_ns = period_ns(rate_hz)
+    if whole_ns < 1 or abs(NS_PER_S / whole_ns - rate_hz) > 1e-12 * rate_hz:
+        raise ValueError(
+            f"{key}: the period must be a whole number of nanoseconds; "
+            f"the nearest such rate is {NS_PER_S / max(whole_ns, 1)!r}"
+        )

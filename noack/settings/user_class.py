@@ -6,6 +6,8 @@ needs it. Plants, triggers and controllers share this module.
 
 import sys
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module, metadata
 from pathlib import Path
 from types import ModuleType
@@ -14,7 +16,7 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
-from noack.core.errors import one_line
+from noack.core.errors import NoackError, one_line
 from noack.core.linear_systems import Vector
 from noack.settings.matrices import Row, Rows
 from noack.settings.named_file import FileSettings, unchanged
@@ -49,14 +51,25 @@ def new_instance(settings: ClassSettings, place: str) -> tuple[Any, str]:
 
     Raises:
         CallerError: the file has changed, or is missing; ``place`` names the table.
-        Exception: anything that the user's code raises; :func:`failure_text` describes it.
+        Exception: anything that the user's code raises; :func:`user_code` describes it.
     """
     made, description = _class(settings, place)
     parameters = {key: _as_list(value) for key, value in settings.parameters.items()}
     return made(**parameters), description
 
 
-def failure_text(settings: ClassSettings, place: str, error: BaseException) -> str:
+@contextmanager
+def user_code(settings: ClassSettings, place: str, failure: type[NoackError]) -> Iterator[None]:
+    """Turn an error of the user's code in this context into a failure; noack's own errors pass."""
+    try:
+        yield
+    except NoackError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise failure(_failure_text(settings, place, error)) from None
+
+
+def _failure_text(settings: ClassSettings, place: str, error: BaseException) -> str:
     """Return one line about an error in the user's code: the class, the error, the source line."""
     frames = [one for one in traceback.extract_tb(error.__traceback__) if not _is_ours(one)]
     where = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""

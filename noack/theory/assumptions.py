@@ -17,6 +17,8 @@ from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.theory.certificate import Constants, NetworkConditions
 
+_NOT_COVERED = "not covered by the theorems and the certificates"
+
 
 class AssumptionStatus(StrEnum):
     """The status of an assumption."""
@@ -43,83 +45,79 @@ class Assumption(NamedTuple):
 
 def assumptions(resolved: Scenario) -> list[Assumption]:
     """Return the paper's assumptions for a resolved scenario, with verdicts."""
-    loop = loop_of(resolved)
-    return [
-        *([_closed_loop(loop)] if resolved.coverage.is_linear else _not_linear(loop, resolved)),
-        *_trigger(loop, resolved),
-        *_control_law(resolved),
-        *_protocol(resolved),
-        *([_unstable_and_distinct(loop.A)] if resolved.coverage.is_linear else []),
-        _mansd(resolved),
-        _continuous_time(resolved),
-        *_disturbed(resolved),
-        *_estimated(loop, resolved),
-    ]
+    loop, linear = loop_of(resolved), resolved.coverage.is_linear
+    found = [_closed_loop(loop)] if linear else _not_linear(loop, resolved)
+    if not resolved.coverage.is_decaying:
+        why = f'the policy is "{resolved.trigger.policy}": {_NOT_COVERED}'
+        found.append(_violated("the trigger is ‖e_s‖ > βe^(−αt)", "eq:thre", why))
+    elif linear:
+        found.append(_decay_rate(loop, resolved.decaying.alpha_per_s))
+    if not resolved.controller.is_linear:
+        why = f'controller.kind = "{resolved.controller.kind}": {_NOT_COVERED}'
+        found.append(_violated("the input is u = K x_c", "eq:ModCont", why))
+    if resolved.protocol.acknowledges:
+        what = "the sensor resets x_s at every event; nothing is acknowledged"
+        found.append(_violated(what, "Section II", f'protocol = "ack": {_NOT_COVERED}'))
+    if linear:
+        found.append(_unstable_and_distinct(loop.A))
+    found += [_mansd(resolved), _continuous_time(resolved)]
+    if resolved.plant.disturbances:
+        kinds = ", ".join(f"{one.kind} at the {one.at}" for one in resolved.plant.disturbances)
+        found.append(
+            _violated("nothing disturbs the plant", "eq:plant", f"{kinds}: {_NOT_COVERED}")
+        )
+    return found + _estimated(loop, resolved)
+
+
+def _violated(what: str, source: str, why: str) -> Assumption:
+    return Assumption(what, source, AssumptionStatus.VIOLATED, why)
+
+
+def _checked(what: str, source: str, holds: bool, why: str) -> Assumption:
+    status = AssumptionStatus.HOLDS if holds else AssumptionStatus.VIOLATED
+    return Assumption(what, source, status, why)
 
 
 def _not_linear(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:
     nominal = spectral_abscissa(loop.A_model + loop.B_model @ loop.K)
+    kind = f'it is of kind "{resolved.plant.system.kind}": {_NOT_COVERED}'
+    why = f"largest real part {nominal:.3g} /s with Â + B̂K{_other_sign(loop)}"
     return [
-        Assumption(
-            "the plant is ẋ = Ax + Bu", "eq:plant", AssumptionStatus.VIOLATED,
-            f'it is of kind "{resolved.plant.system.kind}": the theorems and the certificates say '
-            "nothing of it",
-        ),
-        Assumption(
-            "the gain stabilises the model", "Theorem 2", _verdict(nominal < 0),
-            f"largest real part {nominal:.3g} /s with Â + B̂K{_other_sign(loop)}",
-        ),
-    ]  # fmt: skip
-
-
-def _disturbed(resolved: Scenario) -> list[Assumption]:
-    if not resolved.plant.disturbances:
-        return []
-    what = ", ".join(f"{one.kind} at the {one.at}" for one in resolved.plant.disturbances)
-    return [
-        Assumption(
-            "nothing disturbs the plant", "eq:plant", AssumptionStatus.VIOLATED,
-            f"{what}: not covered by the theorems and the certificates",
-        )
-    ]  # fmt: skip
+        _violated("the plant is ẋ = Ax + Bu", "eq:plant", kind),
+        _checked("the gain stabilises the model", "Theorem 2", nominal < 0, why),
+    ]
 
 
 def _estimated(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:
     """Return the assumptions that replace "the sensor measures x" with an observer or noise."""
     if resolved.coverage.knows_state:
         return []
-    found = steady_state(resolved)
-    rms, p = float(np.sqrt(np.trace(found.covariance))), resolved.message_sizes.outputs
-    how = (
-        "with noise"
-        if resolved.observer is None
-        else f"by an observer ({resolved.observer.kind}), from y of {p} "
-        + ("entry" if p == 1 else "entries")
-    )
-    measured = Assumption(
-        "the sensor measures x", "Section II", AssumptionStatus.VIOLATED,
-        f"x is known {how}: not covered by the theorems and the certificates",
-    )  # fmt: skip
-    if resolved.observer is None:
-        return [measured, *_above_noise(loop, resolved, found)]
-    if not np.isfinite(found.radius):
-        why = "no steady state found: model and covariances differ by too many magnitudes"
-        decays = Assumption("the observer's error decays", "(I − LC)e^(ÂT)", _verdict(False), why)
-        return [measured, decays]
-    comes_to = (
-        f"noise and random disturbances alone give ‖x̂ − x‖ = {rms:.3g} (RMS)"
-        if found.radius < 1
-        else "‖x̂ − x‖ grows"
-    )
-    decays = Assumption(
-        "the observer's error decays", "(I − LC)e^(ÂT)", _verdict(found.radius < 1),
-        f"steady-state spectral radius {found.radius:.4g} per measurement; {comes_to}",
-    )  # fmt: skip
-    above = _above_noise(loop, resolved, found) if found.radius < 1 else []
-    return [measured, decays, *above]
+    estimation = steady_state(resolved)
+    rms = float(np.sqrt(np.trace(estimation.covariance)))
+    how = "with noise"
+    if resolved.observer is not None:
+        p = resolved.message_sizes.outputs
+        entries = "1 entry" if p == 1 else f"{p} entries"
+        how = f"by an observer ({resolved.observer.kind}), from y of {entries}"
+    found = [_violated("the sensor measures x", "Section II", f"x is known {how}: {_NOT_COVERED}")]
+    decays = estimation.radius < 1
+    if resolved.observer is not None:
+        error = (
+            f"noise and random disturbances alone give ‖x̂ − x‖ = {rms:.3g} (RMS)"
+            if decays
+            else "‖x̂ − x‖ grows"
+        )
+        why = f"steady-state spectral radius {estimation.radius:.4g} per measurement; {error}"
+        if not np.isfinite(estimation.radius):
+            why = "no steady state found: model and covariances differ by too many magnitudes"
+        found.append(_checked("the observer's error decays", "(I − LC)e^(ÂT)", decays, why))
+    least = resolved.trigger.least_threshold
+    if least is not None and (decays or resolved.observer is None):
+        found.append(_above_noise(loop, least, estimation))
+    return found
 
 
-def _above_noise(loop: LoopMatrices, resolved: Scenario, found: SteadyState) -> list[Assumption]:
+def _above_noise(loop: LoopMatrices, least: float, estimation: SteadyState) -> Assumption:
     """Return whether the trigger's smallest threshold is above the e_s from estimation errors.
 
     This e_s is the difference between the estimation error now and at the last event. Its RMS is
@@ -127,68 +125,22 @@ def _above_noise(loop: LoopMatrices, resolved: Scenario, found: SteadyState) -> 
     exceeded. For an unstable plant the error from the last event grows until every threshold is
     reached.
     """
-    least = resolved.trigger.least_threshold
-    if least is None:
-        return []
     weight = np.eye(loop.n) if loop.weight is None else loop.weight
-    size = float(np.sqrt(2 * np.trace(weight @ found.covariance @ weight.T)))
-    return [
-        Assumption(
-            "the threshold stays above the noise", "trigger", _verdict(least >= 3 * size),
-            f"it falls to {least:.3g}; noise alone gives ‖e_s‖ = {size:.3g} (RMS): set "
-            f"trigger.floor ≥ {3 * size:.2g}; below that, noise alone triggers",
-        )
-    ]  # fmt: skip
-
-
-def _trigger(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:
-    if resolved.coverage.is_decaying:
-        rate = _decay_rate(loop, resolved.decaying.alpha_per_s)
-        return [rate] if resolved.coverage.is_linear else []
-    policy = resolved.trigger.policy
-    return [
-        Assumption(
-            "the trigger is ‖e_s‖ > βe^(−αt)", "eq:thre", AssumptionStatus.VIOLATED,
-            f'the policy is "{policy}": not covered by the theorems and the certificates',
-        )
-    ]  # fmt: skip
-
-
-def _control_law(resolved: Scenario) -> list[Assumption]:
-    if resolved.controller.is_linear:
-        return []
-    return [
-        Assumption(
-            "the input is u = K x_c", "eq:ModCont", AssumptionStatus.VIOLATED,
-            f'controller.kind = "{resolved.controller.kind}": the theorems and the certificates '
-            "do not cover it",
-        )
-    ]  # fmt: skip
-
-
-def _protocol(resolved: Scenario) -> list[Assumption]:
-    if not resolved.protocol.acknowledges:
-        return []
-    return [
-        Assumption(
-            "the sensor resets x_s at every event; nothing is acknowledged", "Section II",
-            AssumptionStatus.VIOLATED,
-            'protocol = "ack": not covered by the theorems and the certificates',
-        )
-    ]  # fmt: skip
-
-
-def _verdict(holds: bool) -> AssumptionStatus:
-    return AssumptionStatus.HOLDS if holds else AssumptionStatus.VIOLATED
+    size = float(np.sqrt(2 * np.trace(weight @ estimation.covariance @ weight.T)))
+    return _checked(
+        "the threshold stays above the noise", "trigger", least >= 3 * size,
+        f"it falls to {least:.3g}; noise alone gives ‖e_s‖ = {size:.3g} (RMS): set "
+        f"trigger.floor ≥ {3 * size:.2g}; below that, noise alone triggers",
+    )  # fmt: skip
 
 
 def _closed_loop(loop: LoopMatrices) -> Assumption:
     true = spectral_abscissa(loop.A + loop.B @ loop.K)
     nominal = spectral_abscissa(loop.A_model + loop.B_model @ loop.K)
-    return Assumption(
+    return _checked(
         "the gain stabilises the plant and the model",
         "Theorem 2",
-        _verdict(true < 0 and nominal < 0),
+        true < 0 and nominal < 0,
         f"largest real part {true:.3g} /s with A + BK, {nominal:.3g} /s with Â + B̂K"
         f"{_other_sign(loop)}",
     )
@@ -204,13 +156,15 @@ def _other_sign(loop: LoopMatrices) -> str:
 
 def _decay_rate(loop: LoopMatrices, alpha_per_s: float) -> Assumption:
     rate = -spectral_abscissa(loop.A + loop.B @ loop.K)
-    how = f"decay rate {rate:.3g} /s" if rate > 0 else f"grows at {0.0 - rate:.3g} /s"
-    return Assumption(
-        "0 < α < ᾱ: the threshold decays more slowly than the closed loop",
-        "Theorem 2",
-        _verdict(alpha_per_s < rate),
-        f"α = {alpha_per_s:g} /s; A + BK: {how}",
-    )
+    what = "0 < α < ᾱ: the threshold decays more slowly than the closed loop"
+    why = f"α = {alpha_per_s:g} /s; A + BK: {_decays(rate)}"
+    return _checked(what, "Theorem 2", alpha_per_s < rate, why)
+
+
+def _decays(rate_per_s: float) -> str:
+    if rate_per_s > 0:
+        return f"decay rate {rate_per_s:.3g} /s"
+    return f"grows at {0.0 - rate_per_s:.3g} /s"
 
 
 def _unstable_and_distinct(A: Matrix) -> Assumption:
@@ -239,12 +193,14 @@ def _mansd(resolved: Scenario) -> Assumption:
         "first_packet": "the first packet is delivered",
         "known_state": "sensor and controller know x(0)",
     }[network.initial_sync]
-    return Assumption(
+    enforced = (
+        "enforced by the network" if network.enforce_mansd else "not enforced (enforce_mansd)"
+    )
+    return _checked(
         f"at most M − 1 = {network.mansd} consecutive losses after a delivered t_0",
         "Section III",
-        _verdict(network.enforce_mansd),
-        ("enforced by the network" if network.enforce_mansd else "not enforced (enforce_mansd)")
-        + f"; {start}",
+        network.enforce_mansd,
+        f"{enforced}; {start}",
     )
 
 
@@ -274,80 +230,54 @@ def certificate_assumptions(
     resolved: Scenario,
     conditions: NetworkConditions,
     decay: dict[str, float],
-    held: bool,
     constants: Constants | None,
     void: str | None,
 ) -> list[Assumption]:
     """Return the assumptions of a certificate, with verdicts.
 
-    Args:
-        resolved: the scenario.
-        conditions: the assumptions about network and schedule.
-        decay: decay rates per second, of "the models" and of "A + BK".
-        held: whether the models hold instead of decaying.
-        constants: constants of the certificate; None if there is no certificate.
-        void: reason for having no certificate.
+    ``decay`` has the decay rates per second of "the models" (infinite if they hold) and "A + BK".
+    Without a certificate, ``constants`` is None and ``void`` is the reason.
     """
-    alpha, network = resolved.decaying.alpha_per_s, resolved.network
-    rate = 0.0 if constants is None else constants.rate_per_s
-    if held:
-        why = "a hold does not decay: the certified bounds are constant"
-        models = Assumption(
-            "α is below the decay rate of the models", "(I1)", AssumptionStatus.VIOLATED, why
-        )
+    alpha = resolved.decaying.alpha_per_s
+    slower = 0.0 if constants is None else constants.rate_per_s
+    found = []
+    for of, source in (("the models", "(I1)"), ("A + BK", "Theorem 2")):
+        holds = below(alpha, decay[of])
+        why = f"α = {alpha:g} /s, {_decays(decay[of])}"
+        if slower and not holds:
+            why += f"; certified instead: bounds with decay rate {slower:.3g} /s"
+        if math.isinf(decay[of]):
+            holds, why = False, "a hold does not decay: the certified bounds are constant"
+        found.append(_checked(f"α is below the decay rate of {of}", source, holds, why))
+    found += _conditions(conditions, resolved.network.enforce_mansd)
+    if constants is None:
+        found.append(_violated("there is a certificate", "certificate", void or ""))
     else:
-        models = _rate("the models", "(I1)", alpha, decay["the models"], rate)
-    assumed = [
+        why = f"met: the loop gain of the errors is {constants.loop_gain:.3g}, below 1"
+        found.append(_checked("small-gain condition", "certificate", True, why))
+    why = "the bounds rest on (I1), which holds for every plant"
+    what, source = "A is unstable with distinct eigenvalues", "Proposition 1"
+    return [*found, Assumption(what, source, AssumptionStatus.NOT_NEEDED, why)]
+
+
+def _conditions(conditions: NetworkConditions, enforced: bool) -> list[Assumption]:
+    losses = Assumption(
         f"at most {conditions.dropouts} consecutive losses after a delivered t_0",
-        f"the trigger is tested every {1e3 * conditions.sampling_s:g} ms"
-        if conditions.sampling_s
-        else "the trigger is tested continuously",
+        "conditions",
+        AssumptionStatus.HOLDS if enforced else AssumptionStatus.ASSUMED,
+        "enforced by the network" if enforced else "not enforced",
+    )
+    sampling = (
+        f"every {1e3 * conditions.sampling_s:g} ms" if conditions.sampling_s else "continuously"
+    )
+    schedule = (
+        f"the trigger is tested {sampling}",
         f"an update reaches the plant within {1e3 * conditions.delay_s:g} ms of its event",
         f"the applied input is at most {1e3 * conditions.hold_s:g} ms old",
         f"the first input arrives within {1e3 * conditions.start_s:g} ms",
-    ]
-    enforced = "enforced by the network" if network.enforce_mansd else "not enforced"
-    checks = [enforced, *["checked in each run"] * 4]
-    verdicts = [AssumptionStatus.HOLDS if network.enforce_mansd else AssumptionStatus.ASSUMED]
-    verdicts += [AssumptionStatus.ASSUMED] * 4
-    gain = (
-        Assumption(
-            "small-gain condition",
-            "certificate",
-            AssumptionStatus.HOLDS,
-            f"met: the loop gain of the errors is {constants.loop_gain:.3g}, below 1",
-        )
-        if constants is not None
-        else Assumption(
-            "there is a certificate", "certificate", AssumptionStatus.VIOLATED, void or ""
-        )
     )
-    return [
-        models,
-        _rate("A + BK", "Theorem 2", alpha, decay["A + BK"], rate),
-        *(
-            Assumption(what, "conditions", verdict, why)
-            for what, verdict, why in zip(assumed, verdicts, checks, strict=True)
-        ),
-        gain,
-        Assumption(
-            "A is unstable with distinct eigenvalues",
-            "Proposition 1",
-            AssumptionStatus.NOT_NEEDED,
-            "the bounds rest on (I1), which holds for every plant",
-        ),
-    ]
-
-
-def _rate(of: str, source: str, alpha: float, decay: float, rate: float) -> Assumption:
-    holds = below(alpha, decay)
-    why = f"α = {alpha:g} /s, " + (
-        f"decay rate {decay:.3g} /s" if decay >= 0 else f"grows at {-decay:.3g} /s"
-    )
-    if not holds:
-        why += f"; certified instead: bounds with decay rate {rate:.3g} /s" if rate else ""
-    verdict = AssumptionStatus.HOLDS if holds else AssumptionStatus.VIOLATED
-    return Assumption(f"α is below the decay rate of {of}", source, verdict, why)
+    checked = AssumptionStatus.ASSUMED, "checked in each run"
+    return [losses, *(Assumption(what, "conditions", *checked) for what in schedule)]
 
 
 def below(alpha_per_s: float, decay_per_s: float) -> bool:

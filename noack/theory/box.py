@@ -21,54 +21,30 @@ import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.contraction import logarithmic_norm
-from noack.theory.enclosure import NotDecayingError, ResponseBounds, factors, response
-from noack.theory.gains import Coefficients, ErrorGains, Growth, Output
+from noack.theory.enclosure import NotDecayingError, ResponseBounds, response
+from noack.theory.gains import Coefficients, Growth, Output, PlantGains
 
 
 @dataclass(frozen=True)
-class BoxGains:
-    """All plants of a box, in the form of a plant for :func:`noack.theory.certificate.solve`.
+class BoxGains(PlantGains):
+    """Gains that hold for all plants of a box around A and B; half-widths (n, n) and (n, m)."""
 
-    Args:
-        error: gains of the models.
-        A_model, B_model: the box's centre, (n, n) and (n, m).
-        halfwidth_A, halfwidth_B: the box, (n, n) and (n, m).
-        start: x(0) as a column, (n, 1); or a matrix that maps the unit ball to a set with x(0).
-        alpha_per_s: α of the scaling.
-    """
-
-    error: ErrorGains
-    A_model: Matrix
-    B_model: Matrix
     halfwidth_A: Matrix
     halfwidth_B: Matrix
-    start: Matrix
-    alpha_per_s: float
-
-    @cached_property
-    def outputs(self) -> Mapping[Output, Matrix]:
-        """C of each output C x; the model error w is added to ``MISMATCH``."""
-        return {
-            Output.STATE: np.eye(len(self.A_model)),
-            Output.WEIGHTED: self.error.weight,
-            Output.MISMATCH: self._split_nominal[1],
-            Output.GAIN_RATE: self.error.outputs[Output.GAIN_RATE],
-        }
 
     @cached_property
     def states(self) -> Mapping[Output, Coefficients]:
-        """sup‖C x‖ from x(0) and from the input error.
+        """sup‖C x‖ from x(0) and from the input error; w is added to ``MISMATCH``.
 
         Raises:
             NotDecayingError: the model decays too slowly, or the box is too large.
         """
-        free, gain = self._mistakes
+        free, gain = self._model_error
         found = {
             output: Coefficients(
-                gains.start + float(gains.from_mistakes @ free),
-                gains.pushed + float(gains.from_mistakes @ gain),
+                peaks.start + float(peaks.from_w @ free), peaks.forced + float(peaks.from_w @ gain)
             )
-            for output, gains in self._peaks.items()
+            for output, peaks in self._peaks.items()
         }
         nominal = found[Output.MISMATCH]
         # sup‖(R_E x, w)‖ ≤ sup‖R_E x‖ + sup‖w‖
@@ -86,40 +62,28 @@ class BoxGains:
             return 0.0, dict.fromkeys(self.outputs, 0.0)
         R, box = self.error.split_K[1], float(np.linalg.norm(self.halfwidth_A, 2))
         # ‖e^{As}‖ ≤ e^{μs}; the logarithmic norm μ of a sum is at most the sum of both norms.
-        mu = max(logarithmic_norm(self.A_model) + box, 0.0) + self.alpha_per_s
+        mu = max(logarithmic_norm(self.A) + box, 0.0) + self.alpha_per_s
         size = float(np.linalg.norm(self.start, 2)) * math.exp(mu * start_s)
-        turn = float(np.linalg.norm(R @ self.A_model, 2)) + float(np.linalg.norm(R, 2)) * box
+        rate = float(np.linalg.norm(R @ self.A, 2)) + float(np.linalg.norm(R, 2)) * box
         first = float(np.linalg.norm(R @ self.start, 2)) * math.exp(self.alpha_per_s * start_s)
-        error = first + start_s * turn * size
-        kick = error * start_s
-        from_kick = self._mistakes_of(kick * np.array([g.kicked for g in self._coordinates]))
+        error = first + start_s * rate * size
+        impulse = error * start_s
+        w = self._bound_of_w(impulse * np.array([peaks.impulse for peaks in self._coordinates]))
         found = {
-            output: kick * gains.kicked + float(gains.from_mistakes @ from_kick)
-            for output, gains in self._peaks.items()
+            output: impulse * peaks.impulse + float(peaks.from_w @ w)
+            for output, peaks in self._peaks.items()
         }
-        found[Output.MISMATCH] += float(np.linalg.norm(from_kick))
+        found[Output.MISMATCH] += float(np.linalg.norm(w))
         return error, found
 
     def growth(self, until_s: float, cells: int) -> Growth:
         """Return the growth of ‖e_s‖_W over ``until_s``, on a grid."""
-        known, mistaken = self._split_nominal[0], self._mistaken_rows
+        nominal, R = self.split_mismatch
         # If H is the closed loop of the box's centre, there is no nominal mismatch.
-        apart = self._split_nominal[1].any() or not self._rows
-        forced = np.concatenate([known, mistaken], axis=1) if apart else mistaken
-        return self.error.growth(forced, self._input_matrix, until_s, cells)
-
-    @cached_property
-    def _closed_loop(self) -> Matrix:
-        shift = self.alpha_per_s * np.eye(len(self.A_model))
-        return self.A_model + self.B_model @ self.error.K + shift
-
-    @cached_property
-    def _split_nominal(self) -> tuple[Matrix, Matrix]:
-        return factors(self.A_model + self.B_model @ self.error.K - self.error.H)
-
-    @cached_property
-    def _input_matrix(self) -> Matrix:
-        return self.B_model @ self.error.split_K[0]
+        differs = R.any() or not self._rows
+        columns = np.concatenate([nominal, self._directions], axis=1)
+        forced = columns if differs else self._directions
+        return self.error.growth(forced, self.input_matrix, until_s, cells)
 
     @cached_property
     def _rows(self) -> list[int]:
@@ -128,26 +92,23 @@ class BoxGains:
         return [int(i) for i in np.flatnonzero(uncertain)]
 
     @cached_property
-    def _mistaken_rows(self) -> Matrix:
-        return np.eye(len(self.A_model))[:, self._rows]
+    def _directions(self) -> Matrix:
+        """The unit vectors of the entries of w that are not 0."""
+        return np.eye(len(self.A))[:, self._rows]
 
     @cached_property
-    def _responses(self) -> tuple[ResponseBounds, ResponseBounds, list[ResponseBounds]]:
-        """Responses of the model's closed loop to x(0), to p, and to each w_i."""
-        return (
-            response(self._closed_loop, self.start),
-            response(self._closed_loop, self._input_matrix),
-            [response(self._closed_loop, column[:, None]) for column in self._mistaken_rows.T],
-        )
+    def _responses(self) -> tuple[ResponseBounds, list[ResponseBounds]]:
+        """Responses of the model's closed loop to x(0), and to each w_i."""
+        to_w = [response(self.closed_loop, column[:, None]) for column in self._directions.T]
+        return response(self.closed_loop, self.start), to_w
 
     def _peaks_at(self, C: Matrix) -> "_PeakGains":
-        start, pushed, mistaken = self._responses
-        forced = pushed.through(C)
+        (start, to_w), forced = self._responses, self._forced.through(C)
         return _PeakGains(
             start.through(C).sup(),
             forced.integral(),
             forced.sup(),
-            np.array([w.through(C).integral() for w in mistaken]),
+            np.array([w.through(C).integral() for w in to_w]),
         )
 
     @cached_property
@@ -157,7 +118,7 @@ class BoxGains:
     @cached_property
     def _coordinates(self) -> list["_PeakGains"]:
         """Peak gains of each coordinate of x and of K x."""
-        rows = np.concatenate([np.eye(len(self.A_model)), self.error.K])
+        rows = np.concatenate([np.eye(len(self.A)), self.error.K])
         return [self._peaks_at(row[None]) for row in rows]
 
     @cached_property
@@ -165,9 +126,9 @@ class BoxGains:
         """Half-widths Δ with |w| ≤ Δ |(x, u)|."""
         return np.concatenate([self.halfwidth_A, self.halfwidth_B], axis=1)[self._rows]
 
-    def _mistakes_of(self, coordinates: Vector) -> Vector:
+    def _bound_of_w(self, coordinates: Vector) -> Vector:
         """Return sup|w| from bounds of |(x, K x)| that were computed without w."""
-        from_w = np.array([gains.from_mistakes for gains in self._coordinates])
+        from_w = np.array([peaks.from_w for peaks in self._coordinates])
         loop = self._halfwidths @ from_w
         if len(loop) and np.abs(np.linalg.eigvals(loop)).max() >= 1:
             raise NotDecayingError("the uncertainty box is too large for the loop's gains")
@@ -175,21 +136,18 @@ class BoxGains:
         return solved
 
     @cached_property
-    def _mistakes(self) -> tuple[Vector, Vector]:
+    def _model_error(self) -> tuple[Vector, Vector]:
         """sup|w_i| ≤ free_i + gain_i sup‖p‖."""
-        inputs = np.linalg.norm(self.error.split_K[0], axis=1)
-        pushed = np.array([gains.pushed for gains in self._coordinates])
-        pushed[len(self.A_model) :] += inputs  # u = K x + p
-        return (
-            self._mistakes_of(np.array([gains.start for gains in self._coordinates])),
-            self._mistakes_of(pushed),
-        )
+        forced = np.array([peaks.forced for peaks in self._coordinates])
+        forced[len(self.A) :] += np.linalg.norm(self.error.split_K[0], axis=1)  # u = K x + p
+        start = np.array([peaks.start for peaks in self._coordinates])
+        return self._bound_of_w(start), self._bound_of_w(forced)
 
 
 class _PeakGains(NamedTuple):
-    """sup‖C x‖ ≤ start + pushed · sup‖p‖ + kicked · ∫‖p‖ + from_mistakes · |w|."""
+    """sup‖C x‖ ≤ start + forced · sup‖p‖ + impulse · ∫‖p‖ + from_w · |w|."""
 
     start: float
-    pushed: float
-    kicked: float
-    from_mistakes: Vector
+    forced: float
+    impulse: float
+    from_w: Vector

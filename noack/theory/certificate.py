@@ -15,12 +15,11 @@ of at least δ, it holds by induction over the events; the largest such δ is us
 """
 
 import math
-from collections.abc import Mapping
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
-from noack.theory.gains import Coefficients, ErrorGains, Growth, Output
+from noack.theory.gains import Coefficients, ErrorGains, Output, PlantGains
 
 _SHORTEST_S, _LONGEST_S = 1e-9, 1e6
 _SETTLED = 1e-3
@@ -77,23 +76,6 @@ class VoidError(ArithmeticError):
     """There is no certificate; the message has the reason."""
 
 
-class PlantConstants(Protocol):
-    """A plant, or all plants of an uncertainty box; see :mod:`noack.theory.gains`."""
-
-    @property
-    def states(self) -> Mapping[Output, Coefficients]:
-        """Return bounds of sup‖C x‖ from the start and from the input error."""
-        ...
-
-    def start_up(self, start_s: float) -> tuple[float, Mapping[Output, float]]:
-        """Return the effect of zero input before ``start_s``: sup‖p‖, and additions to sup‖C x‖."""
-        ...
-
-    def growth(self, until_s: float, cells: int) -> Growth:
-        """Return the growth of ‖e_s‖_W, on a grid."""
-        ...
-
-
 class Level(NamedTuple):
     """The trigger's threshold, scaled."""
 
@@ -125,7 +107,7 @@ _CLEAN = Background()
 
 def solve(
     error: ErrorGains,
-    plant: PlantConstants,
+    plant: PlantGains,
     conditions: NetworkConditions,
     level: Level,
     background: Background = _CLEAN,
@@ -157,7 +139,7 @@ class _Step:
     def __init__(
         self,
         error: ErrorGains,
-        plant: PlantConstants,
+        plant: PlantGains,
         conditions: NetworkConditions,
         level: Level,
         background: Background,
@@ -249,7 +231,7 @@ class _Step:
 
 
 def first_passage_s(
-    plant: PlantConstants, level: float, mismatch: float, input_error: float, own: float
+    plant: PlantGains, level: float, mismatch: float, input_error: float, own: float
 ) -> float:
     """Return a time before which ‖e_s‖_W, starting at 0, cannot reach ``level``.
 
@@ -259,12 +241,8 @@ def first_passage_s(
 
     This is iterated from ρ = ``level``; every iterate is a bound until the level is reached.
 
-    Args:
-        plant: provides the kernels.
-        level: ‖e_s‖_W at an event.
-        mismatch: sup‖R_E x‖.
-        input_error: π', the input error without the effect of the present e_s.
-        own: ‖K W^{−1}‖.
+    ``level`` is ‖e_s‖_W at an event, ``mismatch`` sup‖R_E x‖, ``own`` ‖K W^{−1}‖, and
+    ``input_error`` π', the input error without the effect of the present e_s.
     """
     window_s, cells = _first_window_s(plant, level, mismatch, input_error + own * level), _COARSE
     known_s = 0.0
@@ -287,9 +265,7 @@ def first_passage_s(
             known_s, window_s = window_s, 2 * window_s
 
 
-def _first_window_s(
-    plant: PlantConstants, level: float, mismatch: float, input_error: float
-) -> float:
+def _first_window_s(plant: PlantGains, level: float, mismatch: float, input_error: float) -> float:
     """Return the first search window: twice the time to ``level`` at the initial speed, limited."""
     start = plant.growth(_SHORTEST_S, 1)
     speed = start.mismatch.sup_on_grid() * mismatch + start.input_error.sup_on_grid() * input_error

@@ -47,11 +47,7 @@ class Decay(NamedTuple):
 
 
 def decay_of(generator: Matrix) -> Decay | None:
-    """Return the better of two candidates for L; None if neither passes its check numerically.
-
-    Args:
-        generator: G, (n, n), per second.
-    """
+    """Return the better of two candidates for L; None if neither passes its check numerically."""
     rounding = EPSILON * len(generator) * float(np.linalg.norm(generator))
     if not spectral_abscissa(generator) < -rounding:
         return None

@@ -32,11 +32,7 @@ class ErrorMonitor:
     """Computes the bounds along a run, measurement by measurement.
 
     A measurement needs a few array operations over the missing events: a network without a bound
-    may lose thousands of consecutive updates.
-
-    Args:
-        H: matrix of both models between updates, (n, n), per second.
-        trigger: the event-triggering policy.
+    may lose thousands of consecutive updates. H is the matrix of both models between updates.
     """
 
     def __init__(self, H: Matrix, trigger: Policy) -> None:
@@ -55,14 +51,10 @@ class ErrorMonitor:
         self._grown = lru_cache(_CACHED_AGES)(self._growth)
 
     def sample(self, t_ns: int, e_s: Vector, event: int, received: int) -> ErrorBounds:
-        """Add a measurement; return the bounds at its time.
+        """Add a measurement with e_s before any reset, (n,); return the bounds at its time.
 
-        Args:
-            t_ns: time of the measurement.
-            e_s: the sensor's error before any reset, (n,).
-            event: sequence number of the event at this measurement, negative for none.
-            received: sequence number of the newest update that the controller has, negative for
-                none.
+        ``event`` is the sequence number of the event at this measurement, ``received`` that of the
+        newest update that the controller has; both are negative for none.
         """
         self._jumps = self._propagate(self._jumps.T, t_ns - self._t_ns).T
         self._t_ns = t_ns

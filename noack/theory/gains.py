@@ -58,14 +58,7 @@ class Growth(NamedTuple):
 
 @dataclass(frozen=True)
 class ErrorGains:
-    """Gains of the models: they depend on H, K and W only, not on the plant.
-
-    Args:
-        H: matrix of the models, (n, n).
-        K: gain, (m, n).
-        weight: W, (n, n).
-        alpha_per_s: α of the scaling.
-    """
+    """Gains of the models, which depend on H (n, n), K (m, n), W (n, n) and α of the scaling."""
 
     H: Matrix
     K: Matrix
@@ -128,14 +121,13 @@ class ErrorGains:
             self.kernels[output].sups(spacing_s * np.arange(events, dtype=np.float64)).sum()
         )
 
-    def growth(self, mismatch: Matrix, pushed: Matrix, until_s: float, cells: int) -> Growth:
+    def growth(self, mismatch: Matrix, forced: Matrix, until_s: float, cells: int) -> Growth:
         """Return the growth of ‖e_s‖_W if E x and B p act through these columns."""
-        return Growth(
-            *(
-                response_until(self.scaled_H, D, until_s, cells).through(self.weight)
-                for D in (mismatch, pushed)
-            )
-        )
+
+        def kernel(D: Matrix) -> KernelBounds:
+            return response_until(self.scaled_H, D, until_s, cells).through(self.weight)
+
+        return Growth(kernel(mismatch), kernel(forced))
 
     def stretch(self, until_s: float) -> float:
         """Return sup‖e^{(H+αI)τ}‖_W over τ ≤ ``until_s``, the growth of a sampled error."""
@@ -149,24 +141,16 @@ class ErrorGains:
         if hold_s == 0:
             return 0.0
         curvature = self.split_K[1] @ self.H @ self.H
-        return max(
-            0.5 * hold_s**2 * followed.through(curvature).sup_on_grid()
-            for followed in (
-                response_until(generator, self.inverse_weight, hold_s, 16)
-                for generator in (-self.H, self.H)
-            )
-        )
+        responses = (response_until(G, self.inverse_weight, hold_s, 16) for G in (-self.H, self.H))
+        return 0.5 * hold_s**2 * max(one.through(curvature).sup_on_grid() for one in responses)
 
 
 @dataclass(frozen=True)
 class PlantGains:
-    """Gains of one known plant.
+    """Gains of one known plant, A (n, n) and B (n, m).
 
-    Args:
-        error: gains of the models.
-        A, B: the plant, (n, n) and (n, m).
-        start: x(0) as a column, (n, 1); or a matrix that maps the unit ball to a set with x(0).
-        alpha_per_s: α of the scaling; may differ from that of ``error``.
+    ``start`` is x(0) as a column, (n, 1), or a matrix that maps the unit ball to a set with x(0).
+    α of the scaling may differ from that of the models.
     """
 
     error: ErrorGains
@@ -218,7 +202,7 @@ class PlantGains:
         return response(self.closed_loop, self.input_matrix)
 
     def start_up(self, start_s: float) -> tuple[float, Mapping[Output, float]]:
-        """Return the effect of zero input before ``start_s``: p = −K x there.
+        """Return the effect of zero input before ``start_s``, where p = −K x.
 
         Returns:
             sup‖p‖ over the start, and its contribution to every sup‖C x‖.

@@ -13,11 +13,7 @@ from noack.core.linear_systems import Matrix, Propagator, Vector
 
 
 class ModelDifference:
-    """Evaluates the right-hand side of (I1) along a run.
-
-    Args:
-        H: matrix of both models between updates, shape (n, n), per second.
-    """
+    """Evaluates the right-hand side of (I1) along a run; H is the matrix of both models."""
 
     def __init__(self, H: Matrix) -> None:
         self.propagate = Propagator(H)

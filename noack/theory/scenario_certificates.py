@@ -11,6 +11,7 @@ import numpy as np
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix, spectral_abscissa
+from noack.settings.matrices import Rows
 from noack.theory.assumptions import Assumption, below, certificate_assumptions
 from noack.theory.box import BoxGains
 from noack.theory.certificate import (
@@ -18,7 +19,6 @@ from noack.theory.certificate import (
     Constants,
     Level,
     NetworkConditions,
-    PlantConstants,
     VoidError,
     solve,
 )
@@ -31,13 +31,13 @@ _SLOWER = 0.9
 _SHARES_OF_ALPHA = (0.8, 0.6, 0.4, 0.2)
 
 _RESOLUTION = 1e-3
-_TOO_LARGE = "the numbers on the way to it are too large or too small for floating point"
+_TOO_LARGE = "intermediate results are too large or too small for floating point"
 
 Change = Callable[[NetworkConditions, float], NetworkConditions]
 """Sets a time of the conditions."""
 
-PlantAt = Callable[[ErrorGains, Matrix, float], PlantConstants]
-"""Returns the plant's constants from the gains of the models, the start of x, and α."""
+PlantAt = Callable[[ErrorGains, Matrix, float], PlantGains]
+"""Returns the plant's gains from the gains of the models, the start of x, and α."""
 
 
 @dataclass(frozen=True)
@@ -99,17 +99,15 @@ class ScenarioCertificate:
 
     def to_json(self) -> dict[str, Any]:
         """Return all fields for JSON."""
-        found = asdict(self)
-        for key, value in (
-            ("constants", self.constants),
-            ("floor_constants", self.floor_constants),
-        ):
-            found[key] = None if value is None else value._asdict()
-        found["conditions"] = self.conditions._asdict()
-        found["assumptions"] = [assumption._asdict() for assumption in self.assumptions]
-        found["inter_event_s"] = self.inter_event_s
-        found["floor_from_s"] = None if self.floor == 0 else self.floor_from_s
-        return found
+        constants, late = self.constants, self.floor_constants
+        return asdict(self) | {
+            "conditions": self.conditions._asdict(),
+            "assumptions": [assumption._asdict() for assumption in self.assumptions],
+            "constants": None if constants is None else constants._asdict(),
+            "floor_constants": None if late is None else late._asdict(),
+            "inter_event_s": self.inter_event_s,
+            "floor_from_s": None if self.floor == 0 else self.floor_from_s,
+        }
 
     def _envelope(self, t_s: Matrix, scale: Callable[[Constants, float], float]) -> Matrix:
         if self.constants is None:
@@ -145,7 +143,7 @@ def own_plant(resolved: Scenario, start_error: float = 0.0) -> "CertificateScope
     """A scenario's own plant."""
     loop = loop_of(resolved)
 
-    def plant_at(error: ErrorGains, start: Matrix, alpha_per_s: float) -> PlantConstants:
+    def plant_at(error: ErrorGains, start: Matrix, alpha_per_s: float) -> PlantGains:
         return PlantGains(error, loop.A, loop.B, start, alpha_per_s)
 
     return CertificateScope(OWN_PLANT, resolved, loop.A + loop.B @ loop.K, plant_at, start_error)
@@ -156,11 +154,13 @@ def box(resolved: Scenario, start_error: float = 0.0) -> "CertificateScope | Non
     loop, plant = loop_of(resolved), resolved.plant
     if plant.uncertainty_A is None and plant.uncertainty_B is None:
         return None
-    half_A = np.zeros_like(loop.A) if plant.uncertainty_A is None else np.array(plant.uncertainty_A)
-    half_B = np.zeros_like(loop.B) if plant.uncertainty_B is None else np.array(plant.uncertainty_B)
+    half_A, half_B = (
+        _halfwidth(plant.uncertainty_A, loop.A),
+        _halfwidth(plant.uncertainty_B, loop.B),
+    )
 
-    def plant_at(error: ErrorGains, start: Matrix, alpha_per_s: float) -> PlantConstants:
-        return BoxGains(error, loop.A_model, loop.B_model, half_A, half_B, start, alpha_per_s)
+    def plant_at(error: ErrorGains, start: Matrix, alpha_per_s: float) -> PlantGains:
+        return BoxGains(error, loop.A_model, loop.B_model, start, alpha_per_s, half_A, half_B)
 
     closed_loop = loop.A_model + loop.B_model @ loop.K
     return CertificateScope(BOX, resolved, closed_loop, plant_at, start_error)
@@ -169,21 +169,25 @@ def box(resolved: Scenario, start_error: float = 0.0) -> "CertificateScope | Non
 def outside_box(resolved: Scenario) -> str | None:
     """Return, as text, an entry of the plant outside its uncertainty box; None if there is none."""
     loop, plant = loop_of(resolved), resolved.plant
-    for name, true, model, halfwidth in (
+    if plant.uncertainty_A is None and plant.uncertainty_B is None:
+        return None
+    for name, true, model, rows in (
         ("A", loop.A, loop.A_model, plant.uncertainty_A),
         ("B", loop.B, loop.B_model, plant.uncertainty_B),
     ):
-        if plant.uncertainty_A is None and plant.uncertainty_B is None:
-            return None
-        half = np.zeros_like(true) if halfwidth is None else np.array(halfwidth)
+        half = _halfwidth(rows, true)
         slack = 1e-12 * (1.0 + np.abs(model))
         for i, j in np.argwhere(np.abs(true - model) > half + slack):
-            apart = abs(true[i, j] - model[i, j])
+            distance = abs(true[i, j] - model[i, j])
             return (
-                f"the plant lies outside: {name}[{i + 1}, {j + 1}] is {apart:.3g} from the "
+                f"the plant lies outside: {name}[{i + 1}, {j + 1}] is {distance:.3g} from the "
                 f"model's, the half-width is {half[i, j]:.3g}"
             )
     return None
+
+
+def _halfwidth(rows: Rows | None, matrix: Matrix) -> Matrix:
+    return np.zeros_like(matrix) if rows is None else np.array(rows)
 
 
 class CertificateScope:
@@ -193,7 +197,7 @@ class CertificateScope:
         name: name of the plants.
         resolved: the scenario.
         closed_loop: A + BK, for a box that of its centre, (n, n).
-        plant_at: returns the plants' constants.
+        plant_at: returns the plants' gains.
         start_error: sup‖u − Kx‖, scaled, while the plant still applies inputs of an earlier run
             at the start. The certificate exists only if its own π is at least that large, so that
             it covers these inputs.
@@ -218,7 +222,7 @@ class CertificateScope:
         }
         self._plant_at = plant_at
         self._errors: dict[float, ErrorGains] = {}
-        self._plants: dict[tuple[float, float, bytes], PlantConstants] = {}
+        self._plants: dict[tuple[float, float, bytes], PlantGains] = {}
 
     def certificate(self, conditions: NetworkConditions) -> ScenarioCertificate:
         """Return the certificate under some conditions; a void certificate has the reason."""
@@ -228,24 +232,12 @@ class CertificateScope:
         void = None
         try:
             with np.errstate(all="ignore"):
-                first = self._first_phase(conditions)
-                if 0 < trigger.floor < trigger.beta and first.rate_per_s == trigger.alpha_per_s:
-                    late = self._after_floor(conditions, first)
+                first, late = self._phases(conditions)
         except (NotDecayingError, VoidError) as error:
-            first, void = None, str(error)
+            void = str(error)
         except (OverflowError, np.linalg.LinAlgError):
-            first, void = None, _TOO_LARGE
-        if first is not None and first.input_error < self._start_error:
-            void = (
-                f"at its start the input was {self._start_error:.3g} from Kx, and a certificate "
-                f"is of {first.input_error:.3g} at the most"
-            )
-            first, late = None, None
-        if not all(_finite(constants) for constants in (first, late)):
-            first, late, void = None, None, _TOO_LARGE
-        assumptions = certificate_assumptions(
-            self._resolved, conditions, self._decay, self._held, first, void
-        )
+            void = _TOO_LARGE
+        assumptions = certificate_assumptions(self._resolved, conditions, self._decay, first, void)
         return ScenarioCertificate(
             self.name, trigger.beta, trigger.alpha_per_s, trigger.floor,
             self._loop.weight is not None, conditions, tuple(assumptions), first, late, void,
@@ -267,6 +259,22 @@ class CertificateScope:
             middle = math.sqrt(low * high) if low > 0 else high / 4
             low, high = (middle, high) if stands(middle) else (low, middle)
         return low
+
+    def _phases(self, conditions: NetworkConditions) -> tuple[Constants, Constants | None]:
+        """Return the constants, and those after the threshold has reached its floor, if any."""
+        trigger, late = self._resolved.decaying, None
+        first = self._first_phase(conditions)
+        if 0 < trigger.floor < trigger.beta and first.rate_per_s == trigger.alpha_per_s:
+            late = self._after_floor(conditions, first)
+        if first.input_error < self._start_error:
+            raise VoidError(
+                f"at its start the input was {self._start_error:.3g} from Kx; a certificate "
+                f"covers at most {first.input_error:.3g}"
+            )
+        for constants in (first, late):
+            if constants is not None and not _is_finite(constants):
+                raise VoidError(_TOO_LARGE)
+        return first, late
 
     def _first_phase(self, conditions: NetworkConditions) -> Constants:
         trigger, decay = self._resolved.decaying, min(self._decay.values())
@@ -347,12 +355,7 @@ class CertificateScope:
         return solve(error, self._plants[key], conditions, level, background)
 
 
-def _finite(constants: Constants | None) -> bool:
+def _is_finite(constants: Constants) -> bool:
     """Return whether every constant is finite; only the inter-event time may be infinite."""
-    if constants is None:
-        return True
-    numbers = constants._replace(inter_event_s=None)
-    endless = constants.inter_event_s
-    return all(math.isfinite(v) for v in numbers if v is not None) and not (
-        endless is not None and math.isnan(endless)
-    )
+    numbers = [v for v in constants._replace(inter_event_s=None) if v is not None]
+    return all(map(math.isfinite, numbers)) and not math.isnan(constants.inter_event_s or 0.0)

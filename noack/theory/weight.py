@@ -30,14 +30,9 @@ def choose_weight(
     mansd: int,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Matrix:
-    """Return W, upper triangular, (n, n).
+    """Return W, upper triangular, (n, n), for a loop of any weight; ``mansd`` is M − 1.
 
-    Args:
-        loop: a resolved loop; its own weight is not used.
-        beta: β.
-        alpha_per_s: α.
-        mansd: M − 1.
-        progress: receives the completed share of the work.
+    ``progress`` receives the completed share of the work.
 
     Raises:
         NotDecayingError: α is not below the decay rate of e^{Ht} and e^{(A+BK)t}.

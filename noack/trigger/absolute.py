@@ -17,32 +17,26 @@ class AbsoluteSettings(WeightedSettings):
     """Send-on-delta: transmit when ‖e_s‖_W > δ."""
 
     policy: Literal["absolute"]
-    """The event-triggering policy."""
     delta: Size
     """δ, in the units of ‖W x‖."""
 
     @classmethod
     def example(cls, n: int) -> Self:
-        """A small δ."""
         return cls(policy="absolute", delta=0.05)
 
     def trigger_policy(self, model: ModelMatrices) -> "AbsoluteTrigger":
-        """Return the behaviour."""
         return AbsoluteTrigger(self.delta, self.weight_matrix)
 
     @property
     def description(self) -> str:
-        """The condition."""
         return f"‖e_s‖ > {self.delta:g}"
 
     @property
     def largest_threshold(self) -> float:
-        """δ."""
         return self.delta
 
     @property
     def least_threshold(self) -> float:
-        """δ."""
         return self.delta
 
 
@@ -55,5 +49,4 @@ class AbsoluteTrigger:
     initial_dynamic_variable = 0.0
 
     def trigger_rule(self, n: int) -> TriggerRule:
-        """The same after every event."""
         return TriggerRule(QuadraticForm(error_map(n, self.weight), empty_map(n)), floor=self.delta)

@@ -31,33 +31,27 @@ class CombinedSettings(PolicySettings):
 
     @property
     def weight(self) -> Rows | None:
-        """W of the rule."""
         return self.rule.weight
 
     @property
     def threshold_decay_per_s(self) -> float:
-        """That of the rule."""
         return self.rule.threshold_decay_per_s
 
     @property
     def largest_threshold(self) -> float:
-        """That of the rule."""
         return self.rule.largest_threshold
 
     @property
     def least_threshold(self) -> float | None:
-        """That of the rule."""
         return self.rule.least_threshold
 
     def check(self, n: int, why: str) -> None:
-        """Require that the rule fits n states."""
         try:
             self.rule.check(n, why)
         except ValueError as error:
             raise ValueError(str(error).replace("trigger.", "trigger.rule.", 1)) from None
 
     def check_period(self, measured_ns: int, key: str = "trigger") -> None:
-        """Require that the rule's sampling period fits the time between measurements."""
         self.rule.check_period(measured_ns, f"{key}.rule")
 
 
@@ -70,10 +64,8 @@ class CombinedTrigger:
 
     @property
     def weight(self) -> Matrix | None:
-        """W of the rule."""
         return self.rule.weight
 
     @property
     def initial_dynamic_variable(self) -> float:
-        """η at the start, of the rule."""
         return self.rule.initial_dynamic_variable

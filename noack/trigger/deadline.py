@@ -17,20 +17,16 @@ class DeadlineSettings(CombinedSettings):
     """Any rule, and at the latest so long after the last event."""
 
     policy: Literal["deadline"]
-    """The event-triggering policy."""
 
     @classmethod
     def example(cls, n: int) -> Self:
-        """A deadline for the mixed rule."""
         return cls(policy="deadline", rule=MixedSettings.example(n), interval_s=1.0)
 
     def trigger_policy(self, model: ModelMatrices) -> "DeadlineTrigger":
-        """Return the behaviour."""
         return DeadlineTrigger(self.rule.trigger_policy(model), nanoseconds(self.interval_s))
 
     @property
     def description(self) -> str:
-        """The rule's condition, or the deadline."""
         return f"{self.rule.description}, or {self.interval_s:g} s after the last event"
 
 
@@ -38,7 +34,6 @@ class DeadlineTrigger(CombinedTrigger):
     """A rule with a deadline."""
 
     def trigger_rule(self, n: int) -> TriggerRule:
-        """The rule's, and the deadline."""
         rule = self.rule.trigger_rule(n)
         return rule._replace(
             longest_ns=min(rule.longest_ns, self.interval_ns),

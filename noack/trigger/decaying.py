@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal, Self
 
-from noack.core.linear_systems import Matrix, Vector, norm
+from noack.core.linear_systems import Matrix
 from noack.settings.section import NonNegative, Positive
 from noack.trigger.policy_settings import ModelMatrices, WeightedSettings
 from noack.trigger.trigger_condition import QuadraticForm, empty_map, error_map
@@ -21,7 +21,6 @@ class DecayingSettings(WeightedSettings):
     """The paper's trigger: transmit when ‖e_s‖_W > max(β e^{−αt}, floor)."""
 
     policy: Literal["decaying"] = "decaying"
-    """The event-triggering policy."""
     beta: Positive
     """β, in the units of ‖W x‖."""
     alpha_per_s: Positive
@@ -31,31 +30,25 @@ class DecayingSettings(WeightedSettings):
 
     @classmethod
     def example(cls, n: int) -> Self:
-        """A decay slower than that of the shipped examples."""
         return cls(beta=0.5, alpha_per_s=0.25)
 
     def trigger_policy(self, model: ModelMatrices) -> "DecayingTrigger":
-        """Return the behaviour."""
         return DecayingTrigger(self.beta, self.alpha_per_s, self.floor, self.weight_matrix)
 
     @property
     def description(self) -> str:
-        """The condition."""
         return f"‖e_s‖ > {decaying_text(self.beta, self.alpha_per_s, self.floor)}"
 
     @property
     def threshold_decay_per_s(self) -> float:
-        """α."""
         return self.alpha_per_s
 
     @property
     def largest_threshold(self) -> float:
-        """The larger of β and ε."""
         return max(self.beta, self.floor)
 
     @property
     def least_threshold(self) -> float:
-        """ε."""
         return self.floor
 
 
@@ -67,14 +60,7 @@ def decaying_text(beta: float, alpha_per_s: float, floor: float) -> str:
 
 @dataclass(frozen=True)
 class DecayingTrigger:
-    """The paper's policy.
-
-    Args:
-        beta: β > 0, in the units of ‖W x‖.
-        alpha_per_s: α > 0.
-        floor: ε ≥ 0.
-        weight: W, shape (n, n), or None for the identity.
-    """
+    """The paper's policy; β > 0 and ε ≥ 0 in the units of ‖W x‖, α > 0 per second."""
 
     beta: float
     alpha_per_s: float
@@ -83,14 +69,9 @@ class DecayingTrigger:
     initial_dynamic_variable = 0.0
 
     def trigger_rule(self, n: int) -> TriggerRule:
-        """The same after every event: eq:thre counts from the run's start."""
         form = QuadraticForm(error_map(n, self.weight), empty_map(n))
         return TriggerRule(form, self.beta, self.alpha_per_s, self.floor)
 
     def threshold(self, t_ns: float) -> float:
         """max(β e^{−αt}, ε)."""
         return max(self.beta * math.exp(-self.alpha_per_s * t_ns * 1e-9), self.floor)
-
-    def error_norm(self, e_s: Vector) -> float:
-        """‖e_s‖_W of a sensor error of shape (n,)."""
-        return norm(e_s if self.weight is None else self.weight @ e_s)

@@ -16,20 +16,16 @@ class DwellSettings(CombinedSettings):
     """Any rule, but not earlier than so long after the last event."""
 
     policy: Literal["dwell"]
-    """The event-triggering policy."""
 
     @classmethod
     def example(cls, n: int) -> Self:
-        """A dwell time for the Lyapunov rule, whose events would accumulate under losses."""
         return cls(policy="dwell", rule=LyapunovSettings.example(n), interval_s=0.1)
 
     def trigger_policy(self, model: ModelMatrices) -> "DwellTrigger":
-        """Return the behaviour."""
         return DwellTrigger(self.rule.trigger_policy(model), nanoseconds(self.interval_s))
 
     @property
     def description(self) -> str:
-        """The rule's condition, and the dwell time."""
         return f"{self.rule.description}, not within {self.interval_s:g} s of the last event"
 
 

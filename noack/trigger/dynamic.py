@@ -27,7 +27,6 @@ class DynamicSettings(LyapunovFunctionSettings):
     at_start_only: ClassVar = ("eta_0",)
 
     policy: Literal["dynamic"]
-    """The event-triggering policy."""
     sigma: Annotated[FiniteFloat, Field(gt=0, lt=1)]
     """σ."""
     theta_s: Annotated[FiniteFloat, Field(gt=0, le=1e9)]
@@ -39,11 +38,9 @@ class DynamicSettings(LyapunovFunctionSettings):
 
     @classmethod
     def example(cls, n: int) -> Self:
-        """A rule that starts with a margin."""
         return cls(policy="dynamic", sigma=0.5, theta_s=0.5, decay_per_s=0.5, eta_0=1.0)
 
     def trigger_policy(self, model: ModelMatrices) -> "DynamicTrigger":
-        """Return the behaviour."""
         P, Q = self.lyapunov_function(model)
         return DynamicTrigger(
             self.sigma, self.theta_s, self.decay_per_s, P, Q, model.B @ model.K, self.eta_0,
@@ -52,7 +49,6 @@ class DynamicSettings(LyapunovFunctionSettings):
 
     @property
     def description(self) -> str:
-        """The condition."""
         return (
             f"η + {self.theta_s:g} w ≤ 0, dη/dt = −{self.decay_per_s:g} η + w, "
             f"w = {self.sigma:g} xᵀQx − 2 xᵀPBK e_s"
@@ -61,18 +57,7 @@ class DynamicSettings(LyapunovFunctionSettings):
 
 @dataclass(frozen=True)
 class DynamicTrigger:
-    """The dynamic rule.
-
-    Args:
-        sigma: σ in (0, 1).
-        theta_s: θ ≥ 0, in seconds.
-        decay_per_s: λ ≥ 0.
-        P: of the Lyapunov function, (n, n).
-        Q: its decrease, (n, n).
-        BK: B̂K, (n, n).
-        initial_dynamic_variable: η at the start, ≥ 0.
-        weight: W of the norm in which errors are shown.
-    """
+    """The dynamic rule; P, Q and BK of shape (n, n), θ ≥ 0 and λ ≥ 0. Events do not reset η."""
 
     sigma: float
     theta_s: float
@@ -94,6 +79,5 @@ class DynamicTrigger:
         return quadratic_form(-self.theta_s * w), quadratic_form(w)
 
     def trigger_rule(self, n: int) -> TriggerRule:
-        """The same after every event; η is not reset."""
         compared, gain = self._forms
         return TriggerRule(compared, dynamic_variable=DynamicVariable(self.decay_per_s, gain))

@@ -27,36 +27,26 @@ class LyapunovSettings(LyapunovFunctionSettings):
     events_may_accumulate: ClassVar = True
 
     policy: Literal["lyapunov"]
-    """The event-triggering policy."""
     rate_per_s: Annotated[FiniteFloat, Field(gt=0, le=1e6)]
     """ρ."""
 
     @classmethod
     def example(cls, n: int) -> Self:
-        """A slow envelope."""
         return cls(policy="lyapunov", rate_per_s=0.3)
 
     def trigger_policy(self, model: ModelMatrices) -> "LyapunovTrigger":
-        """Return the behaviour."""
         P, _ = self.lyapunov_function(model)
         factor = np.ascontiguousarray(np.linalg.cholesky(P).T)
         return LyapunovTrigger(factor, self.rate_per_s, self.weight_matrix)
 
     @property
     def description(self) -> str:
-        """The condition."""
         return f"V(x) > V(x(t_k)) e^(−{self.rate_per_s:g} (t−t_k))"
 
 
 @dataclass(frozen=True)
 class LyapunovTrigger:
-    """The envelope rule.
-
-    Args:
-        factor: L with P = LᵀL, shape (n, n).
-        rate_per_s: ρ > 0.
-        weight: W of the norm in which errors are shown.
-    """
+    """The envelope rule; ``factor`` is L with P = LᵀL, shape (n, n), and ρ > 0."""
 
     factor: Matrix
     rate_per_s: float
@@ -64,6 +54,5 @@ class LyapunovTrigger:
     initial_dynamic_variable = 0.0
 
     def trigger_rule(self, n: int) -> TriggerRule:
-        """The envelope that begins at the event."""
         form = QuadraticForm(state_map(n, self.factor), empty_map(n))
         return TriggerRule(form, rate_per_s=self.rate_per_s / 2, from_event=True)

@@ -22,7 +22,6 @@ class MixedSettings(WeightedSettings):
     """Transmit when ‖e_s‖_W² > σ²‖x‖_W² + ε²."""
 
     policy: Literal["mixed"]
-    """The event-triggering policy."""
     sigma: Share
     """σ."""
     epsilon: Size
@@ -30,26 +29,21 @@ class MixedSettings(WeightedSettings):
 
     @classmethod
     def example(cls, n: int) -> Self:
-        """A small constant."""
         return cls(policy="mixed", sigma=0.1, epsilon=0.05)
 
     def trigger_policy(self, model: ModelMatrices) -> "MixedTrigger":
-        """Return the behaviour."""
         return MixedTrigger(self.sigma, self.epsilon, self.weight_matrix)
 
     @property
     def description(self) -> str:
-        """The condition."""
         return f"‖e_s‖² > {self.sigma:g}² ‖x‖² + {self.epsilon:g}²"
 
     @property
     def largest_threshold(self) -> float:
-        """ε."""
         return self.epsilon
 
     @property
     def least_threshold(self) -> float:
-        """ε."""
         return self.epsilon
 
 
@@ -63,7 +57,6 @@ class MixedTrigger:
     initial_dynamic_variable = 0.0
 
     def trigger_rule(self, n: int) -> TriggerRule:
-        """The same after every event."""
         down: Matrix = self.sigma * state_map(n, self.weight)
         return TriggerRule(
             QuadraticForm(error_map(n, self.weight), np.asarray(down)), floor=self.epsilon

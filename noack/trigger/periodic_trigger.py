@@ -13,22 +13,18 @@ class PeriodicSettings(WeightedSettings):
     """Time-triggered: transmit every period."""
 
     policy: Literal["periodic"]
-    """The event-triggering policy."""
     period_s: Interval
     """Period."""
 
     @classmethod
     def example(cls, n: int) -> Self:
-        """Once a second."""
         return cls(policy="periodic", period_s=1.0)
 
     def trigger_policy(self, model: ModelMatrices) -> "PeriodicTrigger":
-        """Return the behaviour."""
         return PeriodicTrigger(nanoseconds(self.period_s), self.weight_matrix)
 
     @property
     def description(self) -> str:
-        """The period."""
         return f"every {self.period_s:g} s"
 
 
@@ -41,5 +37,4 @@ class PeriodicTrigger:
     initial_dynamic_variable = 0.0
 
     def trigger_rule(self, n: int) -> TriggerRule:
-        """A period after the event."""
         return TriggerRule(QuadraticForm(empty_map(n), empty_map(n)), longest_ns=self.period_ns)

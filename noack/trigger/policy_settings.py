@@ -52,11 +52,7 @@ class PolicySettings(ScenarioSection):
 
     @classmethod
     def example(cls, n: int) -> Self | None:
-        """Return settings for n states of size 1, for tests and benchmarks; None: no general ones.
-
-        Args:
-            n: number of states.
-        """
+        """Return settings for n states of size 1, for tests and benchmarks, if there are any."""
         raise NotImplementedError
 
     def trigger_policy(self, model: ModelMatrices) -> Policy:
@@ -101,10 +97,6 @@ class PolicySettings(ScenarioSection):
 
     def check_period(self, measured_ns: int, key: str = "trigger") -> None:
         """Require that the policy's own sampling period fits the time between measurements.
-
-        Args:
-            measured_ns: time between measurements.
-            key: of the policy's table, for messages.
 
         Raises:
             ValueError: the period is not a whole number of that time.

@@ -24,7 +24,6 @@ class QuadraticSettings(WeightedSettings):
     """Periodic event-triggered control: at sampling times, transmit when zᵀQz > ε, z = (x, e_s)."""
 
     policy: Literal["quadratic"]
-    """The event-triggering policy."""
     Q: Rows
     """Q by rows, 2n x 2n, symmetric."""
     epsilon: NonNegative = 0.0
@@ -36,13 +35,11 @@ class QuadraticSettings(WeightedSettings):
 
     @classmethod
     def example(cls, n: int) -> Self:
-        """The mixed rule, sampled."""
         diagonal = np.diag([-0.04] * n + [1.0] * n).tolist()
         Q = tuple(map(tuple, diagonal))
         return cls(policy="quadratic", Q=Q, epsilon=0.0025, period_s=0.05)
 
     def trigger_policy(self, model: ModelMatrices) -> "QuadraticTrigger":
-        """Return the behaviour."""
         return QuadraticTrigger(
             np.array(self.Q), nanoseconds(self.period_s), self.epsilon, self.heartbeat,
             self.weight_matrix,
@@ -50,17 +47,14 @@ class QuadraticSettings(WeightedSettings):
 
     @property
     def description(self) -> str:
-        """The condition, its period and the heartbeat."""
         heartbeat = f", or after {self.heartbeat} periods" if self.heartbeat else ""
         return f"zᵀQz > {self.epsilon:g}, sampled every {self.period_s:g} s{heartbeat}"
 
     @property
     def largest_threshold(self) -> float:
-        """ε."""
         return self.epsilon
 
     def check(self, n: int, why: str) -> None:
-        """Require matrices of the right shapes, and a symmetric Q."""
         super().check(n, why)
         require_shape(self.Q, "trigger.Q", (2 * n, 2 * n), f"{why}, and z = (x, e_s)")
         Q = np.array(self.Q)
@@ -68,7 +62,6 @@ class QuadraticSettings(WeightedSettings):
             raise ValueError("trigger.Q: must be symmetric")
 
     def check_period(self, measured_ns: int, key: str = "trigger") -> None:
-        """Require a whole number of the time between measurements."""
         if nanoseconds(self.period_s) % measured_ns:
             raise ValueError(
                 f"{key}.period_s: must be a whole number of the {measured_ns / NS_PER_S} s "
@@ -78,15 +71,7 @@ class QuadraticSettings(WeightedSettings):
 
 @dataclass(frozen=True)
 class QuadraticTrigger:
-    """The quadratic rule on a grid.
-
-    Args:
-        Q: symmetric, shape (2n, 2n), on z = (x, e_s).
-        period_ns: sampling period.
-        epsilon: ε ≥ 0.
-        heartbeat: transmit after so many periods at the latest; 0 for none.
-        weight: W of the norm in which errors are shown.
-    """
+    """The quadratic rule on a grid; Q is symmetric, shape (2n, 2n), on z = (x, e_s)."""
 
     Q: Matrix
     period_ns: int
@@ -96,13 +81,11 @@ class QuadraticTrigger:
     initial_dynamic_variable = 0.0
 
     @cached_property
-    def form(self) -> QuadraticForm:
-        """Q as a difference of squares."""
+    def _form(self) -> QuadraticForm:
         return quadratic_form(self.Q)
 
     def trigger_rule(self, n: int) -> TriggerRule:
-        """On the grid, later than the event."""
         return TriggerRule(
-            self.form, floor=float(np.sqrt(self.epsilon)), grid_ns=self.period_ns,
+            self._form, floor=float(np.sqrt(self.epsilon)), grid_ns=self.period_ns,
             longest_ns=self.heartbeat * self.period_ns if self.heartbeat else NEVER_NS,
         )  # fmt: skip

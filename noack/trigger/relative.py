@@ -14,27 +14,22 @@ class RelativeSettings(WeightedSettings):
     """Transmit when ‖e_s‖_W > σ‖x‖_W (Tabuada 2007)."""
 
     policy: Literal["relative"]
-    """The event-triggering policy."""
     sigma: Share
     """σ."""
 
     @classmethod
     def example(cls, n: int) -> Self:
-        """A σ with which the shipped loops are stable."""
         return cls(policy="relative", sigma=0.2)
 
     def trigger_policy(self, model: ModelMatrices) -> MixedTrigger:
-        """Return the behaviour."""
         return relative_trigger(self.sigma, self.weight_matrix)
 
     @property
     def description(self) -> str:
-        """The condition."""
         return f"‖e_s‖ > {self.sigma:g} ‖x‖"
 
     @property
     def least_threshold(self) -> float:
-        """0: the threshold vanishes with the state."""
         return 0.0
 
 

@@ -32,7 +32,6 @@ class SelfTriggeredSettings(WeightedSettings):
     """
 
     policy: Literal["self_triggered"]
-    """The event-triggering policy."""
     beta: Positive
     """β, in the units of ‖W x‖."""
     alpha_per_s: Positive
@@ -58,72 +57,46 @@ class SelfTriggeredSettings(WeightedSettings):
 
     @classmethod
     def example(cls, n: int) -> Self:
-        """A forecast that is pessimistic for the shipped loops."""
         return cls(
             policy="self_triggered", beta=0.5, alpha_per_s=0.25, growth_per_s=1.0,
             mismatch_per_s=1.0, shortest_s=0.1, longest_s=5.0,
         )  # fmt: skip
 
     def trigger_policy(self, model: ModelMatrices) -> "SelfTrigger":
-        """Return the behaviour."""
-        return SelfTrigger(
-            self.beta, self.alpha_per_s, self.floor, self.growth_per_s, self.mismatch_per_s,
-            self.disturbance_per_s, nanoseconds(self.shortest_s), nanoseconds(self.longest_s),
-            self.weight_matrix,
+        forecast = Forecast(
+            self.beta, self.alpha_per_s, self.floor,
+            self.growth_per_s, self.mismatch_per_s, self.disturbance_per_s,
         )  # fmt: skip
+        shortest_ns, longest_ns = nanoseconds(self.shortest_s), nanoseconds(self.longest_s)
+        return SelfTrigger(forecast, shortest_ns, longest_ns, self.weight_matrix)
 
     @property
     def description(self) -> str:
-        """The condition."""
         threshold = decaying_text(self.beta, self.alpha_per_s, self.floor)
         return f"‖e_s‖ could reach {threshold}, as forecast at the last event"
 
     @property
     def largest_threshold(self) -> float:
-        """The larger of β and ε."""
         return max(self.beta, self.floor)
 
     @property
     def least_threshold(self) -> float:
-        """ε."""
         return self.floor
 
 
 @dataclass(frozen=True)
 class SelfTrigger:
-    """The self-triggered rule.
+    """The self-triggered rule; the next event is τ_min > 0 to τ_max after the last one."""
 
-    Args:
-        beta: β > 0, in the units of ‖W x‖.
-        alpha_per_s: α > 0.
-        floor: ε ≥ 0.
-        growth_per_s: L ≥ 0.
-        mismatch_per_s: a ≥ 0.
-        disturbance_per_s: b ≥ 0, in the units of ‖W x‖ per second.
-        shortest_ns: τ_min > 0.
-        longest_ns: τ_max.
-        weight: W, shape (n, n), or None for the identity.
-    """
-
-    beta: float
-    alpha_per_s: float
-    floor: float
-    growth_per_s: float
-    mismatch_per_s: float
-    disturbance_per_s: float
+    forecast: Forecast
     shortest_ns: int
     longest_ns: int
     weight: Matrix | None = None
     initial_dynamic_variable = 0.0
 
     def trigger_rule(self, n: int) -> TriggerRule:
-        """The time of the next event, from the state at this one."""
-        forecast = Forecast(
-            self.beta, self.alpha_per_s, self.floor,
-            self.growth_per_s, self.mismatch_per_s, self.disturbance_per_s,
-        )  # fmt: skip
         return TriggerRule(
             QuadraticForm(empty_map(n), empty_map(n)),
             longest_ns=self.longest_ns, shortest_ns=self.shortest_ns,
-            forecast=forecast, weight=self.weight,
+            forecast=self.forecast, weight=self.weight,
         )  # fmt: skip

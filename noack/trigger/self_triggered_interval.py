@@ -1,8 +1,4 @@
-"""How long a sensor may sleep: the self-triggered rule's interval, in plain numbers.
-
-The rule is :mod:`noack.trigger.self_triggered`'s. It is interpreted for a live sensor and compiled
-for a batch.
-"""
+"""The interval of :mod:`noack.trigger.self_triggered`; compiled for a batch of simulations."""
 
 import math
 from typing import NamedTuple
@@ -12,7 +8,7 @@ _LARGEST_EXPONENT = 700.0
 
 
 class Forecast(NamedTuple):
-    """What the sensor supposes of its error, and the threshold that it must not pass."""
+    """The assumed growth of the sensor's error, and its threshold."""
 
     beta: float
     """β > 0."""
@@ -31,21 +27,17 @@ class Forecast(NamedTuple):
 def interval_ns(
     forecast: Forecast, size: float, t_s: float, shortest_ns: float, longest_ns: float
 ) -> float:
-    """How long after an event the error may have reached the threshold, in whole nanoseconds.
+    """Return the time in ns from an event at ``t_s`` until the error may reach the threshold.
 
-    Args:
-        forecast: what is supposed.
-        size: ‖x‖_W at the event.
-        t_s: time of the event.
-        shortest_ns: the interval is not shorter.
-        longest_ns: nor longer.
+    ``size`` is ‖x‖_W at the event. The result is at least ``shortest_ns`` and at most
+    ``longest_ns``.
     """
     low_s, high_s = shortest_ns * 1e-9, longest_ns * 1e-9
     if is_reached(forecast, size, t_s, low_s):
         return shortest_ns
     if not is_reached(forecast, size, t_s, high_s):
         return longest_ns
-    # The left side grows and the right one does not: they meet once.
+    # The error grows and the threshold does not, so there is one crossing.
     for _ in range(_HALVINGS):
         if math.floor(low_s * 1e9) == math.floor(high_s * 1e9):
             break
@@ -58,7 +50,7 @@ def interval_ns(
 
 
 def is_reached(forecast: Forecast, size: float, t_s: float, tau_s: float) -> bool:
-    """Whether the error may have reached the threshold so long after an event."""
+    """Whether the error may have reached the threshold ``tau_s`` after an event at ``t_s``."""
     speed = forecast.mismatch_per_s * size + forecast.disturbance_per_s
     exponent = min(forecast.growth_per_s * tau_s, _LARGEST_EXPONENT)
     # The first two terms of the series where the third is below rounding.

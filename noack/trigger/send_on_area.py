@@ -22,22 +22,18 @@ class SendOnAreaSettings(WeightedSettings):
     """Transmit when ∫‖e_s‖_W dt since the last event exceeds δ (Miskowicz)."""
 
     policy: Literal["send_on_area"]
-    """The event-triggering policy."""
     delta_s: Size
     """δ, in the units of ‖W x‖ times seconds."""
 
     @classmethod
     def example(cls, n: int) -> Self:
-        """A small δ."""
         return cls(policy="send_on_area", delta_s=0.02)
 
     def trigger_policy(self, model: ModelMatrices) -> "SendOnAreaTrigger":
-        """Return the behaviour."""
         return SendOnAreaTrigger(self.delta_s, self.weight_matrix)
 
     @property
     def description(self) -> str:
-        """The condition."""
         return f"∫‖e_s‖ dt since the last event > {self.delta_s:g}"
 
 
@@ -50,6 +46,5 @@ class SendOnAreaTrigger:
     initial_dynamic_variable = 0.0
 
     def trigger_rule(self, n: int) -> TriggerRule:
-        """The same after every event; the integral begins at 0 there."""
         form = QuadraticForm(error_map(n, self.weight), empty_map(n))
         return TriggerRule(form, floor=self.delta_s, integrates=True)

@@ -80,21 +80,14 @@ class TriggerCondition(NamedTuple):
         return self.integrates or self.dynamic_variable is not None
 
     def auxiliary_rates(self, z: Matrix) -> Vector:
-        """What drives the auxiliary variable, per second, at k z, shape (k, 2n) → (k,)."""
+        """Rates of the auxiliary variable, per second, at k z, shape (k, 2n) → (k,)."""
         if self.dynamic_variable is not None:
             return self.dynamic_variable.gain.values(z)
         rates: Vector = np.linalg.norm(z @ self.form.up.T, axis=1)
         return rates
 
     def auxiliary_after(self, dt_s: float, auxiliary: float, first: float, last: float) -> float:
-        """The auxiliary variable one measurement later.
-
-        Args:
-            dt_s: time between the measurements.
-            auxiliary: its value at the first of them.
-            first: its rate at the first, of :meth:`auxiliary_rates`.
-            last: its rate at the second.
-        """
+        """The auxiliary variable after a time, from its rates at the first and the last time."""
         if self.dynamic_variable is not None:
             return self.dynamic_variable.after(dt_s, auxiliary, first)
         return auxiliary + dt_s * (first + last) / 2
@@ -107,14 +100,7 @@ class TriggerCondition(NamedTuple):
     def sides(
         self, t_ns: float, x: Vector, e_s: Vector, auxiliary: float = 0.0
     ) -> "ComparisonSides":
-        """Both sides of the comparison; of one without an integral as square roots.
-
-        Args:
-            t_ns: time.
-            x: the plant's state, shape (n,).
-            e_s: the sensor's error, shape (n,).
-            auxiliary: η, or the integral.
-        """
+        """Both sides of the comparison; without an integral, as square roots."""
         right = self.threshold(t_ns)
         if self.integrates:
             return ComparisonSides(auxiliary, right)
@@ -126,13 +112,7 @@ class TriggerCondition(NamedTuple):
     def exceeds(
         self, t_ns: NDArray[Any], z: Matrix, auxiliary: Vector | float = 0.0
     ) -> NDArray[np.bool_]:
-        """Whether the comparison holds at k times, whether it counts there or not.
-
-        Args:
-            t_ns: times, shape (k,).
-            z: (x, e_s) at them, shape (k, 2n).
-            auxiliary: η or the integral at them.
-        """
+        """Whether the comparison holds at k times, counted or not; z has the shape (k, 2n)."""
         decayed = self.level * np.exp(-self.rate_per_s * 1e-9 * (t_ns - self.since_ns))
         right = np.maximum(decayed, self.floor)
         if self.integrates:
@@ -170,11 +150,7 @@ def empty_map(n: int) -> Matrix:
 
 
 def quadratic_form(Q: Matrix) -> QuadraticForm:
-    """The form zᵀQz of a symmetric matrix, as the difference of two squares.
-
-    Args:
-        Q: symmetric, shape (2n, 2n).
-    """
+    """The form zᵀQz of a symmetric matrix, (2n, 2n), as the difference of two squares."""
     values, vectors = np.linalg.eigh(Q)
     rows = np.sqrt(np.abs(values))[:, None] * vectors.T
     return QuadraticForm(rows[values > 0], rows[values < 0])

@@ -1,6 +1,7 @@
 """What an event-triggering policy is, and the machine that applies one to measurements."""
 
-from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -30,26 +31,17 @@ class Policy(Protocol):
         ...
 
 
-class CodedPolicy(ABC):
+@dataclass(frozen=True)
+class CodedPolicy:
     """A policy that decides by code of its own, and so has no trigger rule."""
 
+    weight: Matrix | None
+    new_trigger: Callable[[], "EventTrigger"]
+    """Returns a trigger that has not started."""
     initial_dynamic_variable = 0.0
 
-    @property
-    @abstractmethod
-    def weight(self) -> Matrix | None:
-        """W of the norm in which errors are shown, (n, n); None is the identity."""
-
-    @abstractmethod
-    def new_trigger(self) -> "EventTrigger":
-        """Return a trigger that has not started."""
-
     def trigger_rule(self, n: int) -> TriggerRule:
-        """Not available.
-
-        Raises:
-            CallerError: always.
-        """
+        """Raise a CallerError."""
         raise CallerError("trigger.policy: this one is code and has no trigger rule")
 
 
@@ -88,11 +80,7 @@ class TriggerDecision(NamedTuple):
 
 
 class Trigger:
-    """Applies a policy at measurements.
-
-    Args:
-        policy: the policy.
-    """
+    """Applies a policy at measurements."""
 
     def __init__(self, policy: Policy) -> None:
         self._policy = policy
@@ -129,13 +117,7 @@ class Trigger:
             self._condition = policy.trigger_rule(len(x)).after(t_ns, x)
 
     def test(self, t_ns: int, x: Vector, e_s: Vector) -> TriggerDecision:
-        """Decide whether a measurement is an event; :meth:`start` comes first.
-
-        Args:
-            t_ns: its time, not before the last one's.
-            x: the measured state, shape (n,).
-            e_s: x_s − x, shape (n,).
-        """
+        """Decide whether a measurement is an event; call :meth:`start` first."""
         condition = self._started()
         if condition.has_auxiliary:
             (rate,) = condition.auxiliary_rates(np.concatenate([x, e_s])[None]).tolist()
@@ -148,12 +130,9 @@ class Trigger:
         return TriggerDecision(due or (left > right and condition.counts_at(t_ns)), left, right)
 
     def first_event(self, t_ns: NDArray[np.int64], x: Matrix, e_s: Matrix) -> int | None:
-        """Test successive measurements up to the first event, and return its index.
+        """Test k successive measurements up to the first event, and return its index.
 
-        Args:
-            t_ns: their times, shape (k,).
-            x: the measured states, shape (k, n).
-            e_s: x_s − x without an event among them, shape (k, n).
+        x and ``e_s`` = x_s − x without an event among them have the shape (k, n).
         """
         condition = self._started()
         if not len(t_ns):

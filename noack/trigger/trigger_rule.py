@@ -49,12 +49,7 @@ class TriggerRule(NamedTuple):
         return 0.0 if self.from_event else self.rate_per_s
 
     def after(self, t_ns: float, x: Vector) -> TriggerCondition:
-        """The condition after an event, or from the start on.
-
-        Args:
-            t_ns: time of the event.
-            x: the plant's state there, shape (n,).
-        """
+        """The condition after an event at a state x, (n,), or from the start on."""
         level, since_ns, due_ns = self.level, 0.0, self.longest_ns
         if self.from_event:
             # The same bits as the compared norm, so that the event itself does not exceed it.

@@ -48,24 +48,6 @@ def rows(outputs: Sequence[object], table: str) -> Any:
     return np.array(found, tables(2, 2)[table])
 
 
-def test_a_scalar_plant_follows_its_closed_form_through_changing_inputs() -> None:
-    a, b, x = -0.7, 2.0, 1.5
-    plant = linear_plant(
-        np.array([[a]]), np.array([[b]]), np.array([x]), period_ns=50_000_000, horizon_ns=10**9
-    )
-    u = 0.0
-    for step in range(21):
-        (message,) = measured(plant.on_timer(step * 50_000_000))
-        assert message.vector.item() == pytest.approx(x, rel=1e-13, abs=1e-13)
-        u = math.sin(step)
-        plant.handle(actuation(step, [u]), step * 50_000_000 + 1)
-        # Latched now and applied from the next step on: x(t + h) still results from the previous
-        # input.
-        held = math.sin(step - 1) if step else 0.0
-        x = math.exp(a * 0.05) * x + math.expm1(a * 0.05) / a * b * held
-    assert plant.next_deadline_ns() is None
-
-
 @given(st.lists(st.tuples(st.floats(-2, 2), st.floats(-2, 2)), min_size=1, max_size=6))
 def test_the_plant_moves_as_an_integrator_does(inputs: list[tuple[float, float]]) -> None:
     h_ns = 40_000_000

@@ -17,7 +17,7 @@ from noack.protocol.record_tables import (
 from noack.protocol.wire_format import NO_VECTOR, Flow, Message
 from noack.trigger.absolute import AbsoluteTrigger
 from noack.trigger.decaying import DecayingTrigger
-from sensor_node.acknowledged_sensor import AcknowledgedSensor
+from sensor_node.sensor import AcknowledgedSensor
 
 MS = 1_000_000
 GRID_NS = 10 * MS

@@ -59,26 +59,6 @@ def test_a_scalar_under_a_hold_has_closed_form_events() -> None:
     assert len(sent) == 21  # 0.14 s apart
 
 
-def test_a_scalar_with_a_model_has_closed_form_events() -> None:
-    """H = −1, x = x₀e^{−2t}, α = 1: x₀(e^{−t} − e^{−2t}) > βe^{−t} from −ln(1 − β/x₀) on."""
-    x0, beta = 2.0, 0.3
-    sensor = Sensor(np.array([[-1.0]]), DecayingTrigger(beta, 1.0), np.array([x0]))
-    first, *_ = updates(feed(sensor, lambda t: x0 * math.exp(-2 * t), 1.0))
-    assert first.t_ns == next_on_grid_ns(-math.log(1 - beta / x0))
-
-
-def test_a_perfect_model_never_transmits() -> None:
-    sensor = Sensor(np.array([[-0.5]]), DecayingTrigger(1e-9, 1e-9), np.array([1.0]))
-    assert updates(feed(sensor, lambda t: math.exp(-0.5 * t), 10.0)) == []
-
-
-def test_the_floor_replaces_the_decayed_threshold() -> None:
-    """A ramp x = t held at its last update has an event every ε seconds once the floor applies."""
-    sensor = Sensor(ZOH, DecayingTrigger(1e-3, 1.0, 0.205), np.array([0.0]))
-    sent = updates(feed(sensor, lambda t: t, 2.0))
-    assert [message.t_ns for message in sent] == [k * 210_000_000 for k in range(1, 10)]
-
-
 def test_an_error_equal_to_the_threshold_is_no_event() -> None:
     beta = 0.1
     for x, events in ((beta, 0), (math.nextafter(beta, 1), 1)):
@@ -94,7 +74,7 @@ def measured_runs(draw: st.DrawFn) -> tuple[Matrix, Matrix | None, list[tuple[in
     # Diagonally dominant, hence invertible.
     W = 3 * np.eye(n) + rng.uniform(-0.5, 0.5, (n, n)) if draw(st.booleans()) else None
     gaps = draw(st.lists(st.integers(1, 5), min_size=1, max_size=30))  # measurements may be missing
-    x, t_ns, run = rng.uniform(-1, 1, n), 0, []
+    x, t_ns, run = rng.uniform(-1, 1, n), draw(st.integers(0, 5)) * GRID_NS, []
     for gap in gaps:
         run.append((t_ns, x))
         x = x + rng.normal(0, 0.05, n)
@@ -102,7 +82,7 @@ def measured_runs(draw: st.DrawFn) -> tuple[Matrix, Matrix | None, list[tuple[in
     return H, W, run
 
 
-@given(measured_runs(), st.booleans(), st.sampled_from([0.0, 0.1]))
+@given(measured_runs(), st.booleans(), st.sampled_from([0.0, 0.18]))
 def test_an_event_is_exactly_where_the_error_exceeds_the_threshold(
     system: tuple[Matrix, Matrix | None, list[tuple[int, np.ndarray]]], known: bool, floor: float
 ) -> None:
@@ -150,21 +130,6 @@ def test_an_update_carries_the_measured_state_and_its_time() -> None:
     assert record["now_ns"].tolist() == [k * GRID_NS + 777 for k in range(4)]
     # Before the reset, so that the record contains e_s(t_k⁻).
     assert record["x_s"].tolist() == [[1.0, 2.0], [1.0, 2.0], [1.0, 2.0], [3.0, 2.0]]
-
-
-def test_the_first_measurement_is_an_event_unless_the_start_is_known() -> None:
-    x = [1.0]
-    for x0, events in ((None, 1), (np.array(x), 0)):
-        sensor = Sensor(ZOH, DecayingTrigger(0.5, 0.25), x0)
-        assert len(updates(sensor.handle(measurement(0, 0, x), 0))) == events
-
-
-def test_a_known_start_is_propagated_to_the_first_measurement() -> None:
-    """A sensor that misses the measurement at t = 0 still starts from x(0)."""
-    sensor = Sensor(np.array([[-1.0]]), DecayingTrigger(1e-6, 1e-3), np.array([2.0]))
-    outputs = sensor.handle(measurement(0, 500_000_000, [2 * math.exp(-0.5)]), 0)
-    assert updates(outputs) == []
-    assert rows(outputs, 1)["x_s"].item() == pytest.approx(2 * math.exp(-0.5), rel=1e-14)
 
 
 def test_the_reading_time_of_a_datagram_does_not_matter() -> None:

@@ -20,7 +20,7 @@ from cosim.analysis.claims.observed_conditions import (
     causes_of,
     earliest,
 )
-from cosim.record.align import AlignedRun, in_common, join_all
+from cosim.record.align import AlignedRun, align_tables, in_common
 from cosim.record.run_record import RunRecord
 from noack.config.resolution import policy_of
 from noack.config.scenario import Scenario
@@ -65,7 +65,7 @@ class RunEvidence:
     @cached_property
     def joined(self) -> AlignedRun:
         """The run's samples on the measurement grid."""
-        return join_all(self.record)
+        return align_tables(self.record)
 
     @cached_property
     def t_s(self) -> Reals:

@@ -26,20 +26,14 @@ def paper(
 ) -> int:
     """Reproduce the paper's Section V: a page with figures, tables and verdicts."""
     from cosim.live.progress import PatientConsole, draws_bar
-    from cosim.studies.paper.paper_run import (
-        document,
-        make_folder,
-        print_claims,
-        reproduce,
-        write_page,
-    )
+    from cosim.studies.paper import paper_run
 
-    make_folder(out)
+    paper_run.make_folder(out)
     with draws_bar(PatientConsole(stderr=True)) as progress:
-        results = reproduce(draws, cli.cores(), progress)
-    found = document(results, write_page(results, out))
+        results = paper_run.reproduce(draws, cli.cores(), progress)
+    found = paper_run.document(results, paper_run.write_page(results, out))
     if json:
         cli.print_json(found)
     else:
-        print_claims(Console(), found)
+        paper_run.print_claims(Console(), found)
     return ExitStatus.OK

@@ -11,7 +11,7 @@ from cosim.analysis.timing_statistics import latency_us, lateness_us
 from cosim.output.report import signal_figures
 from cosim.output.report.axes import Bound, BoundKind
 from cosim.output.report.decimate import Reals
-from cosim.record.align import AlignedRun, join_all
+from cosim.record.align import AlignedRun, align_tables
 from cosim.record.estimation_error import true_states
 from cosim.record.packet_outcomes import packet_outcomes
 from cosim.record.run_record import RunRecord
@@ -59,7 +59,7 @@ def pictures(
     @cache
     def joined() -> AlignedRun:
         with np.errstate(all="ignore"):  # a diverged run has figures, too
-            return join_all(record)
+            return align_tables(record)
 
     found = {
         "states": lambda: _states(record, joined()),

@@ -215,12 +215,7 @@ class QuadraticEventDetector:
 
 
 class _Squares:
-    """A quadratic form on the first entries of z, in all cells of a window at once.
-
-    Args:
-        form: the form.
-        cells: map from z at the window's start to the Taylor coefficients of z in the cells.
-    """
+    """A quadratic form on the first entries of z, in all cells of a window at once."""
 
     def __init__(self, form: QuadraticForm, cells: Matrix) -> None:
         rows = np.vstack([form.up, form.down])

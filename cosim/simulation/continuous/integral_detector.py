@@ -73,13 +73,9 @@ class IntegralEventDetector:
 
 
 def _norm_integral(y: Matrix, begin: float, end: float, grain: float) -> float:
-    """Return ∫‖y(u)‖du over [begin, end], to a tolerance of 1e-13 times (the integral + ``grain``).
+    """Return ∫‖y(u)‖du over [begin, end], to 1e-13 times (the integral + ``grain``).
 
-    Args:
-        y: Taylor coefficients, shape (p + 1, r).
-        begin: in [0, 1].
-        end: in [begin, 1].
-        grain: scale of the integral; differences below its rounding error are ignored.
+    y has the Taylor coefficients, shape (p + 1, r).
     """
     pending, total = [(begin, end)], 0.0
     while pending:

@@ -62,13 +62,7 @@ class SampledRun:
 
 
 class SampledLoop:
-    """The loop under a schedule.
-
-    Args:
-        system: matrices and trigger, of any policy.
-        schedule: times of measurements, deliveries and actuations.
-        known_start: sensor and controller start from x(0); else the first measured step is event 0.
-    """
+    """The loop under a schedule."""
 
     def __init__(
         self, system: ContinuousLoop, schedule: StepSchedule, *, known_start: bool
@@ -143,15 +137,7 @@ class SampledLoop:
         return self._schedule.delay_ns(event)
 
     def _continuous(self, x: Vector, updates: list["_Update"], step: int, until: int) -> Matrix:
-        """Return x at the steps after ``step`` up to ``until``, under u = K x_c(t).
-
-        Args:
-            x: state at ``step``.
-            updates: the newest update in effect at ``step``, then those that take effect within
-                the next step.
-            step: number of the step with state ``x``.
-            until: the last step to compute; ``step`` + 1 if updates take effect before it.
-        """
+        """Return x at the steps after ``step`` up to ``until``, under u = K x_c(t)."""
         n, now_ns, newest = len(x), step * self._schedule.period_ns, updates[0]
         z = self._state(x, newest, now_ns)
         if len(updates) == 1:

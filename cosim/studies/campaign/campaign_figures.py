@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -32,17 +32,8 @@ _MARKERS = "os^Dv<>PXph*"
 _DASHES: tuple[Any, ...] = ("-", (0, (6, 1.5)), (0, (2, 1.2)), (0, (6, 1.5, 1.5, 1.5)))
 
 
-class Drawn(NamedTuple):
-    """A figure of the page."""
-
-    name: str
-    """Name of the figure, one word."""
-    figure: Figure
-    caption: str
-
-
-def figures(summary: CampaignSummary, store: Store) -> Iterator[Drawn]:
-    """Draw the figures that the campaign asks for."""
+def figures(summary: CampaignSummary, store: Store) -> Iterator[tuple[str, Figure, str]]:
+    """Draw the figures that the campaign asks for; return them with name and caption."""
     for i, wanted in enumerate(summary.campaign.figures):
         places = set(summary.campaign.selected(wanted.where))
         found = [one for one in summary.found if one.point.place in places]
@@ -58,7 +49,7 @@ def figures(summary: CampaignSummary, store: Store) -> Iterator[Drawn]:
                 figure, caption = _heat_map(summary, found, wanted)
             case campaign_file.Distribution():
                 figure, caption = _distribution(summary, found, wanted, store)
-        yield Drawn(f"{wanted.kind.replace('_', '-')}-{i + 1}", figure, f"{caption}{where}.")
+        yield f"{wanted.kind.replace('_', '-')}-{i + 1}", figure, f"{caption}{where}."
 
 
 @styled
@@ -195,22 +186,17 @@ def _curve(
     summary: CampaignSummary, found: Sequence[GridPointResult], wanted: campaign_file.Curve
 ) -> tuple[Figure, str]:
     axis = summary.campaign.by_name[wanted.x]
-    numbers = None if axis.numbers is None else np.array(axis.numbers)
-    place = summary.campaign.axes.index(axis)
-    kept = sorted({one.point.place[place] for one in found if wanted.metric in one.estimates})
-    series: dict[str, list[Estimate | None]] = {}
-    for label, group in _series(summary, found, (wanted.x, *wanted.where)):
-        known = {one.point.place[place]: one.estimates.get(wanted.metric) for one in group}
-        if any(known.values()):
-            series[label] = [known.get(i) for i in kept]
-    figure = curve_figure(
-        None if numbers is None else numbers[kept],
-        [axis.labels[i] for i in kept],
-        series,
-        axis.called,
-        wanted.metric,
-    )
-    return figure, (
+    known = {
+        name: {one.point.labels[axis.name]: one.estimates.get(wanted.metric) for one in group}
+        for name, group in _series(summary, found, (wanted.x, *wanted.where)).items()
+    }
+    places = [i for i, x in enumerate(axis.labels) if any(one.get(x) for one in known.values())]
+    labels = [axis.labels[i] for i in places]
+    series = {
+        name: [one.get(x) for x in labels] for name, one in known.items() if any(one.values())
+    }
+    numbers = None if axis.numbers is None else np.array(axis.numbers)[places]
+    return curve_figure(numbers, labels, series, axis.called, wanted.metric), (
         f"{_title(wanted.metric)} over {axis.called}: means and 95 % confidence intervals"
     )
 
@@ -218,32 +204,26 @@ def _curve(
 def _heat_map(
     summary: CampaignSummary, found: Sequence[GridPointResult], wanted: campaign_file.HeatMap
 ) -> tuple[Figure, str]:
-    axes = [summary.campaign.by_name[name] for name in (wanted.x, wanted.y)]
-    places = [summary.campaign.axes.index(axis) for axis in axes]
+    x, y = (summary.campaign.by_name[name] for name in (wanted.x, wanted.y))
     maps = {}
-    for label, group in _series(summary, found, (wanted.x, wanted.y, *wanted.where)):
-        values = np.full([len(axis.labels) for axis in reversed(axes)], np.nan)
+    spanned = (wanted.x, wanted.y, *wanted.where)
+    for label, group in _series(summary, found, spanned).items():
+        maps[label] = np.full((len(y.labels), len(x.labels)), np.nan)
         for one in group:
             if wanted.metric in one.estimates:
-                column, row = (one.point.place[place] for place in places)
-                mean = one.estimates[wanted.metric].mean
-                values[row, column] = mean if np.isfinite(mean) else np.nan
-        maps[label] = values
-    x, y = ((axis.called, axis.labels) for axis in axes)
-    return heat_map_figure(maps, x, y, wanted.metric), (
-        f"{_title(wanted.metric)} over {x[0]} and {y[0]}: means"
-    )
+                row, column = (axis.labels.index(one.point.labels[axis.name]) for axis in (y, x))
+                maps[label][row, column] = one.estimates[wanted.metric].mean
+    figure = heat_map_figure(maps, (x.called, x.labels), (y.called, y.labels), wanted.metric)
+    return figure, f"{_title(wanted.metric)} over {x.called} and {y.called}: means"
 
 
 def _distribution(
-    summary: CampaignSummary,
-    found: Sequence[GridPointResult],
-    wanted: campaign_file.Distribution,
-    store: Store,
-) -> tuple[Figure, str]:
+    summary: CampaignSummary, found: Sequence[GridPointResult],
+    wanted: campaign_file.Distribution, store: Store,
+) -> tuple[Figure, str]:  # fmt: skip
     series = {
         label: runs_at(one.point, store)[0][wanted.metric]
-        for label, group in _series(summary, found, tuple(wanted.where))
+        for label, group in _series(summary, found, tuple(wanted.where)).items()
         for one in group if wanted.metric in one.estimates
     }  # fmt: skip
     return distribution_figure(series, wanted.metric), (
@@ -253,7 +233,7 @@ def _distribution(
 
 def _series(
     summary: CampaignSummary, found: Sequence[GridPointResult], spanned: tuple[str, ...]
-) -> Iterator[tuple[str, list[GridPointResult]]]:
+) -> dict[str, list[GridPointResult]]:
     """Group grid points by the values of the axes that the figure does not show as coordinates."""
     rest = [axis for axis in summary.campaign.axes if axis.name not in spanned]
     groups: dict[str, list[GridPointResult]] = {}
@@ -264,7 +244,7 @@ def _series(
             for axis in rest
         )  # fmt: skip
         groups.setdefault(label, []).append(one)
-    yield from groups.items()
+    return groups
 
 
 def _panel(

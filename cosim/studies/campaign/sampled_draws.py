@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from cosim.record.align import in_common, join_all
+from cosim.record.align import align_tables, in_common
 from cosim.record.run_record import RunRecord
 from cosim.simulation.batch.batch_interface import ROW
 from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS
@@ -93,7 +93,7 @@ class SampledWork:
             row["settling_s"] = t_s[above[-1]]
         row["final_norm"] = norms[-1]
         row["cost"] = self._cost(record)
-        joined = join_all(record)
+        joined = align_tables(record)
         decay_per_s = record.scenario.trigger.threshold_decay_per_s
         scaled = joined.e_c_norm * np.exp(decay_per_s * joined.t_ns / NS_PER_S)
         row["sup_e_c_scaled"] = scaled[in_common(record.scenario, joined)].max(initial=0.0)

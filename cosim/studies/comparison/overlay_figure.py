@@ -15,7 +15,7 @@ from cosim.output.report.decimate import Reals
 from cosim.output.report.figure_files import inline, save_figure
 from cosim.output.report.figure_style import NotebookFigure, printed, styled
 from cosim.output.report.report_page import templates
-from cosim.record.align import AlignedRun, join_all
+from cosim.record.align import AlignedRun, align_tables
 from cosim.studies.comparison.run_comparison import ComparedRun, RunComparison
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
@@ -37,7 +37,7 @@ def overlay_figure(runs: Sequence[ComparedRun]) -> Figure:
         runs: runs with the same number of states; the first 6 states are drawn.
     """
     with np.errstate(all="ignore"):  # a run may diverge
-        joined = [join_all(run.record) for run in runs]
+        joined = [align_tables(run.record) for run in runs]
     states = min(runs[0].record.loop.n, _MOST_STATES)
     heights_in = [*[_STATE_IN] * states, _NORM_IN, _NORM_IN, _EVENTS_IN * (len(runs) + 1)]
     size_in = (draw.WIDTH_IN, sum(heights_in) + _SPACE_IN)

@@ -214,10 +214,7 @@ def _settling_times_s(t_s: Vector, norms: Vector) -> tuple[float, float]:
 
 def _settling_s(t_s: Vector, norms: Vector, level: float) -> float:
     """Return the last time with ``norms`` above ``level``; infinite if it is above at the end."""
-    above = np.flatnonzero(norms > level)
-    if not len(above):
-        return 0.0
-    last = int(above[-1])
+    last = int(np.flatnonzero(norms > level)[-1])
     if last == len(norms) - 1:
         return _NEVER
     # Assumption: between two samples the norm falls exponentially.

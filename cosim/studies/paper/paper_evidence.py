@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import schur
 
-from cosim.record.align import join_all
-from cosim.simulation.continuous.continuous_loop import continuous_loop_of
+from cosim.record.align import align_tables
+from cosim.simulation.continuous.continuous_loop import ContinuousLoop, continuous_loop_of
 from cosim.simulation.continuous.continuous_report import run_continuous
 from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
 from cosim.simulation.virtual_time import simulate
@@ -159,7 +159,10 @@ def _slow_model(M: int) -> Numbers:
         weight=None, state_names=entry_names("x", 2), input_names=entry_names("u", 1),
     )  # fmt: skip
     run = simulate_continuous(
-        loop, trigger, horizon_s=250.0, delivered=lambda event: event % M == 0, known_start=False
+        ContinuousLoop(loop, trigger),
+        horizon_s=250.0,
+        delivered=lambda event: event % M == 0,
+        known_start=False,
     )
     ends = [state for i, state in enumerate(run.before) if i % M == 0 and i > 0]
     return {
@@ -279,7 +282,7 @@ def _sampled(scenario: Scenario, representative: int) -> Numbers:
     resolved = resolved_draw(scenario, representative, "model")
     continuous = run_continuous(resolved)
     record = simulate(resolved)
-    joined = join_all(record)
+    joined = align_tables(record)
     tested = record[SENSOR_MEASUREMENT]["event"] > 0  # event 0 happens without a test
     beyond = joined.e_s_norm[tested] / joined.threshold[tested]
     exact = continuous.at(joined.t_ns / NS_PER_S)

@@ -13,8 +13,7 @@ from noack.disturbances.disturbance_settings import Place
 from noack.observers.estimation_model import NoiseVariances
 from noack.plants.linear import LinearSettings
 from noack.settings.matrices import Row, Rows, require_non_negative
-from noack.settings.rates import RateHz, require_whole_period
-from noack.settings.section import ScenarioSection
+from noack.settings.section import RateHz, ScenarioSection, require_whole_period
 
 
 class WatchdogSection(ScenarioSection):

@@ -11,7 +11,7 @@ import io
 import os
 import weakref
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -27,9 +27,15 @@ from noack.settings.named_file import unchanged
 _WARNING, _DISCARD, _ERROR, _FATAL = 1, 2, 3, 4
 """Status codes of FMI."""
 _REAL = {"Real", "Float64", "Float32"}
-_TEXT = {"String"}
-_TRUTH = {"Boolean"}
-_READABLE = {"output", "local"}
+_VALUES: Mapping[str, tuple[tuple[type, ...], str]] = {
+    **dict.fromkeys(_REAL, ((int, float), "a number")),
+    "Boolean": ((bool,), "true or false"),
+    "String": ((str,), "a text"),
+}
+"""Python types of a variable's value, by its FMI type; all others are whole numbers."""
+Refusal = Callable[[Any], str | None]
+"""Returns why a variable is unsuitable; None if it is suitable."""
+
 _ALIKE = 1e-6
 """Largest relative difference between x(0) of the scenario and x(0) of the FMU."""
 _LONGEST = 300
@@ -38,10 +44,6 @@ _LONGEST = 300
 
 class FmuSystem:
     """An instance of an FMU, initialised at x(0).
-
-    Args:
-        settings: of a loaded scenario.
-        x0: x(0), shape (n,).
 
     Raises:
         CallerError: FMPy is missing, the FMU does not match the settings, or it cannot be started.
@@ -52,9 +54,8 @@ class FmuSystem:
         path = unchanged(settings, "plant.system")
         self._place = f'plant.system.file = "{path.name}"'
         self._operating_state = np.array(settings.operating_state or np.zeros_like(x0))
-        self._operating_input = np.array(
-            settings.operating_input or [0.0] * len(settings.input_variables)
-        )
+        m = len(settings.input_variables)
+        self._operating_input = np.array(settings.operating_input or np.zeros(m))
         self._log = _Log()
         end = contextlib.ExitStack()
         weakref.finalize(self, end.close)  # when the object is deleted, or the process ends
@@ -77,7 +78,7 @@ class FmuSystem:
                 self._inputs.set(u + self._operating_input)
                 done = self._instance.fmu.doStep(t_ns * 1e-9, dt_ns * 1e-9)
                 if done is not None and done[1]:
-                    raise RuntimeError("it wants the simulation to end")
+                    raise RuntimeError("it requests the end of the simulation")
                 self._read()
         except Exception as error:  # as above
             self._instance.status = getattr(error, "status", _ERROR)
@@ -99,7 +100,7 @@ class FmuSystem:
         except Exception as error:  # a file that is not an FMU can raise any error
             self._wrong(f"is no FMU of FMI 2 or 3, or a damaged one: {_short(error)}")
         if description.fmiVersion.startswith("1."):
-            self._wrong(f"is of FMI {description.fmiVersion}; FMI 2 and 3 can be run")
+            self._wrong(f"is of FMI {description.fmiVersion}; FMI 2 and 3 are supported")
         if description.coSimulation is None:
             self._wrong("is not for co-simulation; export it as a co-simulation FMU")
         return description
@@ -131,19 +132,23 @@ class FmuSystem:
         there = sorted(one.name for one in (folder / "binaries").glob("*") if one.is_dir())
         has = f"binaries for {', '.join(there)} only" if there else "no binaries"
         sources = (folder / "sources").is_dir()
-        hint = "; `fmpy compile` can make it of the sources that it has" if sources else ""
+        hint = "; it has sources, which `fmpy compile` can compile" if sources else ""
         self._wrong(f"has {has}; this machine needs {platform}/{name}{hint}")
 
     def _start(self, settings: FmuSettings, x0: Vector, description: Any) -> None:
         """Set the start values and initialise the FMU."""
         fmu, variables = self._instance.fmu, _Variables(description)
-        self._states = _Port(fmu, variables.readable("state_variables", settings.state_variables))
-        self._inputs = _Port(fmu, variables.inputs("input_variables", settings.input_variables))
-        self._recorded = _Port(fmu, variables.real("on_record", settings.on_record))
+
+        def port(key: str, names: Sequence[str], refusal: Refusal = lambda one: None) -> _Port:
+            return _Port(fmu, variables.real(key, names, refusal))
+
+        self._states = port("state_variables", settings.state_variables, _not_readable)
+        self._inputs = port("input_variables", settings.input_variables, _not_an_input)
+        self._recorded = port("on_record", settings.on_record)
         initial = settings.initial_variables
         if initial is None:
             initial = settings.state_variables
-        start = _Port(fmu, variables.initial("initial_variables", initial))
+        start = port("initial_variables", initial, _not_settable)
         parameters = [variables.parameter(*entry) for entry in settings.parameters.items()]
         with quiet():
             if description.fmiVersion == "2.0":
@@ -161,7 +166,7 @@ class FmuSystem:
         if not np.all(np.abs(self.x - x0) <= _ALIKE * scale):
             raise CallerError(
                 f"plant.initial_state: it is {x0.tolist()}, but the FMU begins at "
-                f"{self.x.tolist()}; plant.system.initial_variables names what sets it"
+                f"{self.x.tolist()}; name in plant.system.initial_variables the variables to set"
             )
 
 
@@ -191,9 +196,9 @@ class _Log:
     def __init__(self) -> None:
         self._last = ""
 
-    def take(self, *said: Any) -> None:
+    def take(self, *arguments: Any) -> None:
         """Keep a message; FMI 2: (environment, name, status, category, message), FMI 3: no name."""
-        status, message = said[-3], said[-1]
+        status, message = arguments[-3], arguments[-1]
         if status > _WARNING and message:
             self._last = _short(message.decode(errors="replace"))
 
@@ -211,64 +216,27 @@ class _Variables:
     def __init__(self, description: Any) -> None:
         self._known: Mapping[str, Any] = {one.name: one for one in description.modelVariables}
 
-    def readable(self, key: str, names: Sequence[str]) -> list[Any]:
-        """Return real outputs and locals."""
-        found = self.real(key, names)
-        for one in found:
-            if one.causality not in _READABLE:
-                _refuse(key, one, f"is neither output nor local, but {one.causality}")
-        return found
-
-    def inputs(self, key: str, names: Sequence[str]) -> list[Any]:
-        """Return real inputs."""
-        found = self.real(key, names)
-        for one in found:
-            if one.causality != "input":
-                _refuse(key, one, f"is no input, but {one.causality}")
-        return found
-
-    def initial(self, key: str, names: Sequence[str]) -> list[Any]:
-        """Return real variables that can be set before the initialisation."""
-        found = self.real(key, names)
-        for one in found:
-            if not _settable(one):
-                _refuse(
-                    key, one, "cannot be set at the start; name variables whose initial is exact "
-                    "or approx, or none: []",
-                )  # fmt: skip
-        return found
-
-    def real(self, key: str, names: Sequence[str]) -> list[Any]:
-        """Return real scalars."""
+    def real(self, key: str, names: Sequence[str], refusal: Refusal) -> list[Any]:
+        """Return real scalars that are not refused."""
         found = [self._named(key, name) for name in names]
         twice = next((name for name, count in Counter(names).items() if count > 1), None)
         if twice is not None:
-            raise CallerError(f'plant.system.{key}: "{twice}" stands there twice')
+            raise CallerError(f'plant.system.{key}: "{twice}" is named twice')
         for one in found:
-            if one.type not in _REAL:
-                _refuse(key, one, f"is of type {one.type}; real numbers are needed")
-            if one.dimensions:
-                _refuse(key, one, "is an array; name scalar variables")
+            if why := _not_a_real_scalar(one) or refusal(one):
+                _refuse(key, one, why)
         return found
 
     def parameter(self, name: str, value: object) -> tuple[Any, Any]:
         """Return a variable and its start value."""
         one = self._named("parameters", name)
-        kinds: tuple[type, ...]
-        if one.type in _REAL:
-            kinds, needed = (int, float), "a number"
-        elif one.type in _TRUTH:
-            kinds, needed = (bool,), "true or false"
-        elif one.type in _TEXT:
-            kinds, needed = (str,), "a text"
-        else:
-            kinds, needed = (int,), "a whole number"
+        kinds, needed = _VALUES.get(one.type, ((int,), "a whole number"))
         if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
             _refuse("parameters", one, f"is of type {one.type}; give {needed}, not {value!r}")
         if one.causality == "input":
             _refuse("parameters", one, "is an input; its value at rest is operating_input")
-        if not _settable(one):
-            _refuse("parameters", one, "cannot be set at the start")
+        if why := _not_settable(one):
+            _refuse("parameters", one, why)
         return one, value
 
     def _named(self, key: str, name: str) -> Any:
@@ -315,10 +283,28 @@ def _set(fmu: Any, kind: str, references: Sequence[int], values: Sequence[Any]) 
     getattr(fmu, f"set{kind}")(references, values)
 
 
-def _settable(variable: Any) -> bool:
+def _not_a_real_scalar(one: Any) -> str | None:
+    if one.type not in _REAL:
+        return f"is of type {one.type}; real numbers are needed"
+    return "is an array; name scalar variables" if one.dimensions else None
+
+
+def _not_readable(one: Any) -> str | None:
+    readable = one.causality in ("output", "local")
+    return None if readable else f"is neither output nor local, but {one.causality}"
+
+
+def _not_an_input(one: Any) -> str | None:
+    return None if one.causality == "input" else f"is no input, but {one.causality}"
+
+
+def _not_settable(one: Any) -> str | None:
+    """Refuse a variable that cannot be set before the initialisation."""
     from fmpy.simulation import settable_in_instantiated
 
-    return bool(settable_in_instantiated(variable))
+    if settable_in_instantiated(one):
+        return None
+    return "cannot be set at the start; name variables whose initial is exact or approx, or none"
 
 
 def _about(description: Any) -> str:

@@ -27,10 +27,6 @@ class OdeSystem:
     The integrator restarts at every step of the plant, because the input changes abruptly there. So
     the result depends on z, v and t alone, and a replay repeats it bit for bit. If z diverges, or f
     cannot be evaluated, z is NaN from then on: the run has diverged.
-
-    Args:
-        equations: f, its output and input, and tolerances.
-        x0: x(0), shape (n,).
     """
 
     def __init__(self, equations: PlantEquations, x0: Vector) -> None:

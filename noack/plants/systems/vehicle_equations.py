@@ -35,12 +35,7 @@ def library(module: str, name: str | None = None) -> Any:
 
 
 def equations(model: str, parameters: Any) -> Rates:
-    """Return the equations of a model.
-
-    Args:
-        model: the library's name, e.g. ``st``.
-        parameters: the library's parameters of a vehicle.
-    """
+    """Return the equations of a model (the library's name, e.g. ``st``) for a vehicle."""
     if (compiled := compiled_dynamics(model)) is None:
         dynamics = _dynamics(model)
         return lambda z, *inputs: np.array(dynamics(z.tolist(), list(inputs), parameters))
@@ -95,14 +90,14 @@ def _say(line: str) -> None:
 
 
 def _of(dynamics: Callable[..., Any]) -> Callable[..., None]:
-    def found(
+    def compute(
         z: Vector, steering: float, acceleration: float, parameters: Any, into: Vector
     ) -> None:
         rates = dynamics(z.copy(), (steering, acceleration), parameters[0])  # it modifies z
         for number in range(len(rates)):
             into[number] = rates[number]
 
-    return found
+    return compute
 
 
 def _compiled(model: str) -> Any:
@@ -116,23 +111,16 @@ def _compiled(model: str) -> Any:
 
 @cache
 def _folder(model: str) -> Path | None:
-    functions = _needed(_dynamics(model))
-    sources = {Path(inspect.getfile(function)) for function in functions}
+    sources = {Path(inspect.getfile(function)) for function in _needed(_dynamics(model))}
     return cache_folder(f"vehicle-{model}", sorted({*sources, Path(__file__)}))
 
 
 def _needed(function: FunctionType) -> list[FunctionType]:
     """Return a function of the library and all library functions that it calls, also indirectly."""
-    found: dict[FunctionType, None] = {}
-
-    def visit(one: FunctionType) -> None:
-        if one not in found:
-            found[one] = None
-            for other in _named(one):
-                visit(other)
-
-    visit(function)
-    return list(found)
+    needed = [function]
+    for one in needed:  # grows
+        needed += [other for other in dict.fromkeys(_named(one)) if other not in needed]
+    return needed
 
 
 def _named(function: FunctionType) -> Iterator[FunctionType]:
@@ -148,18 +136,17 @@ def _named(function: FunctionType) -> Iterator[FunctionType]:
 def _record(parameters: Any) -> NDArray[np.void]:
     """A vehicle's parameters as an array of one record; its type is the same for all vehicles."""
 
-    def told(section: Any) -> tuple[list[Any], tuple[Any, ...]]:
+    def convert(section: Any) -> tuple[list[Any], tuple[Any, ...]]:
         types: list[Any] = []
         values: list[Any] = []
         for field in fields(section):
+            kind: Any = np.float64
             value = getattr(section, field.name)
             if is_dataclass(value):
-                inner, value = told(value)
-                types.append((field.name, inner))
-            else:
-                types.append((field.name, np.float64))
+                kind, value = convert(value)
+            types.append((field.name, kind))
             values.append(np.nan if value is None else value)
         return types, tuple(values)
 
-    dtype, values = told(parameters)
+    dtype, values = convert(parameters)
     return np.array([values], dtype=dtype)

@@ -10,7 +10,7 @@ import pytest
 
 import noack
 from cosim.analysis.replay.replay_result import rows_differ
-from cosim.record.align import join_all
+from cosim.record.align import align_tables
 from cosim.record.packet_outcomes import packet_outcomes
 from cosim.record.run_record import load_record
 
@@ -26,7 +26,7 @@ def test_a_table_is_the_file_with_a_column_of_seconds_first(simulated: noack.Run
 
 
 def test_samples_are_the_aligned_record(simulated: noack.Run) -> None:
-    joined = join_all(load_record(simulated.directory))
+    joined = align_tables(load_record(simulated.directory))
     samples = simulated.samples()
     for name, states in (("x", joined.x), ("x_s", joined.x_s), ("x_c", joined.x_c)):
         for i in range(2):

@@ -53,7 +53,7 @@ def test_check_prints_the_defaults_that_depend_on_other_keys(
     silent = said()
     assert "plant.watchdog: policy hold, after 0.1 s without an actuation" in silent
     assert "controller.safe_input: 0, the input before the first update" in silent
-    assert "recovery.rejoin_within_s: 0: a process that dies ends the run;" in silent
+    assert "recovery.rejoin_within_s: 0, a process that dies ends the run;" in silent
     assert "start_within_s: 30, longer on a busy machine" in silent
     content["plant"]["watchdog"] = {"timeout_s": 0.2}
     content["controller"] = {"safe_input": [0.1]}

@@ -14,7 +14,7 @@ from cosim.analysis.claims.claims_by_part import RunClaims
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
 from cosim.analysis.summary_model import ClaimVerdict
-from cosim.record.align import identity_residual, join_all
+from cosim.record.align import align_tables, identity_residual
 from cosim.record.recorded_changes import changes_of
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import Shuttle, _Gathered, _report, simulate
@@ -87,7 +87,7 @@ def test_whatever_changes_the_run_is_replayed_and_the_identity_holds(
     found = replay(record)
     assert found.bit_exact
     assert found.gaps == []
-    joined = join_all(record)
+    joined = align_tables(record)
     residual = identity_residual(record, joined)
     scale = float(np.abs(joined.x_s).max())
     assert np.nanmax(residual) <= 1e-12 * max(scale, 1.0)
@@ -225,7 +225,7 @@ def test_a_change_received_too_late_is_reported_and_voids_its_claims() -> None:
     assert claims[0].until_s == 0.9
     assert claims[-1].from_s > made.everywhere_ns * 1e-9
     # In between, only one of the two models had the change.
-    joined = join_all(record)
+    joined = align_tables(record)
     between = (joined.t_ns > 910 * MS) & (joined.t_ns < claims[-1].from_s * 1e9)
     assert np.nanmax(identity_residual(record, joined)[between]) > 1e-3
 
@@ -240,7 +240,7 @@ def test_a_sensor_with_an_observer_applies_a_change() -> None:
     record = simulate(resolve(validate(content, "here")))
     assert len(record[SENSOR_SETTING]) == 2
     assert replay(record).bit_exact
-    residual = identity_residual(record, join_all(record))
+    residual = identity_residual(record, align_tables(record))
     assert np.nanmax(residual) < 1e-12
 
 

@@ -11,7 +11,7 @@ from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
 from cosim.analysis.step_schedule import live_run
 from cosim.output.certificate_report import Certificates
-from cosim.record.align import join_all
+from cosim.record.align import align_tables
 from cosim.record.estimation_error import estimation_error, expected_rms, true_states
 from cosim.record.run_record import RunRecord
 from cosim.simulation.batch.batch_interface import setting_of
@@ -177,7 +177,7 @@ def test_only_i1_and_its_consequences_are_claimed_of_the_estimate(
     assert claims.certificates == []
     assert [one.label for one in claims.envelopes()] == ["bound from (I1)"]
     # Relative to the plant's own state the second claim would not hold, so it is not claimed.
-    joined = join_all(record)
+    joined = align_tables(record)
     e_c = row_norms(joined.x_c - true_states(record[PLANT_STEP], joined.t_ns))
     assert (e_c > joined.e_c_norm + 1e-6).any()
     assert (e_c <= joined.e_c_norm + row_norms(estimation_error(record)) + 1e-12).all()

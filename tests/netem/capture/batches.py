@@ -18,7 +18,7 @@ SPECS = [
     LinkSpec("link0", ("127.0.0.1", 1), ("127.0.0.1", 2), LinkSettings(), LinkSettings())
 ]  # fmt: skip
 INTERFACES = (("link0 client", "127.0.0.1:1"), ("link0 server", "127.0.0.1:2"))
-USUAL = {
+USUAL: dict[str, Any] = {
     "t_ns": T_NS, "family": 4, "source_port": 40_001, "destination_port": 40_002,
     "source": "192.0.2.1", "destination": "198.51.100.7", "flow": 3, "packet": 17,
     "mansd": -1, "bit": -1, "payload": b"payload",

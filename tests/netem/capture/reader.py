@@ -2,14 +2,12 @@
 
 import ipaddress
 import struct
-from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 Options = dict[int, list[bytes]]
 
 
-@dataclass(frozen=True)
-class Packet:
+class Packet(NamedTuple):
     interface: int
     t_ns: int
     original_bytes: int
@@ -22,8 +20,7 @@ class Packet:
         return comment.decode()
 
 
-@dataclass(frozen=True)
-class File:
+class File(NamedTuple):
     section: Options
     interfaces: list[tuple[int, int, Options]]
     """Link type, snap length, options."""
@@ -32,8 +29,7 @@ class File:
     """By interface: time, options."""
 
 
-@dataclass(frozen=True)
-class Datagram:
+class Datagram(NamedTuple):
     source: str
     destination: str
     source_port: int
@@ -41,20 +37,8 @@ class Datagram:
     payload: bytes
 
 
-def blocks(data: bytes) -> Iterator[tuple[int, bytes]]:
-    at = 0
-    while at < len(data):
-        kind, size = struct.unpack_from("<II", data, at)
-        assert size % 4 == 0
-        assert struct.unpack_from("<I", data, at + size - 4) == (size,)
-        yield kind, data[at + 8 : at + size - 4]
-        at += size
-    assert at == len(data)
-
-
 def padded(data: bytes, at: int, size: int) -> tuple[bytes, int]:
-    end = at + size
-    rest = -size % 4
+    end, rest = at + size, -size % 4
     assert data[end : end + rest] == bytes(rest)
     assert end + rest <= len(data)
     return data[at:end], end + rest
@@ -62,26 +46,29 @@ def padded(data: bytes, at: int, size: int) -> tuple[bytes, int]:
 
 def options(data: bytes) -> Options:
     found: Options = {}
-    at = 0
-    while True:
+    at, code = 0, -1
+    while code != 0:
         code, size = struct.unpack_from("<HH", data, at)
         value, at = padded(data, at + 4, size)
-        if code == 0:
-            assert size == 0
-            assert at == len(data)
-            return found
         found.setdefault(code, []).append(value)
+    assert found.pop(0) == [b""]
+    assert at == len(data)
+    return found
 
 
 def read(data: bytes) -> File:
-    section: Options | None = None
     file = File({}, [], [], {})
-    for kind, body in blocks(data):
+    at = 0
+    while at < len(data):
+        kind, size = struct.unpack_from("<II", data, at)
+        assert size % 4 == 0
+        assert (kind == 0x0A0D0D0A) == (at == 0), "one section"
+        body = data[at + 8 : at + size - 4]
+        at += size
+        assert struct.unpack_from("<I", data, at - 4) == (size,)
         if kind == 0x0A0D0D0A:
-            assert section is None, "one section"
             assert struct.unpack_from("<IHHq", body) == (0x1A2B3C4D, 1, 0, -1)
-            section = options(body[16:])
-            file.section.update(section)
+            file.section.update(options(body[16:]))
         elif kind == 1:
             link_type, reserved, snap = struct.unpack_from("<HHI", body)
             assert reserved == 0
@@ -89,14 +76,14 @@ def read(data: bytes) -> File:
         elif kind == 6:
             index, high, low, captured, original = struct.unpack_from("<IIIII", body)
             assert captured <= min(original, file.interfaces[index][1])
-            frame, at = padded(body, 20, captured)
-            t_ns = high << 32 | low
-            file.packets.append(Packet(index, t_ns, original, frame, options(body[at:])))
+            frame, end = padded(body, 20, captured)
+            packet = Packet(index, high << 32 | low, original, frame, options(body[end:]))
+            file.packets.append(packet)
         else:
             assert kind == 5
             index, high, low = struct.unpack_from("<III", body)
             file.statistics[index] = (high << 32 | low, options(body[12:]))
-    assert section is not None
+    assert at == len(data)
     return file
 
 
@@ -108,20 +95,16 @@ def ones_complement(data: bytes) -> int:
 
 def datagram(frame: bytes) -> Datagram:
     """Return the datagram in a frame; its checksums must be correct."""
-    version = frame[0] >> 4
-    if version == 4:
-        first, tos, total, ident, fragment, hops, protocol, _ = struct.unpack_from(
-            ">BBHHHBBH", frame
-        )
-        assert (first, tos, ident, fragment, protocol) == (0x45, 0, 0, 0x4000, 17)
-        assert total == len(frame)
+    if frame[0] >> 4 == 4:
+        *constant, hops, protocol, _ = struct.unpack_from(">HHHHBBH", frame)
+        assert constant == [0x4500, len(frame), 0, 0x4000]
         assert ones_complement(frame[:20]) == 0xFFFF
         addresses, udp = frame[12:20], frame[20:]
     else:
         word, total, protocol, hops = struct.unpack_from(">IHBB", frame)
-        assert (word, protocol) == (6 << 28, 17)
-        assert total == len(frame) - 40
+        assert (word, total) == (6 << 28, len(frame) - 40)
         addresses, udp = frame[8:40], frame[40:]
+    assert protocol == 17
     assert hops > 1
     source_port, destination_port, size, checksum = struct.unpack_from(">HHHH", udp)
     assert size == len(udp)
@@ -129,6 +112,7 @@ def datagram(frame: bytes) -> Datagram:
     pseudo = addresses + struct.pack(">IHH", size, 0, 17)
     assert ones_complement(pseudo + udp) == 0xFFFF
     half = len(addresses) // 2
-    source = str(ipaddress.ip_address(addresses[:half]))
-    destination = str(ipaddress.ip_address(addresses[half:]))
-    return Datagram(source, destination, source_port, destination_port, udp[8:])
+    source, destination = (
+        ipaddress.ip_address(one) for one in (addresses[:half], addresses[half:])
+    )
+    return Datagram(str(source), str(destination), source_port, destination_port, udp[8:])

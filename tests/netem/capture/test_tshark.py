@@ -1,93 +1,55 @@
 """tshark reads and filters a capture."""
 
-import ipaddress
-import random
 from pathlib import Path
-from typing import Any
 
-from tests.netem.capture.batches import INTERFACES, T_NS, file_of
+from tests.netem.capture.batches import INTERFACES, T_NS, USUAL, file_of
 from tests.netem.capture.conftest import Tshark
 
+IPV6 = {"family": 6, "source": "2001:db8::1", "destination": "2001:db8::2"}
+EVENTS = [
+    {"flow": 3, "packet": 1, "payload": b""},
+    {"flow": 33, "packet": 1, "payload": bytes(range(250))},
+    {"flow": 3, "packet": 2, "fate": 1, "consecutive_losses": 1, "mansd": 4} | IPV6,
+    {"flow": 3, "packet": 1, "interface": 1, "departure": 1, "delay_ns": 1_500_000},
+    {"flow": 4, "packet": 1, "payload": bytes(65_507)} | IPV6,
+]
+FIELDS = (
+    "frame.time_epoch", "frame.interface_name", "frame.interface_description",
+    "frame.packet_flags_direction", "ip.src", "ip.dst", "ipv6.src", "ipv6.dst", "udp.srcport",
+    "udp.dstport", "udp.length", "ip.checksum.status", "udp.checksum.status", "udp.payload",
+)  # fmt: skip
 GOOD = "1"
-SIZES = [0, 1, 2, 3, 1472, 65_507]
 
 
-def fields(tshark: Tshark, path: Path, *names: str) -> list[list[str]]:
-    chosen = [word for name in names for word in ("-e", name)]
-    lines = tshark(path, "-T", "fields", "-E", "occurrence=f", *chosen).splitlines()
-    return [line.split("\t") for line in lines]
-
-
-def random_event(rng: random.Random, family: int, size: int) -> dict[str, Any]:
-    address = ipaddress.IPv4Address if family == 4 else ipaddress.IPv6Address
-    departure = rng.randrange(2)
-    return {
-        "t_ns": T_NS + rng.randrange(10**10), "interface": rng.randrange(2),
-        "departure": departure, "fate": rng.randrange(6), "consecutive_losses": rng.randrange(3),
-        "family": family, "source": str(address(rng.randbytes(4 if family == 4 else 16))),
-        "destination": str(address(rng.randbytes(4 if family == 4 else 16))),
-        # Ports without a Wireshark dissector: these tests do not cover payloads.
-        "source_port": rng.randrange(50_000, 65_536),
-        "destination_port": rng.randrange(50_000, 65_536),
-        "payload": rng.randbytes(size),
-    }  # fmt: skip
-
-
-def test_tshark_reads_all_that_was_written(tshark: Tshark, tmp_path: Path) -> None:
-    rng = random.Random(1)
-    described = [
-        random_event(rng, family, size)
-        for family in (4, 6)
-        for size in [*SIZES, *(rng.randrange(200) for _ in range(20))]
-    ]
+def test_tshark_reads_and_filters_what_was_written(tshark: Tshark, tmp_path: Path) -> None:
     path = tmp_path / "capture.pcapng"
-    path.write_bytes(file_of(*described))
-    rows = fields(
-        tshark, path,
-        "frame.time_epoch", "frame.interface_name", "frame.packet_flags_direction",
-        "ip.src", "ip.dst", "ipv6.src", "ipv6.dst", "udp.srcport", "udp.dstport", "udp.length",
-        "ip.checksum.status", "udp.checksum.status", "udp.payload",
-    )  # fmt: skip
-    assert len(rows) == len(described)
-    for row, event in zip(rows, described, strict=True):
-        seconds, nanoseconds = divmod(event["t_ns"], 10**9)
-        ip = [event["source"], event["destination"]]
+    path.write_bytes(file_of(*EVENTS))
+
+    def fields(*names: str, where: str = "") -> list[list[str]]:
+        chosen = [word for name in names for word in ("-e", name)]
+        lines = tshark(path, "-Y", where, "-T", "fields", "-E", "occurrence=f", *chosen)
+        return [line.split("\t") for line in lines.splitlines()]
+
+    for row, given in zip(fields(*FIELDS), EVENTS, strict=True):
+        event = USUAL | given
+        ends = [event["source"], event["destination"]]
+        is_ipv4 = event["family"] == 4
         assert row == [
-            f"{seconds}.{nanoseconds:09d}",
-            INTERFACES[event["interface"]][0],
-            "0x00000002" if event["departure"] else "0x00000001",
-            *(ip if event["family"] == 4 else ["", ""]),
-            *(ip if event["family"] == 6 else ["", ""]),
+            f"{T_NS // 10**9}.{T_NS % 10**9:09d}",
+            *INTERFACES[event.get("interface", 0)],
+            "0x00000002" if event.get("departure") else "0x00000001",
+            *(ends if is_ipv4 else ["", ""]),
+            *(["", ""] if is_ipv4 else ends),
             str(event["source_port"]),
             str(event["destination_port"]),
             str(len(event["payload"]) + 8),
-            GOOD if event["family"] == 4 else "",
+            GOOD if is_ipv4 else "",
             GOOD,
             event["payload"].hex(),
         ]
-
-
-def test_tshark_filters_by_fate_flow_and_datagram(tshark: Tshark, tmp_path: Path) -> None:
-    path = tmp_path / "capture.pcapng"
-    path.write_bytes(
-        file_of(
-            {"flow": 3, "packet": 1}, {"flow": 33, "packet": 1},
-            {"flow": 3, "packet": 2, "fate": 1, "consecutive_losses": 1, "mansd": 4},
-            {"flow": 3, "packet": 1, "interface": 1, "departure": 1, "delay_ns": 1_500_000},
-        )
-    )  # fmt: skip
-    lost = tshark(
-        path, "-Y", 'frame.comment contains "dropped"', "-T", "fields", "-e", "frame.number"
-    )
-    assert lost.split() == ["3"]
-    flow = tshark(
-        path, "-Y", 'frame.comment contains "flow 3,"', "-T", "fields", "-e", "frame.number"
-    )
-    assert flow.split() == ["1", "3", "4"]
-    rows = fields(tshark, path, "frame.packet_id", "frame.comment", "frame.interface_description")
-    assert rows[0][0] == rows[3][0] != rows[2][0]
-    assert rows[2][1:] == [
-        "dropped by the loss model, consecutive loss 1, cap 4; forward, flow 3, packet 2",
-        INTERFACES[0][1],
+    flow_3 = fields("frame.number", "frame.packet_id", where='frame.comment contains "flow 3,"')
+    assert [number for number, _ in flow_3] == ["1", "3", "4"]
+    assert flow_3[0][1] == flow_3[2][1] != flow_3[1][1]
+    assert fields("frame.comment", where='frame.comment contains "dropped"') == [
+        ["dropped by the loss model, consecutive loss 1, cap 4; forward, flow 3, packet 2"]
     ]
-    assert rows[3][1] == "delivered, after 1.5 ms; forward, flow 3, packet 1"

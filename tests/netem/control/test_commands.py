@@ -2,9 +2,7 @@
 
 import json
 import os
-import pty
 import sys
-import termios
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -17,7 +15,7 @@ from netem.control.control_server import ControlServer
 from netem.control.live_screen import Screen
 from netem.words.words_to_settings import settings_of
 from noack.core.errors import ExitStatus
-from tests.netem.control.processes import read_until
+from tests.netem.control.processes import press_q, read_until, terminal
 from tests.netem.control.relays import FakeRelay, running
 
 LEAVE = "\x1b[?1049l"
@@ -149,32 +147,15 @@ def test_watch_fails_when_the_emulator_ends(
     assert capsys.readouterr().err == "noack netem watch: emulator 'lab' has ended\n"
 
 
+@pytest.mark.usefixtures("server")
 def test_watch_redraws_on_a_terminal_until_q(
-    relay: FakeRelay, server: ControlServer, monkeypatch: pytest.MonkeyPatch
+    relay: FakeRelay, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     relay.counters["up", "forward"].received = 7
-    terminal, end = pty.openpty()
-    termios.tcsetwinsize(end, (24, 80))
-    before = termios.tcgetattr(end)
-    monkeypatch.setenv("TERM", "xterm-256color")
-
-    def press_q() -> str:
-        drawn = read_until(terminal, lambda text: "q ends" in text and "→ up" in text)
-        os.write(terminal, b"q")
-        return drawn
-
-    with (
-        os.fdopen(os.dup(end), "w") as stdout,
-        os.fdopen(os.dup(end)) as stdin,
-        ThreadPoolExecutor() as threads,
-    ):
-        monkeypatch.setattr(sys, "stdout", stdout)
-        monkeypatch.setattr(sys, "stdin", stdin)
-        pressing = threads.submit(press_q)
-        assert run("watch") == ExitStatus.OK
-    assert LEAVE not in pressing.result()
-    # The last screen stays visible.
-    read_until(terminal, lambda text: "╯" in text.partition(LEAVE)[2])
-    assert termios.tcgetattr(end) == before
-    os.close(terminal)
-    os.close(end)
+    with terminal(monkeypatch) as user:
+        with ThreadPoolExecutor() as threads:
+            drawn = threads.submit(press_q, user, "q ends", "→ up")
+            assert run("watch") == ExitStatus.OK
+        assert LEAVE not in drawn.result()
+        # The last screen stays visible.
+        read_until(user, lambda text: "╯" in text.partition(LEAVE)[2])

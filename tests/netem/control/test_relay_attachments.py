@@ -1,20 +1,18 @@
 import argparse
 import io
 import json
-import os
-import pty
-import subprocess
 import sys
-import termios
 import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from netem.control.emulator_session import running
 from netem.control.relay_attachments import Options, add_options, attached, options_of
-from noack.core.errors import CallerError, ExitStatus
-from tests.netem.control.processes import read_until, udp_socket
+from noack.core.errors import CallerError
+from tests.netem.control.processes import press_q, read_until, terminal
 from tests.netem.control.relays import FakeRelay
 
 
@@ -85,26 +83,18 @@ def test_a_full_disk_is_reported_and_the_relay_continues(
     )
 
 
-def test_the_view_of_an_emulator_in_its_own_terminal() -> None:
-    terminal, end = pty.openpty()
-    termios.tcsetwinsize(end, (30, 80))
-    arguments = ["--listen", "127.0.0.1:0", "--engine", "plain", "--view", "loss", "100%"]
-    with (
-        udp_socket() as server,
-        subprocess.Popen(
-            [sys.executable, "-m", "netem", "--to", f"127.0.0.1:{server.getsockname()[1]}",
-             *arguments],
-            env=os.environ | {"TERM": "xterm-256color"}, stdin=end, stdout=end, stderr=end,
-        ) as process,
-    ):  # fmt: skip
-        try:
-            read_until(terminal, lambda text: "Ctrl-C ends" in text and "forward →" in text)
-            os.write(terminal, b"q")
-            rest = read_until(terminal, lambda text: text.count("Ctrl-C ends") == 1)
-            assert process.wait(60) == ExitStatus.OK
-        finally:
-            process.kill()
-    # Messages printed during the view stay visible below it.
-    assert "forward →" in rest.partition("\x1b[?1049l")[2]
-    os.close(terminal)
-    os.close(end)
+def test_the_view_shows_the_relay_and_later_messages_until_q(
+    relay: FakeRelay, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    relay.counters["up", "forward"].received = 7
+    with terminal(monkeypatch) as user:
+        with ThreadPoolExecutor() as threads:
+            drawn = threads.submit(press_q, user, "q ends", "→ up", "a message")
+            with attached(relay, Options(view=True)) as side:
+                print("a message", file=sys.stderr)
+                while not side.quit_requested and not drawn.done():
+                    side.commands.run_pending()
+                    time.sleep(0.01)
+            assert drawn.exception() is None
+        read_until(user, lambda text: "forward →" in text.partition("\x1b[?1049l")[2])
+    assert capsys.readouterr().err == "a message\n"

@@ -1,17 +1,15 @@
 import json
-from typing import Any, get_type_hints
+from typing import Any
 
-import numpy as np
 import pytest
 
 from netem.control.command_queue import AppliedSettings, Snapshot
 from netem.control.emulator_statistics import (
     DirectionStatistics,
-    RecentRates,
     Statistics,
     statistics,
 )
-from netem.engine.relay_interface import DIRECTIONS, FlowReport
+from netem.engine.relay_interface import FlowReport
 from netem.words.words_to_settings import settings_of
 from noack.core.clock import NS_PER_S
 from noack.impairments.link_records import Counters
@@ -65,36 +63,15 @@ def test_the_statistics_contain_every_counter_of_a_relay(relay: FakeRelay) -> No
     assert found["loss"]["drawn"] == pytest.approx((8 + 4) / 100)
     assert found["loss"]["lost"] == pytest.approx((8 + 4 + 2 + 1) / 100)
     assert found["recent"] is None
-    assert (down["name"], down["forward"]["received"], down["reverse"]["mansd"]) == (
-        "down",
-        0,
-        None,
-    )
-
-
-def test_the_document_is_json_and_has_the_documented_keys(relay: FakeRelay) -> None:
-    first = look(relay, 1)
-    relay.counters["up", "forward"] = Counters(received=10, delivered=10)
-    relay.delays = times(1000)
-    document = statistics(look(relay, 2), first)
+    assert (down["name"], down["reverse"]["mansd"]) == ("down", None)
     assert json.loads(json.dumps(document, allow_nan=False)) == document
-    assert set(document) == set(get_type_hints(Statistics))
-    for way in DIRECTIONS:
-        found = document["links"][0][way]
-        assert set(found) == set(get_type_hints(DirectionStatistics))
-        assert found["recent"] is not None
-        assert set(found["recent"]) == set(get_type_hints(RecentRates))
 
 
 def test_rates_are_differences_of_two_documents(relay: FakeRelay) -> None:
     relay.counters["up", "forward"] = Counters(
-        received=50,
-        received_bytes=5000,
-        delivered=40,
-        dropped=10,
-        forwarded=40,
+        received=50, received_bytes=5000, delivered=40, dropped=10, forwarded=40,
         forwarded_bytes=4000,
-    )
+    )  # fmt: skip
     relay.delays = times(1_000_000)
     before = look(relay, 10)
     relay.counters["up", "forward"] = Counters(
@@ -139,15 +116,6 @@ def test_values_without_data_are_null(relay: FakeRelay) -> None:
     found = forward(statistics(look(relay, 1)))
     assert found["loss"]["realised"] is None
     assert set(found["delay_ns"].values()) == {None}
-
-
-def test_delay_quantiles_match_the_delays(relay: FakeRelay) -> None:
-    drawn_ns = np.random.default_rng(4).lognormal(13, 2, 20_000).astype(np.int64)
-    relay.delays = times(*drawn_ns.tolist())
-    found = forward(statistics(look(relay, 1)))["delay_ns"]
-    for name, share in (("p50", 0.5), ("p99", 0.99), ("p999", 0.999), ("max", 1.0)):
-        exact = np.quantile(drawn_ns, share, method="inverted_cdf")
-        assert found[name] == pytest.approx(exact, rel=0.03)  # type: ignore[literal-required]
 
 
 def test_long_words_are_cut(relay: FakeRelay) -> None:

@@ -112,6 +112,25 @@ def test_answers_from_another_address_of_the_server_do_not_make_it_a_client(engi
             assert one.report().clients_ever == 1
 
 
+def test_the_same_port_of_two_addresses_is_two_flows_with_a_path_each(engine: Engine) -> None:
+    with endpoints(V4, "127.0.0.2") as (server, first), ExitStack() as stack:
+        second = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        second.bind(("127.0.0.3", name_of(first)[1]))
+        second.setblocking(False)
+        clients = {name_of(client): client for client in (first, second)}
+        with running([link(name_of(server))], engine) as one:
+            for client in clients.values():
+                client.sendto(str(name_of(client)).encode(), one.address())
+            questions = one.receive(server, 2)
+            for data, path in questions:
+                server.sendto(data, path)
+            for name, client in clients.items():
+                assert [data for data, _ in one.receive(client)] == [str(name).encode()]
+            flows = one.report().forward.flows
+    assert {flow.client for flow in flows} == set(clients)
+    assert len({path for _, path in questions}) == 2
+
+
 def test_only_answers_of_the_server_reach_the_client(engine: Engine) -> None:
     with (
         endpoints(V4, V4, V4) as (server, client, stranger),

@@ -1,11 +1,72 @@
 """Emulators for real programs, each in a separate process."""
 
+import json
+import signal
+import subprocess
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
+import pyarrow.parquet as pq
 import pytest
 
-from tests.netem.programs.emulator import Emulator
+from noack.protocol.record_tables import Fate
+
+FORWARDED = (Fate.DELIVERED, Fate.FORCED, Fate.CORRUPTED)
+
+
+class Emulator:
+    """``python -m netem`` with one link, in a separate folder.
+
+    Args:
+        folder: the folder for its fate trace.
+        to: the server, HOST:PORT.
+        words: impairments and options.
+        listen: the address to which clients send.
+        inside: a command prefix, e.g. to run the emulator in a network namespace.
+    """
+
+    def __init__(
+        self, folder: Path, to: str, *words: str, listen: str, inside: Sequence[str] = ()
+    ) -> None:
+        self._trace = folder / "fates.parquet"
+        self.process = subprocess.Popen(
+            [
+                *inside, sys.executable, "-m", "netem", "--listen", listen, "--to", to, "--json",
+                "--record-fates", str(self._trace), *words,
+            ],
+            cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert self.process.stdout is not None
+        ready = self.process.stdout.readline()
+        assert ready, self.process.communicate()[1]
+        (link,) = json.loads(ready)["ready"]
+        self.host, _, port = link["listen"].rpartition(":")
+        self.port = int(port)
+
+    def finish(self) -> dict[str, Any]:
+        """End the emulator and check for unintended losses; return its link's statistics."""
+        link, status, stderr = self.end()
+        assert status == 0, stderr
+        for line in stderr.splitlines():
+            # A program may end with datagrams to it in flight.
+            usual = ("compiling", "Ctrl-C ends", "ICMP port unreachable")
+            assert any(words in line for words in usual), stderr
+        return link
+
+    def end(self) -> tuple[dict[str, Any], int, str]:
+        """End the emulator; return its link's statistics, exit status and standard error."""
+        self.process.send_signal(signal.SIGINT)
+        stdout, stderr = self.process.communicate(timeout=60)
+        (link,) = json.loads(stdout)["links"]
+        return dict(link), self.process.returncode, stderr
+
+    def fates(self, direction: str) -> list[dict[str, Any]]:
+        """Return the fate of each datagram of the first flow, in the order of arrival."""
+        rows: list[dict[str, Any]] = pq.read_table(self._trace).to_pylist()
+        return [row for row in rows if row["direction"] == direction and row["flow"] == 0]
+
 
 Emulate = Callable[..., Emulator]
 
@@ -20,10 +81,10 @@ def emulate(tmp_path: Path) -> Iterator[Emulate]:
     ) -> Emulator:
         folder = tmp_path / f"emulator {len(started)}"
         folder.mkdir()
-        emulator = Emulator(folder, to, *words, listen=listen, inside=inside)
-        started.append(emulator)
-        return emulator
+        started.append(Emulator(folder, to, *words, listen=listen, inside=inside))
+        return started[-1]
 
     yield start
     for emulator in started:
-        emulator.kill()
+        emulator.process.kill()
+        emulator.process.communicate()

@@ -19,13 +19,10 @@ LOSS: TypeAdapter[Loss] = TypeAdapter(Loss)
 ONE: TypeAdapter[AnyImpairment] = TypeAdapter(AnyImpairment)
 
 LOSS_MISTAKES: list[tuple[dict[str, Any], str]] = [
-    ({"model": "bernoulli"}, "Field required"),
     ({"model": "bernoulli", "probability": 1.1}, "less than or equal to 1"),
-    ({"model": "bernoulli", "probability": "10%"}, "valid number"),
     ({"model": "bernoulli", "probability": 0.1, "correlation": 1.0}, "less than 1"),
     ({"model": "bernoulli", "probability": 0.1, "correlaton": 0.5}, "not permitted"),
     ({"model": "gilbert_elliott"}, "good_to_bad: give good_to_bad and bad_to_good, or mean_loss"),
-    ({"model": "gilbert_elliott", "good_to_bad": 0.1}, "good_to_bad: give good_to_bad and"),
     ({"model": "gilbert_elliott", "mean_loss": 0.1}, "good_to_bad: give good_to_bad and"),
     ({"model": "gilbert_elliott", "good_to_bad": 0.1, "bad_to_good": 0.1, "mean_loss": 0.1},
      "mean_loss: goes instead of good_to_bad and bad_to_good"),
@@ -37,9 +34,7 @@ LOSS_MISTAKES: list[tuple[dict[str, Any], str]] = [
     ({"model": "four_state", "p13": 0.1, "p31": 0.7, "p32": 0.4}, "p31: p31 + p32 must not exceed"),
     ({"model": "four_state", "p13": 0.6, "p31": 0.7, "p14": 0.5}, "p13: p13 + p14 must not exceed"),
     ({"model": "periodic", "period": 4, "burst": 5}, "burst: must not exceed the period, 4"),
-    ({"model": "periodic", "period": 0}, "greater than or equal to 1"),
     ({"model": "scripted", "lost": [3, 3]}, "lost: the numbers must ascend"),
-    ({"model": "scripted", "lost": [5, 3]}, "lost: the numbers must ascend"),
     ({"model": "scripted", "lost": [-1]}, "greater than or equal to 0"),
     ({"model": "scripted", "lost": [1, 5], "repeat_every": 5},
      "repeat_every: the script is longer, up to 5"),
@@ -49,12 +44,8 @@ LOSS_MISTAKES: list[tuple[dict[str, Any], str]] = [
 
 MISTAKES: list[tuple[dict[str, Any], str]] = [
     ({"kind": "jitter"}, "does not match any of the expected tags"),
-    ({"kind": "duplicate"}, "Field required"),
-    ({"kind": "corrupt", "probability": -0.1}, "greater than or equal to 0"),
-    ({"kind": "reorder", "gap": 0}, "greater than or equal to 1"),
     ({"kind": "delay", "delay_s": -0.1}, "greater than or equal to 0"),
     ({"kind": "delay", "delay_s": float("nan")}, "finite number"),
-    ({"kind": "delay", "loss_correlation": 1.5}, "less than or equal to 1"),
     ({"kind": "delay", "distribution": "empirical"},
      "samples_s: an empirical distribution needs samples_s, or a file"),
     ({"kind": "delay", "distribution": "empirical", "samples_s": [0.1, 0.2], "file": "a.txt"},
@@ -63,8 +54,6 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
     ({"kind": "delay", "distribution": "normal", "file": "a.txt"},
      'samples_s: goes with distribution = "empirical"'),
     ({"kind": "delay", "distribution": "empirical", "samples_s": [0.1]}, "at least 2 items"),
-    ({"kind": "rate", "rate_bps": 0}, "greater than or equal to 1"),
-    ({"kind": "rate", "rate_bps": 1000, "queue": 0}, "greater than or equal to 1"),
     ({"kind": "rate", "rate_bps": 1, "queue": 1_000_000},
      "rate_bps: a full queue of the longest packets would take more than a century"),
     ({"kind": "blackout", "intervals_s": []}, "at least 1 item"),
@@ -74,7 +63,6 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
      "intervals_s: each must end after it begins, and before the next"),
     ({"kind": "blackout", "intervals_s": [[1.0, 2.0]], "every_s": 1.5},
      "every_s: the intervals last longer, until 2 s"),
-    ({"kind": "blackout", "intervals_s": [[1.0, 2.0]], "every_s": 0.0}, "greater than"),
 ]  # fmt: skip
 
 

@@ -76,14 +76,12 @@ def test_a_mat_file_may_have_sparse_matrices_integers_and_text(tmp_path: Path) -
         ({"A": np.zeros((65, 65)), "B": B}, "has no matrix A of numbers, at most 64 x 64"),
         ({"A": A, "B": B, "K": K, "dt": 0.01}, "dt is 0.01, so it is a system in discrete time"),
         ({"A": A, "B": B, "K": K, "C": np.eye(2)[:1]}, "C is not the identity"),
-        ({"A": A, "B": B, "K": K, "C": 2 * np.eye(2)}, "C is not the identity"),
         ({"A": A, "B": B, "K": K, "D": np.ones((2, 1))}, "D is not zero"),
         ({"A": A * 1j, "B": B}, "A is not of real numbers"),
         ({"A": A, "B": B + np.inf}, "B has entries that are not finite"),
         ({"A": A, "B": B}, "gain: give a model by name"),
         ({"A": A, "B": B, "gain": K, "K": 2 * K}, "has gain and K; say which by names = { gain"),
         ({"A": A, "B": B, "K": K.T}, "gain = [[-8.0], [-4.0]]: expected 1 x 2"),
-        ({"A": A, "B": np.zeros((3, 1)), "K": K}, "B = [[0.0], [0.0], [0.0]]: expected 2 x 1"),
     ],
 )
 def test_a_file_without_a_valid_system_is_refused_in_one_line(
@@ -109,7 +107,6 @@ def test_a_file_without_a_valid_system_is_refused_in_one_line(
         ('file = "m.npz"\nA = [[1.0]]', "the file has A, and so has the scenario"),
         ('file = "m.npz"\nnames = { gain = "G" }', "has no matrix G"),
         ('file = "m.npz"\nnames = { C = "G" }', "should be 'A', 'B' or 'gain'"),
-        ("file = 3", "should be a valid string"),
         ('names = { A = "G" }\nA = [[1.0]]\nB = [[1.0]]\ngain = [[-2.0]]', "give file, too"),
     ],
 )

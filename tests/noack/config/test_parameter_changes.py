@@ -34,8 +34,6 @@ def scenario(content: dict[str, Any]) -> Scenario:
     ("settings", "why"),
     [
         ({"speed": 2.0}, "speed: cannot be changed during a run; what can is network.loss, "),
-        ({"trigger.policy": "periodic"}, "trigger.policy: cannot be changed"),
-        ({"trigger.weight": [[1.0]]}, "trigger.weight: cannot be changed"),
         ({"network.loss.probability": 1.5}, "network.loss.probability = 1.5: should be less than"),
         ({"network.loss.p": 0.5}, "network.loss.p = 0.5: unknown key; the keys here are"),
         ({"network.loss.model": "gilbert"}, "must be one of .* did you mean gilbert_elliott"),

@@ -4,7 +4,6 @@ import errno
 import fcntl
 import os
 import signal
-import tempfile
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any, NoReturn
@@ -80,17 +79,6 @@ def test_without_a_home_there_is_no_cache(home: Path, monkeypatch: pytest.Monkey
     assert function(21) == 42
     # numba, under its older rules, has no location of its own for it either
     assert function._cache.cache_path is None
-
-
-def test_a_cache_folder_of_another_user_is_not_used(
-    home: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(**_: Any) -> NoReturn:
-        raise PermissionError(errno.EACCES, "Permission denied")
-
-    assert cache_folder("netem", SOURCES) is not None
-    monkeypatch.setattr(tempfile, "TemporaryFile", refuse)
-    assert cache_folder("netem", SOURCES) is None
 
 
 def test_on_a_full_disk_only_an_existing_cache_is_used(

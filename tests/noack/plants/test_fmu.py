@@ -21,10 +21,10 @@ from noack.plants.systems.ode_integrator import OdeSystem
 from noack.plants.systems.plant_linearisation import linearise
 from noack.plants.systems.plant_system import SystemFailedError
 from noack.settings.named_file import located
+from tests.noack.plants.motion import H_NS, motion
 from tests.plant_server.fmus.build import build
 
 pytest.importorskip("fmpy")
-H_NS = 2_000_000
 VERSIONS = pytest.mark.parametrize("version", [2, 3])
 
 
@@ -43,15 +43,7 @@ def settings(path: Path, **more: Any) -> FmuSettings:
     return loaded
 
 
-def run(system: Any, inputs: list[float]) -> np.ndarray:
-    states = [system.x]
-    for step, u in enumerate(inputs):
-        system.advance(np.array([u]), step * H_NS, H_NS)
-        states.append(system.x)
-    return np.array(states)
-
-
-INPUTS = [math.sin(0.01 * step) for step in range(500)]
+INPUTS = [math.sin(0.01 * step) for step in range(200)]
 X0 = np.array([1.0, -0.5])
 
 
@@ -60,9 +52,9 @@ def test_a_linear_fmu_moves_like_the_linear_system(version: int, tmp_path: Path)
     parameters = {"mu": 0.3, "k": 4.0, "linear": True}
     system = FmuSystem(settings(build(tmp_path, version), parameters=parameters), X0)
     A, B = np.array([[0.0, 1.0], [-4.0, -0.3]]), np.array([[0.0], [1.0]])
-    exact = run(LinearSystem(A, B, X0, step_ns=H_NS), INPUTS)
+    exact = motion(LinearSystem(A, B, X0, step_ns=H_NS), INPUTS)
     # The error of the fourth-order Runge-Kutta method with steps of 125 µs is far below.
-    np.testing.assert_allclose(run(system, INPUTS), exact, atol=1e-11)
+    np.testing.assert_allclose(motion(system, INPUTS), exact, atol=1e-11)
 
 
 @VERSIONS
@@ -74,7 +66,9 @@ def test_van_der_pol_agrees_with_another_integrator(version: int, tmp_path: Path
         settings(build(tmp_path, version), parameters={"mu": 2}, on_record=("energy",)), X0
     )
     np.testing.assert_allclose(
-        run(system, INPUTS), run(OdeSystem(PlantEquations(van_der_pol), X0), INPUTS), atol=1e-9
+        motion(system, INPUTS),
+        motion(OdeSystem(PlantEquations(van_der_pol), X0), INPUTS),
+        atol=1e-9,
     )
     assert system.z == pytest.approx([(system.x[1] ** 2 + system.x[0] ** 2) / 2])
 
@@ -83,7 +77,8 @@ def test_van_der_pol_agrees_with_another_integrator(version: int, tmp_path: Path
 def test_the_same_steps_give_bit_identical_states(version: int, tmp_path: Path) -> None:
     loaded = settings(build(tmp_path, version))
     assert (
-        run(FmuSystem(loaded, X0), INPUTS).tobytes() == run(FmuSystem(loaded, X0), INPUTS).tobytes()
+        motion(FmuSystem(loaded, X0), INPUTS).tobytes()
+        == motion(FmuSystem(loaded, X0), INPUTS).tobytes()
     )
 
 
@@ -103,23 +98,23 @@ def test_x_and_u_are_deviations_from_the_operating_point(version: int, tmp_path:
         operating_state=(2.0, 0.0), operating_input=(6.0,),
     )  # fmt: skip
     still = FmuSystem(loaded, np.zeros(2))
-    np.testing.assert_allclose(run(still, [0.0] * 100), np.zeros((101, 2)), atol=1e-12)
+    np.testing.assert_allclose(motion(still, [0.0] * 100), np.zeros((101, 2)), atol=1e-12)
     moved = FmuSystem(loaded, X0)
     linear = LinearSystem(np.array([[0, 1], [-3.0, -1]]), np.array([[0.0], [1]]), X0, step_ns=H_NS)
-    np.testing.assert_allclose(run(moved, INPUTS), run(linear, INPUTS), atol=1e-11)
+    np.testing.assert_allclose(motion(moved, INPUTS), motion(linear, INPUTS), atol=1e-11)
 
 
 @VERSIONS
-@pytest.mark.parametrize(("status", "said"), [(2, "discard"), (3, "error"), (4, "fatal")])
+@pytest.mark.parametrize(("status", "name"), [(2, "discard"), (3, "error"), (4, "fatal")])
 def test_a_failed_step_is_reported_once_with_the_reason(
-    version: int, status: int, said: str, tmp_path: Path
+    version: int, status: int, name: str, tmp_path: Path
 ) -> None:
     parameters = {"fail_at_s": 0.02, "fail_status": status}
     system = FmuSystem(settings(build(tmp_path, version), parameters=parameters), X0)
     with pytest.raises(SystemFailedError) as failed:
-        run(system, [0.0] * 100)
+        motion(system, [0.0] * 100)
     text = str(failed.value)
-    assert said in text
+    assert name in text
     assert "the spring broke" in text
     assert "\n" not in text
 
@@ -127,8 +122,8 @@ def test_a_failed_step_is_reported_once_with_the_reason(
 def test_an_fmu_that_requests_termination_has_failed(tmp_path: Path) -> None:
     parameters = {"fail_at_s": 0.02, "fail_status": -1}
     system = FmuSystem(settings(build(tmp_path, 3), parameters=parameters), X0)
-    with pytest.raises(SystemFailedError, match="wants the simulation to end"):
-        run(system, [0.0] * 100)
+    with pytest.raises(SystemFailedError, match="requests the end of the simulation"):
+        motion(system, [0.0] * 100)
 
 
 @VERSIONS
@@ -137,7 +132,7 @@ def test_a_warning_is_not_a_failure_and_fmu_output_is_suppressed(
 ) -> None:
     system = FmuSystem(settings(build(tmp_path, version), parameters={"noisy": True}), X0)
     print("before")
-    states = run(system, INPUTS)
+    states = motion(system, INPUTS)
     print("after")
     assert np.isfinite(states).all()
     del system
@@ -163,7 +158,7 @@ def test_a_warning_is_not_a_failure_and_fmu_output_is_suppressed(
         ({"parameters": {"name": 1}}, "give a text, not 1"),
         ({"parameters": {"energy": 1.0}}, '"energy" cannot be set at the start'),
         ({"parameters": {"u": 1.0}}, '"u" is an input; its value at rest is operating_input'),
-        ({"state_variables": ("x0", "x0")}, 'state_variables: "x0" stands there twice'),
+        ({"state_variables": ("x0", "x0")}, 'state_variables: "x0" is named twice'),
         ({"on_record": ("heat",)}, 'plant.system.on_record: the FMU has no variable "heat"'),
         ({"initial_variables": ()}, "but the FMU begins at [0.0, 0.0]"),
     ],

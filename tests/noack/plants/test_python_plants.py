@@ -13,8 +13,8 @@ from noack.core.errors import CallerError
 from noack.plants.python_plant import PythonPlantSettings, PythonSystem
 from noack.plants.systems.plant_system import SystemFailedError
 from noack.settings.named_file import located
+from tests.noack.plants.motion import H_NS, motion
 
-H_NS = 2_000_000
 X0 = np.array([0.3, 0.0])
 PENDULUM = """
     import math
@@ -52,11 +52,6 @@ def settings(folder: Path, code: str, name: str, **more: Any) -> PythonPlantSett
     return loaded
 
 
-def follow(system: PythonSystem, steps: int) -> None:
-    for step in range(steps):
-        system.advance(np.zeros(1), step * H_NS, H_NS)
-
-
 def made(folder: Path, code: str, name: str, **more: Any) -> PythonSystem:
     return PythonSystem(settings(folder, code, name, **more), X0, 1)
 
@@ -64,9 +59,7 @@ def made(folder: Path, code: str, name: str, **more: Any) -> PythonSystem:
 def test_a_user_derivative_is_integrated(tmp_path: Path) -> None:
     """A pendulum keeps its energy."""
     system = made(tmp_path, PENDULUM, "Pendulum", parameters={"g": 4.0})
-    for step in range(1000):
-        system.advance(np.zeros(1), step * H_NS, H_NS)
-    angle, rate = system.x
+    angle, rate = motion(system, [0.0] * 500)[-1]
     energy = rate**2 / 2 - 4.0 * math.cos(angle)
     assert energy == pytest.approx(-4.0 * math.cos(0.3), rel=1e-9)
     assert abs(angle - 0.3) > 0.01
@@ -94,8 +87,7 @@ def test_a_plants_internal_state_is_mapped_and_recorded(tmp_path: Path) -> None:
         parameters={"T": ((2.0, 1.0), (0.0, 3.0))}, on_record=("a", "b", "clock"),
     )  # fmt: skip
     assert system.x.tolist() == pytest.approx(X0.tolist())
-    for step in range(500):
-        system.advance(np.array([2.0]), step * H_NS, H_NS)
+    motion(system, [2.0] * 500)
     assert system.x.tolist() == pytest.approx([0.3 + 1.0, 2.0])
     assert system.z[2] == pytest.approx(1.0)
 
@@ -161,7 +153,7 @@ def test_a_plant_is_found_by_entry_point_and_by_module(
          "AttributeError: 'P' object has no attribute 'x'"),
     ],
 )  # fmt: skip
-def test_an_object_that_is_not_a_plant_is_refused_in_one_line(
+def test_a_class_that_is_not_a_plant_is_refused_in_one_line(
     code: str, expected: str, tmp_path: Path
 ) -> None:
     with np.errstate(all="raise"), pytest.raises(CallerError) as refused:
@@ -171,46 +163,48 @@ def test_an_object_that_is_not_a_plant_is_refused_in_one_line(
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize("kind", ["derivative", "advance"])
-def test_an_exception_in_a_step_is_a_failure_that_names_class_and_line(
-    kind: str, tmp_path: Path
+DERIVATIVE = """
+    import sys
+
+    class P:
+        def derivative(self, t_s, z, u):
+            if t_s > 0.0201:
+                {}
+            return 0 * z
+"""
+ADVANCE = """
+    class P:
+        def start(self, x0):
+            self.x = x0
+
+        def advance(self, u, t_s, dt_s):
+            if t_s > 0.0199:
+                {}
+"""
+
+
+@pytest.mark.parametrize(
+    ("code", "line", "expected"),
+    [
+        (DERIVATIVE, 'raise KeyError("wind")', "KeyError: 'wind' (mine.py, line 7)"),
+        (DERIVATIVE, "sys.exit(3)", "SystemExit: 3"),
+        (DERIVATIVE, "z[0] = 7.0", "read-only"),
+        (DERIVATIVE, "return [z[1] + 1e-3j, 0.0]",
+         "TypeError: derivative(t_s, z, u) is not of real numbers"),
+        (DERIVATIVE, 'return ["1", "2"]', "derivative(t_s, z, u) is not of real numbers"),
+        (ADVANCE, 'raise KeyError("wind")', "KeyError: 'wind' (mine.py, line 8)"),
+        (ADVANCE, "self.x = [1.0, 2.0, 3.0]", "x has shape (3,), expected (2,)"),
+    ],
+)  # fmt: skip
+def test_a_mistake_in_a_step_is_a_failure_that_names_class_and_line(
+    code: str, line: str, expected: str, tmp_path: Path
 ) -> None:
-    code = """
-        class P:
-            def start(self, x0):
-                self.x = x0
-
-            def advance(self, u, t_s, dt_s):
-                if t_s > 0.0199:
-                    raise KeyError("wind")
-
-        class Q:
-            def derivative(self, t_s, z, u):
-                if t_s > 0.0201:
-                    raise KeyError("wind")
-                return 0 * z
-    """
-    name = "Q" if kind == "derivative" else "P"
-    system = made(tmp_path, code, name)
-    for step in range(10):
-        system.advance(np.zeros(1), step * H_NS, H_NS)
+    system = made(tmp_path, code.format(line), "P")
+    assert np.isfinite(motion(system, [0.0] * 10)).all()
     with pytest.raises(SystemFailedError) as failed:
-        system.advance(np.zeros(1), 10 * H_NS, H_NS)
-    assert f"name = \"{name}\": KeyError: 'wind' (mine.py, line " in str(failed.value)
-
-
-def test_a_shape_that_changes_later_is_a_failure(tmp_path: Path) -> None:
-    code = """
-        class P:
-            def start(self, x0):
-                self.x = x0
-
-            def advance(self, u, t_s, dt_s):
-                self.x = [1.0, 2.0, 3.0]
-    """
-    system = made(tmp_path, code, "P")
-    with pytest.raises(SystemFailedError, match=r"x has shape \(3,\), expected \(2,\)"):
-        system.advance(np.zeros(1), 0, H_NS)
+        motion(system, [0.0] * 20)
+    assert str(failed.value).startswith('plant.system.name = "P": ')
+    assert expected in str(failed.value)
 
 
 def test_a_file_changed_after_loading_is_not_executed(tmp_path: Path) -> None:
@@ -242,7 +236,7 @@ def test_a_failed_integration_is_not_reported_as_divergence(
     """
     system = made(tmp_path, code, "P")
     with pytest.raises(SystemFailedError, match=expected):
-        follow(system, 20)
+        motion(system, [0.0] * 20)
     assert np.isfinite(system.x).all()
 
 
@@ -254,40 +248,5 @@ def test_a_state_that_escapes_has_diverged(tmp_path: Path) -> None:
     """
     system = made(tmp_path, code, "P")
     with np.errstate(all="ignore"):
-        follow(system, 100)
+        motion(system, [0.0] * 100)
     assert not np.isfinite(system.x).all()
-
-
-@pytest.mark.parametrize(
-    ("returned", "expected"),
-    [
-        ("[z[1] + 1e-3j, 0.0]", "TypeError: derivative(t_s, z, u) is not of real numbers"),
-        ('["1", "2"]', "TypeError: derivative(t_s, z, u) is not of real numbers"),
-        ("sys.exit(3)", "SystemExit: 3"),
-    ],
-)
-def test_an_invalid_derivative_is_refused(returned: str, expected: str, tmp_path: Path) -> None:
-    code = f"""
-        import sys
-
-        class P:
-            def derivative(self, t_s, z, u):
-                return {returned} if t_s > 0.0201 else 0 * z
-    """
-    system = made(tmp_path, code, "P")
-    with pytest.raises(SystemFailedError) as failed:
-        follow(system, 20)
-    assert expected in str(failed.value)
-
-
-def test_a_derivative_cannot_modify_its_arguments(tmp_path: Path) -> None:
-    code = """
-        class P:
-            def derivative(self, t_s, z, u):
-                if t_s > 0.0201:
-                    z[0] = 7.0
-                return 0 * z
-    """
-    system = made(tmp_path, code, "P")
-    with pytest.raises(SystemFailedError, match="read-only"):
-        follow(system, 20)

@@ -13,11 +13,10 @@ from noack.core.errors import CallerError
 from noack.plants.systems.ode_integrator import OdeSystem
 from noack.plants.systems.plant_linearisation import linearise
 from noack.plants.vehicle import VehicleSettings
+from tests.noack.plants.motion import H_NS, motion
 
-H_NS = 2_000_000
 X0 = np.array([0.2, -0.1, 0.05, 3.0])
 CARS = ("ford_escort", "bmw_320i", "vw_vanagon")
-MODELS = ("kinematic", "single_track", "drift", "multi_body")
 
 
 def settings(**given: Any) -> VehicleSettings:
@@ -28,14 +27,6 @@ def parameters(car: str) -> Any:
     number = (*CARS, "truck").index(car) + 1
     name = f"parameters_vehicle{number}"
     return getattr(import_module(f"vehiclemodels.{name}"), name)()
-
-
-def steered(system: OdeSystem, angles: list[float]) -> np.ndarray:
-    states = [system.x]
-    for step, angle in enumerate(angles):
-        system.advance(np.array([angle]), step * H_NS, H_NS)
-        states.append(system.x)
-    return np.array(states)
 
 
 @pytest.mark.parametrize("car", CARS)
@@ -52,13 +43,13 @@ def test_the_lateral_velocity_of_a_kinematic_vehicle_follows_from_its_yaw_rate()
     np.testing.assert_allclose(system.x, [0.1 * behind, *X0[1:]], rtol=1e-12)
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", ["kinematic", "single_track", "drift", "multi_body"])
 def test_the_lane_position_agrees_with_the_lane_model(model: str) -> None:
     """Ẏ_g = V − v ψ and ψ̇ = r, for small angles."""
     system = OdeSystem(
         settings(model=model, speed_m_per_s=15.0).equations(), np.array([0.0, 0.0, 0.01, 0.0])
     )
-    states = steered(system, [0.003] * 250)
+    states = motion(system, [0.003] * 250)
     t_s = np.arange(251) * H_NS * 1e-9
     V, r, psi, Y_g = states.T
     turned = np.trapezoid(r, t_s)
@@ -66,6 +57,12 @@ def test_the_lane_position_agrees_with_the_lane_model(model: str) -> None:
     assert psi[-1] > psi[0]
     aside = np.trapezoid(V - 15.0 * psi, t_s)
     assert Y_g[-1] - Y_g[0] == pytest.approx(aside, rel=0.01)  # its speed is not quite constant
+
+
+def linearised(chosen: VehicleSettings) -> tuple[np.ndarray, np.ndarray]:
+    return linearise(
+        lambda x0: OdeSystem(chosen.equations(), x0), 4, 1, settling_s=chosen.settling_s
+    )
 
 
 @pytest.mark.parametrize("car", CARS)
@@ -78,19 +75,13 @@ def test_the_linearised_single_track_model_is_the_textbooks(car: str) -> None:
          "front_n_per_rad": per_weight * p.b, "rear_n_per_rad": per_weight * p.a,
          "speed_m_per_s": v}
     )  # fmt: skip
-    chosen = settings(parameters=car, speed_m_per_s=v)
-    A, B = linearise(
-        lambda x0: OdeSystem(chosen.equations(), x0), 4, 1, settling_s=chosen.settling_s
-    )
+    A, B = linearised(settings(parameters=car, speed_m_per_s=v))
     np.testing.assert_allclose(A, model.A, atol=2e-3)
     np.testing.assert_allclose(B, model.B, rtol=1e-3, atol=2e-3)  # the servo has not fully settled
 
 
 def test_the_named_model_is_that_of_the_bmw() -> None:
-    chosen = settings()
-    A, B = linearise(
-        lambda x0: OdeSystem(chosen.equations(), x0), 4, 1, settling_s=chosen.settling_s
-    )
+    A, B = linearised(settings())
     model = single_track_lane({})
     np.testing.assert_allclose(A, model.A, atol=2e-3)
     np.testing.assert_allclose(B, model.B, rtol=1e-3, atol=2e-3)
@@ -99,12 +90,7 @@ def test_the_named_model_is_that_of_the_bmw() -> None:
 @pytest.mark.parametrize("model", ["kinematic", "multi_body"])
 def test_a_vehicle_has_no_linearisation_if_x_is_not_its_state(model: str) -> None:
     """A kinematic vehicle has fewer states; a multi-body vehicle rolls as fast as it turns."""
-    chosen = settings(model=model)
-    A, B = linearise(
-        lambda x0: OdeSystem(chosen.equations(), x0), 4, 1, settling_s=chosen.settling_s
-    )
-    assert np.isnan(A).all()
-    assert np.isnan(B).all()
+    assert all(np.isnan(matrix).all() for matrix in linearised(settings(model=model)))
 
 
 @pytest.mark.parametrize(("model", "library", "atol"), [
@@ -126,7 +112,7 @@ def test_the_motion_agrees_with_another_solver_of_the_librarys_equations(
 
     z = system.z
     for angle, steps in ((0.015, 100), (-0.02, 100)):
-        steered(system, [angle] * steps)
+        motion(system, [angle] * steps)
         z = solve_ivp(whole, (0, steps * H_NS * 1e-9), z, args=(angle,), method="Radau",
                       rtol=1e-9, atol=1e-11).y[:, -1]  # fmt: skip
     np.testing.assert_allclose(system.z, z, atol=atol * max(1.0, np.abs(z).max()))
@@ -135,15 +121,15 @@ def test_the_motion_agrees_with_another_solver_of_the_librarys_equations(
 def test_steering_is_limited_to_the_vehicles_rate_and_angle() -> None:
     limits = parameters("bmw_320i").steering
     system = OdeSystem(settings(speed_m_per_s=2.0, steering_s=0.01).equations(), np.zeros(4))
-    steered(system, [2.0] * 500)
+    motion(system, [2.0] * 500)
     assert system.z[2] == pytest.approx(limits.v_max, rel=1e-6)  # rad, after 1 s at v_max rad/s
-    steered(system, [2.0] * 1500)
+    motion(system, [2.0] * 1500)
     assert system.z[2] == pytest.approx(limits.max, rel=1e-6)
 
 
 def test_a_car_turns_less_on_ice() -> None:
     yaw = [
-        steered(
+        motion(
             OdeSystem(settings(model="drift", friction=friction).equations(), np.zeros(4)),
             [0.1] * 400,
         )[-1, 2]
@@ -155,18 +141,10 @@ def test_a_car_turns_less_on_ice() -> None:
 def test_a_truck_is_simulated_with_its_trailer() -> None:
     truck = settings(model="kinematic", parameters="truck", speed_m_per_s=10.0)
     system = OdeSystem(truck.equations(), np.zeros(4))
-    steered(system, [0.05] * 1000)
+    motion(system, [0.05] * 1000)
     assert truck.internal_names[-1] == "hitch_angle"
     assert math.isfinite(system.z[-1])
     assert system.z[-1] < -0.01  # the trailer follows on the inside of the curve
-
-
-def test_the_same_steps_give_bit_identical_states() -> None:
-    runs = [
-        steered(OdeSystem(settings(model="multi_body").equations(), X0), [0.01, -0.02] * 20)
-        for _ in "ab"
-    ]
-    assert runs[0].tobytes() == runs[1].tobytes()
 
 
 def test_a_speed_above_the_vehicles_maximum_is_refused() -> None:
@@ -177,12 +155,14 @@ def test_a_speed_above_the_vehicles_maximum_is_refused() -> None:
         )
 
 
-@pytest.mark.parametrize(("given", "said"), [
+@pytest.mark.parametrize(("given", "expected"), [
     ({"parameters": "truck"}, "parameters: the library has no masses"),
     ({"friction": 0.5}, 'friction: the model "single_track" has none'),
 ])  # fmt: skip
-def test_what_the_library_does_not_have_is_refused(given: dict[str, Any], said: str) -> None:
-    with pytest.raises(ValueError, match=said):
+def test_settings_that_the_library_does_not_support_are_refused(
+    given: dict[str, Any], expected: str
+) -> None:
+    with pytest.raises(ValueError, match=expected):
         settings(**given)
 
 

@@ -23,13 +23,12 @@ def states(model: str, p: Any) -> np.ndarray:
     random = np.random.default_rng(7)
     core = [0.0, 1.0, 0.02, 15.0, 0.1, 0.2, 0.01]
     start = library(f"init_{model}")(core, p) if model in ("std", "mb") else core[: WIDTHS[model]]
-    tried = np.array(start) + random.normal(size=(40, WIDTHS[model])) * 0.05
+    tried = np.array(start) + random.normal(size=(16, WIDTHS[model])) * 0.05
     # below 0.1 m/s the library uses a kinematic model
-    tried[:10, 3] = random.uniform(-0.2, 0.2, 10)
+    tried[:5, 3] = random.uniform(-0.2, 0.2, 5)
     if model == "mb":
-        tried[5:20, 23:27] *= -1.0  # wheels do not spin backwards
-    found: np.ndarray = tried
-    return found
+        tried[3:8, 23:27] *= -1.0  # wheels do not spin backwards
+    return tried
 
 
 @pytest.mark.parametrize("car", CARS)
@@ -37,7 +36,7 @@ def states(model: str, p: Any) -> np.ndarray:
 def test_the_equations_give_the_librarys_values(model: str, car: int) -> None:
     p = parameters(car)
     rates, dynamics = equations(model, p), library(f"vehicle_dynamics_{model}")
-    said = 0
+    compared = 0
     for z in states(model, p):
         for inputs in ([0.1, -1.0], [-5.0, 30.0], [0.0, 0.0]):
             before = z.copy()
@@ -47,10 +46,10 @@ def test_the_equations_give_the_librarys_values(model: str, car: int) -> None:
                 with pytest.raises(ZeroDivisionError):
                     rates(z, *inputs)
             else:
-                said += 1
+                compared += 1
                 np.testing.assert_allclose(rates(z, *inputs), expected, rtol=1e-12, atol=1e-12)
             np.testing.assert_array_equal(z, before)
-    assert said > 80
+    assert compared > 30
 
 
 @pytest.mark.parametrize(("model", "is_compiled"), [("st", False), ("std", True), ("mb", True)])
@@ -63,12 +62,8 @@ def test_the_given_parameters_are_used() -> None:
     slippery, grippy = parameters(2), parameters(2)
     slippery.tire.p_dy1 *= 0.1
     z = states("std", grippy)[-1]
-    assert (
-        np.abs(
-            equations("std", slippery)(z, 0.0, 0.0) - equations("std", grippy)(z, 0.0, 0.0)
-        ).max()
-        > 0.1
-    )
+    rates = [equations("std", p)(z, 0.0, 0.0) for p in (slippery, grippy)]
+    assert np.abs(rates[0] - rates[1]).max() > 0.1
 
 
 def test_equations_that_cannot_be_compiled_are_run_in_python(
@@ -83,8 +78,8 @@ def test_equations_that_cannot_be_compiled_are_run_in_python(
     monkeypatch.setattr(compiled, "compiled_dynamics", uncached)
     rates = equations("other", parameters(2))
     assert rates(np.array([1.0, 3.0]), 0.0, 0.0).tolist() == [2.0, 6.0]
-    told = capsys.readouterr().err.splitlines()
-    assert told[-1].startswith("noack: warning: the vehicle's equations stay slow")
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[-1].startswith("noack: warning: the vehicle's equations stay slow")
 
 
 def test_the_equations_are_compiled_once_before_a_run(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,9 +28,3 @@ def test_rows_have_the_vector_lengths_of_the_loop() -> None:
                 shape = dtype[column].shape
                 expected = (m,) if column == "u" else (n,) if column.startswith("x") else ()
                 assert shape == expected, (table, column)
-
-
-def test_every_row_has_its_input_number_and_times() -> None:
-    for dtype in tables(2, 1, acknowledged=True).values():
-        assert dtype.names is not None
-        assert dtype.names[:4] == ("input", "sequence", "t_ns", "now_ns")

@@ -46,15 +46,11 @@ def test_an_address_of_a_link_keeps_its_interface() -> None:
     ("text", "says"),
     [
         ("", "here: expected HOST:PORT, e.g. 127.0.0.1:9000, [::1]:9000 or :9000; found ''"),
-        ("9000", "expected HOST:PORT"),
         ("host:", "expected HOST:PORT"),
         ("host:65536", "expected HOST:PORT"),
-        ("host:x", "expected HOST:PORT"),
         ("::1:9000", "found '::1:9000'; put an IPv6 address in brackets"),
-        ("[]:9000", "expected HOST:PORT"),
         ("[127.0.0.1]:9000", "here: 127.0.0.1: no such host ("),
         ("a b:9000", "here: a b: no such host ("),
-        (f"{'a' * 70}.b:9000", "no such host ("),
     ],
 )
 def test_a_mistake_gets_one_line(text: str, says: str) -> None:

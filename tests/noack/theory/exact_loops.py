@@ -25,9 +25,6 @@ class Observed(NamedTuple):
     run: ContinuousRun
     samples: Samples
 
-    def norms(self, errors: np.ndarray) -> Vector:
-        return self.run.system.norms(errors)
-
 
 def loop_of(system: System) -> LoopMatrices:
     plain = np.array_equal(system.weight, np.eye(len(system.A)))
@@ -39,13 +36,14 @@ def loop_of(system: System) -> LoopMatrices:
     )  # fmt: skip
 
 
-def observe(system: System, horizon_s: float, seed: int, samples: int = 400) -> Iterator[Observed]:
-    """Runs with several loss patterns: the maximum, none, every other update, random."""
+def observe(system: System, periods: float, seed: int, samples: int = 200) -> Iterator[Observed]:
+    """Runs over some time constants with several loss patterns: the maximum, none, random."""
+    horizon_s = periods / float(np.abs(np.linalg.eigvals(system.A + system.B @ system.K)).max())
     loop = loop_of(system)
     trigger = DecayingTrigger(system.beta, system.alpha, weight=loop.weight)
     continuous = ContinuousLoop(loop, trigger)
     rng = np.random.default_rng(seed)
-    for share in (1.0, 0.0, 0.5, 0.8):
+    for share in (1.0, 0.0, 0.6):
         arrives = _pattern(rng.uniform(size=_MOST_EVENTS) < share, system)
         try:
             run = simulate_continuous(
@@ -54,10 +52,10 @@ def observe(system: System, horizon_s: float, seed: int, samples: int = 400) -> 
             )  # fmt: skip
         except TooManyEventsError:
             continue
-        yield Observed(run, _looked_at(run, np.linspace(0.0, run.reached_s, samples)))
+        yield Observed(run, _sampled(run, np.linspace(0.0, run.reached_s, samples)))
 
 
-def _looked_at(run: ContinuousRun, t_s: Vector) -> Samples:
+def _sampled(run: ContinuousRun, t_s: Vector) -> Samples:
     """The signals at the given times and at the events, before their resets."""
     dense, before = run.at(t_s), run.before
     if not before:

@@ -7,19 +7,26 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from hypothesis import HealthCheck, Phase, assume, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
-from noack.theory.certificate import Constants, Level, NetworkConditions, solve
+from noack.theory.certificate import Constants, Level, NetworkConditions, VoidError, solve
 from noack.theory.gains import ErrorGains, PlantGains
 
 Reals = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-RUNS = 25
-STEPS = 360
+RUNS, STEPS = 128, 240
+
+ROUNDING = 1 + 1e-9
+"""Simulation and enclosure are both rounded; each error is below this."""
+
+SEARCH = settings(deadline=None, suppress_health_check=list(HealthCheck), phases=[Phase.generate])
+
+seeds = st.integers(0, 2**32)
 
 
 @dataclass(frozen=True)
@@ -49,46 +56,41 @@ class System:
     @property
     def conditions(self) -> NetworkConditions:
         """The conditions of :func:`simulate` that the certificate may assume."""
-        steps = Steps(self)
-        applied_input = steps.delay + (steps.hold - 1 + steps.lag if steps.hold else 0)
+        applied_input = self.delay_steps
+        applied_input += self.hold_steps - 1 + self.lag if self.hold_steps else 0
         sampling_s = self.sample_steps * self.step_s
         return NetworkConditions(
             dropouts=self.mansd,
             sampling_s=sampling_s,
             spacing_s=sampling_s,
             delay_s=applied_input * self.step_s,
-            hold_s=(steps.hold + steps.lag) * self.step_s,
+            hold_s=(self.hold_steps + self.lag) * self.step_s,
             start_s=applied_input * self.step_s,
         )
 
-    def certify(self, conditions: NetworkConditions | None = None) -> Constants:
-        error = ErrorGains(self.H, self.K, self.weight, self.alpha)
-        plant = PlantGains(error, self.A, self.B, self.x0[:, None], self.alpha)
-        level = Level(self.beta, self.beta)
-        return solve(error, plant, conditions or self.conditions, level)
+    @property
+    def lag(self) -> int:
+        return self.lag_steps if self.hold_steps else 0
+
+    def gains(
+        self, error: type[ErrorGains] = ErrorGains, plant: type[PlantGains] = PlantGains
+    ) -> PlantGains:
+        models = error(self.H, self.K, self.weight, self.alpha)
+        return plant(models, self.A, self.B, self.x0[:, None], self.alpha)
+
+    def certify(
+        self, conditions: NetworkConditions | None = None, plant: PlantGains | None = None
+    ) -> Constants:
+        plant = plant or self.gains()
+        return solve(plant.error, plant, conditions or self.conditions, Level(self.beta, self.beta))
 
 
-class Worst(NamedTuple):
-    """The largest values observed, each times e^{αt}; the shortest time between two events."""
-
-    sensor_error: float
-    controller_error: float
-    state: float
-    state_weighted: float
-    input_error: float
-    inter_event_s: float
-
-    def shares(self, certified: Constants, beta: float) -> dict[str, float]:
-        """Observed values over certified bounds; a valid bound gives at most 1."""
-        assert certified.inter_event_s is not None
-        return {
-            "sensor error": self.sensor_error / (certified.overshoot * beta),
-            "controller error": self.controller_error / (certified.delta * beta),
-            "state": self.state / certified.state,
-            "weighted state": self.state_weighted / certified.state_weighted,
-            "input error": self.input_error / certified.input_error,
-            "inter-event time": certified.inter_event_s / self.inter_event_s,
-        }
+def certified_or_skipped(system: System, conditions: NetworkConditions | None = None) -> Constants:
+    try:
+        return system.certify(conditions)
+    except VoidError:
+        assume(False)
+        raise
 
 
 class Trace(NamedTuple):
@@ -102,9 +104,19 @@ class Trace(NamedTuple):
     input_error: Reals
     inter_event_s: float
 
-    def worst(self, system: System) -> Worst:
-        growth = np.exp(system.alpha * times_s(system))
-        return Worst(*(float((growth * series).max()) for series in self[:-1]), self.inter_event_s)
+    def exceeded(self, system: System, certified: Constants) -> list[str]:
+        """The bounds that some run exceeds."""
+        growth, beta = np.exp(system.alpha * times_s(system)), system.beta
+        assert certified.inter_event_s is not None
+        shares = {
+            "sensor error": growth * self.sensor_error / (certified.overshoot * beta),
+            "controller error": growth * self.controller_error / (certified.delta * beta),
+            "state": growth * self.state / certified.state,
+            "weighted state": growth * self.state_weighted / certified.state_weighted,
+            "input error": growth * self.input_error / certified.input_error,
+            "inter-event time": np.array(certified.inter_event_s / self.inter_event_s),
+        }
+        return [name for name, share in shares.items() if share.max() > ROUNDING]
 
 
 def times_s(system: System) -> Reals:
@@ -139,13 +151,15 @@ def simulate(
         plants: replace the system's own plant.
     """
     runs, n, K, W = len(delivered), len(system.A), system.K.T, system.weight.T
-    steps = Steps(system)
     pool = [(system.A, system.B)] if plants is None else plants.pool
     model = [_Propagators(system, A, B) for A, B in pool]
     x = np.tile(system.x0, (runs, 1))
     x_s, x_c = x.copy(), x.copy() if system.known_start else np.zeros_like(x)
     # An update in flight is stored as its value on arrival; 0 in ``arrives`` means no update.
-    arriving, arrives = np.zeros((runs, steps.delay + 1, n)), np.zeros((runs, steps.delay + 1), int)
+    arriving, arrives = (
+        np.zeros((runs, system.delay_steps + 1, n)),
+        np.zeros((runs, system.delay_steps + 1), int),
+    )
     newest, events, last_event = np.zeros(runs, int), np.zeros(runs, int), np.zeros(runs, int)
     synchronised = np.full(runs, system.known_start)
     commands: list[tuple[Reals, Flags]] = []
@@ -153,54 +167,45 @@ def simulate(
     for step in range(STEPS):
         threshold = max(system.beta * np.exp(-system.alpha * step * system.step_s), floor)
         trace[0, step] = np.linalg.norm((x_s - x) @ W, axis=1).max()
-        if step % steps.sample == 0:
+        if step % system.sample_steps == 0:
             event = np.linalg.norm((x_s - x) @ W, axis=1) > threshold
             event |= step == 0 and not system.known_start
             shortest = min(
                 shortest, int((step - last_event)[event & (events > 0)].min(initial=10**9))
             )
             x_s, last_event = np.where(event[:, None], x, x_s), np.where(event, step, last_event)
-            put = np.flatnonzero(event & delivered[every, events])
-            in_flight = delays[put, events[put]]
-            slot = (step + in_flight) % (steps.delay + 1)
-            arriving[put, slot] = np.einsum("ri,rij->rj", x[put], model[0].late[in_flight])
-            arrives[put, slot] = events[put] + 1
+            sent = np.flatnonzero(event & delivered[every, events])
+            in_flight = delays[sent, events[sent]]
+            slot = (step + in_flight) % (system.delay_steps + 1)
+            arriving[sent, slot] = np.einsum("ri,rij->rj", x[sent], model[0].late[in_flight])
+            arrives[sent, slot] = events[sent] + 1
             events = events + event
-        slot_now = step % (steps.delay + 1)
+        slot_now = step % (system.delay_steps + 1)
         fresh = arrives[:, slot_now] > newest
         x_c = np.where(fresh[:, None], arriving[:, slot_now], x_c)
         newest = np.where(fresh, arrives[:, slot_now], newest)
         arrives[:, slot_now] = 0
         synchronised = synchronised | fresh
-        if steps.hold == 0 or step % steps.hold == 0:
+        if system.hold_steps == 0 or step % system.hold_steps == 0:
             commands.append((x_c @ K, synchronised))
         else:
             commands.append(commands[-1])
         nothing = (np.zeros((runs, K.shape[1])), np.zeros(runs, bool))
-        u, feels = commands[step - steps.lag] if step >= steps.lag else nothing
-        u = np.where(feels[:, None], u, 0.0)
+        u, has_input = commands[step - system.lag] if step >= system.lag else nothing
+        u = np.where(has_input[:, None], u, 0.0)
         for i, value in enumerate(
             (
                 np.linalg.norm((x_c - x) @ W, axis=1)[synchronised],
                 np.linalg.norm(x, axis=1),
                 np.linalg.norm(x @ W, axis=1),
-                np.linalg.norm(u - x @ K, axis=1)[feels],
+                np.linalg.norm(u - x @ K, axis=1)[has_input],
             )
         ):
             trace[i + 1, step] = value.max(initial=0.0)
-        following = [own.advance(x, x_c, u, feels, held=steps.hold > 0) for own in model]
+        following = [own.advance(x, x_c, u, has_input, held=system.hold_steps > 0) for own in model]
         x = following[0] if plants is None else np.array(following)[plants.which[:, step], every]
         x_s, x_c = x_s @ model[0].model, x_c @ model[0].model
     return Trace(*trace, shortest * system.step_s)
-
-
-class Steps:
-    """The schedule of a system, in steps."""
-
-    def __init__(self, system: System) -> None:
-        self.sample, self.delay = system.sample_steps, system.delay_steps
-        self.hold = system.hold_steps
-        self.lag = system.lag_steps if system.hold_steps else 0
 
 
 class _Propagators:
@@ -216,16 +221,17 @@ class _Propagators:
         self.free, self.model = expm(A * step_s).T, expm(system.H * step_s).T
         self.late = np.array([expm(system.H * step_s * k).T for k in range(system.delay_steps + 1)])
 
-    def advance(self, x: Reals, x_c: Reals, u: Reals, feels: Flags, *, held: bool) -> Reals:
+    def advance(self, x: Reals, x_c: Reals, u: Reals, has_input: Flags, *, held: bool) -> Reals:
         """x of all runs one step later; u = K x_c changes with x_c unless it is held."""
         if held:
             return np.concatenate([x, u], axis=1) @ self.held
         together = np.concatenate([x, x_c], axis=1) @ self.both
-        return np.where(feels[:, None], together, x @ self.free)
+        return np.where(has_input[:, None], together, x @ self.free)
 
 
-def networks(rng: np.random.Generator, system: System) -> tuple[Flags, NDArray[np.int64]]:
+def networks(seed: int, system: System) -> tuple[Flags, NDArray[np.int64]]:
     """Loss patterns with at most M − 1 consecutive losses: worst cases, and random ones."""
+    rng = np.random.default_rng(seed)
     events = STEPS // system.sample_steps + 2
     lost = rng.uniform(size=(RUNS, events)) < rng.uniform(size=(RUNS, 1)) ** 0.5
     lost[0] = True

@@ -2,8 +2,10 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from decimal import Decimal, localcontext
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +19,6 @@ from noack.theory.contraction import decay_of
 from noack.theory.enclosure import (
     KernelBounds,
     NotDecayingError,
-    constant_kernel,
     factors,
     norm_bounds,
     response,
@@ -106,75 +107,60 @@ ROUNDING = 1 - 1e-10
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_no_value_is_above_its_enclosure_and_the_enclosure_is_tight(kind: str) -> None:
+@settings(max_examples=6)
+@given(data=st.data())
+def test_no_value_is_above_its_enclosure_and_the_enclosure_is_tight(
+    kind: str, data: st.DataObject
+) -> None:
     """Cell by cell, beyond the grid, and from any time on; the supremum is within 1 %."""
-
-    @settings(max_examples=12)
-    @given(cases(kind))
-    def check(case: tuple[Matrix, Matrix, Matrix]) -> None:
-        C, G, D = case
-        kernel = response(G, D).through(C)
-        grid_s = float(kernel.edges_s[-1])
-        t_s = times(G, 1.2 * grid_s)
-        found = values(C, G, D, t_s)
-        on_grid = t_s < grid_s
-        highest = kernel.highest[cell_of(kernel, t_s[on_grid])]
-        assert (highest >= found[on_grid] * ROUNDING).all()
-        # Values as small as the reference's rounding are not compared.
-        assert (kernel.sups(t_s) + 1e-13 * found.max() >= found * ROUNDING).all()
-        assert (np.diff(kernel.sups(t_s)) <= 0).all()
-        assert kernel.sup() == kernel.sups(np.zeros(1))[0] == kernel.highest.max()
-        assert kernel.sup() <= 1.01 * peak(kernel, C, G, D)
-
-    check()
+    C, G, D = data.draw(cases(kind))
+    kernel = response(G, D).through(C)
+    grid_s = float(kernel.edges_s[-1])
+    t_s = times(G, 1.2 * grid_s)
+    found = values(C, G, D, t_s)
+    on_grid = t_s < grid_s
+    highest = kernel.highest[cell_of(kernel, t_s[on_grid])]
+    assert (highest >= found[on_grid] * ROUNDING).all()
+    # Values as small as the reference's rounding are not compared.
+    assert (kernel.sups(t_s) + 1e-13 * found.max() >= found * ROUNDING).all()
+    assert (np.diff(kernel.sups(t_s)) <= 0).all()
+    assert kernel.sup() == kernel.sups(np.zeros(1))[0] == kernel.highest.max()
+    assert kernel.sup() <= 1.01 * peak(kernel, C, G, D)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_no_integral_is_above_its_enclosure_and_the_enclosure_is_tight(kind: str) -> None:
+@settings(max_examples=2)
+@given(n=st.integers(2, 5), seed=st.integers(0, 2**32))
+def test_no_integral_is_above_its_enclosure_and_the_enclosure_is_tight(
+    kind: str, n: int, seed: int
+) -> None:
     """Cell by cell, against Gauss's formula, which gives ‖C e^{Gτ} d‖ for a vector d to 1e-8."""
     points, weights = np.polynomial.legendre.leggauss(4)
-
-    @settings(max_examples=5)
-    @given(st.integers(2, 5), st.integers(0, 2**32))
-    def check(n: int, seed: int) -> None:
-        rng = np.random.default_rng(seed)
-        G, C, d = KINDS[kind](rng, n), rng.normal(size=(n, n)), rng.normal(size=(n, 1))
-        kernel = response(G, d).through(C)
-        begins_s, steps_s = kernel.edges_s[:-1, None], np.diff(kernel.edges_s)[:, None]
-        t_s = begins_s + steps_s * (1 + points) / 2
-        areas = values(C, G, d, t_s.ravel()).reshape(t_s.shape) @ weights * steps_s[:, 0] / 2
-        assert (kernel.area + 1e-13 * areas.sum() >= areas * (1 - 1e-7)).all()
-        assert kernel.integral_on_grid() == pytest.approx(float(kernel.area.sum()))
-        assert kernel.integral() <= 1.01 * float(areas.sum())
-
-    check()
+    rng = np.random.default_rng(seed)
+    G, C, d = KINDS[kind](rng, n), rng.normal(size=(n, n)), rng.normal(size=(n, 1))
+    kernel = response(G, d).through(C)
+    begins_s, steps_s = kernel.edges_s[:-1, None], np.diff(kernel.edges_s)[:, None]
+    t_s = begins_s + steps_s * (1 + points) / 2
+    areas = values(C, G, d, t_s.ravel()).reshape(t_s.shape) @ weights * steps_s[:, 0] / 2
+    assert (kernel.area + 1e-13 * areas.sum() >= areas * (1 - 1e-7)).all()
+    assert kernel.integral_on_grid() == pytest.approx(float(kernel.area.sum()))
+    assert kernel.integral() <= 1.01 * float(areas.sum())
 
 
-def test_the_integral_of_one_mode_is_its_closed_form() -> None:
-    for rate in (1e-3, 1.0, 1e5):
-        kernel = response(np.array([[-rate]]), np.array([[2.0]])).through(np.array([[3.0]]))
-        assert 1.0 <= kernel.integral() / (6 / rate) <= 1.002
-        assert 1.0 <= kernel.sup() / 6 <= 1.001
-        for after in (0.0, 0.5, 3.0, 100.0):  # the last one is far beyond the grid
-            assert kernel.sups(np.array([after / rate]))[0] >= 6 * math.exp(-after)
-
-
-def test_the_tail_bounds_all_times_beyond_the_grid() -> None:
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_tail_bounds_all_times_beyond_the_grid(kind: str) -> None:
     """The grid ends before any mode has decayed."""
-    for kind, make in KINDS.items():
-        G, D = make(np.random.default_rng(4), 4), np.eye(4)
-        whole = response(G, D)
-        for end in (1, 40, 200):
-            cut = whole.__class__(G, whole.edges_s[: end + 1], whole.states[: end + 1],
-                                  whole.decay, endless=True)  # fmt: skip
-            kernel, end_s = cut.through(np.eye(4)), float(whole.edges_s[end])
-            later_s = np.concatenate([[end_s], end_s + times(G, float(whole.edges_s[-1]))])
-            found = values(np.eye(4), G, D, later_s)
-            bounds = kernel.tail_highest * np.exp(-kernel.tail_rate_per_s * (later_s - end_s))
-            assert (bounds + 1e-13 * found.max() >= found * ROUNDING).all(), kind
-            np.testing.assert_allclose(kernel.sups(later_s), bounds, rtol=1e-12)
-            rest = whole.through(np.eye(4)).area[end:].sum()
-            assert kernel.tail_area >= rest / 1.01
+    G, everything = KINDS[kind](np.random.default_rng(4), 4), np.eye(4)
+    whole = response(G, everything)
+    end = 40
+    cut = replace(whole, edges_s=whole.edges_s[: end + 1], states=whole.states[: end + 1])
+    kernel, end_s = cut.through(everything), float(whole.edges_s[end])
+    later_s = np.concatenate([[end_s], end_s + times(G, float(whole.edges_s[-1]))])
+    found = values(everything, G, everything, later_s)
+    bounds = kernel.tail_highest * np.exp(-kernel.tail_rate_per_s * (later_s - end_s))
+    assert (bounds + 1e-13 * found.max() >= found * ROUNDING).all()
+    np.testing.assert_allclose(kernel.sups(later_s), bounds, rtol=1e-12)
+    assert kernel.tail_area >= whole.through(everything).area[end:].sum() / 1.01
 
 
 @settings(max_examples=12)
@@ -204,15 +190,6 @@ def test_over_a_finite_time_growing_systems_are_enclosed_too(
     assert kernel.tail_highest == kernel.tail_area == math.inf  # not requested
 
 
-def test_a_fast_decaying_mode_hardly_loosens_a_coarse_grid() -> None:
-    """10 cells for 1000 time constants of the fast mode, beyond the range of Taylor's formula."""
-    G = np.array([[-1.0, 1.0], [0.0, -1e4]])
-    kernel = response_until(G, np.eye(2), 0.1, 10).through(np.eye(2))
-    assert kernel.sup_on_grid() < 20_000
-    slow = response_until(G, np.array([[1.0], [0.0]]), 0.1, 10).through(np.eye(2))
-    assert slow.sup_on_grid() <= 1.0001
-
-
 def test_a_maximum_within_a_single_cell_is_enclosed() -> None:
     """The first six derivatives of t⁷e^{−t}/7! at 0 are 0; it decays within the cell."""
     G = np.diag(np.ones(7), 1) - np.eye(8)
@@ -232,11 +209,8 @@ def test_the_rounding_of_a_product_is_covered(seed: int, n: int, columns: int) -
     Y = rng.normal(size=(n, columns)) / np.abs(C[:1]).T
     Y[-1] = -(C[0, :-1] @ Y[:-1]) / C[0, -1]
     C, Y = C[:1], Y[:, :1] if columns == 1 else Y
-    product = [
-        [sum(Fraction(a) * Fraction(b) for a, b in zip(row, column, strict=True)) for column in Y.T]
-        for row in C
-    ]
-    exact = math.hypot(*(float(entry) for row in product for entry in row))
+    fractions = np.vectorize(Fraction, otypes=[object])
+    exact = float(np.linalg.norm((fractions(C) @ fractions(Y)).astype(np.float64)))
     bound = float(norm_bounds(C, Y[None])[0])
     assert exact <= bound <= exact + 1e-12
 
@@ -262,7 +236,7 @@ def test_a_system_that_decays_only_to_rounding_is_refused() -> None:
     assert 1.0 <= response(triangular, np.eye(10)).through(np.eye(10)).sup() / peak < 1.001
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(st.sampled_from(sorted(KINDS)), st.integers(1, 6), st.integers(0, 2**32))
 def test_in_its_coordinates_a_system_contracts(kind: str, n: int, seed: int) -> None:
     G = KINDS[kind](np.random.default_rng(seed), n)
@@ -277,52 +251,37 @@ def test_in_its_coordinates_a_system_contracts(kind: str, n: int, seed: int) -> 
         assert np.linalg.norm(expm(G * t_s), 2) <= decay.stretch * (1 + 1e-9)
 
 
-def decimals(matrix: Matrix) -> list[list[Decimal]]:
-    return [[Decimal(float(entry)) for entry in row] for row in matrix]
+def decimals(matrix: Matrix) -> Any:
+    return np.vectorize(Decimal, otypes=[object])(matrix)
 
 
-def times_of(a: list[list[Decimal]], b: list[list[Decimal]]) -> list[list[Decimal]]:
-    columns = list(zip(*b, strict=True))
-    return [
-        [sum((x * y for x, y in zip(row, column, strict=True)), Decimal(0)) for column in columns]
-        for row in a
-    ]
-
-
-def exactly(C: Matrix, G: Matrix, D: list[list[Decimal]], t_s: float) -> float:
+def exactly(C: Matrix, G: Matrix, D: Matrix, t_s: float) -> float:
     """‖C e^{Gt} D‖ in 60 digits: Taylor's series at t/2^k, squared k times."""
     with localcontext() as context:
         context.prec = 60
         halvings = max(0, math.ceil(math.log2(max(np.linalg.norm(G) * t_s, 1e-9))) + 2)
-        step = Decimal(t_s) / 2**halvings
-        scaled = [[entry * step for entry in row] for row in decimals(G)]
-        n = len(G)
-        total = term = decimals(np.eye(n))
+        scaled = decimals(G) * (Decimal(t_s) / 2**halvings)
+        total = term = decimals(np.eye(len(G)))
         for k in range(1, 35):
-            term = [[entry / k for entry in row] for row in times_of(term, scaled)]
-            pairs = zip(total, term, strict=True)
-            total = [[x + y for x, y in zip(*rows, strict=True)] for rows in pairs]
+            term = term @ scaled / k
+            total = total + term
         for _ in range(halvings):
-            total = times_of(total, total)
-        found = times_of(decimals(C), times_of(total, D))
-        return float(np.linalg.norm(np.array(found, dtype=np.float64), 2))
+            total = total @ total
+        found = decimals(C) @ total @ decimals(D)
+    return float(np.linalg.norm(found.astype(np.float64), 2))
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("condition", [1.0, 1e4, 1e8, 1e11])
+@pytest.mark.parametrize(("kind", "condition"), [("dense", 1e4), ("stiff", 1e8), ("ringing", 1e11)])
 def test_rounding_is_covered_where_weights_are_ill_conditioned(kind: str, condition: float) -> None:
     """‖W e^{Gτ} W⁻¹‖ for a W that amplifies errors of 1e-16 by its condition number."""
-    rng = np.random.default_rng(11)
-    n = 3
+    rng, n = np.random.default_rng(11), 3
     U, V = (np.linalg.qr(rng.normal(size=(n, n)))[0] for _ in range(2))
     W = U @ np.diag(np.geomspace(1, condition**-1, n)) @ V
-    G = KINDS[kind](rng, n)
-    D = np.linalg.inv(W)
-    response_ = response(G, D)
-    kernel = response_.through(W)
-    for node in (0, 1, 40, 64, 300):
+    G, D = KINDS[kind](rng, n), np.linalg.inv(W)
+    kernel = response(G, D).through(W)
+    for node in (0, 1, 64):
         t_s = float(kernel.edges_s[node])
-        exact = exactly(W, G, decimals(D), t_s)
+        exact = exactly(W, G, D, t_s)
         assert kernel.highest[node] >= exact
         assert kernel.sups(np.array([t_s]))[0] >= exact
 
@@ -341,12 +300,6 @@ def test_the_rank_of_a_factor_is_detected_and_preserved() -> None:
     L, R = factors(np.zeros((3, 2)))
     assert L.shape[1] == R.shape[0] == 1
     assert not R.any()
-
-
-def test_a_constant_system_is_enclosed() -> None:
-    kernel = constant_kernel(2.5)
-    np.testing.assert_array_equal(kernel.sups(np.array([0.0, 0.3, 1.0, 1e9])), [2.5] * 4)
-    assert kernel.integral() == math.inf
 
 
 def test_many_states_take_little_memory_and_are_enclosed() -> None:

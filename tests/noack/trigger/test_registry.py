@@ -1,6 +1,5 @@
 """Properties of every policy file in the policies' folder."""
 
-import json
 from typing import Any
 
 import numpy as np
@@ -9,9 +8,7 @@ from numpy.typing import NDArray
 
 from noack.config.feature_kinds import POLICIES
 from noack.config.resolution import policy_of, resolve
-from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
-from noack.trigger.policy_settings import PolicySettings
 from noack.trigger.trigger_policy import Trigger
 
 N = 2
@@ -19,11 +16,6 @@ EXAMPLES = {
     name: example for name, made in POLICIES.items() if (example := made.example(N)) is not None
 }
 MS = 1_000_000
-
-
-def scenario(content: dict[str, Any], settings: PolicySettings) -> Scenario:
-    table = settings.model_dump(mode="json", exclude_none=True)
-    return validate(content | {"trigger": table}, "here")
 
 
 def samples(seed: int, k: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -36,23 +28,13 @@ def samples(seed: int, k: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     return t_ns, z
 
 
-@pytest.mark.parametrize("name", EXAMPLES)
-def test_settings_are_unchanged_by_conversion_to_a_table(
-    content: dict[str, Any], name: str
-) -> None:
-    made = scenario(content, EXAMPLES[name])
-    assert made.trigger == EXAMPLES[name]
-    assert made.trigger.policy == name
-    assert Scenario.model_validate_json(json.dumps(made.model_dump(mode="json"))) == made
-    assert len(made.trigger.description.splitlines()) == 1
-
-
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_a_block_of_measurements_gives_the_same_event_as_single_ones(
     content: dict[str, Any], name: str, seed: int
 ) -> None:
-    policy = policy_of(resolve(scenario(content, EXAMPLES[name])))
+    table = EXAMPLES[name].model_dump(mode="json", exclude_none=True)
+    policy = policy_of(resolve(validate(content | {"trigger": table}, "here")))
     at_once, one_by_one = Trigger(policy), Trigger(policy)
     t_ns, z = samples(seed, 400)
     start = np.array([0.5, -0.3])

@@ -13,7 +13,7 @@ from cosim.analysis.claims.catalogue.theorem_1_controller_error import (
     trajectory_delta,
     undominated,
 )
-from cosim.record.align import AlignedRun, join_all
+from cosim.record.align import AlignedRun, align_tables
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT
@@ -21,7 +21,7 @@ from tests.cosim.analysis.claims.conftest import MS, Make, network_of, of_scenar
 
 
 def delta_of(record: RunRecord) -> float | None:
-    return trajectory_delta(record, join_all(record))
+    return trajectory_delta(record, align_tables(record))
 
 
 def by_hand(record: RunRecord, joined: AlignedRun, horizon: int = 10**9) -> float:
@@ -56,7 +56,7 @@ def test_theorem_1_bounds_the_error_and_the_sum_over_the_real_intervals(
         plant={"rate_hz": 1000.0}, controller={"rate_hz": 1000.0}, horizon_s=3.0,
     )  # fmt: skip
     record = simulate(fast)
-    joined = join_all(record)
+    joined = align_tables(record)
     delta = trajectory_delta(record, joined)
     assert delta is not None
     assert delta >= by_hand(record, joined) * (1 - 1e-6)
@@ -72,7 +72,7 @@ def test_theorem_1_bounds_the_error_and_the_sum_over_the_real_intervals(
 def test_a_late_update_is_missing_exactly_until_it_arrives(make: Make) -> None:
     """Every update is 15 ms late, so two are never missing at once."""
     record = simulate(make(), network_of(lambda n: 15))
-    joined = join_all(record)
+    joined = align_tables(record)
     starts = np.flatnonzero(record[SENSOR_MEASUREMENT]["event"] != NO_SEQUENCE)
     assert (joined.received[starts[1:]] == np.arange(len(starts) - 1)).all()
     delta, alone = trajectory_delta(record, joined), by_hand(record, joined)

@@ -6,11 +6,19 @@ from typing import Any
 
 import pytest
 import tomli_w
+from click.testing import Result
+from typer.testing import CliRunner
 
+from cosim.cli import app
 from cosim.studies.campaign.campaign_file import Campaign, load
 from cosim.studies.campaign.campaign_grid import Point, grid
+from cosim.studies.campaign.campaign_run import run_campaign
+from cosim.studies.campaign.campaign_workers import alone
+from cosim.studies.campaign.chunk_store import Store
 
 Write = Callable[..., Path]
+Command = Callable[..., Result]
+Few = tuple[Campaign, list[Point]]
 
 
 @pytest.fixture
@@ -49,15 +57,39 @@ def write(tmp_path: Path, content: dict[str, Any]) -> Write:
 
     def written(plan: dict[str, Any], **changed: Any) -> Path:
         path = tmp_path / "few.toml"
-        said = {key: value for key, value in (plan | changed).items() if value is not None}
-        path.write_text(tomli_w.dumps(said))
+        settings = {key: value for key, value in (plan | changed).items() if value is not None}
+        path.write_text(tomli_w.dumps(settings))
         return path
 
     return written
 
 
 @pytest.fixture
-def campaign(write: Write, plan: dict[str, Any]) -> tuple[Campaign, list[Point]]:
-    path = write(plan)
+def campaign(write: Write, plan: dict[str, Any]) -> Few:
+    return few_of(write(plan))
+
+
+@pytest.fixture
+def full(tmp_path: Path, campaign: Few) -> Store:
+    """The folder of the campaign, with all runs."""
+    settings, points = campaign
+    store = Store(tmp_path / "out", points, settings.draws, settings.chunk)
+    assert run_campaign(store, alone) == 28
+    return store
+
+
+@pytest.fixture
+def run_command(tmp_path: Path) -> Command:
+    """Runs the command in this process; the campaign's folder is ``out``."""
+
+    def run(path: Path, *words: str) -> Result:
+        options = ("--workers", "1", "--out", str(tmp_path / "out"))
+        return CliRunner().invoke(app, ["campaign", str(path), *options, *words])
+
+    return run
+
+
+def few_of(path: Path) -> Few:
+    """Return a campaign and its grid points."""
     loaded = load(path)
     return loaded, grid(loaded, path)

@@ -8,18 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from cosim.cli import app
 from cosim.studies.campaign import campaign_workers
-from cosim.studies.campaign.campaign_file import load
-from cosim.studies.campaign.campaign_grid import grid
 from cosim.studies.campaign.campaign_run import run_campaign
 from cosim.studies.campaign.campaign_workers import alone, cluster
 from cosim.studies.campaign.chunk_store import Store
 from cosim.studies.campaign.worker_identity import arithmetic
 from noack.core.errors import CallerError, PeerError
-from tests.cosim.studies.campaign.conftest import Write
+from tests.cosim.studies.campaign.conftest import Command, Write, few_of
 from tests.cosim.studies.campaign.test_store import files
 from tests.cosim.studies.campaign.test_workers import contents
 
@@ -83,8 +79,7 @@ def test_a_cluster_from_its_first_worker_to_its_end(
     dask: Cluster, tmp_path: Path, write: Write, plan: dict[str, Any],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    path = write(plan, draws=60, chunk=2)
-    points = grid(load(path), path)
+    _, points = few_of(write(plan, draws=60, chunk=2))
     here, there, unfinished = (
         Store(tmp_path / name, points, 60, 2) for name in ("here", "there", "unfinished")
     )
@@ -147,13 +142,11 @@ def test_an_unreachable_or_invalid_scheduler_address_gives_one_line(
 
 
 def test_only_a_campaign_with_a_scheduler_imports_dask(
-    write: Write, plan: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    write: Write, plan: dict[str, Any], run_command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for module in ("distributed", "dask"):
         monkeypatch.setitem(sys.modules, module, None)
-    words = ["campaign", str(write(plan, draws=1, figures=[])), "--out", str(tmp_path / "o")]
-    done = CliRunner().invoke(app, [*words, "--workers", "1"])
+    done = run_command(write(plan, draws=1, figures=[]))
     assert done.exit_code == 0, done.output
-    done = CliRunner().invoke(app, [*words, "--scheduler", "tcp://127.0.0.1:9"])
-    assert done.exit_code == 2
-    assert done.stderr.endswith("is not installed; pip install 'noack[cluster]'\n")
+    with pytest.raises(CallerError, match=r"pip install 'noack\[cluster\]'"), cluster("x:1"):
+        pass

@@ -4,16 +4,11 @@ import numpy as np
 import pytest
 
 from cosim.simulation.batch.batch_interface import run_batch
-from cosim.simulation.continuous.continuous_loop import continuous_loop_of
-from cosim.simulation.continuous.continuous_run import simulate_continuous
-from cosim.simulation.continuous.network_fates import network_fates
-from cosim.studies.campaign.campaign_file import Campaign
-from cosim.studies.campaign.campaign_grid import Point
+from cosim.simulation.continuous.continuous_report import run_continuous
 from cosim.studies.campaign.random_draws import box_of, drawn_scenario
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
-
-Few = tuple[Campaign, list[Point]]
+from tests.cosim.studies.campaign.conftest import Few
 
 
 def with_plant(scenario: Scenario, **changed: object) -> Scenario:
@@ -21,21 +16,15 @@ def with_plant(scenario: Scenario, **changed: object) -> Scenario:
     return scenario.model_copy(update={"plant": plant})
 
 
-def test_draws_do_not_depend_on_the_chunk_size(campaign: Few) -> None:
-    box = campaign[1][0].work.box
-    whole = box.population(11, range(40))
-    for part, ranges in ((3, (0, 17, 39)), (1, range(40))):
-        for start in ranges:
-            some = box.population(11, range(start, min(start + part, 40)))
-            for one, all_ in zip(some, whole, strict=True):
-                np.testing.assert_array_equal(one, all_[start : start + part])
-
-
-def test_draws_are_the_same_at_every_grid_point(campaign: Few) -> None:
-    first, *others = (point.work.box.population(11, range(9)) for point in campaign[1])
-    for other in others:
-        for one, another in zip(first, other, strict=True):
-            np.testing.assert_array_equal(one, another)
+def test_draws_depend_neither_on_the_chunk_nor_on_the_grid_point(campaign: Few) -> None:
+    first, *others = (point.work.box for point in campaign[1])
+    whole = first.population(11, range(9))
+    parts = [(slice(3, 5), first.population(11, range(3, 5)))]
+    parts += [(slice(0, 9), box.population(11, range(9))) for box in others]
+    for place, part in parts:
+        for found, expected in zip(part, whole, strict=True):
+            np.testing.assert_array_equal(found, expected[place])
+    assert first.population(11, range(10**8, 10**8 + 1)).x0.shape == (1, 2)
 
 
 def test_other_seeds_and_draws_give_other_numbers_throughout(campaign: Few) -> None:
@@ -65,9 +54,7 @@ def test_draws_are_uniform_in_the_box(campaign: Few) -> None:
     assert len(set(found.loss_seeds.tolist())) == 20_000
 
 
-def test_vertex_draws_are_corners_and_nominal_and_given_plants_are_constant(
-    campaign: Few,
-) -> None:
+def test_vertex_draws_are_corners_and_nominal_and_given_plants_are_constant(campaign: Few) -> None:
     scenario = campaign[1][0].scenario
     vertices = box_of(with_plant(scenario, draw="vertex")).population(0, range(200)).A
     assert set(np.round(vertices[:, 1, 0], 12)) == {-0.2, 0.2}
@@ -79,27 +66,16 @@ def test_vertex_draws_are_corners_and_nominal_and_given_plants_are_constant(
     assert (np.array(B) == given.B).all()
 
 
-def test_a_draw_with_a_large_number_is_computed_directly(campaign: Few) -> None:
-    found = campaign[1][0].work.box.population(11, range(10**8, 10**8 + 1))
-    assert found.x0.shape == (1, 2)
-
-
 def test_a_draw_of_a_campaign_can_be_run_as_a_scenario(campaign: Few) -> None:
     plan, points = campaign
     for point in points:
-        rows = point.work.run(range(4))
-        for draw in range(4):
+        for draw, row in enumerate(point.work.run(range(4))):
             alone = drawn_scenario(point.scenario, plan.seed, draw)
-            run = simulate_continuous(
-                continuous_loop_of(alone),
-                horizon_s=alone.horizon_s,
-                delivered=network_fates(alone),
-                known_start=False,
-            )
-            assert rows[draw]["transmissions"] == len(run.event_s)
-            assert rows[draw]["deliveries"] == run.delivered.sum()
+            run = run_continuous(alone)
+            assert row["transmissions"] == len(run.event_s)
+            assert row["deliveries"] == run.delivered.sum()
             end = run.at([alone.horizon_s]).x[0]
-            assert rows[draw]["final_norm"] == pytest.approx(np.linalg.norm(end), rel=1e-9)
+            assert row["final_norm"] == pytest.approx(np.linalg.norm(end), rel=1e-9)
 
 
 def test_chunks_do_not_change_the_measures(campaign: Few) -> None:

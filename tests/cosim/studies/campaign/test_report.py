@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from cosim.cli import app
 from cosim.output.report.figure_files import inline
 from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS
-from cosim.studies.campaign import campaign_figures as figures_module
+from cosim.studies.campaign import campaign_grid
 from cosim.studies.campaign.campaign_figures import (
     curve_figure,
     distribution_figure,
@@ -25,14 +25,9 @@ from cosim.studies.campaign.campaign_figures import (
     pareto_figure,
     undominated,
 )
-from cosim.studies.campaign.campaign_file import Campaign, load
-from cosim.studies.campaign.campaign_grid import Point, base_of, grid
-from cosim.studies.campaign.campaign_report import (
-    SummaryRow,
-    tables_of,
-    write_report,
-    written,
-)
+from cosim.studies.campaign.campaign_file import load
+from cosim.studies.campaign.campaign_grid import base_of
+from cosim.studies.campaign.campaign_report import SummaryRow, tables_of, write_report, written
 from cosim.studies.campaign.campaign_run import run_campaign
 from cosim.studies.campaign.campaign_summary import summarise
 from cosim.studies.campaign.campaign_workers import alone
@@ -45,19 +40,10 @@ from noack.config.scenario_file import load as load_scenario
 from noack.config.scenario_file import validate
 from noack.theory.run_conditions import ideal_conditions
 from noack.theory.scenario_certificates import certify
-from tests.cosim.studies.campaign.conftest import Write
+from tests.cosim.studies.campaign.conftest import Command, Few, Write, few_of
 
 ROOT = Path(__file__).parents[4]
 HOSTILE = "</title></svg><script>alert('x')</script> & \"$\\frac{1}{2}$\""
-Few = tuple[Campaign, list[Point]]
-
-
-@pytest.fixture
-def full(tmp_path: Path, campaign: Few) -> Store:
-    plan, points = campaign
-    store = Store(tmp_path / "out", points, plan.draws, plan.chunk)
-    run_campaign(store, alone)
-    return store
 
 
 def scalar(content: dict[str, Any], **changed: Any) -> Scenario:
@@ -99,36 +85,25 @@ def test_the_certified_error_bounds_that_of_a_plants_own_certificate() -> None:
         assert name != "lane_weighted" or bound == pytest.approx(5 * 0.5, rel=1e-6)  # Δ = M
 
 
-def test_metrics_without_a_value_are_infinite_and_shares_are_derived() -> None:
+@pytest.mark.parametrize("failure", [DIVERGED, TOO_MANY_EVENTS])
+def test_metrics_without_a_value_and_of_failed_runs_are_infinite(failure: int) -> None:
     columns = {
-        "transmissions": np.array([10, 1]),
-        "deliveries": np.array([4, 1]),
-        "settling_s": np.array([1.5, math.nan]),
-        "sup_e_c_scaled": np.array([0.5, 0.25]),
-        "status": np.array([OK, OK]),
+        "transmissions": np.array([10, 1, 1]),
+        "deliveries": np.array([4, 1, 0]),
+        "settling_s": np.array([1.5, math.nan, 0.1]),
+        "sup_e_c_scaled": np.array([0.5, 0.25, 0.1]),
+        "status": np.array([OK, OK, failure]),
     }
     found = measured(columns, 2.0)
-    assert found["lost_share"].tolist() == [0.6, 0.0]
-    assert found["settling_s"].tolist() == [1.5, math.inf]
-    assert found["certificate_used"].tolist() == [0.25, 0.125]
+    assert found["transmissions"].tolist() == [10.0, 1.0, math.inf]
+    assert found["lost_share"].tolist() == [0.6, 0.0, math.inf]
+    assert found["settling_s"].tolist() == [1.5, math.inf, math.inf]
+    assert found["certificate_used"].tolist() == [0.25, 0.125, math.inf]
     assert "certificate_used" not in measured(columns, None)
 
 
-@pytest.mark.parametrize("status", [DIVERGED, TOO_MANY_EVENTS])
-def test_a_failed_run_is_not_counted_as_one_with_few_transmissions(status: int) -> None:
-    columns = {
-        "transmissions": np.array([10, 1]),
-        "deliveries": np.array([5, 0]),
-        "status": np.array([OK, status]),
-    }
-    found = measured(columns, None)
-    assert found["transmissions"].tolist() == [10.0, math.inf]
-    assert found["lost_share"].tolist() == [0.5, math.inf]
-    assert estimate(found["transmissions"]).mean == 10.0
-
-
 def test_a_curve_has_gaps_where_a_metric_is_unknown(
-    write: Write, plan: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    write: Write, plan: dict[str, Any], tmp_path: Path
 ) -> None:
     """Each of the two models has a certificate for other values of α."""
     plan["axes"] = [
@@ -136,21 +111,13 @@ def test_a_curve_has_gaps_where_a_metric_is_unknown(
                                       "strong": {"model.gain": [[-9.0, -6.0]]}}},
         {"name": "alpha", "key": "trigger.alpha_per_s", "values": [4.0, 0.25, 2.0]},
     ]  # fmt: skip
-    figure = {"kind": "curve", "x": "alpha", "metric": "certificate_used"}
-    path = write(plan | {"compare": None}, figures=[figure], draws=2)
-    campaign = load(path)
-    store = Store(tmp_path / "out", grid(campaign, path), 2, 3)
+    curve = {"kind": "curve", "x": "alpha", "metric": "certificate_used"}
+    campaign, points = few_of(write(plan, compare=None, figures=[curve], draws=2))
+    store = Store(tmp_path / "out", points, 2, 3)
     run_campaign(store, alone)
-    drawn: list[Any] = []
-    monkeypatch.setattr(figures_module, "curve_figure", lambda *given: drawn.append(given))
-    list(figures(summarise(campaign, store), store))
-    ((x, labels, series, *_),) = drawn
-    assert (x.tolist(), labels) == ([0.25, 2.0], ["0.25", "2"])
-    assert [e is None for e in series["weak"]] == [False, True]
-    assert [e is None for e in series["strong"]] == [False, False]
-    monkeypatch.undo()
-    (one,) = figures(summarise(campaign, store), store)
-    lines = [line.get_xydata() for line in one.figure.axes[0].lines]
+    ((_, figure, _),) = figures(summarise(campaign, store), store)
+    lines = [np.asarray(line.get_xydata()) for line in figure.axes[0].lines]
+    assert [line[:, 0].tolist() for line in lines] == 2 * [[0.25, 2.0]]
     assert [np.isfinite(line[:, 1]).tolist() for line in lines] == [[True, False], [True, True]]
 
 
@@ -171,32 +138,27 @@ def test_a_summary_covers_all_draws_and_pairs_them(full: Store, campaign: Few) -
 
 
 def test_an_exceeded_certificate_is_reported_in_every_output(
-    write: Write, plan: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(
-        "cosim.studies.campaign.campaign_grid.certified_error", lambda resolved: 1e-3
-    )
-    out = tmp_path / "out"
-    path = write(plan, figures=[])
-    done = CliRunner().invoke(app, ["campaign", str(path), "--workers", "1", "--out", str(out)])
+    write: Write, plan: dict[str, Any], tmp_path: Path, run_command: Command,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(campaign_grid, "certified_error", lambda resolved: 1e-3)
+    done = run_command(write(plan, figures=[]))
     assert done.exit_code == 1
     assert "28 of 28 runs exceed a certified bound." in done.output
-    assert 'class="verdict bad"' in (out / "campaign.html").read_text()
+    assert 'class="verdict bad"' in (tmp_path / "out" / "campaign.html").read_text()
 
 
 def test_the_command_writes_the_reported_files_and_keeps_complete_chunks(
-    write: Write, plan: dict[str, Any], tmp_path: Path
+    write: Write, plan: dict[str, Any], tmp_path: Path, run_command: Command
 ) -> None:
-    out = tmp_path / "out"
-    arguments = ["campaign", str(write(plan)), "--workers", "1", "--out", str(out), "--json"]
-    done = CliRunner().invoke(app, [*arguments, "--draws", "4"])
+    path = write(plan, figures=[])
+    done = run_command(path, "--json", "--draws", "4")
     assert done.exit_code == 0, done.output
-    said = json.loads(done.stdout)
-    assert said["made"] == 16
-    assert all(Path(file).exists() for file in said["files"])
-    kept = json.loads((out / "summary.json").read_text())
-    assert kept == {key: value for key, value in said.items() if key not in ("made", "files")}
-    assert json.loads(CliRunner().invoke(app, arguments).stdout)["made"] == 4 * (7 - 3)
+    report = json.loads(done.stdout)
+    assert report.pop("made") == 16
+    assert all(Path(file).exists() for file in report.pop("files"))
+    assert json.loads((tmp_path / "out" / "summary.json").read_text()) == report
+    assert json.loads(run_command(path, "--json").stdout)["made"] == 4 * (7 - 3)
 
 
 def test_a_missing_campaign_gives_one_line() -> None:
@@ -280,20 +242,18 @@ def test_numbers_are_written_with_their_interval() -> None:
 
 
 def test_terminal_tables_print_names_literally_and_list_failed_runs(
-    write: Write, plan: dict[str, Any], tmp_path: Path
+    write: Write, plan: dict[str, Any], run_command: Command
 ) -> None:
     name = "[/x] [red]"
     plan["axes"][0]["variants"] = {name: {"mode": "model"}, "ZOH": {"mode": "zoh"}}
     plan["axes"][1]["title"] = "[/b]"
-    path = write(plan, figures=[], draws=2, metrics={"most_events": 1})
-    out = str(tmp_path / "out")
-    result = CliRunner().invoke(app, ["campaign", str(path), "--out", out, "--workers", "1"])
+    result = run_command(write(plan, figures=[], draws=2, metrics={"most_events": 1}))
     assert result.exit_code == 0, result.output
     assert name in result.stdout
     assert "[/b]" in result.stdout
-    told = " ".join(result.stdout.split())
-    assert f"At policy {name}, beta 0.1 not all runs reached the horizon: 2 too many" in told
-    assert "continuous time: the trigger acts at once and the network has no delay" in told
+    text = " ".join(result.stdout.split())
+    assert f"At policy {name}, beta 0.1 not all runs reached the horizon: 2 too many" in text
+    assert "continuous time: the trigger acts at once and the network has no delay" in text
 
 
 @pytest.mark.parametrize("width", [45, 60, 88, 89, 119])

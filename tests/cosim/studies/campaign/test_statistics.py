@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from cosim.studies.campaign.draw_statistics import difference, estimate
+from cosim.studies.campaign.draw_statistics import difference, estimate, interval_ranks
 
 
 def test_the_interval_of_a_mean_is_the_textbooks() -> None:
@@ -74,3 +74,18 @@ def test_pairing_narrows_the_interval() -> None:
     paired = difference(common + noise, common).estimate
     assert paired.halfwidth < 0.02 < estimate(common).halfwidth
     assert abs(paired.mean - 0.5) < 3 * paired.halfwidth
+
+
+def at_most(j: int, count: int, share: float) -> float:
+    """P(Bin(count, share) ≤ j), term by term."""
+    return math.fsum(
+        math.comb(count, i) * share**i * (1 - share) ** (count - i) for i in range(j + 1)
+    )
+
+
+@pytest.mark.parametrize(("count", "quantile"), [(100, 0.5), (200, 0.9), (400, 0.95)])
+def test_ranks_are_the_tightest_with_the_required_confidence(count: int, quantile: float) -> None:
+    low, high = interval_ranks(count, quantile)
+    # The value of rank r (from 0) is above the quantile if at most r values are below it.
+    assert at_most(high, count, quantile) >= 0.975 > at_most(high - 1, count, quantile)
+    assert at_most(low, count, quantile) <= 0.025 < at_most(low + 1, count, quantile)

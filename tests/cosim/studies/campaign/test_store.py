@@ -9,15 +9,12 @@ import numpy as np
 import pyarrow.dataset
 import pytest
 
-from cosim.studies.campaign.campaign_file import Campaign, load
-from cosim.studies.campaign.campaign_grid import Point, base_of, grid
+from cosim.studies.campaign.campaign_grid import base_of
 from cosim.studies.campaign.campaign_run import run_campaign
 from cosim.studies.campaign.campaign_workers import alone
 from cosim.studies.campaign.chunk_store import Chunk, Store, opened
 from noack.core.errors import CallerError, MachineError
-from tests.cosim.studies.campaign.conftest import Write
-
-Few = tuple[Campaign, list[Point]]
+from tests.cosim.studies.campaign.conftest import Few, Write, few_of
 
 
 def files(folder: Path) -> dict[str, int]:
@@ -25,14 +22,6 @@ def files(folder: Path) -> dict[str, int]:
     return {
         str(path.relative_to(folder)): path.stat().st_mtime_ns for path in folder.rglob("*.parquet")
     }
-
-
-@pytest.fixture
-def full(tmp_path: Path, campaign: Few) -> Store:
-    plan, points = campaign
-    store = Store(tmp_path / "out", points, plan.draws, plan.chunk)
-    assert run_campaign(store, alone) == 28
-    return store
 
 
 def test_every_chunk_contains_its_draws_and_their_axis_values(full: Store, campaign: Few) -> None:
@@ -50,15 +39,11 @@ def test_every_chunk_contains_its_draws_and_their_axis_values(full: Store, campa
         np.testing.assert_array_equal(column, expected["cost"])
 
 
-def test_existing_chunks_are_not_computed_again(full: Store) -> None:
+def test_only_a_damaged_file_is_computed_again(full: Store) -> None:
     before = files(full.folder)
     assert list(full.missing()) == []
     assert run_campaign(full, alone) == 0
     assert files(full.folder) == before
-
-
-def test_only_a_damaged_file_is_computed_again(full: Store) -> None:
-    before = files(full.folder)
     path = full.folder / "runs" / "point-00001" / "draws-000000003.parquet"
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
@@ -106,12 +91,12 @@ def test_a_full_disk_gives_one_line_and_leaves_complete_files_only(
     assert run_campaign(store, alone) == 16
 
 
-def changed_folder(write: Write, folder: Path, plan: dict[str, Any]) -> None:
-    path = write(plan)
-    campaign = load(path)
-    store = Store(folder, grid(campaign, path), campaign.draws, campaign.chunk)
+def use(path: Path, folder: Path, draws: int | None = None) -> int:
+    """Run a campaign's missing chunks in its folder; return the number of runs."""
+    campaign, points = few_of(path)
+    store = Store(folder, points, draws or campaign.draws, campaign.chunk)
     with opened(campaign, base_of(campaign, path)[1], store):
-        pass
+        return run_campaign(store, alone)
 
 
 @pytest.mark.parametrize(
@@ -121,22 +106,18 @@ def changed_folder(write: Write, folder: Path, plan: dict[str, Any]) -> None:
         ("chunk", 4, "campaign.chunk is 3 there, 4 here"),
         ("settings", {"horizon_s": 2.0}, "campaign.settings.horizon_s is null there, 2.0 here"),
         ("metrics", {"settle": 0.1}, "campaign.metrics.settle is 0.02 there, 0.1 here"),
-        (
-            "axes",
-            [{"name": "beta", "key": "trigger.beta", "values": [0.1]}],
-            "campaign.axes is ",
-        ),
+        ("axes", [{"name": "m", "key": "network.mansd", "values": [1]}], "campaign.axes is "),
     ],
 )
 def test_another_campaign_is_refused_in_the_same_folder(
     write: Write, plan: dict[str, Any], tmp_path: Path, key: str, value: Any, expected: str
 ) -> None:
     folder = tmp_path / "out"
-    changed_folder(write, folder, plan)
-    changed_folder(write, folder, plan)
-    other = plan | {"compare": None, "figures": []} | {key: value}
+    path = write(plan, draws=1)
+    use(path, folder)
+    assert use(path, folder) == 0
     with pytest.raises(CallerError) as found:
-        changed_folder(write, folder, other)
+        use(write(plan, **{"compare": None, "figures": [], key: value}), folder)
     text = str(found.value)
     assert text.startswith(f"{folder}: holds another campaign (")
     assert expected in text
@@ -146,46 +127,51 @@ def test_another_campaign_is_refused_in_the_same_folder(
 def test_a_changed_scenario_makes_another_campaign_and_changed_figures_do_not(
     write: Write, plan: dict[str, Any], tmp_path: Path
 ) -> None:
-    folder = tmp_path / "out"
-    changed_folder(write, folder, plan)
+    folder, losses = tmp_path / "out", tmp_path / "lost.txt"
+    losses.write_text("0 1 1\n")
+    plan["settings"]["network.loss"] = {"model": "trace", "file": "lost.txt"}
+    use(write(plan, draws=1), folder)
     plan["axes"][1]["title"] = "threshold"
-    shown = {"figures": [], "compare": None, "draws": 99, "description": "new"}
-    changed_folder(write, folder, plan | shown | {"metrics": {"shown": ["cost"]}})
+    shown = {"figures": [], "compare": None, "draws": 2, "description": "new"}
+    assert use(write(plan, **shown, metrics={"shown": ["cost"]}), folder) == 8
     scenario = tmp_path / "small.toml"
-    scenario.write_text(scenario.read_text().replace("mansd = 2", "mansd = 3"))
+    before = scenario.read_text()
+    path = write(plan)
+    scenario.write_text(before.replace("mansd = 2", "mansd = 3"))
     with pytest.raises(CallerError, match=r"scenario\.network\.mansd is 2 there, 3 here"):
-        changed_folder(write, folder, plan)
+        use(path, folder)
+    scenario.write_text(before)
+    losses.write_text("0 1 0\n")
+    with pytest.raises(CallerError, match="holds another campaign"):
+        use(path, folder)
 
 
 def test_a_folder_in_use_or_of_other_content_is_refused(
     write: Write, plan: dict[str, Any], tmp_path: Path
 ) -> None:
-    path = write(plan)
-    campaign = load(path)
-    base = base_of(campaign, path)[1]
-    store = Store(tmp_path / "out", grid(campaign, path), campaign.draws, campaign.chunk)
+    path = write(plan, draws=1)
+    campaign, points = few_of(path)
+    store = Store(tmp_path / "out", points, 1, campaign.chunk)
     with (
-        opened(campaign, base, store),
+        opened(campaign, base_of(campaign, path)[1], store),
         pytest.raises(CallerError, match="another noack uses this folder"),
-        opened(campaign, base, store),
     ):
-        pass
+        use(path, store.folder)
     (tmp_path / "mine" / "runs").mkdir(parents=True)
     with pytest.raises(CallerError, match="holds runs"):
-        changed_folder(write, tmp_path / "mine", plan)
+        use(path, tmp_path / "mine")
     with pytest.raises(MachineError, match="cannot be written"):
-        changed_folder(write, path, plan)  # a file, not a folder
+        use(path, path)  # a file, not a folder
 
 
 def test_incomplete_files_of_a_killed_run_are_removed(
     write: Write, plan: dict[str, Any], tmp_path: Path
 ) -> None:
-    folder = tmp_path / "out"
-    changed_folder(write, folder, plan)
-    left = folder / "runs" / "point-00000" / ".draws-000000000.parquet.partial"
-    left.parent.mkdir(parents=True)
+    left = tmp_path / "out" / "runs" / "point-00000" / ".draws-000000000.parquet.partial"
+    path = write(plan, draws=1)
+    use(path, tmp_path / "out")
     left.write_bytes(b"PAR1")
-    changed_folder(write, folder, plan)
+    use(path, tmp_path / "out")
     assert not left.exists()
 
 
@@ -201,38 +187,17 @@ def test_a_damaged_parquet_page_gives_one_line_with_the_remedy(full: Store) -> N
         full.columns(1, ["cost"])
 
 
-def test_files_that_the_scenario_refers_to_are_part_of_the_campaign(
-    write: Write, plan: dict[str, Any], tmp_path: Path
-) -> None:
-    (tmp_path / "lost.txt").write_text("0 1 1\n")
-    plan["settings"]["network.loss"] = {"model": "trace", "file": "lost.txt"}
-    changed_folder(write, tmp_path / "out", plan)
-    changed_folder(write, tmp_path / "out", plan)
-    (tmp_path / "lost.txt").write_text("0 1 0\n")
-    with pytest.raises(CallerError, match="holds another campaign"):
-        changed_folder(write, tmp_path / "out", plan)
-
-
 def test_runs_of_another_version_are_shown_but_not_extended(
     write: Write, plan: dict[str, Any], tmp_path: Path
 ) -> None:
     path, folder = write(plan), tmp_path / "out"
-    campaign = load(path)
-    store = Store(folder, grid(campaign, path), campaign.draws, campaign.chunk)
-    base = base_of(campaign, path)[1]
-    with opened(campaign, base, store):
-        run_campaign(store, alone)
+    use(path, folder)
     manifest = json.loads((folder / "campaign.json").read_text())
     manifest["arithmetic"]["numpy"] = "1.0"
     (folder / "campaign.json").write_text(json.dumps(manifest))
-    with opened(campaign, base, store):
-        assert run_campaign(store, alone) == 0
-    more = Store(folder, store.points, 10, campaign.chunk)
-    with (
-        pytest.raises(CallerError, match=r"differ from the existing ones \(numpy is 1\.0 there"),
-        opened(campaign, base, more),
-    ):
-        pass
+    assert use(path, folder) == 0
+    with pytest.raises(CallerError, match=r"differ from the existing ones \(numpy is 1\.0 there"):
+        use(path, folder, draws=10)
 
 
 @pytest.mark.parametrize("text", ["[]", "{}", "nonsense", '{"arithmetic": 3}'])
@@ -242,7 +207,7 @@ def test_an_invalid_manifest_gives_one_line(
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "campaign.json").write_text(text)
     with pytest.raises(CallerError, match=r"campaign\.json: not a manifest of a campaign; give"):
-        changed_folder(write, tmp_path / "out", plan)
+        use(write(plan), tmp_path / "out")
 
 
 def test_too_many_files_for_a_folder_are_refused(campaign: Few, tmp_path: Path) -> None:

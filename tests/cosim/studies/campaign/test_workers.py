@@ -1,7 +1,6 @@
 """Local worker processes: the same results for any number, and no harm from kills or interrupts."""
 
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -12,12 +11,8 @@ from typing import Any
 
 import psutil
 import pytest
-from typer.testing import CliRunner
 
-from cosim.cli import app
 from cosim.studies.campaign import campaign_workers
-from cosim.studies.campaign.campaign_file import load
-from cosim.studies.campaign.campaign_grid import grid
 from cosim.studies.campaign.campaign_run import run_campaign
 from cosim.studies.campaign.campaign_workers import (
     Chunk,
@@ -28,7 +23,7 @@ from cosim.studies.campaign.campaign_workers import (
     local,
 )
 from cosim.studies.campaign.chunk_store import Store
-from tests.cosim.studies.campaign.conftest import Write
+from tests.cosim.studies.campaign.conftest import Command, Write, few_of
 from tests.cosim.studies.campaign.test_store import files
 
 Start = Callable[[], "subprocess.Popen[str]"]
@@ -48,7 +43,7 @@ def many(write: Write, plan: dict[str, Any]) -> Path:
 def test_a_killed_worker_gives_one_line_and_no_byte_depends_on_the_workers(
     many: Path, tmp_path: Path
 ) -> None:
-    points = grid(load(many), many)
+    _, points = few_of(many)
     by_two, reverse = (Store(tmp_path / name, points, 80, 1) for name in ("two", "reverse"))
     workers: list[psutil.Process] = []
 
@@ -104,7 +99,7 @@ def when_files(folder: Path, count: int, process: "subprocess.Popen[str]") -> li
 
 
 def test_an_interrupted_and_then_killed_campaign_continues_where_it_stopped(
-    start: Start, many: Path, tmp_path: Path
+    start: Start, many: Path, tmp_path: Path, run_command: Command
 ) -> None:
     folder = tmp_path / "out"
     interrupted = start()
@@ -124,8 +119,7 @@ def test_an_interrupted_and_then_killed_campaign_continues_where_it_stopped(
     assert psutil.wait_procs(children, timeout=60)[1] == []
     before = files(folder)
     assert 10 <= len(before) < RUNS
-    words = ["campaign", str(many), "--workers", "1", "--out", str(folder), "--json"]
-    ended = CliRunner().invoke(app, words)
+    ended = run_command(many, "--json")
     assert ended.exit_code == 0, ended.output
     assert f'"made": {RUNS - len(before)}' in ended.stdout
     assert files(folder).items() >= before.items()
@@ -133,8 +127,9 @@ def test_an_interrupted_and_then_killed_campaign_continues_where_it_stopped(
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_a_campaign_with_one_line(
-    many: Path, tmp_path: Path, number: signal.Signals, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    many: Path, tmp_path: Path, number: signal.Signals, run_command: Command,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
     def signalled(works: Sequence[Work], chunks: Iterable[Chunk]) -> Iterator[Finished]:
         for i, finished in enumerate(alone(works, chunks)):
             if i == 5:
@@ -142,14 +137,11 @@ def test_a_signal_ends_a_campaign_with_one_line(
             yield finished
 
     monkeypatch.setattr(campaign_workers, "alone", signalled)
-    out = tmp_path / "out"
-    words = ["campaign", str(many), "--workers", "1", "--out", str(out)]
     before = signal.getsignal(number)
-    ended = CliRunner().invoke(app, words)
+    ended = run_command(many)
     assert signal.getsignal(number) == before
     assert ended.exit_code == 143
-    assert re.fullmatch(
-        rf"noack: ended by {number.name}; 5 of {RUNS} runs are in {out}; "
-        r"the same command continues the campaign\n",
-        ended.stderr,
+    assert ended.stderr == (
+        f"noack: ended by {number.name}; 5 of {RUNS} runs are in {tmp_path / 'out'}; "
+        "the same command continues the campaign\n"
     )

@@ -1,5 +1,6 @@
 """The chosen design meets the limits, and no cheaper candidate does."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import pytest
 
 from cosim.simulation.batch.batch_interface import run_batch, setting_of
 from cosim.studies.campaign.random_draws import box_of
-from cosim.studies.design.candidate_measures import DesignLimits, measure
+from cosim.studies.design.candidate_measures import DesignLimits, measure, require_draws
 from cosim.studies.design.design_result import DesignResult
 from cosim.studies.design.design_space import LEVELS
 from noack.config.resolution import resolve
@@ -24,11 +25,11 @@ def test_the_chosen_design_settles_in_time_on_draws_of_another_seed(found: Desig
     assert found.feasible
     assert found.confirmed
     setting = replace(setting_of(resolve(found.scenario)), settle=LIMITS.settle)
-    rows = run_batch(setting, box_of(found.scenario).population(99, range(4000)))
+    rows = run_batch(setting, box_of(found.scenario).population(99, range(2000)))
     share = float(np.mean(rows["settling_s"] <= LIMITS.settling_s))
     assert share >= LIMITS.quantile
     # 4 standard deviations of the difference of two means
-    spread = 4 * np.hypot(found.fresh.halfwidth, 0.08) / 1.96
+    spread = 4 * np.hypot(found.fresh.halfwidth, 0.12) / 1.96
     assert abs(rows["transmissions"].mean() - found.fresh.transmissions) < spread
 
 
@@ -56,9 +57,7 @@ def test_a_tighter_limit_costs_transmissions(found: DesignResult, scenario: Scen
     assert free.best.measured.transmissions < found.best.measured.transmissions
 
 
-def test_no_candidate_meets_the_limits_with_fewer_transmissions(
-    found: DesignResult,
-) -> None:
+def test_no_candidate_meets_the_limits_with_fewer_transmissions(found: DesignResult) -> None:
     best = found.best.measured
     assert found.best.full
     assert best.settling_high_s <= LIMITS.settling_s
@@ -95,41 +94,31 @@ def test_the_trade_off_curve_contains_the_nondominated_candidates(found: DesignR
         if trial.bounds.get("error", 0.0) <= LIMITS.bounds["error"]:
             sent, settling_s = trial.measured.transmissions, trial.measured.settling_s
             assert not any(sent < a and settling_s < b for a, b in points)
-            never = settling_s == float("inf")
-            assert (
-                never
-                or trial in found.front
-                or any(a <= sent and b <= settling_s for a, b in points)
-            )
+            better = any(a <= sent and b <= settling_s for a, b in points)
+            assert better or trial in found.front or settling_s == math.inf
 
 
 def test_the_same_seed_gives_the_same_design_and_another_seed_other_draws(
     scenario: Scenario,
 ) -> None:
     limits = replace(LIMITS, bounds={})
-    one, again, other = (designed(scenario, limits, draws=80, seed=s) for s in (5, 5, 6))
+    one, again, other = (designed(scenario, limits, draws=40, seed=s) for s in (5, 5, 6))
     assert again.document() == one.document()
     assert other.fresh != one.fresh
 
 
 def test_candidates_lie_below_the_decay_rate(found: DesignResult) -> None:
     # s² + 1.5 s + 1: the real part of both roots is −0.75
-    rates = [trial.candidate.alpha_per_s for trial in found.trials]
-    assert max(rates) < 0.75
-    assert max(rates) > 0.7
+    assert 0.7 < max(trial.candidate.alpha_per_s for trial in found.trials) < 0.75
     assert min(trial.candidate.beta for trial in found.trials) > LEVELS[0] / 3
 
 
 def test_infeasible_limits_are_reported_with_the_closest_candidate(scenario: Scenario) -> None:
-    limits = DesignLimits(1.0, 0.9, 0.02, {})
-    found = designed(scenario, limits, draws=80)
+    found = designed(scenario, DesignLimits(1.0, 0.5, 0.02, {}), draws=20)
     assert not found.feasible
     assert not found.confirmed
-    verdict = found.verdict()
-    assert "\n" not in verdict
-    assert verdict.startswith("no design meets the limits; the closest has a settling time of ")
+    assert f"{found.best.measured.settling_s:.4g} s" in found.verdict()
     closest = found.best.measured.settling_high_s
-    assert f"{found.best.measured.settling_s:.4g} s" in verdict
     assert all(t.measured.settling_high_s >= closest for t in found.trials if t.full)
 
 
@@ -137,3 +126,19 @@ def test_no_bound_is_certified_for_a_drawn_initial_state(scenario: Scenario) -> 
     plant = scenario.plant.model_copy(update={"initial_state_halfwidth": (0.1, 0.1)})
     with pytest.raises(CallerError, match="initial_state_halfwidth"):
         designed(scenario.model_copy(update={"plant": plant}), LIMITS)
+
+
+def test_too_few_draws_for_a_quantile_are_refused_with_the_required_number() -> None:
+    with pytest.raises(CallerError, match="--draws: 50 are too few") as caught:
+        require_draws(50, 0.95)
+    enough = int(str(caught.value).split()[-3])
+    require_draws(enough, 0.95)
+    assert 1 - 0.95**enough >= 0.975  # P(the largest value exceeds the quantile)
+
+
+def test_the_largest_excess_over_a_limit_counts() -> None:
+    limits = DesignLimits(10.0, 0.95, 0.02, {"state": 4.0, "error": 1.0})
+    assert limits.excess(10.0, {"state": 4.0, "error": 1.0}) == 0
+    assert limits.excess(20.0, {"state": 5.0, "error": 1.0}) == pytest.approx(0.5)
+    assert limits.excess(9.0, {"state": math.inf, "error": 1.0}) == 1
+    assert limits.excess(9.0, {}) == 0  # not yet computed

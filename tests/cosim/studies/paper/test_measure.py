@@ -10,8 +10,6 @@ from cosim.simulation.continuous.continuous_report import run_continuous, summar
 from cosim.studies.paper.draw_measures import (
     MODES,
     Draw,
-    _ideal_norms,
-    _settling_s,
     certified,
     measure_draw,
     open_loop_eigenvalues,
@@ -31,24 +29,19 @@ def found() -> Draw:
     return measure_draw(SCENARIO, DRAW)
 
 
-def test_the_settling_time_of_an_exponential_is_its_closed_form() -> None:
-    t_s = np.linspace(0.0, 10.0, 101)
-    assert _settling_s(t_s, np.exp(-t_s), 0.05) == pytest.approx(math.log(20), rel=1e-12)
-
-
-def test_settling_counts_from_the_last_time_above_the_level() -> None:
-    t_s = np.arange(5.0)
-    assert _settling_s(t_s, np.array([1.0, 0.01, 1.0, 0.01, 0.01]), 0.1) == pytest.approx(2.5)
-    assert _settling_s(t_s, np.full(5, 0.01), 0.1) == 0.0
-    assert _settling_s(t_s, np.array([1.0, 0.0, 0.0, 0.0, 1.0]), 0.1) == math.inf
-
-
-def test_the_loop_without_a_network_is_the_matrix_exponential() -> None:
+def test_the_loop_without_a_network_settles_when_its_matrix_exponential_does(found: Draw) -> None:
     loop = loop_of(resolved_draw(SCENARIO, DRAW, "model"))
     closed = loop.A + loop.B @ loop.K
-    t_s, norms = _ideal_norms(closed, loop.x0, 20.0)
-    for k in (0, 137, 2000):
-        assert norms[k] == pytest.approx(np.linalg.norm(expm(closed * t_s[k]) @ loop.x0), rel=1e-10)
+    for share, settled_s in ((0.05, found.ideal_settled_5_s), (0.01, found.ideal_settled_1_s)):
+        times_s = np.linspace(settled_s, 40.0, 200)
+        norms = [np.linalg.norm(expm(closed * t_s) @ loop.x0) for t_s in times_s]
+        assert norms[0] == pytest.approx(share * found.start_norm, rel=1e-4)
+        assert max(norms[1:]) < norms[0]
+
+
+def test_a_loop_that_does_not_settle_within_the_horizon_never_settles() -> None:
+    short = measure_draw(SCENARIO.model_copy(update={"horizon_s": 1.0}), DRAW)
+    assert short.model.settled_5_s == short.zoh.settled_1_s == short.ideal_settled_5_s == math.inf
 
 
 def test_other_draws_have_other_plants_starts_and_losses() -> None:

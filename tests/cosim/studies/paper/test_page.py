@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from cosim.cli import app
-from cosim.cli.commands import paper_command
+from cosim.cli import app, command
 from cosim.studies.campaign.draw_statistics import paired, quartiles
 from cosim.studies.paper import paper_run
 from cosim.studies.paper.paper_campaign import BASE, COLUMNS, load_campaign, parts
@@ -65,7 +64,7 @@ def test_the_command_computes_the_committed_draws_and_writes_the_page(
         assert 0 <= representative < DRAWS
         return results.evidence  # test_evidence.py computes it
 
-    monkeypatch.setattr(paper_command, "cores", lambda: 1)
+    monkeypatch.setattr(command, "cores", lambda: 1)
     monkeypatch.setattr(paper_run, "evidence", evidence)
     words = ["paper", "--draws", str(DRAWS), "--out", str(tmp_path), "--json"]
     done = CliRunner().invoke(app, words)
@@ -87,35 +86,33 @@ def with_column(results: Results, name: str, values: Any, variation: str = BASE)
     return Results({**results.tables, ("draws", variation): table}, results.evidence)
 
 
-def test_verdicts_follow_from_the_draws(results: Results) -> None:
-    """A claim that the draws contradict is not confirmed; one that most draws confirm is partly."""
-    gist = "With ZOH the number of updates increases."
-
-    def verdict(changed: Results) -> PaperVerdict:
-        return next(claim.verdict for claim in claims(changed) if claim.gist == gist)
-
-    events, some = results.column("zoh.events"), np.arange(results.count()) % 10
-    assert verdict(results) == PaperVerdict.CONFIRMED
-    assert verdict(with_column(results, "zoh.events", 1)) == PaperVerdict.NOT_CONFIRMED
-    most = np.where(some < 6, events, 1)
-    assert verdict(with_column(results, "zoh.events", most)) == PaperVerdict.PARTLY
-    # A variation of an unspecified detail counts; one that departs from the paper's example does
-    # not.
-    assert verdict(with_column(results, "zoh.events", 1, "x(0) × 10")) == PaperVerdict.PARTLY
-    assert verdict(with_column(results, "zoh.events", 1, "box × 5")) == PaperVerdict.CONFIRMED
-
-
-def test_a_loop_that_never_settles_confirms_no_claim(results: Results) -> None:
-    never = with_column(results, "model.settled_1_s", math.inf)
-    (claim,) = [c for c in claims(never) if c.gist == "MB-ET stabilises the uncertain system."]
-    assert claim.verdict == PaperVerdict.NOT_CONFIRMED
-    assert "> 40" in render(never)
-
-
-def test_an_inter_event_time_below_the_certified_one_is_reported(results: Results) -> None:
-    short = with_column(results, "model.gap_min_s", 1e-3)
-    (claim,) = [c for c in claims(short) if "minimum inter-event" in c.gist]
-    assert claim.verdict == PaperVerdict.NOT_CONFIRMED
+@pytest.mark.parametrize(
+    ("column", "values", "variation", "verdict"),
+    [
+        ("zoh.events", None, BASE, PaperVerdict.CONFIRMED),
+        ("zoh.events", 1, BASE, PaperVerdict.NOT_CONFIRMED),
+        ("zoh.events", "some", BASE, PaperVerdict.PARTLY),
+        # A variation of an unspecified detail counts; another example does not.
+        ("zoh.events", 1, "x(0) × 10", PaperVerdict.PARTLY),
+        ("zoh.events", 1, "box × 5", PaperVerdict.CONFIRMED),
+        ("model.settled_1_s", math.inf, BASE, PaperVerdict.NOT_CONFIRMED),
+        ("model.gap_min_s", 1e-3, BASE, PaperVerdict.NOT_CONFIRMED),  # below the certified one
+    ],
+)
+def test_verdicts_follow_from_the_draws(
+    results: Results, column: str, values: Any, variation: str, verdict: PaperVerdict
+) -> None:
+    gist = {
+        "zoh.events": "With ZOH the number of updates increases.",
+        "model.settled_1_s": "MB-ET stabilises the uncertain system.",
+        "model.gap_min_s": "A positive minimum inter-event time exists.",
+    }
+    before = results.column(column, variation)
+    if values == "some":
+        values = np.where(np.arange(len(before)) % 10 < 6, before, 1)
+    changed = with_column(results, column, before if values is None else values, variation)
+    assert [c.verdict for c in claims(changed) if c.gist == gist[column]] == [verdict]
+    assert values is not math.inf or "> 40" in render(changed)
 
 
 def test_the_least_favourable_variation_is_named(results: Results) -> None:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, Phase, find, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
@@ -13,14 +13,9 @@ from noack.core.linear_systems import Matrix, Vector
 from noack.theory.error_bounds import ErrorBounds, ErrorMonitor
 from noack.trigger.decaying import DecayingTrigger
 from tests.noack.theory.exact_loops import observe
-from tests.noack.theory.loops import System, systems
+from tests.noack.theory.loops import SEARCH, System, seeds, systems
 
-ROUNDING = 1 + 1e-9
 NS = 1e-9
-
-SEARCH = settings(deadline=None, suppress_health_check=list(HealthCheck), phases=[Phase.generate])
-
-seeds = st.integers(0, 2**32)
 
 
 class Moment(NamedTuple):
@@ -83,19 +78,23 @@ def follow(history: History, trigger: DecayingTrigger) -> list[ErrorBounds]:
 
 def explicit(history: History, trigger: DecayingTrigger, upto: int) -> ErrorBounds:
     """Both sums, term by term, from the first event on."""
+
+    def threshold(t_ns: int) -> float:
+        return max(trigger.beta * math.exp(-trigger.alpha_per_s * t_ns * NS), trigger.floor)
+
     H, W, now = history.H, history.weight, history.moments[upto]
     identity = 0.0 if now.event >= 0 else float(np.linalg.norm(W @ now.e_s))
-    printed = trigger.threshold(now.t_ns)
+    printed = threshold(now.t_ns)
     for moment in history.moments[: upto + 1]:
         if moment.event > now.received:
             moved = expm(H * (now.t_ns - moment.t_ns) * NS)
             identity += float(np.linalg.norm(W @ moved @ moment.e_s))
             growth = np.linalg.norm(W @ moved @ np.linalg.inv(W), 2)
-            printed += trigger.threshold(moment.t_ns) * float(growth)
+            printed += threshold(moment.t_ns) * float(growth)
     return ErrorBounds(identity, printed)
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(histories(), st.floats(0.01, 2.0), st.sampled_from([0.0, 0.3]))
 def test_both_bounds_are_the_explicit_sums(history: History, alpha: float, floor: float) -> None:
     trigger = DecayingTrigger(0.5, alpha, floor, history.weight)
@@ -104,9 +103,11 @@ def test_both_bounds_are_the_explicit_sums(history: History, alpha: float, floor
         assert found == pytest.approx(expected, rel=1e-9, abs=1e-12)
 
 
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(histories())
-def test_the_identity_bounds_the_error_whatever_happens(history: History) -> None:
+def test_the_identity_bounds_the_error_for_every_trigger_plant_and_network(
+    history: History,
+) -> None:
     """No assumption on trigger, plant or network."""
     trigger = DecayingTrigger(1e-3, 1.0, 0.0, history.weight)
     largest = 0.0
@@ -116,30 +117,19 @@ def test_the_identity_bounds_the_error_whatever_happens(history: History) -> Non
         assert error <= found.identity + 1e-12 * max(largest, 1.0)
 
 
-def test_the_bound_is_exact_with_a_single_missing_event() -> None:
-    """With one term, the triangle inequality is an equality right after the reset."""
-    history = History(
-        np.array([[-1.0, 2.0], [0.0, -3.0]]), np.eye(2),
-        [Moment(0, np.array([3.0, 4.0]), 0, -1, np.array([3.0, 4.0]))],
-    )  # fmt: skip
-    found = follow(history, DecayingTrigger(1.0, 1.0))[0]
-    assert found.identity == pytest.approx(5.0)
-    assert found.printed == pytest.approx(2.0)
-
-
 def in_continuous_time(system: System, seed: int, forgotten: int) -> float:
     """The largest share of eq:LossEv3 that ‖e_c‖ uses; the first missing events are left out."""
     H, alpha, beta, W = system.H, system.alpha, system.beta, system.weight
     trigger = DecayingTrigger(beta, alpha, 0.0, W)
-    speed, largest = float(np.abs(np.linalg.eigvals(H)).max()), 0.0
-    for run, _ in observe(system, 6.0 / speed, seed, samples=2):
+    largest = 0.0
+    for run, _ in observe(system, 6.0, seed, samples=2):
         monitor, received = ErrorMonitor(H, trigger), -1
-        happenings = [
+        moments = [
             *((state.t_s, k, state) for k, state in enumerate(run.before)),
             *((float(t_s), -1, None) for t_s in np.linspace(0, run.reached_s, 40)),
         ]
         left_out = 0
-        for t_s, event, state in sorted(happenings, key=lambda h: (h[0], h[1])):
+        for t_s, event, state in sorted(moments, key=lambda h: (h[0], h[1])):
             t_ns = round(t_s * 1e9)
             if state is None:
                 now = run.at([t_s])
@@ -164,43 +154,8 @@ def in_continuous_time(system: System, seed: int, forgotten: int) -> float:
 TO_THE_NANOSECOND = 1 + 1e-6
 
 
-@settings(SEARCH, max_examples=12)
+@settings(SEARCH, max_examples=6)
 @given(systems(), seeds)
-def test_the_printed_bound_holds_in_the_papers_loop(system: System, seed: int) -> None:
+def test_the_papers_formula_holds_in_its_loop(system: System, seed: int) -> None:
     """eq:LossEv3, for a continuous trigger; there, the bound of the identity is the smaller one."""
     assert in_continuous_time(system, seed, 0) <= TO_THE_NANOSECOND
-
-
-def test_a_missing_event_left_out_is_caught() -> None:
-    eventful = systems(mismatch=0.5, beta=0.01, mansd=4, n=1)
-    find(
-        st.tuples(eventful, seeds),
-        lambda case: in_continuous_time(*case, forgotten=1) > TO_THE_NANOSECOND,
-        settings=settings(SEARCH, max_examples=60, database=None),
-    )
-
-
-def test_each_missing_event_adds_one_threshold_under_a_hold() -> None:
-    trigger = DecayingTrigger(1.0, math.log(2.0))
-    monitor = ErrorMonitor(np.zeros((2, 2)), trigger)
-    for second in range(4):
-        found = monitor.sample(second * 10**9, np.array([0.5**second, 0.0]), second, -1)
-    assert found.printed == pytest.approx(1 / 8 + 1 + 1 / 2 + 1 / 4 + 1 / 8)
-    assert found.identity == pytest.approx(1 + 1 / 2 + 1 / 4 + 1 / 8)
-    found = monitor.sample(4 * 10**9, np.array([1 / 16, 0.0]), -1, 2)
-    assert found.printed == pytest.approx(1 / 16 + 1 / 8)
-    assert found.identity == pytest.approx(1 / 16 + 1 / 8)
-
-
-def test_thousands_of_missing_events_are_summed_exactly() -> None:
-    """Against the closed form: equal jumps of age 0, 1, … steps, each decayed by its age."""
-    H, step_ns, jump, count = np.array([[-2.0]]), 1_000_000, np.array([0.5]), 3000
-    monitor = ErrorMonitor(H, DecayingTrigger(0.25, 1.0))
-    for k in range(count):
-        found = monitor.sample(k * step_ns, jump, k, -1)
-    shrinks = math.exp(-2.0 * step_ns * NS)
-    identity = 0.5 * (1 - shrinks**count) / (1 - shrinks)
-    now_s = (count - 1) * step_ns * NS
-    ages_s = np.arange(count) * step_ns * NS
-    printed = 0.25 * (math.exp(-now_s) + np.exp(-(now_s - ages_s) - 2 * ages_s).sum())
-    assert found == pytest.approx((identity, printed), rel=1e-9)

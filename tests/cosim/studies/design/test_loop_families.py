@@ -1,0 +1,125 @@
+"""Kinds of loops: regulators, a hold, the schedule, a single state with the worst-case losses."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cosim.simulation.batch.batch_interface import run_batch, setting_of
+from cosim.simulation.continuous.continuous_report import run_continuous
+from cosim.studies.campaign.random_draws import box_of
+from cosim.studies.design.candidate_measures import DesignLimits, certificate_of
+from cosim.studies.design.design_search import design
+from cosim.studies.design.loop_families import families_of, lqr_gain
+from noack.config.named_models import lane_following
+from noack.config.resolution import resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import load
+from noack.core.errors import CallerError
+from noack.core.linear_systems import spectral_abscissa
+from tests.cosim.studies.design.conftest import designed
+from tests.cosim.studies.design.test_command import ONE
+
+
+def largest_errors(scenario: Scenario, seeds: range) -> list[float]:
+    """sup‖e_c‖ over 2,000 times of exact runs, with the scenario's own plants and losses."""
+    found = []
+    for seed in seeds:
+        drawn = scenario.seeds.model_copy(update={"plant": seed, "loss": seed})
+        exact = run_continuous(resolve(scenario.model_copy(update={"seeds": drawn})))
+        samples = exact.at(np.linspace(0.0, 10.0, 2000))
+        found.append(float(np.linalg.norm(samples.e_c, axis=1).max()))
+    return found
+
+
+def test_a_hold_is_designed_like_a_model(mass: Path) -> None:
+    limits = DesignLimits(9.0, 0.8, 0.02, {"error": 0.3})
+    scenario = load(mass, ['mode="zoh"'])
+    found = design(families_of(scenario, ("identity",), None), limits, draws=60, seed=3)
+    assert found.feasible
+    assert found.bounds is not None
+    assert found.scenario.mode == "zoh"
+    setting = replace(setting_of(resolve(found.scenario)), settle=0.02)
+    rows = run_batch(setting, box_of(scenario).population(99, range(400)))
+    assert np.mean(rows["settling_s"] <= 9.0) >= 0.8
+    assert max(largest_errors(found.scenario, range(5))) <= found.bounds["error"] <= 0.3
+
+
+def test_a_bound_under_the_schedule_is_that_of_the_scheduled_certificate(
+    scenario: Scenario,
+) -> None:
+    """A real loop samples, holds and delays, so its certified bound is never smaller."""
+    limits = DesignLimits(9.0, 0.8, 0.02, {"error": 0.2}, schedule=True)
+    found = designed(scenario, limits, draws=60)
+    assert found.feasible
+    scheduled, ideal = (
+        certificate_of(found.scenario, replace(limits, schedule=schedule)).constants
+        for schedule in (True, False)
+    )
+    assert scheduled is not None
+    assert ideal is not None
+    assert scheduled.state > ideal.state
+    assert found.bounds is not None
+    assert found.bounds["state"] == pytest.approx(scheduled.state)
+    assert found.document()["limits"]["under"] == "schedule"
+
+
+def test_without_randomness_every_draw_is_the_exact_run(tmp_path: Path) -> None:
+    path = tmp_path / "one.toml"
+    path.write_text(ONE)
+    families = families_of(load(path), ("identity",), None)
+    found = design(families, DesignLimits(4.0, 0.5, 0.02, {}), draws=20, seed=0)
+    assert found.confirmed
+    assert found.fresh.halfwidth == 0
+    assert found.fresh.settling_high_s == found.fresh.settling_s
+    exact = run_continuous(resolve(found.scenario))
+    assert found.fresh.transmissions == len(exact.event_s)
+    x = exact.at([found.fresh.settling_s]).x
+    assert abs(float(x[0, 0])) == pytest.approx(0.02, rel=1e-6)
+
+
+def test_a_small_quantile_has_the_lower_limit_zero(mass: Path) -> None:
+    found = designed(load(mass), DesignLimits(9.0, 0.02, 0.02, {}), draws=20)
+    assert found.fresh.settling_low_s == 0
+    assert 0 < found.fresh.settling_s <= found.fresh.settling_high_s < math.inf
+
+
+def test_the_gain_comes_from_a_solution_of_the_riccati_equation() -> None:
+    A, B, *_ = lane_following({})
+    Q, R = np.diag([1.0, 2.0, 3.0, 4.0]), np.array([[2.0, 0.5], [0.5, 1.0]])
+    K = lqr_gain(A, B, Q, R)
+    closed = A + B @ K
+    assert spectral_abscissa(closed) < 0
+    # P is the cost of the closed loop by another equation; K must follow from it.
+    cost = Q + K.T @ R @ K
+    n = len(A)
+    lyapunov = np.kron(np.eye(n), closed.T) + np.kron(closed.T, np.eye(n))
+    P = np.linalg.solve(lyapunov, -cost.ravel()).reshape(n, n)
+    np.testing.assert_allclose(R @ K, -B.T @ P, rtol=1e-8, atol=1e-8)
+    residual = A.T @ P + P @ A - P @ B @ np.linalg.solve(R, B.T @ P) + Q
+    np.testing.assert_allclose(residual, 0.0, atol=1e-7)
+
+
+def test_the_double_integrator_has_its_textbook_gain() -> None:
+    A, B = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
+    np.testing.assert_allclose(
+        lqr_gain(A, B, np.eye(2), np.eye(1)), [[-1.0, -np.sqrt(3.0)]], rtol=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    ("A", "Q", "R", "word"),
+    [
+        ([[1, 0], [0, -1]], [[1, 0], [0, 1]], 1, "stabilising"),  # B does not affect state 1
+        ([[0, 1], [0, 0]], [[-1, 0], [0, -1]], 1, "semidefinite"),
+        ([[0, 1], [0, 0]], [[1, 1], [0, 1]], 1, "symmetric"),
+        ([[0, 1], [0, 0]], [[1, 0], [0, 1]], 0, "definite"),
+    ],
+)
+def test_a_system_without_a_regulator_is_refused(
+    A: list[list[float]], Q: list[list[float]], R: float, word: str
+) -> None:
+    with pytest.raises(CallerError, match=word):
+        lqr_gain(np.array(A), np.array([[0.0], [1.0]]), np.array(Q), np.array([[R]]))
