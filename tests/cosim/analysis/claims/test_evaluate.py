@@ -1,6 +1,7 @@
 """Claims against runs: held, violated or void, as constructed; random runs violate none."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,9 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
+from cosim.analysis.claims import catalogue
+from cosim.analysis.claims.claim_definition import CertifiedClaim, ClaimDefinition
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, definitions
 from cosim.analysis.summary_model import Claim, ClaimVerdict
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
@@ -47,6 +50,20 @@ def certified(record: RunRecord) -> dict[str, Claim]:
 
 def from_I1(record: RunRecord) -> list[Claim]:
     return [claim for claim in ClaimEvaluation(record).judge() if claim.source == "(I1)"]
+
+
+DOCS = Path(__file__).parents[4] / "docs" / "record.md"
+
+
+def test_every_file_of_the_catalogue_is_a_claim_that_the_docs_list() -> None:
+    files = {path.stem for path in Path(catalogue.__path__[0]).glob("*.py")} - {"__init__"}
+    rows = {(one.statement, one.source, one.assumes) for one in definitions(ClaimDefinition)}
+    rows |= {(one.statement, "certificate", one.assumes) for one in definitions(CertifiedClaim)}
+    assert len(rows) == len(files)
+    text = DOCS.read_text(encoding="utf-8")
+    section = text[text.index("\n## Claims") : text.index("\n## The summary")]
+    listed = [line.strip("| ").split(" | ") for line in section.splitlines() if " | " in line]
+    assert {tuple(cells) for cells in listed[1:]} == rows
 
 
 # --- held -----------------------------------------------------------------------------------------
