@@ -120,7 +120,7 @@ def test_amplified_rounding_is_reported_and_not_attributed_to_the_run() -> None:
         None,
         f"trigger={policy}",
         'mode="zoh"',
-        "horizon_s=90",
+        "horizon_s=100",
         "plant.rate_hz=40",
         "controller.rate_hz=40",
     )

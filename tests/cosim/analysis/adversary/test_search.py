@@ -38,7 +38,7 @@ def rate_of(resolved: Scenario) -> float | None:
     return None if constants is None else constants.rate_per_s
 
 
-@given(resolved=scenarios(6, mansd=2))
+@given(resolved=scenarios(5, mansd=2))
 @settings(MANY, max_examples=5)
 def test_the_search_finds_the_worst_of_all_patterns(resolved: Scenario) -> None:
     """Also without initial patterns, so that only the tree's own branches can find it."""
