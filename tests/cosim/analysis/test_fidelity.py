@@ -116,14 +116,7 @@ def test_a_negative_share_partly_cancels_the_other_effects() -> None:
 def test_amplified_rounding_is_reported_and_not_attributed_to_the_run() -> None:
     """This rule does not tolerate the losses; a deviation grows between equal events."""
     policy = '{ policy = "dynamic", sigma = 0.2, theta_s = 0.1, decay_per_s = 0.5 }'
-    record = lane(
-        None,
-        f"trigger={policy}",
-        'mode="zoh"',
-        "horizon_s=100",
-        "plant.rate_hz=40",
-        "controller.rate_hz=40",
-    )
+    record = lane(None, f"trigger={policy}", 'mode="zoh"', "horizon_s=100")
     with pytest.raises(IncomparableError, match="turns rounding into another run"):
         compute_fidelity(record)
 
