@@ -68,10 +68,10 @@ def test_fates_and_order_are_the_machines(
             for k, size in enumerate(sizes):
                 clients[k % CLIENTS].sendto(payload_of(k, size), one.address())
             one.settle(len(sizes))
-            came = drain(server)
-            for data, source in came:
+            received = drain(server)
+            for data, source in received:
                 server.sendto(data, source)
-            one.settle(len(came), "reverse")
+            one.settle(len(received), "reverse")
         ports = [name_of(client)[1] for client in clients]
         at_clients = [[data for data, _ in drain(client)] for client in clients]
         events, began_ns = tap.events, one.relay.began_unix_ns
@@ -82,7 +82,7 @@ def test_fates_and_order_are_the_machines(
         for event in events
         if event["departure"] and not event["direction"]
     }
-    for data, (_, port) in came:
+    for data, (_, port) in received:
         by_flow[flow_of[b"\x7f\0\0\1", port]].append(data)
     assert by_flow == replayed(spec, 0, events, tap.payloads, began_ns)
     flow_at = {
@@ -94,7 +94,7 @@ def test_fates_and_order_are_the_machines(
     for port, found in zip(ports, at_clients, strict=True):
         assert found == expected.get(flow_at[port], [])
     departures = events[events["departure"] == 1]
-    assert len(departures) == len(came) + sum(map(len, at_clients))
+    assert len(departures) == len(received) + sum(map(len, at_clients))
 
 
 def payload_of(number: int, size: int) -> bytes:
