@@ -33,6 +33,7 @@ from cosim.simulation.batch.batch_interface import (
     run_events,
     setting_of,
 )
+from cosim.simulation.continuous.continuous_loop import ContinuousLoop
 from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
 from cosim.simulation.continuous.network_fates import network_fates
 from noack.config.feature_kinds import POLICIES
@@ -277,8 +278,8 @@ def simulated(
             A[0], B[0], setting.K, setting.H, A[0], B[0], x0[0], setting.trigger.weight, (), ()
         )
         runs.append(simulate_continuous(
-            loop, setting.trigger, horizon_s=setting.horizon_s, delivered=delivered.tolist(),
-            known_start=setting.known_start,
+            ContinuousLoop(loop, setting.trigger), horizon_s=setting.horizon_s,
+            delivered=delivered.tolist(), known_start=setting.known_start,
         ))  # fmt: skip
     return runs
 

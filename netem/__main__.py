@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
         options, more = joining.parse_known_args(given)
         if not more:
             return join_run("netem", _in_a_run, options)
-        from netem.cli.stand_alone import alone
+        from netem.cli.relay_run import alone
 
         return alone(given)
     except NoackError as error:

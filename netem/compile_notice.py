@@ -13,10 +13,8 @@ from noack.core.code_cache import while_compiling
 def announced(what: str, folder: Path | None, typical_s: float) -> Iterator[None]:
     """Print that code is compiled within the context, and the expected duration.
 
-    Args:
-        what: name of the code.
-        folder: cache folder of the compiled code; None if there is no cache.
-        typical_s: expected duration, until one has been measured on this machine.
+    ``typical_s`` is the duration until one has been measured on this machine; ``folder`` is the
+    cache folder of the compiled code, if there is a cache.
     """
     about_s = typical_s
     # Not in the folder itself: its name changes with the sources.

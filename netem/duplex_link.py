@@ -17,13 +17,7 @@ ACKNOWLEDGEMENT_LINK = "acknowledgement"
 
 
 class Duplex(FixedMachine):
-    """The machine of a network with a reverse direction.
-
-    Args:
-        forward: the link for flow 0.
-        reverse: the link for flow 1.
-        first_number: number of the first input.
-    """
+    """The machine of a network with a reverse direction."""
 
     def __init__(
         self, forward: Machine[Datagram], reverse: Machine[Datagram], *, first_number: int = 0
@@ -62,13 +56,7 @@ class Duplex(FixedMachine):
 def network_of(
     resolved: Scenario, start: Start = BEGINNING, forward: Machine[Datagram] | None = None
 ) -> Machine[Datagram]:
-    """Return the network of a resolved scenario.
-
-    Args:
-        resolved: the scenario.
-        start: where in the run the network starts.
-        forward: replaces the link from sensor to controller.
-    """
+    """Return the network of a resolved scenario; ``forward`` replaces the link of the updates."""
     forward = update_link_of(resolved, start) if forward is None else forward
     if not resolved.protocol.acknowledges:
         return forward

@@ -64,6 +64,7 @@ class Link:
         name: names of the link and the direction; part of its random streams' names.
         decisions: recorded decisions per flow; each flow repeats them before the settings apply.
         first_number: number of the first input and of the first packet.
+        schedule: announced changes of the settings; None: nothing can be announced.
     """
 
     def __init__(
@@ -73,8 +74,11 @@ class Link:
         *name: str,
         decisions: Sequence[Sequence[RecordedDecision]] = (),
         first_number: int = 0,
+        schedule: ChangeSchedule | None = None,
     ) -> None:
-        self._first_delivered = settings.first_delivered
+        self._settings = settings
+        self._schedule = schedule
+        self._reached_ns = -1
         self._seed = seed
         self._name = name
         self._program = program_of(settings, seed, *name, decisions=decisions)
@@ -125,7 +129,7 @@ class Link:
     def change(self, settings: LinkSettings) -> None:
         """Apply other settings; see :mod:`netem.rules.settings_change`."""
         old, before = self._program, self._state
-        self._first_delivered = settings.first_delivered
+        self._settings = settings
         self._program = program_of(settings, self._seed, *self._name, tracks=old.tracks)._replace(
             decisions=old.decisions, decisions_begin=old.decisions_begin
         )
@@ -144,6 +148,17 @@ class Link:
             latest_ns[row] = max(latest_ns[row], leaving.release_ns)
         carry(old, before, self._program, self._state, latest_ns)
 
+    def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
+        """Accept a change; it applies from the first datagram that arrives at or after its time T.
+
+        A smaller cap applies from that datagram on: if the number of consecutive losses before it
+        has reached the new cap, the datagram passes. Hence a loss burst is never longer than the
+        largest cap that applied during it.
+        """
+        assert self._schedule is not None
+        number, self._inputs = self._inputs, self._inputs + 1
+        return self._schedule.announce(NETEM_SETTING, change, number, now_ns, self._reached_ns)
+
     def next_deadline_ns(self) -> int | None:
         """Time of the next departure; None: nothing is in flight."""
         return self._in_flight[0].release_ns if self._in_flight else None
@@ -161,6 +176,8 @@ class Link:
 
     def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
         """Process a datagram; return it if it is neither lost nor delayed."""
+        if self._schedule is not None:
+            self._apply_changes(self._schedule, now_ns)
         decision = self.decide(message.flow, len(message.data), now_ns)
         head = message.data[:PACKET_HEAD_BYTES].ljust(PACKET_HEAD_BYTES, b"\0")
         row = (
@@ -185,6 +202,14 @@ class Link:
         admit(self._program, self._state, row, size_bytes, now_ns, self._decision)
         return self._decision
 
+    def _apply_changes(self, schedule: ChangeSchedule, now_ns: int) -> None:
+        while (change := schedule.take(now_ns)) is not None:
+            first = self._settings.first_delivered  # a restarted emulator has its own value
+            settings = change.prepared.model_copy(update={"first_delivered": first})
+            if settings != self._settings:
+                self.change(settings)
+        self._reached_ns = now_ns
+
     def _release(
         self, message: Datagram, release_ns: int, bit: int, *, copy: bool
     ) -> tuple[Datagram, ...]:
@@ -207,17 +232,11 @@ class Link:
         return (message,)
 
     def _leave(self, leaving: _InFlight) -> bool:
-        return leave(
-            self._state,
-            self._rows[leaving.datagram.flow],
-            leaving.packet,
-            len(leaving.datagram.data),
-            leaving.delayed,
-            leaving.counts,
-        )
+        row, size_bytes = self._rows[leaving.datagram.flow], len(leaving.datagram.data)
+        return leave(self._state, row, leaving.packet, size_bytes, leaving.delayed, leaving.counts)
 
     def _add_flow(self, flow: int) -> int:
-        state = new_flow(flow, self._first_delivered)
+        state = new_flow(flow, self._settings.first_delivered)
         memory, recent_ns = new_memory(self._program), [NEVER_NS] * recent_width(self._program)
         if self._free_rows:
             row = self._free_rows.pop()
@@ -231,56 +250,6 @@ class Link:
         return row
 
 
-class RunLink(Link):
-    """The link from sensor to controller in a run: its settings may change at set times.
-
-    Args:
-        settings: the settings at the start.
-        seed: seed of its random streams.
-        name: names of the link and the direction; part of its random streams' names.
-        schedule: the changes of settings.
-        first_number: number of the first input and of the first packet.
-    """
-
-    def __init__(
-        self,
-        settings: LinkSettings,
-        seed: int,
-        *name: str,
-        schedule: ChangeSchedule,
-        first_number: int = 0,
-    ) -> None:
-        super().__init__(settings, seed, *name, first_number=first_number)
-        self._settings = settings
-        self._schedule = schedule
-        self._reached_ns = -1
-
-    def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
-        """Accept a change; it applies from the first datagram that arrives at or after its time T.
-
-        A smaller cap applies from that datagram on: if the number of consecutive losses before it
-        has reached the new cap, the datagram passes. Hence a loss burst is never longer than the
-        largest cap that applied during it.
-        """
-        number, self._inputs = self._inputs, self._inputs + 1
-        return self._schedule.announce(NETEM_SETTING, change, number, now_ns, self._reached_ns)
-
-    def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
-        """Process a datagram; return it if it is neither lost nor delayed."""
-        if self._schedule.next_ns is not None:
-            while (change := self._schedule.take(now_ns)) is not None:
-                self._apply(change.prepared)
-        self._reached_ns = now_ns
-        return super().handle(message, now_ns)
-
-    def _apply(self, settings: LinkSettings) -> None:
-        first = self._settings.first_delivered  # a restarted emulator has its own value
-        settings = settings.model_copy(update={"first_delivered": first})
-        if settings != self._settings:
-            self._settings = settings
-            self.change(settings)
-
-
 def flipped(data: bytes, bit: int) -> bytes:
     """Return the data with one bit flipped; bit 0 is the least significant bit of byte 0."""
     changed = bytearray(data)
@@ -288,31 +257,23 @@ def flipped(data: bytes, bit: int) -> bytes:
     return bytes(changed)
 
 
-def update_link_of(resolved: Scenario, start: Start = BEGINNING) -> RunLink:
+def update_link_of(resolved: Scenario, start: Start = BEGINNING) -> Link:
     """Return the link from sensor to controller of a resolved scenario."""
-    settings, names = _at_the_start(resolved.network.link, UPDATE_LINK, start)
-    return RunLink(
-        settings, resolved.seeds.loss, *names,
-        schedule=ChangeSchedule(resolved, lambda one: one.network.link),
-        first_number=start.first_number,
-    )  # fmt: skip
+    schedule = ChangeSchedule(resolved, lambda one: one.network.link)
+    return link_of(resolved.network.link, resolved.seeds.loss, UPDATE_LINK, start, schedule)
 
 
-def link_of(settings: LinkSettings, seed: int, name: str, start: Start) -> Link:
-    """Return a link of a run with constant settings."""
-    settings, names = _at_the_start(settings, name, start)
-    return Link(settings, seed, *names, first_number=start.first_number)
-
-
-def _at_the_start(
-    settings: LinkSettings, name: str, start: Start
-) -> tuple[LinkSettings, tuple[str, ...]]:
-    """Return a link's settings and the names of its random streams.
+def link_of(
+    settings: LinkSettings, seed: int, name: str, start: Start,
+    schedule: ChangeSchedule | None = None,
+) -> Link:  # fmt: skip
+    """Return a link of a run.
 
     A restarted emulator has lost its count of consecutive losses. Therefore its first datagram
     passes, and later ones are drawn from other random streams than before.
     """
-    if not start.is_restart:
-        return settings, (name,)
-    again = f"again-{start.generation}"
-    return settings.model_copy(update={"first_delivered": True}), (name, again)
+    names: tuple[str, ...] = (name,)
+    if start.is_restart:
+        names = (name, f"again-{start.generation}")
+        settings = settings.model_copy(update={"first_delivered": True})
+    return Link(settings, seed, *names, first_number=start.first_number, schedule=schedule)

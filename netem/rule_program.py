@@ -31,13 +31,13 @@ def program_of(
     decisions: Sequence[Sequence[RecordedDecision]] = (),
     tracks: bool = False,
 ) -> LinkProgram:
-    """Return the program of one direction of a link.
+    """Return the program of one direction of a link; see :class:`netem.link_machine.Link`.
 
     Args:
-        settings: the settings; they must not name files.
+        settings: the settings.
         seed: seed of its random streams.
-        name: names of the link and the direction; part of its random streams' names.
-        decisions: recorded decisions per flow; each flow repeats them before the settings apply.
+        name: names of the link and the direction.
+        decisions: recorded decisions per flow.
         tracks: packets may be in flight from earlier settings.
 
     Raises:
@@ -67,12 +67,7 @@ def program_of(
 
 
 def stream_names(settings: LinkSettings, *name: str) -> list[tuple[str, ...]]:
-    """Return the names of the random streams of a program's stages, in their order.
-
-    Args:
-        settings: the link's settings.
-        name: names of the link and the direction.
-    """
+    """Return the names of the random streams of a program's stages, in their order."""
     return [stream for _, stream in _stages(settings, StageTables(), name)]
 
 

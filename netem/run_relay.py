@@ -12,24 +12,15 @@ from noack.runtime.udp_sockets import MAX_UDP_BYTES, CountingSocket
 
 
 class RelayShell(CountingSocket[Datagram]):
-    """The channel of a link.
+    """The channel of a link: forwards from source to destination, as flow 0.
 
-    Args:
-        endpoint: a bound socket, from :func:`noack.runtime.udp_sockets.bind`.
-        destination: where surviving datagrams go.
-        source: datagrams from here are forwarded, as flow 0; other senders are ignored.
-        duplex: datagrams from the destination are forwarded to the source, as flow 1.
+    If it is duplex, also from destination to source, as flow 1. Other senders are ignored.
     """
 
     most_bytes = MAX_UDP_BYTES
 
     def __init__(
-        self,
-        endpoint: socket.socket,
-        destination: Address,
-        source: Address,
-        *,
-        duplex: bool = False,
+        self, endpoint: socket.socket, destination: Address, source: Address, *, duplex: bool
     ) -> None:
         self._flows = {source: 0, destination: 1} if duplex else {source: 0}
         self._back = {1: source} if duplex else {}

@@ -1,14 +1,12 @@
 """Check the theory's identities and claims on the whole loop in virtual time."""
 
 import itertools
-import math
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
@@ -26,7 +24,6 @@ from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
     NO_SEQUENCE,
-    PLANT_STEP,
     SENSOR_MEASUREMENT,
     tables,
 )
@@ -129,7 +126,7 @@ class Case(NamedTuple):
 
 
 @st.composite
-def cases(draw: st.DrawFn, *, delayed: bool) -> Case:
+def cases(draw: st.DrawFn) -> Case:
     n, m = draw(st.integers(1, 5)), draw(st.integers(1, 3))
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     A, B, K = rng.uniform(-1, 1, (n, n)), rng.uniform(-1, 1, (n, m)), rng.uniform(-1, 1, (m, n))
@@ -148,7 +145,7 @@ def cases(draw: st.DrawFn, *, delayed: bool) -> Case:
         phase_ns=draw(st.integers(0, PERIOD_NS - 1)),
         beta=draw(st.sampled_from([1e-6, 0.003, 0.03, 0.3])),
         lost=draw(st.lists(st.booleans(), min_size=1, max_size=12)),
-        delays_ns=draw(delays) if delayed else [0],
+        delays_ns=draw(st.one_of(st.just([0]), delays)),
     )
 
 
@@ -196,39 +193,16 @@ def check_identity(case: Case) -> int:
     return compared
 
 
-@given(cases(delayed=False))
-def test_the_models_differ_by_the_missed_jumps(case: Case) -> None:
+@given(cases())
+def test_the_models_differ_by_the_missed_jumps_whatever_the_network_does(
+    case: Case,
+) -> None:
     compared = check_identity(case)
     if case.known:  # all steps, measurements and ticks from the first measurement on
         assert compared > 2 * STEPS
 
 
-@given(cases(delayed=True))
-def test_the_models_differ_by_the_missed_jumps_in_a_network_that_delays_and_reorders(
-    case: Case,
-) -> None:
-    check_identity(case)
-
-
-@pytest.mark.parametrize(
-    ("known", "lost"), [(True, [True]), (True, [True, True, False]), (False, [False, True])]
-)
-def test_the_identity_is_compared_at_every_sample(known: bool, lost: list[bool]) -> None:
-    """``check_identity`` compares all samples except those before a common start."""
-    A, B, K = np.array([[0.0, 1.0], [0.5, 0.0]]), np.array([[0.0], [1.0]]), np.array([[-1.0, -2.0]])
-    case = Case(A, B, K, A + B @ K + 0.1, np.ones(2), known, PERIOD_NS // 2, 1e-3, lost, [0])
-    loop = case.shuttle()
-    happened = sum(1 for _ in loop.run())
-    # Not compared: the first step, its measurement, and the update in the network.
-    assert happened - check_identity(case) <= 3
-    assert len(loop.rows[SENSOR_MEASUREMENT]) == STEPS + 1
-    events = sum(row["event"] != NO_SEQUENCE for row in loop.rows[SENSOR_MEASUREMENT])
-    assert events > 10
-    expected = 0 if lost == [True] else events // len(lost)
-    assert abs(len(loop.rows[CONTROLLER_DELIVERY]) - expected) <= 1
-
-
-@given(cases(delayed=True))
+@given(cases())
 def test_nothing_flows_from_the_controller_to_the_sensor(case: Case) -> None:
     loop = case.shuttle()
     for _ in loop.run():
@@ -267,7 +241,7 @@ def test_no_process_of_the_ordinary_loop_accepts_acknowledgements() -> None:
         assert ear.rejected[Rejection.LENGTH] == 1
 
 
-@given(cases(delayed=True))
+@given(cases())
 def test_an_overtaken_update_is_discarded_and_counted_as_dropped(case: Case) -> None:
     loop = case.shuttle()
     for _ in loop.run():
@@ -280,42 +254,6 @@ def test_an_overtaken_update_is_discarded_and_counted_as_dropped(case: Case) -> 
     ]
     rejected = loop.decoders["controller"].rejected
     assert sum(rejected.values()) == rejected[Rejection.STALE]
-
-
-def test_a_linear_loop_without_losses_is_a_linear_recursion() -> None:
-    """The model is exact, so no event occurs; compare x(t_k) with the exact discretisation.
-
-    A scalar plant ẋ = x + u with u = −3 x_c; ticks coincide with the plant's steps. The plant
-    latches the input of tick k at step k + 1 and applies it from then on.
-    """
-    a, b, k, x0 = 1.0, 1.0, -3.0, 2.0
-    h = PERIOD_NS * 1e-9
-    plant = linear_plant(
-        np.array([[a]]), np.array([[b]]), np.array([x0]), horizon_ns=STEPS * PERIOD_NS
-    )
-    H = np.array([[a + b * k]])
-    sensor = Sensor(H, DecayingTrigger(10.0, 1e-3), np.array([x0]))  # no event occurs
-    controller = Controller(
-        H,
-        LinearFeedback(np.array([[k]])),
-        inputs=1,
-        period_ns=PERIOD_NS,
-        phase_ns=0,
-        horizon_ns=STEPS * PERIOD_NS,
-        mansd=0,
-        x0=np.array([x0]),
-    )
-    loop = Loop(plant, sensor, controller, 1, 1, lambda data, now_ns: 0)
-    for _ in loop.run():
-        pass
-    found = [row["x"].item() for row in loop.rows[PLANT_STEP]]
-    x, u, expected = x0, 0.0, []
-    for step in range(STEPS + 1):
-        expected.append(x)
-        x = math.exp(a * h) * x + math.expm1(a * h) / a * b * u
-        u = k * x0 * math.exp((a + b * k) * step * h)
-    np.testing.assert_allclose(found, expected, rtol=1e-12)
-    assert loop.rows[CONTROLLER_DELIVERY] == []
 
 
 def papers_example(mode: str) -> RunRecord:

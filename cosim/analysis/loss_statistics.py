@@ -59,14 +59,14 @@ def unintended_losses(record: RunRecord) -> dict[str, int]:
     legs = {
         "measurement": (sent[sent % every == 0] // every, sensor["sequence"]),
         "update to netem": (sensor["event"][sensor["event"] != NO_SEQUENCE], outcomes.sequence),
-        "update to controller": (outcomes.sequence[outcomes.left], received),
+        "update to controller": (outcomes.sequence[outcomes.forwarded], received),
         "actuation": (record[CONTROLLER_STEP]["sequence"], record[PLANT_ACTUATION]["sequence"]),
     }
     if record.scenario.protocol.acknowledges:
         answers = packet_outcomes(record, Flow.ACKNOWLEDGEMENT)
         arrived = record[SENSOR_ACKNOWLEDGEMENT]["sequence"]
         legs["acknowledgement to netem"] = (received, answers.sequence)
-        legs["acknowledgement to sensor"] = (answers.sequence[answers.left], arrived)
+        legs["acknowledgement to sensor"] = (answers.sequence[answers.forwarded], arrived)
     complete = all(record.reports.get(role, {}).get("ended") == HORIZON for role in LOOP_ROLES)
     lost: dict[str, int] = {}
     for leg, (out, arrived) in legs.items():

@@ -6,27 +6,17 @@ function imports these modules when it is first called.
 
 from importlib.metadata import version
 
-from cosim.api.certificates import certify
-from cosim.api.runs import Run, compare, open_run, run, simulate
-from cosim.api.scenarios import from_system, load, with_settings
-from cosim.output.certificate_report import Certificates
-from noack.config.scenario import Scenario
-from noack.core.errors import NoackError
+from cosim.api.certificates import certify as certify
+from cosim.api.runs import Run as Run
+from cosim.api.runs import compare as compare
+from cosim.api.runs import open_run as open_run
+from cosim.api.runs import run as run
+from cosim.api.runs import simulate as simulate
+from cosim.api.scenarios import from_system as from_system
+from cosim.api.scenarios import load as load
+from cosim.api.scenarios import with_settings as with_settings
+from cosim.output.certificate_report import Certificates as Certificates
+from noack.config.scenario import Scenario as Scenario
+from noack.core.errors import NoackError as NoackError
 
 __version__ = version("noack")
-
-__all__ = [
-    "Certificates",
-    "NoackError",
-    "Run",
-    "Scenario",
-    "__version__",
-    "certify",
-    "compare",
-    "from_system",
-    "load",
-    "open_run",
-    "run",
-    "simulate",
-    "with_settings",
-]

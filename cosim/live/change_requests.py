@@ -22,12 +22,7 @@ _MILLISECOND_NS = 1_000_000
 
 
 class ChangeRequests:
-    """The changes of a run.
-
-    Args:
-        ticket: the run's ticket; the changes in its scenario are taken first.
-        plane: where changes are announced.
-    """
+    """The changes of a run."""
 
     def __init__(self, ticket: Ticket, plane: ControlPlane) -> None:
         self._scenario, self._run_dir = ticket.scenario, ticket.run_dir
@@ -39,12 +34,7 @@ class ChangeRequests:
             self._add(change, 0, "in the scenario")
 
     def answer(self, request: bytes, now_ns: int, obstacle: str | None) -> dict[str, Any]:
-        """Announce the requested change, if any; return the parameters.
-
-        Args:
-            request: the message.
-            now_ns: simulated time.
-            obstacle: why the run cannot be changed now; None if it can.
+        """Announce the requested change, unless there is an obstacle; return the parameters.
 
         Raises:
             CallerError: the settings cannot be changed, or not now.

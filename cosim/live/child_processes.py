@@ -41,10 +41,7 @@ Failure = tuple[ExitStatus, str]
 class ChildProcesses:
     """The launched processes of a run, by role.
 
-    Args:
-        ticket: each process receives it on its standard input, which stays open as a lifeline.
-        run_dir: holds their logs.
-        roles: which processes to launch.
+    Each receives the ticket on its standard input, which stays open as a lifeline.
     """
 
     def __init__(self, ticket: Ticket, run_dir: Path, roles: Sequence[str]) -> None:
@@ -56,9 +53,6 @@ class ChildProcesses:
     @contextmanager
     def started(self, *, live: bool) -> Iterator[None]:
         """Start the processes; end all of them with the context.
-
-        Args:
-            live: whether the recorder also opens a viewer.
 
         Raises:
             MachineError: a process cannot be started.
@@ -94,11 +88,7 @@ class ChildProcesses:
         return child is not None and child.poll() in (ExitStatus.FAILED, ExitStatus.CALLER)
 
     def failures(self, reported: Callable[[str], str | None]) -> dict[str, Failure]:
-        """How launched processes failed, by role.
-
-        Args:
-            reported: returns what a process reported to the coordinator, if it did.
-        """
+        """How launched processes failed, by role."""
         codes = {role: child.poll() for role, child in self._children.items()}
         return {role: self._failure(role, code, reported) for role, code in codes.items() if code}
 

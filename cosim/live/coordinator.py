@@ -58,9 +58,6 @@ class _Member(LifeCycle):
 class Coordinator:
     """Admission, start barrier, liveliness and stop of one run.
 
-    Args:
-        ticket: the run's ticket; its endpoint is listened on.
-
     Raises:
         PeerError: the endpoint cannot be listened on.
     """

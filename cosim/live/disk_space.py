@@ -41,10 +41,6 @@ def needed_bytes(resolved: Scenario) -> int:
 def require_disk_space(resolved: Scenario, runs: Path) -> None:
     """Check that a run's record fits on the disk; warn if it may not.
 
-    Args:
-        resolved: the resolved scenario.
-        runs: where the run directory will be made; it need not exist.
-
     Raises:
         MachineError: the record needs more than the free space.
     """

@@ -27,17 +27,14 @@ from cosim.record.run_directory import (
 )
 from cosim.record.run_ending import EndingFile, RunEnding
 from cosim.record.run_record import RunRecord, finish_record, load_record
-from noack.core.errors import CallerError, ExitStatus, MachineError, why
+from noack.core.errors import CallerError, ExitStatus, MachineError
+from noack.core.file_access import write_whole
 from noack.runtime.spool import SPOOL
 
 
 @np.errstate(all="ignore")
 def finalize(ending: RunEnding, *, report: bool = True) -> Outcome:
     """Complete the record of a run; write its summary and report.
-
-    Args:
-        ending: how the run ended.
-        report: whether to write the report.
 
     Raises:
         CallerError: the run is still under way.
@@ -90,30 +87,23 @@ def _with_reason(ending: RunEnding) -> Iterator[None]:
 
 
 def _write_summary(run_dir: Path, summary: RunSummary) -> None:
-    path = run_dir / SUMMARY_FILE
-    scratch = path.with_suffix(".partial")
     try:
-        scratch.write_text(summary.model_dump_json(indent=2), encoding="utf-8")
-        scratch.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            scratch.unlink(missing_ok=True)
-        raise MachineError(
-            f"{path}: cannot be written: {why(error)}; try `noack summary {run_dir}` later"
-        ) from None
+        write_whole(run_dir / SUMMARY_FILE, summary.model_dump_json(indent=2))
+    except MachineError as error:
+        raise MachineError(f"{error}; try `noack summary {run_dir}` later") from None
 
 
 def _with_results(record: RunRecord, claims: RunClaims, summary: RunSummary) -> RunSummary:
     """Add the results of replay, fidelity and claims; a failure of one is a line or a warning."""
-    found: dict[str, Any] = {"fidelity": fidelity_for_summary(record)}
+    results: dict[str, Any] = {"fidelity": fidelity_for_summary(record)}
     if record.kind == "live":
         try:
-            found["replay"] = replay(record).verdict()
+            results["replay"] = replay(record).verdict()
         except Exception as error:  # the run itself did not fail
-            found["replay"] = {"bit_exact": None, "error": repr(error)}
-        found["exit"] = _exit(summary.exit, found["replay"])
+            results["replay"] = {"bit_exact": None, "error": repr(error)}
+        results["exit"] = _exit(summary.exit, results["replay"])
     try:
-        found["linearisation"] = linearisation(record.scenario)
+        results["linearisation"] = linearisation(record.scenario)
     except Exception as error:  # likewise
         print(f"noack: warning: the plant was not linearised: {error!r}", file=sys.stderr)
     try:
@@ -121,7 +111,7 @@ def _with_results(record: RunRecord, claims: RunClaims, summary: RunSummary) -> 
         longest = summary.longest_loss_burst
         if summary.unintended_losses:
             longest = max(longest, int(claims.conditions["dropouts"] or 0))
-        found |= {
+        results |= {
             "conditions": claims.conditions,
             "claims": claims.judge(),
             "judged_until_s": claims.judged_until_s,
@@ -130,7 +120,7 @@ def _with_results(record: RunRecord, claims: RunClaims, summary: RunSummary) -> 
         }
     except Exception as error:  # likewise
         print(f"noack: warning: the claims were not judged: {error!r}", file=sys.stderr)
-    return summary.with_results(**found)
+    return summary.with_results(**results)
 
 
 def _exit(end: ExitPart, replayed: dict[str, Any]) -> ExitPart:

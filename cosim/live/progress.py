@@ -31,13 +31,7 @@ class PatientConsole(Console):
 def progress_line(
     console: Console, scenario: Scenario, session: str | None = None
 ) -> Iterator[Watcher]:
-    """Show the progress of a run while the context lasts.
-
-    Args:
-        console: where to show it.
-        scenario: the run's.
-        session: its session name, for processes started by hand.
-    """
+    """Show the progress of a run while the context lasts."""
     live = console.is_terminal and not console.is_dumb_terminal
     columns = (BarColumn(bar_width=12), TextColumn("{task.description}"))
     with Progress(*columns, console=console, disable=not live, transient=False) as progress:

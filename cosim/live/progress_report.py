@@ -17,11 +17,7 @@ from noack.protocol.record_tables import (
 
 
 class ProgressReport:
-    """Fields of :class:`noack.runtime.control_messages.RunProgress`.
-
-    Args:
-        live: where the live viewer shows the run; None without one.
-    """
+    """Fields of :class:`noack.runtime.control_messages.RunProgress`."""
 
     def __init__(self, live: str | None) -> None:
         self._fields: dict[str, Any] = {
@@ -48,12 +44,12 @@ class ProgressReport:
         elif table == CONTROLLER_DELIVERY:
             fields["deliveries"] += len(rows)
             # Includes stale updates, which the emulator cannot know in advance.
-            self._see_losses(rows["dropouts"])
+            self._count_losses(rows["dropouts"])
         elif table == NETEM_PACKET:
             rows = updates_in(rows)[0]
-            self._see_losses(rows["consecutive_losses"][~effective(rows["fate"])])
+            self._count_losses(rows["consecutive_losses"][~effective(rows["fate"])])
 
-    def _see_losses(self, consecutive: NDArray[np.int64]) -> None:
+    def _count_losses(self, consecutive: NDArray[np.int64]) -> None:
         longest = int(consecutive.max(initial=0))
         self._fields["longest_loss_burst"] = max(self._fields["longest_loss_burst"], longest)
 

@@ -23,15 +23,7 @@ class _Failed(NamedTuple):
 
 
 class RestartPolicy:
-    """Follows the failures of a run's processes.
-
-    Args:
-        scenario: the run's.
-        coordinator: knows the life cycle of each process.
-        children: the launched processes.
-        on_failure: called with reason, simulated time in s, and the role to restart by hand.
-        on_restart: called with role and simulated time in s.
-    """
+    """Follows the failures of a run's processes."""
 
     def __init__(
         self,
@@ -95,15 +87,15 @@ class RestartPolicy:
     def _failures(self, exited: dict[str, Failure]) -> dict[str, Failure]:
         """Failures that are not being waited for, by role."""
         running = self._children.running()
-        seen = {
+        failures = {
             role: (ExitStatus.FAILED, why)
             for role, why in self._coordinator.failures().items()
             # The exit status of a launched process explains more than its report.
             if not (role in running and self._coordinator.is_exiting(role))
         }
         if self._is_past_horizon() and RECORDER in running:
-            seen.pop(RECORDER, None)  # sorting a long record, it may not respond
-        return {role: one for role, one in (seen | exited).items() if role not in self._failed}
+            failures.pop(RECORDER, None)  # sorting a long record, it may not respond
+        return {role: one for role, one in (failures | exited).items() if role not in self._failed}
 
     def _is_past_horizon(self) -> bool:
         return self._coordinator.now_ns() >= self._scenario.timing.horizon_ns

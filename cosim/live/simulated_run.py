@@ -3,8 +3,8 @@
 import json
 import secrets
 import shutil
+from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
 
 from cosim.record.environment import write_environment
 from cosim.record.run_directory import (
@@ -20,21 +20,14 @@ from cosim.simulation.virtual_time import Progress, simulate
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import ExitStatus, MachineError, why
+from noack.core.file_access import write_whole
 from noack.runtime.life_cycle import HORIZON
-
-
-class Simulator(Protocol):
-    """Turns a resolved scenario into the record of a run."""
-
-    def __call__(self, resolved: Scenario, *, progress: Progress | None) -> RunRecord:
-        """Simulate the run; report the simulated time to ``progress``."""
-        ...
 
 
 def simulate_run(
     scenario: Scenario,
     runs: Path,
-    simulator: Simulator = simulate,
+    simulator: Callable[..., RunRecord] = simulate,
     progress: Progress | None = None,
     *,
     view: bool = True,
@@ -46,7 +39,7 @@ def simulate_run(
     Args:
         scenario: as loaded; it is resolved here.
         runs: where run directories are made.
-        simulator: produces the record.
+        simulator: makes the record from the resolved scenario and ``progress``.
         progress: called with the simulated time.
         view: whether to write the recording for the viewer.
 
@@ -62,8 +55,7 @@ def simulate_run(
             resolved = write_scenario(resolved, run_dir)
             write_environment(run_dir, "simulated")
             record = simulator(resolved, progress=progress)
-            reports = json.dumps(record.reports, indent=2)
-            (run_dir / REPORTS_FILE).write_text(reports, encoding="utf-8")
+            write_whole(run_dir / REPORTS_FILE, json.dumps(record.reports, indent=2))
             write_record(record, run_dir)
             if view:
                 from cosim.output.viewer.run_view import write_view  # imports rerun

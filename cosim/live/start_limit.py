@@ -19,12 +19,7 @@ def _cores() -> int:
 
 @dataclass
 class StartLimit:
-    """The time that the processes of a run have to get ready.
-
-    Args:
-        within_s: limit on an idle machine, in seconds.
-        cores: cores that the launcher may use.
-    """
+    """The time that the processes of a run have to get ready."""
 
     within_s: float
     cores: int = field(default_factory=_cores)

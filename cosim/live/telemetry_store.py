@@ -83,11 +83,7 @@ class TelemetryStore:
         self._writer.append(notices_of(RECORDER), 0, payload)
 
     def load(self, on_rows: Callable[[str, Rows], None]) -> None:
-        """Read what an earlier recorder of this run has stored.
-
-        Args:
-            on_rows: called with each batch, by table.
-        """
+        """Read what an earlier recorder of this run has stored."""
         for table, dtype in self.types.items():
             for first, data in read_chunks(self._folder, table):
                 if len(data) and len(data) % dtype.itemsize == 0:

@@ -283,9 +283,9 @@ def _print_constants(console: Console, found: Certificates) -> None:
         table.add_row(label, *values, *([of_theorem] if printed else []))
     console.print(table)
     console.print(
-        "[dim]All bounds are multiplied by e^(−rate·t). paper: no sampling, no delay, no hold. "
-        "schedule: the scenario's rates, plus the lateness that it allows. plant: the scenario's "
-        "plant. box: every plant of the uncertainty box.[/]"
+        "[dim]Each bound of a norm is multiplied by e^(−rate·t). paper: no sampling, no delay, no "
+        "hold. schedule: the scenario's rates, plus the lateness that it allows. plant: the "
+        "scenario's plant. box: every plant of the uncertainty box.[/]"
     )
     for under, certificate in found:
         if certificate.void:

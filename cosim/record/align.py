@@ -223,15 +223,11 @@ def align_tables(record: RunRecord) -> AlignedRun:
 
 
 def identity_residual(record: RunRecord, joined: AlignedRun) -> Reals:
-    """Return the largest entry of |x_c − x_s − Σ e^{H(t−t_k)} e_s(t_k⁻)| by measurement, (k,).
+    """Return max |x_c − x_s − Σ e^{H(t−t_k)} e_s(t_k⁻)| at each measurement, (k,).
 
     This is the residual of (I1). It is zero up to rounding on every run, for all losses. It is NaN
     if x_c is not recorded, and before the first delivery unless x(0) is known. In a run with
     acknowledgements all are NaN, since (I1) assumes that x_s is reset at every event.
-
-    Args:
-        record: the run.
-        joined: the run, aligned.
     """
     residual = np.full(len(joined.t_ns), np.nan)
     if record.scenario.protocol.acknowledges:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from cosim.record.run_directory import ENVIRONMENT_FILE, read_object
+from noack.core.file_access import write_whole
 
 Kind = Literal["live", "simulated"]
 """Whether a run used processes (live) or virtual time (simulated)."""
@@ -35,21 +36,20 @@ def environment(kind: Kind) -> dict[str, Any]:
 
 def write_environment(run_dir: Path, kind: Kind) -> None:
     """Write ``environment.json`` into a run directory."""
-    content = json.dumps(environment(kind), indent=2)
-    (run_dir / ENVIRONMENT_FILE).write_text(content, encoding="utf-8")
+    write_whole(run_dir / ENVIRONMENT_FILE, json.dumps(environment(kind), indent=2))
 
 
 def kind_of(run_dir: Path) -> Kind:
-    """Return the kind of a run from its environment file; old runs have no entry for it."""
-    said = read_object(run_dir / ENVIRONMENT_FILE)
-    return "simulated" if said.get("kind") == "simulated" else "live"
+    """Return the kind of a run from its environment file; live if the file is missing."""
+    stored = read_object(run_dir / ENVIRONMENT_FILE)
+    return "simulated" if stored.get("kind") == "simulated" else "live"
 
 
 def changed_since(run_dir: Path) -> list[str]:
     """Return the changes since the run that may affect its arithmetic, in words."""
     then, now = read_object(run_dir / ENVIRONMENT_FILE), environment("live")
-    said = then.get("packages")
-    packages = said if isinstance(said, dict) else {}
+    packages = then.get("packages")
+    packages = packages if isinstance(packages, dict) else {}
     pairs = [
         *((key, then.get(key), now[key]) for key in ("python", "machine", "processor")),
         *((name, packages.get(name), now["packages"][name]) for name in _ARITHMETIC),

@@ -17,10 +17,7 @@ Reals = NDArray[np.float64]
 def true_states(steps: Rows, t_ns: NDArray[np.int64], column: str = "x") -> Reals:
     """Return the plant's own state at some times, (k, n); NaN if its row is missing.
 
-    Args:
-        steps: rows of ``plant_step``, ordered.
-        t_ns: (k,) times of measurements.
-        column: ``x``, or ``z`` for the whole state of a nonlinear plant.
+    ``column`` of ``plant_step`` is ``x``, or ``z`` for the whole state of a nonlinear plant.
     """
     found = np.full((len(t_ns), steps[column].shape[1]), np.nan)
     if len(steps):

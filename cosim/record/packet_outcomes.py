@@ -29,7 +29,7 @@ class PacketOutcome(NamedTuple):
     """Not yet forwarded when the run ended."""
 
     @property
-    def left(self) -> NDArray[np.bool_]:
+    def forwarded(self) -> NDArray[np.bool_]:
         """Forwarded intact, and before every newer update."""
         return ~self.lost & ~self.in_flight
 
@@ -47,14 +47,14 @@ def packet_outcomes(record: RunRecord, flow: Flow = Flow.UPDATE) -> PacketOutcom
     rows, sequence, event_ns = updates_in(record[NETEM_PACKET], flow)
     releases = record[NETEM_RELEASE]
     if record.scenario.protocol.acknowledges:
-        number = ACKNOWLEDGEMENTS if flow is Flow.ACKNOWLEDGEMENT else UPDATES
-        releases = releases[releases["flow"] == number]
+        direction = ACKNOWLEDGEMENTS if flow is Flow.ACKNOWLEDGEMENT else UPDATES
+        releases = releases[releases["flow"] == direction]
     # Of a datagram and its copy, the first intact one counts; it may be the copy.
     which = (rows["bit"] >= 0).astype(np.int64)
     numbers = 2 * rows["sequence"] + which
-    left = 2 * releases["sequence"] + releases["copy"]
+    forwarded = 2 * releases["sequence"] + releases["copy"]
     effectively = effective(rows["fate"])
-    stale = np.isin(numbers, left[releases["stale"] != 0])
+    stale = np.isin(numbers, forwarded[releases["stale"] != 0])
     delayed = np.where(which == 1, rows["copy_ns"], rows["release_ns"]) > rows["now_ns"]
-    in_flight = effectively & delayed & ~np.isin(numbers, left)
+    in_flight = effectively & delayed & ~np.isin(numbers, forwarded)
     return PacketOutcome(rows, sequence, event_ns, ~effectively | stale, in_flight)

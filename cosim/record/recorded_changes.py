@@ -72,12 +72,7 @@ def changes_of(record: RunRecord) -> list[RecordedChange]:
 
 
 def model_flow(scenario: Scenario, received: Rows) -> ModelFlow:
-    """The flow of the controller's model in a run, with its set-points.
-
-    Args:
-        scenario: the resolved scenario.
-        received: rows of ``controller_setting``.
-    """
+    """The flow of the controller's model in a run, with its set-points."""
     loop, schedule = loop_of(scenario), ChangeSchedule(scenario)
     flow, known = ModelFlow(loop.H, (), loop.setpoint), set()
     for change, since_ns in _changes_in(received):
@@ -90,11 +85,7 @@ def model_flow(scenario: Scenario, received: Rows) -> ModelFlow:
 
 
 def claimed_until_s(received: Rows) -> float:
-    """Return the time of the change that ends the claims at the start of a run; infinite if none.
-
-    Args:
-        received: rows of one of the tables of changes.
-    """
+    """Return the time of the first change of a table that ends the claims; infinite if none."""
     ends_ns = [
         change.t_ns for change, _ in _changes_in(received) if not is_of_loss_alone(change.settings)
     ]

@@ -14,7 +14,7 @@ from typing import Any
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import dumps
 from noack.core.errors import CallerError, MachineError, why
-from noack.core.file_access import locked, read_regular
+from noack.core.file_access import locked, read_regular, write_whole
 from noack.settings.named_file import file_tables, unchanged, with_tables
 
 DEFAULT_RUNS = Path("runs")
@@ -45,8 +45,8 @@ def new_run_dir(runs: Path, name: str) -> Path:
         free_bytes = shutil.disk_usage(runs).free
         if free_bytes < LEAST_FREE_BYTES:
             raise MachineError(
-                f"{runs}: only {free_bytes // 1024} KiB are free on the disk; a run wants "
-                f"{LEAST_FREE_BYTES // 2**20} MiB at the least"
+                f"{runs}: only {free_bytes // 1024} KiB are free on the disk; a run needs "
+                f"at least {LEAST_FREE_BYTES // 2**20} MiB"
             )
         for attempt in range(1000):
             run_dir = runs / (f"{stamp}-{name}" + (f"-{attempt}" if attempt else ""))
@@ -70,7 +70,7 @@ def write_scenario(resolved: Scenario, run_dir: Path) -> Scenario:
 
     Raises:
         CallerError: a file has changed since the scenario was loaded.
-        OSError: the directory cannot be written.
+        MachineError, OSError: the directory cannot be written.
     """
     relative, absolute = {}, {}
     for place, table in file_tables(resolved):
@@ -80,18 +80,17 @@ def write_scenario(resolved: Scenario, run_dir: Path) -> Scenario:
         shutil.copyfile(file, run_dir / name)
         relative[place] = table.model_copy(update={"file": name})
         absolute[place] = table.model_copy(update={"file": str((run_dir / name).absolute())})
-    text = dumps(with_tables(resolved, relative))
-    (run_dir / SCENARIO_FILE).write_text(text, encoding="utf-8")
+    write_whole(run_dir / SCENARIO_FILE, dumps(with_tables(resolved, relative)))
     return with_tables(resolved, absolute)
 
 
 def read_object(path: Path) -> dict[str, Any]:
     """Return the object of a JSON file of a run; empty if the file is missing or damaged."""
     try:
-        found = json.loads(read_regular(path, _MOST_JSON_BYTES))
+        content = json.loads(read_regular(path, _MOST_JSON_BYTES))
     except (OSError, ValueError, RecursionError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return content if isinstance(content, dict) else {}
 
 
 def point_to_latest(run_dir: Path) -> None:

@@ -34,9 +34,6 @@ class EndingFile:
 
     As a context manager it stores the error that leaves the context, unless an end is stored.
 
-    Args:
-        run_dir: the run's directory.
-
     Raises:
         MachineError: the file cannot be written.
     """

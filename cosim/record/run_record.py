@@ -23,6 +23,7 @@ from noack.config.resolution import LoopMatrices, loop_of, tables_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, MachineError, PeerError, one_line, why
+from noack.core.file_access import write_whole
 from noack.protocol.machine_interface import GENERATION, RESTART
 from noack.protocol.record_tables import OWNER, entry_names
 from noack.protocol.topology import LOOP_ROLES, RECORDER
@@ -129,9 +130,6 @@ def generations(owned: Mapping[str, Rows]) -> list[int]:
     """Return the generations of a role that wrote rows, from the number of each one's first input.
 
     If that row is missing, the rows of a later generation prove that there were earlier ones.
-
-    Args:
-        owned: the rows of the role's tables.
     """
     inputs = np.concatenate([rows["input"] for rows in owned.values()])
     first = inputs[(inputs % GENERATION == 0) & (inputs > 0)] // GENERATION
@@ -204,12 +202,7 @@ def finish_record(run_dir: Path) -> RunRecord:
 
 
 def merge_rows(parts: Sequence[Rows], dtype: np.dtype[np.void]) -> Rows:
-    """Return the rows of a table in the order of the machine's inputs, without duplicates.
-
-    Args:
-        parts: batches, in any order.
-        dtype: the table's row type.
-    """
+    """Return the rows of a table in the order of the machine's inputs, without duplicates."""
     rows = np.concatenate([np.zeros(0, dtype), *parts])
     _, first = np.unique(rows["input"], return_index=True)
     return rows[first]
@@ -222,24 +215,20 @@ def updates_in(
 
     The emulator reads no payload, so the packets' headers are read here.
 
-    Args:
-        packets: rows of ``netem_packet``.
-        flow: the flow to select.
-
     Returns:
         Their rows of ``netem_packet``, sequence numbers and event times.
     """
-    kept, sequences, events_ns = [], [], []
+    indices, sequences, events_ns = [], [], []
     for i, head in enumerate(packets["head"]):
         header = read_header(head.tobytes())
         if header is None or (header.version, header.flow) != (VERSION, flow):
             continue
         if header.sequence < 2**63 and header.t_ns >= 0:  # others do not fit the record's columns
-            kept.append(i)
+            indices.append(i)
             sequences.append(header.sequence)
             events_ns.append(header.t_ns)
     return (
-        packets[kept],
+        packets[indices],
         np.array(sequences, dtype=np.int64),
         np.array(events_ns, dtype=np.int64),
     )
@@ -278,20 +267,15 @@ def _read_notices(folder: Path) -> list[dict[str, Any]]:
         raise CallerError(f"{path}: cannot be read: {error}") from None
 
 
-def report_of(role: str, said: bytes | str, tables: Iterable[str]) -> dict[str, Any]:
+def report_of(role: str, text: bytes | str, tables: Iterable[str]) -> dict[str, Any]:
     """Return a process's final report from its JSON.
-
-    Args:
-        role: the process.
-        said: the JSON text.
-        tables: the run's tables.
 
     Raises:
         PeerError: the text is no report, or has no entry for a table of the process.
     """
-    report = parse_message(ProcessReport, said)
+    report = parse_message(ProcessReport, text)
     if not report["rows"].keys() >= {table for table in tables if OWNER[table] == role}:
-        raise PeerError("the report does not say how many rows there are")
+        raise PeerError("the report lacks the number of rows of a table")
     return report
 
 
@@ -305,11 +289,7 @@ def write_reports(run_dir: Path, reports: Iterable[Mapping[str, Any]]) -> None:
     newest = {report["process"]: report for report in in_order}
     earlier = [report for report in in_order if report is not newest[report["process"]]]
     content = newest | ({_EARLIER: earlier} if earlier else {})
-    path = run_dir / REPORTS_FILE
-    try:
-        path.write_text(json.dumps(content, indent=2), encoding="utf-8")
-    except OSError as error:
-        raise MachineError(f"{path}: cannot be written: {why(error)}") from None
+    write_whole(run_dir / REPORTS_FILE, json.dumps(content, indent=2))
 
 
 def _reports(
@@ -317,9 +297,9 @@ def _reports(
 ) -> tuple[dict[str, dict[str, Any]], list[dict[str, Any]]]:
     """Return the reports of the last process of each role, and those of earlier processes."""
     try:
-        said = read_object(run_dir / REPORTS_FILE)
-        entries = [(role, said[role]) for role in LOOP_ROLES if role in said]
-        entries += [(one["process"], one) for one in said.get(_EARLIER, ())]
+        content = read_object(run_dir / REPORTS_FILE)
+        entries = [(role, content[role]) for role in LOOP_ROLES if role in content]
+        entries += [(one["process"], one) for one in content.get(_EARLIER, ())]
     # A killed recorder wrote no report or an incomplete one.
     except (LookupError, TypeError):
         return {}, []
@@ -378,10 +358,6 @@ def _columns(dtype: np.dtype[np.void]) -> Iterator[tuple[str, pa.DataType]]:
 
 def read_table(path: Path, dtype: np.dtype[np.void]) -> pa.Table:
     """Read a table's file as it is.
-
-    Args:
-        path: path of the Parquet file.
-        dtype: the table's row type.
 
     Raises:
         CallerError: the file cannot be read, or does not have all columns of that type.

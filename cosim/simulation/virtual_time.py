@@ -61,11 +61,7 @@ _HAPPENINGS_PER_WORD = 4096
 
 
 class DecidedLink:
-    """A link with given losses and delays: of a pattern, an adversary or another run.
-
-    Args:
-        decide: the network's decision for each datagram.
-    """
+    """A link with given losses and delays: of a pattern, an adversary or another run."""
 
     def __init__(self, decide: Network) -> None:
         self._decide = decide

@@ -153,7 +153,7 @@ def specs_of(options: argparse.Namespace) -> tuple[LinkSpec, ...]:
         raise CallerError("--listen and --to must be given together")
     listen = parse_address(options.listen, "--listen")
     to = parse_address(options.to, "--to", listen)
-    forward, reverse, seed = directions(options)
+    forward, reverse, seed = _directions(options)
     return (
         LinkSpec(
             name=LINK_NAME,
@@ -187,12 +187,8 @@ def _idle_s(text: str) -> float:
     return idle_s
 
 
-def directions(options: argparse.Namespace) -> tuple[LinkSettings, LinkSettings, int]:
-    """Return the forward and the reverse settings, and the seed; files are not read yet.
-
-    Raises:
-        CallerError: the words have a mistake.
-    """
+def _directions(options: argparse.Namespace) -> tuple[LinkSettings, LinkSettings, int]:
+    """Return the forward and the reverse settings, and the seed; files are not read yet."""
     forward, seed = parse(options.words or ())
     if options.both and options.reverse is not None:
         raise CallerError("--reverse and --both exclude each other")

@@ -15,49 +15,44 @@ from netem.engine.relay_interface import LinkSpec
 from netem.loss_prediction import predict
 from netem.words.tc_command import tc_command
 from netem.words.words_to_settings import text_of
+from noack.core.errors import shortened
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import text_of as address_text
 
-_FROM_TO = {"forward": "from clients to the server", "reverse": "from the server to clients"}
 _MAX_TOML = 4000
 _NARROW_WIDTH, _WIDE_WIDTH = 20, 44
 """Minimum and maximum columns for words."""
 
 
 def explain(specs: Sequence[LinkSpec], *, as_json: bool, as_file: bool) -> None:
-    """Print the effect of links' settings on standard output.
+    """Print the effect of links' settings on standard output, as tables or as JSON.
 
-    Args:
-        specs: the links.
-        as_json: print one JSON document instead of tables for people.
-        as_file: also print them as a file of links; False: print their names instead.
+    ``as_file``: tables have the links as a file of links instead of their names.
     """
     if as_json:
-        print(json.dumps({"links": [_link_document(spec) for spec in specs]}, indent=2))
+        links = [
+            {
+                "name": spec.name, "listen": address_text(spec.listen),
+                "to": address_text(spec.to), "seed": spec.seed, "forward": _document(spec.forward),
+                "reverse": _document(spec.reverse) if spec.return_path else None,
+            }
+            for spec in specs
+        ]  # fmt: skip
+        print(json.dumps({"links": links}, indent=2))
         return
     console = Console(highlight=False)
     for number, spec in enumerate(specs):
         if number:
             console.print()
         if not as_file:
-            console.print(Text(_heading(spec), "bold underline"))
+            seed = f", seed {spec.seed}" if spec.seed else ""
+            addresses = f"{address_text(spec.listen)} → {address_text(spec.to)}"
+            console.print(Text(f"{spec.name}: {addresses}{seed}", "bold underline"))
         _print_link(console, spec)
         if as_file:
             console.print(Text("\nas a file of links (--links)", "bold"))
-            # Text to be copied must not be wrapped.
             toml = tomli_w.dumps({"link": [_link_table(spec)]}).strip()
-            console.print(Text(_cut(toml, _MAX_TOML)), soft_wrap=True)
-
-
-def _link_document(spec: LinkSpec) -> dict[str, Any]:
-    return {
-        "name": spec.name,
-        "listen": address_text(spec.listen),
-        "to": address_text(spec.to),
-        "seed": spec.seed,
-        "forward": _document(spec.forward),
-        "reverse": _document(spec.reverse) if spec.return_path else None,
-    }
+            console.print(Text(shortened(toml, _MAX_TOML)), soft_wrap=True)  # for copying
 
 
 def _document(settings: LinkSettings) -> dict[str, Any]:
@@ -99,19 +94,14 @@ def settings_meaning(settings: LinkSettings) -> list[tuple[str, str]]:
     return found
 
 
-def _heading(spec: LinkSpec) -> str:
-    seed = f", seed {spec.seed}" if spec.seed else ""
-    return f"{spec.name}: {address_text(spec.listen)} → {address_text(spec.to)}{seed}"
-
-
 def _print_link(console: Console, spec: LinkSpec) -> None:
     if spec.return_path and spec.forward == spec.reverse:
         _print_direction(console, "both directions, each by itself", spec.forward)
         return
-    _print_direction(console, f"forward, {_FROM_TO['forward']}", spec.forward)
+    _print_direction(console, "forward, from clients to the server", spec.forward)
     console.print()
     if spec.return_path:
-        _print_direction(console, f"reverse, {_FROM_TO['reverse']}", spec.reverse)
+        _print_direction(console, "reverse, from the server to clients", spec.reverse)
     else:
         console.print(Text("reverse: not relayed; the server's answers are discarded", "bold"))
 
@@ -134,7 +124,7 @@ def _table(settings: LinkSettings, width: int) -> Table:
     table.add_column(overflow="fold")
     for number, one in enumerate(settings.impairments, 1):
         # As text: a bracket in a file's name is not markup.
-        words, meaning = _cut(one.text(), 200), one.meaning()
+        words, meaning = shortened(one.text(), 200), one.meaning()
         table.add_row(str(number), Text(words), Text(meaning))
     if not settings.impairments:
         table.add_row("", "", "no impairment")
@@ -202,7 +192,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, BaseModel):
         return _given(value)
     return [_plain(entry) for entry in value] if isinstance(value, tuple) else value
-
-
-def _cut(text: str, limit: int) -> str:
-    return text if len(text) <= limit else f"{text[: limit - 3]}..."

@@ -10,16 +10,21 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
+from rich.console import Console
+
+from netem.cli import emulator_options
+from netem.cli.explain_links import explain
+from netem.cli.relay_totals import print_totals
 from netem.control import relay_attachments
 from netem.control.emulator_session import starting
-from netem.control.emulator_statistics import Statistics, statistics
+from netem.control.emulator_statistics import Statistics, statistics, unintended
 from netem.engine.engine_choice import compiled_engine_is_missing, open_relay
 from netem.engine.relay_base import Relay
 from netem.engine.relay_interface import DIRECTIONS, Direction, LinkSpec, Tap
 from netem.fates.fate_recorder import FateRecorder
 from netem.fates.fate_replay import read_fates
 from netem.standard_error import say
-from noack.core.errors import CallerError
+from noack.core.errors import CallerError, ExitStatus
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import text_of
 from noack.runtime.real_time_settings import realtime
@@ -79,12 +84,36 @@ def compile_all() -> None:
     say(f"compiled ({time.monotonic() - began_s:.1f} s)")
 
 
-def relay(specs: Sequence[LinkSpec], options: argparse.Namespace) -> Statistics:
-    """Relay until Ctrl-C; return the totals.
+def alone(arguments: Sequence[str]) -> ExitStatus:
+    """Run a stand-alone emulator until Ctrl-C, or explain its settings; print the totals.
 
-    Args:
-        specs: the links.
-        options: parsed options of :func:`add_options`.
+    Returns:
+        UNINTENDED_LOSSES if there were any; the guarantee is void then.
+
+    Raises:
+        CallerError: the command line has a mistake.
+    """
+    parser = emulator_options.parser()
+    add_options(parser)
+    options = emulator_options.parsed(parser, arguments)
+    if options.compile:
+        compile_all()
+        return ExitStatus.OK
+    specs = emulator_options.specs_of(options)
+    if options.explain:
+        explain(specs, as_json=options.json, as_file=options.links is None)
+        return ExitStatus.OK
+    totals = relay(specs, options)
+    if options.json:
+        print(json.dumps(totals, indent=2))
+    else:
+        console = Console(stderr=True, highlight=False)
+        print_totals(totals, console, predicted=options.replay_fates is None)
+    return ExitStatus.UNINTENDED_LOSSES if unintended(totals) else ExitStatus.OK
+
+
+def relay(specs: Sequence[LinkSpec], options: argparse.Namespace) -> Statistics:
+    """Relay until Ctrl-C, with the options of :func:`add_options`; return the totals.
 
     Raises:
         CallerError: an address is in use, or a file cannot be written.
@@ -97,7 +126,11 @@ def relay(specs: Sequence[LinkSpec], options: argparse.Namespace) -> Statistics:
         specs = _replaying(specs, options.replay_fates)
     with ExitStack() as last, ExitStack() as stack:
         with starting(attachments.name):
-            taps = _taps(specs, options, stack)
+            taps: list[Tap] = []
+            if options.capture is not None:
+                taps.append(stack.enter_context(_capture(options.capture, specs)))
+            if options.record_fates is not None:
+                taps.append(stack.enter_context(FateRecorder(options.record_fates, specs)))
             opened = open_relay(
                 specs, options.engine, options.segment, taps, _SPIN_NS if options.realtime else 0
             )
@@ -105,10 +138,13 @@ def relay(specs: Sequence[LinkSpec], options: argparse.Namespace) -> Statistics:
             # Signals stay handled until all files are complete.
             signals = last.enter_context(Signals().handled())
             side = stack.enter_context(relay_attachments.attached(opened, attachments))
-        stack.enter_context(_in_realtime(options.realtime))
-        _say_ready(opened)
-        if options.capture != "-" and not attachments.takes_output:
-            _print_ready(opened, as_json=options.json)
+        for setting, answer in stack.enter_context(
+            realtime(options.realtime, _FIFO_PRIORITY)
+        ).items():
+            if answer.startswith("refused"):
+                say(f"{setting} {answer}")
+        takes_output = options.capture == "-" or attachments.takes_output
+        _report_ready(opened, print_it=not takes_output, as_json=options.json)
         opened.run(
             lambda: side.quit_requested or signals.received is not None, side.commands.run_pending
         )
@@ -146,17 +182,6 @@ def _check_files(options: argparse.Namespace) -> None:
                 raise CallerError(f"{name} {path}: {other} has the same file; choose another")
 
 
-def _taps(
-    specs: Sequence[LinkSpec], options: argparse.Namespace, stack: ExitStack
-) -> Sequence[Tap]:
-    taps: list[Tap] = []
-    if options.capture is not None:
-        taps.append(stack.enter_context(_capture(options.capture, specs)))
-    if options.record_fates is not None:
-        taps.append(stack.enter_context(FateRecorder(options.record_fates, specs)))
-    return taps
-
-
 @contextmanager
 def _capture(path: str, specs: Sequence[LinkSpec]) -> Iterator[Tap]:
     try:
@@ -174,34 +199,22 @@ def _capture(path: str, specs: Sequence[LinkSpec]) -> Iterator[Tap]:
             say(f"the capture lacks {writer.missing_events} events")
 
 
-def _say_ready(opened: Relay) -> None:
-    """Report on standard error that the relay runs; call it when Ctrl-C is handled."""
-    addresses = opened.addresses()
+def _report_ready(opened: Relay, *, print_it: bool, as_json: bool) -> None:
+    """Report on standard error that the relay runs, when Ctrl-C is handled already.
+
+    ``print_it``: also print a line on standard output that other programs can wait for.
+    """
+    listen = {name: text_of(address) for name, address in opened.addresses().items()}
     for spec in opened.specs:
         name = f" ({spec.name})" if len(opened.specs) > 1 else ""
-        where = f"{text_of(addresses[spec.name])} → {text_of(spec.to)}{name}"
-        say(f"{where}, Ctrl-C ends")
-
-
-def _print_ready(opened: Relay, *, as_json: bool) -> None:
-    """Print a line on standard output that other programs can wait for."""
-    addresses = opened.addresses()
-    line = f"ready: listening on {', '.join(map(text_of, addresses.values()))}"
+        say(f"{listen[spec.name]} → {text_of(spec.to)}{name}, Ctrl-C ends")
+    line = f"ready: listening on {', '.join(listen.values())}"
     if as_json:
         links = [
-            {"name": spec.name, "listen": text_of(addresses[spec.name]), "to": text_of(spec.to)}
+            {"name": spec.name, "listen": listen[spec.name], "to": text_of(spec.to)}
             for spec in opened.specs
         ]
         line = json.dumps({"ready": links})
-    if sys.stdout is not None:
+    if print_it and sys.stdout is not None:
         with suppress(OSError, ValueError):  # no reader: the relay continues
             os.write(sys.stdout.fileno(), f"{line}\n".encode())
-
-
-@contextmanager
-def _in_realtime(wanted: bool) -> Iterator[None]:
-    with realtime(wanted, _FIFO_PRIORITY) as applied:
-        for setting, answer in applied.items():
-            if answer.startswith("refused"):
-                say(f"{setting} {answer}")
-        yield

@@ -1,7 +1,6 @@
 """The totals of a relay, as a table for people."""
 
-from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
 
 from rich.console import Console
 from rich.table import Table
@@ -33,20 +32,12 @@ _COUNTS: dict[str, Callable[[DirectionStatistics], int]] = {
 """Rows that are shown if their value is not 0."""
 
 
-class _Row(NamedTuple):
-    label: str
-    texts: tuple[str, ...]
-    style: str = ""
+_Row = tuple[str, Sequence[str], str]
+"""Label, a text per direction, style."""
 
 
 def print_totals(totals: Statistics, console: Console, *, predicted: bool) -> None:
-    """Print a table for each link.
-
-    Args:
-        totals: the statistics at the end.
-        console: the output.
-        predicted: whether the settings predict the loss; they do not predict replayed fates.
-    """
+    """Print a table for each link; settings do not predict the loss of replayed fates."""
     for link in totals["links"]:
         clients = link["clients_ever"]
         title = f"{link['name']}: {link['listen']} → {link['to']}, {clients:,} client"
@@ -68,8 +59,8 @@ def _table(link: LinkStatistics, predicted: bool) -> Table:
     table.add_column("")
     for name in DIRECTIONS[: 1 + both]:
         table.add_column(name, justify="right")
-    for row in _rows(link, predicted):
-        table.add_row(row.label, *row.texts[: 1 + both], style=row.style)
+    for label, texts, style in _rows(link, predicted):
+        table.add_row(label, *texts[: 1 + both], style=style)
     return table
 
 
@@ -77,7 +68,7 @@ def _rows(link: LinkStatistics, predicted: bool) -> Iterator[_Row]:
     sides = link["forward"], link["reverse"]
 
     def row(label: str, text: Callable[[DirectionStatistics], str]) -> _Row:
-        return _Row(label, tuple(map(text, sides)))
+        return label, tuple(map(text, sides)), ""
 
     yield row("received", lambda side: f"{side['received']:,}")
     yield row("forwarded", lambda side: f"{side['forwarded']:,}")
@@ -85,7 +76,7 @@ def _rows(link: LinkStatistics, predicted: bool) -> Iterator[_Row]:
         if any(map(count, sides)):
             yield row(label, _number(count))
     if any(side["received_before"] for side in sides):
-        yield _Row("since the last change:", (), "dim")
+        yield "since the last change:", (), "dim"
     yield row("longest loss burst", burst_text)
     yield row("loss rate", lambda side: percent_text(side["loss"]["lost"]))
     if predicted and any(side["loss"]["predicted"] is not None for side in sides):
@@ -99,13 +90,13 @@ def _rows(link: LinkStatistics, predicted: bool) -> Iterator[_Row]:
         yield row("lateness p50, p99", lambda side: _times(side["lateness_ns"]))
     for cause in sorted({cause for side in sides for cause, n in side["unintended"].items() if n}):
         numbers = tuple(f"{side['unintended'].get(cause, 0):,}" for side in sides)
-        yield _Row(f"unintended: {cause.replace('_', ' ')}", numbers, "bold red")
+        yield (f"unintended: {cause.replace('_', ' ')}", numbers, "bold red")
     if link["refused"]:
-        yield _Row("refused: too many clients", (f"{link['refused']:,}",), "bold red")
+        yield ("refused: too many clients", (f"{link['refused']:,}",), "bold red")
     if link["port_unreachable"]:
-        yield _Row("port unreachable (ICMP)", (f"≥ {link['port_unreachable']:,}",), "yellow")
+        yield ("port unreachable (ICMP)", (f"≥ {link['port_unreachable']:,}",), "yellow")
     if link["discarded"]:
-        yield _Row("answers discarded (--one-way)", ("", f"{link['discarded']:,}"))
+        yield "answers discarded (--one-way)", ("", f"{link['discarded']:,}"), ""
 
 
 def _number(count: Callable[[DirectionStatistics], int]) -> Callable[[DirectionStatistics], str]:

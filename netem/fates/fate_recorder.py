@@ -62,7 +62,11 @@ class FateRecorder:
         self._missed = 0
         self._unwritten = 0
         self._failed = False
-        _check_overwriting(path)
+        with suppress(OSError), path.open("rb") as file:
+            if path.is_file() and file.read(len(_MAGIC)) not in (b"", _MAGIC):
+                raise CallerError(
+                    f"--record-fates {path}: exists and is not a Parquet file; choose another name"
+                )
         try:
             self._writer = pq.ParquetWriter(path, SCHEMA)
         except OSError as error:
@@ -160,15 +164,6 @@ class FateRecorder:
 
     def _report(self, what: str) -> None:
         say(f"fate trace {self._path}: {what}; it cannot be replayed; the relay continues")
-
-
-def _check_overwriting(path: Path) -> None:
-    """Refuse to overwrite a file that is not Parquet."""
-    with suppress(OSError), path.open("rb") as file:
-        if path.is_file() and file.read(len(_MAGIC)) not in (b"", _MAGIC):
-            raise CallerError(
-                f"--record-fates {path}: exists and is not a Parquet file; choose another name"
-            )
 
 
 def _reason(error: OSError) -> str:

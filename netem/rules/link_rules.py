@@ -27,18 +27,10 @@ def admit(
     now_ns: int,
     decision: PacketDecision,
 ) -> None:
-    """Decide for a packet that arrives at ``now_ns``.
+    """Fill in the decision for a packet that arrives at ``now_ns``; ``row`` is that of its flow.
 
     Every stage is applied to every packet of a flow, so that a stage's random draws do not depend
     on other stages. A packet that must pass is exempt from everything that would lose it.
-
-    Args:
-        program: the link's settings.
-        state: the link's state.
-        row: row of the packet's flow.
-        size_bytes: size of the payload.
-        now_ns: arrival time.
-        decision: receives the decision.
     """
     flow, memories, counters = state.flows[row], state.memory[row], state.counters
     decision.packet = flow.packets
@@ -129,7 +121,11 @@ def settle(program: LinkProgram, state: LinkMemory, row: int, decision: PacketDe
         if program.tracks:
             needed_ns = needed_until_ns(flow, recent_ns, program.mansd, packet)
             if needed_ns > effective_ns:
-                hold_back(decision, effective_ns, needed_ns)
+                decision.hold_back_ns = needed_ns - effective_ns
+                if decision.bit < 0:
+                    decision.release_ns = needed_ns
+                if decision.copy_ns != NEVER_NS:
+                    decision.copy_ns = max(decision.copy_ns, needed_ns)
                 effective_ns = needed_ns
                 counters.held_back += 1
             decision.makes_stale = make_stale(recent_ns, program.mansd, packet, effective_ns)
@@ -157,21 +153,6 @@ def settle(program: LinkProgram, state: LinkMemory, row: int, decision: PacketDe
     counters.most_in_flight = max(counters.most_in_flight, state.link.in_flight)
 
 
-def hold_back(decision: PacketDecision, effective_ns: int, needed_ns: int) -> None:
-    """Delay a packet, and its copy, until ``needed_ns``.
-
-    Args:
-        decision: for the packet.
-        effective_ns: planned departure of the first intact one of the two.
-        needed_ns: departure time of the earlier packet that it must not precede.
-    """
-    decision.hold_back_ns = needed_ns - effective_ns
-    if decision.bit < 0:
-        decision.release_ns = needed_ns
-    if decision.copy_ns != NEVER_NS:
-        decision.copy_ns = max(decision.copy_ns, needed_ns)
-
-
 def count(counters: Counters, fate: int) -> None:
     """Count a fate."""
     if fate == DELIVERED:
@@ -191,17 +172,9 @@ def count(counters: Counters, fate: int) -> None:
 def leave(
     state: LinkMemory, row: int, packet: int, size_bytes: int, delayed: bool, counts: bool
 ) -> bool:
-    """Note that a packet, or a copy, leaves; return whether it is stale.
+    """Note that a packet, or a copy, actually leaves; return whether it is stale.
 
-    This uses the actual departure, not the decision.
-
-    Args:
-        state: the link's state.
-        row: row of the packet's flow.
-        packet: number of the packet in its flow.
-        size_bytes: size of the payload.
-        delayed: whether it was in flight.
-        counts: whether it is the packet's first intact copy.
+    ``delayed``: it was in flight. ``counts``: it is the packet's first intact copy.
     """
     flow, counters = state.flows[row], state.counters
     counters.forwarded += 1

@@ -18,26 +18,16 @@ from noack.impairments.link_records import NEVER_NS, FlowState
 
 
 def must_pass(flow: FlowState, mansd: int) -> bool:
-    """Whether the next packet has to be delivered.
-
-    Args:
-        flow: state of the flow.
-        mansd: M − 1, or −1 for no cap.
-    """
+    """Whether the next packet has to be delivered; ``mansd`` is M − 1, or −1 for no cap."""
     return flow.forced_first != 0 or (mansd >= 0 and flow.consecutive_losses >= mansd)
 
 
 def needed_until_ns(flow: FlowState, recent_ns: Sequence[int], mansd: int, packet: int) -> int:
     """Return the time before which ``packet`` must not leave; −1 if there is none.
 
-    It is the release time of the earlier packet that ``packet`` must not precede.
-
-    Args:
-        flow: state of the flow.
-        recent_ns: ring of the mansd + 1 previous packets' release times; −1 for packets that are
-            not effectively delivered.
-        mansd: M − 1, or −1 for no cap; without a cap, only the first packet can be needed.
-        packet: number of the packet in its flow.
+    It is the release time of the earlier packet that ``packet`` must not precede. ``recent_ns`` is
+    a ring of the mansd + 1 previous packets' release times; −1 for packets that are not effectively
+    delivered. Without a cap, only the first packet can be needed.
     """
     needed_ns = flow.first_release_ns
     oldest = packet - 1 - mansd

@@ -70,26 +70,18 @@ class LinkTable(ScenarioSection):
         return self
 
     def spec(self, folder: Path, place: str) -> LinkSpec:
-        """Return the link for a relay; resolves its addresses and reads its files.
-
-        Args:
-            folder: folder to which relative file names refer.
-            place: position of the table, for messages.
+        """Return the link for a relay; resolves its addresses and reads its files in a folder.
 
         Raises:
-            CallerError: the table has a mistake; one line.
+            CallerError: the table has a mistake; one line, which begins with ``place``.
         """
         listen = parse_address(self.listen, f"{place}.listen")
         return LinkSpec(
-            name=self.name,
             listen=listen,
             to=parse_address(self.to, f"{place}.to", listen),
             forward=read_files(self.words or self.forward, folder, f"{place}.forward"),
             reverse=read_files(self.reverse, folder, f"{place}.reverse"),
-            seed=self.seed,
-            return_path=self.return_path,
-            idle_s=self.idle_s,
-            most_clients=self.most_clients,
+            **self.model_dump(include={"name", "seed", "return_path", "idle_s", "most_clients"}),
         )
 
 
@@ -101,11 +93,10 @@ class LinksFile(ScenarioSection):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        names: set[str] = set()
-        for number, link in enumerate(self.link):
-            if link.name in names:
+        names = [link.name for link in self.link]
+        for number, name in enumerate(names):
+            if name in names[:number]:
                 raise ValueError(f"link.{number}.name: another link has this name already")
-            names.add(link.name)
         return self
 
 

@@ -1,8 +1,8 @@
 """The nearest ``tc`` command to a link's settings, and the settings that it leaves out."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
+from noack.core.errors import shortened
 from noack.impairments.feature import Impairment
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.quantities import percent_text
@@ -36,7 +36,7 @@ def tc_command(settings: LinkSettings) -> TcCommand:
         if any(other.kind == one.kind for other in kept):
             what = f"a second {one.kind}"
         if what:
-            lacks.append(f"{_cut(one.text())} ({what})")
+            lacks.append(f"{shortened(one.text(), _LONGEST)} ({what})")
         else:
             kept.append(one)
     if settings.mansd is not None:
@@ -46,16 +46,8 @@ def tc_command(settings: LinkSettings) -> TcCommand:
     if wanted and not kept:
         return TcCommand(None, tuple(lacks), ())
     words = " ".join([f"limit {settings.limit}", *(one.tc_text() for one in kept)])
-    return TcCommand(words, tuple(lacks), _differences(kept))
-
-
-def _differences(impairments: Sequence[Impairment]) -> tuple[str, ...]:
-    notes = [note for one in impairments for note in one.tc_notes()]
-    order = [_FIXED_ORDER.index(one.kind) for one in impairments if one.kind in _FIXED_ORDER]
+    notes = [note for one in kept for note in one.tc_notes()]
+    order = [_FIXED_ORDER.index(one.kind) for one in kept if one.kind in _FIXED_ORDER]
     if order != sorted(order):
         notes.append(f"its order is fixed: {', '.join(_FIXED_ORDER)}")
-    return tuple(dict.fromkeys(notes))
-
-
-def _cut(text: str) -> str:
-    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
+    return TcCommand(words, tuple(lacks), tuple(dict.fromkeys(notes)))

@@ -59,10 +59,7 @@ class LinkWords(NamedTuple):
 
 
 def parse(words: str | Sequence[str]) -> LinkWords:
-    """Read the settings of one direction of a link from words.
-
-    Args:
-        words: one string of words, as on a shell's command line, or a sequence of such strings.
+    """Read the settings of one direction of a link; see :class:`WordReader`.
 
     Raises:
         CallerError: one line with the wrong word, the expected words, and the nearest known word.
@@ -71,7 +68,12 @@ def parse(words: str | Sequence[str]) -> LinkWords:
     impairments: list[Impairment] = []
     settings: Table = {}
     while (word := reader.begin()) is not None:
-        _require_keyword(reader, word)
+        if word in _REFUSED:
+            reader.wrong(_REFUSED[word])
+        if word in _AFTER:
+            reader.wrong(f"goes right after {_AFTER[word]}")
+        if word not in KEYWORDS:
+            reader.unknown(word, KEYWORDS)
         if word in _FEATURES:
             kind, found = _FEATURES[word]
             assert found.read is not None
@@ -123,24 +125,11 @@ def text_of(settings: LinkSettings, seed: int | None = None) -> str:
 
 
 def require_no_dashes(arguments: Sequence[str]) -> None:
-    """Require that no word begins with dashes.
-
-    Raises:
-        CallerError: a word does.
-    """
+    """Raise a CallerError if a word begins with dashes."""
     for argument in arguments:
         word = argument.lstrip("-").partition("=")[0]
         if argument.startswith("-") and word in EXAMPLES:
             raise CallerError(f"{argument}: write words without the dashes, e.g. {EXAMPLES[word]}")
-
-
-def _require_keyword(reader: WordReader, word: str) -> None:
-    if word in _REFUSED:
-        reader.wrong(_REFUSED[word])
-    if word in _AFTER:
-        reader.wrong(f"goes right after {_AFTER[word]}")
-    if word not in KEYWORDS:
-        reader.unknown(word, KEYWORDS)
 
 
 def _validated(kind: TypeAdapter[Any], given: object, reader: WordReader) -> Any:

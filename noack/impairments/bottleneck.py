@@ -29,11 +29,7 @@ def enters(
 ) -> bool:
     """Whether the queue has a free place at ``now_ns``; removes packets that have left until then.
 
-    Args:
-        stage: the bottleneck's settings.
-        queue: its state.
-        departures_ns: the rings of departure times.
-        now_ns: time at which the packet reaches the queue.
+    ``departures_ns``: the rings of departure times of all queues.
     """
     queue.entry_ns = max(queue.entry_ns, now_ns)
     while queue.count > 0 and departures_ns[stage.queue_begin + queue.head] <= queue.entry_ns:

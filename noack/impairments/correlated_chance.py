@@ -36,14 +36,7 @@ class ChanceStage(RuleStage):
 
 
 def latent(correlation: float, innovation: float, memory: StageMemory, u: float) -> float:
-    """Advance a latent process by one packet and return z, standard normal.
-
-    Args:
-        correlation: ρ.
-        innovation: √(1 − ρ²).
-        memory: the stage's memory of the flow.
-        u: a uniform number.
-    """
+    """Advance a latent process by one packet and return z, standard normal; u is uniform."""
     z = -score(u)
     if correlation != 0.0:
         if memory.phase != 0:

@@ -18,13 +18,13 @@ _DELAY = re.compile(r"([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)\s*
 def read_samples(
     name: str, jitter_s: float, most_s: float, folder: Path, place: str
 ) -> tuple[float, ...]:
-    """Return the delays in a file, in seconds.
+    """Return the delays in a file, in seconds; the jitter scales a distribution table.
 
     Args:
-        name: name of the file.
-        jitter_s: scale of a distribution table.
+        name: name of the file, relative to ``folder``.
+        jitter_s: the jitter.
         most_s: maximum delay.
-        folder: folder to which relative names refer.
+        folder: the folder.
         place: position of the file name in the settings, for messages.
 
     Raises:

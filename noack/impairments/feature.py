@@ -7,13 +7,14 @@ derived from one of the three classes at the end.
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
 from noack.impairments.link_records import QueueState, RuleStage
 from noack.impairments.markov_chain import Chain, Pattern
 from noack.impairments.word_reader import WordReader
 from noack.settings.section import ScenarioSection
 
+T = TypeVar("T")
 Table = dict[str, Any]
 """A table of settings, before it is validated."""
 
@@ -46,28 +47,20 @@ class Behaviour(NamedTuple):
 
 
 class StageTables:
-    """Tables of numbers that the stages of a program read.
-
-    Args:
-        scored: a delay is correlated with loss, and needs a score of the link's state.
-    """
+    """Tables of numbers that the stages of a program read."""
 
     def __init__(self, *, scored: bool = False) -> None:
         self.scored = scored
+        """A delay is correlated with loss, and needs a score of the link's state."""
         self.integers: list[int] = []
         self.reals: list[float] = []
 
-    def add_integers(self, numbers: Iterable[int]) -> tuple[int, int]:
-        """Add integers; return the range [begin, end) of their places."""
-        begin = len(self.integers)
-        self.integers.extend(map(int, numbers))
-        return begin, len(self.integers)
 
-    def add_reals(self, numbers: Iterable[float]) -> tuple[int, int]:
-        """Add numbers; return the range [begin, end) of their places."""
-        begin = len(self.reals)
-        self.reals.extend(numbers)
-        return begin, len(self.reals)
+def add_numbers(table: list[T], numbers: Iterable[T]) -> tuple[int, int]:
+    """Append numbers to a table; return the range [begin, end) of their places."""
+    begin = len(table)
+    table.extend(numbers)
+    return begin, len(table)
 
 
 class Feature(ScenarioSection):
@@ -99,11 +92,7 @@ class Feature(ScenarioSection):
         return ""
 
     def tc_lacks(self, before: Sequence["Impairment"]) -> str:
-        """Return the missing feature of ``tc netem``; empty if none is missing.
-
-        Args:
-            before: the impairments that tc applies before it.
-        """
+        """Return the missing feature of tc, which applies the impairments ``before`` before it."""
         return self.tc_missing
 
 
@@ -114,11 +103,7 @@ class QueueDiscipline(Feature):
 
     @abstractmethod
     def queue_stage(self, bottleneck: Mapping[str, int]) -> RuleStage:
-        """Return the settings as numbers.
-
-        Args:
-            bottleneck: the fields of :class:`noack.impairments.bottleneck.BottleneckStage`.
-        """
+        """Return the settings as numbers, with the fields of a ``BottleneckStage``."""
 
 
 class StageFeature(Feature):
@@ -194,10 +179,5 @@ class Impairment(StageFeature):
         return True
 
     def reorders(self, delayed: bool, reordered: bool) -> tuple[bool, bool]:
-        """Return whether packets may be delayed, and reordered, after it.
-
-        Args:
-            delayed: whether packets may be delayed before it.
-            reordered: whether packets may be reordered before it.
-        """
+        """Return whether packets may be delayed, and reordered, after it; given both before it."""
         return delayed, reordered

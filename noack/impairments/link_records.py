@@ -239,12 +239,7 @@ class PacketContext(NamedTuple):
 
 
 def refuse(decision: PacketDecision, fate: int) -> None:
-    """Lose a packet, unless it is lost already or must pass.
-
-    Args:
-        decision: for the packet.
-        fate: DROPPED, OVERFLOWED or BLACKED_OUT.
-    """
+    """Lose a packet by DROPPED, OVERFLOWED or BLACKED_OUT, unless it is lost or must pass."""
     if decision.fate == DELIVERED:
         if decision.must_pass != 0:
             decision.spared = 1

@@ -52,10 +52,6 @@ class LinkSettings(ScenarioSection):
 def require_scores(impairments: Iterable[AnyImpairment], loss: LossModel | None = None) -> None:
     """Check that each delay correlated with loss follows a loss model that gives a score.
 
-    Args:
-        impairments: the impairments in their order.
-        loss: the loss model before them, if there is one.
-
     Raises:
         ValueError: there is no such loss model; the message begins with the key.
     """
@@ -75,8 +71,7 @@ def read_files(settings: LinkSettings, folder: Path, place: str = "") -> LinkSet
     Args:
         settings: settings of one direction of a link.
         folder: folder to which relative names refer.
-        place: position of the settings, for messages, e.g. ``links.toml: link.0.forward``; empty:
-            messages name only the file.
+        place: as in :meth:`noack.impairments.feature.StageFeature.without_files`.
 
     Raises:
         CallerError: one line; a file cannot be read, or has wrong content.

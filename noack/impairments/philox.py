@@ -33,12 +33,8 @@ def philox(c0: int, c1: int, c2: int, c3: int, k0: int, k1: int) -> tuple[int, i
 def uniforms(key0: int, key1: int, flow: int, packet: int, block: int) -> tuple[float, float]:
     """Return two uniform numbers in [0, 1), multiples of 2⁻⁵³.
 
-    Args:
-        key0: the stream's key, low word.
-        key1: high word.
-        flow: number of the flow, below 2³².
-        packet: number of the datagram in its flow, below 2⁶³.
-        block: number of the pair for this datagram.
+    The stream's key has two words, low and high; flow < 2³², packet < 2⁶³; ``block`` is the number
+    of the pair for this datagram.
     """
     a, b, c, d = philox(packet & _WORD, packet >> 32, flow, block, key0, key1)
     return (

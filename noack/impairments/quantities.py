@@ -154,12 +154,17 @@ def brief_percent(share: float) -> str:
     return percent_text(float(f"{share:.6g}"))
 
 
+def without_defaults(values: Sequence[T], defaults: Sequence[T | None]) -> Sequence[T]:
+    """Return the values without those at the end that have their default value."""
+    count = len(values)
+    while count > 0 and values[count - 1] == defaults[count - 1]:
+        count -= 1
+    return values[:count]
+
+
 def percents_text(shares: Sequence[float], defaults: Sequence[float | None]) -> str:
     """Percentages, without those at the end that have their default value."""
-    count = len(shares)
-    while shares[count - 1] == defaults[count - 1]:
-        count -= 1
-    return " ".join(map(percent_text, shares[:count]))
+    return " ".join(map(percent_text, without_defaults(shares, defaults)))
 
 
 def time_text(time_s: float) -> str:
@@ -168,12 +173,8 @@ def time_text(time_s: float) -> str:
     if exact == 0:
         return "0s"
     units = (("s", 0), ("ms", 3), ("us", 6), ("ns", 9))
-    return min((_digits(exact.scaleb(shift)) + unit for unit, shift in units), key=_ease)
-
-
-def _ease(text: str) -> tuple[int, bool]:
-    """Sort key: shorter numbers first, then whole numbers."""
-    return len(text), "." in text
+    texts = (_digits(exact.scaleb(shift)) + unit for unit, shift in units)
+    return min(texts, key=lambda text: (len(text), "." in text))
 
 
 def rate_text(rate_bps: int) -> str:

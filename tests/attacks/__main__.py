@@ -3,51 +3,37 @@
 import argparse
 import sys
 import tempfile
-from collections.abc import Callable
+from collections import Counter
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
 from noack.protocol.topology import LOOP_ROLES, SENDER
-from noack.runtime.udp_sockets import SHED
 from tests.attacks.attacked import Attacked, attack, may_forge_addresses
 from tests.attacks.checks import CHECKS
-from tests.attacks.kinds import FROM_ANYWHERE, FROM_THE_PEER
-from tests.attacks.sender import PEER, STRANGER
 
 _WIDTH = 120
 
 
 def table_of(run: Attacked) -> Table:
-    """Return a table by kind and port: datagrams sent and rejected."""
-    table = Table("", "", *LOOP_ROLES, title="Hostile datagrams at each port")
+    """Return a table by port: datagrams sent by kind, rejected by reason, and accepted."""
+    table = Table("", *LOOP_ROLES, title="Hostile datagrams at each port")
+    columns = []
     for role in LOOP_ROLES:
-        table.columns[2 + LOOP_ROLES.index(role)].justify = "right"
-
-    def row(what: str, which: str, number: Callable[[str], int | None]) -> None:
-        found = [number(role) for role in LOOP_ROLES]
-        table.add_row(what, which, *("-" if n is None else f"{n:,}" for n in found))
-
-    for sender, kinds in ((STRANGER, FROM_ANYWHERE), (PEER, FROM_THE_PEER)):
-        for kind in kinds:
-            row(f"sent, {sender}", kind, lambda role, at=(sender, kind): _sent(run, role, *at))
-    table.add_section()
-    rejected = {role: run.channel(role)["rejected"] for role in LOOP_ROLES}
-    reasons = sorted({reason for found in rejected.values() for reason in found} - {SHED})
-    for reason in reasons:
-        row("rejected", reason, lambda role, reason=reason: rejected[role].get(reason, 0))
-    row("dropped by the kernel", SHED, lambda role: rejected[role].get(SHED, 0))
-    table.add_section()
-    row("lost in the kernel", "of the peer's", lambda role: run.channel(role)["lost_in_kernel"])
-    row("accepted", "of the peer's", run.accepted)
-    row("", "others", lambda role: run.accepted(role) - run.channel(SENDER[role])["sent"])
+        channel, peer_sent = run.channel(role), run.channel(SENDER[role])["sent"]
+        column: Counter[str] = Counter()
+        for (to, sender, kind, _), number in run.sent.items():
+            if to == role:
+                column[f"sent, {sender}: {kind}"] += number
+        column.update({f"rejected: {reason}": n for reason, n in channel["rejected"].items()})
+        column["lost in the kernel, of the peer's"] = channel["lost_in_kernel"]
+        column["accepted, of the peer's"] = run.accepted(role)
+        column["accepted, others"] = run.accepted(role) - peer_sent
+        columns.append(column)
+    for label in dict.fromkeys(label for column in columns for label in column):
+        table.add_row(label, *(f"{column[label]:,}" for column in columns))
     return table
-
-
-def _sent(run: Attacked, role: str, sender: str, kind: str) -> int | None:
-    reasons = run.sent.get(role, {}).get(sender, {}).get(kind)
-    return None if reasons is None else sum(reasons.values())
 
 
 def main() -> int:
@@ -69,10 +55,9 @@ def main() -> int:
     if not console.is_terminal:
         console.width = _WIDTH
     console.print(table_of(run))
-    summary = run.summary
-    held = sum(claim["verdict"] == "held" for claim in summary["claims"])
-    print(f"claims: {held} of {len(summary['claims'])} held, the others void with their reason")
-    late = {role: summary["lateness_us"][role]["p99"] for role in LOOP_ROLES}
+    held = sum(claim["verdict"] == "held" for claim in run.summary["claims"])
+    print(f"claims: {held} of {len(run.summary['claims'])} held, the others void with their reason")
+    late = {role: run.summary["lateness_us"][role]["p99"] for role in LOOP_ROLES}
     print("lateness p99:", ", ".join(f"{role} {us:.0f} µs" for role, us in late.items()))
     wrong = [f"{name}: {line}" for name, check in CHECKS.items() for line in check(run)]
     for line in wrong:

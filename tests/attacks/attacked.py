@@ -1,6 +1,5 @@
 """A run under attack, one process at a time, so that this user can read its ticket and key."""
 
-import contextlib
 import json
 import os
 import socket
@@ -8,10 +7,12 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import psutil
 
@@ -27,11 +28,9 @@ from noack.protocol.topology import LOOP_ROLES, ROUTES, SENDER
 from noack.protocol.wire_format import Flow
 from noack.runtime.join_ticket import Ticket, loads
 from tests.attacks.kinds import Target
-from tests.attacks.sender import Plan
+from tests.attacks.sender import Plan, Sent, carry_out
 
 PATIENCE_S = 150.0
-Sent = Mapping[str, Mapping[str, Mapping[str, Mapping[str, int]]]]
-"""Numbers of datagrams by role, sender, kind and expected rejection reason."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +43,9 @@ class Attacked:
     record: RunRecord
     sent: Sent
 
-    def channel(self, role: str) -> Mapping[str, Any]:
+    def channel(self, role: str) -> Any:
         """Return the datagram counters of a process."""
-        found: Mapping[str, Any] = self.record.reports[role]["channel"]
-        return found
+        return self.record.reports[role]["channel"]
 
     def accepted(self, role: str) -> int:
         """Datagrams that a process accepted, or that the emulator, which verifies none, relayed."""
@@ -57,10 +55,12 @@ class Attacked:
     def sent_to(self, role: str) -> Counter[str]:
         """Return how many hostile datagrams a process must reject, by reason."""
         total: Counter[str] = Counter()
-        for kinds in self.sent.get(role, {}).values():
-            for reasons in kinds.values():
-                total.update(reasons)
+        for (to, _, _, reason), number in self.sent.items():
+            total[reason] += number * (to == role)
         return total
+
+    def kinds_sent(self, role: str, sender: str) -> set[str]:
+        return {kind for to, by, kind, _ in self.sent if (to, by) == (role, sender)}
 
 
 def may_forge_addresses() -> bool:
@@ -72,42 +72,31 @@ def may_forge_addresses() -> bool:
     return True
 
 
-@contextlib.contextmanager
-def run_by_hand(folder: Path, *arguments: str) -> Iterator["Run"]:
-    """Start a run, one process at a time; kill the remaining processes at the end."""
-    environment = os.environ | {"XDG_RUNTIME_DIR": str(folder)}
+class Run:
+    """An active run, started one process at a time; the context's end kills what remains."""
 
-    def start(*command: str) -> subprocess.Popen[str]:
-        return subprocess.Popen(
-            [sys.executable, "-m", "cosim.cli", *command, "--json"], env=environment, text=True,
-            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    def __init__(self, folder: Path, *arguments: str) -> None:
+        self._folder = folder
+        self._recording = self._start(
+            "record", "lane_following", "--runs", str(folder / "runs"), "--no-report",
+            "--set", "ports={}", *arguments,
         )  # fmt: skip
+        self.processes = {role: self._start(role) for role in LOOP_ROLES}
 
-    runs = folder / "runs"
-    recording = start(
-        "record", "lane_following", "--runs", str(runs), "--no-report",
-        "--set", "ports={}", *arguments,
-    )  # fmt: skip
-    processes = {role: start(role) for role in LOOP_ROLES}
-    try:
-        yield Run(folder, recording, processes)
-    finally:
-        for process in (recording, *processes.values()):
-            if process.poll() is None:
-                process.kill()
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for process in (self._recording, *self.processes.values()):
+            process.kill()
             process.communicate()
 
-
-class Run:
-    """An active run."""
-
-    def __init__(
-        self, folder: Path, recording: "subprocess.Popen[str]",
-        processes: Mapping[str, "subprocess.Popen[str]"],
-    ) -> None:  # fmt: skip
-        self.processes = processes
-        self._folder = folder
-        self._recording = recording
+    def _start(self, *command: str) -> "subprocess.Popen[str]":
+        return subprocess.Popen(
+            [sys.executable, "-m", "cosim.cli", *command, "--json"], text=True,
+            env=os.environ | {"XDG_RUNTIME_DIR": str(self._folder)},
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        )  # fmt: skip
 
     def targets(self) -> list[Target]:
         """Wait until the loop runs; return its processes with their ports."""
@@ -172,16 +161,9 @@ def attack(
     """
     sending_s = per_port / rate_hz
     horizon_s = speed * (1.5 * sending_s + 7.0)
-    with run_by_hand(
-        folder, "--set", f"speed={speed}", "--set", f"horizon_s={horizon_s:.0f}"
-    ) as run:
+    with Run(folder, "--set", f"speed={speed}", "--set", f"horizon_s={horizon_s:.0f}") as run:
         targets = run.targets()
-        plan = Plan(
-            targets, per_port, rate_hz, forge_addresses,
-            until_s=time.monotonic() + 1.5 * sending_s + 3.0,
-        )  # fmt: skip
-        done = subprocess.run(
-            [sys.executable, "-m", "tests.attacks.sender"], input=plan.dumps(), text=True,
-            stdout=subprocess.PIPE, check=True, timeout=2 * sending_s + PATIENCE_S,
-        )  # fmt: skip
-        return run.finish(json.loads(done.stdout))
+        until_s = time.monotonic() + 1.5 * sending_s + 3.0
+        plan = Plan(targets, per_port, rate_hz, forge_addresses, until_s)
+        with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+            return run.finish(pool.submit(carry_out, plan).result())

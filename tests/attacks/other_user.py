@@ -30,7 +30,7 @@ def as_another_user(code: str, *arguments: str) -> Iterator["subprocess.Popen[st
             process.kill()
 
 
-def said_by_another_user(code: str, *arguments: str) -> str:
+def output_of_another_user(code: str, *arguments: str) -> str:
     """Run a program as another user to its end, and return what it printed."""
     with as_another_user(code, *arguments) as process:
         return process.communicate(timeout=60)[0].strip()

@@ -24,6 +24,12 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "up" / "cache"
 
 
+def new_folder() -> Path:
+    folder = cache_folder("netem", SOURCES)
+    assert folder is not None
+    return folder
+
+
 def give_away(path: Path) -> None:
     os.chown(path, NOBODY, NOBODY)
 
@@ -37,6 +43,7 @@ def open_to_the_group(path: Path) -> None:
 
 
 CHANGES = [pytest.param(give_away, marks=needs_root), open_up, open_to_the_group]
+Change = Callable[[Path], None]
 
 
 class Payload:
@@ -54,11 +61,8 @@ def tripled(number: int) -> int:
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_a_planted_index_is_not_unpickled(
-    change: Callable[[Path], None], home: Path, tmp_path: Path
-) -> None:
-    folder = cache_folder("netem", SOURCES)
-    assert folder is not None
+def test_a_planted_index_is_not_unpickled(change: Change, home: Path, tmp_path: Path) -> None:
+    folder = new_folder()
     assert compiler(folder)(tripled)(7) == 21
     (index,) = folder.rglob("*.tripled-*.nbi")
     version = pickle.loads(index.read_bytes())
@@ -72,61 +76,49 @@ def test_a_planted_index_is_not_unpickled(
 @pytest.mark.parametrize("level", ["up", "up/cache", "the folder"])
 @pytest.mark.parametrize("change", CHANGES)
 def test_no_cache_below_a_folder_that_others_may_write(
-    change: Callable[[Path], None], level: str, home: Path, tmp_path: Path
+    change: Change, level: str, home: Path, tmp_path: Path
 ) -> None:
-    folder = cache_folder("netem", SOURCES)
-    assert folder is not None
+    folder = new_folder()
     change(folder if level == "the folder" else tmp_path / level)
     assert cache_folder("netem", SOURCES) is None
 
 
 @needs_root
-def test_no_cache_in_a_folder_with_a_file_of_another_user(home: Path) -> None:
-    folder = cache_folder("netem", SOURCES)
-    assert folder is not None
-    (folder / "of.another-1.nbi").write_bytes(b"planted")
-    give_away(folder / "of.another-1.nbi")
+@pytest.mark.parametrize("theirs", ["a file", "the folder", "noack"])
+def test_no_cache_with_a_file_or_folder_of_another_user(theirs: str, home: Path) -> None:
+    folder = new_folder()
+    if theirs == "a file":
+        (folder / "of.another-1.nbi").write_bytes(b"planted")
+        give_away(folder / "of.another-1.nbi")
+    else:
+        folder.parent.chmod(0o777)
+        give_away(folder.parent if theirs == "noack" else folder)
     assert cache_folder("netem", SOURCES) is None
 
 
 def test_created_folders_are_private(home: Path) -> None:
     before = os.umask(0)
     try:
-        folder = cache_folder("netem", SOURCES)
+        folder = new_folder()
     finally:
         os.umask(before)
-    assert folder is not None
     for made in (folder, folder.parent, home, home.parent):
         assert stat.S_IMODE(made.stat().st_mode) == 0o700
 
 
-@pytest.mark.parametrize("mode", [0o755, 0o775, 0o777])
-def test_a_folder_of_an_older_version_with_open_permissions_is_made_private(
-    mode: int, home: Path
-) -> None:
-    before = cache_folder("netem", SOURCES)
-    assert before is not None
+@pytest.mark.parametrize("mode", [0o755, 0o777])
+def test_a_folder_of_this_user_with_open_permissions_is_made_private(mode: int, home: Path) -> None:
+    before = new_folder()
     (home / "noack").chmod(mode)
-    assert cache_folder("netem", SOURCES) == before
+    assert new_folder() == before
     assert stat.S_IMODE((home / "noack").stat().st_mode) == 0o700
-
-
-@needs_root
-@pytest.mark.parametrize("level", ["noack", "noack/below"])
-def test_no_cache_in_a_folder_of_another_user(level: str, home: Path) -> None:
-    """The other user owns either the whole folder or the inner folder with the code."""
-    folder = cache_folder("netem", SOURCES)
-    assert folder is not None
-    folder.parent.chmod(0o777)
-    give_away(folder.parent if level == "noack" else folder)
-    assert cache_folder("netem", SOURCES) is None
 
 
 def test_a_cache_below_a_sticky_folder_is_allowed(home: Path) -> None:
     """In a sticky folder, others can create files but cannot replace or remove this user's."""
     home.mkdir(parents=True)
     home.parent.chmod(0o1777)
-    assert cache_folder("netem", SOURCES) is not None
+    assert new_folder()
 
 
 def test_the_target_of_a_symbolic_link_is_checked(home: Path, tmp_path: Path) -> None:

@@ -55,27 +55,20 @@ def join() -> Ticket:
     return wait_for_ticket("default", 0.0, lambda: False, lambda path: None)
 
 
-def enter(context: Any) -> Callable[[], object]:
-    def use() -> None:
-        with context():
-            pass
-
-    return use
-
-
-USES: dict[str, Callable[[Ticket], Callable[[], object]]] = {
-    "publish a ticket": lambda ticket: enter(lambda: published(ticket, "default")),
-    "join a run": lambda _: join,
-    "publish a run": lambda ticket: enter(lambda: run_registry.published(ticket, None)),
-    "find a run": lambda _: run_registry.find,
-    "publish an emulator": lambda _: enter(lambda: emulator_session.published(EMULATOR)),
-    "list emulators": lambda _: emulator_session.running,
+Use = Callable[[Ticket], object]
+USES: dict[str, Use] = {
+    "publish a ticket": lambda ticket: published(ticket, "default").__enter__(),
+    "join a run": lambda _: join(),
+    "publish a run": lambda ticket: run_registry.published(ticket, None).__enter__(),
+    "find a run": lambda _: run_registry.find(),
+    "publish an emulator": lambda _: emulator_session.published(EMULATOR).__enter__(),
+    "list emulators": lambda _: emulator_session.running(),
 }
 
 
 @pytest.mark.parametrize("use", USES.values(), ids=USES)
 def test_a_symbolic_link_instead_of_the_folder_is_refused(
-    use: Callable[[Ticket], Callable[[], object]], shared: Path, ticket: Ticket
+    use: Use, shared: Path, ticket: Ticket
 ) -> None:
     """Even a link to this user's own folder: its owner can change the target at any time."""
     own = shared / "own"
@@ -84,7 +77,7 @@ def test_a_symbolic_link_instead_of_the_folder_is_refused(
     (own / "default.json").write_text(ticket.model_dump_json())
     (shared / OWN).symlink_to(own)
     with pytest.raises(CallerError, match="closed to others"):
-        use(ticket)()
+        use(ticket)
     assert [file.name for file in own.rglob("*") if file.is_file()] == ["default.json"]
 
 
@@ -102,7 +95,7 @@ def test_a_folder_of_another_user_inside_is_refused(
         folder.mkdir(mode=0o700)
     (shared / OWN / kind).symlink_to(shared / "own")
     with pytest.raises(CallerError, match="closed to others"):
-        USES[use](ticket)()
+        USES[use](ticket)
 
 
 def test_a_ticket_is_not_written_into_a_folder_swapped_in_meanwhile(

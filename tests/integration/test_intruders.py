@@ -1,10 +1,11 @@
-"""Another user on the same machine attacks the control plane's port during a run."""
+"""Another user attacks the control plane's port of a run of which each process started by hand."""
 
 import contextlib
 import json
 import os
 import signal
 import socket
+import stat
 import subprocess
 import threading
 from collections import Counter
@@ -101,13 +102,16 @@ class Attacked:
         by_hand: Callable[[str], subprocess.Popen[str]],
         private: Path,
     ) -> None:
+        early = [by_hand(role) for role in LOOP_ROLES[:2]]
         recording = start(
             *settings(speed=2.0, horizon_s=400.0), command=("record", "lane_following")
         )
         path = private / "default.json"
         wait_for(path.exists)
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+        assert stat.S_IMODE(private.stat().st_mode) == 0o700
         self.ticket = loads(path.read_text())
-        processes = [by_hand(role) for role in LOOP_ROLES]
+        processes = early + [by_hand(role) for role in LOOP_ROLES[2:]]
         recording.wait_started()
         self.intruder = Intruder(self.ticket)
         with self.intruder.at_work():

@@ -1,9 +1,6 @@
 """Processes that are killed during a run and restarted."""
 
 import signal
-import socket
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,7 +22,6 @@ from tests.integration.conftest import (
     wait_for,
 )
 
-Start = Callable[..., Running]
 LOOP = ("plant_step", "sensor_measurement", "controller_step")
 KEEPS = {
     "sensor": "sensor_measurement",
@@ -65,14 +61,6 @@ def let_run(running: Running, simulated_s: float) -> None:
 
     until_ns = now_ns() + simulated_s * 1e9
     wait_for(lambda: now_ns() > until_ns)
-
-
-def taken(squatter: socket.socket, port: int) -> bool:
-    try:
-        squatter.bind(("127.0.0.1", port))
-    except OSError:
-        return False
-    return True
 
 
 @pytest.fixture(scope="module")
@@ -128,18 +116,16 @@ def test_no_recorded_row_is_lost_and_all_rows_are_replayed(restarted: Finished) 
     assert np.array_equal(steps, np.arange(len(steps)))
 
 
-def test_a_restarted_sensor_transmits_its_first_measurement(restarted: Finished) -> None:
+def test_a_restarted_sensor_and_network_begin_with_a_delivered_measurement(
+    restarted: Finished,
+) -> None:
     record = load_record(restarted.run_dir)
-    _, again = record.lives("sensor")
-    first = again.rows["sensor_measurement"][0]
+    _, sensor = record.lives("sensor")
+    first = sensor.rows["sensor_measurement"][0]
     assert first["event"] == GENERATION
     assert np.array_equal(first["x"], first["x_s"])
-
-
-def test_a_restarted_network_passes_its_first_packet(restarted: Finished) -> None:
-    record = load_record(restarted.run_dir)
-    _, again = record.lives("netem")
-    packets = again.rows["netem_packet"]
+    _, netem = record.lives("netem")
+    packets = netem.rows["netem_packet"]
     assert packets["consecutive_losses"][0] == 0
     assert packets["consecutive_losses"].max() <= 1
 
@@ -161,7 +147,7 @@ def test_a_restarted_controller_outputs_zero_until_its_first_update(
 
 def test_the_loop_converges_again_and_its_identity_holds(restarted: Finished) -> None:
     record = load_record(restarted.run_dir)
-    assert restarted.summary["identity_residual_max"] < 1e-11
+    assert restarted.summary["identity_residual_relative"] < 1e-11
     joined = align_tables(record)
     away = np.isnan(joined.x_c).any(axis=1)
     _, controller = record.lives("controller")
@@ -188,19 +174,3 @@ def test_a_restarted_process_accepts_no_old_message(restarted: Finished) -> None
         before, again = record.lives(role)
         last_ns = before.rows[table]["t_ns"].max()
         assert again.rows[table]["t_ns"].min() > last_ns
-
-
-def test_a_process_that_fails_at_its_restart_ends_the_run(start: Start, tmp_path: Path) -> None:
-    running = start(*AT_RATE, *settings(speed=2.0, horizon_s=4000.0, recovery__rejoin_within_s=60))
-    running.wait_started()
-    sensor = running.child("sensor")
-    port = running.udp_port("sensor")
-    sensor.kill()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as squatter:
-        wait_for(lambda: taken(squatter, port))
-        finished = running.finish()
-    assert finished.status != 0
-    assert (
-        "sensor died: killed by SIGKILL; restarted, sensor: " in finished.summary["exit"]["reason"]
-    )
-    assert f"127.0.0.1:{port} is already taken" in finished.summary["exit"]["reason"]

@@ -1,53 +1,11 @@
-"""Runs with each process started by hand in its own terminal."""
+"""A process that was started by hand, in its own terminal, is restarted by hand."""
 
-import json
-import os
 import signal
-import stat
 import subprocess
 from collections.abc import Callable
-from pathlib import Path
 
-from cosim.record.run_record import load_record
 from noack.protocol.topology import LOOP_ROLES
-from tests.integration.conftest import (
-    AT_RATE,
-    PATIENCE_S,
-    RATE_HZ,
-    Running,
-    settings,
-    wait_for,
-)
-
-
-def test_five_processes_may_be_started_by_hand_in_any_order(
-    start: Callable[..., Running],
-    by_hand: Callable[[str], subprocess.Popen[str]],
-    tmp_path: Path,
-) -> None:
-    early = [by_hand(role) for role in LOOP_ROLES[:2]]
-    recording = start(
-        *AT_RATE, *settings(speed=5.0, horizon_s=10.0), command=("record", "lane_following")
-    )
-    (folder,) = [tmp_path / f"noack-{os.getuid()}"]
-    ticket = folder / "default.json"
-    wait_for(ticket.exists)
-    assert stat.S_IMODE(ticket.stat().st_mode) == 0o600
-    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
-    key = json.loads(ticket.read_text())["key"].encode()
-    late = [by_hand(role) for role in LOOP_ROLES[2:]]
-    finished = recording.finish()
-    assert finished.status == 0, finished.stderr
-    assert finished.summary["missing_samples"] == 0
-    assert finished.summary["unintended_losses"] == 0
-    for process in early + late:
-        stdout, stderr = process.communicate(timeout=PATIENCE_S)
-        assert process.returncode == 0, stderr
-        assert json.loads(stdout)["ended"] == "horizon"
-    assert not ticket.exists()
-    for path in finished.run_dir.rglob("*"):
-        assert not path.is_file() or key not in path.read_bytes()
-    assert len(load_record(finished.run_dir)["plant_step"]) == 10 * RATE_HZ + 1
+from tests.integration.conftest import AT_RATE, PATIENCE_S, Running, settings
 
 
 def test_a_process_may_be_restarted_by_hand(

@@ -149,20 +149,16 @@ def test_another_probability_changes_no_other_randomness(
     assert all(count > 50 for name, count in compared.items() if name != its_own)
 
 
-def test_the_payload_does_not_change_the_decision() -> None:
-    zeros, full = new_link(ALL_TIMELESS), new_link(ALL_TIMELESS)
+def test_neither_payload_nor_size_changes_the_losses() -> None:
+    small, large = new_link(ALL_TIMELESS), new_link(ALL_TIMELESS)
+    same, other = new_link(ALL_TIMELESS), new_link(ALL_TIMELESS)
     for k in range(100):
-        (one,) = rows_of(zeros.handle(Datagram(0, bytes(k)), 0))
-        (other,) = rows_of(full.handle(Datagram(0, bytes([k]) * k), 0))
+        losses = [link.decide(0, size, 0).fate == 1 for link, size in ((small, 0), (large, 10 * k))]
+        assert losses[0] == losses[1]
+        (one,) = rows_of(same.handle(Datagram(0, bytes(k)), 0))
+        (two,) = rows_of(other.handle(Datagram(0, bytes([k]) * k), 0))
         for name in ("fate", "release_ns", "copy_ns", "bit"):
-            assert one[name] == other[name]
-
-
-def test_the_size_of_a_datagram_does_not_change_its_loss() -> None:
-    small, great = new_link("loss 60%"), new_link("loss 60%")
-    for k in range(100):
-        one, other = small.decide(0, 0, 0).fate, great.decide(0, 10 * k, 0).fate
-        assert one == other
+            assert one[name] == two[name]
 
 
 # The fate of a datagram.

@@ -81,11 +81,11 @@ def _dependent_defaults(resolved: Scenario) -> Iterator[str]:
         yield "controller.safe_input: 0, the input before the first update"
     if resolved.recovery.rejoin_within_s is None:
         yield (
-            "recovery.rejoin_within_s: 0: a process that dies ends the run; with `noack record` "
-            f"{RESTART_BY_HAND_S:g}: it may be restarted within {RESTART_BY_HAND_S:g} s"
+            "recovery.rejoin_within_s: 0, a process that dies ends the run; with `noack record`: "
+            f"{RESTART_BY_HAND_S:g} s to restart it"
         )
     if resolved.start_within_s is None:
         yield (
-            f"start_within_s: {DEFAULT_S:g}, longer on a busy machine; with `noack record` "
+            f"start_within_s: {DEFAULT_S:g}, longer on a busy machine; with `noack record`: "
             "unlimited"
         )

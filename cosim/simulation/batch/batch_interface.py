@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.simulation.continuous.continuous_loop import vanished
 from cosim.simulation.continuous.continuous_run import MAX_EVENTS
 from cosim.simulation.continuous.network_fates import timeless
 from netem.link_machine import UPDATE_LINK
@@ -139,12 +140,7 @@ def run_batch(setting: Setting, population: Population) -> NDArray[np.void]:
 
 
 def run_events(setting: Setting, population: Population) -> Events:
-    """Run one draw and return its events; raises the errors of :func:`run_batch`.
-
-    Args:
-        setting: the shared settings.
-        population: a population of one run.
-    """
+    """Run one draw and return its events; raises the errors of :func:`run_batch`."""
     if len(population.A) != 1:
         raise ValueError(f"one run is wanted, not {len(population.A)}")
     rows, log = _run(setting, population, setting.most_events)
@@ -153,7 +149,7 @@ def run_events(setting: Setting, population: Population) -> Events:
 
 
 def _run(setting: Setting, population: Population, room: int) -> tuple[NDArray[np.void], Any]:
-    from cosim.simulation.batch import batch_run, vector_lanes
+    from cosim.simulation.batch import batch_data, vector_lanes
     from cosim.simulation.batch.batch_rule import rule_of
     from cosim.simulation.batch.quadratic_crossing import squares_of
     from cosim.simulation.batch.taylor import DEGREES, HIGHEST
@@ -161,7 +157,7 @@ def _run(setting: Setting, population: Population, room: int) -> tuple[NDArray[n
     _check(setting, population)
     n, m = len(setting.H), len(setting.K)
     rule, terms = setting.trigger.trigger_rule(n), HIGHEST + 1
-    system = batch_run.BatchSystem(
+    system = batch_data.BatchSystem(
         H=_columns(setting.H),
         K=_columns(setting.K),
         weight=_columns(setting.trigger.weight),
@@ -181,11 +177,11 @@ def _run(setting: Setting, population: Population, room: int) -> tuple[NDArray[n
     keys = np.zeros((len(population.A), len(names), 2), np.int64)
     for stage, name in enumerate(names):
         keys[:, stage] = stream_keys(population.loss_seeds, *name)
-    draws = batch_run.Draws(
+    draws = batch_data.Draws(
         A=_columns(population.A), B=_columns(population.B), x0=_flat(population.x0), keys=keys
     )
     states = ("x_c", "e_c", "d", "x", "error", "weighted", "x_scaled")
-    space = batch_run.BatchMemory(
+    space = batch_data.BatchMemory(
         E=np.empty(n * n),
         A_k=np.empty((terms + 1) * n * n),
         X_k=np.empty((terms + 1) * n * n),
@@ -198,8 +194,8 @@ def _run(setting: Setting, population: Population, room: int) -> tuple[NDArray[n
         **{name: np.empty(terms * max(n, m)) for name in states},
     )
     rows = np.zeros(len(population.A), ROW)
-    log = batch_run.EventLog(np.empty(room), np.empty(room, np.bool_))
-    batch = batch_run.Batch(
+    log = batch_data.EventLog(np.empty(room), np.empty(room, np.bool_))
+    batch = batch_data.Batch(
         vector_lanes.width(n), vector_lanes.width(m), system, draws, _network(setting.link), space,
         log,
     )  # fmt: skip
@@ -209,7 +205,7 @@ def _run(setting: Setting, population: Population, room: int) -> tuple[NDArray[n
 
 def _network(link: LinkSettings) -> Any:
     """The link's rules, compiled, with room for one flow."""
-    from cosim.simulation.batch.batch_run import LossTable
+    from cosim.simulation.batch.batch_data import LossTable
     from netem.engine.compiled_rules import compiled_program, compiled_state, set_flow
 
     program = program_of(link, 0, UPDATE_LINK)
@@ -221,6 +217,7 @@ def _network(link: LinkSettings) -> Any:
 @cache
 def _compiled() -> Any:
     from cosim.simulation.batch import (
+        batch_data,
         batch_rule,
         batch_run,
         batch_status,
@@ -236,8 +233,8 @@ def _compiled() -> Any:
 
     modules: tuple[ModuleType, ...] = (
         self_triggered_interval, batch_status, vector_lanes, taylor, norm_crossing,
-        integral_crossing, level_crossing, batch_rule, quadratic_crossing, piece_measures,
-        batch_run,
+        integral_crossing, level_crossing, batch_rule, batch_data, quadratic_crossing,
+        piece_measures, batch_run,
     )  # fmt: skip
     return compile_kept(batch_run.run_many, prepare("batch", modules))
 
@@ -287,8 +284,4 @@ def _check(setting: Setting, population: Population) -> None:
         return
     vanishes_s = math.log(rule.level / _SMALLEST_THRESHOLD) / rule.rate_per_s
     if vanishes_s < setting.horizon_s:
-        raise CallerError(
-            f"trigger: from {vanishes_s:g} s on the threshold is below "
-            f"{_SMALLEST_THRESHOLD:g}, where no error can be told from rounding; "
-            "give trigger.floor or a shorter horizon"
-        )
+        raise vanished(vanishes_s, _SMALLEST_THRESHOLD)

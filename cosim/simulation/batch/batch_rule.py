@@ -69,13 +69,9 @@ class Span(NamedTuple):
 
 
 def span_after(rule: Rule, t_s: float, left: float, size: float) -> Span:
-    """Return the rule's span after an event or after the start.
+    """Return the rule's span after an event or after the start at ``t_s``.
 
-    Args:
-        rule: the rule.
-        t_s: time of the event.
-        left: ‖P z‖ just after the event; used if the rule is ``from_event``.
-        size: ‖x‖_W; used if the rule has a forecast.
+    ``left`` is ‖P z‖ just after it (for rules ``from_event``), ``size`` ‖x‖_W (for forecasts).
     """
     level, since_s, due_ns, point = rule.level, 0.0, rule.longest_ns, 0
     if rule.from_event:
@@ -125,3 +121,10 @@ def phase_at(rule: Rule, span: Span, t_s: float) -> Phase:
 def last_point(rule: Rule, t_s: float) -> int:
     """Return the last grid point up to a time."""
     return math.floor(t_s / rule.grid_s + _GRID_SLACK)
+
+
+def threshold_after(phase: Phase, s: float) -> float:
+    """Return the threshold ``s`` seconds after the start of a phase."""
+    if phase.rate_per_s > 0.0:
+        return phase.threshold * math.exp(-phase.rate_per_s * s)
+    return phase.threshold

@@ -3,10 +3,17 @@
 import math
 from typing import Any, NamedTuple
 
-from cosim.simulation.batch.batch_rule import Rule, Span, phase_at, span_after
+from cosim.simulation.batch.batch_data import Batch, LossTable
+from cosim.simulation.batch.batch_rule import (
+    Phase,
+    Span,
+    phase_at,
+    span_after,
+    threshold_after,
+)
 from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS, UNDECIDED
 from cosim.simulation.batch.integral_crossing import first_excess
-from cosim.simulation.batch.norm_crossing import MOST_STEPS, NONE, UNRESOLVED, first_exit
+from cosim.simulation.batch.norm_crossing import MOST_STEPS, NONE, UNRESOLVED, Search, first_exit
 from cosim.simulation.batch.piece_measures import (
     CERTAINTY,
     is_within,
@@ -26,10 +33,10 @@ from cosim.simulation.batch.quadratic_crossing import (
     put,
     scale_of,
 )
-from cosim.simulation.batch.taylor import Array, degree_for, driven, powers, reaches, value
-from cosim.simulation.batch.vector_lanes import Lanes, Width, dot, filled, load, store, times
+from cosim.simulation.batch.taylor import Models, degree_for, driven, powers, reaches, state_at
+from cosim.simulation.batch.vector_lanes import Lanes, dot, filled, load, store, times
 from netem.rules.link_rules import admit
-from noack.impairments.link_records import DELIVERED, FORCED, NEVER_NS, LinkMemory, LinkProgram
+from noack.impairments.link_records import DELIVERED, FORCED, NEVER_NS
 
 _LARGEST = 1e100
 """A state above this norm counts as diverged, as in ``continuous_loop``."""
@@ -40,104 +47,16 @@ _AHEAD = 1.25
 initial speed."""
 
 
-class BatchSystem(NamedTuple):
-    """The data that all runs share; matrices in column-major order."""
+class Comparison(NamedTuple):
+    """The comparison from the start of a piece on."""
 
-    H: Array
-    K: Array
-    weight: Array
-    """W; empty: the identity."""
-    Q: Array
-    """Empty: the identity."""
-    R: Array
-    """Empty: the identity."""
-    inverse: Array
-    """1/k at index k."""
-    H_k: Array
-    """Table of H^k/k!."""
-    rule: Rule
-    fading_per_s: float
-    """α of the supremum of ‖W e_c‖ e^{αt}."""
-    horizon_s: float
-    known_start: bool
-    first_delivered: bool
-    settle: float
-    most_events: int
-
-
-class Draws(NamedTuple):
-    """The data that differ between the runs; matrices in column-major order, run by run."""
-
-    A: Array
-    B: Array
-    x0: Array
-    keys: Any
-    """Keys of the random streams, (runs, stages, 2)."""
-
-
-class BatchMemory(NamedTuple):
-    """Scratch, written before it is read."""
-
-    E: Array
-    A_k: Array
-    X_k: Array
-    reach_s: Array
-    """Time over which a polynomial is accurate, by degree."""
-    measured_s: Array
-    """The same, at the accuracy of the measures."""
-    x_c: Array
-    """Coefficients, as in all arrays below."""
-    e_c: Array
-    d: Array
-    x: Array
-    u: Array
-    error: Array
-    """W e_s."""
-    weighted: Array
-    """W e_c."""
-    x_scaled: Array
-    u_scaled: Array
-    squares: Array
-    """Coefficients of ‖W e_c‖²."""
-    sizes: Array
-
-
-class LossTable(NamedTuple):
-    """The compiled rules of the link, and their state."""
-
-    program: LinkProgram
-    state: LinkMemory
-    verdicts: Any
-    """One :class:`noack.impairments.link_records.PacketDecision`."""
-
-
-class EventLog(NamedTuple):
-    """The events of a run, up to the length of the arrays."""
-
-    event_s: Array
-    delivered: Any
-
-
-class Batch(NamedTuple):
-    """All data of a batch."""
-
-    n: Width
-    """Tuple of n entries, n the number of states."""
-    m: Width
-    """Tuple of m entries, m the number of inputs."""
-    system: BatchSystem
-    draws: Draws
-    network: LossTable
-    space: BatchMemory
-    log: EventLog
-
-
-class Models(NamedTuple):
-    """The state of a run in the coordinates of :mod:`cosim.simulation.batch.taylor`."""
-
-    x_c: Lanes
-    e_c: Lanes
-    d: Lanes
+    phase: Phase
+    scale: float
+    """The values of a quadratic comparison are divided by its square; otherwise 1."""
+    level: float
+    """Squared threshold, divided by the square of the scale."""
+    auxiliary: float
+    """η or the integral, at the start."""
 
 
 class Piece(NamedTuple):
@@ -163,6 +82,7 @@ def run_many(batch: Batch, squares: QuadraticCurves | None, rows: Any) -> None:
     for run in range(len(rows)):
         renew(batch.network, batch.draws.keys, run, batch.system.first_delivered)
         prepare(batch, run)
+        begin_row(rows[run])
         follow(batch, squares, run, rows[run])
 
 
@@ -240,115 +160,106 @@ def weighted(batch: Batch, v: Lanes) -> Lanes:
 
 def follow(batch: Batch, squares: QuadraticCurves | None, run: int, row: Any) -> None:
     """Follow one run to its end."""
-    n, system, space = batch.n, batch.system, batch.space
-    rule = system.rule
-    nothing = filled(0.0, n)
-    x0 = load(batch.draws.x0, run * len(n), n)
-    settled = system.settle * math.sqrt(dot(x0, x0))
-    farthest_s = space.reach_s[len(space.reach_s) - 1]
-    auxiliary, first_degree = 0.0, 1
-    if squares is not None:
-        auxiliary, first_degree = squares.initial_dynamic_variable, 2
-        if squares.decay_per_s > 0.0:
-            farthest_s = min(farthest_s, SLOWEST / squares.decay_per_s)
+    system, space, n = batch.system, batch.space, batch.n
+    x0, nothing = load(batch.draws.x0, run * len(n), n), filled(0.0, n)
+    settled, farthest_s = system.settle * size_of(x0), farthest(batch, squares)
+    auxiliary, first_degree = start_of(squares)
     event = not system.known_start
     state = Models(nothing, nothing - x0, nothing) if event else Models(x0, nothing, nothing)
-    t_s, last_s, first_s, status = 0.0, -1.0, 0.0, OK
-    above, fresh, looked, agree = math.sqrt(dot(x0, x0)) > settled, True, False, True
-    span, point, scale, level = Span(0.0, 0.0, 0.0, 0.0, 0.0, 0), 0, 1.0, 0.0
-    begin_row(row)
+    t_s, last_s, first_s, status = 0.0, -1.0, 0.0, UNDECIDED
+    above, fresh, looked, agree = size_of(x0) > settled, True, False, True
+    span, point = Span(0.0, 0.0, 0.0, 0.0, 0.0, 0), 0
     for _ in range(_MOST_PIECES if farthest_s > 0.0 else 0):
         if event:
             if row.transmissions >= system.most_events or t_s <= last_s:
                 status = TOO_MANY_EVENTS
                 break
-            agree = count_event(batch, row, t_s, last_s)
-            if row.transmissions == 1:
-                first_s = t_s
-                if t_s == 0.0 and not agree:
-                    row.sup_e_c_scaled = size_of(weighted(batch, state.e_c))
-            last_s, fresh = t_s, True
-            state = updated(state, agree, nothing)
+            agree = count_event(batch, row, state, t_s, last_s)
+            first_s = t_s if row.transmissions == 1 else first_s
+            last_s, fresh, state = t_s, True, updated(state, agree, nothing)
         if t_s >= system.horizon_s:
+            status = OK
             break
         if fresh:
-            span = next_span(batch, squares, state, t_s)
-            point, fresh, looked = span.point, False, False
-            if rule.integrates:
-                auxiliary = 0.0
-        phase = phase_at(rule, span, t_s)
-        until_s = min(phase.until_s, system.horizon_s)
-        threshold, rate = phase.threshold, phase.rate_per_s
-        # The degree, and the length of the first search after an event.
+            span, fresh, looked = next_span(batch, squares, state, t_s), False, False
+            point, auxiliary = span.point, 0.0 if system.rule.integrates else auxiliary
+        phase = phase_at(system.rule, span, t_s)
+        left_s = min(phase.until_s, system.horizon_s) - t_s
+        now = comparison_at(squares, phase, state, auxiliary)
+        expand(batch, squares, state, 1.0 / now.scale, 0, first_degree)
         window_s = farthest_s
-        if squares is not None:
-            scale = scale_of(size_of_state(state), threshold, auxiliary)
-            level = (threshold / scale) * (threshold / scale)
-        expand(batch, squares, state, 1.0 / scale, 0, first_degree)
         if phase.compares and not looked:
-            if not is_within(state.x_c, state.e_c, state.d, _LARGEST, threshold):
+            if not is_within(state, _LARGEST, phase.threshold):
                 status = DIVERGED
                 break
-            if squares is None:
-                window_s = min(window_s, first_window(batch, threshold, auxiliary))
-            else:
-                soon_s = first_look(squares, level, 2.0 * rate, auxiliary / (scale * scale))
-                window_s = min(window_s, max(_AHEAD * soon_s, point * rule.grid_s - t_s))
+            window_s = min(window_s, first_window(batch, squares, now, point, t_s))
             looked = True
-        closes = window_s >= until_s - t_s
-        if closes:
-            window_s = until_s - t_s
+        window_s = min(window_s, left_s)
         p = degree_for(space.reach_s, window_s)
-        expand(batch, squares, state, 1.0 / scale, first_degree + 1, p)
-        # The event.
-        found_s = NONE
-        if squares is not None:
-            if phase.compares or len(squares.gain) > 0:
-                degree = compare(squares, p, auxiliary / (scale * scale))
-                if phase.compares:
-                    found_s, point = first_event(
-                        squares, rule, degree, level, 2.0 * rate, point, t_s, window_s
-                    )
-        elif rule.integrates:
-            found_s, auxiliary = first_excess(
-                space.error, p, auxiliary, threshold if phase.compares else math.inf, rate,
-                window_s, n,
-            )  # fmt: skip
-        elif phase.compares:
-            found_s = first_exit(space.error, p, threshold, rate, window_s, False, MOST_STEPS, n)
+        expand(batch, squares, state, 1.0 / now.scale, first_degree + 1, p)
+        found_s, auxiliary, point = find_event(batch, squares, now, p, point, t_s, window_s)
         if found_s == UNRESOLVED:
-            status = UNDECIDED
             break
         event = found_s != NONE
         spent_s = found_s if event else window_s
         if squares is not None:
-            auxiliary = dynamic_variable_at(squares, p, spent_s) * (scale * scale)
-        p = degree_for(space.reach_s, spent_s)
-        x_c, e_c = value(space.x_c, p, spent_s, n), value(space.e_c, p, spent_s, n)
-        state = Models(x_c, e_c, value(space.d, p, spent_s, n))
-        # The end of a run that diverges.
-        decayed = threshold * math.exp(-rate * spent_s) if rate > 0.0 else threshold
-        if not is_within(state.x_c, state.e_c, state.d, _LARGEST, decayed):
+            auxiliary = dynamic_variable_at(squares, p, spent_s) * (now.scale * now.scale)
+        state = state_at(space, degree_for(space.reach_s, spent_s), spent_s, n)
+        if not is_within(state, _LARGEST, threshold_after(phase, spent_s)):
             status = DIVERGED
-            t_s += passed_at(
-                space.x_c, space.e_c, space.d, p, spent_s, _LARGEST, threshold, rate, n
-            )
+            t_s += passed_at(space, spent_s, _LARGEST, phase, n)
             break
-        # While both models agree, e_c = e_s, and ‖W e_s‖ is at most the threshold between events.
-        ceiling = math.inf
-        if agree and phase.compares and squares is None and not rule.integrates:
-            until = t_s + (spent_s if rate == 0.0 else 0.0)
-            ceiling = threshold * math.exp(system.fading_per_s * until)
+        bounded = agree and squares is None and phase.compares and not system.rule.integrates
+        ceiling = ceiling_of(batch, phase, t_s, spent_s) if bounded else math.inf
         within_s = measure_piece(batch, row, state, Piece(t_s, spent_s, settled, ceiling))
         if within_s == UNRESOLVED:
-            status = UNDECIDED
             break
         above = within_s == spent_s
-        t_s = until_s if closes and not event else t_s + spent_s
+        t_s = t_s + spent_s if event or window_s < left_s else min(phase.until_s, system.horizon_s)
         event = event or t_s >= span.due_s
-    else:
-        status = UNDECIDED
     finish_row(row, status, t_s, last_s - first_s, above, size_of(state.x_c - state.e_c))
+
+
+def comparison_at(
+    squares: QuadraticCurves | None, phase: Phase, state: Models, auxiliary: float
+) -> Comparison:
+    """Return the comparison of a phase, scaled to the state."""
+    if squares is None:
+        return Comparison(phase, 1.0, 0.0, auxiliary)
+    scale = scale_of(size_of_state(state), phase.threshold, auxiliary)
+    level = (phase.threshold / scale) * (phase.threshold / scale)
+    return Comparison(phase, scale, level, auxiliary)
+
+
+def find_event(
+    batch: Batch, squares: QuadraticCurves | None, now: Comparison, p: int, point: int,
+    t_s: float, window_s: float,
+) -> tuple[float, float, int]:  # fmt: skip
+    """Return the time of the next event on a piece, or NONE; the integral; the next grid point."""
+    phase, rule, space = now.phase, batch.system.rule, batch.space
+    if squares is not None:
+        if phase.compares or len(squares.gain) > 0:
+            degree = compare(squares, p, now.auxiliary / (now.scale * now.scale))
+            if phase.compares:
+                search = Search(now.level, 2.0 * phase.rate_per_s, window_s, False)
+                found_s, point = first_event(squares, rule, degree, search, point, t_s)
+                return found_s, now.auxiliary, point
+    elif rule.integrates:
+        level = phase.threshold if phase.compares else math.inf
+        search = Search(level, phase.rate_per_s, window_s, False)
+        found_s, integral = first_excess(space.error, p, search, now.auxiliary, batch.n)
+        return found_s, integral, point
+    elif phase.compares:
+        search = Search(phase.threshold, phase.rate_per_s, window_s, False)
+        found_s = first_exit(space.error, p, search, MOST_STEPS, batch.n)
+        return found_s, now.auxiliary, point
+    return NONE, now.auxiliary, point
+
+
+def ceiling_of(batch: Batch, phase: Phase, t_s: float, spent_s: float) -> float:
+    """Return a bound on ‖W e_c‖ e^{αt} on a piece on which both models agree: then e_c = e_s."""
+    until_s = t_s + (spent_s if phase.rate_per_s == 0.0 else 0.0)
+    return phase.threshold * math.exp(batch.system.fading_per_s * until_s)
 
 
 def begin_row(row: Any) -> None:
@@ -362,16 +273,7 @@ def begin_row(row: Any) -> None:
 
 
 def finish_row(row: Any, status: int, t_s: float, span_s: float, above: bool, norm: float) -> None:
-    """Complete a row.
-
-    Args:
-        row: the row, with its sums and extremes up to ``t_s``.
-        status: how the run ended.
-        t_s: end of the run.
-        span_s: time from the first event to the last.
-        above: whether ‖x‖ is above the settling level at the end.
-        norm: ‖x‖ at the end.
-    """
+    """Complete a row."""
     gaps, finished = row.transmissions - 1, status == OK
     row.inter_event_min_s = row.inter_event_min_s if gaps > 0 else math.nan
     row.inter_event_mean_s = span_s / gaps if gaps > 0 else math.nan
@@ -383,7 +285,7 @@ def finish_row(row: Any, status: int, t_s: float, span_s: float, above: bool, no
     row.status = status
 
 
-def count_event(batch: Batch, row: Any, t_s: float, last_s: float) -> bool:
+def count_event(batch: Batch, row: Any, state: Models, t_s: float, last_s: float) -> bool:
     """Count an event; return whether its update arrives."""
     delivered, log = arrives(batch.network), batch.log
     if row.transmissions < len(log.event_s):
@@ -391,6 +293,8 @@ def count_event(batch: Batch, row: Any, t_s: float, last_s: float) -> bool:
         log.delivered[row.transmissions] = delivered
     if row.transmissions > 0:
         row.inter_event_min_s = min(row.inter_event_min_s, t_s - last_s)
+    elif t_s == 0.0 and not delivered:
+        row.sup_e_c_scaled = size_of(weighted(batch, state.e_c))
     row.transmissions += 1
     if delivered:
         row.deliveries += 1
@@ -416,34 +320,47 @@ def next_span(
     return span_after(batch.system.rule, t_s, left, length)
 
 
-def first_window(batch: Batch, threshold: float, auxiliary: float) -> float:
-    """Return the length of the first search after an event, from the error's initial speed."""
+def start_of(squares: QuadraticCurves | None) -> tuple[float, int]:
+    """Return the auxiliary variable at the start, and the degree of the first estimate."""
+    if squares is not None:
+        return squares.initial_dynamic_variable, 2
+    return 0.0, 1
+
+
+def farthest(batch: Batch, squares: QuadraticCurves | None) -> float:
+    """Return the length of the longest piece; 0 if no polynomial is accurate."""
+    farthest_s = batch.space.reach_s[len(batch.space.reach_s) - 1]
+    if squares is not None and squares.decay_per_s > 0.0:
+        return min(farthest_s, SLOWEST / squares.decay_per_s)
+    return farthest_s
+
+
+def first_window(
+    batch: Batch, squares: QuadraticCurves | None, now: Comparison, point: int, t_s: float
+) -> float:
+    """Return the length of the first search after an event, from the first coefficients."""
+    threshold = now.phase.threshold
+    if squares is not None:
+        rate, scaled = 2.0 * now.phase.rate_per_s, now.auxiliary / (now.scale * now.scale)
+        soon_s = first_look(squares, now.level, rate, scaled)
+        return max(_AHEAD * soon_s, point * batch.system.rule.grid_s - t_s)
     speed = size_of(load(batch.space.error, len(batch.n), batch.n))
     if speed == 0.0:
         return math.inf
     if batch.system.rule.integrates:  # of an error that grows in proportion to time: ½ speed s²
-        return _AHEAD * math.sqrt(2.0 * max(threshold - auxiliary, 0.0) / speed)
+        return _AHEAD * math.sqrt(2.0 * max(threshold - now.auxiliary, 0.0) / speed)
     return _AHEAD * threshold / speed
 
 
 def measure_piece(batch: Batch, row: Any, end: Models, piece: Piece) -> float:
     """Add a piece's contribution to a row.
 
-    Args:
-        batch: the batch; its memory contains the coefficients of the piece.
-        row: the row, with its sums and extremes up to the piece.
-        end: the state at the end of the piece.
-        piece: the piece.
-
     Returns:
         The last time on the piece at which ‖x‖ is above the settling level; NONE; or UNRESOLVED.
     """
     n, system, space = batch.n, batch.system, batch.space
     q = degree_for(space.measured_s, piece.length_s)
-    row.cost += square_integrals(
-        space.x, space.u, q, piece.length_s, system.Q, system.R, system.inverse,
-        space.x_scaled, space.u_scaled, n, batch.m,
-    )  # fmt: skip
+    row.cost += square_integrals(system, space, q, piece.length_s, n, batch.m)
     growth = math.exp(system.fading_per_s * piece.t_s)
     rise = math.exp(system.fading_per_s * piece.length_s)
     best = max(row.sup_e_c_scaled, size_of(weighted(batch, end.e_c)) * growth * rise)

@@ -9,7 +9,7 @@ to the last bits of the time on the piece.
 
 import math
 
-from cosim.simulation.batch.norm_crossing import NONE, UNRESOLVED
+from cosim.simulation.batch.norm_crossing import NONE, UNRESOLVED, Search
 from cosim.simulation.batch.taylor import Array, value
 from cosim.simulation.batch.vector_lanes import Width, dot
 
@@ -35,24 +35,16 @@ def gauss(curve: Array, p: int, begin_s: float, end_s: float, n: Width) -> float
 
 
 def first_excess(
-    curve: Array, p: int, integral: float, level: float, rate: float, end_s: float, n: Width
+    curve: Array, p: int, search: Search, integral: float, n: Width
 ) -> tuple[float, float]:
-    """Return the first time at which the integral exceeds ``level`` e^{−``rate`` s}.
-
-    Args:
-        curve: coefficients of y.
-        p: the degree.
-        integral: its value at the start of the piece.
-        level: threshold at the start; infinity to compute only the integral.
-        rate: decay rate of the threshold, per second.
-        end_s: length of the piece.
-        n: number of entries of y.
+    """Return the first time at which the integral exceeds the level of a search.
 
     Returns:
         The time in seconds from the start of the piece, NONE or UNRESOLVED; and the integral at
         that time, or at the end.
     """
-    if integral > level:
+    end_s = search.end_s
+    if integral > search.level:
         return 0.0, integral
     s, step = 0.0, end_s
     for _ in range(_MOST_INTERVALS):
@@ -64,8 +56,8 @@ def first_excess(
         error = abs(gained - gauss(curve, p, s, following, n))
         if error > TOLERANCE * (integral + gained) and step > _SHORTEST * end_s:
             step = 0.5 * (following - s)
-        elif integral + gained > level * math.exp(-rate * following):
-            return crossing(curve, p, integral, level, rate, s, following, n)
+        elif integral + gained > search.level * math.exp(-search.rate * following):
+            return crossing(curve, p, search, integral, s, following, n)
         else:
             integral += gained
             s, step = following, 2.0 * step
@@ -73,9 +65,8 @@ def first_excess(
 
 
 def crossing(
-    curve: Array, p: int, integral: float, level: float, rate: float, begin_s: float, end_s: float,
-    n: Width,
-) -> tuple[float, float]:  # fmt: skip
+    curve: Array, p: int, search: Search, integral: float, begin_s: float, end_s: float, n: Width
+) -> tuple[float, float]:
     """Return the crossing, as :func:`first_excess`, where one quadrature is exact."""
     low_s, high_s = begin_s, end_s
     for _ in range(_BISECTIONS):
@@ -83,7 +74,7 @@ def crossing(
         if not low_s < middle_s < high_s:
             break
         reached = integral + gauss(curve, p, begin_s, middle_s, n)
-        if reached > level * math.exp(-rate * middle_s):
+        if reached > search.level * math.exp(-search.rate * middle_s):
             high_s = middle_s
         else:
             low_s = middle_s

@@ -26,13 +26,14 @@ bisected to the last bit.
 import math
 
 from cosim.simulation.batch.norm_crossing import (
-    CLOSE,
     MOST_STEPS,
-    NEWTON_STEPS,
     NONE,
-    TURNS,
     UNRESOLVED,
-    bracketed,
+    Point,
+    Search,
+    ascent,
+    excess_and_slope,
+    level_at,
 )
 from cosim.simulation.batch.taylor import Array
 
@@ -40,34 +41,20 @@ _AHEAD = 3.0
 _NEARER = 0.6
 
 
-def first_root(
-    g: Array, degree: int, level: float, rate: float, grain: float, end_s: float
-) -> float:
-    """Return the first s in [0, ``end_s``) from which g(s) ≥ ``level`` e^{−``rate`` s}.
-
-    Args:
-        g: coefficients g_k.
-        degree: the highest k.
-        level: c ≥ 0.
-        rate: r ≥ 0, per second.
-        grain: bound on the rounding error of h(0).
-        end_s: end of the search.
-
-    Returns:
-        The time; NONE; or UNRESOLVED after MOST_STEPS.
-    """
+def first_root(g: Array, degree: int, search: Search, grain: float) -> float:
+    """Return the first s in [0, ``end_s``) from which g(s) ≥ c e^{−rs}, NONE or UNRESOLVED."""
+    rate, end_s = search.rate, search.end_s
     s, ahead_s = 0.0, end_s
     most = bend_of(g, degree, end_s)
-    limit = level
-    value, slope = g[0] - level, g[1] + rate * level
+    value, slope = g[0] - search.level, g[1] + rate * search.level
     if value > grain or (value >= -grain and slope > 0.0):
         return 0.0
     if end_s <= 0.0:
         return NONE
     value = min(value, 0.0)
     for _ in range(MOST_STEPS):
-        if slope > (most + rate * rate * limit) * (ahead_s - s):
-            s = ascending_root(g, degree, level, rate, s, value, slope, ahead_s)
+        if slope > (most + rate * rate * level_at(search, s)) * (ahead_s - s):
+            s = ascent(g, degree, search, Point(s, value, slope), ahead_s, None)
             if s != NONE or ahead_s == end_s:
                 return s
             s = ahead_s
@@ -84,66 +71,20 @@ def first_root(
         if s == ahead_s:
             ahead_s = end_s
             most = bend_of(g, degree, ahead_s)
-        limit = level * math.exp(-rate * s) if rate > 0.0 else level
-        value, slope = number_and_slope(g, degree, s)
-        value, slope = value - limit, slope + rate * limit
+        value, slope = excess_and_slope(g, degree, search, s, None)
         if value >= 0.0:
             return s
     return UNRESOLVED
 
 
 def safe_step(value: float, slope: float, most: float, span: float) -> float:
-    """Return φ's positive root, given φ(0) ≤ 0, or ``span`` if that is smaller.
-
-    Args:
-        value: φ(0) = h(s).
-        slope: ḣ(s).
-        most: b.
-        span: a − s.
-    """
+    """Return φ's positive root, given φ(0) ≤ 0, or ``span`` if that is smaller."""
     if value + span * (slope + 0.5 * most * span) <= 0.0:
         return span
     root = math.sqrt(slope * slope - 2.0 * most * value)
     if slope > 0.0:
         return min(-2.0 * value / (slope + root), span)
     return min((root - slope) / most, span)
-
-
-def ascending_root(
-    g: Array, degree: int, level: float, rate: float, s: float, value: float, slope: float,
-    ahead_s: float,
-) -> float:  # fmt: skip
-    """Return the root of an increasing h in (``s``, ``ahead_s``), or NONE.
-
-    Args:
-        g: as in :func:`first_root`.
-        degree: the highest k.
-        level: c.
-        rate: r.
-        s: a point where h is negative.
-        value: h(s).
-        slope: ḣ(s).
-        ahead_s: a.
-    """
-    low_s, high_s, beyond = s, ahead_s, False
-    for turn in range(TURNS):
-        following = s - value / slope if slope > 0.0 else math.inf
-        if abs(following - s) <= CLOSE * s and turn < NEWTON_STEPS:
-            return following if following < ahead_s or beyond else NONE
-        following = bracketed(following, turn, low_s, high_s, beyond)
-        if following == s:
-            return s
-        s = following
-        limit = level * math.exp(-rate * s) if rate > 0.0 else level
-        value, slope = number_and_slope(g, degree, s)
-        value, slope = value - limit, slope + rate * limit
-        if value >= 0.0:
-            high_s, beyond = s, True
-        elif s == ahead_s:
-            return NONE
-        else:
-            low_s = s
-    return s
 
 
 def estimate(g: Array, level: float, rate: float) -> float:
@@ -156,15 +97,6 @@ def estimate(g: Array, level: float, rate: float) -> float:
     if slope > 0.0:
         return -2.0 * min(value, 0.0) / (slope + math.sqrt(square))
     return (math.sqrt(square) - slope) / (2.0 * half) if half > 0.0 else math.inf
-
-
-def number_and_slope(g: Array, degree: int, s: float) -> tuple[float, float]:
-    """Return the polynomial and its derivative."""
-    total, slope = g[degree], 0.0
-    for k in range(degree - 1, -1, -1):
-        slope = slope * s + total
-        total = total * s + g[k]
-    return total, slope
 
 
 def bend_of(g: Array, degree: int, s: float) -> float:

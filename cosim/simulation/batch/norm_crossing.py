@@ -23,13 +23,17 @@ result is UNRESOLVED. A chord of φ lies above φ, so Newton's method may stop a
 step is then shorter and equally safe. Where h increases, Newton's method takes at most
 NEWTON_STEPS; then its bracket is bisected to the last bit.
 
+In all functions ``curve`` has the coefficients of y, p is its degree, n the number of its entries;
+``most``, ``limit`` and ``span`` are b, c_s and a − s.
+
 This module compares |y| only. Other quadratic event functions are in
 :mod:`cosim.simulation.batch.quadratic_crossing`.
 """
 
 import math
+from typing import NamedTuple
 
-from cosim.simulation.batch.taylor import Array, bend, value_and_slope
+from cosim.simulation.batch.taylor import Array, bend, number_and_slope, value_and_slope
 from cosim.simulation.batch.vector_lanes import Lanes, Width, dot, filled, load
 
 NONE = -1.0
@@ -45,34 +49,45 @@ TURNS = NEWTON_STEPS + 1100
 """More bisections than any two floating-point numbers need."""
 
 
-def first_exit(
-    curve: Array, p: int, level: float, rate: float, end_s: float, backward: bool, most_steps: int,
-    n: Width,
-) -> float:  # fmt: skip
-    """Return the first s in [0, ``end_s``) from which |y(s)| ≥ ``level`` e^{−``rate`` s}.
+class Search(NamedTuple):
+    """A search on [0, ``end_s``] for the first crossing of c e^{−rs}."""
 
-    Args:
-        curve: coefficients of y.
-        p: the degree.
-        level: c > 0.
-        rate: r ≥ 0, per second; 0 if ``backward``.
-        end_s: end of the search.
-        backward: search y(``end_s`` − s) instead.
-        most_steps: largest number of steps.
-        n: number of entries of y.
+    level: float
+    """c > 0."""
+    rate: float
+    """r ≥ 0, per second; 0 if ``backward``."""
+    end_s: float
+    backward: bool
+    """Search y(``end_s`` − s) instead of y(s)."""
 
-    Returns:
-        The time; NONE; or UNRESOLVED.
-    """
+
+class Point(NamedTuple):
+    """A point of the search."""
+
+    s: float
+    excess: float
+    """h(s)."""
+    slope: float
+    """ḣ(s)."""
+
+
+def level_at(search: Search, s: float) -> float:
+    """Return c e^{−rs}."""
+    return search.level * math.exp(-search.rate * s) if search.rate > 0.0 else search.level
+
+
+def first_exit(curve: Array, p: int, search: Search, most_steps: int, n: Width) -> float:
+    """Return the first s in [0, ``end_s``) from which |y(s)| ≥ c e^{−rs}, NONE or UNRESOLVED."""
+    rate, end_s, backward = search.rate, search.end_s, search.backward
     s, ahead_s = 0.0, end_s
     most = bend(curve, p, end_s, n)
     if backward:
-        y, dy = look(curve, p, s, end_s, backward, n)
+        y, dy = look(curve, p, search, s, n)
     else:
         y, dy = load(curve, 0, n), load(curve, len(n), n)
     for _ in range(most_steps):
         square, mixed, speed = dot(y, y), dot(y, dy), dot(dy, dy)
-        limit = level * math.exp(-rate * s) if rate > 0.0 else level
+        limit = level_at(search, s)
         size = math.sqrt(square)
         if size >= limit:
             return s
@@ -80,7 +95,7 @@ def first_exit(
             return NONE
         slope = rate * limit + (mixed / size if size > 0.0 else math.sqrt(speed))
         if slope > (most + rate * rate * limit) * (ahead_s - s):
-            s = ascent(curve, p, level, rate, s, size - limit, slope, ahead_s, end_s, backward, n)
+            s = ascent(curve, p, search, Point(s, size - limit, slope), ahead_s, n)
             if s != NONE or ahead_s == end_s:
                 return s
             s = ahead_s
@@ -97,24 +112,14 @@ def first_exit(
         if s == ahead_s:
             ahead_s = end_s
             most = bend(curve, p, ahead_s, n)
-        y, dy = look(curve, p, s, end_s, backward, n)
+        y, dy = look(curve, p, search, s, n)
     return UNRESOLVED
 
 
 def safe(
     square: float, mixed: float, speed: float, limit: float, rate: float, most: float, span: float
 ) -> float:
-    """Return the length of a step that skips no crossing; ``span`` if there is none within it.
-
-    Args:
-        square: |y|².
-        mixed: y·ẏ.
-        speed: |ẏ|².
-        limit: c_s.
-        rate: r.
-        most: b.
-        span: a − s.
-    """
+    """Return the length of a step that skips no crossing; ``span`` if there is none within it."""
     length, below = span, limit - math.sqrt(square)
     above = 0.0
     for _ in range(NEWTON_STEPS):
@@ -135,24 +140,10 @@ def safe(
 
 
 def ascent(
-    curve: Array, p: int, level: float, rate: float, s: float, excess: float, slope: float,
-    ahead_s: float, end_s: float, backward: bool, n: Width,
-) -> float:  # fmt: skip
-    """Return the root of an increasing h in (``s``, ``ahead_s``), or NONE.
-
-    Args:
-        curve: as in :func:`first_exit`.
-        p: the degree.
-        level: c.
-        rate: r.
-        s: a point where h is negative.
-        excess: h(s).
-        slope: ḣ(s).
-        ahead_s: a.
-        end_s: as in :func:`first_exit`.
-        backward: as in :func:`first_exit`.
-        n: number of entries of y.
-    """
+    curve: Array, p: int, search: Search, start: Point, ahead_s: float, n: Width | None
+) -> float:
+    """Return the root of an increasing h in (``start.s``, ``ahead_s``), or NONE."""
+    s, excess, slope = start.s, start.excess, start.slope
     low_s, high_s, beyond = s, ahead_s, False
     for turn in range(TURNS):
         following = s - excess / slope if slope > 0.0 else math.inf
@@ -162,11 +153,7 @@ def ascent(
         if following == s:
             return s
         s = following
-        y, dy = look(curve, p, s, end_s, backward, n)
-        limit = level * math.exp(-rate * s) if rate > 0.0 else level
-        size = math.sqrt(dot(y, y))
-        excess = size - limit
-        slope = rate * limit + (dot(y, dy) / size if size > 0.0 else 0.0)
+        excess, slope = excess_and_slope(curve, p, search, s, n)
         if excess >= 0.0:
             high_s, beyond = s, True
         elif s == ahead_s:
@@ -177,14 +164,9 @@ def ascent(
 
 
 def bracketed(following: float, turn: int, low_s: float, high_s: float, beyond: bool) -> float:
-    """Return Newton's next point if it is in the bracket and within NEWTON_STEPS, else a safe one.
+    """Return Newton's point ``following`` if it is in the bracket, else a safe one.
 
-    Args:
-        following: Newton's next point.
-        turn: number of earlier points.
-        low_s: a point below the root, if there is a root.
-        high_s: a point above the root if ``beyond``, else the end of the interval.
-        beyond: whether there is a root below ``high_s``.
+    ``low_s`` is below the root, if there is one; there is one below ``high_s`` if ``beyond``.
     """
     if turn < NEWTON_STEPS and low_s < following < high_s:
         return following
@@ -193,17 +175,28 @@ def bracketed(following: float, turn: int, low_s: float, high_s: float, beyond: 
     return 0.5 * (low_s + high_s)
 
 
-def look(
-    curve: Array, p: int, s: float, end_s: float, backward: bool, n: Width
-) -> tuple[Lanes, Lanes]:
+def excess_and_slope(
+    curve: Array, p: int, search: Search, s: float, n: Width | None
+) -> tuple[float, float]:
+    """Return h(s) and ḣ(s), for |y| or for a scalar polynomial."""
+    limit = level_at(search, s)
+    if n is None:
+        number, slope = number_and_slope(curve, p, s)
+        return number - limit, slope + search.rate * limit
+    y, dy = look(curve, p, search, s, n)
+    size = math.sqrt(dot(y, y))
+    return size - limit, search.rate * limit + (dot(y, dy) / size if size > 0.0 else 0.0)
+
+
+def look(curve: Array, p: int, search: Search, s: float, n: Width) -> tuple[Lanes, Lanes]:
     """Return y and ẏ, forward or backward."""
-    if backward:
-        y, dy = value_and_slope(curve, p, end_s - s, n)
+    if search.backward:
+        y, dy = value_and_slope(curve, p, search.end_s - s, n)
         return y, filled(0.0, n) - dy
     return value_and_slope(curve, p, s, n)
 
 
 def last_entry(curve: Array, p: int, level: float, end_s: float, n: Width) -> float:
     """Return the last s in [0, ``end_s``] with |y(s)| ≥ ``level``, NONE or UNRESOLVED."""
-    back_s = first_exit(curve, p, level, 0.0, end_s, True, MOST_STEPS, n)
+    back_s = first_exit(curve, p, Search(level, 0.0, end_s, True), MOST_STEPS, n)
     return back_s if back_s < 0.0 else end_s - back_s

@@ -6,9 +6,19 @@ from crossings with a level (:mod:`cosim.simulation.batch.norm_crossing`), witho
 
 import math
 
+from cosim.simulation.batch.batch_data import BatchMemory, BatchSystem
+from cosim.simulation.batch.batch_rule import Phase
 from cosim.simulation.batch.level_crossing import first_root
-from cosim.simulation.batch.norm_crossing import NONE, UNRESOLVED, first_exit, last_entry
-from cosim.simulation.batch.taylor import Array, largest, squared, value, value_and_slope
+from cosim.simulation.batch.norm_crossing import NONE, UNRESOLVED, Search, first_exit, last_entry
+from cosim.simulation.batch.taylor import (
+    Array,
+    Models,
+    degree_for,
+    largest,
+    squared,
+    state_at,
+    value_and_slope,
+)
 from cosim.simulation.batch.vector_lanes import Lanes, Width, dot, filled, fma, load, store, times
 
 CERTAINTY = 1e-10
@@ -25,30 +35,18 @@ CERTAINTY."""
 
 
 def square_integrals(
-    x: Array, u: Array, p: int, s: float, Q: Array, R: Array, inverse: Array,
-    x_scaled: Array, u_scaled: Array, n: Width, m: Width,
-) -> float:  # fmt: skip
-    """Return ∫₀ˢ xᵀQx + uᵀRu of polynomials, exact up to rounding.
+    system: BatchSystem, space: BatchMemory, p: int, s: float, n: Width, m: Width
+) -> float:
+    """Return ∫₀ˢ xᵀQx + uᵀRu of polynomials of degree p, exact up to rounding.
 
     With v_k = c_k s^k the integral of xᵀQx is s Σ_{i,j} v_iᵀ Q v_j/(i + j + 1).
-
-    Args:
-        x: coefficients c_k.
-        u: coefficients of u.
-        p: the degree.
-        s: upper limit of the integral.
-        Q: symmetric, n² numbers; empty for the identity.
-        R: symmetric, m² numbers; empty for the identity.
-        inverse: 1/k at index k, up to 2p + 1.
-        x_scaled: scratch, (p + 1) n numbers.
-        u_scaled: scratch, (p + 1) m numbers.
-        n: number of states.
-        m: number of inputs.
     """
+    x_scaled, u_scaled, inverse = space.x_scaled, space.u_scaled, system.inverse
+    Q, R = system.Q, system.R
     size, inputs, power = len(n), len(m), 1.0
     for k in range(p + 1):
-        store(x_scaled, k * size, load(x, k * size, n) * power)
-        store(u_scaled, k * inputs, load(u, k * inputs, m) * power)
+        store(x_scaled, k * size, load(space.x, k * size, n) * power)
+        store(u_scaled, k * inputs, load(space.u, k * inputs, m) * power)
         power *= s
     # The last coefficients often contribute nothing to the sum.
     v, w = load(x_scaled, 0, n), load(u_scaled, 0, m)
@@ -89,25 +87,15 @@ def raised(
     one level, such as an oscillation, is searched again as the scalar |y|², in which cancelling
     terms vanish (:mod:`cosim.simulation.batch.level_crossing`). The result is UNRESOLVED if this
     search fails too, or if there are too many rises.
-
-    Args:
-        best: the largest value so far.
-        curve: coefficients of y.
-        p: the degree.
-        end_s: end of the interval.
-        rate: per second.
-        growth: a factor.
-        squares: scratch, 2p + 1 numbers.
-        n: number of entries of y.
     """
     for _ in range(_RISES):
         if best >= _LARGEST:
             return best
         level = max(best * (1.0 + CERTAINTY), _LEAST) / growth
-        s = first_exit(curve, p, level, rate, end_s, False, _FEW_STEPS, n)
+        s = first_exit(curve, p, Search(level, rate, end_s, False), _FEW_STEPS, n)
         if s == UNRESOLVED:
             squared(curve, p, filled(1.0, n), squares, n)
-            s = first_root(squares, 2 * p, level * level, 2.0 * rate, 0.0, end_s)
+            s = first_root(squares, 2 * p, Search(level * level, 2.0 * rate, end_s, False), 0.0)
         if s == NONE:
             return best
         if s == UNRESOLVED:
@@ -142,16 +130,7 @@ def _climbed(curve: Array, p: int, low_s: float, high_s: float, rate: float, n: 
 
 
 def last_above(curve: Array, p: int, end_s: float, level: float, ended: Lanes, n: Width) -> float:
-    """Return the last s in [0, ``end_s``] at which |y(s)| > ``level``, NONE or UNRESOLVED.
-
-    Args:
-        curve: coefficients of y.
-        p: the degree.
-        end_s: end of the interval.
-        level: the level.
-        ended: y(``end_s``).
-        n: number of entries of y.
-    """
+    """Return the last s in [0, ``end_s``] at which |y(s)| > ``level``, NONE or UNRESOLVED."""
     square = level * level
     if dot(ended, ended) > square:
         return end_s
@@ -160,45 +139,22 @@ def last_above(curve: Array, p: int, end_s: float, level: float, ended: Lanes, n
     return last_entry(curve, p, level, end_s, n)
 
 
-def passed_at(
-    x_c: Array, e_c: Array, d: Array, p: int, end_s: float, limit: float, level: float,
-    rate: float, n: Width,
-) -> float:  # fmt: skip
-    """Return the time at which the loop's norm exceeds a limit: below at 0, above at ``end_s``.
-
-    Args:
-        x_c: coefficients.
-        e_c: coefficients.
-        d: coefficients.
-        p: the degree.
-        end_s: a time at which the limit is exceeded.
-        limit: limit of the norm.
-        level: the second limit is ``level`` ``limit`` e^{−rate s}; 0 if there is no second limit.
-        rate: per second.
-        n: number of states.
-    """
-    low_s, high_s = 0.0, end_s
+def passed_at(space: BatchMemory, end_s: float, limit: float, phase: Phase, n: Width) -> float:
+    """Return the time on a piece at which the loop's norm exceeds a limit, at most ``end_s``."""
+    low_s, high_s, p = 0.0, end_s, degree_for(space.reach_s, end_s)
     for _ in range(_HALVINGS):
         s = 0.5 * (low_s + high_s)
-        model, error, apart = value(x_c, p, s, n), value(e_c, p, s, n), value(d, p, s, n)
-        if is_within(model, error, apart, limit, level * math.exp(-rate * s)):
+        level = phase.threshold * math.exp(-phase.rate_per_s * s)
+        if is_within(state_at(space, p, s, n), limit, level):
             low_s = s
         else:
             high_s = s
     return high_s
 
 
-def is_within(x_c: Lanes, e_c: Lanes, d: Lanes, limit: float, level: float) -> bool:
-    """Return whether ‖(x, e_s, e_c)‖ is below ``limit``, and below ``limit`` ``level`` if given.
-
-    Args:
-        x_c: the controller's model.
-        e_c: its error.
-        d: x_s − x_c.
-        limit: the limit.
-        level: the threshold, or 0.
-    """
-    x, e_s = x_c - e_c, e_c + d
+def is_within(state: Models, limit: float, level: float) -> bool:
+    """Return whether ‖(x, e_s, e_c)‖ is below ``limit``, and below ``limit`` ``level`` if > 0."""
+    x, e_s, e_c = state.x_c - state.e_c, state.e_c + state.d, state.e_c
     if level > 0.0:
         limit *= min(level, 1.0)
     return dot(x, x) + dot(e_s, e_s) + dot(e_c, e_c) < limit * limit

@@ -23,9 +23,9 @@ from typing import NamedTuple
 import numpy as np
 
 from cosim.simulation.batch.batch_rule import Rule, last_point
-from cosim.simulation.batch.level_crossing import estimate, first_root, number_and_slope
-from cosim.simulation.batch.norm_crossing import NONE
-from cosim.simulation.batch.taylor import HIGHEST, Array, squared
+from cosim.simulation.batch.level_crossing import estimate, first_root
+from cosim.simulation.batch.norm_crossing import NONE, Search, level_at
+from cosim.simulation.batch.taylor import HIGHEST, Array, number_and_slope, squared
 from cosim.simulation.batch.vector_lanes import Lanes, Width, dot, load, store, times, width
 from noack.trigger.trigger_condition import QuadraticForm, error_map
 from noack.trigger.trigger_policy import Policy
@@ -64,12 +64,7 @@ class QuadraticCurves(NamedTuple):
 
 
 def squares_of(policy: Policy, n: int) -> QuadraticCurves | None:
-    """Return a policy's comparison; None if it has none or compares ‖W e_s‖ with a threshold.
-
-    Args:
-        policy: the policy.
-        n: number of states.
-    """
+    """Return a policy's comparison; None if it has none or compares ‖W e_s‖ with a threshold."""
     rule = policy.trigger_rule(n)
     form, dynamic_variable = rule.form, rule.dynamic_variable
     if not len(form.up):
@@ -128,11 +123,6 @@ def put(squares: QuadraticCurves, k: int, x: Lanes, e_s: Lanes, factor: float) -
 def compare(squares: QuadraticCurves, p: int, dynamic_variable: float) -> int:
     """Compute the comparison's coefficients from those of the state.
 
-    Args:
-        squares: the forms.
-        p: degree of the state's polynomial.
-        dynamic_variable: η at the start, divided by the square of the scale.
-
     Returns:
         The degree of the comparison.
     """
@@ -166,48 +156,31 @@ def left_side(squares: QuadraticCurves, x: Lanes) -> float:
 def first_look(
     squares: QuadraticCurves, level: float, rate: float, dynamic_variable: float
 ) -> float:
-    """Estimate the time of the next event from the first three coefficients of the state.
-
-    Args:
-        squares: the forms.
-        level: squared threshold, divided by the square of the scale.
-        rate: decay rate of ``level``, per second.
-        dynamic_variable: η, divided by the square of the scale.
-    """
+    """Estimate the time of the next event from the first three coefficients of the state."""
     compare(squares, 2, dynamic_variable)
     return estimate(squares.g, level, rate)
 
 
 def first_event(
-    squares: QuadraticCurves, rule: Rule, degree: int, level: float, rate: float, point: int,
-    t_s: float, end_s: float,
-) -> tuple[float, int]:  # fmt: skip
+    squares: QuadraticCurves, rule: Rule, degree: int, search: Search, point: int, t_s: float
+) -> tuple[float, int]:
     """Return the first time at which the comparison holds on a piece.
 
-    Args:
-        squares: the forms.
-        rule: the rule.
-        degree: degree of the comparison.
-        level: squared threshold at the start, divided by the square of the scale.
-        rate: decay rate of ``level``, per second.
-        point: the next point of the grid, if there is a grid.
-        t_s: start of the piece.
-        end_s: length of the piece.
-
     Returns:
-        The time in seconds from the piece's start, or NONE; and the next point of the grid.
+        The time in seconds from the piece's start, NONE or UNRESOLVED; and the next point of the
+        grid.
     """
     if rule.grid_s == 0.0:
         start = load(squares.y, 0, squares.rows)
-        grain = dot(start, start) + level
+        grain = dot(start, start) + search.level
         if len(squares.gain) > 0:
             grain += abs(squares.eta[0])
-        return first_root(squares.g, degree, level, rate, _GRAIN * grain, end_s), point
-    last = last_point(rule, t_s + end_s)
+        return first_root(squares.g, degree, search, _GRAIN * grain), point
+    last = last_point(rule, t_s + search.end_s)
     while point <= last:
-        s = min(max(point * rule.grid_s - t_s, 0.0), end_s)
+        s = min(max(point * rule.grid_s - t_s, 0.0), search.end_s)
         number, _ = number_and_slope(squares.g, degree, s)
-        if number > level * math.exp(-rate * s):
+        if number > level_at(search, s):
             return s, point
         point += 1
     return NONE, point

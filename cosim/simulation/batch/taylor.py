@@ -24,6 +24,7 @@ of the part driven by a small E is relative to E. All norms are Frobenius norms,
 """
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,15 +52,16 @@ _LESS_STRICT = tuple((_MEASURED / _NEGLIGIBLE) ** (1.0 / (p + 1)) for p in DEGRE
 _ROUNDED_UP = 1.0 + 1e-9
 
 
-def powers(H: Array, at: int, table: Array, n: Width) -> None:
-    """Fill a table with H^k/k!, k = 0 … HIGHEST + 1, each matrix in column-major order.
+class Models(NamedTuple):
+    """The state of a run."""
 
-    Args:
-        H: array with the matrix in column-major order.
-        at: index in ``H`` at which the matrix starts.
-        table: receives (HIGHEST + 2) n² numbers.
-        n: number of states.
-    """
+    x_c: Lanes
+    e_c: Lanes
+    d: Lanes
+
+
+def powers(H: Array, at: int, table: Array, n: Width) -> None:
+    """Fill a table with H^k/k!, k = 0 … HIGHEST + 1, each matrix in column-major order."""
     size = len(n)
     for j in range(size):
         store(table, j * size, filled(0.0, n))
@@ -97,18 +99,7 @@ def reaches(
     H_k: Array, A_k: Array, X_k: Array, E: Array, sizes: Array, reach_s: Array,
     measured_s: Array, n: Width,
 ) -> None:  # fmt: skip
-    """Compute the time over which the polynomial of each degree in DEGREES is accurate.
-
-    Args:
-        H_k: table.
-        A_k: table.
-        X_k: table.
-        E: in column-major order.
-        sizes: scratch, (HIGHEST + 2,).
-        reach_s: receives the times in seconds, (len(DEGREES),); 0 where a table is not finite.
-        measured_s: receives the times for the measures, which allow a relative error of _MEASURED.
-        n: number of states.
-    """
+    """Compute the time over which the polynomial of each degree in DEGREES is accurate."""
     area = len(n) * len(n)
     widest = max(square_sum(A_k, area, n), square_sum(H_k, area, n))
     mismatch = square_sum(E, 0, n)
@@ -150,12 +141,27 @@ def value(curve: Array, p: int, s: float, n: Width) -> Lanes:
     return total
 
 
+def state_at(space: Any, p: int, s: float, n: Width) -> Models:
+    """Return the state at a time on a piece, from the coefficients in ``BatchMemory``."""
+    x_c, e_c = value(space.x_c, p, s, n), value(space.e_c, p, s, n)
+    return Models(x_c, e_c, value(space.d, p, s, n))
+
+
 def value_and_slope(curve: Array, p: int, s: float, n: Width) -> tuple[Lanes, Lanes]:
     """Return the polynomial and its derivative."""
     total, slope = load(curve, p * len(n), n), filled(0.0, n)
     for k in range(p - 1, -1, -1):
         slope = fma(slope, s, total)
         total = fma(total, s, load(curve, k * len(n), n))
+    return total, slope
+
+
+def number_and_slope(g: Array, degree: int, s: float) -> tuple[float, float]:
+    """Return the polynomial and its derivative."""
+    total, slope = g[degree], 0.0
+    for k in range(degree - 1, -1, -1):
+        slope = slope * s + total
+        total = total * s + g[k]
     return total, slope
 
 

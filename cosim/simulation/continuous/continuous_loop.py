@@ -86,27 +86,16 @@ class Samples(NamedTuple):
 
 
 class ContinuousLoop:
-    """The loop in continuous time, under any policy.
-
-    Args:
-        loop: the matrices.
-        trigger: the event-triggering policy; its weight is W.
-    """
+    """The loop in continuous time, under any policy."""
 
     def __init__(self, loop: LoopMatrices, trigger: Policy) -> None:
         self.loop = loop
         self.trigger = trigger
         n, H, BK = loop.n, loop.H, loop.B @ loop.K
-        mismatch = loop.A + BK - H
-        self.generator: Matrix = np.zeros((3 * n, 3 * n))
+        closed, none = loop.A + BK, np.zeros((n, n))
+        E = closed - H
+        self.generator: Matrix = np.block([[closed, none, BK], [-E, H, -BK], [-E, none, H - BK]])
         """G of dz/dt = G z, per second, shape (3n, 3n)."""
-        self.generator[:n, :n] = loop.A + BK
-        self.generator[:n, 2 * n :] = BK
-        self.generator[n : 2 * n, :n] = -mismatch
-        self.generator[n : 2 * n, n : 2 * n] = H
-        self.generator[n : 2 * n, 2 * n :] = -BK
-        self.generator[2 * n :, :n] = -mismatch
-        self.generator[2 * n :, 2 * n :] = H - BK
         self._rule = trigger.trigger_rule(n)
         condition = self._rule.after(0.0, loop.x0)
         scaled = self.generator + condition.rate_per_s * np.eye(3 * n)
@@ -137,28 +126,6 @@ class ContinuousLoop:
         norms: Vector = np.linalg.norm(errors if W is None else errors @ W.T, axis=-1)
         return norms
 
-    def next_event(
-        self, state: LoopState, until_s: float, condition: TriggerCondition | None = None
-    ) -> LoopState | None:
-        """Return the state just before the reset at the next event in [``state.t_s``, ``until_s``].
-
-        Args:
-            state: the loop's state.
-            until_s: end of the search.
-            condition: the trigger condition; by default the policy's after an event (or a start) at
-                ``state``.
-
-        Returns:
-            None if there is no event until ``until_s``. If ``state`` already exceeds the threshold,
-            or equals it and grows, the event is at ``state``.
-
-        Raises:
-            DivergedError: the state becomes too large to compute with before an event.
-            CallerError: the threshold decays below 1e-200 before an event.
-        """
-        found = self.next_crossing(state, until_s, condition or self.condition(state))
-        return None if found is None else found[0]
-
     def condition(self, state: LoopState) -> TriggerCondition:
         """Return the trigger condition after an event at a state."""
         return self._rule.after(state.t_s * 1e9, state.x)
@@ -171,7 +138,7 @@ class ContinuousLoop:
         condition: TriggerCondition,
         auxiliary: float = 0.0,
     ) -> tuple[LoopState, float] | None:
-        """Return the next event like :meth:`next_event`, with the condition's auxiliary variable.
+        """Return the next event in [``state.t_s``, ``until_s``], just before its reset.
 
         Args:
             state: the loop's state.
@@ -179,8 +146,13 @@ class ContinuousLoop:
             condition: the trigger condition.
             auxiliary: η or the integral at ``state``.
 
+        Returns:
+            State and auxiliary variable; None if there is no event. If ``state`` already exceeds
+            the threshold, or equals it and grows, the event is at ``state``.
+
         Raises:
             DivergedError: the run diverges before an event; contains the time.
+            CallerError: the threshold decays below 1e-200 before an event.
         """
         try:
             found = self._next_crossing(state, until_s, condition, auxiliary)
@@ -256,11 +228,7 @@ class ContinuousLoop:
             if found.exceeds or end_s <= min(floor_from_s, vanishes_s):
                 return found
             if vanishes_s < floor_from_s:
-                raise CallerError(
-                    f"trigger: from {vanishes_s:g} s on the threshold is below "
-                    f"{_SMALLEST_THRESHOLD:g}, where no error can be told from rounding; "
-                    "give trigger.floor or a shorter horizon"
-                )
+                raise vanished(vanishes_s, _SMALLEST_THRESHOLD)
             z, auxiliary, t_s = found.z, found.auxiliary, floor_from_s
         level = (
             condition.floor if condition.rate_per_s > 0 else max(condition.floor, condition.level)
@@ -273,30 +241,28 @@ class ContinuousLoop:
         self, condition: TriggerCondition, rate_per_s: float, threshold: float
     ) -> EventDetector:
         """Return the cached detector of a condition; with η, the threshold does not decay."""
-        form, plain = condition.form, not len(condition.form.down)
-        if not condition.integrates:
-            plain = plain and threshold > 0 and condition.dynamic_variable is None
-            rate_per_s = rate_per_s if plain or threshold > 0 else 0.0
+        form, variable = condition.form, condition.dynamic_variable
+        plain = not len(form.down) and threshold > 0 and variable is None
+        rate_per_s = rate_per_s if threshold > 0 else 0.0
         kind = bytes([plain, condition.integrates])
         key = (form.up.tobytes() + form.down.tobytes() + kind, rate_per_s)
         if key not in self._detectors:
-            self._detectors[key] = self._new_detector(condition, rate_per_s, plain=plain)
+            size = len(self.generator)
+            output = np.pad(form.up, ((0, 0), (0, size - form.up.shape[1])))
+            if condition.integrates:
+                made: EventDetector = IntegralEventDetector(
+                    self.flow, self.generator, output, rate_per_s
+                )
+            elif plain:
+                made = NormEventDetector(self.flow, self.generator, output, rate_per_s)
+            else:
+                gain = None if variable is None else variable.gain
+                decay_per_s = 0.0 if variable is None else variable.decay_per_s
+                made = QuadraticEventDetector(
+                    self.flow, self.generator, form, rate_per_s, gain, decay_per_s
+                )
+            self._detectors[key] = made
         return self._detectors[key]
-
-    def _new_detector(
-        self, condition: TriggerCondition, rate_per_s: float, *, plain: bool
-    ) -> EventDetector:
-        if plain:
-            output = np.zeros((len(condition.form.up), len(self.generator)))
-            output[:, : condition.form.up.shape[1]] = condition.form.up
-            made = IntegralEventDetector if condition.integrates else NormEventDetector
-            return made(self.flow, self.generator, output, rate_per_s)
-        variable = condition.dynamic_variable
-        return QuadraticEventDetector(
-            self.flow, self.generator, condition.form, rate_per_s,
-            None if variable is None else variable.gain,
-            0.0 if variable is None else variable.decay_per_s,
-        )  # fmt: skip
 
     def _advance(
         self, z: Vector, dt_s: float, condition: TriggerCondition, auxiliary: float
@@ -351,6 +317,14 @@ class ContinuousLoop:
     def _state(self, t_s: float, z: Vector) -> LoopState:
         n = self.loop.n
         return LoopState(t_s, z[:n], z[n : 2 * n], z[2 * n :])
+
+
+def vanished(from_s: float, smallest: float) -> CallerError:
+    """Return the error of a threshold that decays too far."""
+    return CallerError(
+        f"trigger: from {from_s:g} s on the threshold is below {smallest:g}, where errors are "
+        "within rounding; give trigger.floor or a shorter horizon"
+    )
 
 
 def reset(state: LoopState, delivered: bool) -> LoopState:

@@ -9,10 +9,8 @@ from numpy.typing import NDArray
 
 from cosim.simulation.continuous.continuous_loop import ContinuousLoop, LoopState, Samples, reset
 from cosim.simulation.continuous.event_detector import DivergedError
-from noack.config.resolution import LoopMatrices
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
-from noack.trigger.trigger_policy import Policy
 
 MAX_EVENTS = 100_000
 
@@ -51,9 +49,6 @@ class ContinuousRun:
     def at(self, t_s: Vector | Sequence[float]) -> Samples:
         """Return the loop at many times, right-continuous: at an event, the state after the reset.
 
-        Args:
-            t_s: times in [0, ``reached_s``], in ascending order, shape (k,).
-
         Raises:
             ValueError: a time is out of range, or the times are not in ascending order.
         """
@@ -86,8 +81,7 @@ class ContinuousRun:
 
 
 def simulate_continuous(
-    loop: LoopMatrices | ContinuousLoop,
-    trigger: Policy | None = None,
+    system: ContinuousLoop,
     *,
     horizon_s: float,
     delivered: Callable[[int], bool] | Sequence[bool],
@@ -98,8 +92,7 @@ def simulate_continuous(
     """Run the loop from t = 0; every event time is exact up to rounding.
 
     Args:
-        loop: the matrices, or an existing :class:`ContinuousLoop`.
-        trigger: the event-triggering policy; None for a :class:`ContinuousLoop`, which has one.
+        system: the loop.
         horizon_s: end of the run.
         delivered: whether the update of event i arrives. If a sequence is shorter than the number
             of events, all updates after its end arrive.
@@ -112,7 +105,6 @@ def simulate_continuous(
         TooManyEventsError: more than ``max_events`` events, or two at the same time.
         CallerError: the threshold decays below the smallest supported value before the horizon.
     """
-    system = loop if isinstance(loop, ContinuousLoop) else ContinuousLoop(loop, _given(trigger))
     x = np.array(system.loop.x0 if x0 is None else x0, dtype=np.float64)
     zero = np.zeros_like(x)
     arrives = delivered if callable(delivered) else _pattern(delivered)
@@ -120,9 +112,8 @@ def simulate_continuous(
     before: list[LoopState] = []
     after: list[LoopState] = []
     fates: list[bool] = []
-    diverged_at_s = None
+    diverged_at_s, auxiliary = None, system.trigger.initial_dynamic_variable
     event = None if known_start else start
-    auxiliary = system.trigger.initial_dynamic_variable
     while True:
         if event is not None:
             fates.append(bool(arrives(len(before))))
@@ -148,12 +139,6 @@ def simulate_continuous(
     return ContinuousRun(
         system, horizon_s, start, tuple(before), tuple(after), np.array(fates, bool), diverged_at_s
     )
-
-
-def _given(trigger: Policy | None) -> Policy:
-    if trigger is None:
-        raise TypeError("a Loop needs a trigger")
-    return trigger
 
 
 def _pattern(delivered: Sequence[bool]) -> Callable[[int], bool]:

@@ -20,13 +20,8 @@ class IntegralEventDetector:
 
     The integral never decreases and the threshold never increases, so they cross at most once. On
     a cell y is a polynomial. ∫‖y‖ is computed by Gauss-Legendre quadrature on intervals that are
-    halved until the two halves agree with the whole to 1e-13 of the integral so far.
-
-    Args:
-        flow: the exact flow of the state z.
-        generator: G, shape (N, N).
-        output: C of y = C z, shape (r, N).
-        rate_per_s: decay rate of the threshold; 0 for a constant one.
+    halved until the two halves agree with the whole to 1e-13 of the integral so far. ``output`` is
+    C of y = C z, shape (r, N).
     """
 
     def __init__(
@@ -73,13 +68,9 @@ class IntegralEventDetector:
 
 
 def _norm_integral(y: Matrix, begin: float, end: float, grain: float) -> float:
-    """Return ∫‖y(u)‖du over [begin, end], to a tolerance of 1e-13 times (the integral + ``grain``).
+    """Return ∫‖y(u)‖du over [begin, end], to 1e-13 times (the integral + ``grain``).
 
-    Args:
-        y: Taylor coefficients, shape (p + 1, r).
-        begin: in [0, 1].
-        end: in [begin, 1].
-        grain: scale of the integral; differences below its rounding error are ignored.
+    y has the Taylor coefficients, shape (p + 1, r).
     """
     pending, total = [(begin, end)], 0.0
     while pending:

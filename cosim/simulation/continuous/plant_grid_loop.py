@@ -62,13 +62,7 @@ class SampledRun:
 
 
 class SampledLoop:
-    """The loop under a schedule.
-
-    Args:
-        system: matrices and trigger, of any policy.
-        schedule: times of measurements, deliveries and actuations.
-        known_start: sensor and controller start from x(0); else the first measured step is event 0.
-    """
+    """The loop under a schedule."""
 
     def __init__(
         self, system: ContinuousLoop, schedule: StepSchedule, *, known_start: bool
@@ -124,16 +118,16 @@ class SampledLoop:
             else:
                 states[following] = self._continuous(x, [newest, *within], step, until)
             x_s_block = self._model_steps[1 : until - step + 1] @ x_s
-            seen = np.flatnonzero(schedule.measured[following])
+            measured = np.flatnonzero(schedule.measured[following])
             if in_common:
-                block = states[following][seen]
+                block = states[following][measured]
                 found = trigger.first_event(
-                    (step + 1 + seen) * period_ns, block, x_s_block[seen] - block
+                    (step + 1 + measured) * period_ns, block, x_s_block[measured] - block
                 )
             else:
-                found = 0 if len(seen) else None
+                found = 0 if len(measured) else None
             event = found is not None
-            taken = until - step - 1 if found is None else int(seen[found])
+            taken = until - step - 1 if found is None else int(measured[found])
             x_s = x_s_block[taken]
             step += 1 + taken
 
@@ -143,15 +137,7 @@ class SampledLoop:
         return self._schedule.delay_ns(event)
 
     def _continuous(self, x: Vector, updates: list["_Update"], step: int, until: int) -> Matrix:
-        """Return x at the steps after ``step`` up to ``until``, under u = K x_c(t).
-
-        Args:
-            x: state at ``step``.
-            updates: the newest update in effect at ``step``, then those that take effect within
-                the next step.
-            step: number of the step with state ``x``.
-            until: the last step to compute; ``step`` + 1 if updates take effect before it.
-        """
+        """Return x at the steps after ``step`` up to ``until``, under u = K x_c(t)."""
         n, now_ns, newest = len(x), step * self._schedule.period_ns, updates[0]
         z = self._state(x, newest, now_ns)
         if len(updates) == 1:

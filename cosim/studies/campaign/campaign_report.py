@@ -1,13 +1,12 @@
 """The results of a campaign as a page, as JSON, and as tables for a terminal."""
 
-import json
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import tomli_w
 from markupsafe import Markup
+from pydantic_core import to_json
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
@@ -44,10 +43,10 @@ def write_report(summary: CampaignSummary, store: Store, base: Mapping[str, Any]
     Raises:
         MachineError: they cannot be written.
     """
-    document = json.dumps(_known(summary.document()), indent=1, allow_nan=False)
+    document = to_json(summary.document(), indent=1, inf_nan_mode="null")
     return [
         write_whole(store.folder / PAGE, page(summary, store, base)),
-        write_whole(store.folder / SUMMARY, document + "\n"),
+        write_whole(store.folder / SUMMARY, document + b"\n"),
         store.folder / RUNS,
     ]
 
@@ -209,12 +208,3 @@ def _unfinished(summary: CampaignSummary) -> Iterator[str]:
             where = ", ".join(f"{axis} {label}" for axis, label in found.point.labels.items())
             counts = ", ".join(f"{n:,} {how.replace('_', ' ')}" for how, n in others.items())
             yield f"At {where} not all runs reached the horizon: {counts}"
-
-
-def _known(value: Any) -> Any:
-    """Return the value for JSON: null for a number that is not finite."""
-    if isinstance(value, dict):
-        return {key: _known(entry) for key, entry in value.items()}
-    if isinstance(value, list):
-        return [_known(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -118,11 +118,9 @@ def run_alike(work: Work, draws: range, wanted: Mapping[str, str] | None) -> NDA
 
 @contextmanager
 def cluster(address: str, say: Callable[[str], None] = lambda line: None) -> Iterator[Runner]:
-    """Compute chunks on a Dask cluster; its workers need the same version of noack.
+    """Compute chunks on the Dask cluster of this scheduler; workers need the same noack.
 
-    Args:
-        address: of the cluster's scheduler.
-        say: called with a message when the campaign waits for the cluster.
+    ``say`` is called with a message when the campaign waits for the cluster.
 
     Raises:
         CallerError: Dask is not installed, or the address is not valid.

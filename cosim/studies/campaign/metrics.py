@@ -66,10 +66,7 @@ def measured(columns: Mapping[str, NDArray[Any]], certified: float | None) -> di
     """Return all metrics of k runs.
 
     A time is infinite if its event does not happen. All metrics of a failed run are infinite.
-
-    Args:
-        columns: of the batch engine, (k,) each.
-        certified: Δβ; without it, the result has no ``certificate_used``.
+    Without a certified Δβ, the result has no ``certificate_used``.
     """
     found: dict[Metric, Vector] = {}
     failed = columns["status"] != OK

@@ -20,7 +20,7 @@ from cosim.record.run_record import RunRecord
 from cosim.simulation.batch.batch_interface import ROW
 from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS
 from cosim.simulation.virtual_time import simulate
-from cosim.studies.campaign.random_draws import Box, box_of, drawn_scenario
+from cosim.studies.campaign.random_draws import drawn_scenario
 from noack.config.scenario import Scenario
 from noack.config.sections.run_sections import PortsSection, RealtimeSection, SeedsSection
 from noack.core.clock import NS_PER_S
@@ -31,6 +31,12 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
+
+_UNKNOWN = (
+    "inter_event_min_s", "inter_event_mean_s", "settling_s", "cost", "sup_e_c_scaled",
+    "final_norm", "diverged_at_s",
+)  # fmt: skip
+"""Columns without a value in some runs."""
 
 
 @dataclass(frozen=True)
@@ -53,11 +59,6 @@ class SampledWork:
     settle: float
     most_events: int
 
-    @property
-    def box(self) -> Box:
-        """The box of plants and initial states."""
-        return box_of(self.scenario)
-
     def run(self, draws: range) -> NDArray[np.void]:
         """Compute consecutive draws; one row of ``batch_interface.ROW`` each."""
         rows = np.zeros(len(draws), ROW)
@@ -73,10 +74,10 @@ class SampledWork:
         gaps_s = np.diff(events_s)
         row["transmissions"] = len(events_s)
         row["deliveries"] = len(record[CONTROLLER_DELIVERY])
-        row["inter_event_min_s"] = gaps_s.min() if len(gaps_s) else np.nan
-        row["inter_event_mean_s"] = gaps_s.mean() if len(gaps_s) else np.nan
-        for name in ("settling_s", "cost", "sup_e_c_scaled", "final_norm", "diverged_at_s"):
+        for name in _UNKNOWN:
             row[name] = np.nan
+        if len(gaps_s):
+            row["inter_event_min_s"], row["inter_event_mean_s"] = gaps_s.min(), gaps_s.mean()
         norms, t_s = np.linalg.norm(steps["x"], axis=1), steps["t_ns"] / NS_PER_S
         lost = np.flatnonzero(~np.isfinite(norms))
         if len(lost):
@@ -86,11 +87,8 @@ class SampledWork:
             row["status"] = TOO_MANY_EVENTS
             return
         row["status"] = OK
-        above = np.flatnonzero(norms > self.settle * norms[0])
-        if not len(above):
-            row["settling_s"] = 0.0
-        elif above[-1] < len(norms) - 1:
-            row["settling_s"] = t_s[above[-1]]
+        if norms[-1] <= self.settle * norms[0]:
+            row["settling_s"] = t_s[norms > self.settle * norms[0]].max(initial=0.0)
         row["final_norm"] = norms[-1]
         row["cost"] = self._cost(record)
         joined = align_tables(record)

@@ -22,27 +22,20 @@ WORDS: dict[Bounded, str] = {"state": "sup‖x‖", "error": "sup‖e_c‖"}
 
 @dataclass(frozen=True)
 class DesignResult:
-    """The result of a design.
-
-    Args:
-        space: the candidates that were available.
-        limits: the limits that the design must meet.
-        trials: all candidates that were tried.
-        front: the trade-off curve, by ascending transmissions.
-        best: the candidate with the fewest transmissions among those that meet the limits; if none
-            does, the closest to the limits.
-        fresh: measures of the best candidate on new draws, which the search did not use.
-        bounds: certified bounds of the best candidate; None if there are none.
-        seed: of the draws.
-    """
+    """The result of a design."""
 
     space: DesignSpace
     limits: DesignLimits
     trials: Sequence[Trial]
+    """All candidates that were tried."""
     front: Sequence[Trial]
+    """The trade-off curve, by ascending transmissions."""
     best: Trial
+    """The candidate with the fewest transmissions within the limits, or the closest to them."""
     fresh: CandidateMeasures
+    """Measures of the best candidate on new draws, which the search did not use."""
     bounds: Bounds | None
+    """Certified bounds of the best candidate; None if there are none."""
     seed: int
 
     @property

@@ -47,12 +47,8 @@ def design(
 ) -> DesignResult:
     """Choose among families; the result is deterministic.
 
-    Args:
-        families: scenarios, not resolved, by the names of gain and norm.
-        limits: the limits that the design must meet.
-        draws: number of draws for the choice; the same number of new draws confirms it.
-        seed: of all draws.
-        progress: called with the approximate share of the work that is done.
+    ``families`` has unresolved scenarios by the names of gain and norm. As many new draws as
+    ``draws`` confirm the choice.
 
     Raises:
         CallerError: the limits or the scenario do not permit a design.

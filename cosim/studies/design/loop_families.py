@@ -27,12 +27,8 @@ def families_of(
 ) -> dict[tuple[str, str], Scenario]:
     """Return scenarios by the names of gain and norm.
 
-    Args:
-        scenario: as loaded.
-        norms: of :data:`NORMS`.
-        lqr: Q and R, for the gains of regulators instead of the scenario's gain; R is multiplied by
-            each of :data:`COSTS_OF_INPUT`.
-        progress: called with the share of the work that is done; computing a norm takes long.
+    With ``lqr`` (Q and R) the gains are those of regulators, one for each of
+    :data:`COSTS_OF_INPUT`; otherwise the gain is the scenario's. Computing a norm takes long.
 
     Raises:
         CallerError: a norm or a gain cannot be computed.

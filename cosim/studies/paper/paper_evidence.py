@@ -8,11 +8,10 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import schur
 
 from cosim.record.align import align_tables
-from cosim.simulation.continuous.continuous_loop import continuous_loop_of
+from cosim.simulation.continuous.continuous_loop import ContinuousLoop, continuous_loop_of
 from cosim.simulation.continuous.continuous_report import run_continuous
 from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
 from cosim.simulation.virtual_time import simulate
@@ -40,9 +39,7 @@ _ZERO = 1e-6
 def evidence(scenario: Scenario, representative: int) -> Numbers:
     """Return all numbers of the page's sections on assumptions and errors, as JSON.
 
-    Args:
-        scenario: of the base ensemble; its seeds and mode are replaced.
-        representative: the draw that is used as an example.
+    The example is the representative draw of the base ensemble with this scenario.
     """
     M, trigger = scenario.network.mansd + 1, scenario.decaying
     return {
@@ -66,7 +63,7 @@ def _eigenvalues() -> Numbers:
     for name, speed in (("printed", -12.0), ("flipped", 12.0)):
         model = lane_following({"speed": speed})
         eigenvalues = np.linalg.eigvals(model.A + model.B @ model.K)
-        found[name] = _complex(eigenvalues[np.lexsort((eigenvalues.imag, eigenvalues.real))])
+        found[name] = sorted([value.real, value.imag] for value in eigenvalues.tolist())
     A = lane_following({}).A
     found["open"] = sorted(open_loop_eigenvalues(A).real.tolist())
     found["rank"] = int(np.linalg.matrix_rank(A))
@@ -159,7 +156,10 @@ def _slow_model(M: int) -> Numbers:
         weight=None, state_names=entry_names("x", 2), input_names=entry_names("u", 1),
     )  # fmt: skip
     run = simulate_continuous(
-        loop, trigger, horizon_s=250.0, delivered=lambda event: event % M == 0, known_start=False
+        ContinuousLoop(loop, trigger),
+        horizon_s=250.0,
+        delivered=lambda event: event % M == 0,
+        known_start=False,
     )
     ends = [state for i, state in enumerate(run.before) if i % M == 0 and i > 0]
     return {
@@ -190,7 +190,6 @@ def _standstill(scenario: Scenario) -> Numbers:
     x0 = np.array([*lateral, yaw, -yaw * loop.K[0, 2] / loop.K[0, 3]])
     run = _only_first_arrives(resolved, x0)
     last = run.before[-1]
-    threshold = run.system.threshold(last.t_s)
     times_s = [0.0, 2.0, 10.0, 20.0, 30.0]
     return {
         "x0": x0.tolist(),
@@ -199,7 +198,7 @@ def _standstill(scenario: Scenario) -> Numbers:
         "events_s": run.event_s.tolist(),
         "times_s": times_s,
         "norms": np.linalg.norm(run.at(times_s).x, axis=1).tolist(),
-        "thresholds": float(np.linalg.norm(last.e_c)) / threshold,
+        "thresholds": float(np.linalg.norm(last.e_c)) / run.system.threshold(last.t_s),
     }
 
 
@@ -208,15 +207,13 @@ def _overshoot(scenario: Scenario, representative: int) -> Numbers:
     scales = (1.0, 1e-2, 1e-4)
     scenario = scenario.model_copy(update={"horizon_s": 100.0})
     found: Numbers = {"scales": list(scales)}
-    for mode in MODES:
+    for mode, scale in itertools.product(MODES, scales):
         resolved = resolved_draw(scenario, representative, mode)
-        found[mode] = []
-        for scale in scales:
-            start = tuple(scale * value for value in resolved.plant.initial_state)
-            plant = resolved.plant.model_copy(update={"initial_state": start})
-            run = run_continuous(resolved.model_copy(update={"plant": plant}))
-            norms = np.linalg.norm(run.at(np.linspace(0, run.reached_s, 2001)).x, axis=1)
-            found[mode].append(float(norms.max() / norms[0]))
+        start = tuple(scale * value for value in resolved.plant.initial_state)
+        plant = resolved.plant.model_copy(update={"initial_state": start})
+        run = run_continuous(resolved.model_copy(update={"plant": plant}))
+        norms = np.linalg.norm(run.at(np.linspace(0, run.reached_s, 2001)).x, axis=1)
+        found.setdefault(mode, []).append(float(norms.max() / norms[0]))
     return found
 
 
@@ -259,17 +256,12 @@ def _theorem_3(scenario: Scenario, representative: int) -> Numbers:
         return float(brentq(excess, 0.0, 1e3))
 
     rows = []
-    for t_s in (0.0, 10.0, 20.0, 30.0):
-        state = run.after[int(np.searchsorted(run.event_s, t_s))]
+    for event in np.searchsorted(run.event_s, (0.0, 10.0, 20.0, 30.0)):
+        state = run.after[event]
         eta = float(np.linalg.norm(state.x))
-        rows.append(
-            {
-                "t_s": state.t_s,
-                "norm": eta,
-                "printed": solved_s(eta, beta),
-                "derived": solved_s(eta, beta * math.exp(-alpha_per_s * state.t_s)),
-            }
-        )
+        derived_s = solved_s(eta, beta * math.exp(-alpha_per_s * state.t_s))
+        row = {"t_s": state.t_s, "norm": eta}
+        rows.append(row | {"printed": solved_s(eta, beta), "derived": derived_s})
     return {"gamma_per_s": gamma, "rows": rows}
 
 
@@ -304,7 +296,3 @@ def _nominal(scenario: Scenario, horizon_s: float) -> Scenario:
     """Return the scenario with the nominal plant and its nominal initial state."""
     plant = scenario.plant.model_copy(update={"draw": "nominal", "initial_state_halfwidth": None})
     return scenario.model_copy(update={"plant": plant, "horizon_s": horizon_s})
-
-
-def _complex(values: NDArray[Any]) -> list[list[float]]:
-    return [[float(value.real), float(value.imag)] for value in values]

@@ -1,27 +1,26 @@
 """The figures of the page: the paper's Fig. 2 and 3 for one draw, and all draws together."""
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 from numpy.typing import NDArray
 
 from cosim.output import palette
-from cosim.output.report.axes import WIDTH_IN, Shown, finish
+from cosim.output.report.axes import WIDTH_IN, Shown, finish, logarithmic
 from cosim.output.report.figure_style import INK, printed, styled
 from cosim.output.report.signal_figures import paper_figure
 from cosim.simulation.continuous.continuous_run import ContinuousRun
+from cosim.simulation.continuous.network_fates import timeless
 from cosim.studies.paper.draw_measures import MODES, Mode
 from cosim.studies.paper.paper_results import Results
-from netem.link_machine import Datagram, update_link_of
+from netem.link_machine import UPDATE_LINK, Link
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Vector
-from noack.protocol.machine_interface import Record
-from noack.protocol.record_tables import NETEM_PACKET, Fate, effective, tables
+from noack.protocol.record_tables import Fate, effective
 
 SHOWN_S = 20.0
 """The representative draw is shown up to this time; later values are too small to be visible."""
@@ -64,16 +63,8 @@ def draw_figure(run: ContinuousRun, resolved: Scenario, draw: int) -> Figure:
 
 def _fates(resolved: Scenario, events: int) -> NDArray[np.int64]:
     """Return the network's decision for each of the first updates, (events,)."""
-    link, fate = update_link_of(resolved), (tables(1, 1)[NETEM_PACKET].names or ()).index("fate")
-    return np.array(
-        [
-            output.row[fate]
-            for _ in range(events)
-            for output in link.handle(Datagram(0, b""), 0)
-            if isinstance(output, Record)
-        ],
-        dtype=np.int64,
-    )
+    link = Link(timeless(resolved.network.link), resolved.seeds.loss, UPDATE_LINK)
+    return np.array([link.decide(0, 1, 0).fate for _ in range(events)], dtype=np.int64)
 
 
 @styled
@@ -108,7 +99,7 @@ def _histogram(axes: Axes, both: Mapping[Mode, Vector], *, logarithm: bool) -> l
         axes.hist(values[np.isfinite(values)], edges.tolist(), **style)
         shown.append((Patch(**style), MODES[mode]))
     if logarithm:
-        _few_decades(axes, "x")
+        logarithmic(axes, "x")
     finish(axes)
     return shown
 
@@ -121,15 +112,6 @@ def _against(axes: Axes, model: Vector, zoh: Vector, *, logarithm: bool) -> None
     axes.plot((low, high), (low, high), color=INK, linewidth=0.9)
     axes.plot(model, zoh, "o", color=_DOT, markersize=2.2, alpha=0.5, markeredgewidth=0)
     if logarithm:
-        _few_decades(axes, "x")
-        _few_decades(axes, "y")
+        logarithmic(axes, "x")
+        logarithmic(axes, "y")
     finish(axes)
-
-
-def _few_decades(axes: Axes, which: Literal["x", "y"]) -> None:
-    """Label a short logarithmic axis at 1 and 3 of each decade only."""
-    axes.set(**{f"{which}scale": "log"})
-    axis = axes.xaxis if which == "x" else axes.yaxis
-    axis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
-    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axis.set_minor_locator(NullLocator())

@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar, Literal, Self
 from pydantic import Field, FiniteFloat, model_validator
 
 from noack.core.clock import NS_PER_S
-from noack.impairments.feature import Behaviour, Impairment, StageTables, Table, Word
+from noack.impairments.feature import Behaviour, Impairment, StageTables, Table, Word, add_numbers
 from noack.impairments.link_records import (
     BLACKED_OUT,
     PacketContext,
@@ -104,9 +104,8 @@ class Blackout(Impairment):
         return f"loses every packet from {', '.join(parts)}{more} after the start{every}"
 
     def stage(self, tables: StageTables) -> BlackoutStage:
-        begin, end = tables.add_integers(
-            round(t_s * NS_PER_S) for interval in self.intervals_s for t_s in interval
-        )
+        times_ns = [round(t_s * NS_PER_S) for interval in self.intervals_s for t_s in interval]
+        begin, end = add_numbers(tables.integers, times_ns)
         return BlackoutStage(begin=begin, end=end, period_ns=round((self.every_s or 0) * NS_PER_S))
 
     def chains(self) -> Sequence[Chain]:

@@ -16,7 +16,7 @@ from pydantic import Field, FiniteFloat, model_validator
 from noack.core.clock import NS_PER_S
 from noack.impairments.correlated_chance import TC_CORRELATION, latent
 from noack.impairments.delay_files import read_samples
-from noack.impairments.feature import Behaviour, Impairment, StageTables, Table, Word
+from noack.impairments.feature import Behaviour, Impairment, StageTables, Table, Word, add_numbers
 from noack.impairments.link_records import (
     NEVER_NS,
     FlowState,
@@ -303,7 +303,9 @@ class Delay(Impairment):
     def stage(self, tables: StageTables) -> DelayStage:
         if self.file is not None:
             raise ValueError(f"{self.file}: the delays have not been read")
-        begin, end = tables.add_reals(sorted(t_s * NS_PER_S for t_s in self.samples_s or ()))
+        begin, end = add_numbers(
+            tables.reals, sorted(t_s * NS_PER_S for t_s in self.samples_s or ())
+        )
         return DelayStage(
             constant_ns=float(round(self.delay_s * NS_PER_S)),
             jitter_ns=self.jitter_s * NS_PER_S,

@@ -9,9 +9,11 @@ from noack.impairments.disciplines import DISCIPLINES, Discipline
 from noack.impairments.disciplines.tail_drop import TailDrop
 from noack.impairments.feature import Behaviour, Impairment, StageTables, Table, Word
 from noack.impairments.link_records import RuleStage
-from noack.impairments.quantities import COUNT, RATE_BPS, SIGNED_COUNT, rate_text
+from noack.impairments.quantities import COUNT, RATE_BPS, SIGNED_COUNT, rate_text, without_defaults
 from noack.impairments.word_reader import WordReader
 
+_QUEUE = 1000
+_HEADERS_BYTES = 28
 _TC_HEADERS_BYTES = 42
 """Bytes that tc adds to a payload on an Ethernet device: headers of Ethernet, IPv4 and UDP."""
 
@@ -38,9 +40,9 @@ class Rate(Impairment):
     kind: Literal["rate"] = "rate"
     rate_bps: Annotated[int, Field(ge=1, le=10**12)]
     """Bits per second."""
-    queue: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
+    queue: Annotated[int, Field(ge=1, le=1_000_000)] = _QUEUE
     """Maximum number of packets that wait or are being sent; further packets are dropped."""
-    overhead_bytes: Annotated[int, Field(ge=-65_535, le=65_535)] = 28
+    overhead_bytes: Annotated[int, Field(ge=-65_535, le=65_535)] = _HEADERS_BYTES
     """Bytes added to each payload; 28: the headers of UDP and IPv4."""
     cell_bytes: Annotated[int, Field(ge=0, le=65_535)] = 0
     """Payload of a link-layer cell, e.g. 48; 0: no cells."""
@@ -113,18 +115,12 @@ class Rate(Impairment):
         ]  # fmt: skip
 
     def text(self) -> str:
-        fields = type(self).model_fields
-        words = ["rate", rate_text(self.rate_bps)]
-        cells = (self.cell_bytes, self.cell_overhead_bytes)
-        if self.overhead_bytes != fields["overhead_bytes"].default or any(cells):
-            words.append(str(self.overhead_bytes))
-        if any(cells):
-            words.append(str(self.cell_bytes))
-        if self.cell_overhead_bytes:
-            words.append(str(self.cell_overhead_bytes))
-        if self.queue != fields["queue"].default:
+        numbers = (self.overhead_bytes, self.cell_bytes, self.cell_overhead_bytes)
+        given = without_defaults(numbers, (_HEADERS_BYTES, 0, 0))
+        words = ["rate", rate_text(self.rate_bps), *given]
+        if self.queue != _QUEUE:
             words.append(f"queue {self.queue}")
-        return " ".join([*words, *filter(None, [self.discipline.text()])])
+        return " ".join(filter(None, [*map(str, words), self.discipline.text()]))
 
     def meaning(self) -> str:
         text = (

@@ -29,10 +29,6 @@ def _read(reader: WordReader) -> Table:
     return table
 
 
-def _read_gap(reader: WordReader) -> Table:
-    return {"gap": reader.value(COUNT)}
-
-
 class Reorder(CorrelatedChance, Impairment):
     """Lets a packet leave at once, before packets that arrived earlier and are delayed."""
 
@@ -44,7 +40,9 @@ class Reorder(CorrelatedChance, Impairment):
 
     words: ClassVar = (
         Word("reorder", "delay 10ms reorder 5%", _read, grammar="reorder P [CORR] [gap N]"),
-        Word("gap", "delay 10ms gap 5", _read_gap, grammar="gap N"),
+        Word(
+            "gap", "delay 10ms gap 5", lambda reader: {"gap": reader.value(COUNT)}, grammar="gap N"
+        ),
     )
     behaviour: ClassVar = Behaviour(ChanceStage, apply)
 

@@ -1,7 +1,6 @@
 """Bursty and isolated losses: a Markov chain of four states (Salsano, Ludovici & Ordine).
 
-State 1: gap, delivered. 2: delivered within a burst. 3: lost within a burst. 4: a single loss in a
-gap. From state 4 the chain returns to 1. It starts in 1 and advances before each packet.
+It starts in state 1 and advances before each packet. From state 4 it returns to 1.
 """
 
 from collections.abc import Sequence

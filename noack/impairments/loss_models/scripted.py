@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from noack.impairments.feature import Behaviour, LossModel, StageTables, Table, Word
+from noack.impairments.feature import Behaviour, LossModel, StageTables, Table, Word, add_numbers
 from noack.impairments.link_records import DROPPED, PacketContext, RuleStage, StageMemory, refuse
 from noack.impairments.markov_chain import NotPredictableError, Pattern, pattern
 from noack.impairments.quantities import COUNT
@@ -88,7 +88,7 @@ class ScriptedLoss(LossModel):
         return f"loses the packets {numbers or '(none)'} of each flow{again}"
 
     def stage(self, tables: StageTables) -> ScriptStage:
-        begin, end = tables.add_integers(self.lost)
+        begin, end = add_numbers(tables.integers, self.lost)
         return ScriptStage(period=self.repeat_every, begin=begin, end=end)
 
     def chains(self) -> Sequence[Pattern]:

@@ -42,8 +42,8 @@ def words_of(example: str) -> list[str]:
 def test_the_help_begins_with_an_introduction() -> None:
     text = help_of()
     story, _, panels = text.partition("Options")
-    told = re.findall(r"^ +noack (\w+)", story, re.MULTILINE)
-    assert told == [
+    commands = re.findall(r"^ +noack (\w+)", story, re.MULTILINE)
+    assert commands == [
         "doctor", "run", "view", "simulate", "certify", "fidelity", "compare", "campaign", "netem",
     ]  # fmt: skip
     assert all(f" {name} " in panels for name in COMMANDS)
@@ -133,9 +133,9 @@ def test_only_long_and_live_commands_have_no_example_that_is_run() -> None:
 
 def test_the_emulators_examples_have_valid_arguments() -> None:
     text = emulator.parser().format_help().replace(" \\\n", " ")
-    told = re.findall(r"^  noack netem (--.*)", text.partition("examples:")[2], re.MULTILINE)
-    assert len(told) >= 5
-    for example in told:
+    shown = re.findall(r"^  noack netem (--.*)", text.partition("examples:")[2], re.MULTILINE)
+    assert len(shown) >= 5
+    for example in shown:
         options = emulator.parsed(emulator.parser(), shlex.split(example))
         parse(options.words or ())
         if options.links is None:
@@ -158,23 +158,22 @@ OF_THEIR_OWN = {
 """Options with a different meaning in each command, which their help states."""
 
 
-def test_options_of_the_same_name_mean_the_same_everywhere() -> None:
-    said: dict[str, set[tuple[str, str | None, str | None]]] = defaultdict(set)
-    for name in OURS:
-        for one in COMMANDS[name].params:
-            if one.param_type_name == "option":
-                said["/".join(one.opts)].add(("/".join(one.secondary_opts), one.metavar, one.help))
-    several = {name for name, variants in said.items() if len(variants) > 1}
-    assert several <= OF_THEIR_OWN.keys(), {name: said[name] for name in several}
-
-
-def test_options_that_mean_the_same_have_the_same_name() -> None:
-    by_words: dict[str, set[str]] = defaultdict(set)
-    for name in OURS:
-        for one in COMMANDS[name].params:
+def test_an_option_has_one_name_and_one_meaning() -> None:
+    meanings: dict[str, set[tuple[str, str | None, str | None]]] = defaultdict(set)
+    names: dict[str, set[str]] = defaultdict(set)
+    for command in OURS:
+        for one in COMMANDS[command].params:
             if one.help:
-                by_words[one.help].add(one.name)
-    assert not [names for names in by_words.values() if len(names) > 1]
+                names[one.help].add(one.name)
+            if one.param_type_name == "option":
+                variant = "/".join(one.secondary_opts), one.metavar, one.help
+                meanings["/".join(one.opts)].add(variant)
+    several = {name for name, variants in meanings.items() if len(variants) > 1}
+    assert several <= OF_THEIR_OWN.keys(), {name: meanings[name] for name in several}
+    assert not [variants for variants in names.values() if len(variants) > 1]
+
+
+def test_arguments_have_few_names() -> None:
     arguments: dict[str, set[str | None]] = defaultdict(set)
     for name in OURS:
         for one in COMMANDS[name].params:

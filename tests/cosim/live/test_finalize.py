@@ -13,28 +13,28 @@ from cosim.live.finalize import finalize, reopen
 from cosim.record.environment import write_environment
 from cosim.record.run_directory import (
     ENDING_FILE,
-    REPORT_FILE,
     REPORTS_FILE,
     SCENARIO_FILE,
     SUMMARY_FILE,
 )
 from cosim.record.run_ending import EndingFile, RunEnding
-from cosim.record.run_record import RunRecord, write_record
+from cosim.record.run_record import RunRecord, load_record, write_record
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
 from noack.config.scenario_file import dumps, load
 from noack.core.errors import CallerError, ExitStatus
 from noack.protocol.record_tables import PLANT_STEP
-
-SHORT = ["horizon_s=1", "plant.rate_hz=200", "controller.rate_hz=200"]
+from noack.runtime.spool import SPOOL, SpoolWriter
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that is marked as live, with the record of a simulated one and without a summary."""
     folder = tmp_path_factory.mktemp("recorded")
-    record = simulate(resolve(load(find_shipped("lane_following", "scenarios"), SHORT)))
+    record = simulate(
+        resolve(load(find_shipped("double_integrator", "scenarios"), ["horizon_s=1"]))
+    )
     (folder / SCENARIO_FILE).write_text(dumps(record.scenario))
     write_environment(folder, "live")
     reports = {role: report | {"realtime": {}} for role, report in record.reports.items()}
@@ -43,28 +43,33 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(autouse=True)
+def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cosim.live.finalize, "_report", lambda *_: None)
+
+
+@pytest.fixture
+def run_dir(recorded: Path, tmp_path: Path) -> Path:
+    """A copy of the run."""
+    return Path(shutil.copytree(recorded, tmp_path / "run"))
+
+
 @pytest.fixture(scope="module")
 def finalized(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same run with its summary and report."""
-    folder = tmp_path_factory.mktemp("finalized") / "run"
-    shutil.copytree(recorded, folder)
-    assert reopen(folder).status == ExitStatus.FAILED  # it has no stored ending
-    assert (folder / REPORT_FILE).stat().st_size > 10_000
+    folder = Path(shutil.copytree(recorded, tmp_path_factory.mktemp("finalized") / "run"))
+    assert finalize(reopened(folder), report=False).status == ExitStatus.FAILED
     return folder
 
 
 @pytest.fixture
-def run_dir(recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A copy of the run to be finalized without a report."""
-    monkeypatch.setattr(cosim.live.finalize, "_report", lambda *_: None)
-    return Path(shutil.copytree(recorded, tmp_path / "run"))
-
-
-@pytest.fixture
-def whole(finalized: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A copy of the finalized run."""
-    monkeypatch.setattr(cosim.live.finalize, "_report", lambda *_: None)
+def whole(finalized: Path, tmp_path: Path) -> Path:
+    """A copy of the run with its summary."""
     return Path(shutil.copytree(finalized, tmp_path / "whole"))
+
+
+def reopened(run_dir: Path) -> RunEnding:
+    """The ending of a run without a stored one."""
+    return RunEnding(run_dir, 0, ExitStatus.FAILED, "the launcher ended early")
 
 
 def summary_of(run_dir: Path) -> dict[str, Any]:
@@ -76,12 +81,12 @@ def test_the_summary_holds_the_replay(whole: Path) -> None:
     replayed = summary_of(whole)["replay"]
     assert replayed["bit_exact"]
     assert replayed["complete"]
-    assert replayed["inputs"] > 700
+    assert replayed["inputs"] > 1500
     assert reopen(whole).summary == summary_of(whole)
 
 
 def test_a_difference_in_the_replay_does_not_fail_the_run(run_dir: Path) -> None:
-    record = cosim.live.finalize.load_record(run_dir)
+    record = load_record(run_dir)
     record[PLANT_STEP]["u"][9, 0] = np.nan
     write_record(record, run_dir)
     outcome = finalize(ended_well(run_dir), report=False)
@@ -109,7 +114,7 @@ def test_a_run_that_cannot_be_replayed_fails(
 
 
 def test_a_run_whose_record_is_lost_fails(run_dir: Path) -> None:
-    record = cosim.live.finalize.load_record(run_dir)
+    record = load_record(run_dir)
     no_rows = {table: record[table][:0] for table in record.tables}
     write_record(RunRecord(record.scenario, no_rows, [], {}), run_dir)
     (run_dir / REPORTS_FILE).unlink()  # the total number of rows is unknown
@@ -120,7 +125,7 @@ def test_a_run_whose_record_is_lost_fails(run_dir: Path) -> None:
 
 @pytest.mark.parametrize("cut", [slice(-40, None), slice(100, 140)])
 def test_a_run_whose_rows_are_missing_fails(run_dir: Path, cut: slice) -> None:
-    record = cosim.live.finalize.load_record(run_dir)
+    record = load_record(run_dir)
     rows = {table: record[table] for table in record.tables}
     lost = len(rows[PLANT_STEP][cut])
     rows[PLANT_STEP] = np.delete(rows[PLANT_STEP], cut)
@@ -175,6 +180,23 @@ def test_an_error_of_the_launcher_is_stored_as_the_end(run_dir: Path) -> None:
         raise CallerError("the port is taken")
     outcome = reopen(run_dir)
     assert (outcome.status, outcome.reason) == (2, "the port is taken")
+
+
+def test_rows_that_are_spooled_after_the_end_are_merged(whole: Path) -> None:
+    record = load_record(whole)
+    steps = record[PLANT_STEP]
+    writer = SpoolWriter(whole / SPOOL, "plant")
+    late = steps[-30:].copy()
+    late["input"] += 30
+    writer.append(PLANT_STEP, 0, steps[-60:].tobytes())
+    writer.append(PLANT_STEP, 60, late.tobytes())
+    writer.close()
+    reopen(whole)
+    merged = load_record(whole)
+    assert len(merged[PLANT_STEP]) > len(steps)
+    for table in set(record.tables) - {PLANT_STEP}:
+        assert np.array_equal(merged[table], record[table])
+    assert not (whole / SPOOL).exists()
 
 
 def test_a_damaged_log_is_one_clear_line(run_dir: Path) -> None:

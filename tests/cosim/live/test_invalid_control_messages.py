@@ -24,52 +24,50 @@ JUNK: list[bytes | None] = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("junk", JUNK)
 def test_an_invalid_request_is_refused_and_the_others_join(
-    content: dict[str, Any], junk: bytes | None, tmp_path: Path
+    content: dict[str, Any], tmp_path: Path
 ) -> None:
     plane = FakePlane()
     ticket = new_ticket(resolve(validate(content, "")), "tcp/127.0.0.1:1", tmp_path, launched=True)
     with patch.object(coordinator, "ControlPlane", lambda *_, **__: plane):
         barrier = coordinator.Coordinator(ticket)
-    plane.put("progress", Sample("progress", junk))
-    assert barrier.progress() is None
-    for question in ("admit", "join"):
-        bad = Query(f"noack/0/{question}/plant", junk)
-        plane.put(question, bad)
-        barrier.poll()
-        assert bad.error is not None
-        assert bad.error.startswith("cannot join: ")
+    for junk in JUNK:
+        plane.put("progress", Sample("progress", junk))
+        assert barrier.progress() is None
+        for question in ("admit", "join"):
+            bad = Query(f"noack/0/{question}/plant", junk)
+            plane.put(question, bad)
+            barrier.poll()
+            assert bad.error is not None
+            assert bad.error.startswith("cannot join: ")
     for number, role in enumerate((*LOOP_ROLES, RECORDER)):
         address = None if role == RECORDER else ["127.0.0.1", 1 + number]
-        hello = json.dumps({"pid": 1, "instance": role, "address": address}).encode()
+        request = json.dumps({"pid": 1, "instance": role, "address": address}).encode()
         for question in ("admit", "join"):
-            plane.put(question, Query(f"noack/0/{question}/{role}", hello))
+            plane.put(question, Query(f"noack/0/{question}/{role}", request))
             barrier.poll()
     assert barrier.epoch_ns is not None
     assert plane.answers[-1]["addresses"].keys() == set(LOOP_ROLES)
 
 
-@pytest.mark.parametrize("junk", JUNK)
 def test_the_recorder_ignores_invalid_telemetry_and_stores_the_rest(
-    content: dict[str, Any],
-    junk: bytes | None,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    content: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scenario, plane = resolve(validate(content, "")), FakePlane()
     (tmp_path / SCENARIO_FILE).write_text(dumps(scenario))
     recorder = Recorder(scenario, tmp_path, plane, view=None)  # type: ignore[arg-type]
     row = np.zeros(1, recorder._store.types[PLANT_STEP]).tobytes()
     header = b'{"first": 0, "rows": 1}'
-    plane.put("telemetry", Sample("t/plant/plant_step", junk, header))
-    plane.put("telemetry", Sample("t/plant/plant_step", row, junk))
-    plane.put("telemetry", Sample("t/sensor/plant_step", row, header))
-    plane.put("telemetry", Sample("t/plant/notices", junk, header))
+    for junk in JUNK:
+        plane.put("telemetry", Sample("t/plant/plant_step", junk, header))
+        plane.put("telemetry", Sample("t/plant/plant_step", row, junk))
+        plane.put("telemetry", Sample("t/sensor/plant_step", row, header))
+        plane.put("telemetry", Sample("t/plant/notices", junk, header))
+        bad = Query("report/plant", junk)
+        plane.put("report", bad)
+        recorder.poll()
+        assert bad.error is not None
     plane.put("telemetry", Sample("t/plant/plant_step", row, header))
-    bad = Query("report/plant", junk)
-    plane.put("report", bad)
     recorder.poll()
-    assert bad.error is not None
     assert len(recorder.finish()[PLANT_STEP]) == 1
     assert capsys.readouterr().err.count("ignored an invalid telemetry message") == 1

@@ -5,32 +5,36 @@ from typing import Any
 import pytest
 
 import noack
+from cosim.analysis.run_summary import summarise
 from cosim.output.run_tables import key_numbers
+from cosim.simulation.virtual_time import simulate
+from noack.config.resolution import resolve
+from noack.config.scenario_file import validate
 
 
-def simulated(scenario: str, **settings: Any) -> noack.Run:
-    named = {key.replace("__", "."): value for key, value in settings.items()}
-    return noack.simulate(noack.load(scenario, named))
+def summary_of(content: dict[str, Any]) -> dict[str, Any]:
+    return summarise(simulate(resolve(validate(content, ""))), 0, "horizon").to_json()
 
 
-def test_the_expected_loss_rate_is_shown_beside_the_measured_one() -> None:
+def test_the_expected_loss_rate_is_shown_beside_the_measured_one(content: dict[str, Any]) -> None:
     """With loss probability p and cap N, Σ_{k=1…N} p^k drops are expected for each delivery."""
-    summary = simulated("lane_following", horizon_s=2.0).summary
-    drops = sum(0.8**k for k in range(1, 5))
+    summary = summary_of(content)
+    drops = 0.5 + 0.5**2
     assert summary["loss_expected"] == pytest.approx(drops / (1 + drops))
-    assert ("  expected loss rate with the cap", "70.3 %") in key_numbers(summary)
+    assert ("  expected loss rate with the cap", "42.9 %") in key_numbers(summary)
 
 
-def test_a_run_with_changed_losses_has_no_expected_loss_rate() -> None:
-    change = {"at_s": 1.0, "set": {"network.loss.probability": 0.2}}
-    summary = simulated("lane_following", horizon_s=2.0, changes=[change]).summary
+def test_a_run_with_changed_losses_has_no_expected_loss_rate(content: dict[str, Any]) -> None:
+    change = {"at_s": 0.5, "set": {"network.loss.probability": 0.2}}
+    summary = summary_of(content | {"changes": [change]})
     assert summary["loss_expected"] is None
     assert not any("expected loss" in quantity for quantity, _ in key_numbers(summary))
 
 
 @pytest.mark.parametrize(("beta", "level"), [(0.02, "βe^(−0.3t), from"), (1e-3, "ε")])
 def test_a_claim_names_the_threshold_in_its_bound(beta: float, level: str) -> None:
-    run = simulated("unstable_pendulum", horizon_s=1.0, trigger__beta=beta, trigger__floor=0.01)
+    settings = {"horizon_s": 1.0, "trigger.beta": beta, "trigger.floor": 0.01}
+    run = noack.simulate(noack.load("unstable_pendulum", settings))
     bounds = [claim["bound"] for claim in run.claims if claim["source"] == "certificate"]
     of_the_sensor = next(bound for bound in bounds if bound.startswith("‖e_s‖ ≤ "))
     assert level in of_the_sensor

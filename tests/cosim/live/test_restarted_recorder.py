@@ -17,9 +17,10 @@ from cosim.output.viewer.recording_file import ViewError
 from cosim.record.run_directory import SCENARIO_FILE
 from noack.config.resolution import resolve
 from noack.config.scenario_file import dumps, validate
+from noack.core.errors import MachineError
 from noack.protocol.machine_interface import BEGINNING, GENERATION, Start
 from noack.protocol.record_tables import OWNER, PLANT_STEP, SENSOR_MEASUREMENT
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.runtime.spool import SPOOL, read_chunks
 from noack.runtime.telemetry import NOTICES
 from tests.fuzz.plane import FakePlane, Query, Sample
@@ -122,6 +123,16 @@ def test_a_restarted_recorder_does_not_wait_for_ended_processes(
     assert not run.recorder.finished
     assert run.report("plant") == {}
     assert run.recorder.finished
+
+
+def test_a_deleted_spool_file_is_reported(run: Run) -> None:
+    run.rows(PLANT_STEP, 2)
+    file = run.run_dir / SPOOL / f"{PLANT_STEP}.{RECORDER}"
+    file.unlink()
+    with pytest.raises(MachineError, match=f"^{file}: was deleted or moved during the run$"):
+        run.recorder.acknowledge()
+    run.recorder.finish()
+    assert "was deleted or moved" in str(run.recorder.lost)
 
 
 def test_a_log_on_a_full_disk_does_not_stop_the_record(

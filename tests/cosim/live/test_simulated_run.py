@@ -2,12 +2,14 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import rerun.chunk
 from typer.testing import CliRunner, Result
 
+import cosim.live.finalize
 from cosim.cli import app
 from cosim.live.simulated_run import simulate_run
 from cosim.output.viewer import blueprint
@@ -24,7 +26,7 @@ from noack.protocol.record_tables import tables
 
 ROOT = Path(__file__).parents[3]
 SHORT = ("horizon_s=2", "plant.rate_hz=100", "controller.rate_hz=100", "trigger.beta=0.05")
-PATH = ROOT / "scenarios" / "lane_following.toml"
+PATH = ROOT / "scenarios" / "double_integrator.toml"
 
 
 def noack(*arguments: str) -> Result:
@@ -49,20 +51,32 @@ def test_a_simulated_run_has_the_files_of_a_live_run(runs: Path) -> None:
     }  # fmt: skip
     assert json.loads((run_dir / "environment.json").read_text())["kind"] == "simulated"
     assert {path.name for path in (run_dir / "record").iterdir()} == {
-        *(f"{table}.parquet" for table in tables(4, 2)),
+        *(f"{table}.parquet" for table in tables(2, 1)),
         "notices.jsonl",
     }
 
 
-def test_a_report_can_be_omitted_and_written_later(tmp_path: Path) -> None:
+@pytest.fixture
+def reported(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """Run directories for which a report would be written."""
+    written: list[Path] = []
+
+    def report(record: RunRecord, summary: Any, run_dir: Path, claims: Any) -> Path:
+        written.append(run_dir)
+        return run_dir / "report.html"
+
+    monkeypatch.setattr(cosim.live.finalize, "_report", report)
+    return written
+
+
+def test_a_report_can_be_omitted_and_written_later(tmp_path: Path, reported: list[Path]) -> None:
     settings = [word for setting in SHORT for word in ("--set", setting)]
     done = noack("simulate", str(PATH), "--runs", str(tmp_path), "--no-report", *settings)
     assert done.exit_code == 0, done.output
     assert "report.html" not in done.stdout
-    report = (tmp_path / "latest").resolve() / "report.html"
-    assert not report.exists()
+    assert reported == []
     assert noack("report", "--runs", str(tmp_path)).exit_code == 0
-    assert report.exists()
+    assert reported == [(tmp_path / "latest").resolve()]
 
 
 def test_the_record_on_disk_equals_the_simulators(runs: Path) -> None:
@@ -80,6 +94,8 @@ def test_the_summary_names_the_kind_of_run(runs: Path) -> None:
     assert summary["exit"] == {"status": 0, "reason": "horizon"}
     assert summary["replay"] is None
     assert summary["reached_s"] == 2.0
+    assert summary["lateness_us"] == summary["realtime"] == {}
+    assert summary["latency_us"] is summary["startup_s"] is None
     shown = noack("summary", "--runs", str(runs))
     assert shown.exit_code == 0
     assert "simulated" in shown.stdout
@@ -87,7 +103,8 @@ def test_the_summary_names_the_kind_of_run(runs: Path) -> None:
     assert "real-time" not in shown.stdout
 
 
-def test_a_lost_summary_is_written_again_from_the_record(runs: Path, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("reported")
+def test_a_lost_summary_is_written_again_from_the_record(runs: Path) -> None:
     summary = runs / "latest" / "summary.json"
     content = json.loads(summary.read_text())
     summary.unlink()
@@ -119,7 +136,6 @@ def test_an_interrupted_simulation_leaves_no_run_directory(
 
 
 def test_a_run_directory_without_a_kind_is_a_live_run(runs: Path, tmp_path: Path) -> None:
-    """Run directories made before simulations existed do not state their kind."""
     folder = tmp_path / "old"
     folder.mkdir()
     for path in (runs / "latest").iterdir():

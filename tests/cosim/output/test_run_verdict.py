@@ -71,7 +71,7 @@ def test_verbose_prints_all_tables_without_warnings(outcome: Outcome) -> None:
 
 
 @pytest.mark.parametrize(
-    ("status", "reason", "said"),
+    ("status", "reason", "message"),
     [
         (0, "horizon", "completed 20 s"),
         (1, "sensor died", "failed after 20 s: sensor died"),
@@ -80,10 +80,10 @@ def test_verbose_prints_all_tables_without_warnings(outcome: Outcome) -> None:
     ],
 )  # fmt: skip
 def test_the_first_line_states_how_the_run_ended(
-    outcome: Outcome, status: int, reason: str, said: str
+    outcome: Outcome, status: int, reason: str, message: str
 ) -> None:
     first, *_ = verdict(outcome.summary | {"exit": {"status": status, "reason": reason}})
-    assert first.text == said
+    assert first.text == message
     assert (first.style == "bold red") == (status == 1)
 
 

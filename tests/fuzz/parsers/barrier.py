@@ -1,4 +1,4 @@
-"""Messages to the coordinator: joins, farewells and progress from any sender on the plane."""
+"""Messages to the coordinator: join requests, ends and progress from any sender on the plane."""
 
 import json
 from typing import Any
@@ -31,8 +31,8 @@ def one_input(data: bytes) -> None:
                 plane.put("ended", Sample(f"noack/0/ended/{role}/one", _bytes(choices, "gone")))
             case 1:
                 plane.put("progress", Sample("noack/0/progress", _bytes(choices, PROGRESS)))
-                account = barrier.progress()
-                assert account is None or account.keys() >= PROGRESS.keys()
+                progress = barrier.progress()
+                assert progress is None or progress.keys() >= PROGRESS.keys()
             case 2 | 3:
                 query = Query(f"noack/0/admit/{role}", _bytes(choices, HELLO))
                 admissions.append(query)
@@ -45,8 +45,8 @@ def one_input(data: bytes) -> None:
     for role, asked in queries.items():
         if barrier.epoch_ns is not None or role not in ROLES:
             # A new join request replaces the sender's previous one.
-            assert _is_over(asked[-1]), "who asks to join waits for an answer"
-    assert all(query.answered == 1 for query in admissions), "who knocks waits for an answer"
+            assert _is_over(asked[-1]), "a join request has no answer"
+    assert all(query.answered == 1 for query in admissions), "an admission request has no answer"
     for answer in plane.answers:
         for host, port in answer.get("addresses", {}).values():
             assert isinstance(host, str)

@@ -8,8 +8,7 @@ from cosim.studies.campaign.campaign_file import json_schema, load
 from cosim.studies.campaign.campaign_grid import grid
 from noack.core.errors import NoackError
 from tests.fuzz.choices import EDITS, Choices
-from tests.fuzz.edits import Vocabulary, edited, vocabulary
-from tests.fuzz.files import bases, quoted, write_named
+from tests.fuzz.edits import Vocabulary, bases, edited, quoted, vocabulary, write_named
 from tests.fuzz.harness import FOLDER, refusal, workspace
 
 _SCHEMA = vocabulary(json_schema(), dates=True)

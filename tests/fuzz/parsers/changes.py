@@ -60,46 +60,46 @@ def one_input(data: bytes) -> None:
     choices = Choices(data)
     match choices.below(4):
         case 0:
-            _asked(_bytes(choices, {"settings": SETTINGS}))
+            _request(_bytes(choices, {"settings": SETTINGS}))
         case 1:
-            _announced(_bytes(choices, ANNOUNCED))
+            _announce(_bytes(choices, ANNOUNCED))
         case 2:
             with refusal("not a valid change reply"):
                 assert isinstance(
                     parse_message(ChangeReply, _bytes(choices, ANSWER))["run_dir"], str
                 )
         case _:
-            _found(_bytes(choices, RUN))
+            _find(_bytes(choices, RUN))
 
 
-def _asked(question: bytes) -> None:
+def _request(content: bytes) -> None:
     """The coordinator replies, and every process can apply the announced changes."""
     plane = FakePlane()
     with patch.object(coordinator, "ControlPlane", lambda *_, **__: plane):
         centre = coordinator.Coordinator(_TICKET)
     centre._clock = RunClock(0, 1.0, lambda: 0)
-    query = Query("noack/0/runtime_parameters", question)
+    query = Query("noack/0/runtime_parameters", content)
     plane.put("runtime_parameters", query)
     centre.poll()
     assert query.answered == 1
     assert query.error is None or query.error.strip()
-    for content in plane.announced:
-        one = parse_message(ChangeAnnouncement, json.dumps(content))
+    for announced in plane.announced:
+        one = parse_message(ChangeAnnouncement, json.dumps(announced))
         ChangeSchedule(_TICKET.scenario).announce(
             "t", ParameterChange(one["number"], one["t_ns"], one["settings"]), 0, 0, -1
         )
     try:
-        settings = parse_message(ChangeRequest, question).get("settings", {})
+        settings = parse_message(ChangeRequest, content).get("settings", {})
     except PeerError:
         assert not plane.announced
     else:
         assert len(plane.announced) <= bool(settings)
 
 
-def _announced(said: bytes) -> None:
+def _announce(content: bytes) -> None:
     """A process applies the change, or refuses it in one line and stays unchanged."""
     with refusal("not a valid change announcement"):
-        one = parse_message(ChangeAnnouncement, said)
+        one = parse_message(ChangeAnnouncement, content)
         schedule = ChangeSchedule(_TICKET.scenario)
         change = ParameterChange(one["number"], one["t_ns"], one["settings"])
         with refusal(("the change", "a change"), lines=True):
@@ -109,7 +109,7 @@ def _announced(said: bytes) -> None:
         assert schedule.last is _TICKET.scenario
 
 
-def _found(data: bytes) -> None:
+def _find(data: bytes) -> None:
     with patch.dict(os.environ, {"XDG_RUNTIME_DIR": str(workspace())}):
         with open_private("runs", create=True) as folder:
             path = folder.path / "up.json"
@@ -122,6 +122,5 @@ def _found(data: bytes) -> None:
 
 
 def _bytes(choices: Choices, content: Any) -> bytes:
-    if choices.flag():
-        return json.dumps(edited(choices, content, KNOWN)).encode()
-    return damaged(choices, json.dumps(edited(choices, content, KNOWN)).encode())
+    whole, data = choices.flag(), json.dumps(edited(choices, content, KNOWN)).encode()
+    return data if whole else damaged(choices, data)

@@ -1,6 +1,7 @@
 """Requests to a running emulator over zenoh, with and without the secret."""
 
 import json
+from types import SimpleNamespace
 from typing import Any
 
 from netem.control.control_server import ControlServer, SettingsChange
@@ -51,12 +52,7 @@ class _AtOnce:
             self.relay.change(link, direction, settings)
 
     def snapshot(self) -> Any:
-        return _Links(self.relay.report())
-
-
-class _Links:
-    def __init__(self, links: Any) -> None:
-        self.links = links
+        return SimpleNamespace(links=self.relay.report())
 
 
 def one_input(data: bytes) -> None:
@@ -66,21 +62,20 @@ def one_input(data: bytes) -> None:
         if "words" in base and choices.flag():
             base["words"] = sentence(choices)
         data = damaged(choices, json.dumps(edited(choices, base, KNOWN)).encode())
-    errands = _AtOnce()
-    server = ControlServer("test", errands)  # type: ignore[arg-type]
+    commands = _AtOnce()
+    server = ControlServer("test", commands)  # type: ignore[arg-type]
     server._token = TOKEN
-    before = dict(errands.relay.settings)
+    before = dict(commands.relay.settings)
     query = Query("netem/test/change", data)
     server._reply(query, server._change)  # type: ignore[arg-type]
     assert query.answered == 1
     if query.error is not None:
         assert "an error of the emulator's own" not in query.error
         assert query.error.isprintable()
-        assert errands.relay.settings == before, "what is refused changes nothing"
+        assert commands.relay.settings == before, "a refused request changed settings"
     else:
-        assert TOKEN.encode() in data, "nobody changes anything without the secret"
-        said = json.loads(query.replies[0])["links"]
-        for link in said:
+        assert TOKEN.encode() in data, "a request without the secret was accepted"
+        for link in json.loads(query.replies[0])["links"]:
             for direction in DIRECTIONS:
                 settings = LinkSettings.model_validate_json(json.dumps(link[direction]["settings"]))
-                assert settings == errands.relay.settings[link["name"], direction]
+                assert settings == commands.relay.settings[link["name"], direction]

@@ -12,8 +12,7 @@ from netem.words.links_file import json_schema, load_links
 from netem.words.words_to_settings import settings_of, text_of
 from noack.impairments.link_settings import LinkSettings
 from tests.fuzz.choices import EDITS, Choices
-from tests.fuzz.edits import edited, vocabulary
-from tests.fuzz.files import NAMED, quoted, write_named
+from tests.fuzz.edits import NAMED, edited, quoted, vocabulary, write_named
 from tests.fuzz.harness import refusal, workspace
 from tests.fuzz.parsers.words import WORDS as TOKENS
 from tests.fuzz.parsers.words import sentence
@@ -60,10 +59,10 @@ def numeric(host: str, port: int, family: int, kind: int) -> Any:
 def one_input(data: bytes) -> None:
     if data[:1] == b"\0":
         choices = Choices(data[1:])
-        said: dict[str, Any] = json.loads(json.dumps(BASE))
+        content: dict[str, Any] = json.loads(json.dumps(BASE))
         if choices.flag():
-            said["link"][0]["words"] = sentence(choices)
-        data = tomli_w.dumps(edited(choices, said, KNOWN)).encode()
+            content["link"][0]["words"] = sentence(choices)
+        data = tomli_w.dumps(edited(choices, content, KNOWN)).encode()
     path = write_named(workspace(), "links.toml", data)
     with refusal(str(path), lines=True), patch("noack.runtime.address.socket.getaddrinfo", numeric):
         for spec in load_links(path):

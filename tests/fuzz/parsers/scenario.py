@@ -10,8 +10,7 @@ from noack.config.scenario import Scenario
 from noack.config.scenario_file import dumps, load, validate
 from noack.config.toml_file import json_schema
 from tests.fuzz.choices import EDITS, Choices
-from tests.fuzz.edits import edited, key, value, vocabulary
-from tests.fuzz.files import bases, quoted, write_named
+from tests.fuzz.edits import bases, edited, key, quoted, value, vocabulary, write_named
 from tests.fuzz.harness import FOLDER, refusal, workspace
 
 KNOWN = vocabulary(json_schema(Scenario), dates=True)

@@ -1,4 +1,4 @@
-"""Messages to the recorder: batches, notices and farewells from any sender on the plane."""
+"""Messages to the recorder: batches, notices and final reports from any sender on the plane."""
 
 import io
 import json
@@ -47,7 +47,7 @@ def one_input(data: bytes) -> None:
     for _ in range(1 + choices.below(6)):
         match choices.below(5):
             case 0:
-                queries.append(_goodbye(choices))
+                queries.append(_report(choices))
                 plane.put("report", queries[-1])
             case 1:
                 plane.put(
@@ -55,13 +55,13 @@ def one_input(data: bytes) -> None:
                 )
             case _:
                 plane.put("telemetry", _batch(choices))
-    with redirect_stderr(io.StringIO()) as told:
+    with redirect_stderr(io.StringIO()) as errors:
         recorder.poll()
-    assert told.getvalue().count("\n") <= 1, "junk must not fill the log"
+    assert errors.getvalue().count("\n") <= 1, "invalid messages fill the log"
     recorder.show()
     recorder.acknowledge()
     assert isinstance(recorder.finished, bool)
-    assert all(query.answered == 1 for query in queries), "who says goodbye waits for an answer"
+    assert all(query.answered == 1 for query in queries), "a report has no answer"
     # The record contains the valid part of the messages.
     record = recorder.finish()
     assert set(record.tables) >= {"plant_step"}
@@ -85,7 +85,7 @@ def _batch(choices: Choices) -> Sample:
     return Sample(f"noack/0/telemetry/{role}/{table}", payload, attachment)
 
 
-def _goodbye(choices: Choices) -> Query:
+def _report(choices: Choices) -> Query:
     report: Any = edited(choices, REPORT, KNOWN)
     payload = None if choices.below(8) == 1 else damaged(choices, json.dumps(report).encode())
     return Query(f"noack/0/report/{choices.one([*OWNER.values(), 'nobody'])}", payload)

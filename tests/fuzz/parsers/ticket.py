@@ -15,8 +15,7 @@ from noack.config.toml_file import json_schema
 from noack.runtime import join_ticket
 from noack.runtime.private_folder import open_private
 from tests.fuzz.choices import EDITS, Choices
-from tests.fuzz.edits import Vocabulary, edited, vocabulary
-from tests.fuzz.files import bases
+from tests.fuzz.edits import Vocabulary, bases, edited, vocabulary
 from tests.fuzz.harness import refusal, workspace
 
 _TICKET = join_ticket.new_ticket(

@@ -51,13 +51,13 @@ def one_input(data: bytes) -> None:
 
 
 def _check(words: str | list[str]) -> None:
-    said = parse(words)
-    again = text_of(*said)
+    parsed = parse(words)
+    text = text_of(*parsed)
     try:
-        assert parse(again) == said, again
+        assert parse(text) == parsed, text
     except CallerError as error:
-        raise AssertionError(f"what is said of settings is not understood: {error}") from error
-    assert text_of(*parse(again)) == again
-    tc_command(said.settings)
-    for impairment in said.settings.impairments:
+        raise AssertionError(f"written settings cannot be read: {error}") from error
+    assert text_of(*parse(text)) == text
+    tc_command(parsed.settings)
+    for impairment in parsed.settings.impairments:
         impairment.meaning()

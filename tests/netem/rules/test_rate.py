@@ -6,7 +6,6 @@ from math import ceil
 from typing import Any
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -78,29 +77,6 @@ def test_it_is_a_queue(rate: Rate, steps: list[tuple[int, int, bool]]) -> None:
         found.append(serve(*own, size_bytes) if room or forced else None)
     assert found == departures(rate, arrivals)
     assert state.departures_ns[:3] == [0, 0, 0]
-
-
-@pytest.mark.parametrize("rate_bps", [9_600, 999_983, 10**9 + 7])
-def test_the_long_term_rate_is_exact_to_a_bit(decide: Any, rate_bps: int) -> None:
-    """The line is never idle: packet k leaves when all bits up to it are sent."""
-    count = 20_000
-    sizes = np.random.default_rng(3).integers(0, 1500, count)
-    words = f"rate {rate_bps}bit queue {count}"
-    decided = decide(words, count, sizes_bytes=sizes, arrivals_ns=0)
-    through = np.cumsum(8 * (sizes + 28)).tolist()
-    expected = [bits_so_far * NS // rate_bps for bits_so_far in through]
-    assert decided.decisions["release_ns"].tolist() == expected
-
-
-def test_packets_that_arrive_at_a_full_queue_are_dropped(decide: Any) -> None:
-    """1 kB every ms through 4 Mbit/s: once the queue is full, it accepts every second packet."""
-    rate = Rate(rate_bps=4_000_000, queue=10, overhead_bytes=0)
-    arrivals = np.arange(10_000) * 10**6
-    decided = decide("rate 4mbit 0 queue 10", 10_000, sizes_bytes=1000, arrivals_ns=arrivals)
-    exact = departures(rate, [(t, 1000, False) for t in arrivals.tolist()])
-    np.testing.assert_array_equal(decided.fates, [4 if t is None else 0 for t in exact])
-    assert abs(np.mean(decided.fates[100:] == 4) - 0.5) < 1e-3
-    assert decided.delays_ns.max() <= 10 * 2 * 10**6
 
 
 def test_a_forced_packet_leaves_after_a_full_queue(decide: Any) -> None:

@@ -34,7 +34,8 @@ def test_events_are_those_of_the_reference(resolved: Scenario) -> None:
     found = flow(t_s, z)
     for i in range(STATES):
         start = LoopState(t_s[i], *np.split(z[i], 3))
-        expected = system.next_event(start, resolved.horizon_s)
+        crossing = system.next_crossing(start, resolved.horizon_s, system.condition(start))
+        expected = None if crossing is None else crossing[0]
         assert found.is_event[i] == (expected is not None)
         if expected is not None:
             assert found.end_s[i] == pytest.approx(expected.t_s, rel=1e-9)

@@ -83,20 +83,16 @@ def test_every_axis_has_a_label_with_its_unit(drawn: dict[str, Figure]) -> None:
                 assert is_hidden or has_unit, (name, label)
 
 
-def test_every_figure_can_be_saved(drawn: dict[str, Figure], tmp_path: Path) -> None:
+def test_figures_are_saved_and_nothing_is_cut_off_and_no_texts_overlap(
+    drawn: dict[str, Figure], tmp_path: Path
+) -> None:
     """Warnings are errors here: no log of zero, no limits that coincide, no layout that fails."""
     for name, figure in drawn.items():
-        save_figure(figure, tmp_path / f"{name}.svg")
-        assert 0 < (tmp_path / f"{name}.svg").stat().st_size < 1_000_000
-
-
-def test_nothing_is_cut_off_and_no_texts_overlap(drawn: dict[str, Figure]) -> None:
-    for name, figure in drawn.items():
+        save_figure(figure, tmp_path / f"{name}.png")
+        assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
         with settings():
-            figure.draw_without_rendering()
             box, size_in = figure.get_tightbbox(), figure.get_size_inches()
-            assert box.x0 >= 0, name
-            assert box.y0 >= 0, name
+            assert min(box.x0, box.y0) >= 0, name
             assert box.x1 <= size_in[0], name
             assert box.y1 <= size_in[1], name
             for axes in figure.axes:
@@ -121,7 +117,7 @@ def spike(k: int) -> np.ndarray:
     return y
 
 
-def test_a_long_run_is_drawn_with_its_peaks_and_few_points() -> None:
+def test_a_long_run_is_drawn_with_its_peaks_and_few_points(tmp_path: Path) -> None:
     k = 200_000
     t_s = np.arange(k) * 0.002
     x = np.column_stack([spike(k), -spike(k)])
@@ -134,6 +130,8 @@ def test_a_long_run_is_drawn_with_its_peaks_and_few_points() -> None:
         for line in axes.lines:
             assert extreme in line.get_ydata()
             assert len(line.get_ydata()) <= 2400
+    save_figure(figure, tmp_path / "long.svg")
+    assert (tmp_path / "long.svg").stat().st_size < 1_000_000
 
 
 def labels(axes: Axes) -> list[str]:
@@ -184,14 +182,23 @@ def test_signal_names_are_drawn_literally() -> None:
     assert "<script" not in text
 
 
-def test_bounds_are_dashed_and_measured_lines_are_solid() -> None:
+def test_bounds_are_dashed_in_the_colour_of_their_kind_and_measured_lines_are_solid() -> None:
     t_s = np.arange(1.0, 5.0)
-    bound = [Bound(f"bound {i}", t_s, 3.0 + t_s + i) for i in range(5)]
-    (axes,) = signal_figures.error_figure(t_s, t_s, t_s, t_s, bound).axes
-    assert [line.get_linestyle() for line in axes.lines] == ["-"] * 3 + ["--"] * 5
-    assert labels(axes)[3:] == [one.label for one in bound]
-    styles = {(line.get_color(), str(line._dash_pattern)) for line in axes.lines[3:7]}
-    assert len(styles) == 4
+    kinds: list[BoundKind] = ["identity", "certified", "printed", "certified", "certified"]
+    bound = [Bound(f"bound {i}", t_s, 3.0 + t_s + i, kind) for i, kind in enumerate(kinds)]
+    own = {
+        "identity": palette.IDENTITY, "certified": palette.CERTIFIED, "printed": palette.PRINTED,
+    }  # fmt: skip
+    for drawn, measured in (
+        (signal_figures.error_figure(t_s, t_s, t_s, t_s, bound), 3),
+        (signal_figures.state_norm_figure(t_s, t_s, bound), 1),
+    ):
+        (axes,) = drawn.axes
+        assert [line.get_linestyle() for line in axes.lines] == ["-"] * measured + ["--"] * 5
+        assert labels(axes)[measured:] == [one.label for one in bound]
+        lines = axes.lines[measured:]
+        assert [line.get_color() for line in lines] == [printed(own[kind]) for kind in kinds]
+        assert len({(line.get_color(), str(line._dash_pattern)) for line in lines}) == 5
 
 
 def test_a_reset_to_zero_is_a_vertical_line_on_a_logarithmic_axis() -> None:
@@ -202,22 +209,6 @@ def test_a_reset_to_zero_is_a_vertical_line_on_a_logarithmic_axis() -> None:
     assert np.array_equal(np.isnan(drawn), np.isnan(e_c))
     assert (drawn[e_c == 0] < axes.get_ylim()[0]).all()
     assert 0 < axes.get_ylim()[0] < axes.get_ylim()[1] < 1e9
-
-
-def test_a_bound_has_the_colour_of_its_assumptions_in_every_figure() -> None:
-    t_s = np.arange(1.0, 5.0)
-    kinds: list[BoundKind] = ["identity", "certified", "printed", "certified"]
-    bound = [Bound(f"bound {i}", t_s, 3.0 + t_s + i, kind) for i, kind in enumerate(kinds)]
-    own = {
-        "identity": palette.IDENTITY, "certified": palette.CERTIFIED, "printed": palette.PRINTED,
-    }  # fmt: skip
-    for drawn, measured in (
-        (signal_figures.error_figure(t_s, t_s, t_s, t_s, bound), 3),
-        (signal_figures.state_norm_figure(t_s, t_s, bound), 1),
-    ):
-        lines = drawn.axes[0].lines[measured:]
-        assert [line.get_color() for line in lines] == [printed(own[kind]) for kind in kinds]
-        assert len({(line.get_color(), str(line._dash_pattern)) for line in lines}) == 4
 
 
 def test_a_legend_has_as_few_rows_as_its_width_permits() -> None:
@@ -245,7 +236,7 @@ def test_the_distribution_of_lateness_is_exact_at_its_ends() -> None:
 @pytest.mark.parametrize("ending", ["svg", "png"])
 def test_the_same_figure_gives_the_same_bytes(tmp_path: Path, ending: str) -> None:
     path, found, t_s = tmp_path / f"figure.{ending}", set(), np.arange(1.0, 5.0)
-    for own in ({}, {"lines.linewidth": 9, "font.size": 20, "svg.hashsalt": "other"}):
+    for own in ({}, {"lines.linewidth": 9, "axes.titlepad": 40, "svg.hashsalt": "other"}):
         with mpl.rc_context(own):
             save_figure(signal_figures.error_figure(t_s, t_s, t_s, t_s), path)
         found.add(path.read_bytes())

@@ -16,41 +16,13 @@ from cosim.output.viewer.viewer_server import RecordingServer
 T_NS = 4_244_000_000
 
 
-def decoded(message: bytes) -> list[tuple[int, int | bytes]]:
-    """Field numbers and values of a protobuf message."""
-    at = 0
-
-    def varint() -> int:
-        nonlocal at
-        value = shift = 0
-        while True:
-            byte = message[at]
-            at, value, shift = at + 1, value | (byte & 0x7F) << shift, shift + 7
-            if byte < 0x80:
-                return value
-
-    found: list[tuple[int, int | bytes]] = []
-    while at < len(message):
-        field, kind = divmod(varint(), 8)
-        value = varint()
-        if kind == 2:
-            at += value
-        found.append((field, message[at - value : at] if kind == 2 else value))
-    return found
-
-
 def test_the_page_sets_the_viewers_time_and_pauses_it() -> None:
+    """The request is a ``SetTimeCursor`` (6): timeline (2), time (3), paused (5)."""
     found = re.search(rb"Uint8Array\((\[[^]]*\])\)", script_to_open_at(T_NS))
     assert found is not None
-    ((set_time_cursor, content),) = decoded(bytes(json.loads(found[1])))
-    assert set_time_cursor == 6
-    assert isinstance(content, bytes)
-    (two, timeline), (three, time), paused = decoded(content)
-    assert (two, three, paused) == (2, 3, (5, 1))
-    assert isinstance(timeline, bytes)
-    assert isinstance(time, bytes)
-    assert decoded(timeline) == [(1, b"t")]
-    assert decoded(time) == [(1, T_NS)]
+    timeline, time = b"\x0a\x01t", b"\x08" + bytes.fromhex("809ad9e70f")
+    cursor = b"\x12\x03" + timeline + b"\x1a\x06" + time + b"\x28\x01"
+    assert bytes(json.loads(found[1])) == b"\x32\x0f" + cursor
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,20 @@
-"""Random batches, and their runs by the exact simulator."""
+"""Random batches, and their comparison with runs of the exact simulator."""
 
 import math
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import pytest
 
-from cosim.simulation.batch.batch_interface import Population, Setting
+from cosim.simulation.batch.batch_interface import (
+    Events,
+    Population,
+    Setting,
+    run_batch,
+)
+from cosim.simulation.batch.batch_status import OK
+from cosim.simulation.continuous.continuous_loop import ContinuousLoop
 from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
 from netem.link_machine import UPDATE_LINK, Link
 from noack.config.resolution import LoopMatrices
@@ -34,7 +42,6 @@ LOSSES = (
     ScriptedLoss(lost=(1, 2, 5, 6, 7), repeat_every=9),
     WorstCaseLoss(),
 )
-SIZES = ((2, 1), (4, 2))
 
 
 def random_setting(rng: np.random.Generator, n: int, m: int) -> Setting:
@@ -96,8 +103,7 @@ def reference(setting: Setting, draw: Population, most_events: int = 2000) -> Co
         return known[-1]
 
     return simulate_continuous(
-        loop,
-        setting.trigger,
+        ContinuousLoop(loop, setting.trigger),
         horizon_s=setting.horizon_s,
         delivered=delivered,
         known_start=setting.known_start,
@@ -142,3 +148,36 @@ def dense(run: ContinuousRun, setting: Setting) -> tuple[Vector, Vector, Vector]
         norms.append(np.linalg.norm(samples.x, axis=1))
         errors.append(run.e_c_norm(samples) * np.exp(alpha * t_s))
     return np.concatenate(times_s), np.concatenate(norms), np.concatenate(errors)
+
+
+def compare(setting: Setting, row: Any, found: Events, run: ContinuousRun) -> None:
+    """Compare a run of a batch with the exact simulator's, which uses another method."""
+    assert row["status"] == OK
+    assert found.delivered.tolist() == run.delivered.tolist()
+    np.testing.assert_allclose(found.event_s, run.event_s, rtol=0, atol=1e-9)
+    assert row["transmissions"] == len(run.event_s)
+    assert row["deliveries"] == run.delivered.sum()
+    gaps_s = np.diff(run.event_s)
+    least_s, mean_s = (gaps_s.min(), gaps_s.mean()) if len(gaps_s) else (math.nan, math.nan)
+    assert row["inter_event_min_s"] == pytest.approx(least_s, abs=2e-9, nan_ok=True)
+    assert row["inter_event_mean_s"] == pytest.approx(mean_s, abs=2e-9, nan_ok=True)
+    assert row["cost"] == pytest.approx(cost_of(run, setting), rel=1e-9, abs=1e-15)
+    t_s, norms, errors = dense(run, setting)
+    assert row["final_norm"] == pytest.approx(norms[-1], rel=1e-9)
+    assert errors.max() <= row["sup_e_c_scaled"] * (1 + 1e-9) + 1e-15
+    assert row["sup_e_c_scaled"] <= errors.max() * (1 + 1e-3) + 1e-15
+    assert math.isnan(row["diverged_at_s"])
+    last = np.flatnonzero(norms > setting.settle * norms[0])[-1]
+    if last == len(norms) - 1:
+        assert math.isnan(row["settling_s"])
+    else:
+        assert t_s[last] - 1e-12 <= row["settling_s"] <= t_s[last + 1] + 1e-12
+
+
+def check_independence(setting: Setting, population: Population, order: Any) -> None:
+    """Check that a row is the same in a permuted batch and in a batch of one draw."""
+    rows = run_batch(setting, population)
+    permuted = run_batch(setting, Population(*(part[order] for part in population)))
+    assert permuted.tobytes() == rows[order].tobytes()
+    alone = [run_batch(setting, one(population, i)) for i in range(len(order))]
+    assert np.concatenate(alone).tobytes() == rows.tobytes()

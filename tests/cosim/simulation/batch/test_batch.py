@@ -1,12 +1,11 @@
-"""Batches against the exact simulator, which uses another method, on the same draws."""
+"""Batches under the paper's policy against the exact simulator, on the same draws."""
 
-import json
 import math
-from typing import Any
 
 import numpy as np
 import pytest
 
+from cosim.shipped_files import find_shipped
 from cosim.simulation.batch.batch_interface import (
     Population,
     Setting,
@@ -15,87 +14,53 @@ from cosim.simulation.batch.batch_interface import (
     setting_of,
 )
 from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS
-from cosim.simulation.continuous.continuous_loop import continuous_loop_of
-from cosim.simulation.continuous.continuous_run import simulate_continuous
-from cosim.simulation.continuous.network_fates import network_fates
+from cosim.simulation.continuous.continuous_report import run_continuous
 from noack.config.resolution import loop_of, resolve
-from noack.config.scenario import Scenario
+from noack.config.scenario_file import load
 from noack.core.errors import CallerError
 from noack.impairments.kinds.delay import Delay
 from noack.impairments.link_settings import LinkSettings
 from noack.trigger.decaying import DecayingTrigger
 from noack.trigger.quadratic import QuadraticTrigger
 from tests.cosim.simulation.batch.exact import (
-    SIZES,
-    cost_of,
-    dense,
+    check_independence,
+    compare,
     one,
     random_population,
     random_setting,
     reference,
 )
 
+SIZE = (4, 2)
+"""States and inputs of most campaigns of the tests: each size is compiled anew."""
 
-@pytest.mark.parametrize("size", SIZES)
-def test_events_fates_and_measures_are_those_of_the_exact_simulator(size: tuple[int, int]) -> None:
-    rng = np.random.default_rng(size[0])
+
+def test_events_fates_and_measures_are_those_of_the_exact_simulator() -> None:
+    rng = np.random.default_rng(4)
     events = lost = settled = 0
     for _ in range(15):
-        setting = random_setting(rng, *size)
-        population = random_population(rng, setting, 4)
-        rows = run_batch(setting, population)
-        for i, row in enumerate(rows):
+        setting = random_setting(rng, *SIZE)
+        population = random_population(rng, setting, 2)
+        for i, row in enumerate(run_batch(setting, population)):
             run = reference(setting, one(population, i))
-            found = run_events(setting, one(population, i))
-            assert row["status"] == OK
-            assert found.delivered.tolist() == run.delivered.tolist()
-            np.testing.assert_allclose(found.event_s, run.event_s, rtol=0, atol=1e-9)
-            assert row["transmissions"] == len(run.event_s)
-            assert row["deliveries"] == run.delivered.sum()
-            gaps_s = np.diff(run.event_s)
-            if len(gaps_s):
-                assert row["inter_event_min_s"] == pytest.approx(gaps_s.min(), abs=2e-9)
-                assert row["inter_event_mean_s"] == pytest.approx(gaps_s.mean(), abs=2e-9)
-            else:
-                assert math.isnan(row["inter_event_min_s"])
-                assert math.isnan(row["inter_event_mean_s"])
-            assert row["cost"] == pytest.approx(cost_of(run, setting), rel=1e-9, abs=1e-15)
-            t_s, norms, errors = dense(run, setting)
-            assert row["final_norm"] == pytest.approx(norms[-1], rel=1e-9)
-            assert errors.max() <= row["sup_e_c_scaled"] * (1 + 1e-9) + 1e-15
-            assert row["sup_e_c_scaled"] <= errors.max() * (1 + 1e-3) + 1e-15
-            above = np.flatnonzero(norms > setting.settle * norms[0])
-            if above[-1] == len(norms) - 1:
-                assert math.isnan(row["settling_s"])
-            else:
-                settled += 1
-                low_s, high_s = t_s[above[-1]], t_s[above[-1] + 1]
-                assert low_s - 1e-12 <= row["settling_s"] <= high_s + 1e-12
-            assert math.isnan(row["diverged_at_s"])
+            compare(setting, row, run_events(setting, one(population, i)), run)
             events += len(run.event_s)
             lost += int((~run.delivered).sum())
-    assert events > 300
-    assert lost > 50
-    assert settled > 3
-
-
-def scenario(content: dict[str, Any], **changes: Any) -> Scenario:
-    return resolve(Scenario.model_validate_json(json.dumps(content | changes)))
+            settled += not math.isnan(row["settling_s"])
+    assert events > 150
+    assert lost > 30
+    assert settled > 1
 
 
 @pytest.mark.parametrize("mode", ["model", "zoh"])
-def test_a_batch_setting_of_a_scenario_gives_the_scenarios_run(
-    content: dict[str, Any], mode: str
-) -> None:
-    content["network"]["impairments"] = [{"kind": "delay", "delay_s": 0.1}]
-    resolved = scenario(content, mode=mode, horizon_s=8.0, seeds={"loss": 2**40 + 3})
+def test_a_batch_setting_of_a_scenario_gives_the_scenarios_run(mode: str) -> None:
+    seed, delay = 2**40 + 3, 'network.impairments=[{kind="delay", delay_s=0.1}]'
+    settings = [f"mode={mode}", "horizon_s=8", f"seeds.loss={seed}", delay]
+    resolved = resolve(load(find_shipped("lane_following", "scenarios"), settings))
     loop = loop_of(resolved)
-    draw = Population(loop.A[None], loop.B[None], loop.x0[None], np.array([2**40 + 3], np.uint64))
+    draw = Population(loop.A[None], loop.B[None], loop.x0[None], np.array([seed], np.uint64))
     found = run_events(setting_of(resolved), draw)
-    run = simulate_continuous(
-        continuous_loop_of(resolved), horizon_s=8.0, delivered=network_fates(resolved),
-        known_start=False,
-    )  # fmt: skip
+    run = run_continuous(resolved)
     assert len(run.event_s) >= (1 if mode == "model" else 5)
     np.testing.assert_allclose(found.event_s, run.event_s, rtol=0, atol=1e-9)
     assert found.delivered.tolist() == run.delivered.tolist()
@@ -103,37 +68,32 @@ def test_a_batch_setting_of_a_scenario_gives_the_scenarios_run(
 
 def test_a_row_depends_only_on_its_own_draw() -> None:
     rng = np.random.default_rng(7)
-    for _ in range(5):
-        setting = random_setting(rng, 3, 2)
-        population = random_population(rng, setting, 40)
-        rows = run_batch(setting, population)
-        order = rng.permutation(40)
-        mixed = run_batch(setting, Population(*(part[order] for part in population)))
-        assert mixed.tobytes() == rows[order].tobytes()
-        alone = np.concatenate([run_batch(setting, one(population, i)) for i in range(40)])
-        assert alone.tobytes() == rows.tobytes()
+    for _ in range(4):
+        setting = random_setting(rng, *SIZE)
+        check_independence(setting, random_population(rng, setting, 10), rng.permutation(10))
 
 
 def turning(depth: float, omega: float, floored: bool) -> tuple[Setting, Population, float]:
     """‖e_s‖ over the threshold is sin(ωt/2)/(1 − depth): it exceeds 1 briefly around t = π/ω."""
     alpha = 0.0 if floored else 0.8
-    turn = np.array([[0.0, omega], [-omega, 0.0]])
+    turn = np.zeros((4, 4))
+    turn[0, 1], turn[1, 0] = omega, -omega
     level = 2.0 * math.hypot(0.3, 0.4) * (1 - depth)
     trigger = DecayingTrigger(level * 1e-3, 0.8, level) if floored else DecayingTrigger(level, 0.8)
     setting = Setting(
-        H=-alpha * np.eye(2), K=np.zeros((1, 2)), trigger=trigger, link=LinkSettings(),
+        H=-alpha * np.eye(4), K=np.zeros((2, 4)), trigger=trigger, link=LinkSettings(),
         horizon_s=1.5 * math.pi / omega, known_start=True,
     )  # fmt: skip
     draw = Population(
-        (turn - alpha * np.eye(2))[None], np.ones((1, 2, 1)), np.array([[0.3, 0.4]]),
+        (turn - alpha * np.eye(4))[None], np.ones((1, 4, 2)), np.array([[0.3, 0.4, 0, 0]]),
         np.zeros(1, np.uint64),
     )  # fmt: skip
     return setting, draw, 2 / omega * math.asin(min(1 - depth, 1.0))
 
 
 @pytest.mark.parametrize("floored", [False, True])
-@pytest.mark.parametrize("omega", [0.3, 7.0, 200.0])
-@pytest.mark.parametrize("depth", [1e-2, 1e-5, 1e-7, 1e-9, 1e-12])
+@pytest.mark.parametrize("omega", [0.3, 200.0])
+@pytest.mark.parametrize("depth", [1e-2, 1e-7, 1e-12])
 def test_very_short_crossings_are_found(depth: float, omega: float, floored: bool) -> None:
     setting, draw, first_s = turning(depth, omega, floored)
     found = run_events(setting, draw)
@@ -152,13 +112,13 @@ def test_the_supremum_between_events_is_certified() -> None:
 
 
 def test_a_diverging_loop_is_reported() -> None:
-    fast = 100 * np.eye(2)
+    fast = 100 * np.eye(4)
     setting = Setting(
-        H=fast, K=np.zeros((1, 2)), trigger=DecayingTrigger(0.5, 0.25), link=LinkSettings(),
+        H=fast, K=np.zeros((2, 4)), trigger=DecayingTrigger(0.5, 0.25), link=LinkSettings(),
         horizon_s=50.0, known_start=True,
     )  # fmt: skip
-    start = np.array([[0.6, 0.8]])
-    draw = Population(fast[None], np.ones((1, 2, 1)), start, np.zeros(1, np.uint64))
+    start = np.array([[0.6, 0.8, 0.0, 0.0]])
+    draw = Population(fast[None], np.ones((1, 4, 2)), start, np.zeros(1, np.uint64))
     (row,) = run_batch(setting, draw)
     assert row["status"] == DIVERGED
     assert row["transmissions"] == 0
@@ -174,9 +134,9 @@ def test_events_of_unstable_loops_agree_until_they_accumulate() -> None:
     rng = np.random.default_rng(3)
     compared = 0
     for _ in range(10):
-        setting = random_setting(rng, 2, 1)
+        setting = random_setting(rng, *SIZE)
         population = random_population(rng, setting, 1)
-        wild = population._replace(A=population.A + 2 * np.eye(2))
+        wild = population._replace(A=population.A + 2 * np.eye(4))
         short = Setting(**{**vars(setting), "horizon_s": 1.5, "most_events": 5000})
         found, run = run_events(short, wild), reference(short, wild, 5000)
         assert len(found.event_s) == len(run.event_s)

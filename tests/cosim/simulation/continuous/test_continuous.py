@@ -45,8 +45,7 @@ class Case(NamedTuple):
 
     def run(self) -> ContinuousRun:
         return simulate_continuous(
-            self.loop,
-            self.trigger,
+            ContinuousLoop(self.loop, self.trigger),
             horizon_s=self.horizon_s,
             delivered=self.delivered,
             known_start=self.known,
@@ -110,7 +109,7 @@ def integrated(case: Case) -> Iterator[tuple[float, Vector]]:
 
 
 @given(cases())
-@settings(max_examples=40)
+@settings(max_examples=15)
 def test_events_are_the_integrators(case: Case) -> None:
     """To 1e-8 s: the integrator's error of 1e-12 over the slope of the error norm, amplified."""
     run = case.run()
@@ -128,7 +127,7 @@ def test_the_random_systems_have_events_and_losses() -> None:
     counts: list[int] = []
 
     @given(cases())
-    @settings(max_examples=30)
+    @settings(max_examples=15)
     def count(case: Case) -> None:
         counts.append(len(case.run().before))
 
@@ -138,11 +137,11 @@ def test_the_random_systems_have_events_and_losses() -> None:
 
 
 @given(cases())
-@settings(max_examples=30)
+@settings(max_examples=15)
 def test_what_holds_between_events(case: Case) -> None:
     """The threshold is never exceeded, and reached at each event; (I1) gives x_c − x_s."""
     run, H = case.run(), case.loop.H
-    t_s = np.linspace(0, run.reached_s, 301)
+    t_s = np.linspace(0, run.reached_s, 101)
     samples = run.at(t_s)
     levels = np.array([run.system.threshold(t) for t in t_s])
     assert (run.e_s_norm(samples) <= levels * (1 + 1e-12)).all()
@@ -214,8 +213,8 @@ def turning(depth: float, omega: float, floored: bool) -> Case:
 
 
 @pytest.mark.parametrize("floored", [False, True])
-@pytest.mark.parametrize("omega", [0.3, 7.0, 200.0])
-@pytest.mark.parametrize("depth", [1e-2, 1e-5, 1e-7, 1e-9, 1e-12])
+@pytest.mark.parametrize("omega", [0.3, 200.0])
+@pytest.mark.parametrize("depth", [1e-2, 1e-7, 1e-12])
 def test_very_short_crossings_are_found(depth: float, omega: float, floored: bool) -> None:
     case = turning(depth, omega, floored)
     run = case.run()
@@ -234,14 +233,13 @@ def test_a_tangency_within_rounding_is_decided_either_way() -> None:
         assert case.run().event_s == pytest.approx([math.pi / 7.0] * len(case.run().event_s))
 
 
-@pytest.mark.parametrize("depth", [1e-4, 1e-9])
-def test_the_highest_of_many_near_misses_is_found(depth: float) -> None:
+def test_the_highest_of_many_near_misses_is_found() -> None:
     """e_1 = Σ a_k (1 − cos ω_k t): hundreds of local maxima, one of which exceeds the threshold.
 
     The weight of the other entries of e_s is almost 0; the reference is the closed form.
     """
     omegas, weights = np.array([1.0, 11.3, 17.7]), np.array([0.5, 0.3, 0.2])
-    horizon_s = 60.0
+    horizon_s, depth = 60.0, 1e-9
 
     def error(t: float) -> float:
         return float(np.sum(weights * (1 - np.cos(omegas * t))))
@@ -275,20 +273,18 @@ def scalar_system(trigger: DecayingTrigger) -> ContinuousLoop:
     return ContinuousLoop(loop_with(one, one, 0 * one, 0 * one, np.ones(1)), trigger)
 
 
+def next_event_s(system: ContinuousLoop, state: LoopState, until_s: float) -> float | None:
+    found = system.next_crossing(state, until_s, system.condition(state))
+    return None if found is None else found[0].t_s
+
+
 def test_an_error_on_the_boundary_exceeds_it_at_once_or_later() -> None:
     system = scalar_system(DecayingTrigger(1e-3, 1.0, 0.5))
     out = LoopState(1.0, np.array([1.0]), np.array([-0.5]), np.zeros(1))
-    event = system.next_event(out, 9.0)
-    assert event is not None
-    assert event.t_s == 1.0
+    assert next_event_s(system, out, 9.0) == 1.0
     back = out._replace(e_s=np.array([0.5]))  # e_s = 1.5 − e^{t−1}: −½ when e^{t−1} = 2
-    event = system.next_event(back, 9.0)
-    assert event is not None
-    assert event.t_s == pytest.approx(1 + math.log(2.0), rel=1e-14)
-    beyond = out._replace(e_s=np.array([0.7]))
-    event = system.next_event(beyond, 9.0)
-    assert event is not None
-    assert event.t_s == 1.0
+    assert next_event_s(system, back, 9.0) == pytest.approx(1 + math.log(2.0), rel=1e-14)
+    assert next_event_s(system, out._replace(e_s=np.array([0.7])), 9.0) == 1.0
 
 
 def test_the_floor_applies_from_where_it_meets_the_decaying_threshold() -> None:
@@ -296,24 +292,22 @@ def test_the_floor_applies_from_where_it_meets_the_decaying_threshold() -> None:
     system = scalar_system(DecayingTrigger(1.0, 1.0, 0.5))
     for x0 in (2.0, 0.6, 0.5, 0.4, 1e-6):
         state = LoopState(0.0, np.array([x0]), np.zeros(1), np.zeros(1))
-        event = system.next_event(state, 99.0)
-        assert event is not None
         decaying = math.log((1 + math.sqrt(1 + 4 / x0)) / 2)
         expected = min(decaying, math.inf) if decaying < math.log(2.0) else math.log1p(0.5 / x0)
-        assert event.t_s == pytest.approx(expected, rel=1e-13)
+        assert next_event_s(system, state, 99.0) == pytest.approx(expected, rel=1e-13)
 
 
 def test_an_event_at_the_horizon_counts_and_a_later_one_does_not() -> None:
     system = scalar_system(DecayingTrigger(1e-3, 1.0, 0.5))
     state = LoopState(0.0, np.ones(1), np.zeros(1), np.zeros(1))
     at_s = math.log1p(0.5)
-    assert system.next_event(state, at_s * (1 - 1e-12)) is None
-    assert system.next_event(state, at_s * (1 + 1e-12)) is not None
-    assert system.next_event(state, 0.0) is None
+    assert next_event_s(system, state, at_s * (1 - 1e-12)) is None
+    assert next_event_s(system, state, at_s * (1 + 1e-12)) is not None
+    assert next_event_s(system, state, 0.0) is None
 
 
 @given(cases(), st.lists(st.floats(0, 2), min_size=1, max_size=20))
-@settings(max_examples=20)
+@settings(max_examples=12)
 def test_states_between_events_are_the_matrix_exponentials(case: Case, t_s: list[float]) -> None:
     system = ContinuousLoop(case.loop, case.trigger)
     n = case.loop.n
@@ -383,11 +377,11 @@ def test_a_diverging_loop_without_events_reports_the_time() -> None:
 def test_events_that_accumulate_are_an_error() -> None:
     one = np.ones((1, 1))
     loop = loop_with(one, one, 0 * one, 0 * one, np.ones(1))
-    case = Case(loop, DecayingTrigger(0.5, 1.0), [False], True, 1e6)
     with pytest.raises(TooManyEventsError, match="accumulate"):
         simulate_continuous(
-            loop, case.trigger, horizon_s=1e6, delivered=[], known_start=True, max_events=50
-        )
+            ContinuousLoop(loop, DecayingTrigger(0.5, 1.0)), horizon_s=1e6, delivered=[],
+            known_start=True, max_events=50,
+        )  # fmt: skip
 
 
 def test_a_threshold_that_vanishes_is_an_error() -> None:

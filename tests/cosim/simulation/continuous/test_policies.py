@@ -16,9 +16,7 @@ from cosim.simulation.continuous.continuous_run import (
     simulate_continuous,
 )
 from noack.config.resolution import LoopMatrices
-from noack.trigger.absolute import AbsoluteTrigger
 from noack.trigger.deadline import DeadlineTrigger
-from noack.trigger.decaying import DecayingTrigger
 from noack.trigger.dwell import DwellTrigger
 from noack.trigger.dynamic import DynamicTrigger
 from noack.trigger.lyapunov import LyapunovTrigger
@@ -50,17 +48,14 @@ def loop_of(*, zoh: bool, mismatch: float = 0.1) -> LoopMatrices:
 
 
 POLICIES: dict[str, Policy] = {
-    "decaying": DecayingTrigger(0.5, 0.3, 0.01),
-    "absolute": AbsoluteTrigger(0.3),
     "relative": relative_trigger(0.05),
     "mixed": MixedTrigger(0.05, 0.02, np.array([[1.0, 0.2], [0.0, 2.0]])),
-    "lyapunov": DwellTrigger(LyapunovTrigger(np.linalg.cholesky(P).T, 0.2), 20 * MS),
     "dynamic": DynamicTrigger(0.1, 0.5, 0.3, P, Q, B @ K, 1.0),
     "dynamic, at once": DynamicTrigger(0.1, 0.5, 0.0, P, Q, B @ K),
     "deadline": DeadlineTrigger(MixedTrigger(0.05, 0.1), 500 * MS),
-    "dwell": DwellTrigger(DynamicTrigger(0.1, 0.5, 0.3, P, Q, B @ K), 70 * MS),
 }
-"""Policies with events at the zero of a continuous function or at a given time."""
+"""Policies with events at the zero of a continuous function or at a given time; the paper's is in
+``test_continuous.py``."""
 Excess = Callable[[float, Vector, float], float]
 """Positive at an event: a function of the time, z = (x, e_s), and η."""
 
@@ -71,8 +66,6 @@ def excess_of(name: str) -> Excess:
 
     W = np.array([[1.0, 0.2], [0.0, 2.0]])
     rules: dict[str, Excess] = {
-        "decaying": lambda t, z, eta: norm(z[2:]) - max(0.5 * math.exp(-0.3 * t), 0.01),
-        "absolute": lambda t, z, eta: norm(z[2:]) - 0.3,
         "relative": lambda t, z, eta: norm(z[2:]) ** 2 - (0.05 * norm(z[:2])) ** 2,
         "mixed": lambda t, z, eta: norm(W @ z[2:]) ** 2 - (0.05 * norm(W @ z[:2])) ** 2 - 0.02**2,
         "deadline": lambda t, z, eta: norm(z[2:]) ** 2 - (0.05 * norm(z[:2])) ** 2 - 0.1**2,
@@ -92,16 +85,13 @@ def norm(v: Vector) -> float:
 def run_of(policy: Policy, *, zoh: bool, lost: int, horizon_s: float = 6.0) -> ContinuousRun:
     loop = loop_of(zoh=zoh)
     return simulate_continuous(
-        loop, policy, horizon_s=horizon_s, known_start=True,
+        ContinuousLoop(loop, policy), horizon_s=horizon_s, known_start=True,
         delivered=lambda event: event % (lost + 1) == lost, max_events=5000,
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("lost", [0, 2])
-@pytest.mark.parametrize("zoh", [False, True])
-@pytest.mark.parametrize(
-    "name", ["decaying", "absolute", "relative", "mixed", "dynamic", "dynamic, at once", "deadline"]
-)
+@pytest.mark.parametrize(("zoh", "lost"), [(False, 2), (True, 0)])
+@pytest.mark.parametrize("name", POLICIES)
 def test_events_are_those_of_an_integrator(name: str, zoh: bool, lost: int) -> None:
     """From each event of the run, an integrator with event detection finds the next one."""
     policy, excess = POLICIES[name], excess_of(name)
@@ -156,27 +146,25 @@ def test_states_evolve_while_the_rule_is_not_tested(decay_per_s: float) -> None:
             np.testing.assert_allclose(run.event_s, times_s, rtol=1e-12)
 
 
-@pytest.mark.parametrize("name", POLICIES)
-@pytest.mark.parametrize("zoh", [False, True])
-def test_no_rule_is_met_between_events(name: str, zoh: bool) -> None:
-    """Sampled densely: the rule is never met after the dwell time and before the event."""
-    policy = POLICIES[name]
-    run = run_of(policy, zoh=zoh, lost=1, horizon_s=4.0)
-    ends_s = [*run.event_s, run.horizon_s]
-    for state, end_s in zip([run.start, *run.after], ends_s, strict=True):
+def test_an_envelope_is_not_exceeded_between_dwell_time_and_event() -> None:
+    """Sampled densely, under losses."""
+    policy = DwellTrigger(LyapunovTrigger(np.linalg.cholesky(P).T, 0.2), 20 * MS)
+    run = run_of(policy, zoh=True, lost=1, horizon_s=4.0)
+    compared = 0
+    for state, end_s in zip([run.start, *run.after], [*run.event_s, run.horizon_s], strict=True):
         condition = run.system.condition(state)
-        if condition.dynamic_variable is not None:
-            continue
         t_s = np.linspace(max(state.t_s, condition.earliest_ns * 1e-9), end_s, 50)[1:-1]
-        if len(t_s) == 0 or t_s[-1] <= t_s[0]:
+        if t_s[-1] <= t_s[0]:
             continue
         samples = run.system.sample(state, t_s)
         for time_s, x, e_s in zip(t_s, samples.x, samples.e_s, strict=True):
             left, right = condition.sides(time_s * 1e9, x, e_s)
             assert left <= right * (1 + 1e-9) + 1e-12
+            compared += 1
+    assert compared > 300
 
 
-@pytest.mark.parametrize("sigma", [0.02, 0.05, 0.2])
+@pytest.mark.parametrize("sigma", [0.02, 0.2])
 def test_tabuadas_example_keeps_the_published_bound_and_comes_close_to_it(sigma: float) -> None:
     """IEEE TAC 52(9), 2007, Corollary IV.1 and Section V: |e| ≤ σ|x|, every update arrives.
 
@@ -189,7 +177,7 @@ def test_tabuadas_example_keeps_the_published_bound_and_comes_close_to_it(sigma:
     shortest_s = math.inf
     for angle in np.linspace(0, math.pi, 40, endpoint=False):
         run = simulate_continuous(
-            system, horizon_s=2.0, delivered=lambda event: True, known_start=True,
+            system, horizon_s=2.0, delivered=[], known_start=True,
             x0=10 * np.array([math.cos(angle), math.sin(angle)]),
         )  # fmt: skip
         shortest_s = min(shortest_s, float(np.diff(run.event_s).min()))
@@ -225,9 +213,8 @@ def test_a_self_trigger_stays_below_the_threshold_under_its_assumption() -> None
     loop = loop_of(zoh=True, mismatch=0.0)
     L, a = np.linalg.norm(loop.A, 2), np.linalg.norm(CLOSED, 2)
     policy = SelfTrigger(Forecast(0.5, 0.2, 0.0, float(L), float(a), 0.0), 1000, 10**9)
-    run = simulate_continuous(
-        loop, policy, horizon_s=6.0, delivered=lambda event: True, known_start=True
-    )
+    system = ContinuousLoop(loop, policy)
+    run = simulate_continuous(system, horizon_s=6.0, delivered=[], known_start=True)
     assert len(run.before) > 20
     for event in run.before:
         assert norm(event.e_s) <= 0.5 * math.exp(-0.2 * event.t_s) * (1 + 1e-9)

@@ -110,11 +110,11 @@ def test_the_reactor_transmits_after_two_periods_in_etceteras_region() -> None:
         121.315797670082, -56.7655786995279, 97.0796601856019,
     )  # fmt: skip
     loop = shipped("reactor_petc")
-    states = np.random.default_rng(1).normal(size=(400, 4))
+    states = np.random.default_rng(1).normal(size=(120, 4))
     expected = [bool(x @ first @ x <= 0 < x @ second @ x) for x in states]
     found = [between(run_from(x, loop, 0.05))[:1].tolist() == [0.02] for x in states]
     assert found == expected
-    assert 50 < sum(found) < 350
+    assert 15 < sum(found) < 105
     # Printed: after an inter-event time of one period, one to three further ones follow; this is
     # from a relaxation, so there may be fewer.
     early = step(REACTOR, 0.01)
@@ -200,11 +200,11 @@ def test_the_lyapunov_rule_meets_its_minimum_time_and_no_earlier_one() -> None:
     met = run_from(np.linalg.solve(L, worst), loop, 1.5 * shortest_s)
     # the square root of the rounding error
     assert met.event_s[0] == pytest.approx(shortest_s, rel=1e-6)
-    for x0 in np.random.default_rng(2).normal(size=(20, 4)):
+    for x0 in np.random.default_rng(2).normal(size=(8, 4)):
         assert (between(run_from(x0, loop, 2.0)) >= shortest_s * (1 - 1e-6)).all()
 
 
-@pytest.mark.parametrize("delta", [0.3, 0.07, 0.011])
+@pytest.mark.parametrize("delta", [0.3, 0.011])
 def test_send_on_delta_samples_a_first_order_response_at_its_levels(delta: float) -> None:
     """Follows from the definition: e^{−t/τ} is reported at t_k = −τ ln(1 − kδ), ⌊1/δ⌋ times.
 
@@ -217,8 +217,7 @@ def test_send_on_delta_samples_a_first_order_response_at_its_levels(delta: float
     np.testing.assert_allclose(run.event_s, -tau_s * np.log1p(-k * delta), rtol=1e-9)
 
 
-@pytest.mark.parametrize("amplitude", [1.0, 3.7])
-def test_send_on_delta_saves_a_sine_the_factor_of_its_slopes(amplitude: float) -> None:
+def test_send_on_delta_saves_a_sine_the_factor_of_its_slopes() -> None:
     """Theorem: at most mean|ẋ|/δ reports a second, where a clock of equal resolution needs
     max|ẋ|/δ; the ratio depends on the signal only and is π/2 for a sine, for any δ.
 
@@ -226,7 +225,7 @@ def test_send_on_delta_saves_a_sine_the_factor_of_its_slopes(amplitude: float) -
     weight of the second is almost 0.
     """
     system = np.array([[0.0, 1.0], [-1.0, 0.0]]), np.array([[0.0], [1.0]]), np.zeros((1, 2))
-    delta, periods = 0.05, 4
+    amplitude, delta, periods = 3.7, 0.05, 4
     rule = AbsoluteTrigger(delta, np.diag([1.0, 1e-9]))
     x0 = amplitude * np.array([math.cos(0.4), math.sin(0.4)])
     events = len(run_from(x0, held(system, rule), 2 * math.pi * periods).event_s)

@@ -121,7 +121,7 @@ def cases(draw: st.DrawFn) -> Case:
 
 @pytest.mark.parametrize("delay", [False, True])
 @given(case=cases())
-@settings(max_examples=40)
+@settings(max_examples=15)
 def test_it_is_what_one_exponential_after_another_gives(delay: bool, case: Case) -> None:
     x, events = case.sampled(delay=delay)
     expected, expected_events = case.naive(delay=delay)
@@ -236,7 +236,7 @@ def records(draw: st.DrawFn) -> RunRecord:
 
 
 @given(records())
-@settings(max_examples=60)
+@settings(max_examples=35)
 def test_with_all_effects_it_is_what_the_machines_do(record: RunRecord) -> None:
     live = live_run(record)
     system = ContinuousLoop(record.loop, policy_of(record.scenario))

@@ -1,0 +1,188 @@
+"""A run survives disturbances: paused processes, a stepped wall clock, a stalled live viewer."""
+
+import mmap
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import psutil
+import pytest
+
+from cosim.record.run_record import RunRecord, load_record
+from tests.cosim.output.viewer.test_viewer import is_left, read
+from tests.integration.conftest import (
+    AT_RATE,
+    RATE_HZ,
+    ROLE_MODULES,
+    Finished,
+    Running,
+    begun,
+    command_of,
+    is_over,
+    settings,
+    wait_for,
+)
+from tests.integration.test_faults import wait_recording
+
+HORIZON_S = 36.0
+HOUR_S = 3600
+PAUSE_S = 0.7
+"""Well below zenoh's lease, and far above every delay that a certificate allows."""
+UNCONFIRMED_S = 1.2
+"""Also below the lease, but long enough that unacknowledged rows are sent again."""
+CLOCKS = "import sys, time\nfor _ in sys.stdin: print(time.time(), time.monotonic(), flush=True)"
+
+
+class WallClock:
+    """A wall clock that can be stepped, for processes with its environment.
+
+    Args:
+        folder: the folder for its files.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        compiler = shutil.which("cc")
+        if compiler is None or sys.platform != "linux":
+            pytest.skip("needs Linux and a C compiler")
+        library, offset = folder / "stepped_clock.so", folder / "offset"
+        source = Path(__file__).with_name("stepped_clock.c")
+        command = [compiler, "-shared", "-fPIC", "-O1", "-o", str(library), str(source), "-ldl"]
+        subprocess.run(command, check=True)
+        offset.write_bytes(bytes(8))
+        with offset.open("r+b") as file:
+            self._offset_s = mmap.mmap(file.fileno(), 8)
+        self.environment = {"LD_PRELOAD": str(library), "STEPPED_CLOCK": str(offset)}
+
+    def step_to(self, offset_s: int) -> tuple[float, float]:
+        """Set the offset from the true time; return the offsets of both clocks in a process."""
+        self._offset_s[:] = offset_s.to_bytes(8, sys.byteorder, signed=True)
+        done = subprocess.run(
+            [sys.executable, "-S", "-c", CLOCKS],
+            input="\n", capture_output=True, text=True, env=os.environ | self.environment,
+            check=True,
+        )  # fmt: skip
+        wall_s, monotonic_s = map(float, done.stdout.split())
+        return wall_s - time.time(), monotonic_s - time.monotonic()
+
+
+class Disturbed(NamedTuple):
+    """A finished run, its record, and its live viewer's processes."""
+
+    finished: Finished
+    record: RunRecord
+    left_behind: list[psutil.Process]
+    viewers: list[psutil.Process]
+    viewer_group: int
+
+
+def pause(process: psutil.Process, pause_s: float) -> None:
+    process.send_signal(signal.SIGSTOP)
+    time.sleep(pause_s)
+    process.send_signal(signal.SIGCONT)
+
+
+def viewers_of(running: Running) -> list[psutil.Process]:
+    """Return the server of the recording and the server of rerun's page."""
+    return [
+        child
+        for child in running.child("recorder").children(recursive=True)
+        if "cosim.output.viewer.live_viewer" in command_of(child) or is_rerun(child)
+    ]
+
+
+def is_rerun(process: psutil.Process) -> bool:
+    try:
+        return "rerun" in Path(process.exe()).name
+    except psutil.Error:  # the process has ended
+        return False
+
+
+@pytest.fixture(scope="module")
+def disturbed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Disturbed]:
+    folder = tmp_path_factory.mktemp("disturbed")
+    clock = WallClock(folder)
+    with pytest.MonkeyPatch.context() as environment, begun(folder) as start:
+        for name in [name for name in os.environ if "DISPLAY" in name]:
+            environment.delenv(name)  # the viewer opens in a browser
+        for name, value in clock.environment.items():
+            environment.setenv(name, value)
+        running = start(*AT_RATE, *settings(speed=4.0, horizon_s=HORIZON_S), "--live")
+        for name in clock.environment:
+            environment.delenv(name)
+        wait_recording(running)
+        viewers = viewers_of(running)
+        (group,) = {os.getpgid(viewer.pid) for viewer in viewers}
+        os.killpg(group, signal.SIGSTOP)
+        for hours, role in zip((1, -1, 0, 1, 0), ROLE_MODULES, strict=True):
+            child = running.child(role)
+            assert "stepped_clock" in Path(f"/proc/{child.pid}/maps").read_text()
+            pause(child, PAUSE_S)
+            wall_s, monotonic_s = clock.step_to(hours * HOUR_S)
+            assert wall_s == pytest.approx(hours * HOUR_S, abs=HOUR_S / 2)
+            assert abs(monotonic_s) < HOUR_S / 2
+        # The launcher's process routes all telemetry; delayed batches are sent again.
+        pause(psutil.Process(running.process.pid), UNCONFIRMED_S)
+        finished = running.finish()
+        assert finished.status == 0, finished.stderr
+        record = load_record(finished.run_dir)
+        yield Disturbed(finished, record, running.left_behind(), viewers, group)
+
+
+def test_every_step_is_executed_recorded_and_replayed(disturbed: Disturbed) -> None:
+    """The steps due during a pause are executed late and in order."""
+    summary, record = disturbed.finished.summary, disturbed.record
+    assert summary["exit"]["reason"] == "horizon"
+    assert summary["reached_s"] == HORIZON_S
+    for table in ("plant_step", "sensor_measurement", "controller_step"):
+        rows = record[table]
+        assert np.array_equal(rows["sequence"], np.arange(len(rows)))
+    assert len(record["plant_step"]) == HORIZON_S * RATE_HZ + 1
+    assert summary["missing_samples"] == 0
+    assert summary["unintended_losses"] == 0
+    assert summary["replay"]["bit_exact"]
+    assert summary["replay"]["complete"]
+    assert summary["identity_residual_relative"] < 1e-11
+    assert summary["longest_loss_burst"] <= summary["mansd"]
+    assert disturbed.left_behind == []
+
+
+def test_inputs_too_old_for_a_certificate_make_its_claims_void(disturbed: Disturbed) -> None:
+    summary, record = disturbed.finished.summary, disturbed.record
+    for role in ("plant", "sensor", "controller"):  # netem may have had no packet
+        assert summary["lateness_us"][role]["max"] > 0.9e6 * PAUSE_S
+    certified = [claim for claim in summary["claims"] if "certificate" in claim["source"]]
+    assert certified
+    for claim in certified:
+        assert claim["verdict"] == "void"
+        assert 0 <= claim["since_s"] < HORIZON_S
+    void = [notice["text"] for notice in record.notices if notice["level"] == "void"]
+    assert any(" s old, " in text or "was felt after " in text for text in void), void
+    for text in void:
+        assert disturbed.finished.stderr.count(text) == 1
+    own = [claim for claim in summary["claims"] if claim["source"] == "(I1)"]
+    assert {claim["verdict"] for claim in own} == {"held"}
+
+
+def test_no_time_depends_on_the_wall_clock(disturbed: Disturbed) -> None:
+    for table in disturbed.record.tables:
+        now_ns = disturbed.record[table]["now_ns"]
+        assert (np.diff(now_ns) >= 0).all()
+        assert now_ns.max(initial=0) < HOUR_S / 2 * 1e9
+    for lateness in disturbed.finished.summary["lateness_us"].values():
+        assert lateness["max"] < 1e6 * HOUR_S / 2
+
+
+def test_the_recording_is_complete_and_the_stalled_viewer_is_ended(disturbed: Disturbed) -> None:
+    assert len(disturbed.viewers) == 2
+    assert "live view: http://127.0.0.1:" in disturbed.finished.stderr
+    chunks = read(disturbed.finished.run_dir / "recording.rrd")
+    assert sum(chunk.num_rows for chunk in chunks["error/log10"]) > HORIZON_S * RATE_HZ
+    wait_for(lambda: not is_left(disturbed.viewer_group))
+    assert all(is_over(viewer) for viewer in disturbed.viewers)
