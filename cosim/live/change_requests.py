@@ -34,12 +34,7 @@ class ChangeRequests:
             self._add(change, 0, "in the scenario")
 
     def answer(self, request: bytes, now_ns: int, obstacle: str | None) -> dict[str, Any]:
-        """Announce the requested change, if any; return the parameters.
-
-        Args:
-            request: the message.
-            now_ns: simulated time.
-            obstacle: why the run cannot be changed now; None if it can.
+        """Announce the requested change, unless there is an obstacle; return the parameters.
 
         Raises:
             CallerError: the settings cannot be changed, or not now.

@@ -41,10 +41,7 @@ Failure = tuple[ExitStatus, str]
 class ChildProcesses:
     """The launched processes of a run, by role.
 
-    Args:
-        ticket: each process receives it on its standard input, which stays open as a lifeline.
-        run_dir: holds their logs.
-        roles: which processes to launch.
+    Each receives the ticket on its standard input, which stays open as a lifeline.
     """
 
     def __init__(self, ticket: Ticket, run_dir: Path, roles: Sequence[str]) -> None:

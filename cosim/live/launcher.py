@@ -161,9 +161,7 @@ class _Run:
     def watch(self, signals: Signals, store: Callable[[ExitStatus, str], None]) -> Failure:
         """Follow the run to its end; return its exit status and the reason of the end.
 
-        Args:
-            signals: received signals stop the run.
-            store: called with the result of a run that ends early, before its processes end.
+        ``store`` is called with the result of a run that ends early, before its processes end.
         """
         result: Failure | None = None
         deadline_s, last_s, started = float("inf"), time.monotonic(), False

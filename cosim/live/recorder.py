@@ -47,16 +47,7 @@ _STOP_TIMEOUT_S = 8.0
 
 
 class Recorder:
-    """Receives, stores and shows the telemetry of one run.
-
-    Args:
-        scenario: the resolved scenario.
-        run_dir: the run's directory.
-        plane: the control plane.
-        view: shows the run; None without a view.
-        live: where the live viewer shows the run, for the user.
-        start: where in the run the recorder begins; a restarted one reads the spool first.
-    """
+    """Receives, stores and shows the telemetry of one run."""
 
     def __init__(
         self,

@@ -17,8 +17,7 @@ _OF_NUMBERS = {
     "double", "single", "sparse", "logical",
     "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64",
 }  # fmt: skip
-_MODERN = 3
-"""Exit status for a file of v7.3."""
+_MODERN = 3  # exit status for a file of v7.3
 _PATIENCE_S = 60.0
 
 

@@ -25,19 +25,15 @@ from noack.protocol.record_tables import CHANGE_BYTES
 
 T = TypeVar("T")
 
-LATE = "violation"
-"""Level of the notice of a process that applies a change late."""
+LATE = "violation"  # level of the notice of a process that applies a change late
 
 
 class ParameterChange(NamedTuple):
     """Settings that take effect at a time."""
 
-    number: int
-    """Number of the change, in the order in which the run's changes were announced."""
-    t_ns: int
-    """T, the time from which the settings are in force."""
-    settings: Mapping[str, Any]
-    """Values by keys of the scenario."""
+    number: int  # number of the change, in the order in which the run's changes were announced
+    t_ns: int  # T, the time from which the settings are in force
+    settings: Mapping[str, Any]  # values by keys of the scenario
 
 
 def settings_bytes(settings: Mapping[str, Any]) -> bytes:
@@ -95,8 +91,7 @@ def scheduled(scenario: Scenario) -> list[ParameterChange]:
     ]
 
 
-CHANGED = "change"
-"""Level of the notice of a change."""
+CHANGED = "change"  # level of the notice of a change
 
 
 def change_notice(change: ParameterChange, more: str = "") -> Notice:
@@ -128,12 +123,10 @@ class AppliedParameters(NamedTuple):
     """A scenario, and the machine's own time from which it is in force."""
 
     since_ns: int
-    number: int
-    """Number of the change; −1 for the run's initial scenario."""
+    number: int  # number of the change; −1 for the run's initial scenario
     settings: Mapping[str, Any]
     scenario: Scenario
-    prepared: Any
-    """Data that the machine computed from the scenario when the change was announced."""
+    prepared: Any  # data that the machine computed from the scenario when the change was announced
 
 
 class ChangeSchedule:
@@ -155,17 +148,11 @@ class ChangeSchedule:
     def announce(
         self, table: str, change: ParameterChange, number: int, now_ns: int, reached_ns: int
     ) -> list[Record | Notice]:
-        """Schedule a change; return its row, and a notice if it is late.
+        """Schedule a change; return its row in the machine's ``table``, and a notice if it is late.
 
-        Args:
-            table: the machine's table of changes.
-            change: the change.
-            number: of the machine's input.
-            now_ns: time of the announcement.
-            reached_ns: the machine's own time up to which it has used the previous settings.
-
-        Raises:
-            CallerError: the scenario with this change would be invalid; nothing is changed.
+        The announcement is the machine's input ``number``, at ``now_ns``. The machine has used the
+        previous settings up to ``reached_ns`` of its own time. Raise CallerError, and change
+        nothing, if the scenario would be invalid.
         """
         since_ns = max(change.t_ns, reached_ns + 1)
         entry = AppliedParameters(

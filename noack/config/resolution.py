@@ -32,29 +32,20 @@ computed."""
 class LoopMatrices:
     """The matrices of a resolved scenario, in the paper's notation (n states, m inputs)."""
 
-    A_model: Matrix
-    """Â, (n, n)."""
-    B_model: Matrix
-    """B̂, (n, m)."""
-    K: Matrix
-    """Gain, (m, n)."""
+    A_model: Matrix  # Â, (n, n)
+    B_model: Matrix  # B̂, (n, m)
+    K: Matrix  # gain, (m, n)
     H: Matrix
     """The matrix that both models integrate between updates, (n, n): Â + B̂K, or 0 in
     zero-order-hold mode."""
-    A: Matrix
-    """True plant, (n, n); Â if the plant is not linear."""
-    B: Matrix
-    """True plant, (n, m); B̂ if the plant is not linear."""
-    x0: Vector
-    """x(0), (n,)."""
-    weight: Matrix | None
-    """W of the trigger's norm, (n, n); None is the identity."""
+    A: Matrix  # true plant, (n, n); Â if the plant is not linear
+    B: Matrix  # true plant, (n, m); B̂ if the plant is not linear
+    x0: Vector  # x(0), (n,)
+    weight: Matrix | None  # W of the trigger's norm, (n, n); None is the identity
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]
-    setpoint: Vector | None = None
-    """x_r, (n,); None is 0."""
-    setpoint_input: Vector | None = None
-    """u_r, (m,), with Âx_r + B̂u_r = 0; None is 0."""
+    setpoint: Vector | None = None  # x_r, (n,); None is 0
+    setpoint_input: Vector | None = None  # u_r, (m,), with Âx_r + B̂u_r = 0; None is 0
 
     @property
     def n(self) -> int:

@@ -31,8 +31,7 @@ from noack.protocol.loop_protocol import PROTOCOLS, LoopProtocol
 from noack.settings.section import ScenarioSection
 from noack.trigger.decaying import DecayingSettings
 
-MOST_CHANGES = 256
-"""Largest number of scheduled changes in a run."""
+MOST_CHANGES = 256  # largest number of scheduled changes in a run
 
 
 class Scenario(ScenarioSection):

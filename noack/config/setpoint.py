@@ -9,8 +9,7 @@ import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector
 
-_ROUNDING = 1e-9
-"""Largest Âx_r + B̂u_r that is taken as 0, relative to the larger term."""
+_ROUNDING = 1e-9  # largest Âx_r + B̂u_r that is taken as 0, relative to the larger term
 
 
 def input_at(A: Matrix, B: Matrix, x_r: Vector) -> Vector:

@@ -16,8 +16,7 @@ from noack.observers.estimation_model import EstimationModel
 class SteadyState(NamedTuple):
     """The estimation error in the steady state, if the plant equals the model."""
 
-    gain: Matrix
-    """The observer's gain, (n, p)."""
+    gain: Matrix  # the observer's gain, (n, p)
     radius: float
     """Spectral radius of (I − L C)Â^(T), the factor by which the error shrinks per measurement;
     infinite if no steady state is found."""

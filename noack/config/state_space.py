@@ -28,13 +28,9 @@ def model_of(
     state_names: Sequence[str] | None = None,
     input_names: Sequence[str] | None = None,
 ) -> ModelSection:
-    """Return the model section of a scenario.
+    """Return the model section of a scenario for a system and the gain K of u = K x, (m, n).
 
-    Args:
-        system: A, (n, n) per second, and B, (n, m), as above.
-        gain: K of u = K x, (m, n).
-        state_names: for plots; by default the names in a python-control object, if it has any.
-        input_names: likewise.
+    The names are for plots; by default they are those in a python-control object, if it has any.
 
     Raises:
         CallerError: the object is not such a system; the shapes do not fit; or u = K x does not
@@ -56,15 +52,10 @@ def model_of(
 
 
 def save_model(path: str | Path, system: Any, gain: Any = None) -> None:
-    """Write a file that ``model.file`` or ``plant.file`` of a scenario can name.
+    """Write an ``.npz`` or ``.mat`` file for ``model.file`` or ``plant.file`` of a scenario.
 
-    Args:
-        path: ends in ``.npz`` or ``.mat``.
-        system: as in :func:`model_of`.
-        gain: K of u = K x, (m, n); without it, the scenario must give the gain.
-
-    Raises:
-        CallerError: as in :func:`model_of`; or the file cannot be written.
+    Without the gain K of u = K x, (m, n), the scenario must give it. Raise CallerError as
+    :func:`model_of` does, and if the file cannot be written.
     """
     try:
         write_matrices(Path(path), matrices_of(system, gain))

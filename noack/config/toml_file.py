@@ -18,10 +18,8 @@ from noack.settings.section import ScenarioSection
 
 M = TypeVar("M", bound=ScenarioSection)
 
-MOST_BYTES = 2**20
-"""Largest size of a settings file."""
-MOST_LEVELS = 32
-"""Largest number of parts of a dotted key, and of nested tables and lists."""
+MOST_BYTES = 2**20  # largest size of a settings file
+MOST_LEVELS = 32  # largest number of parts of a dotted key, and of nested tables and lists
 
 _STRING = re.compile(
     r"""

@@ -10,12 +10,10 @@ NS_PER_S = 1_000_000_000
 
 
 class RunClock:
-    """Simulated time tied to the machine's monotonic clock by an epoch and a speed.
+    """Simulated time tied to the machine's monotonic clock.
 
-    Args:
-        epoch_ns: monotonic clock reading at simulated time 0, common to all processes of a run.
-        speed: simulated seconds per wall second, positive.
-        monotonic_ns: the wall clock.
+    ``epoch_ns`` is the clock's reading at simulated time 0, common to all processes of a run;
+    ``speed`` is simulated seconds per wall second.
     """
 
     def __init__(

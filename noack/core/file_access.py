@@ -31,9 +31,7 @@ def write_whole(path: Path, content: str | bytes) -> Path:
 def read_regular(path: Path, most_bytes: int) -> bytes:
     """Return the bytes of a regular file.
 
-    Raises:
-        OSError: the file cannot be opened or read.
-        ValueError: it is a device, a FIFO or a directory, or it is larger than ``most_bytes``.
+    Raise ValueError if it is a device, a FIFO or a directory, or larger than ``most_bytes``.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # so that a FIFO does not block
     try:

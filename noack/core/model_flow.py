@@ -12,12 +12,9 @@ from noack.core.linear_systems import Matrix, Propagator, Vector
 
 
 class ModelFlow:
-    """Propagates the model's state from one time to another.
+    """Propagates the state of the model with the closed-loop matrix H, (n, n), per second.
 
-    Args:
-        H: the closed-loop matrix, shape (n, n), per second.
-        steps_ns: steps to precompute.
-        setpoint: initial x_r, shape (n,); None is 0.
+    ``steps_ns`` are steps to precompute, ``setpoint`` is the initial x_r, (n,); None is 0.
     """
 
     def __init__(

@@ -6,12 +6,10 @@ from decimal import Decimal
 NONE = "-"
 """Text for a missing number."""
 
-_DIGITS = 2
-"""Significant digits of the half-width."""
+_DIGITS = 2  # significant digits of the half-width
 _ALONE = 4
 """Significant digits of a mean without an interval, or with an interval in exponent notation."""
-_FIXED = range(-5, 7)
-"""Powers of ten that are written without exponent notation."""
+_FIXED = range(-5, 7)  # powers of ten that are written without exponent notation
 _SIZES = (1e9, 1e6, 1e3)
 
 

@@ -12,16 +12,12 @@ from types import MappingProxyType
 class LoopProtocol:
     """A protocol of the loop."""
 
-    acknowledgement_routes: Mapping[str, str]
-    """To whom each process sends acknowledgements."""
+    acknowledgement_routes: Mapping[str, str]  # to whom each process sends acknowledgements
     states_caption: str
     """When x_s and x_c jump, for readers; ``{known}`` is the state that they jump to."""
-    error_caption: str
-    """When the sensor's error is reset, for readers."""
-    summary: str
-    """One sentence for readers."""
-    reset: str
-    """When x_s is reset, for readers."""
+    error_caption: str  # when the sensor's error is reset, for readers
+    summary: str  # one sentence for readers
+    reset: str  # when x_s is reset, for readers
 
     @property
     def acknowledges(self) -> bool:

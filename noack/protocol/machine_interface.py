@@ -17,8 +17,7 @@ class Start(NamedTuple):
 
     generation: int = 0
     """How often its process was restarted in this run; a restarted process knows no state."""
-    from_ns: int = 0
-    """No timer is due before."""
+    from_ns: int = 0  # no timer is due before
 
     @property
     def first_number(self) -> int:
@@ -31,8 +30,7 @@ class Start(NamedTuple):
         return self.generation > 0
 
 
-BEGINNING = Start()
-"""The start of the run."""
+BEGINNING = Start()  # the start of the run
 
 
 class Record(NamedTuple):
@@ -42,10 +40,8 @@ class Record(NamedTuple):
     row: tuple[Any, ...]
 
 
-RESTART = "restart"
-"""Level of the notice of a restarted process."""
-FAILED = "failed"
-"""Level of the notice of a plant or controller that cannot continue."""
+RESTART = "restart"  # level of the notice of a restarted process
+FAILED = "failed"  # level of the notice of a plant or controller that cannot continue
 
 
 class Notice(NamedTuple):

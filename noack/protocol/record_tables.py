@@ -29,14 +29,12 @@ CONTROLLER_SETTING = "controller_setting"
 
 SETTINGS = (SENSOR_SETTING, NETEM_SETTING, CONTROLLER_SETTING)
 """Tables of the changes of settings that each process received during the run."""
-CHANGE_BYTES = 1024
-"""Width of a change in the record: JSON, padded with zero bytes."""
+CHANGE_BYTES = 1024  # width of a change in the record: JSON, padded with zero bytes
 
 PACKET_HEAD_BYTES = 32
 """Leading bytes of each datagram that the network emulator records without interpreting them."""
 
-NO_SEQUENCE = -1
-"""Stands for "none" in a column of sequence numbers."""
+NO_SEQUENCE = -1  # stands for "none" in a column of sequence numbers
 
 
 class Fate(IntEnum):
@@ -76,30 +74,23 @@ def entry_names(vector: str, entries: int) -> tuple[str, ...]:
 class RecordShape:
     """The sizes of a run's vectors; a column of size 0 is not in the record."""
 
-    n: int
-    """States."""
-    m: int
-    """Inputs."""
-    acknowledged: bool = False
-    """Whether updates are acknowledged."""
-    predictive: bool = False
-    """Whether actuations carry the controller's model state."""
-    internal: int = 0
-    """Entries of the plant's own state z."""
+    n: int  # states
+    m: int  # inputs
+    acknowledged: bool = False  # whether updates are acknowledged
+    predictive: bool = False  # whether actuations carry the controller's model state
+    internal: int = 0  # entries of the plant's own state z
     disturbed_input: bool = False
     disturbed_state: bool = False
     outputs: int = 0
     """Measured outputs from which an observer estimates the state; 0 without an observer."""
-    inputs_reported: int = 0
-    """Numbers of a measurement that are inputs."""
+    inputs_reported: int = 0  # numbers of a measurement that are inputs
 
 
 class Column(NamedTuple):
     """A column of a table."""
 
     name: str
-    unit: str
-    """Empty: a number without unit."""
+    unit: str  # empty: a number without unit
     meaning: str
     entries: Callable[[RecordShape], int] | None = None
     """Length of a vector; None for a single number."""
@@ -130,12 +121,9 @@ class Table(NamedTuple):
     """A table of the record."""
 
     name: str
-    owner: str
-    """The process that fills it."""
-    row: str
-    """What one row stands for."""
-    columns: tuple[Column, ...]
-    """Besides ``COMMON``."""
+    owner: str  # the process that fills it
+    row: str  # what one row stands for
+    columns: tuple[Column, ...]  # besides ``COMMON``
     exists: Callable[[RecordShape], bool] = lambda shape: True
 
 

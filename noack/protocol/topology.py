@@ -30,8 +30,7 @@ SENDER: Mapping[str, str] = {leg.to: role for role, leg in ROUTES.items()}
 
 LOOP_ROLES = tuple(ROUTES)
 PLANT = "plant"
-CHANGEABLE = ("sensor", "netem", "controller")
-"""Processes with runtime parameters."""
+CHANGEABLE = ("sensor", "netem", "controller")  # processes with runtime parameters
 RECORDER = "recorder"
 COORDINATOR = "coordinator"
 ROLES = (*LOOP_ROLES, RECORDER)

@@ -59,8 +59,7 @@ class Flow(IntEnum):
     and event time, and no vector, shape (0,)."""
 
 
-NO_VECTOR: Vector = np.zeros(0)
-"""The vector of an acknowledgement."""
+NO_VECTOR: Vector = np.zeros(0)  # the vector of an acknowledgement
 
 
 class Message(NamedTuple):

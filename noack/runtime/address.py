@@ -5,8 +5,7 @@ import socket
 
 from noack.core.errors import CallerError
 
-Address = tuple[str, int]
-"""Numeric host and port."""
+Address = tuple[str, int]  # numeric host and port
 
 _FORM = re.compile(r"(?:\[(?P<six>[^\[\]]+)\]|(?P<host>[^\[\]:]*)):(?P<port>[0-9]{1,5})")
 

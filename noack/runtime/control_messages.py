@@ -23,8 +23,7 @@ from noack.core.errors import PeerError
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 Nanoseconds = Annotated[int, Field(ge=-(2**63), lt=2**63)]
 Generation = Annotated[int, Field(ge=0, lt=2**20)]
-Ranges = tuple[tuple[Count, Count], ...]
-"""Half-open ranges of numbers."""
+Ranges = tuple[tuple[Count, Count], ...]  # half-open ranges of numbers
 
 
 class ControlMessage(BaseModel):
@@ -47,46 +46,36 @@ SocketAddress = tuple[
 class AdmissionRequest(ControlMessage):
     """A process asks for admission to the run."""
 
-    instance: str
-    """Random name of this process."""
+    instance: str  # random name of this process
 
 
 class Admission(ControlMessage):
     """The coordinator admits a process."""
 
-    generation: Generation
-    """How many processes of its role were in the run before it."""
+    generation: Generation  # how many processes of its role were in the run before it
     admitted_ns: Nanoseconds
     """Simulated time of the admission; older messages were meant for the process before it."""
-    from_ns: Nanoseconds
-    """Simulated time at which its work begins."""
+    from_ns: Nanoseconds  # simulated time at which its work begins
     address: SocketAddress | None
     """Receiving address of the process before it, which it takes over; None at the run's start."""
-    replaces: str | None
-    """How the process before it ended; None at the run's start."""
+    replaces: str | None  # how the process before it ended; None at the run's start
 
 
 class JoinRequest(ControlMessage):
     """A process is ready and waits at the start barrier."""
 
     instance: str
-    address: SocketAddress | None
-    """Its receiving address; None for the recorder."""
+    address: SocketAddress | None  # its receiving address; None for the recorder
 
 
 class ChangeAnnouncement(ControlMessage):
     """The coordinator announces a change of runtime parameters."""
 
-    number: Count
-    """Numbers the changes of the run from 0."""
-    t_ns: Count
-    """Simulated time from which it applies."""
-    settings: dict[str, JsonValue]
-    """Values by scenario key."""
-    requested_ns: Nanoseconds
-    """Simulated time of the request."""
-    requested_at: str
-    """Date and time of the request; or that the scenario contains the change."""
+    number: Count  # numbers the changes of the run from 0
+    t_ns: Count  # simulated time from which it applies
+    settings: dict[str, JsonValue]  # values by scenario key
+    requested_ns: Nanoseconds  # simulated time of the request
+    requested_at: str  # date and time of the request; or that the scenario contains the change
 
 
 class ChangeRequest(ControlMessage):
@@ -110,18 +99,15 @@ class ChangeReply(ControlMessage):
 class RunStart(ControlMessage):
     """The coordinator lets a process pass the start barrier."""
 
-    epoch_ns: Count
-    """Monotonic clock reading at simulated time 0."""
+    epoch_ns: Count  # monotonic clock reading at simulated time 0
     addresses: dict[str, SocketAddress]
-    changes: tuple[ChangeAnnouncement, ...] = ()
-    """The changes announced so far."""
+    changes: tuple[ChangeAnnouncement, ...] = ()  # the changes announced so far
 
 
 class BatchHeader(ControlMessage):
     """Header of a batch of rows."""
 
-    first: Count
-    """Number of its first row among this generation's rows of the table."""
+    first: Count  # number of its first row among this generation's rows of the table
     generation: Generation = 0
 
 
@@ -156,15 +142,12 @@ class ChannelCounters(ControlMessage):
 class ProcessReport(ControlMessage):
     """Final report of a process."""
 
-    ended: str
-    """The reason."""
+    ended: str  # the reason
     channel: ChannelCounters
-    rows: dict[str, Count]
-    """Number of recorded rows, by table."""
+    rows: dict[str, Count]  # number of recorded rows, by table
     generation: Count = 0
     instance: str = ""
-    realtime: dict[str, str] = Field({})
-    """Whether each real-time setting was applied."""
+    realtime: dict[str, str] = Field({})  # whether each real-time setting was applied
     reached_ns: Nanoseconds | None = None
     """Simulated time up to which all its deadlines were served; None if it failed."""
 
@@ -180,8 +163,7 @@ class RunProgress(ControlMessage):
     live: str | None
     void: list[str] = []
     """Which claims are void so far, and why; or why that cannot be checked during the run."""
-    changes: list[str] = []
-    """Changes of runtime parameters during the run."""
+    changes: list[str] = []  # changes of runtime parameters during the run
 
 
 M = TypeVar("M", bound=ControlMessage)

@@ -32,13 +32,10 @@ class Ticket(ScenarioSection):
 
     run_id: Seed
     key: Annotated[bytes, Field(min_length=KEY_BYTES, max_length=KEY_BYTES)]
-    endpoint: str
-    """zenoh endpoint of the control plane, e.g. ``tcp/127.0.0.1:7447``."""
+    endpoint: str  # zenoh endpoint of the control plane, e.g. ``tcp/127.0.0.1:7447``
     run_dir: str
-    launched: bool
-    """Whether a launcher holds the process's standard input open as its lifeline."""
-    scenario: Scenario
-    """Resolved."""
+    launched: bool  # whether a launcher holds the process's standard input open as its lifeline
+    scenario: Scenario  # resolved
 
 
 def new_ticket(scenario: Scenario, endpoint: str, run_dir: Path, *, launched: bool) -> Ticket:

@@ -10,10 +10,8 @@ from enum import Enum
 
 from noack.core.errors import CallerError, PeerError
 
-HORIZON = "horizon"
-"""Reason of a process that has reached the end of the run."""
-LAUNCHER_GONE = "the launcher ended early"
-"""Reason of a process whose launcher has ended before it."""
+HORIZON = "horizon"  # reason of a process that has reached the end of the run
+LAUNCHER_GONE = "the launcher ended early"  # reason of a process whose launcher has ended before it
 
 
 class Side(Enum):

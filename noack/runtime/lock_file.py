@@ -30,11 +30,8 @@ class LockFile(NamedTuple):
 def lock_file(kind: str, name: str, content: Mapping[str, object]) -> Iterator[Path]:
     """Keep a lock file with this content, as JSON, while the context lasts.
 
-    It is in the folder ``kind`` of the runtime directory; "" is the directory itself.
-
-    Raises:
-        CallerError: the folder cannot be made, or is not the user's own.
-        FileExistsError: a running process has a file of this name.
+    It is in the folder ``kind`` of the runtime directory; "" is the directory itself. Raise
+    FileExistsError if a running process has a file of this name.
     """
     with open_private(*_inside(kind), create=True) as folder:
         scratch, name = f"{name}.{secrets.token_hex(8)}", name + _SUFFIX

@@ -21,8 +21,7 @@ from noack.runtime.address import Address, text_of
 IN_AN_INTERVAL = 256
 """Datagrams from unknown sources read between two turns of housekeeping, 50 ms: about 5,000 a
 second, which takes a twentieth of a core."""
-IN_A_FLOOD = 16
-"""Datagrams of a flood that are read per interval, to see its sources and its end."""
+IN_A_FLOOD = 16  # datagrams of a flood that are read per interval, to see its sources and its end
 _CALM_INTERVALS = 20
 _MOST_CALM_INTERVALS = 1200
 _REPORTED_SOURCES = 16

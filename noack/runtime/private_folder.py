@@ -93,10 +93,8 @@ class PrivateFolder:
 def open_private(*inside: str, create: bool = False) -> Iterator[PrivateFolder]:
     """Open the user's private folder, or nested folders ``inside`` it, while the context lasts.
 
-    Raises:
-        CallerError: a folder cannot be created, belongs to another user, is a link, or is open to
-            others.
-        FileNotFoundError: it does not exist, and ``create`` is false.
+    Raise CallerError if a folder cannot be created, belongs to another user, is a link, or is open
+    to others; FileNotFoundError if it does not exist and ``create`` is false.
     """
     path = private_folder()
     with ExitStack() as stack:

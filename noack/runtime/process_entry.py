@@ -16,8 +16,7 @@ from noack.runtime.life_cycle import HORIZON, Event
 from noack.runtime.process_life import RunProcess, lifeline_cut
 from noack.runtime.signals import Signals
 
-_TICKET_TIMEOUT_S = 24 * 3600.0
-"""A person may start the recorder late; Ctrl-C ends the wait."""
+_TICKET_TIMEOUT_S = 24 * 3600.0  # a person may start the recorder late; Ctrl-C ends the wait
 
 TICKET_ON_STDIN = "NOACK_TICKET_ON_STDIN"
 

@@ -44,15 +44,13 @@ from noack.runtime.udp_sockets import MessageSocket, bind
 
 T = TypeVar("T")
 
-_JOIN_TIMEOUT_S = 24 * 3600.0
-"""A person may start the other processes late; Ctrl-C ends the wait."""
+_JOIN_TIMEOUT_S = 24 * 3600.0  # a person may start the other processes late; Ctrl-C ends the wait
 _ADMISSION_TIMEOUT_S = 10.0
 _COORDINATOR_AWAY_S = 8.0
 """Four leases of the connection: a connection that a busy machine broke comes back by then."""
 _CHANGES_AT_ONCE = 2
 """Changes taken in the loop every 50 ms: a machine needs some tenths of a millisecond for each."""
-_GRACE_S = 0.15
-"""Wall time after the horizon for packets in flight."""
+_GRACE_S = 0.15  # wall time after the horizon for packets in flight
 
 
 class ReportingChannel(Channel[T], Protocol[T]):

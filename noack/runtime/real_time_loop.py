@@ -18,8 +18,7 @@ T = TypeVar("T")
 
 _HOUSEKEEPING_S = 0.05
 _OVERLOAD_PAUSE_S = 0.002
-_QUIET_S = 0.0005
-"""Housekeeping takes 0.1 ms; it waits when the next deadline is nearer than this."""
+_QUIET_S = 0.0005  # housekeeping takes 0.1 ms; it waits when the next deadline is nearer than this
 _yield_core: Callable[[], None] = getattr(os, "sched_yield", lambda: None)
 """After a rejected datagram: lets other threads of the same real-time priority run first."""
 
@@ -74,16 +73,9 @@ def run_loop(
 ) -> int:
     """Drive ``machine`` until simulated time ``end_ns`` (None: no end), or until ``stop()``.
 
-    Args:
-        machine: the pure machine.
-        channel: its socket.
-        clock: simulated time.
-        telemetry: receives its records and notices.
-        end_ns: when to end; None runs until stopped.
-        stop: asked every 50 ms of wall time.
-        spin_us: busy-wait for the last microseconds before a deadline.
-        news: passes input from outside the socket to the machine, before the first step and every
-            50 ms, and returns the machine's outputs.
+    Every 50 ms of wall time ``stop`` is asked. Before the first step and every 50 ms, ``news``
+    passes input from outside the socket to the machine and returns the machine's outputs. The
+    loop busy-waits for the last ``spin_us`` before a deadline.
 
     Returns:
         How late the machine's next deadline was at the end, in ns; 0 if it was not late.

@@ -28,13 +28,10 @@ _ANSWER_S = 10.0
 class OpenRun(NamedTuple):
     """How to reach a run."""
 
-    run_id: str
-    """As in the keys of its control plane."""
+    run_id: str  # as in the keys of its control plane
     run_dir: str
-    session: str | None
-    """Session name for processes started by hand; None if all were launched."""
-    endpoint: str
-    """zenoh endpoint of the control plane."""
+    session: str | None  # session name for processes started by hand; None if all were launched
+    endpoint: str  # zenoh endpoint of the control plane
     user: str
     password: str
 
@@ -79,9 +76,7 @@ def find(session: str | None = None, run_dir: Path | None = None) -> OpenRun:
 def request_change(run: OpenRun, settings: Mapping[str, Any]) -> dict[str, Any]:
     """Request a change of runtime parameters; without settings, their values. Return the answer.
 
-    Raises:
-        CallerError: the settings are wrong; one line per mistake.
-        PeerError: the run does not answer.
+    Raise CallerError, with one line per mistake, for wrong settings, PeerError without an answer.
     """
     secret = SessionSecret(run.user, run.password)
     try:

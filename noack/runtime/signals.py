@@ -10,8 +10,7 @@ from types import FrameType
 
 from noack.core.errors import ExitStatus
 
-_ECHO_NS = 500_000_000
-"""A parent may pass on a signal that the process group has received already."""
+_ECHO_NS = 500_000_000  # a parent may pass on a signal that the process group has received already
 
 
 class Signals:

@@ -18,19 +18,16 @@ from noack.runtime.control_messages import BatchHeader, parse_message
 
 _BATCH_ROWS = 256
 _HELD_BYTES = 256 * 1024 * 1024
-_RESENT_AT_ONCE = 8
-"""Batches that are sent again at a time: the loop waits for it."""
+_RESENT_AT_ONCE = 8  # batches that are sent again at a time: the loop waits for it
 
 _Batch = tuple[str, int, int, bytes]
 """Table, number of the first row, rows, and the rows themselves."""
 
-Publish = Callable[[str, bytes, bytes], None]
-"""Publishes a batch: table, header (JSON), rows."""
+Publish = Callable[[str, bytes, bytes], None]  # publishes a batch: table, header (JSON), rows
 
 NOTICES = "notices"
 
-Ranges = Sequence[tuple[int, int]]
-"""Half-open ranges of row numbers."""
+Ranges = Sequence[tuple[int, int]]  # half-open ranges of row numbers
 
 
 class ReceivedRows:
@@ -62,13 +59,9 @@ class ReceivedRows:
 
 
 class TelemetryBuffer:
-    """Collects rows by table.
+    """Collects rows by table and passes them to ``publish``, which does not block.
 
-    Args:
-        tables: row type of each table that the process fills.
-        publish: publishes a batch without blocking.
-        generation: the process's generation.
-        persisted: returns ranges of rows that are newly confirmed to be on disk, by table.
+    ``persisted`` returns ranges of rows that are newly confirmed to be on disk, by table.
     """
 
     def __init__(

@@ -29,8 +29,7 @@ _UNKNOWN_READ_AT_END = 4096
 _SO_MEMINFO = 55
 _MEMINFO_WORDS = 9
 _MEMINFO_DROPS = 8
-_READ_AT_ONCE = 8
-"""Datagrams read before the next look at deadlines: about 50 µs."""
+_READ_AT_ONCE = 8  # datagrams read before the next look at deadlines: about 50 µs
 SHED = "shed"
 """Rejection reason of datagrams from unknown sources that the kernel dropped in a flood."""
 MAX_UDP_BYTES = 65_535

@@ -16,8 +16,7 @@ from zenoh.handlers import FifoChannel
 
 from noack.core.errors import CallerError
 
-LEASE_MS = 2000
-"""A peer that is silent for longer is gone."""
+LEASE_MS = 2000  # A peer that is silent for longer is gone
 _CONNECT_MS = 5000
 _SHAKE_HANDS_MS = 2000
 """zenoh serves at most 100 connections at a time that have not yet shown the secret."""

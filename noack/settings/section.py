@@ -18,8 +18,7 @@ Probability = Annotated[FiniteFloat, Field(ge=0, le=1)]
 Correlation = Annotated[FiniteFloat, Field(ge=0, lt=1)]
 Seed = Annotated[int, Field(ge=0, lt=2**64)]
 RateHz = Annotated[FiniteFloat, Field(gt=0, le=100_000)]
-_LEAST_RATE_HZ = 1e-9
-"""Lowest rate; its period in nanoseconds fits into 64 bits."""
+_LEAST_RATE_HZ = 1e-9  # lowest rate; its period in nanoseconds fits into 64 bits
 
 
 class ScenarioSection(BaseModel):

@@ -10,7 +10,6 @@ from scipy.stats import kstest
 from noack.config.resolution import resolve, tables_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
-from noack.core.random_streams import normals
 from noack.disturbances.gaussian import GaussianDisturbance
 from noack.disturbances.step import StepDisturbance
 from noack.disturbances.uniform import UniformDisturbance
@@ -119,29 +118,6 @@ def test_the_plant_agrees_with_an_integrator_under_the_recorded_disturbance(
         np.testing.assert_allclose(rows["x"][k + 1], x, atol=1e-10)
 
 
-def test_input_disturbances_act_on_a_nonlinear_plant(
-    content: dict[str, Any],
-) -> None:
-    content["model"] = {
-        "A": [[0.0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1], [0, 0, 30, 0]],
-        "B": [[0.0], [1.0], [0.0], [-4.0]], "gain": [[1.0, 2.0, 60.0, 10.0]],
-    }  # fmt: skip
-    content["plant"] = {
-        "system": {"kind": "cart_pole"}, "initial_state": [0.0, 0.0, 0.1, 0.0],
-        "disturbances": [{"kind": "step", "amplitude": [0.5]}],
-    }  # fmt: skip
-    pushed = resolved(content)
-    plain = resolved({**content, "plant": {**content["plant"], "disturbances": []}})
-    one, other = plant_of(pushed), plant_of(plain)
-    for k in range(50):
-        one.handle(Message(Flow.ACTUATION, k, 0, np.array([0.1])), 0)
-        other.handle(Message(Flow.ACTUATION, k, 0, np.array([0.6])), 0)
-        one.on_timer(k * 2_000_000)
-        other.on_timer(k * 2_000_000)
-    # The second plant has no input before the first actuation, so both start in the same state.
-    np.testing.assert_array_equal(one.x, other.x)
-
-
 def test_measurements_carry_the_inputs_of_every_step_since_the_last(
     disturbed: dict[str, Any],
 ) -> None:
@@ -168,12 +144,6 @@ def test_noise_has_its_distribution() -> None:
 def test_measurements_without_noise_equal_the_state(content: dict[str, Any]) -> None:
     content["plant"]["measurement"] = {"C": [[1.0, 0.0], [0.0, 1.0]], "noise_std": [0.0, 0.0]}
     assert measurement_model_of(resolved(content)) is None
-
-
-def test_normal_numbers_are_finite_and_any_row_is_computed_directly() -> None:
-    table = normals(3, "test", rows=range(1000), width=3)
-    assert np.isfinite(table).all()
-    assert normals(3, "test", rows=range(500, 503), width=3).tolist() == table[500:503].tolist()
 
 
 def test_variances_are_those_of_the_distributions() -> None:

@@ -15,7 +15,6 @@ from plant_server.plant import Plant, plant_of
 from plant_server.watchdog import Watchdog, hold, zero
 
 MS = 1_000_000
-H = np.array([[0.0, 1.0], [-2.0, -1.0]])
 K = np.array([[-3.0, -1.5]])
 
 
@@ -143,10 +142,3 @@ def test_the_state_carried_by_an_actuation_is_recorded() -> None:
     row = np.array([record.row], tables(2, 1, predictive=True)[PLANT_ACTUATION])[0]
     assert row["u"].tolist() == [0.5]
     assert row["x_c"].tolist() == [1.0, 2.0]
-
-
-def test_the_default_timeout_is_fifty_controller_periods() -> None:
-    plant = {"initial_state": [1.0, 0.0], "rate_hz": 100.0}
-    resolved = scenario("hold", plant=plant, controller={"rate_hz": 200.0})
-    assert resolved.timing.actuation_timeout_ns == 250 * MS
-    assert resolved.plant.watchdog.policy == "hold"

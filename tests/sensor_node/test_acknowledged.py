@@ -9,9 +9,6 @@ import pytest
 from noack.core.linear_systems import transition
 from noack.protocol.machine_interface import Output, Record
 from noack.protocol.record_tables import (
-    NO_SEQUENCE,
-    SENSOR_ACKNOWLEDGEMENT,
-    SENSOR_MEASUREMENT,
     tables,
 )
 from noack.protocol.wire_format import NO_VECTOR, Flow, Message
@@ -114,19 +111,3 @@ def test_an_acknowledgement_of_an_unsent_update_changes_nothing() -> None:
     before = one.x_s.copy()
     _, row = split(one.handle(Message(Flow.ACKNOWLEDGEMENT, 7, 0, NO_VECTOR), 5))
     assert row["x_s"].tobytes() == row["x_s_before"].tobytes() == before.tobytes()
-
-
-def test_every_input_gives_one_numbered_row() -> None:
-    one = sensor(GRID_NS)
-    numbers = []
-    for k in range(6):
-        sent, row = split(one.handle(measurement(k, [float(k + 1), 0.0]), k * GRID_NS))
-        assert row["event"] == k != NO_SEQUENCE
-        numbers.append(int(row["input"]))
-        (output,) = one.handle(acknowledgement(sent[0]), k * GRID_NS)
-        assert isinstance(output, Record)
-        assert output.table == SENSOR_ACKNOWLEDGEMENT != SENSOR_MEASUREMENT
-        numbers.append(output.row[0])
-    assert numbers == list(range(12))
-    assert one.next_deadline_ns() is None
-    assert one.on_timer(0) == ()

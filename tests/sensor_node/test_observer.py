@@ -5,13 +5,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
+from scipy.linalg import expm, solve_discrete_are
 
 from noack.config.resolution import resolve, tables_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
 from noack.config.state_estimation import assumed_model, steady_state, true_model
-from noack.core.linear_systems import Matrix, Vector, discretise
+from noack.core.linear_systems import Vector, discretise
 from noack.observers.estimation_model import EstimationModel
 from noack.observers.kalman import KalmanObserver
 from noack.observers.luenberger import LuenbergerObserver
@@ -55,46 +55,21 @@ def measurement(sequence: int, t_ns: int, vector: Sequence[float]) -> Message:
     return Message(Flow.MEASUREMENT, sequence, t_ns, np.array(vector, dtype=float))
 
 
-def batch_estimate(P0: Matrix, x0: Vector, u: Vector, y: Vector) -> tuple[Vector, Matrix]:
-    """x(t_K) given all of y by the conditional mean of jointly normal numbers, without recursion.
-
-    Stacks ξ = (x(0), q_1 … q_K, v_0 … v_K); x(t_k) and y(t_k) are linear in it.
-    """
-    Ad, Bd, *_ = model()
-    K = len(u)
-    size = 2 + 2 * K + K + 1
-    covariance = np.zeros((size, size))
-    covariance[:2, :2] = P0
-    for k in range(K):
-        covariance[2 + 2 * k : 4 + 2 * k, 2 + 2 * k : 4 + 2 * k] = Q
-    covariance[2 + 2 * K :, 2 + 2 * K :] = R[0, 0] * np.eye(K + 1)
-    mean, state = x0, np.eye(2, size)
-    ys, y_means = [], []
-    for k in range(K + 1):
-        if k > 0:
-            mean, state = Ad @ mean + Bd @ u[k - 1], Ad @ state
-            state[:, 2 * k : 2 * k + 2] += np.eye(2)
-        row = (C @ state)[0]
-        row[2 + 2 * K + k] += 1.0
-        ys.append(row)
-        y_means.append(float((C @ mean)[0]))
-    G = np.array(ys)
-    gain = state @ covariance @ G.T @ np.linalg.inv(G @ covariance @ G.T)
-    conditional = state @ covariance @ state.T - gain @ G @ covariance @ state.T
-    return mean + gain @ (y - np.array(y_means)), conditional
-
-
-def test_the_kalman_filter_is_the_conditional_mean() -> None:
-    rng = np.random.default_rng(1)
-    x0, P0 = np.array([0.3, -0.2]), np.diag([0.5, 0.2])
-    u, y = rng.normal(size=(12, 1)), rng.normal(size=13)
-    following = AppliedInputTracker(KalmanObserver(model(), x0, P0), 1, 1, H_NS, None)
-    for k in range(13):
-        inputs = u[k - 1] if k else np.zeros(1)
-        x = following.take(k * H_NS, y[k : k + 1], inputs)
-    expected, covariance = batch_estimate(P0, x0, u, y)
-    np.testing.assert_allclose(x, expected, rtol=1e-10)
-    np.testing.assert_allclose(following.observer.covariance, covariance, rtol=1e-8)  # type: ignore[attr-defined]
+def test_the_kalman_filter_converges_to_the_observer_with_the_steady_gain() -> None:
+    """P converges to the solution of the Riccati equation, from there on L is constant."""
+    kalman = KalmanObserver(model(), np.zeros(2), np.eye(2))
+    for _ in range(2000):
+        kalman.predict(np.zeros(1))
+        kalman.correct(np.zeros(1))
+    before = solve_discrete_are(expm(A * H_NS * 1e-9).T, C.T, Q, R)
+    after = np.linalg.inv(np.linalg.inv(before) + C.T @ np.linalg.inv(R) @ C)
+    np.testing.assert_allclose(kalman.covariance, after, rtol=1e-9)
+    steady = LuenbergerObserver(model(), after @ C.T @ np.linalg.inv(R), kalman.x)
+    for u, y in np.random.default_rng(1).normal(size=(20, 2, 1)):
+        for observer in (kalman, steady):
+            observer.predict(u)
+            observer.correct(y)
+        np.testing.assert_allclose(kalman.x, steady.x, rtol=1e-8)
 
 
 @pytest.mark.parametrize("steps", [1, 3])

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.simulation.continuous.continuous_loop import vanished
 from cosim.simulation.continuous.continuous_run import MAX_EVENTS
 from cosim.simulation.continuous.network_fates import timeless
 from netem.link_machine import UPDATE_LINK
@@ -283,8 +284,4 @@ def _check(setting: Setting, population: Population) -> None:
         return
     vanishes_s = math.log(rule.level / _SMALLEST_THRESHOLD) / rule.rate_per_s
     if vanishes_s < setting.horizon_s:
-        raise CallerError(
-            f"trigger: from {vanishes_s:g} s on the threshold is below "
-            f"{_SMALLEST_THRESHOLD:g}, where no error can be told from rounding; "
-            "give trigger.floor or a shorter horizon"
-        )
+        raise vanished(vanishes_s, _SMALLEST_THRESHOLD)

@@ -25,11 +25,7 @@ _NEWTON_RESOLUTION = 2.0**-50
 
 
 class CurveBasis:
-    """Vector-valued polynomials of one degree on [0, 1].
-
-    Args:
-        degree: p of the curve; its squared norm has degree 2p.
-    """
+    """Vector-valued polynomials of one degree on [0, 1]."""
 
     def __init__(self, degree: int) -> None:
         self.degree = degree
@@ -92,9 +88,6 @@ class CurveBasis:
         An excursion is always found if its depth max |y|² − 1 exceeds the rounding error of the
         polynomial, about 1e-14. A shallower excursion (a tangency in floating point) may be missed.
         A curve that starts on the sphere and moves outward leaves the ball at u = 0.
-
-        Args:
-            taylor: coefficients of y(u) = Σ_k ``taylor``[k] u^k, shape (p + 1, n).
         """
         control = self.from_taylor @ taylor
         inside = 1.0 - self.square @ (control @ control.T).ravel()

@@ -228,11 +228,7 @@ class ContinuousLoop:
             if found.exceeds or end_s <= min(floor_from_s, vanishes_s):
                 return found
             if vanishes_s < floor_from_s:
-                raise CallerError(
-                    f"trigger: from {vanishes_s:g} s on the threshold is below "
-                    f"{_SMALLEST_THRESHOLD:g}, where no error can be told from rounding; "
-                    "give trigger.floor or a shorter horizon"
-                )
+                raise vanished(vanishes_s, _SMALLEST_THRESHOLD)
             z, auxiliary, t_s = found.z, found.auxiliary, floor_from_s
         level = (
             condition.floor if condition.rate_per_s > 0 else max(condition.floor, condition.level)
@@ -321,6 +317,14 @@ class ContinuousLoop:
     def _state(self, t_s: float, z: Vector) -> LoopState:
         n = self.loop.n
         return LoopState(t_s, z[:n], z[n : 2 * n], z[2 * n :])
+
+
+def vanished(from_s: float, smallest: float) -> CallerError:
+    """Return the error of a threshold that decays too far."""
+    return CallerError(
+        f"trigger: from {from_s:g} s on the threshold is below {smallest:g}, where errors are "
+        "within rounding; give trigger.floor or a shorter horizon"
+    )
 
 
 def reset(state: LoopState, delivered: bool) -> LoopState:

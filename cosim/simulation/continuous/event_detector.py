@@ -47,13 +47,6 @@ class EventDetector(Protocol):
     ) -> DetectedEvent:
         """Follow the loop until the comparison holds or the span ends.
 
-        Args:
-            z: state at ``t_s``, shape (N,).
-            t_s: time.
-            threshold: at ``t_s``.
-            span_s: length of the span.
-            auxiliary: η or the integral at ``t_s``.
-
         Raises:
             DivergedError: the state becomes too large to compute with.
         """
@@ -61,14 +54,7 @@ class EventDetector(Protocol):
 
 
 class NormEventDetector:
-    """Finds the first time at which (output / decaying threshold) leaves the unit ball.
-
-    Args:
-        flow: the exact flow of the state z.
-        generator: G, shape (N, N).
-        output: C of the output C z that is compared with the threshold, shape (r, N).
-        rate_per_s: decay rate of the threshold; 0 for a constant one.
-    """
+    """Finds the first time at which ‖C z‖ exceeds a decaying threshold; ``output`` is C, (r, N)."""
 
     def __init__(
         self, flow: ExactFlow, generator: Matrix, output: Matrix, rate_per_s: float

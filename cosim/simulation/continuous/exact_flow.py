@@ -36,12 +36,7 @@ def taylor_terms(generator: Matrix, width_s: float) -> Matrix:
 
 
 class ExactFlow:
-    """Propagates states of ``dz/dt = G z``.
-
-    Args:
-        generator: G, shape (N, N), per second.
-        width_s: d, at most 1/:func:`growth_rate`.
-    """
+    """Propagates states of ``dz/dt = G z``; the width d is at most 1/:func:`growth_rate`."""
 
     def __init__(self, generator: Matrix, width_s: float) -> None:
         self.width_s = width_s

@@ -20,13 +20,8 @@ class IntegralEventDetector:
 
     The integral never decreases and the threshold never increases, so they cross at most once. On
     a cell y is a polynomial. ∫‖y‖ is computed by Gauss-Legendre quadrature on intervals that are
-    halved until the two halves agree with the whole to 1e-13 of the integral so far.
-
-    Args:
-        flow: the exact flow of the state z.
-        generator: G, shape (N, N).
-        output: C of y = C z, shape (r, N).
-        rate_per_s: decay rate of the threshold; 0 for a constant one.
+    halved until the two halves agree with the whole to 1e-13 of the integral so far. ``output`` is
+    C of y = C z, shape (r, N).
     """
 
     def __init__(

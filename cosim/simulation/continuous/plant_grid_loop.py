@@ -118,16 +118,16 @@ class SampledLoop:
             else:
                 states[following] = self._continuous(x, [newest, *within], step, until)
             x_s_block = self._model_steps[1 : until - step + 1] @ x_s
-            seen = np.flatnonzero(schedule.measured[following])
+            measured = np.flatnonzero(schedule.measured[following])
             if in_common:
-                block = states[following][seen]
+                block = states[following][measured]
                 found = trigger.first_event(
-                    (step + 1 + seen) * period_ns, block, x_s_block[seen] - block
+                    (step + 1 + measured) * period_ns, block, x_s_block[measured] - block
                 )
             else:
-                found = 0 if len(seen) else None
+                found = 0 if len(measured) else None
             event = found is not None
-            taken = until - step - 1 if found is None else int(seen[found])
+            taken = until - step - 1 if found is None else int(measured[found])
             x_s = x_s_block[taken]
             step += 1 + taken
 

@@ -1,4 +1,4 @@
-"""The true plant, its initial state, and its behaviour without actuations."""
+"""The true plant, its initial state, its measurement, and its behaviour without actuations."""
 
 from typing import Annotated, Literal, Self
 
@@ -6,14 +6,66 @@ import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
 from noack.config.feature_kinds import AnyDisturbance, AnyPlant
-from noack.config.sections.measurement_section import MeasurementSection
 from noack.config.sections.model_section import require_read
 from noack.core.linear_systems import Vector
 from noack.disturbances.disturbance_settings import Place
 from noack.observers.estimation_model import NoiseVariances
 from noack.plants.linear import LinearSettings
-from noack.settings.matrices import Row, Rows, require_non_negative
+from noack.settings.matrices import (
+    Row,
+    Rows,
+    require_length,
+    require_non_negative,
+    require_shape,
+    require_squares,
+)
 from noack.settings.section import RateHz, ScenarioSection, require_whole_period
+
+
+class MeasurementSection(ScenarioSection):
+    """The measurement of the plant: y = C x + v."""
+
+    C: Rows | None = None
+    """C by rows, p x n; by default the identity: every state is measured."""
+    noise_std: Row | None = None
+    """Standard deviation of the normally distributed part of v, p entries; by default 0."""
+    noise_bound: Row | None = None
+    """Bound of the uniformly distributed part of v, p entries; by default 0."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        require_squares(self.noise_std or (), "noise_std", "standard deviations")
+        require_squares(self.noise_bound or (), "noise_bound", "bounds")
+        return self
+
+    def outputs(self, n: int) -> int:
+        """Number of measured outputs p of a plant of n states."""
+        return n if self.C is None else len(self.C)
+
+    def selects_all(self, n: int) -> bool:
+        """Whether C is the identity."""
+        return self.C is None or (
+            np.shape(self.C) == (n, n) and bool((np.array(self.C) == np.eye(n)).all())
+        )
+
+    @property
+    def is_noisy(self) -> bool:
+        """Whether there is any noise."""
+        return any(self.noise_std or ()) or any(self.noise_bound or ())
+
+    def variance(self, n: int) -> Vector:
+        """Variance of v, shape (p,)."""
+        variance = np.zeros(self.outputs(n))
+        if self.noise_std is not None:
+            variance = variance + np.square(self.noise_std)
+        return variance if self.noise_bound is None else variance + np.square(self.noise_bound) / 3
+
+    def check(self, n: int, why: str) -> None:
+        """Raise ValueError, with the key, unless the shapes fit a model of n states."""
+        place, p = "plant.measurement", self.outputs(n)
+        require_shape(self.C, f"{place}.C", (p, n), f"{why}; one row per output")
+        for key in ("noise_std", "noise_bound"):
+            require_length(getattr(self, key), f"{place}.{key}", p, "one per measured output")
 
 
 class WatchdogSection(ScenarioSection):

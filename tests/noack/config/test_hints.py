@@ -55,9 +55,9 @@ def mistake(path: Path, *settings: str) -> str:
 def test_hint_is_what_would_be_right(
     path: Path, setting: str, hint: str, before: list[str]
 ) -> None:
-    said = mistake(path, *before, setting)
-    begin, found, right = said.partition(hint)
-    assert found, said
+    message = mistake(path, *before, setting)
+    begin, found, right = message.partition(hint)
+    assert found, message
     key = begin.removeprefix("--set ").partition(" = ")[0].removesuffix(".0")
     tomllib.loads(f"value = {right}")
     value = f'{{model="scripted",lost={right}}}' if key == "network.loss.lost" else right
@@ -77,9 +77,9 @@ def test_hint_is_what_would_be_right(
     ],
 )
 def test_no_invalid_value_is_suggested(path: Path, setting: str) -> None:
-    said = mistake(path, setting)
-    assert "% is" not in said
-    assert "transposed" not in said
+    message = mistake(path, setting)
+    assert "% is" not in message
+    assert "transposed" not in message
 
 
 @pytest.mark.parametrize(

@@ -101,10 +101,10 @@ def test_an_invalid_impairment_is_refused_with_the_reason(
 )
 def test_a_delay_that_depends_on_the_loss_state_needs_a_loss_with_states(before: list[Any]) -> None:
     late = {"kind": "delay", "jitter_s": 0.1, "loss_correlation": 0.5}
-    found = message(TypeAdapter(LinkSettings), {"impairments": [*before, late]})
-    assert f"impairments.{len(before)}.loss_correlation: needs a loss before it" in found
-    told = {"kind": "loss", "loss": {"model": "bernoulli", "probability": 0.1}}
-    LinkSettings.model_validate_json(json.dumps({"impairments": [*before, told, late]}))
+    refused = message(TypeAdapter(LinkSettings), {"impairments": [*before, late]})
+    assert f"impairments.{len(before)}.loss_correlation: needs a loss before it" in refused
+    loss = {"kind": "loss", "loss": {"model": "bernoulli", "probability": 0.1}}
+    LinkSettings.model_validate_json(json.dumps({"impairments": [*before, loss, late]}))
 
 
 @given(st.floats(0, 0.99), st.floats(1, 1000))

@@ -15,7 +15,7 @@ LUENBERGER: dict[str, Any] = {"kind": "luenberger", "poles_per_s": [-5.0, -6.0]}
 POSITION: dict[str, Any] = {"C": [[1.0, 0.0]], "noise_std": [0.01]}
 
 
-def said_of(content: dict[str, Any], **changes: Any) -> str:
+def refusal_of(content: dict[str, Any], **changes: Any) -> str:
     content = json.loads(json.dumps(content))
     for key, value in changes.items():
         section, _, last = key.rpartition("__")
@@ -49,8 +49,8 @@ def said_of(content: dict[str, Any], **changes: Any) -> str:
 def test_a_mistake_in_disturbances_gets_one_line(
     content: dict[str, Any], one: dict[str, Any], line: str
 ) -> None:
-    said = said_of(content, plant__disturbances=[one])
-    assert said.startswith(f"file: {line}") or f"\nfile: {line}" in said, said
+    message = refusal_of(content, plant__disturbances=[one])
+    assert message.startswith(f"file: {line}") or f"\nfile: {line}" in message, message
 
 
 def test_a_state_disturbance_needs_a_linear_plant(content: dict[str, Any]) -> None:
@@ -61,7 +61,7 @@ def test_a_state_disturbance_needs_a_linear_plant(content: dict[str, Any]) -> No
         "system": {"kind": "cart_pole"}, "initial_state": [0.0] * 4,
         "disturbances": [{"kind": "uniform", "at": "state", "bound": [1.0] * 4}],
     }  # fmt: skip
-    assert said_of(content) == (
+    assert refusal_of(content) == (
         'file: plant.disturbances.0.at = "state": "state" needs a linear plant; '
         'this one can be disturbed at "input"'
     )
@@ -126,14 +126,14 @@ def test_a_mistake_in_measurements_or_observers_gets_one_line(
     content: dict[str, Any], measurement: Any, observer: Any, line: str
 ) -> None:
     changes = {"plant__measurement": measurement}
-    said = said_of(content, **changes, **({"observer": observer} if observer else {}))
-    assert said.startswith((f"file: {line}", line)), said
-    assert "\n" not in said
+    message = refusal_of(content, **changes, **({"observer": observer} if observer else {}))
+    assert message.startswith((f"file: {line}", line)), message
+    assert "\n" not in message
 
 
 def test_measurements_too_long_for_a_datagram_are_refused(content: dict[str, Any]) -> None:
     changes: dict[str, Any] = {"plant__measurement": POSITION, "plant__measure_every": 64}
-    assert said_of(content, **changes, observer=KALMAN) == (
+    assert refusal_of(content, **changes, observer=KALMAN) == (
         "file: plant.measure_every = 64: with an observer a measurement carries y and the inputs "
         "of 64 steps, 1 + 64 numbers; at most 64 fit"
     )

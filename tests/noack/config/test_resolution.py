@@ -145,11 +145,15 @@ def test_the_shipped_lane_scenario_has_the_papers_numbers() -> None:
     """Â, B̂, K, β, α, M − 1 and the box of Section V."""
     scenario = load(SCENARIOS / "lane_following.toml")
     loop, paper = loop_of(resolve(scenario)), lane_following({})
-    np.testing.assert_array_equal(loop.A_model, paper.A)
-    np.testing.assert_array_equal(loop.B_model, paper.B)
-    np.testing.assert_array_equal(loop.K, paper.K)
-    assert (scenario.trigger.beta, scenario.trigger.alpha_per_s) == (0.5, 0.25)
-    assert (scenario.trigger.floor, scenario.trigger.weight) == (0.0, None)
+    for found, expected in ((loop.A_model, paper.A), (loop.B_model, paper.B), (loop.K, paper.K)):
+        np.testing.assert_array_equal(found, expected)
+    rule = scenario.trigger
+    assert (rule.beta, rule.alpha_per_s, rule.floor, rule.weight) == (
+        0.5,
+        0.25,
+        0,
+        None,
+    )
     assert scenario.network.mansd == 4
     # Only the six physical parameters are uncertain: a ∈ ±0.1, b ∈ ±0.05.
     off_A, off_B = np.abs(loop.A - loop.A_model), np.abs(loop.B - loop.B_model)

@@ -75,9 +75,8 @@ def mistakes_with(text: str, folder: Path, settings: Sequence[str]) -> list[str]
 
 @pytest.mark.parametrize("text", [LANE, DOUBLE], ids=["lane", "double"])
 def test_the_scenarios_are_valid_before_mistakes_are_added(text: str, tmp_path: Path) -> None:
-    path = tmp_path / "some.toml"
-    path.write_text(text)
-    resolve(load(path))
+    (tmp_path / "some.toml").write_text(text)
+    resolve(load(tmp_path / "some.toml"))
 
 
 # One setting each that makes LANE invalid: how its line begins after the file name, and what the
@@ -262,7 +261,7 @@ def test_every_mistake_gets_its_own_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "told"),
+    ("settings", "expected"),
     [
         (["trigger.beta=-1"], ["--set trigger.beta = -1: should be greater than 0"]),
         (["network.loss={model='bernoulli'}"], ["--set network.loss.probability: missing "]),
@@ -280,13 +279,13 @@ def test_every_mistake_gets_its_own_line(tmp_path: Path) -> None:
     ],
 )
 def test_an_error_in_a_setting_is_not_attributed_to_the_file(
-    settings: list[str], told: list[str], tmp_path: Path
+    settings: list[str], expected: list[str], tmp_path: Path
 ) -> None:
-    name = "1" if told[0].startswith("FILE: ") else '"lane"'
+    name = "1" if expected[0].startswith("FILE: ") else '"lane"'
     text = LANE.replace('name = "lane"', f"name = {name}", 1)
     lines = mistakes_with(text, tmp_path, settings)
-    assert len(lines) == len(told)
-    for line, begins in zip(lines, told, strict=True):
+    assert len(lines) == len(expected)
+    for line, begins in zip(lines, expected, strict=True):
         assert line.startswith(begins), line
 
 

@@ -48,16 +48,6 @@ X0 = np.array([1.0, -0.5])
 
 
 @VERSIONS
-def test_a_linear_fmu_moves_like_the_linear_system(version: int, tmp_path: Path) -> None:
-    parameters = {"mu": 0.3, "k": 4.0, "linear": True}
-    system = FmuSystem(settings(build(tmp_path, version), parameters=parameters), X0)
-    A, B = np.array([[0.0, 1.0], [-4.0, -0.3]]), np.array([[0.0], [1.0]])
-    exact = motion(LinearSystem(A, B, X0, step_ns=H_NS), INPUTS)
-    # The error of the fourth-order Runge-Kutta method with steps of 125 µs is far below.
-    np.testing.assert_allclose(motion(system, INPUTS), exact, atol=1e-11)
-
-
-@VERSIONS
 def test_van_der_pol_agrees_with_another_integrator(version: int, tmp_path: Path) -> None:
     def van_der_pol(t: float, z: np.ndarray, v: np.ndarray) -> tuple[float, float]:
         return float(z[1]), 2.0 * (1.0 - z[0] ** 2) * z[1] - z[0] + v[0]
@@ -76,10 +66,8 @@ def test_van_der_pol_agrees_with_another_integrator(version: int, tmp_path: Path
 @VERSIONS
 def test_the_same_steps_give_bit_identical_states(version: int, tmp_path: Path) -> None:
     loaded = settings(build(tmp_path, version))
-    assert (
-        motion(FmuSystem(loaded, X0), INPUTS).tobytes()
-        == motion(FmuSystem(loaded, X0), INPUTS).tobytes()
-    )
+    one, other = (motion(FmuSystem(loaded, X0), INPUTS[:50]) for _ in "ab")
+    assert one.tobytes() == other.tobytes()
 
 
 @VERSIONS

@@ -201,18 +201,3 @@ def test_a_scalar_box_is_as_large_as_it_can_be(alpha: float, share_of_A: float) 
         state, p = certified.state, certified.input_error
         w = found.halfwidth_A.item() * state + found.halfwidth_B.item() * (-k * state + p)
         assert certified.mismatch == pytest.approx(w, rel=1e-3)
-
-
-@settings(SEARCH, max_examples=4)
-@given(systems(mismatch=0.0, hold_steps=0, delay_steps=0, step_share=0.01))
-def test_an_empty_box_is_the_model(system: System) -> None:
-    n, m = system.B.shape
-    box = Case(system, np.zeros((n, n)), np.zeros((n, m)))
-    for conditions in (NetworkConditions(system.mansd), system.conditions):
-        try:
-            own = system.certify(conditions)
-        except VoidError:
-            continue
-        found = box.certify(conditions)
-        for mine, theirs in zip(found, own, strict=True):
-            assert mine == pytest.approx(theirs, rel=1e-9, abs=1e-9)

@@ -12,8 +12,7 @@ from scipy.linalg import expm
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.error_bounds import ErrorBounds, ErrorMonitor
 from noack.trigger.decaying import DecayingTrigger
-from tests.noack.theory.exact_loops import observe
-from tests.noack.theory.loops import SEARCH, System, seeds, systems
+from tests.noack.theory.loops import seeds
 
 NS = 1e-9
 
@@ -115,47 +114,3 @@ def test_the_identity_bounds_the_error_for_every_trigger_plant_and_network(
         error = float(np.linalg.norm(history.weight @ moment.e_c))
         largest = max(largest, error)
         assert error <= found.identity + 1e-12 * max(largest, 1.0)
-
-
-def in_continuous_time(system: System, seed: int, forgotten: int) -> float:
-    """The largest share of eq:LossEv3 that ‖e_c‖ uses; the first missing events are left out."""
-    H, alpha, beta, W = system.H, system.alpha, system.beta, system.weight
-    trigger = DecayingTrigger(beta, alpha, 0.0, W)
-    largest = 0.0
-    for run, _ in observe(system, 6.0, seed, samples=2):
-        monitor, received = ErrorMonitor(H, trigger), -1
-        moments = [
-            *((state.t_s, k, state) for k, state in enumerate(run.before)),
-            *((float(t_s), -1, None) for t_s in np.linspace(0, run.reached_s, 40)),
-        ]
-        left_out = 0
-        for t_s, event, state in sorted(moments, key=lambda h: (h[0], h[1])):
-            t_ns = round(t_s * 1e9)
-            if state is None:
-                now = run.at([t_s])
-                e_s, e_c = now.e_s[0], now.e_c[0]
-            else:
-                e_s, e_c = state.e_s, run.after[event].e_c
-                if run.delivered[event]:
-                    received = event
-                elif left_out < forgotten:
-                    left_out += 1
-                    continue
-            # The sample at an event shows the values after the reset.
-            bounds = monitor.sample(t_ns, e_s, event, received)
-            if system.known_start or received >= 0:
-                share = float(np.linalg.norm(W @ e_c)) / bounds.printed
-                assert bounds.identity <= bounds.printed * (1 + 1e-6)
-                largest = max(largest, share)
-    return largest
-
-
-# Times are rounded to whole nanoseconds: 1e-9 s at rates of up to some 10 /s.
-TO_THE_NANOSECOND = 1 + 1e-6
-
-
-@settings(SEARCH, max_examples=6)
-@given(systems(), seeds)
-def test_the_papers_formula_holds_in_its_loop(system: System, seed: int) -> None:
-    """eq:LossEv3, for a continuous trigger; there, the bound of the identity is the smaller one."""
-    assert in_continuous_time(system, seed, 0) <= TO_THE_NANOSECOND

@@ -1,5 +1,4 @@
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
@@ -44,23 +43,3 @@ def test_the_sum_is_the_sum_of_the_propagated_jumps(
         expected += expm(H * (t_ns - then_ns) * 1e-9) @ e_s
     # Twelve terms with at most twelve roundings of about 1e-15 each, and their maximum growth.
     np.testing.assert_allclose(missed.total(), expected, atol=1e-12 * GROWTH)
-
-
-def test_the_sum_is_zero_without_missing_events() -> None:
-    missed = ModelDifference(H)
-    missed.advance_to(10**9)
-    assert missed.total().tolist() == [0.0, 0.0, 0.0]
-    missed.event(0, np.ones(3))
-    assert missed.total().tolist() == [1.0, 1.0, 1.0]
-    missed.received(0)
-    missed.advance_to(2 * 10**9)
-    assert missed.total().tolist() == [0.0, 0.0, 0.0]
-
-
-def test_a_scalar_jump_decays_with_the_model() -> None:
-    missed = ModelDifference(np.array([[-2.0]]))
-    missed.event(0, np.array([3.0]))
-    missed.advance_to(500_000_000)
-    missed.event(1, np.array([1.0]))
-    missed.advance_to(1_000_000_000)
-    assert missed.total().item() == pytest.approx(3 * np.exp(-2) + np.exp(-1), rel=1e-14)

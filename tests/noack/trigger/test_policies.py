@@ -100,19 +100,6 @@ def test_the_dynamic_rule_integrates_its_variable(
             assert found.event == (excess > 0)
 
 
-def test_dynamic_waits_longer_than_static_from_the_same_state() -> None:
-    """Girard (2015), Proposition: with any η ≥ 0, each event also satisfies the rule w < 0."""
-    rng = np.random.default_rng(1)
-    for _ in range(200):
-        trigger = Trigger(
-            DynamicTrigger(0.3, 1.0, 0.5, P, Q, BK, initial_dynamic_variable=rng.uniform(0, 1))
-        )
-        trigger.start(0, rng.normal(size=2))
-        x, e = rng.normal(size=(2, 2))
-        if trigger.test(MS, x, e).event:
-            assert 0.3 * x @ Q @ x - 2 * x @ P @ BK @ e < 0
-
-
 def events_ms(policy: Policy, error: Callable[[int, int], float]) -> Iterator[int]:
     """Events in the first second, tested every ms; the error depends on the last event's age."""
     trigger, last = Trigger(policy), 0

@@ -71,38 +71,28 @@ def _compiled(version: int) -> bytes:
 
 
 def _description(version: int) -> str:
-    if version == 2:
-        variables = "\n".join(
-            f'<ScalarVariable name="{name}" valueReference="{number}" causality="{causality}"'
-            f' variability="{variability}"{_given("initial", initial)}>'
-            f"<{kind}{_given('start', start)}/></ScalarVariable>"
-            for number, (name, kind, causality, variability, initial, start) in enumerate(VARIABLES)
-        )
-        return f"""<?xml version="1.0" encoding="UTF-8"?>
-<fmiModelDescription fmiVersion="2.0" modelName="Oscillator" guid="{{oscillator}}"
- generationTool="noack's tests">
-<CoSimulation modelIdentifier="oscillator" canHandleVariableCommunicationStepSize="true"/>
-<ModelVariables>{variables}</ModelVariables>
-<ModelStructure><Outputs><Unknown index="1"/><Unknown index="2"/></Outputs></ModelStructure>
-</fmiModelDescription>"""
-    variables = "\n".join(
-        f'<{_TYPES_3.get(kind, kind)} name="{name}" valueReference="{number}"'
-        f' causality="{causality}" variability="{variability}"{_given("initial", initial)}'
-        + (
-            f'><Start value="{start}"/></String>'
-            if kind == "String"
-            else f"{_given('start', start)}/>"
-        )
-        for number, (name, kind, causality, variability, initial, start) in enumerate(VARIABLES)
-    )
+    variables = "\n".join(_variable(version, number, *one) for number, one in enumerate(VARIABLES))
+    identity, structure = {
+        2: ("guid", '<Outputs><Unknown index="1"/><Unknown index="2"/></Outputs>'),
+        3: ("instantiationToken", '<Output valueReference="0"/><Output valueReference="1"/>'),
+    }[version]
     return f"""<?xml version="1.0" encoding="UTF-8"?>
-<fmiModelDescription fmiVersion="3.0" modelName="Oscillator" instantiationToken="{{oscillator}}"
+<fmiModelDescription fmiVersion="{version}.0" modelName="Oscillator" {identity}="{{oscillator}}"
  generationTool="noack's tests">
 <CoSimulation modelIdentifier="oscillator" canHandleVariableCommunicationStepSize="true"/>
 <ModelVariables>{variables}</ModelVariables>
-<ModelStructure><Output valueReference="0"/><Output valueReference="1"/></ModelStructure>
+<ModelStructure>{structure}</ModelStructure>
 </fmiModelDescription>"""
 
 
-def _given(key: str, value: str | None) -> str:
-    return "" if value is None else f' {key}="{value}"'
+def _variable(version: int, number: int, name: str, kind: str, *given: str | None) -> str:
+    keys = ("causality", "variability", "initial")
+    attributes = f'name="{name}" valueReference="{number}"' + "".join(
+        f' {key}="{value}"' for key, value in zip(keys, given, strict=False) if value is not None
+    )
+    start = "" if given[3] is None else f' start="{given[3]}"'
+    if version == 2:
+        return f"<ScalarVariable {attributes}><{kind}{start}/></ScalarVariable>"
+    if kind == "String":
+        return f'<String {attributes}><Start value="{given[3]}"/></String>'
+    return f"<{_TYPES_3.get(kind, kind)} {attributes}{start}/>"
