@@ -105,8 +105,7 @@ class Fidelity:
     max_event_difference_s: float | None
     """Largest time difference between ideal loop and live run, over the events that both have."""
     first_different_event: int | None
-    """First event that is more than ten measurements apart, or that only one of the two has. From
-    there on the same packet fates apply to different events."""
+    """As in :class:`FidelityStage`. From there on the packet fates apply to different events."""
     t_s: Vector
     """(samples,) times of the measurements."""
     stage_norms: Matrix
@@ -170,9 +169,7 @@ def fidelity_for_summary(record: RunRecord) -> FidelityPart | NoFidelityPart:
 def compute_fidelity(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelity:
     """Compare a live run with the ideal loop, effect by effect.
 
-    Args:
-        record: the run's record.
-        max_events: largest number of events of the ideal loop; an unstable loop may exceed it.
+    The ideal loop may have at most ``max_events`` events, which an unstable loop may exceed.
 
     Raises:
         IncomparableError: the run diverged, its record is too short or incomplete, or rounding
@@ -232,11 +229,7 @@ def compute_fidelity(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelit
 def _require_stable_events(
     system: ContinuousLoop, schedule: StepSchedule, x: Matrix, limit: float, known_start: bool
 ) -> None:
-    """Require that a change of x(0) by rounding changes the simulation ``x`` less than ``limit``.
-
-    Raises:
-        IncomparableError: it does not.
-    """
+    """Require that a change of x(0) by rounding changes ``x`` by less than ``limit``."""
     other = replace(system.loop, x0=system.loop.x0 * (1 + _NUDGE))
     nudged = SampledLoop(ContinuousLoop(other, system.trigger), schedule, known_start=known_start)
     moved = nudged.run(delay=True, hold=True).x[schedule.measured] - x

@@ -33,9 +33,8 @@ VIOLATION = "violation"
 def drops_by_cause(outcomes: PacketOutcome) -> dict[str, int]:
     """Return the number of lost updates by cause, without causes of no losses."""
     fates = outcomes.rows["fate"]
-    causes = {
-        fate.name.lower(): int((fates == fate).sum()) for fate in Fate if not fate.effective
-    } | {"delivered_out_of_order": int((effective(fates) & outcomes.lost).sum())}
+    causes = {one.name.lower(): int((fates == one).sum()) for one in Fate if not one.effective}
+    causes["delivered_out_of_order"] = int((effective(fates) & outcomes.lost).sum())
     return {cause: n for cause, n in causes.items() if n}
 
 
@@ -139,7 +138,7 @@ def list_violations(
 
 def _largest_mansd(record: RunRecord, since_ns: int) -> int:
     """The largest M − 1 in force at any time from ``since_ns`` on."""
-    caps = [(0, record.scenario.network.mansd)]
-    caps += [(one.everywhere_ns, one.scenario.network.mansd) for one in changes_of(record)]
-    ends_ns = [*(from_ns for from_ns, _ in caps[1:]), NEVER_NS]
-    return max(cap for (_, cap), end_ns in zip(caps, ends_ns, strict=True) if end_ns > since_ns)
+    changes = changes_of(record)
+    caps = [record.scenario.network.mansd, *(one.scenario.network.mansd for one in changes)]
+    ends_ns = [*(one.everywhere_ns for one in changes), NEVER_NS]
+    return max(cap for cap, end_ns in zip(caps, ends_ns, strict=True) if end_ns > since_ns)

@@ -72,11 +72,7 @@ def summarise(
 ) -> RunSummary:
     """Return the summary of a run, without the results of replay, fidelity and claims.
 
-    Args:
-        record: the run's record.
-        exit_status: the run's exit status.
-        reason: why the run ended.
-        startup_s: wall time from the launch to simulated time 0; None if unknown.
+    ``startup_s`` is the wall time from the launch to simulated time 0; None if unknown.
     """
     scenario, live = record.scenario, record.kind == "live"
     missing, lost, diverged = missing_rows(record), unintended_losses(record), _divergence(record)
@@ -162,17 +158,12 @@ def _signals(record: RunRecord, joined: AlignedRun) -> dict[str, Any]:
     }
 
 
-def _true_e_c(record: RunRecord, joined: AlignedRun) -> NDArray[np.float64]:
-    """Return ‖x_c − x‖_W with the plant's own x, from the controller's first update on."""
-    e_c = joined.x_c - true_states(record[PLANT_STEP], joined.t_ns)
-    if record.loop.weight is not None:
-        e_c = e_c @ record.loop.weight.T
-    norms = row_norms(e_c)
-    return norms[np.isfinite(norms) & joined.since_delivery(record.scenario)]
-
-
 def _estimation(record: RunRecord, joined: AlignedRun) -> EstimationPart | None:
-    found = estimation_summary(record, _or_none(np.max, _true_e_c(record, joined)))
+    # ‖x_c − x‖_W with the plant's own x, from the controller's first update on
+    e_c = joined.x_c - true_states(record[PLANT_STEP], joined.t_ns)
+    norms = row_norms(e_c if record.loop.weight is None else e_c @ record.loop.weight.T)
+    norms = norms[np.isfinite(norms) & joined.since_delivery(record.scenario)]
+    found = estimation_summary(record, _or_none(np.max, norms))
     return None if found is None else EstimationPart(**found)
 
 
@@ -198,8 +189,8 @@ def _watchdog(record: RunRecord) -> WatchdogPart:
 
 def _rejected(channel: Mapping[str, Any]) -> dict[str, int]:
     """The datagrams that a process rejected, by reason, on all its sockets."""
-    first, second = channel, channel.get("acknowledgements") or {}
-    return dict(Counter(first.get("rejected") or {}) + Counter(second.get("rejected") or {}))
+    both = (channel, channel.get("acknowledgements") or {})
+    return dict(sum((Counter(one.get("rejected") or {}) for one in both), Counter()))
 
 
 def _why_failed(
@@ -213,8 +204,8 @@ def _why_failed(
             at_s = notice["t_ns"] * 1e-9
             return f"the {notice['process']} failed at {at_s:g} s: {notice['text']}"
     # Missing last rows of a killed process are no failure: a restarted process replaced it.
-    lacking = [f"{missing[table]:,} of {table}" for table in record.tables if missing[table] > 0]
-    return f"rows are missing from the record: {', '.join(lacking)}" if lacking else None
+    incomplete = [f"{missing[table]:,} of {table}" for table in record.tables if missing[table] > 0]
+    return f"rows are missing from the record: {', '.join(incomplete)}" if incomplete else None
 
 
 def _divergence(record: RunRecord) -> Divergence | None:

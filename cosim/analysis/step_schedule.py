@@ -49,62 +49,60 @@ def live_run(record: RunRecord) -> LiveRun:
             model.
         CallerError: exact simulation does not support the scenario.
     """
-    if changes_of(record):
-        raise IncomparableError(
-            "no ideal loop is like it: its settings were changed during the run"
-        )
+    changed = bool(changes_of(record))
+    _require(not changed, "the ideal loop has no changes of settings, as this run has")
     record.scenario.coverage.require_unchanging()
     record.scenario.coverage.require_exact()
     steps, sensor = record[PLANT_STEP], record[SENSOR_MEASUREMENT]
-    if (again := record.restarted()) is not None:
-        raise IncomparableError(
-            f"the ideal loop has no restarts: {again} was restarted during the run"
-        )
-    if len(sensor) < _LEAST_MEASUREMENTS:
-        raise IncomparableError(
-            f"the record holds {len(sensor)} measurements; {_LEAST_MEASUREMENTS} are needed"
-        )
+    restarted, count = record.restarted(), len(sensor)
+    why = f"the ideal loop has no restarts: {restarted} was restarted during the run"
+    _require(restarted is None, why)
+    _require(
+        count >= _LEAST_MEASUREMENTS,
+        f"the record holds {count} measurements; {_LEAST_MEASUREMENTS} are needed",
+    )
     period_ns = record.scenario.timing.plant_period_ns
     last = int(sensor["t_ns"][-1]) // period_ns
     steps = steps[: last + 1]
-    if len(steps) <= last or (steps["sequence"] != np.arange(last + 1)).any():
-        raise IncomparableError("steps of the plant are missing from the record")
-    if (np.diff(sensor["input"], prepend=-1) != 1).any():
-        raise IncomparableError("measurements are missing from the sensor's record")
+    whole = len(steps) > last and np.array_equal(steps["sequence"], np.arange(last + 1))
+    _require(whole, "steps of the plant are missing from the record")
+    whole = np.array_equal(sensor["input"], np.arange(count))
+    _require(whole, "measurements are missing from the sensor's record")
     _require_times(record)
-    if not np.abs(steps["x"]).max() < _LARGEST:  # also true for NaN
-        raise IncomparableError("the run diverged")
+    _require(bool(np.abs(steps["x"]).max() < _LARGEST), "the run diverged")  # also for NaN
     measured = np.zeros(last + 1, dtype=np.bool_)
     measured[sensor["t_ns"] // period_ns] = True
-    ticks, taken = _ticks(record[CONTROLLER_STEP], record[CONTROLLER_DELIVERY])
+    ticks, accepted = _ticks(record[CONTROLLER_STEP], record[CONTROLLER_DELIVERY])
     latched = _latched(steps["actuation"], ticks)
     seen = read_conditions(record)
-    if len(seen.watchdog.t_s) or len(seen.safe_input.t_s):
-        raise IncomparableError(
-            "for a time the input was the watchdog's, or a safe one, which no ideal loop has"
-        )
+    _require(
+        not (len(seen.watchdog.t_s) or len(seen.safe_input.t_s)),
+        "the ideal loop has no watchdog and no safe input, which this run applied for a time",
+    )
     events = sensor[sensor["event"] != NO_SEQUENCE]
     numbers, event_ns = np.arange(len(events)), events["t_ns"]
     acts_at_tick = np.searchsorted(ticks.newest, numbers)
     acts_at_step = np.searchsorted(latched.newest, numbers)
     act_ns = np.append(ticks.model_ns, _NEVER_NS)[acts_at_tick]
+    network = network_fates(record.scenario)
     schedule = StepSchedule(
         period_ns=period_ns,
         measured=measured,
-        delivered=_fates(taken, len(events), network_fates(record.scenario)),
-        delay_ns=_delays(taken, act_ns - event_ns, act_ns < _NEVER_NS),
-        delay_steps=_delays(taken, acts_at_step - event_ns // period_ns, acts_at_step <= last),
+        delivered=lambda event: event in accepted if event < len(events) else network(event),
+        delay_ns=_delays(accepted, act_ns - event_ns, act_ns < _NEVER_NS),
+        delay_steps=_delays(accepted, acts_at_step - event_ns // period_ns, acts_at_step <= last),
         model_ns=latched.model_ns,
     )
     return LiveRun(schedule, steps["x"][measured], event_ns * 1e-9)
 
 
-def _require_times(record: RunRecord) -> None:
-    """Require possible times: with others, as in a damaged record, a simulation would not end.
+def _require(met: bool, why: str) -> None:
+    if not met:
+        raise IncomparableError(why)
 
-    Raises:
-        IncomparableError: a time is impossible.
-    """
+
+def _require_times(record: RunRecord) -> None:
+    """Require possible times: with others, as in a damaged record, a simulation would not end."""
     horizon_ns = record.scenario.timing.horizon_ns
     for table, column in (
         (SENSOR_MEASUREMENT, "t_ns"),
@@ -112,8 +110,9 @@ def _require_times(record: RunRecord) -> None:
         (CONTROLLER_DELIVERY, "model_t_ns"),
     ):
         times_ns = record[table][column]
-        if (times_ns < 0).any() or (times_ns > horizon_ns).any() or (np.diff(times_ns) < 0).any():
-            raise IncomparableError(f"the record's {table} has times that no run has")
+        possible = (times_ns >= 0).all() and (times_ns <= horizon_ns).all()
+        possible = possible and (np.diff(times_ns) >= 0).all()
+        _require(bool(possible), f"the record's {table} has times that no run has")
 
 
 class _Ticks(NamedTuple):
@@ -128,8 +127,8 @@ def _ticks(ticks: Rows, deliveries: Rows) -> tuple[_Ticks, set[int]]:
     """Return the origin of each actuation, and the updates that the controller accepted."""
     inputs = np.sort(np.concatenate([ticks["input"], deliveries["input"]]))
     whole = np.array_equal(inputs, np.arange(len(inputs)))
-    if not whole or (ticks["sequence"] != np.arange(len(ticks))).any():
-        raise IncomparableError("ticks or deliveries are missing from the controller's record")
+    whole = whole and np.array_equal(ticks["sequence"], np.arange(len(ticks)))
+    _require(whole, "ticks or deliveries are missing from the controller's record")
     sequences = np.concatenate([[NO_SEQUENCE], deliveries["sequence"]])
     newest = sequences[np.searchsorted(deliveries["input"], ticks["input"])]
     return _Ticks(ticks["model_t_ns"], newest), set(deliveries["sequence"].tolist())
@@ -137,23 +136,18 @@ def _ticks(ticks: Rows, deliveries: Rows) -> tuple[_Ticks, set[int]]:
 
 def _latched(actuations: NDArray[np.int64], ticks: _Ticks) -> _Ticks:
     """Return the origin of the input held from each step on; −1 before the first."""
-    if actuations.max(initial=NO_SEQUENCE) >= len(ticks.newest):
-        raise IncomparableError("the controller's record ends before the plant's")
+    known = bool(actuations.max(initial=NO_SEQUENCE) < len(ticks.newest))
+    _require(known, "the controller's record ends before the plant's")
     by_sequence = _Ticks(
         np.append(ticks.model_ns, NO_ACTUATION), np.append(ticks.newest, NO_SEQUENCE)
     )
     return _Ticks(by_sequence.model_ns[actuations], by_sequence.newest[actuations])
 
 
-def _fates(taken: set[int], known: int, network: Callable[[int], bool]) -> Callable[[int], bool]:
-    """Return whether the controller accepted each update; for other events, ask ``network``."""
-    return lambda event: event in taken if event < known else network(event)
-
-
 def _delays(
-    taken: set[int], delays: NDArray[np.int64], acted: NDArray[np.bool_]
+    accepted: set[int], delays: NDArray[np.int64], acted: NDArray[np.bool_]
 ) -> Callable[[int], int]:
     """Return the recorded delays; for events that the run did not have, their median."""
-    usable = [int(delays[event]) for event in taken if event < len(delays) and acted[event]]
+    usable = [int(delays[event]) for event in accepted if event < len(delays) and acted[event]]
     usual = int(np.median(usable)) if usable else 0
     return lambda event: int(delays[event]) if event < len(delays) else usual

@@ -23,13 +23,11 @@ def lateness_us(record: RunRecord, role: str) -> NDArray[np.float64]:
     """
     if role == "netem":
         outcomes = packet_outcomes(record)
-        rows, due_ns = outcomes.rows, outcomes.event_ns
+        late_ns = outcomes.rows["now_ns"] - outcomes.event_ns
     else:
         steps = {"plant": PLANT_STEP, "sensor": SENSOR_MEASUREMENT, "controller": CONTROLLER_STEP}
-        rows = record[steps[role]]
-        due_ns = rows["t_ns"]
-    late_us: NDArray[np.float64] = (rows["now_ns"] - due_ns) / (1e3 * record.scenario.speed)
-    return late_us
+        late_ns = record[steps[role]]["now_ns"] - record[steps[role]]["t_ns"]
+    return np.asarray(late_ns / (1e3 * record.scenario.speed))
 
 
 def lateness(record: RunRecord, role: str) -> LatenessPart:
@@ -68,7 +66,6 @@ def latency(record: RunRecord) -> LatencyPart:
 
 
 def _quantiles(times_us: NDArray[np.float64]) -> dict[str, float | None]:
-    if not len(times_us):
-        return dict.fromkeys(("p50", "p99", "p999", "max"))
-    values = np.quantile(times_us, [0.5, 0.99, 0.999, 1.0]).tolist()
-    return dict(zip(("p50", "p99", "p999", "max"), values, strict=True))
+    shares = {"p50": 0.5, "p99": 0.99, "p999": 0.999, "max": 1.0}
+    known = len(times_us) > 0
+    return {key: float(np.quantile(times_us, q)) if known else None for key, q in shares.items()}

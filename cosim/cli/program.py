@@ -43,8 +43,8 @@ class Program(TyperGroup):
             )
         except typer.TyperException as error:
             status = ExitStatus.CALLER
-            if said := self._line(error, words):
-                failed(said, status, who=NAME, as_json="--json" in words)
+            if message := self._line(error, words):
+                failed(message, status, who=NAME, as_json="--json" in words)
         except OSError as error:  # help is written to a full disk
             status = failed(
                 f"cannot write: {why(error)}",

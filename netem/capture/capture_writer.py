@@ -2,9 +2,8 @@
 
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
 from typing import NamedTuple
@@ -32,11 +31,12 @@ class CaptureWriter:
     """An open capture file.
 
     Create it before the packet path applies its real-time settings: the constructor may compile
-    for some seconds, and the new thread would inherit the settings.
+    for some seconds, and the new thread would inherit the settings. Each link has two interfaces:
+    the clients' side, then the server's.
 
     Args:
         path: the file, which is replaced; a FIFO; ``-`` for standard output.
-        specs: the relay's links. Each has two interfaces: the clients' side, then the server's.
+        specs: the relay's links.
         batches: maximum number of queued batches.
 
     Raises:
@@ -110,31 +110,19 @@ class CaptureWriter:
             self._fail(f"nothing could be written for {patience_s:g} s")
 
     def _run(self) -> None:
-        self._attempt(lambda: self._write(self._section.header()))
-        while (batch := self._queue.get()) is not None:
-            self._attempt(partial(self._write_batch, batch))
-        self._attempt(self._finish)
-        os.close(self._file)
-
-    def _attempt(self, step: Callable[[], None]) -> None:
-        """Run a step unless the capture has ended; an error ends it."""
-        if self.error is not None:
-            return
         try:
-            step()
-        except OSError as error:
-            self._fail(error.strerror or str(error))
-        except ValueError as error:
-            self._fail(str(error))
-
-    def _write_batch(self, batch: _Batch) -> None:
-        self._section.miss(batch.missing)
-        self._write(self._section.packets(batch.events, batch.data))
-        self._written += batch.events.size
-
-    def _finish(self) -> None:
-        self._section.miss(self._unreported)
-        self._write(self._section.statistics())
+            self._write(self._section.header())
+            while self.error is None and (batch := self._queue.get()) is not None:
+                self._section.miss(batch.missing)
+                self._write(self._section.packets(batch.events, batch.data))
+                self._written += batch.events.size
+            if self.error is None:
+                self._section.miss(self._unreported)
+                self._write(self._section.statistics())
+        except (OSError, ValueError) as error:
+            self._fail(getattr(error, "strerror", None) or str(error))
+        finally:
+            os.close(self._file)
 
     def _write(self, blocks: bytes | memoryview) -> None:
         view = memoryview(blocks)

@@ -1,24 +1,13 @@
-"""Live control of a relay over zenoh, on loopback.
+"""Live control of a relay over zenoh, on loopback, in a thread of its own.
 
-A running emulator listens on a free TCP port of the loopback interface. Its session file
-(:mod:`netem.control.emulator_session`) holds the address. Below ``netem/NAME`` it
-
-* answers ``report`` with statistics (:mod:`netem.control.emulator_statistics`);
-* answers ``settings`` with the settings of each link, as words and as a table;
-* answers ``change``: checks and applies new settings of a link, and answers as ``settings`` does;
-* publishes ``statistics`` once a second.
-
-A query is a JSON object. It must hold ``token``, the secret of the session file. ``change`` takes
-``link`` (optional if there is only one), ``direction`` (``forward``, the default, ``reverse`` or
-``both``) and either ``words`` (of ``tc netem``) or ``settings`` (a
-:class:`~noack.impairments.link_settings.LinkSettings`). The new settings replace the old ones, as
-with ``tc qdisc change``. If words name files, the client reads them and sends their content. A
-query with a mistake is answered with one line, and changes nothing.
+A running emulator listens on a free TCP port of the loopback interface; its session file
+(:mod:`netem.control.emulator_session`) holds the address and a secret. Below ``netem/NAME`` it
+answers ``report``, ``settings`` and ``change``, and publishes ``statistics`` once a second, as
+docs/netem-control.md describes. A query with a mistake is answered with one line, and changes
+nothing.
 
 zenoh authenticates each connection with the secret as its password, by challenge and response: this
 never sends the secret itself. In addition, each query must contain the secret.
-
-All of this runs in a thread of its own; see :mod:`netem.control.command_queue`.
 """
 
 import hmac

@@ -16,7 +16,6 @@ from netem.engine.relay_interface import (
     DIRECTIONS,
     Direction,
     DirectionReport,
-    FlowReport,
     LinkReport,
 )
 from noack.core.clock import NS_PER_S
@@ -75,7 +74,10 @@ class FlowStatistics(TypedDict):
 
 
 class DirectionStatistics(TypedDict):
-    """One direction of a link."""
+    """One direction of a link; see :class:`netem.engine.relay_interface.DirectionReport`.
+
+    The counts are those of :class:`noack.impairments.link_records.Counters`.
+    """
 
     words: str
     """Its settings in the words of ``tc netem``; long tables are cut."""
@@ -85,32 +87,23 @@ class DirectionStatistics(TypedDict):
     received: int
     received_bytes: int
     forwarded: int
-    """Forwarded datagrams and copies."""
     forwarded_bytes: int
     fates: dict[str, int]
     """Datagrams by fate: ``delivered``, ``dropped`` by a loss model, ``forced`` by the cap,
     ``corrupted``, ``overflowed``, ``blacked_out``."""
     duplicated: int
     delivered_out_of_order: int
-    """Forwarded after a newer datagram of their flow: stale at the receiver."""
     held_back: int
-    """Held back for the guarantee."""
     longest_loss_burst: int
-    """Maximum number of consecutive datagrams of a flow that were not effectively delivered."""
     mansd: int | None
     """The cap on that number (M − 1); null if there is none."""
     loss: LossStatistics
     unintended: dict[str, int]
-    """Unintended losses by cause; any of them voids the guarantee."""
     in_flight: int
-    """Datagrams that are delayed or wait for a bottleneck now."""
     most_in_flight: int
     flows: list[FlowStatistics]
-    """At most 16: the present clients that sent most."""
     delay_ns: DelayQuantiles
-    """From arrival to departure."""
     lateness_ns: DelayQuantiles
-    """From the scheduled to the actual departure of a delayed datagram."""
     delay_histogram: list[list[int]]
     """Lower limit in ns and count of each bin that is not empty."""
     lateness_histogram: list[list[int]]
@@ -207,7 +200,10 @@ def _direction(
         "unintended": dict(report.unintended),
         "in_flight": report.in_flight,
         "most_in_flight": counters.most_in_flight,
-        "flows": [_flow(flow) for flow in report.flows],
+        "flows": [
+            FlowStatistics(flow=flow, client=text_of(client), packets=n, longest_loss_burst=burst)
+            for flow, client, n, burst in report.flows
+        ],
         "delay_ns": quantiles(report.delays),
         "lateness_ns": quantiles(report.lateness),
         "delay_histogram": coarse(report.delays),
@@ -266,12 +262,3 @@ def quantiles(counts: NDArray[np.int64]) -> DelayQuantiles:
         return {"p50": None, "p99": None, "p999": None, "max": None}
     p50, p99, p999, largest = (round(quantile_ns(counts, q)) for q in (0.5, 0.99, 0.999, 1.0))
     return {"p50": p50, "p99": p99, "p999": p999, "max": largest}
-
-
-def _flow(flow: FlowReport) -> FlowStatistics:
-    return {
-        "flow": flow.flow,
-        "client": text_of(flow.client),
-        "packets": flow.packets,
-        "longest_loss_burst": flow.longest_loss_burst,
-    }

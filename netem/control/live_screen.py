@@ -25,11 +25,8 @@ _MESSAGES_SHOWN = 3
 class Screen:
     """Shows statistics within the context; the last picture remains afterwards.
 
-    Messages on standard error are shown below the picture, and written at the end.
-
-    Args:
-        title: name of the emulator.
-        as_json: print each document as a line of JSON instead.
+    Messages on standard error are shown below the picture, and written at the end. With ``as_json``
+    it prints each document as a line of JSON instead.
     """
 
     def __init__(self, title: str, *, as_json: bool = False) -> None:
@@ -47,16 +44,15 @@ class Screen:
 
     def __enter__(self) -> Self:
         if self._console.is_terminal and not self._console.is_dumb_terminal and not self._as_json:
+            live = Live(
+                console=self._console, screen=True, auto_refresh=False,
+                redirect_stdout=False, redirect_stderr=False,
+            )  # fmt: skip
             with ExitStack() as stack:
                 stack.callback(self._leave)
                 stack.enter_context(contextlib.redirect_stderr(self._messages))
                 self._keys = stack.enter_context(_single_keys())
-                self._live = stack.enter_context(
-                    Live(
-                        console=self._console, screen=True, auto_refresh=False,
-                        redirect_stdout=False, redirect_stderr=False,
-                    )
-                )  # fmt: skip
+                self._live = stack.enter_context(live)
                 self._stack = stack.pop_all()
             self._draw()
         return self

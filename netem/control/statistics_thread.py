@@ -17,13 +17,8 @@ _JOIN_S = 10.0
 class StatisticsThread:
     """Calls ``show`` with new statistics at once and then every ``period_s``, within the context.
 
-    Args:
-        commands: gives access to the relay.
-        period_s: time between two calls of ``show``.
-        show: takes the statistics.
-        poll: called every ``poll_s``.
-        at_end: whether ``show`` is called with the final statistics at the end of the context. The
-            relay must have ended by then.
+    It calls ``poll`` every ``poll_s``. With ``at_end``, it shows the final statistics at the end of
+    the context; the relay must have ended by then.
     """
 
     def __init__(

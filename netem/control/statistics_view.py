@@ -88,14 +88,7 @@ class History:
 
 
 def render(history: History, title: str, width: int, height: int | None) -> RenderableType:
-    """Return the full-screen view of the latest statistics.
-
-    Args:
-        history: the statistics.
-        title: name of the emulator.
-        width: columns of the terminal.
-        height: lines of the terminal; None: no limit.
-    """
+    """Return the full-screen view of the latest statistics, for a terminal of this size."""
     latest = history.latest
     if latest is None:
         return Text(f"{title}: waiting for statistics", style="dim")

@@ -2,16 +2,15 @@
 
 import ctypes
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager, nullcontext, suppress
+from contextlib import closing, nullcontext, suppress
 from functools import cache
 
 import numpy as np
 
 from netem.compile_notice import announced
-from netem.engine.batched_clients import ClientTable
+from netem.engine.batched_clients import ClientTable, Epoll
 from netem.engine.batched_directions import BatchedDirection
 from netem.engine.compiled_rules import compile_rule, is_kept, prepare
-from netem.engine.epoll_waiter import Epoll
 from netem.engine.pump import pump_layout
 from netem.engine.pump.client_table import insert, remove
 from netem.engine.pump.pump_loop import run_pump
@@ -26,7 +25,7 @@ from noack.runtime.udp_sockets import LOOPBACK
 
 _COMPILING_S = 15.0
 _LONG_AGO_NS = -(2**62)
-_PR_SET_TIMERSLACK, _PR_GET_TIMERSLACK = 29, 30
+_PR_SET_TIMERSLACK = 29
 
 
 class BatchedRelay(Relay):
@@ -66,9 +65,10 @@ class BatchedRelay(Relay):
         self._rarely_ns = 0
 
     def run(self, stop: Callable[[], bool], housekeeping: Callable[[], None]) -> None:
-        """See :meth:`netem.engine.relay_base.Relay.run`."""
-        with _shortest_timer_slack():
-            super().run(stop, housekeeping)
+        """See :meth:`netem.engine.relay_base.Relay.run`; sets the thread's timer slack to 1 ns."""
+        with suppress(AttributeError):
+            ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
+        super().run(stop, housekeeping)
 
     def _end(self) -> None:
         self._clients.query_all_drops()
@@ -190,21 +190,6 @@ class BatchedRelay(Relay):
         errors = self._memory.memory.errors
         for direction, error in np.argwhere(errors).tolist():
             yield direction, error, int(errors[direction, error])
-
-
-@contextmanager
-def _shortest_timer_slack() -> Iterator[None]:
-    """Set this thread's timer slack to the minimum; this needs no privilege."""
-    libc = ctypes.CDLL(None)
-    slack_ns = 0
-    with suppress(AttributeError):
-        slack_ns = libc.prctl(_PR_GET_TIMERSLACK, 0, 0, 0, 0)
-        libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
-    try:
-        yield
-    finally:
-        if slack_ns > 0:
-            libc.prctl(_PR_SET_TIMERSLACK, slack_ns, 0, 0, 0)
 
 
 @cache

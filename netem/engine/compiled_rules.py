@@ -53,13 +53,9 @@ def compiled_program(program: LinkProgram) -> LinkProgram:
 
 
 def compiled_state(program: LinkProgram, state: LinkMemory, rows: int, width: int) -> LinkMemory:
-    """Return a state as arrays, with room for ``rows`` flows; see :func:`set_flow`.
+    """Return a state without flows as arrays, with room for ``rows`` flows; see :func:`set_flow`.
 
-    Args:
-        program: the link's program.
-        state: its state without flows, from :func:`netem.rule_program.empty_state`.
-        rows: maximum number of flows.
-        width: length of the rings of release times.
+    ``width`` is the length of the rings of release times.
     """
     arrays: dict[str, Any] = {
         "flows": np.zeros(rows, dtype_of(link_records.FlowState)),

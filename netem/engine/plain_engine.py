@@ -9,8 +9,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from netem.engine.link_listeners import OpenLink
-from netem.engine.plain_direction import PlainDirection, ScheduledDeparture
-from netem.engine.plain_taps import PlainTaps, TapRoute
+from netem.engine.plain_direction import (
+    PlainDirection,
+    PlainTaps,
+    ScheduledDeparture,
+    TapRoute,
+)
 from netem.engine.relay_base import RARE_PERIOD_NS, REPORTED_FLOWS, STALL_NS, Relay, has_headroom
 from netem.engine.relay_interface import (
     DIRECTIONS,

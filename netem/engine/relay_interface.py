@@ -7,7 +7,7 @@ server's answers arrive.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,8 +48,7 @@ class LinkSpec:
     """Recorded decisions per flow; each flow repeats them before the settings apply."""
 
 
-@dataclass(frozen=True)
-class FlowReport:
+class FlowReport(NamedTuple):
     """One flow of a direction."""
 
     flow: int

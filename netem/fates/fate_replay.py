@@ -61,8 +61,8 @@ def read_fates(path: Path, links: Sequence[str] | None = None) -> Fates:
             found[link, direction] = _flows(rows, len(table), f"{path}: {link} {direction}")
             cap = getattr(settings[link], direction).mansd
             # The cap may have changed during the recording.
-            kept = cap is not None and rows["consecutive_losses"].max(initial=0) <= cap
-            caps[link, direction] = cap if kept else None
+            holds = cap is not None and rows["consecutive_losses"].max(initial=0) <= cap
+            caps[link, direction] = cap if holds else None
     return Fates(found, caps)
 
 

@@ -26,28 +26,28 @@ class TcCommand(NamedTuple):
 
 def tc_command(settings: LinkSettings) -> TcCommand:
     """Return the nearest words of tc's own netem, and the settings that they leave out."""
-    kept: list[Impairment] = []
+    supported: list[Impairment] = []
     lacks: list[str] = []
     wanted = [one for one in settings.impairments if one.tc_text()]
     for one in wanted:
         if share := getattr(one, "loss_correlation", 0.0):
             lacks.append(f"lossrel {percent_text(share)} (a delay correlated with loss)")
-        what = one.tc_lacks(kept)
-        if any(other.kind == one.kind for other in kept):
+        what = one.tc_lacks(supported)
+        if any(other.kind == one.kind for other in supported):
             what = f"a second {one.kind}"
         if what:
             lacks.append(f"{shortened(one.text(), _LONGEST)} ({what})")
         else:
-            kept.append(one)
+            supported.append(one)
     if settings.mansd is not None:
         lacks.append(f"mansd {settings.mansd} (a cap on consecutive losses)")
     if settings.first_delivered:
         lacks.append("first (that the first packet of each flow is delivered)")
-    if wanted and not kept:
+    if wanted and not supported:
         return TcCommand(None, tuple(lacks), ())
-    words = " ".join([f"limit {settings.limit}", *(one.tc_text() for one in kept)])
-    notes = [note for one in kept for note in one.tc_notes()]
-    order = [_FIXED_ORDER.index(one.kind) for one in kept if one.kind in _FIXED_ORDER]
+    words = " ".join([f"limit {settings.limit}", *(one.tc_text() for one in supported)])
+    notes = [note for one in supported for note in one.tc_notes()]
+    order = [_FIXED_ORDER.index(one.kind) for one in supported if one.kind in _FIXED_ORDER]
     if order != sorted(order):
         notes.append(f"its order is fixed: {', '.join(_FIXED_ORDER)}")
     return TcCommand(words, tuple(lacks), tuple(dict.fromkeys(notes)))

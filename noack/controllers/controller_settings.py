@@ -1,5 +1,6 @@
 """The settings and the interface that every kind of controller has."""
 
+from abc import abstractmethod
 from typing import Annotated, ClassVar, NamedTuple, Protocol, Self
 
 from pydantic import Field, FiniteFloat, model_validator
@@ -76,10 +77,10 @@ class ControllerSettings(ScenarioSection):
         require_whole_period(self.rate_hz, "rate_hz")
         return self
 
+    @abstractmethod
     def law(self, model: ControlModel) -> ControlLaw:
         """Return the control law.
 
         Raises:
             CallerError: the law cannot be created.
         """
-        raise NotImplementedError

@@ -5,6 +5,7 @@ input is added to u after the actuator, where it is not measured. A disturbance 
 ẋ = Ax + Bu + w.
 """
 
+from abc import abstractmethod
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -50,6 +51,6 @@ class DisturbanceSettings(ScenarioSection):
         """Variance of the random part of each entry; zeros if the disturbance is not random."""
         return np.zeros(len(self.entries))
 
+    @abstractmethod
     def signal(self, steps: range, source: SignalSource) -> Matrix:
         """Return the values that are added during the given steps, shape (len(steps), entries)."""
-        raise NotImplementedError

@@ -98,6 +98,6 @@ def _nodes(probability: float, correlation: float) -> tuple[Array, Array, Array]
 
 def stochastic(matrix: Array) -> Array:
     """Normalise rows to sum 1, since rounding errors would grow; set tiny, slow entries to 0."""
-    kept: Array = np.where(matrix < 1e-100, 0.0, matrix)
-    kept /= kept.sum(axis=1, keepdims=True)
-    return kept
+    rows: Array = np.where(matrix < 1e-100, 0.0, matrix)
+    rows /= rows.sum(axis=1, keepdims=True)
+    return rows

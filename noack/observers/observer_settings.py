@@ -1,5 +1,6 @@
 """The settings and the interface that every kind of observer has."""
 
+from abc import abstractmethod
 from typing import Any, ClassVar, Protocol, Self
 
 from noack.core.linear_systems import Matrix, Vector
@@ -57,10 +58,10 @@ class ObserverSettings(ScenarioSection):
         """Return the model with the covariances that the observer assumes."""
         return model
 
+    @abstractmethod
     def steady_gain(self, assumed: EstimationModel) -> Matrix | None:
         """Return L in the steady state, (n, p); None if none is found."""
-        raise NotImplementedError
 
+    @abstractmethod
     def estimator(self, assumed: EstimationModel, x: Vector) -> StateObserver:
         """Return the observer, at x̂ before the first measurement."""
-        raise NotImplementedError

@@ -95,8 +95,9 @@ def read_chunks(folder: Path, table: str) -> Iterator[tuple[int, bytes]]:
     """Yield ``(first row, rows)`` of each complete batch of a table, from all writers."""
     for path in sorted(folder.glob(f"{table}.*")):
         with path.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
             while len(head := file.read(_CHUNK.size)) == _CHUNK.size:
                 first, length = _CHUNK.unpack(head)
-                if len(payload := file.read(length)) < length:
+                if file.tell() + length > size:  # incomplete, or damaged: a read could be endless
                     break
-                yield first, payload
+                yield first, file.read(length)

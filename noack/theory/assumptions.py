@@ -1,6 +1,6 @@
 """Assumptions of the paper and of a certificate, checked for one scenario before it runs.
 
-A claim holds only under its assumptions. Each assumption gets a verdict with its reason.
+A claim holds only under its assumptions. Each assumption has a status, with the reason.
 Assumptions about the run itself (delays, the longest loss burst) are checked against its record.
 """
 
@@ -34,7 +34,7 @@ class AssumptionStatus(StrEnum):
 
 
 class Assumption(NamedTuple):
-    """One assumption and its verdict."""
+    """One assumption and its status."""
 
     what: str
     source: str

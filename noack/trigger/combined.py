@@ -1,4 +1,4 @@
-"""What the policies have in common that combine a rule with an interval."""
+"""The base of policies that combine a rule with an interval."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING

@@ -1,8 +1,7 @@
 """Any rule with a deadline: transmit at the latest T_max after the last event.
 
 This is the combined rule of Garcia & Antsaklis's earlier work (the paper's reference Garcia16iet):
-if the controller hears nothing for T_max, an update was lost. What the rule keeps below its
-threshold stays there.
+if the controller receives nothing for T_max, an update was lost. The rule's error bound holds.
 """
 
 from typing import Literal, Self
@@ -14,7 +13,7 @@ from noack.trigger.trigger_rule import TriggerRule
 
 
 class DeadlineSettings(CombinedSettings):
-    """Any rule, and at the latest so long after the last event."""
+    """Any rule with a deadline: an event at the latest ``interval_s`` after the last one."""
 
     policy: Literal["deadline"]
 

@@ -1,7 +1,7 @@
 """Any rule, but not earlier than τ_min after the last event (time regularisation).
 
-The minimum inter-event time is τ_min by construction. What the rule would have kept below its
-threshold may exceed it for as long.
+The minimum inter-event time is τ_min by construction. Until then, the quantity that the rule
+compares may exceed the threshold.
 """
 
 from typing import Literal, Self
@@ -13,7 +13,7 @@ from noack.trigger.trigger_rule import TriggerRule
 
 
 class DwellSettings(CombinedSettings):
-    """Any rule, but not earlier than so long after the last event."""
+    """Any rule, but no event earlier than ``interval_s`` after the last one."""
 
     policy: Literal["dwell"]
 

@@ -1,4 +1,4 @@
-"""Time-triggered control: transmit every period, whatever is measured."""
+"""Time-triggered control: transmit every period, independently of the measurements."""
 
 from dataclasses import dataclass
 from typing import Literal, Self

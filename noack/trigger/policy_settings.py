@@ -1,4 +1,4 @@
-"""What the settings of every trigger policy have.
+"""The settings that every trigger policy has.
 
 A policy is one file of this folder. The file holds a subclass of :class:`PolicySettings` with a
 field ``policy``, and the behaviour that the settings describe;

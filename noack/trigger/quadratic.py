@@ -1,7 +1,7 @@
 """Periodic event-triggered control: at sampling times, transmit when zᵀQz > ε, z = (x, e_s).
 
 (Heemels, Donkers, Teel: IEEE TAC 58(4), 2013.) The minimum inter-event time is the sampling
-period by construction. A heartbeat transmits after so many periods without an event.
+period by construction. A heartbeat transmits after a number of periods without an event.
 """
 
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class QuadraticSettings(WeightedSettings):
     period_s: Interval
     """Sampling period; a whole number of the time between measurements."""
     heartbeat: Annotated[int, Field(ge=0, le=1_000_000)] = 0
-    """Transmit after so many periods at the latest; 0: only when the rule says so."""
+    """Transmit at the latest after this number of periods; 0: no heartbeat."""
 
     @classmethod
     def example(cls, n: int) -> Self:

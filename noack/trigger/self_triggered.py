@@ -25,9 +25,9 @@ from noack.trigger.trigger_rule import TriggerRule
 
 
 class SelfTriggeredSettings(WeightedSettings):
-    """At each event the sensor decides when the next one is.
+    """At each event the sensor computes the time of the next one.
 
-    It is when ‖e_s‖_W could reach the paper's threshold, given
+    This is the time at which ‖e_s‖_W could reach the paper's threshold, given
     d‖e_s‖_W/dt ≤ L‖e_s‖_W + a‖x(t_k)‖_W + b.
     """
 
@@ -45,9 +45,9 @@ class SelfTriggeredSettings(WeightedSettings):
     disturbance_per_s: NonNegative = 0.0
     """b, in the units of ‖W x‖ per second."""
     shortest_s: Interval
-    """The next event is not earlier."""
+    """Shortest time to the next event."""
     longest_s: Interval
-    """It is not later."""
+    """Longest time to the next event."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -4,7 +4,7 @@ With z = (x, e_s), the sensor transmits at the first time t at which
 
     ‖P z‖² > max(c e^{−ρ(t−t₀)}, f)² + ‖N z‖² + η(t),    η̇ = −λη + ‖P_η z‖² − ‖N_η z‖²,
 
-but not before ``earliest_ns`` and, on a grid, at its points only; and at ``latest_ns`` in any case.
+but not before ``earliest_ns``, on a grid only at its points, and at ``latest_ns`` in any case.
 A condition that integrates compares ∫‖P z‖dτ, from the last event to t, instead of ‖P z‖.
 
 η and the integral are the *auxiliary variable* of a condition. The live sensor evaluates the

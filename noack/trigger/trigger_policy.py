@@ -1,4 +1,4 @@
-"""What an event-triggering policy is, and the machine that applies one to measurements."""
+"""The interface of an event-triggering policy, and the trigger that applies one to measurements."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from noack.trigger.trigger_rule import TriggerRule
 
 
 class Policy(Protocol):
-    """An event-triggering policy: a trigger rule, and what it needs beside it."""
+    """An event-triggering policy: a trigger rule, W and η at the start."""
 
     @property
     def weight(self) -> Matrix | None:
@@ -53,7 +53,7 @@ class EventTrigger(Protocol):
         ...
 
     def restart(self, t_ns: int, x: Vector) -> object:
-        """Begin after a past event, known only now to have reset the model."""
+        """Begin after a past event that, as is known only now, has reset the model."""
         ...
 
     def change(self, policy: Policy) -> None:
@@ -99,7 +99,7 @@ class Trigger:
             self._rate = float(condition.auxiliary_rates(z[None])[0])
 
     def restart(self, t_ns: int, x: Vector) -> TriggerCondition:
-        """Apply the condition after a past event, known only now to have reset the model.
+        """Apply the condition after a past event that, as is known only now, has reset the model.
 
         An integral begins at 0 now.
         """

@@ -161,9 +161,10 @@ def attack(
     """
     sending_s = per_port / rate_hz
     horizon_s = speed * (1.5 * sending_s + 7.0)
-    with Run(folder, "--set", f"speed={speed}", "--set", f"horizon_s={horizon_s:.0f}") as run:
-        targets = run.targets()
-        until_s = time.monotonic() + 1.5 * sending_s + 3.0
-        plan = Plan(targets, per_port, rate_hz, forge_addresses, until_s)
-        with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        pool.submit(carry_out, Plan((), 0, 1.0, False, 0.0)).result()  # the process has started
+        with Run(folder, "--set", f"speed={speed}", "--set", f"horizon_s={horizon_s:.0f}") as run:
+            targets = run.targets()
+            until_s = time.monotonic() + 1.5 * sending_s + 3.0
+            plan = Plan(targets, per_port, rate_hz, forge_addresses, until_s)
             return run.finish(pool.submit(carry_out, plan).result())

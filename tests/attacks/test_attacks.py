@@ -34,7 +34,7 @@ def test_a_run_under_attack_passes_each_check(
 def test_every_kind_was_sent_to_every_port(attacked: Attacked) -> None:
     for role in LOOP_ROLES:
         assert attacked.kinds_sent(role, STRANGER) == FROM_ANYWHERE.keys()
-        assert attacked.sent_to(role).total() > 1000  # even on a busy machine
+        assert attacked.sent_to(role).total() > 300  # even on a busy machine
 
 
 def test_datagrams_with_a_forged_peer_address_are_rejected_by_content(attacked: Attacked) -> None:

@@ -1,7 +1,7 @@
 """Beam search: if there are too many patterns, only the most promising of each kind are continued.
 
 All runs pass through the same time windows. At the end of each window the runs are thinned out. Of
-runs that nearly coincide, one is kept. The others are grouped by their number of consecutive losses
+runs that nearly coincide, one remains. The runs are grouped by their number of consecutive losses
 and their part of the window; from each group first the best run is selected, then the second best,
 and so on. One half of the selection ranks runs by their value so far, the other half by their
 promise: the integral of the output's square over the next window, for the loop without events.

@@ -1,7 +1,5 @@
 """The values of given patterns, and their improvement by changes of single decisions."""
 
-from typing import NamedTuple
-
 import numpy as np
 
 from cosim.analysis.adversary.search_nodes import (
@@ -22,17 +20,10 @@ _NODES_FOR_A_GUESS = 20_000
 _LONGEST = 1000
 
 
-class Outcomes(NamedTuple):
-    """The results of patterns."""
+def follow(flow: SegmentFlow, mansd: int, patterns: list[Pattern]) -> tuple[Vector, list[Pattern]]:
+    """Run patterns to the horizon; return their values and the applied decisions.
 
-    value: Vector
-    """(N,)"""
-    patterns: list[Pattern]
-    """The applied decisions, up to the horizon."""
-
-
-def follow(flow: SegmentFlow, mansd: int, patterns: list[Pattern]) -> Outcomes:
-    """Run patterns to the horizon; an update is delivered if its loss would exceed ``mansd``.
+    An update is delivered if its loss would exceed ``mansd``.
 
     Raises:
         TooManyEventsError: a run has more than 100,000 events, or two at the same time.
@@ -50,7 +41,7 @@ def follow(flow: SegmentFlow, mansd: int, patterns: list[Pattern]) -> Outcomes:
         last[run] = nodes.entry
         going = np.flatnonzero(segments.is_event)
         if not len(going):
-            return Outcomes(value, [log.decisions(int(entry)) for entry in last])
+            return value, [log.decisions(int(entry)) for entry in last]
         forced = nodes.dropouts[going] >= mansd
         delivered = wanted[run[going], min(event, longest)] | forced
         run, nodes = run[going], after_events(nodes, segments, value[run], going, delivered, log)
@@ -61,11 +52,11 @@ def guess(search: PatternSearch, own: Pattern, rng: np.random.Generator) -> floa
     """Try the pattern ``own``, regular and random patterns; return an inter-event time in s."""
     search.step = "guesses"
     flow, mansd = search.flow, search.mansd
-    events = len(follow(flow, mansd, [(False,) * _LONGEST]).patterns[0])
-    tried = follow(flow, mansd, [own, *_candidates(mansd, events, rng)])
-    search.nodes += events + sum(map(len, tried.patterns))
-    for i in np.argsort(-tried.value, kind="stable")[:_IMPROVED]:
-        improve(search, tried.patterns[i], float(tried.value[i]), _NODES_FOR_A_GUESS)
+    events = len(follow(flow, mansd, [(False,) * _LONGEST])[1][0])
+    values, patterns = follow(flow, mansd, [own, *_candidates(mansd, events, rng)])
+    search.nodes += events + sum(map(len, patterns))
+    for i in np.argsort(-values, kind="stable")[:_IMPROVED]:
+        improve(search, patterns[i], float(values[i]), _NODES_FOR_A_GUESS)
     return flow.horizon_s / (events + 1)
 
 
@@ -90,17 +81,14 @@ def improve(search: PatternSearch, pattern: Pattern, value: float, most_nodes: i
     """
     flow, mansd = search.flow, search.mansd
     # A pattern may end at the time of its largest value; complete it up to the horizon.
-    pattern = follow(flow, mansd, [pattern]).patterns[0]
+    pattern = follow(flow, mansd, [pattern])[1][0]
     visited = len(pattern)
     while pattern and visited + len(pattern) ** 2 <= most_nodes:
-        tried = follow(flow, mansd, [_changed(pattern, i) for i in range(len(pattern))])
-        visited += sum(map(len, tried.patterns))
-        top = int(tried.value.argmax())
-        if not tried.value[top] > value:
+        changed = [(*pattern[:i], not one, *pattern[i + 1 :]) for i, one in enumerate(pattern)]
+        values, patterns = follow(flow, mansd, changed)
+        visited += sum(map(len, patterns))
+        top = int(values.argmax())
+        if not values[top] > value:
             break
-        value, pattern = float(tried.value[top]), tried.patterns[top]
+        value, pattern = float(values[top]), patterns[top]
     search.offer(value, pattern, visited)
-
-
-def _changed(pattern: Pattern, i: int) -> Pattern:
-    return (*pattern[:i], not pattern[i], *pattern[i + 1 :])

@@ -27,8 +27,7 @@ class CurveStack(CurveBasis):
     def first_exits(self, taylor: Stack) -> Vector:
         """Return each curve's first u in [0, 1] after which |y(u)| becomes > 1; NaN for none.
 
-        Args:
-            taylor: coefficients of y(u) = Σ_k ``taylor``[·, k] u^k, shape (N, p + 1, n).
+        The coefficients of y(u) = Σ_k ``taylor``[·, k] u^k have the shape (N, p + 1, n).
         """
         found = np.full(len(taylor), np.nan)
         if not len(taylor):
@@ -72,12 +71,9 @@ def powers(u: Vector, degree: int) -> Stack:
 
 
 def peak_squares(taylor: Stack, at: Vector, reach: float) -> Vector:
-    """Return the maximum of |y|² within ``reach`` of u = ``at``, by Newton's method, (N,).
+    """Return the maximum of |y|² within ``reach`` of u = ``at``, (N,), by Newton's method.
 
-    Args:
-        taylor: coefficients of the curves, (N, p + 1, n).
-        at: approximate positions of the maxima, (N,).
-        reach: half width of an interval so short that |y|² has one maximum in it.
+    |y|² has at most one maximum in this interval.
     """
     degree = taylor.shape[1] - 1
     first = np.arange(1.0, degree + 1)[:, None] * taylor[:, 1:]

@@ -86,10 +86,7 @@ class PatternSearch:
     """A search through the patterns with at most ``mansd`` = M − 1 consecutive losses."""
 
     def __init__(
-        self,
-        flow: SegmentFlow,
-        mansd: int,
-        report: SearchReport = lambda step, nodes, value: None,
+        self, flow: SegmentFlow, mansd: int, report: SearchReport = lambda step, nodes, value: None
     ) -> None:
         self.flow, self.mansd = flow, mansd
         self.step = ""
@@ -139,22 +136,13 @@ class PatternSearch:
 
 
 def after_events(
-    nodes: Nodes,
-    segments: Segments,
-    value: Vector,
-    these: Indices,
-    delivered: Flags,
+    nodes: Nodes, segments: Segments, value: Vector, these: Indices, delivered: Flags,
     log: DecisionLog,
-) -> Nodes:
-    """Return the runs ``these`` just after the events at the end of their segments.
+) -> Nodes:  # fmt: skip
+    """Return the runs ``these``, (k,), just after the events at the end of their segments.
 
-    Args:
-        nodes: the runs before the segments.
-        segments: the segments; those of ``these`` end in events.
-        value: values of the runs at the end of the segments, (N,).
-        these: indices of the runs, (k,).
-        delivered: whether the update of each run arrives, (k,).
-        log: receives the decisions.
+    ``delivered``, (k,), tells whether the update of each run arrives; the ``log`` receives that.
+    ``value``, (N,), has the values of the runs at the end of the segments.
 
     Raises:
         TooManyEventsError: two events at the same time.

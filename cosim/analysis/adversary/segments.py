@@ -31,11 +31,9 @@ _CLOSE = 0.95
 
 
 class OutputCurve:
-    """An output at fixed points of parts of cells.
+    """An output at fixed points, shares of parts of cells.
 
-    Args:
-        taylor: Taylor coefficients of y over a cell, (p + 1, q, 3n).
-        points: the points, as shares of a part.
+    Its Taylor coefficients over a cell are ``taylor``, (p + 1, q, 3n).
     """
 
     def __init__(self, taylor: Stack, points: Vector) -> None:
@@ -65,12 +63,9 @@ class Supremum(OutputCurve):
         super().__init__(taylor, _POINTS)
 
     def __call__(self, z: Matrix, u: Vector, known: Vector) -> Vector:
-        """Return the suprema over parts of cells, (N,).
+        """Return the suprema over [0, u] of cells, (N,), that start at scaled states z, (N, 3n).
 
-        Args:
-            z: scaled states at the start of cells, (N, 3n).
-            u: the share of each cell that is evaluated, from its start, in (0, 1], (N,).
-            known: results below these values may be inaccurate, (N,).
+        Results below ``known``, (N,), may be inaccurate.
         """
         squares = self.squares(z, u)
         highest = np.asarray(squares.max(axis=1))
@@ -93,7 +88,7 @@ class SquareIntegral(OutputCurve):
         self._weights = width_s * weights / 2
 
     def __call__(self, z: Matrix, u: Vector, known: Vector | None = None) -> Vector:
-        """Return the integrals, (N,); see :class:`Supremum` for the arguments."""
+        """Return the integrals over [0, u] of cells, (N,), that start at states z, (N, 3n)."""
         return np.asarray(u * (self.squares(z, u) @ self._weights))
 
 
@@ -116,13 +111,9 @@ class Segments(NamedTuple):
 
 
 class SegmentFlow:
-    """Follows states to their next events.
+    """Follows states to their next events, at most to the horizon.
 
-    Args:
-        system: the loop.
-        measure: the objective that evaluates a segment.
-        horizon_s: end of the runs.
-        known_start: sensor and controller start from x(0), so there is no event at t = 0.
+    With ``known_start``, sensor and controller start from x(0), so there is no event at t = 0.
     """
 
     def __init__(
@@ -139,12 +130,9 @@ class SegmentFlow:
         self._floored = _Phase(system, measure, 0.0, late_rate)
 
     def __call__(self, t_s: Vector, z: Matrix, known: float = -math.inf) -> Segments:
-        """Follow N states to their next events.
+        """Follow N states z = (x, e_s, e_c), (N, 3n), at times (N,) to their next events.
 
-        Args:
-            t_s: their times, at most the horizon, (N,).
-            z: (x, e_s, e_c), (N, 3n).
-            known: results below this value may be inaccurate.
+        Results below ``known`` may be inaccurate.
         """
         measure, nothing = self.measure, np.full(len(t_s), self.measure.nothing)
         found = Segments(t_s.copy(), z.copy(), np.zeros(len(t_s), bool), nothing)

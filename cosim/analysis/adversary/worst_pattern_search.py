@@ -50,7 +50,7 @@ def find_worst(
 
     Args:
         resolved: the scenario; its ``network.mansd`` is used, its loss model only for comparison.
-        objective: the value to maximise.
+        objective: the objective.
         most_nodes: largest number of nodes of the search through all patterns; 0 for no search.
         beam: width of the beam search; 0 for no search.
         certificate: the certificate to compare with; by default that of the scenario's own plant,

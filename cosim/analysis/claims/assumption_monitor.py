@@ -25,11 +25,7 @@ are more, the monitor stops."""
 
 
 class AssumptionMonitor:
-    """Reports each assumption of a run's claims once, when the run first violates it.
-
-    Args:
-        scenario: the resolved scenario.
-    """
+    """Reports each assumption of a run's claims once, when the run first violates it."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._reader = ConditionReader(scenario)

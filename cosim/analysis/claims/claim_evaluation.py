@@ -97,7 +97,7 @@ class ClaimEvaluation(RunEvidence):
         for claim in definitions(ClaimDefinition):
             if (bound := claim.bound(self)) is not None:
                 unmet = _IDEAL_LOOP if claim.needs_ideal_loop else ""
-                found.append(check(bound, claim.statement, claim.source, self.until_s, unmet))
+                found.append(check(bound, claim.statement, claim.source, self.part.until_s, unmet))
         for certificate in self.certificates:
             found += self._certified(certificate)
         return found
@@ -113,7 +113,7 @@ class ClaimEvaluation(RunEvidence):
             if (bound := claim.bound(self, certificate)) is not None:
                 if outside is not None:
                     bound = bound._replace(void=VoidFrom(0.0, outside))
-                found.append(check(bound, claim.statement, source, self.until_s))
+                found.append(check(bound, claim.statement, source, self.part.until_s))
         return found
 
     def envelopes(self) -> list[Envelope]:

@@ -7,6 +7,9 @@ the controller received: there x_s = x, and x_c is reset to x. There are no clai
 Such a part starts with an input of the part before: until the plant applies the first input of the
 new part, u was computed from older updates. ‖u − Kx‖ is recorded, and the certificate holds if it
 covers input errors of this size (:class:`noack.theory.scenario_certificates.CertificateScope`).
+
+The processes of a stopped run end some milliseconds apart. Claims and conditions are checked up to
+the last time that all of them reached, because the loop is incomplete after it.
 """
 
 import math
@@ -18,7 +21,6 @@ import numpy as np
 
 from cosim.analysis.claims.claim_definition import Envelope
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, void_claim
-from cosim.analysis.claims.common_time import common_end_ns, up_to_common_end
 from cosim.analysis.claims.observed_conditions import AssumptionViolation
 from cosim.analysis.claims.run_evidence import RunPart
 from cosim.analysis.summary_model import Claim
@@ -33,10 +35,13 @@ from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
     NETEM_PACKET,
+    OWNER,
     PLANT_STEP,
     SENSOR_MEASUREMENT,
     SETTINGS,
 )
+from noack.protocol.topology import LOOP_ROLES
+from noack.runtime.life_cycle import HORIZON
 from noack.theory.scenario_certificates import BOX, OWN_PLANT
 from noack.trigger.decaying import DecayingSettings
 
@@ -46,14 +51,18 @@ _LEAST_BETA = 1e-300
 _AT_REST = 1e-9
 """The set-point is an equilibrium if |A x_r + B u_r| is at most this share of its larger term."""
 
+_PACES = {
+    "plant": (PLANT_STEP, "t_ns"),
+    "sensor": (SENSOR_MEASUREMENT, "t_ns"),
+    "netem": (NETEM_PACKET, "now_ns"),
+    "controller": (CONTROLLER_STEP, "t_ns"),
+}
+"""By process: the table and column with the times of its steps."""
+
 
 @dataclass(frozen=True)
 class RunClaims:
-    """The claims about a run, part by part; each property is computed once.
-
-    Args:
-        record: the run's record.
-    """
+    """The claims about a run, part by part; each property is computed once."""
 
     record: RunRecord
 
@@ -68,21 +77,19 @@ class RunClaims:
         return None if end_ns is None else end_ns / NS_PER_S
 
     @cached_property
-    def _changes(self) -> list[RecordedChange]:
-        return [made for made in changes_of(self._judged) if made.touches_claims]
+    def _setpoint(self) -> tuple[Vector, Vector] | None:
+        return setpoint_of(self._judged.scenario)
 
     @cached_property
     def parts(self) -> list[ClaimEvaluation | Claim]:
         """The claims of each part; for a part without claims, the reason as a void claim."""
-        record, changes = self._judged, self._changes
-        at_0 = setpoint_of(record.scenario)
-        if not changes and at_0 is None:
-            return [ClaimEvaluation(record)]
+        record = self._judged
+        changes = [made for made in changes_of(record) if made.touches_claims]
         first_ns = changes[0].first_ns if changes else NEVER_NS
         part = RunPart(record, 0.0, _seconds(first_ns), None, _void(record, record.scenario))
-        own = record if at_0 is None else _part_of(record, record.scenario, 0, None)
+        own = record if self._setpoint is None else _part_of(record, record.scenario, 0, None)
         found: list[ClaimEvaluation | Claim] = [ClaimEvaluation(own, part)]
-        for made, after in zip(changes, [*changes[1:], None], strict=True):
+        for made, after in zip(changes, [*changes[1:], None], strict=False):
             until_ns = NEVER_NS if after is None else after.first_ns
             found.append(self._after(made, until_ns))
         return found
@@ -97,7 +104,7 @@ class RunClaims:
         found = []
         for one in self.parts:
             if not isinstance(one, Claim):
-                from_s = 0.0 if one.part is None else one.part.from_s
+                from_s = one.part.from_s
                 found += [each._replace(t_s=each.t_s + from_s) for each in one.violations()]
         return sorted(found, key=lambda one: one.t_s)
 
@@ -108,7 +115,7 @@ class RunClaims:
             if isinstance(one, Claim):
                 found.append(one)
                 continue
-            from_s, until_s = (0.0, math.inf) if one.part is None else one.part[1:3]
+            from_s, until_s = one.part.from_s, one.part.until_s
             found += [
                 claim.model_copy(
                     update={
@@ -125,14 +132,9 @@ class RunClaims:
         """The curves of all bounds, each over its own part of the run."""
         found: list[Envelope] = []
         for one in self.parts:
-            if isinstance(one, Claim):
-                continue
-            if one.part is None:
-                return one.envelopes()
-            if setpoint_of(self._judged.scenario) is not None or one.part.from_s > 0:
-                # These bounds hold for deviations from another set-point, or start later.
-                continue
-            found += [_until(envelope, one.part.until_s) for envelope in one.envelopes()]
+            # Other bounds hold for deviations from another set-point, or start later.
+            if not isinstance(one, Claim) and one.part.from_s == 0 and self._setpoint is None:
+                found += [_until(envelope, one.part.until_s) for envelope in one.envelopes()]
         return found
 
     def _after(self, made: RecordedChange, until_ns: int) -> ClaimEvaluation | Claim:
@@ -171,39 +173,33 @@ def _seconds(t_ns: int) -> float:
 
 
 def _until(envelope: Envelope, until_s: float) -> Envelope:
-    values = np.where(envelope.t_s < until_s, envelope.values, np.nan)
     if envelope.quantity == "inter_event":  # two ends of a line
-        ends_s = np.minimum(envelope.t_s, until_s)
-        return envelope._replace(t_s=ends_s)
-    return envelope._replace(values=values)
+        return envelope._replace(t_s=np.minimum(envelope.t_s, until_s))
+    return envelope._replace(values=np.where(envelope.t_s < until_s, envelope.values, np.nan))
 
 
 def _part_of(
     record: RunRecord, scenario: Scenario, origin_ns: int, sequence: int | None
 ) -> RunRecord:
-    """Return the part of a run after an event, in the form of the record of a separate run.
+    """Return the part of a run after the event ``sequence``, in the form of a separate record.
 
-    Args:
-        record: the run's record.
-        scenario: the scenario of the part.
-        origin_ns: time of the event, which becomes time 0.
-        sequence: number of the event; None for the start of the run.
+    The time of the event becomes time 0. Without an event it is the whole run.
     """
     setpoint = setpoint_of(scenario)
     loop = loop_of(scenario)
     x_r, u_r = (np.zeros(loop.n), np.zeros(loop.m)) if setpoint is None else setpoint
     rows: dict[str, Rows] = {}
     for table in record.tables:
-        kept = record[table]
+        part = record[table]
         if table in SETTINGS:
-            kept = kept[:0]
+            part = part[:0]
         elif table in (SENSOR_MEASUREMENT, PLANT_STEP, CONTROLLER_STEP):
-            kept = kept[kept["t_ns"] >= origin_ns]
+            part = part[part["t_ns"] >= origin_ns]
         elif table == NETEM_PACKET:
-            kept = kept[kept["now_ns"] >= origin_ns]
+            part = part[part["now_ns"] >= origin_ns]
         elif table == CONTROLLER_DELIVERY and sequence is not None:
-            kept = kept[kept["sequence"] >= sequence]
-        rows[table] = _shifted(kept, origin_ns, x_r, u_r)
+            part = part[part["sequence"] >= sequence]
+        rows[table] = _shifted(part, origin_ns, x_r, u_r)
     sensor = rows[SENSOR_MEASUREMENT]
     if sequence is not None and len(sensor):  # the state before the reset belongs to the last part
         sensor["x_s"][0] = sensor["x"][0]
@@ -279,3 +275,40 @@ def _void(record: RunRecord, scenario: Scenario) -> Mapping[str, str]:
     if moved.any():
         return {BOX: "not every plant of the box rests at the set-point, A x_r + B u_r ≠ 0"}
     return {}
+
+
+def common_end_ns(record: RunRecord) -> int | None:
+    """Return the latest time that every process of a stopped run reached.
+
+    None if the run was not stopped, or if a process did not report its time.
+    """
+    reports = [record.reports.get(role, {}) for role in LOOP_ROLES]
+    if all(report.get("ended") == HORIZON for report in reports):
+        return None
+    reached_ns = [report.get("reached_ns") for report in reports]
+    known_ns = [int(one) for one in reached_ns if one is not None]
+    measured_ns = record[SENSOR_MEASUREMENT]["t_ns"]
+    if len(known_ns) < len(reports) or not len(measured_ns):
+        return None
+    # A sensor has no deadlines, so its time is that of its last measurement.
+    return int(min(*known_ns, measured_ns[-1]))
+
+
+def up_to_common_end(record: RunRecord) -> RunRecord:
+    """Return the record of a run up to its common end; the record itself if it has none.
+
+    The rows of each process are cut at its first row beyond that time, in all tables.
+    """
+    end_ns = common_end_ns(record)
+    if end_ns is None:
+        return record
+    rows: dict[str, Rows] = {}
+    for role, (pace, column) in _PACES.items():
+        beyond = record[pace]["input"][record[pace][column] > end_ns]
+        first = int(beyond[0]) if len(beyond) else np.iinfo(np.int64).max
+        for table in record.tables:
+            if OWNER[table] == role:
+                rows[table] = record[table][record[table]["input"] < first]
+    return RunRecord(
+        record.scenario, rows, record.notices, record.reports, record.kind, record.earlier
+    )

@@ -136,8 +136,8 @@ class _Measurements:
             times.append(np.array([self.newest_ns, end_ns]))
         since_ns = np.concatenate([_NO_TIMES, *(t_ns[:-1] for t_ns in times)])
         gaps_ns = np.concatenate([_NO_TIMES, *map(np.diff, times)])
-        kept = gaps_ns > 0
-        return SampledSeries(since_ns[kept] * 1e-9, gaps_ns[kept] * 1e-9)
+        longer = gaps_ns > 0
+        return SampledSeries(since_ns[longer] * 1e-9, gaps_ns[longer] * 1e-9)
 
     def restarts(self) -> SampledSeries:
         t_ns, of = _columns(self._restarts, 2)
@@ -159,7 +159,7 @@ class _Ticks:
 
     def __init__(self) -> None:
         self._ticks: _Batches = []
-        self._taken: _Batches = []
+        self._deliveries: _Batches = []
         self.newest = NO_SEQUENCE
 
     def ticks(self, rows: Rows) -> None:
@@ -167,25 +167,25 @@ class _Ticks:
         self.newest = int(rows["sequence"][-1])
 
     def deliveries(self, rows: Rows) -> None:
-        self._taken.append((rows["input"], rows["sequence"], rows["model_t_ns"]))
+        self._deliveries.append((rows["input"], rows["sequence"], rows["model_t_ns"]))
 
     @property
     def waiting(self) -> int:
-        return sum(len(inputs) for inputs, *_ in self._taken)
+        return sum(len(inputs) for inputs, *_ in self._deliveries)
 
     def receipts(self, *, ended: bool) -> _Receipts:
         """Return the updates whose tick was determined; at the end, also those without a tick."""
         inputs, ticks = _columns(self._ticks, 2)
-        taken, sequence, model_ns = _columns(self._taken, 3)
-        first = np.searchsorted(inputs, taken, "right")
-        known = len(taken) if ended else int((first < len(inputs)).sum())
-        self._taken = [(taken[known:], sequence[known:], model_ns[known:])]
+        received, sequence, model_ns = _columns(self._deliveries, 3)
+        first = np.searchsorted(inputs, received, "right")
+        known = len(received) if ended else int((first < len(inputs)).sum())
+        self._deliveries = [(received[known:], sequence[known:], model_ns[known:])]
         self._ticks = [(inputs[-_KEPT_TICKS:], ticks[-_KEPT_TICKS:])]
         tick = np.append(ticks, _NEVER)[first[:known]]
         # If the controller died before its next tick, the restarted one does not have the update.
-        of = taken[:known] // GENERATION
-        kept = (tick == _NEVER) | (tick // GENERATION == of)
-        return _Receipts(sequence[:known][kept], model_ns[:known][kept], tick[kept])
+        of = received[:known] // GENERATION
+        same = (tick == _NEVER) | (tick // GENERATION == of)
+        return _Receipts(sequence[:known][same], model_ns[:known][same], tick[same])
 
 
 class _Inputs:
@@ -222,8 +222,8 @@ class _Inputs:
 
     @property
     def waiting(self) -> int:
-        held = (self._steps, self._latches, self._receipts)
-        return sum(len(batch[0]) for batches in held for batch in batches)
+        stored = (self._steps, self._latches, self._receipts)
+        return sum(len(batch[0]) for batches in stored for batch in batches)
 
     def add_receipts(self, receipts: _Receipts, ticked: int) -> None:
         """Add updates that the controller received, and the number of its newest tick."""
@@ -262,9 +262,9 @@ class _Inputs:
         replaced = controlled & self._replaces & too_old(t_ns, model_ns, self._timeout_ns)
         # Until the first input with a state, the certificates assume that the input is 0.
         safe = there & ~controlled & (began | ~(sizes == 0))
-        step_s, kept = t_ns * 1e-9, controlled & ~replaced
+        step_s, held = t_ns * 1e-9, controlled & ~replaced
         return (
-            SampledSeries(step_s[kept], age_ns[kept] * 1e-9),
+            SampledSeries(step_s[held], age_ns[held] * 1e-9),
             SampledSeries(step_s[replaced], (t_ns - model_ns)[replaced] * 1e-9),
             SampledSeries(step_s[safe], sizes[safe]),
         )
@@ -309,7 +309,7 @@ class _Updates:
 
     def __init__(self) -> None:
         self._events: deque[tuple[int, int]] = deque()
-        self._taken: deque[tuple[int, int, int | None]] = deque()
+        self._applied: deque[tuple[int, int, int | None]] = deque()
         self._passed: dict[int, bool] = {}
         self._newest_packet = NO_SEQUENCE
         self._resolved = NO_SEQUENCE
@@ -325,11 +325,11 @@ class _Updates:
             self._newest_packet = max(self._newest_packet, sequence)
 
     def add_applied(self, applied: list[tuple[int, int, int | None]]) -> None:
-        self._taken.extend(applied)
+        self._applied.extend(applied)
 
     @property
     def waiting(self) -> int:
-        return len(self._events) + len(self._taken) + len(self._passed)
+        return len(self._events) + len(self._applied) + len(self._passed)
 
     def resolved(self, start_s: float, end_ns: int | None) -> tuple[PacketLosses, SampledSeries]:
         """Losses and delays of the events that were resolved since the last call, in order."""
@@ -361,16 +361,16 @@ class _Updates:
         None if this is not determined yet. An update in flight at the end is not lost; it counts as
         delivered at the end.
         """
-        while self._taken and self._taken[0][0] < sequence:
-            self._taken.popleft()
+        while self._applied and self._applied[0][0] < sequence:
+            self._applied.popleft()
         passed = self._passed.get(sequence)
-        if not self._taken:
+        if not self._applied:
             if passed is False:
                 return np.inf, None
             return None if end_ns is None else (0.0, end_ns)
-        taken, model_ns, applied_ns = self._taken[0]
+        received, model_ns, applied_ns = self._applied[0]
         applied_ns = end_ns if applied_ns is None else applied_ns
-        if taken == sequence:
+        if received == sequence:
             return None if applied_ns is None else (0.0, max(applied_ns, model_ns))
         if passed is None and end_ns is None and self._newest_packet < sequence:
             return None  # its row of netem_packet has not arrived yet

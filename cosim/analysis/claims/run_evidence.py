@@ -3,7 +3,7 @@
 import math
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -37,9 +37,10 @@ _ANY = NetworkConditions(sys.maxsize, *[_LONG_S] * 5)
 
 
 class RunPart(NamedTuple):
-    """A part of a run that is checked as a run of its own."""
+    """A part of a run that is checked as a run of its own; by default the whole run."""
 
-    whole: RunRecord
+    whole: RunRecord | None = None
+    """The record of the run, if that of the part is another one."""
     from_s: float = 0.0
     """Start of the part, in the run's time."""
     until_s: float = math.inf
@@ -55,13 +56,11 @@ class RunPart(NamedTuple):
 class RunEvidence:
     """The data of a run for checking claims; each property is computed once, when first used.
 
-    Args:
-        record: the record of the run, or of a part of it in the form of a separate run.
-        part: the part; None: the whole run.
+    The record is that of the whole run, or of the ``part`` in the form of a separate run.
     """
 
     record: RunRecord
-    part: RunPart | None = None
+    part: RunPart = field(default_factory=RunPart)
 
     @cached_property
     def joined(self) -> AlignedRun:
@@ -79,37 +78,29 @@ class RunEvidence:
         common = in_common(self.record.scenario, self.joined)
         return np.asarray(np.isfinite(self.joined.e_c_norm) & common)
 
-    @property
-    def until_s(self) -> float:
-        """The claims end here; infinite: at the end of the run."""
-        return math.inf if self.part is None else self.part.until_s
-
     @cached_property
     def certificates(self) -> list[ScenarioCertificate]:
         """The certificates of the run's scenario under the scenario's schedule."""
-        if self.part is None:
-            return scheduled_certificates(self.record.scenario)
-        found = scheduled_certificates(self.record.scenario, self.part.start_error)
-        return [
-            replace(one, constants=None, floor_constants=None, void=self.part.void[one.scope])
-            if one.scope in self.part.void
-            else one
-            for one in found
-        ]
+        found, void = [], self.part.void
+        for one in scheduled_certificates(self.record.scenario, self.part.start_error):
+            if one.scope in void:
+                one = replace(one, constants=None, floor_constants=None, void=void[one.scope])
+            found.append(one)
+        return found
 
     @cached_property
     def observed(self) -> ObservedConditions:
         """The conditions under which the run took place."""
         found = read_conditions(self.record)
-        if self.part is None or self.part.start_error is None:
+        if self.part.start_error is None:
             return found
         # The certificate's start error covers the inputs before the part's first one.
         safe, restarts = found.safe_input, found.restarts
-        kept, again = safe.t_s >= found.start_s, restarts.t_s > 0
+        later, restarted = safe.t_s >= found.start_s, restarts.t_s > 0
         return found._replace(
             start_s=0.0 if np.isfinite(found.start_s) else found.start_s,
-            safe_input=SampledSeries(safe.t_s[kept], safe.value[kept]),
-            restarts=SampledSeries(restarts.t_s[again], restarts.value[again]),
+            safe_input=SampledSeries(safe.t_s[later], safe.value[later]),
+            restarts=SampledSeries(restarts.t_s[restarted], restarts.value[restarted]),
         )
 
     @property
@@ -126,23 +117,22 @@ class RunEvidence:
         """The assumptions that the run violated, M − 1 included, each at the first time."""
         scenario = self.record.scenario
         conditions = allowed_conditions(scenario)
-        if self.part is not None and self.part.start_error is not None:
+        if self.part.start_error is not None:
             conditions = conditions._replace(start_s=0.0)
         found = self.observed.violations(conditions, {*causes_of(scenario), "dropouts"})
-        return [one for one in found if one.t_s < self.until_s]
+        return [one for one in found if one.t_s < self.part.until_s]
 
     @cached_property
     def first_gap(self) -> VoidFrom | None:
         """The time from which the record is incomplete and no claim can be checked."""
         limit = _ANY._replace(sampling_s=self._schedule.sampling_s)
         found = [self.observed.first_violation(limit, ("sampling",))]
-        whole, from_s = self.record, 0.0
-        if self.part is not None:
-            whole, from_s = self.part.whole, self.part.from_s
+        whole = self.part.whole or self.record
         for role in LOOP_ROLES:
             gaps_ns = filter(None, (life.hole_ns() for life in whole.lives(role)))
+            times_s = [ns * 1e-9 - self.part.from_s for ns in gaps_ns]
             why = f"rows of {role} are missing from the record"
-            found += [VoidFrom(t_s, why) for ns in gaps_ns if (t_s := ns * 1e-9 - from_s) >= 0]
+            found += [VoidFrom(t_s, why) for t_s in times_s if t_s >= 0]
         first = np.argmax(self.in_common)
         gaps = np.flatnonzero(~self.in_common[first:])
         if len(gaps):
@@ -210,10 +200,7 @@ def scheduled_certificates(
 ) -> list[ScenarioCertificate]:
     """Return the certificates of a resolved scenario under its schedule, if it can have any.
 
-    Args:
-        scenario: the scenario.
-        start_error: for a part that starts with an input of the part before; see
-            :class:`noack.theory.scenario_certificates.CertificateScope`.
+    A part that starts with an input of the part before has a ``start_error``.
     """
     if not scenario.coverage.is_certifiable:
         return []

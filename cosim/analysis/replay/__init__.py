@@ -27,5 +27,5 @@ def replay(record: RunRecord) -> Replay:
     with np.errstate(all="ignore"):  # a diverging run overflows and is replayed all the same
         replayed = {role: replay_machine(role, record) for role in LOOP_ROLES}
         messages = check_messages(record, replayed)
-    accounts = tuple(account for one in replayed.values() for account in one.accounts)
-    return Replay(processes=accounts, messages=messages)
+    results = tuple(result for one in replayed.values() for result in one.results)
+    return Replay(processes=results, messages=messages)

@@ -49,13 +49,13 @@ _MOST_BYTES = 65_535
 class MachineReplay:
     """The replay of a role's machines: the result of each, and the messages that they emitted."""
 
-    accounts: tuple[ProcessReplay, ...]
+    results: tuple[ProcessReplay, ...]
     sent: Sequence[Any]
 
     @property
     def whole(self) -> bool:
         """Whether every input was replayed."""
-        return all(account.whole for account in self.accounts)
+        return all(result.whole for result in self.results)
 
 
 def received_vectors(table: str, rows: Rows) -> tuple[Matrix, list[str]]:
@@ -79,8 +79,8 @@ def replay_machine(role: str, record: RunRecord) -> MachineReplay:
     If the process was restarted, the machine of each restarted process is replayed too.
     """
     sent: list[Any] = []
-    accounts = [_replay_life(role, record.scenario, life, sent) for life in record.lives(role)]
-    return MachineReplay(tuple(accounts), sent)
+    results = [_replay_life(role, record.scenario, life, sent) for life in record.lives(role)]
+    return MachineReplay(tuple(results), sent)
 
 
 def _replay_life(role: str, scenario: Scenario, life: Life, sent: list[Any]) -> ProcessReplay:
@@ -111,8 +111,9 @@ def _start(life: Life) -> Start:
     """
     if not life.generation or CONTROLLER_STEP not in life.rows:
         return Start(life.generation)
-    ticks, taken = life.rows[CONTROLLER_STEP]["t_ns"], life.rows[CONTROLLER_DELIVERY]["model_t_ns"]
-    return Start(life.generation, int(min((*ticks[:1], *taken[:1]), default=0)))
+    steps, deliveries = life.rows[CONTROLLER_STEP], life.rows[CONTROLLER_DELIVERY]
+    first_ns = (*steps["t_ns"][:1], *deliveries["model_t_ns"][:1])
+    return Start(life.generation, int(min(first_ns, default=0)))
 
 
 class _Inputs(NamedTuple):
@@ -134,18 +135,18 @@ def _inputs(owned: Mapping[str, Rows], report: Mapping[str, Any] | None, first: 
     unexpected = np.flatnonzero(numbers != np.arange(count))
     whole = int(unexpected[0]) if len(unexpected) else count
     if whole < count:
-        doubtful = whole
+        suspect = whole
         if numbers[whole] > whole:
             missing_from = whole
             if written == count:  # no row is missing, so an ``input`` number is wrong
                 repeated = np.append(np.diff(numbers) == 0, False)
-                doubtful = int(np.flatnonzero(repeated | (numbers >= count))[0])
+                suspect = int(np.flatnonzero(repeated | (numbers >= count))[0])
         if numbers[whole] < whole or written == count:
             missing_from = None
-            table, row = places[order[doubtful]]
+            table, row = places[order[suspect]]
             damage = difference(
                 table, row, int(owned[table]["now_ns"][row]), "the inputs are not numbered in turn",
-                "input", int(numbers[doubtful]), whole,
+                "input", int(numbers[suspect]), whole,
             )  # fmt: skip
     return _Inputs([places[i] for i in order[:whole].tolist()], missing_from, damage)
 

@@ -6,36 +6,26 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-NAME_BYTES = 32
-"""Room for a socket address; those of IPv6 have 28 bytes."""
-BLOCK_BYTES = 512
-"""Payloads of delayed datagrams are kept in chained blocks of this size."""
-CHUNK_BLOCKS = 4096
-"""Number of blocks per allocation."""
-MOST_BYTES = 65_536
-"""No received datagram is longer."""
+NAME_BYTES = 32  # room for a socket address; those of IPv6 have 28 bytes
+BLOCK_BYTES = 512  # payloads of delayed datagrams are kept in chained blocks of this size
+CHUNK_BLOCKS = 4096  # number of blocks per allocation
+MOST_BYTES = 65_536  # no received datagram is longer
 SLOT_STRIDE = MOST_BYTES + 256
 """Distance of receive buffers: their first bytes are in different cache sets."""
 READY_WORDS = 3 if platform.machine() in ("x86_64", "AMD64") else 4
 """32-bit words in struct epoll_event, which is packed on x86-64 only."""
 
-HOUSEKEEPING = 0
-"""Reason why the pump returned: the time for housekeeping has come."""
-NEW_CLIENT = 1
-"""The current datagram is from a new client."""
-STORE_FULL = 2
-"""There is no room to store the current datagram."""
-EVENTS_FULL = 3
-"""The event buffer is full: pass the events to the taps."""
-LEAVING_FULL = 4
-"""Within the pump: the list of departures is full and must be sent."""
-CARRY_ON = 5
-"""Within the pump: no reason to return."""
+# Why the pump returned; the last two occur within the pump only.
+HOUSEKEEPING = 0  # the time for housekeeping has come
+NEW_CLIENT = 1  # the current datagram is from a new client
+STORE_FULL = 2  # there is no room to store the current datagram
+EVENTS_FULL = 3  # the event buffer is full: pass the events to the taps
+LEAVING_FULL = 4  # the list of departures is full and must be sent
+CARRY_ON = 5  # no reason to return
 
-NO_NAME = 0
-"""Destination of a direction's datagrams: the address to which their socket is connected."""
-SERVER_NAME = 1
-"""The server, from a socket that is not connected."""
+# The destination of a direction's datagrams.
+NO_NAME = 0  # the address to which their socket is connected
+SERVER_NAME = 1  # the server, from a socket that is not connected
 CLIENT_NAME = 2
 
 PUMP = np.dtype(
@@ -175,8 +165,7 @@ HEADER = np.dtype(
 """struct mmsghdr of 64-bit Linux."""
 VECTOR = np.dtype([("base", "<i8"), ("size_bytes", "<i8")])
 """struct iovec."""
-CONTROL_BYTES = 64
-"""Buffer size for the control messages of a received datagram."""
+CONTROL_BYTES = 64  # Buffer size for the control messages of a received datagram
 ERROR_CONTROL_BYTES = 128
 """Buffer size for the control messages of an error: timestamp, error, address of the reporter."""
 CONTROL = np.dtype(
@@ -190,54 +179,35 @@ Array = NDArray[Any]
 class Memory(NamedTuple):
     """The arrays; each has rows of one of the types above, unless stated otherwise."""
 
-    pump: Array
-    """(1,)"""
+    pump: Array  # (1,)
     sockets: Array
     clients: Array
-    table: Array
-    """(power of 2,) int32: rows of clients by the hash of their address, −1 for none."""
-    directions: Array
-    """(2 · links,) Forward and reverse direction of each link."""
-    link_states: Array
-    """(2 · links,) :class:`noack.impairments.link_records.LinkState`."""
-    counters: Array
-    """(2 · links,) :class:`noack.impairments.link_records.Counters`."""
-    delays: Array
-    """(2 · links, BUCKETS) Histograms of the time from arrival to departure."""
+    table: Array  # (power of 2,) int32: rows of clients by the hash of their address, -1 for none
+    directions: Array  # (2 · links,) Forward and reverse direction of each link
+    link_states: Array  # (2 · links,) :class:`noack.impairments.link_records.LinkState`
+    counters: Array  # (2 · links,) :class:`noack.impairments.link_records.Counters`
+    delays: Array  # (2 · links, BUCKETS) Histograms of the time from arrival to departure
     lateness: Array
-    errors: Array
-    """(2 · links, 256) Number of datagrams that could not be sent or stored, by errno."""
-    time: Array
-    """(2,) int64: struct timespec."""
-    poll: Array
-    """(2,) int32: struct pollfd."""
-    ready: Array
-    """(k · READY_WORDS,) uint32: struct epoll_event."""
+    errors: Array  # (2 · links, 256) Number of datagrams that could not be sent or stored, by errno
+    time: Array  # (2,) int64: struct timespec
+    poll: Array  # (2,) int32: struct pollfd
+    ready: Array  # (k · READY_WORDS,) uint32: struct epoll_event
     in_headers: Array
     in_vectors: Array
-    in_names: Array
-    """(slots_in, 4) int64: socket addresses."""
-    in_controls: Array
-    """(slots_in, CONTROL_BYTES / 8) int64."""
+    in_names: Array  # (slots_in, 4) int64: socket addresses
+    in_controls: Array  # (slots_in, CONTROL_BYTES / 8) int64
     error_headers: Array
-    error_controls: Array
-    """(error_headers, k) int64."""
+    error_controls: Array  # (error_headers, k) int64
     out_headers: Array
-    out_first: Array
-    """(out_headers,) int32: first datagram of each message."""
+    out_first: Array  # (out_headers,) int32: first datagram of each message
     out_vectors: Array
     out_controls: Array
     leaving: Array
-    order: Array
-    """(leaving,) int32: the sockets that have something to send."""
+    order: Array  # (leaving,) int32: the sockets that have something to send
     heap: Array
     slots: Array
-    chunks: Array
-    """(k,) int64: addresses of chunks of blocks."""
-    block_next: Array
-    """(k · CHUNK_BLOCKS,) int32."""
+    chunks: Array  # (k,) int64: addresses of chunks of blocks
+    block_next: Array  # (k · CHUNK_BLOCKS,) int32
     events: Array
-    data: Array
-    """(k,) uint8."""
-    integers: Array
-    """(1,) int32; only its type matters."""
+    data: Array  # (k,) uint8
+    integers: Array  # (1,) int32; only its type matters

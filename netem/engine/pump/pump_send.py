@@ -92,6 +92,7 @@ def _fill(memory: Memory, number: int) -> tuple[int, int]:
         header.control_bytes = 0
         if pump.segment != 0 and 0 < size_bytes < pump.segment_below:
             segments, all_bytes, last_bytes = 1, size_bytes, size_bytes
+            to_client = memory.directions[leaving.direction].sends == layout.CLIENT_NAME
             while number >= 0 and segments < _MOST_SEGMENTS and last_bytes == size_bytes:
                 other = memory.leaving[number]
                 last_bytes = other.size_bytes
@@ -101,7 +102,7 @@ def _fill(memory: Memory, number: int) -> tuple[int, int]:
                     or all_bytes + last_bytes > _MOST_SEGMENTED_BYTES
                     or vectors + needed > len(memory.out_vectors)
                     or other.direction != leaving.direction
-                    or (other.client != leaving.client and _by_client(memory, number))
+                    or (other.client != leaving.client and to_client)
                 ):
                     break
                 vectors = _add_vectors(memory, vectors, number)
@@ -122,19 +123,15 @@ def _fill(memory: Memory, number: int) -> tuple[int, int]:
     return headers, number
 
 
-def _by_client(memory: Memory, number: int) -> bool:
-    return memory.directions[memory.leaving[number].direction].sends == layout.CLIENT_NAME
-
-
-def _address(memory: Memory, header: int, way: int, client: int) -> None:
+def _address(memory: Memory, header: int, number: int, client: int) -> None:
     """Write the destination of a message."""
-    direction = memory.directions[way]
+    direction = memory.directions[number]
     name, name_bytes = 0, 0
     if direction.sends == layout.CLIENT_NAME:
         name = libc.address_of(memory.clients) + client * _CLIENT_BYTES + _CLIENT_NAME
         name_bytes = memory.clients[client].name_bytes
     elif direction.sends != layout.NO_NAME:
-        name = libc.address_of(memory.directions) + way * _DIRECTION_BYTES + _DIRECTION_NAME
+        name = libc.address_of(memory.directions) + number * _DIRECTION_BYTES + _DIRECTION_NAME
         name_bytes = direction.name_bytes
     memory.out_headers[header].name = name
     memory.out_headers[header].name_bytes = name_bytes

@@ -57,10 +57,10 @@ def linearise(
 
     before, after, later = (np.eye(n + m) for _ in range(3))
     for i in range(n + m):
-        aside = np.zeros(n + m)
-        aside[i] = off
-        there, back = (followed(sign * aside[:n], sign * aside[n:]) for sign in (1.0, -1.0))
-        before[:n, i], after[:n, i], later[:n, i] = (there - back) / (2 * off)
+        change = np.zeros(n + m)
+        change[i] = off
+        plus, minus = (followed(sign * change[:n], sign * change[n:]) for sign in (1.0, -1.0))
+        before[:n, i], after[:n, i], later[:n, i] = (plus - minus) / (2 * off)
     unknown = np.full((n, n), np.nan), np.full((n, m), np.nan)
     if not (np.isfinite(before).all() and np.isfinite(later).all()):
         return unknown

@@ -61,7 +61,7 @@ def compiled_dynamics(model: str) -> Any:
     from numba.core.errors import NumbaError
 
     if not is_compiled(model):
-        _say(while_compiling("the vehicle's equations", kept=_folder(model) is not None))
+        _print(while_compiling("the vehicle's equations", kept=_folder(model) is not None))
     compiled = _compiled(model)
     vector = numba.types.Array(numba.float64, 1, "C")
     dtype = _record(library("vehicle_parameters", "VehicleParameters")()).dtype
@@ -70,7 +70,7 @@ def compiled_dynamics(model: str) -> Any:
         compiled.compile((vector, numba.float64, numba.float64, parameters, vector))
     except NumbaError as error:  # numba may not support another version of the library
         why = str(error).partition("\n")[0]
-        _say(f"warning: the vehicle's equations stay slow, as they cannot be compiled: {why}")
+        _print(f"warning: the vehicle's equations stay slow, as they cannot be compiled: {why}")
         return None
     return compiled
 
@@ -84,7 +84,7 @@ def _dynamics(model: str) -> Any:
     return library(f"vehicle_dynamics_{model}")
 
 
-def _say(line: str) -> None:
+def _print(line: str) -> None:
     with suppress(OSError, ValueError):  # stderr is closed
         print(f"noack: {line}", file=sys.stderr, flush=True)
 

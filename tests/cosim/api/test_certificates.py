@@ -45,16 +45,16 @@ def test_the_box_is_certified_and_shown(scenario: noack.Scenario) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"weight": "best"}, 'weight: given, identity or chosen, not "best"'),
         ({"late": -1}, "late: -1 steps; give 0 to 1000"),
     ],
 )
-def test_what_cannot_be_asked_is_one_line(options: dict[str, object], said: str) -> None:
+def test_what_cannot_be_asked_is_one_line(options: dict[str, object], message: str) -> None:
     with pytest.raises(noack.NoackError) as caught:
         noack.certify("double_integrator", **options)  # type: ignore[arg-type]
-    assert str(caught.value) == said
+    assert str(caught.value) == message
 
 
 def test_a_missing_certificate_gives_one_line() -> None:

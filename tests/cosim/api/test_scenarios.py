@@ -49,7 +49,7 @@ def test_settings_replace_values_in_a_copy_of_the_scenario() -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "said"),
+    ("settings", "message"),
     [
         ({"network.loss.probabilty": 0.8}, "did you mean probability?"),
         ({"network.loss.probability": 1.8}, "settings: network.loss.probability = 1.8: should be"),
@@ -59,10 +59,10 @@ def test_settings_replace_values_in_a_copy_of_the_scenario() -> None:
         ({"horizon_s": object()}, "is no value of a setting"),
     ],
 )
-def test_a_wrong_setting_gives_one_line(settings: dict[str, Any], said: str) -> None:
+def test_a_wrong_setting_gives_one_line(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(noack.NoackError) as caught:
         noack.with_settings(noack.load("lane_following"), settings)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -98,7 +98,7 @@ def test_a_python_control_system_keeps_its_names_and_may_have_another_plant() ->
 
 
 @pytest.mark.parametrize(
-    ("gain", "initial_state", "said"),
+    ("gain", "initial_state", "message"),
     [
         ([[15.0, 5.0]], [0.2, 0.0], "give -K"),
         ([[0.0, 0.0]], [0.2, 0.0], "has an eigenvalue with real part 3.08 /s; give a gain"),
@@ -106,10 +106,10 @@ def test_a_python_control_system_keeps_its_names_and_may_have_another_plant() ->
         (GAIN, "upright", "plant.initial_state"),
     ],
 )
-def test_an_invalid_system_gives_one_line(gain: Any, initial_state: Any, said: str) -> None:
+def test_an_invalid_system_gives_one_line(gain: Any, initial_state: Any, message: str) -> None:
     with pytest.raises(noack.NoackError) as caught:
         noack.from_system(SYSTEM, gain, initial_state)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 

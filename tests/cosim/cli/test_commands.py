@@ -42,7 +42,7 @@ def test_check_prints_the_defaults_that_depend_on_other_keys(
 ) -> None:
     path = tmp_path / "small.toml"
 
-    def said() -> str:
+    def message() -> str:
         path.write_text(tomli_w.dumps(content))
         done = CliRunner().invoke(app, ["check", str(path)])
         assert done.exit_code == 0, done.stderr
@@ -50,7 +50,7 @@ def test_check_prints_the_defaults_that_depend_on_other_keys(
         assert tomllib.loads(done.stdout)["name"] == content["name"]
         return " ".join(done.stdout.replace("\n# ", "\n").split())
 
-    silent = said()
+    silent = message()
     assert "plant.watchdog: policy hold, after 0.1 s without an actuation" in silent
     assert "controller.safe_input: 0, the input before the first update" in silent
     assert "recovery.rejoin_within_s: 0, a process that dies ends the run;" in silent
@@ -59,5 +59,5 @@ def test_check_prints_the_defaults_that_depend_on_other_keys(
     content["controller"] = {"safe_input": [0.1]}
     content["recovery"] = {"rejoin_within_s": 5.0}
     content["start_within_s"] = 60.0
-    explicit = said()
+    explicit = message()
     assert not any(key in explicit for key in ("watchdog:", "safe_input:", "_within_s:"))

@@ -42,8 +42,8 @@ def words_of(example: str) -> list[str]:
 def test_the_help_begins_with_an_introduction() -> None:
     text = help_of()
     story, _, panels = text.partition("Options")
-    told = re.findall(r"^ +noack (\w+)", story, re.MULTILINE)
-    assert told == [
+    commands = re.findall(r"^ +noack (\w+)", story, re.MULTILINE)
+    assert commands == [
         "doctor", "run", "view", "simulate", "certify", "fidelity", "compare", "campaign", "netem",
     ]  # fmt: skip
     assert all(f" {name} " in panels for name in COMMANDS)
@@ -133,9 +133,9 @@ def test_only_long_and_live_commands_have_no_example_that_is_run() -> None:
 
 def test_the_emulators_examples_have_valid_arguments() -> None:
     text = emulator.parser().format_help().replace(" \\\n", " ")
-    told = re.findall(r"^  noack netem (--.*)", text.partition("examples:")[2], re.MULTILINE)
-    assert len(told) >= 5
-    for example in told:
+    shown = re.findall(r"^  noack netem (--.*)", text.partition("examples:")[2], re.MULTILINE)
+    assert len(shown) >= 5
+    for example in shown:
         options = emulator.parsed(emulator.parser(), shlex.split(example))
         parse(options.words or ())
         if options.links is None:

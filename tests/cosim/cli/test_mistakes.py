@@ -49,22 +49,22 @@ def noack(line: str) -> Result:
     return CliRunner().invoke(app, line.split(), prog_name="noack")
 
 
-@pytest.mark.parametrize(("line", "said"), MISTAKES.items())
-def test_a_mistake_gives_one_line_and_with_json_a_document(line: str, said: str) -> None:
+@pytest.mark.parametrize(("line", "expected"), MISTAKES.items())
+def test_a_mistake_gives_one_line_and_with_json_a_document(line: str, expected: str) -> None:
     done = noack(line)
-    assert (done.exit_code, done.stdout, done.stderr) == (2, "", f"{said}\n")
+    assert (done.exit_code, done.stdout, done.stderr) == (2, "", f"{expected}\n")
     done = noack(f"{line} --json" if line != "demo --set" else "demo --json --set")
     document = json.loads(done.stdout)
-    _, _, message = said.partition(": ")
+    _, _, message = expected.partition(": ")
     assert document == {"error": message, "exit": {"status": 2, "reason": message}}
-    assert done.stderr == f"{said}\n"
+    assert done.stderr == f"{expected}\n"
 
 
-@pytest.mark.parametrize(("name", "said"), NOT_FOUND.items())
-def test_an_unknown_scenario_suggests_the_nearest_name(name: str, said: str) -> None:
+@pytest.mark.parametrize(("name", "expected"), NOT_FOUND.items())
+def test_an_unknown_scenario_suggests_the_nearest_name(name: str, expected: str) -> None:
     done = noack(f"check {name} --json")
     assert done.exit_code == 2
-    assert said in done.stderr
+    assert expected in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert json.loads(done.stdout)["error"] in done.stderr
 
@@ -100,13 +100,13 @@ def test_a_process_that_fails_is_named_once(tmp_path: Path) -> None:
             capture_output=True, text=True, check=False,
         )  # fmt: skip
     (run_dir,) = tmp_path.iterdir()
-    said = (
+    expected = (
         f"sensor: UDP port 127.0.0.1:{port} is already taken by another program; "
         "set ports.sensor to another port, or to 0 for any"
     )
     assert done.returncode == 2
-    assert done.stderr == f"noack: {said} (logs in {run_dir / 'logs'})\n"
-    assert (run_dir / "logs/sensor.log").read_text() == f"noack {said}\n"
+    assert done.stderr == f"noack: {expected} (logs in {run_dir / 'logs'})\n"
+    assert (run_dir / "logs/sensor.log").read_text() == f"noack {expected}\n"
 
 
 def test_a_folder_that_cannot_be_written_is_named_once() -> None:

@@ -57,7 +57,7 @@ def test_arguments_are_keys_and_values() -> None:
         (["mansd", "9" * 5000], "mansd: an integer is too large"),
     ],
 )
-def test_mistaken_words_are_told(words: list[str], why: str) -> None:
+def test_mistaken_words_are_reported(words: list[str], why: str) -> None:
     with pytest.raises(CallerError, match=why):
         parsed(words)
 

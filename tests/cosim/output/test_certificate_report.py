@@ -84,8 +84,8 @@ def test_the_documentation_quotes_computed_figures(
     ]
     live = constants(lane.schedule)
     least_ms = 1e3 * live.inter_event_s
-    said = f"Δ = {live.delta:.3g}, X = {live.state:.3g} and δ = {least_ms:.0f} ms"
-    assert said in " ".join(text.split())
+    message = f"Δ = {live.delta:.3g}, X = {live.state:.3g} and δ = {least_ms:.0f} ms"
+    assert message in " ".join(text.split())
     limits = weighted.limits
     assert f"sampling periods up to {1e3 * limits.sampling_s:.0f} ms" in text
 
@@ -184,8 +184,8 @@ def test_the_text_states_the_bounds_and_their_conditions(document: dict[str, Any
 def test_a_gain_of_the_opposite_sign_is_recognised() -> None:
     settings = ["--set", "model.gain=[[15.0, 5.0]]", "--set", "model.allow_unstable=true"]
     arguments = ["certify", "unstable_pendulum", *settings]
-    said = " ".join(CliRunner().invoke(app, arguments).stdout.split())
-    assert "the loop's u is +Kx, and −K would stabilise it" in said
+    message = " ".join(CliRunner().invoke(app, arguments).stdout.split())
+    assert "the loop's u is +Kx, and −K would stabilise it" in message
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -234,8 +234,10 @@ def test_a_plant_outside_its_box_is_named() -> None:
         "lane_following", *BOXED, 'plant.draw="given"', "plant.A=[[0.0,1.0],[2.0,0.0]]",
         "plant.B=[[0.0],[1.0]]",
     )  # fmt: skip
-    said = outside_box(outside)
-    assert said == ("the plant lies outside: A[2, 1] is 2 from the model's, the half-width is 0.3")
+    message = outside_box(outside)
+    assert message == (
+        "the plant lies outside: A[2, 1] is 2 from the model's, the half-width is 0.3"
+    )
     claims = [
         c for c in ClaimEvaluation(simulate(outside)).judge() if c.source == "box certificate"
     ]

@@ -97,13 +97,13 @@ def test_every_colour_has_enough_contrast_to_its_background(background: str) -> 
 
 @pytest.mark.parametrize("vision", VISIONS)
 @pytest.mark.parametrize("panel", PANELS)
-def test_colours_of_one_panel_can_be_told_apart(panel: str, vision: str) -> None:
+def test_colours_of_one_panel_can_be_distinguished(panel: str, vision: str) -> None:
     least = 0.15 if panel == "states" else 0.09
     for one, other in combinations(PANELS[panel], 2):
         assert distance(one, other, VISIONS[vision]) > least, (one, other)
 
 
-def test_all_concepts_can_be_told_apart_with_colour_blindness() -> None:
+def test_all_concepts_can_be_distinguished_with_colour_blindness() -> None:
     for vision in VISIONS.values():
         for one, other in combinations(CONCEPTS, 2):
             assert distance(one, other, vision) > 0.05, (one, other)

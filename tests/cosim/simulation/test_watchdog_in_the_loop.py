@@ -71,7 +71,7 @@ def test_the_watchdogs_input_is_not_compared_with_the_ideal_loop(run: RunRecord)
     if run.scenario.plant.watchdog.policy == "hold":
         live_run(run)
         return
-    with pytest.raises(IncomparableError, match="the watchdog's, or a safe one"):
+    with pytest.raises(IncomparableError, match="no watchdog and no safe input"):
         live_run(run)
 
 

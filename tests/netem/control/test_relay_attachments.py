@@ -92,9 +92,11 @@ def test_the_view_shows_the_relay_and_later_messages_until_q(
             drawn = threads.submit(press_q, user, "q ends", "→ up", "a message")
             with attached(relay, Options(view=True)) as side:
                 print("a message", file=sys.stderr)
-                while not side.quit_requested and not drawn.done():
+                late_s = time.monotonic() + 20
+                while not side.quit_requested and time.monotonic() < late_s:
                     side.commands.run_pending()
                     time.sleep(0.01)
+                assert side.quit_requested
             assert drawn.exception() is None
         read_until(user, lambda text: "forward →" in text.partition("\x1b[?1049l")[2])
     assert capsys.readouterr().err == "a message\n"

@@ -96,21 +96,6 @@ def test_compiled_and_plain_rules_agree(
         assert expected is None or found == expected
 
 
-@settings(max_examples=50)
-@given(own=any_settings.harsh, batch=arrivals, sizes=st.lists(st.integers(1, 30), min_size=1))
-def test_batches_do_not_matter(
-    own: LinkSettings, batch: list[tuple[int, int, int]], sizes: list[int]
-) -> None:
-    batch = ascending(batch)
-    together, apart = Compiled(own), Compiled(own)
-    found, begin = [], 0
-    while begin < len(batch):
-        size = sizes[begin % len(sizes)]
-        found += apart.decide(batch[begin : begin + size])
-        begin += size
-    assert found == together.decide(batch)
-
-
 @pytest.mark.parametrize("mansd", [None, 2])
 def test_recorded_decisions_are_repeated_by_flow_not_by_row(mansd: int | None) -> None:
     own = LinkSettings(mansd=mansd)

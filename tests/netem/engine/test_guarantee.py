@@ -16,9 +16,9 @@ from tests.netem.engine.relays import drain, endpoints, link, name_of, running
 CLIENTS = 3
 
 
-def sealed(number: int, way: str, size: int) -> bytes:
+def sealed(number: int, side: str, size: int) -> bytes:
     """Return a payload with its number and a check of its integrity."""
-    head = number.to_bytes(4, "big") + way.encode()
+    head = number.to_bytes(4, "big") + side.encode()
     body = head.ljust(size, b".")
     return hashlib.blake2b(body, digest_size=8).digest() + body
 
@@ -56,12 +56,8 @@ def test_the_cap_holds_in_both_directions_for_every_client(
     other: LinkSettings | None,
     segment: bool,
 ) -> None:
-    assert forward.mansd is not None
-    assert reverse.mansd is not None
-    forward_cap, back_cap = forward.mansd, reverse.mansd
-    if other is not None:
-        assert other.mansd is not None
-        forward_cap = max(forward_cap, other.mansd)
+    forward_cap = max(one.mansd or 0 for one in (forward, other or forward))
+    reverse_cap = reverse.mansd or 0
     with endpoints(*["127.0.0.1"] * (CLIENTS + 1)) as (server, *clients):
         spec = link(name_of(server), forward, reverse)
         with running([spec], engine, segment=segment) as one:
@@ -88,19 +84,8 @@ def test_the_cap_holds_in_both_directions_for_every_client(
             one.settle(sent * CLIENTS, "reverse")
             for client in clients:
                 received = [payload for payload, _ in drain(client)]
-                assert longest_loss_burst(received, sent) <= back_cap
+                assert longest_loss_burst(received, sent) <= reverse_cap
             report = one.report()
     assert report.forward.counters.longest_loss_burst <= forward_cap
-    assert report.reverse.counters.longest_loss_burst <= back_cap
-    for way in (report.forward, report.reverse):
-        assert way.unintended == {"lost_in_kernel": 0}
-
-
-def test_the_burst_counter_includes_missing_damaged_and_stale_datagrams() -> None:
-    all_of_them = [sealed(number, "there", 20) for number in range(6)]
-    assert longest_loss_burst(all_of_them, 6) == 0
-    assert longest_loss_burst(all_of_them[:2] + all_of_them[4:], 6) == 2
-    assert longest_loss_burst(all_of_them[:3], 6) == 3
-    assert longest_loss_burst([all_of_them[k] for k in (0, 3, 1, 2, 4, 5)], 6) == 2
-    damaged = bytes([all_of_them[1][0] ^ 4]) + all_of_them[1][1:]
-    assert longest_loss_burst([all_of_them[0], damaged, *all_of_them[2:]], 6) == 1
+    assert report.reverse.counters.longest_loss_burst <= reverse_cap
+    assert report.forward.unintended == report.reverse.unintended == {"lost_in_kernel": 0}

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from netem.engine import engine_choice, plain_taps, pump_memory, relay_base
+from netem.engine import engine_choice, plain_direction, pump_memory, relay_base
 from netem.engine.engine_choice import Engine, open_relay
 from netem.engine.relay_interface import DirectionReport
 from netem.engine.relay_sockets import raise_file_limit
@@ -425,7 +425,7 @@ class CountOnly:
 def test_taps_receive_every_event(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
     """There are more events than the buffer for events holds."""
     monkeypatch.setattr(pump_memory, "_EVENTS", 200)
-    monkeypatch.setattr(plain_taps, "_MOST", 20)
+    monkeypatch.setattr(plain_direction, "_MOST_EVENTS", 20)
     many, tap = 500, CountOnly()
     with (
         endpoints(V4, V4) as (server, client),

@@ -240,6 +240,7 @@ def test_a_system_that_decays_only_to_rounding_is_refused() -> None:
 @given(st.sampled_from(sorted(KINDS)), st.integers(1, 6), st.integers(0, 2**32))
 def test_in_its_coordinates_a_system_contracts(kind: str, n: int, seed: int) -> None:
     G = KINDS[kind](np.random.default_rng(seed), n)
+    assert decay_of(-G) is None
     decay = decay_of(G)
     assume(decay is not None)
     assert decay is not None

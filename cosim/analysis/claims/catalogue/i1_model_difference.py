@@ -19,7 +19,7 @@ def _bound(run: RunEvidence) -> Bound:
     here, margin = run.in_common, _margin(run)
     residual = identity_residual(run.record, run.joined)[here]
     # Use the larger model state, since a missed update may have moved x_c far from x_s.
-    before_end = run.t_s < run.until_s
+    before_end = run.t_s < run.part.until_s
     both = np.concatenate([run.joined.x_s[before_end], run.joined.x_c[here & before_end]])
     scale = max(float(np.abs(both).max(initial=0.0)), np.finfo(float).tiny)
     formula = "x_c − x_s = Σ e^(H(t−t_k)) e_s(t_k), relative residual ≤ {:.0e}"

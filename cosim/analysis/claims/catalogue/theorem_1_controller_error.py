@@ -67,11 +67,11 @@ def undominated(stretches: Sequence[Sequence[float]]) -> list[Sequence[float]]:
     reaches = np.zeros((len(stretches), most))
     for row, stretch in zip(reaches, stretches, strict=True):
         row[: len(stretch)] = np.cumsum(stretch[::-1])[::-1]
-    kept: list[int] = []
+    largest: list[int] = []
     for place in np.argsort(-reaches.sum(axis=1), kind="stable").tolist():
-        if not (reaches[kept] >= reaches[place]).all(axis=1).any():
-            kept.append(place)
-    return [stretches[place] for place in kept]
+        if not (reaches[largest] >= reaches[place]).all(axis=1).any():
+            largest.append(place)
+    return [stretches[place] for place in largest]
 
 
 def _model_decay(record: RunRecord) -> float:
@@ -111,7 +111,7 @@ def _bound(run: RunEvidence) -> Bound | None:
     ):
         return None
     void = run.paper_violation
-    until_s = run.until_s if void is None else min(run.until_s, void.t_s)
+    until_s = run.part.until_s if void is None else min(run.part.until_s, void.t_s)
     delta = trajectory_delta(run.record, run.joined, until_s)
     if delta is None:
         return None

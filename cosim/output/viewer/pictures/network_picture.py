@@ -88,13 +88,13 @@ class NetworkDiagram:
                 colors=colour,
             )  # fmt: skip
             found[f"box/{name}/word"] = label(text, (x, 0.28), colour)
-        ways = [_arrow(a + _HALF_WIDE, b - _HALF_WIDE, 0.0) for a, b in pairwise(_BOXES.values())]
+        arrows = [_arrow(a + _HALF_WIDE, b - _HALF_WIDE, 0.0) for a, b in pairwise(_BOXES.values())]
         if self._acknowledged:
-            ways += [
+            arrows += [
                 _arrow(a - _HALF_WIDE, b + _HALF_WIDE, _REVERSE_Y)
                 for a, b in ((_CONTROLLER, _NETWORK), (_NETWORK, _SENSOR))
             ]
-        found["ways"] = lines([line for way in ways for line in way], STILL, 0.03)
+        found["arrows"] = lines([line for arrow in arrows for line in arrow], STILL, 0.03)
         home = [(_CONTROLLER, -_HALF_HIGH), (_CONTROLLER, _LOW), (0.0, _LOW), (0.0, -_HALF_HIGH)]
         head = [(-0.14, -_HALF_HIGH - 0.2), (0.0, -_HALF_HIGH), (0.14, -_HALF_HIGH - 0.2)]
         found["input"] = lines([home, head], STILL, 0.03)

@@ -57,8 +57,8 @@ def test_the_value_of_a_pattern_is_that_of_its_run(resolved: Scenario) -> None:
     runs = [simulate(resolved, first + pattern) for pattern in wanted]
     for objective in Objective:
         flow = flow_of(resolved, objective)
-        outcomes = follow(flow, resolved.network.mansd, wanted)
-        for value, pattern, run in zip(outcomes.value, outcomes.patterns, runs, strict=True):
+        values, patterns = follow(flow, resolved.network.mansd, wanted)
+        for value, pattern, run in zip(values, patterns, runs, strict=True):
             assert tuple(run.delivered.tolist()) == first + pattern
             assert value == pytest.approx(evaluate(run, flow.measure).value, rel=1e-6)
 

@@ -83,14 +83,17 @@ def test_every_axis_has_a_label_with_its_unit(drawn: dict[str, Figure]) -> None:
                 assert is_hidden or has_unit, (name, label)
 
 
-def test_figures_are_saved_and_nothing_is_cut_off_and_no_texts_overlap(
-    drawn: dict[str, Figure], tmp_path: Path
-) -> None:
-    """Warnings are errors here: no log of zero, no limits that coincide, no layout that fails."""
-    for name, figure in drawn.items():
+def test_every_figure_can_be_saved(tmp_path: Path) -> None:
+    """Warnings are errors here: no log of zero, no limits that coincide."""
+    for name, figure in drawn_for("not finite").items():
         save_figure(figure, tmp_path / f"{name}.png")
         assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_nothing_is_cut_off_and_no_texts_overlap(drawn: dict[str, Figure]) -> None:
+    for name, figure in drawn.items():
         with settings():
+            figure.draw_without_rendering()
             box, size_in = figure.get_tightbbox(), figure.get_size_inches()
             assert min(box.x0, box.y0) >= 0, name
             assert box.x1 <= size_in[0], name

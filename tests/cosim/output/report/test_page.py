@@ -266,14 +266,14 @@ def test_every_run_gets_a_report(case: str, content: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("exit_", "said"),
+    ("exit_", "message"),
     [
         ({"status": 0, "reason": "horizon"}, "completed 1 s"),
         ({"status": 1, "reason": "plant died"}, "failed after 1 s: plant died"),
     ],
 )
-def test_the_verdict_comes_first(record: RunRecord, exit_: dict[str, Any], said: str) -> None:
-    assert said in shown(record, exit=exit_).partition("Key numbers")[0]
+def test_the_verdict_comes_first(record: RunRecord, exit_: dict[str, Any], message: str) -> None:
+    assert message in shown(record, exit=exit_).partition("Key numbers")[0]
 
 
 def test_envelopes_are_drawn_with_their_signals(record: RunRecord) -> None:

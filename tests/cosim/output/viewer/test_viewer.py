@@ -364,9 +364,9 @@ def test_a_disk_that_fills_during_the_run_is_reported_by_the_closing(tmp_path: P
         "t.add_samples(view, 50); view.close()"
     )
     with another_process(code, path) as child:
-        _, told = child.communicate()
+        _, errors = child.communicate()
         assert child.returncode == 1
-    last = told.splitlines()[-1]
+    last = errors.splitlines()[-1]
     assert "ViewError" in last
     assert str(path) in last
     assert "the recording is incomplete" in last

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from cosim.cli import app, command
@@ -73,6 +74,11 @@ def test_the_command_computes_the_committed_draws_and_writes_the_page(
     assert report["draws"] == DRAWS
     assert len(report["files"]) == 5
     assert all(Path(file).is_file() for file in report["files"])
+    console = Console(record=True, width=200)
+    paper_run.print_claims(console, report)
+    text = console.export_text()
+    assert f"Section V over {DRAWS} draws" in text
+    assert all(claim["gist"] in text and claim["verdict"] in text for claim in report["claims"])
     written = load_results(tmp_path / "figures" / "paper.json")
     assert (tmp_path / "paper.md").read_text(encoding="utf-8") == render(written)
     for key, rows in results.tables.items():
