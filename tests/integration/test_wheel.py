@@ -82,7 +82,7 @@ def noack(dist: Path, tmp_path_factory: pytest.TempPathFactory) -> Installed:
     assert made.returncode == 0, made.stderr
     lock = ROOT / "requirements.lock"
     done = uv("pip", "install", "--python", python, "--constraint", lock, wheel)
-    if done.returncode != 0 and any(said in done.stderr for said in OF_THE_NETWORK):
+    if done.returncode != 0 and any(text in done.stderr for text in OF_THE_NETWORK):
         pytest.skip(f"no package index can be reached: {' '.join(done.stderr.split())[:200]}")
     assert done.returncode == 0, done.stderr
     (place / "work").mkdir()

@@ -130,8 +130,8 @@ def test_a_restarted_sensor_restarts_its_estimate_and_is_replayed(
     scenario, at_ns = resolved(observed), 800_000_000
     successor = sensor_of(scenario, Start(1, at_ns))
     record = simulate_with(scenario, "sensor", lambda one: Reborn(one, successor, at_ns))
-    said = [one for one in record.notices if "observer" in one["text"]]
-    assert [(one["t_ns"], one["process"]) for one in said] == [(at_ns, "sensor")]
+    notices = [one for one in record.notices if "observer" in one["text"]]
+    assert [(one["t_ns"], one["process"]) for one in notices] == [(at_ns, "sensor")]
     rows = record[SENSOR_MEASUREMENT]
     again = np.flatnonzero(rows["input"] >= GENERATION)[0]
     assert rows["t_ns"][again] == at_ns
