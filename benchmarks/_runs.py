@@ -67,7 +67,8 @@ def execute(command: Sequence[str], cwd: Path | None = None) -> Finished:
             lines = [Line(time.monotonic(), text.rstrip()) for text in process.stderr]
         stdout.seek(0)
         if process.returncode != 0:
-            last = lines[-1].text if lines else "no message"
+            messages = [line.text for line in lines if not PROGRESS.match(line.text)]
+            last = messages[-1] if messages else "no message"
             raise MeasurementError(f"{command[0]} ended with {process.returncode}: {last}")
         return Finished(begun_s, lines, stdout.read())
 
