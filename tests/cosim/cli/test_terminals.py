@@ -69,6 +69,18 @@ def test_the_variable_no_color_disables_colours(tmp_path: Path) -> None:
     assert not COLOUR.search(on_a_terminal("--help", cwd=tmp_path, NO_COLOR="1"))
 
 
+@pytest.mark.parametrize("no_color", ["", "1"])
+def test_colours_that_are_forced_are_still_disabled_by_no_color(
+    no_color: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, value in environment(FORCE_COLOR="1", NO_COLOR=no_color).items():
+        monkeypatch.setenv(name, value)
+    done = CliRunner().invoke(app, SIMULATE)
+    assert done.exit_code == 0
+    assert bool(COLOUR.search(done.stdout)) == (no_color == "")
+
+
 def test_a_dumb_terminal_receives_no_control_characters(tmp_path: Path) -> None:
     output = on_a_terminal(*SIMULATE, cwd=tmp_path, TERM="dumb")
     assert all(one.isprintable() or one in "\r\n" for one in output), output
