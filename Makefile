@@ -103,7 +103,7 @@ setup-dev: $(VENV)/.installed-dev
 test: check pytest ## Lint, types, import rules, and all tests (ARGS are pytest's, e.g. ARGS="-k mansd")
 
 pytest: setup-dev
-	$(BIN)/python -m pytest $(or $(ARGS),--numprocesses=3 --dist=worksteal)
+	$(BIN)/python -m pytest $(or $(ARGS),--numprocesses=3 --dist=loadfile --no-loadscope-reorder)
 
 fuzz: setup-dev ## Fuzz every parser for MINUTES=10 in total; exit status 1 if an input fails
 	$(BIN)/python -m tests.fuzz run --minutes $(MINUTES) $(ARGS)
