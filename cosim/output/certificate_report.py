@@ -272,7 +272,7 @@ def _print_constants(console: Console, found: Certificates) -> None:
     norm = "‖W·‖" if trigger.weight is not None else "‖·‖"
     table = Table(
         title=f"{found.scenario.name}: certified bounds, M − 1 = {found.scenario.network.mansd}, "
-        f"β = {trigger.beta:g}, α = {trigger.alpha_per_s:g} /s, error norm {norm}"
+        f"β = {trigger.beta:g}, α = {trigger.alpha_per_s:g} /s, norm {norm}"
     )
     table.add_column("")
     for under, certificate in found:
