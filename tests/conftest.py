@@ -33,7 +33,9 @@ settings.register_profile(
 settings.load_profile("noack")
 
 
-def pytest_collection_finish() -> None:
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    # Live runs wait most: with several workers they begin first.
+    items.sort(key=lambda item: not item.nodeid.startswith("tests/integration/"))
     if settings().derandomize:
         # Hypothesis would also try constants of the loaded modules, which depend on the tests that
         # this worker has run before.

@@ -1,13 +1,12 @@
 import itertools
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks import relay_delay, relay_flows, relay_soak, relays
-from benchmarks._relay_decisions import Decide, LossRuns, compiled, plain, predicted_loss
+from benchmarks._relay_decisions import LossRuns, plain, predicted_loss
 from benchmarks._relay_load import Burst, Soak
 from benchmarks._relay_ours import Ours, Totals, command_of, totals_of
 from benchmarks._relay_process import figures_of
@@ -128,20 +127,13 @@ def test_the_predicted_loss_is_that_of_the_stationary_markov_chain(
     assert predicted_loss(probability, mansd) == pytest.approx(expected, rel=1e-12)
 
 
-@pytest.mark.parametrize("way", [plain, compiled])
-def test_the_pure_link_keeps_its_guarantee_and_the_predicted_loss(
-    way: Callable[[int], Decide],
-) -> None:
-    found = relay_flows.decide_all(way(200), 100_000, 200)
+def test_the_pure_link_keeps_its_guarantee_and_the_predicted_loss() -> None:
+    found = relay_flows.decide_all(plain(200), 100_000, 200)
     assert found.runs.longest == 4
     assert found.runs.decisions >= 100_000
     # 5 standard errors of independent draws; the cap reduces the variance.
     share = found.runs.lost / found.runs.decisions
     assert share == pytest.approx(predicted_loss(0.5, 4), abs=0.008)
-
-
-def test_plain_and_compiled_links_make_the_same_decisions() -> None:
-    assert (plain(20)(30) == compiled(20)(30)).all()
 
 
 def test_a_loss_burst_beyond_the_cap_misses_the_goal() -> None:

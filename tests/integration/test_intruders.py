@@ -117,7 +117,7 @@ class Attacked:
         with self.intruder.at_work():
             run_dir = (recording.runs / "latest").resolve()
             self.seen = {
-                "command lines and environments": _told_by_processes(recording, processes),
+                "command lines and environments": _visible_in_processes(recording, processes),
                 "the run directory": _files(run_dir),
                 "the private folder": {
                     name: content
@@ -146,18 +146,18 @@ def _files(folder: Path) -> dict[str, bytes]:
     return found
 
 
-def _told_by_processes(
+def _visible_in_processes(
     recording: Running, processes: list[subprocess.Popen[str]]
 ) -> dict[str, bytes]:
     """Return command lines, environments and names of the processes."""
     launcher = psutil.Process(recording.process.pid)
     pids = [launcher.pid, *(child.pid for child in launcher.children(recursive=True))]
     pids += [process.pid for process in processes]
-    told = {}
+    contents = {}
     for pid in pids:
         for name in ("cmdline", "environ", "comm"):
-            told[f"{pid}/{name}"] = Path(f"/proc/{pid}/{name}").read_bytes()
-    return told
+            contents[f"{pid}/{name}"] = Path(f"/proc/{pid}/{name}").read_bytes()
+    return contents
 
 
 def test_attacks_on_the_control_plane_do_not_affect_a_run(

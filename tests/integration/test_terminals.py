@@ -25,8 +25,8 @@ def test_a_process_may_be_restarted_by_hand(
     assert processes["sensor"].wait(PATIENCE_S) == 130
     again = by_hand("sensor")
     assert again.stderr is not None
-    said = "replaces a process (sensor ended early: SIGINT)"
-    assert any(said in line for line in iter(again.stderr.readline, ""))
+    message = "replaces a process (sensor ended early: SIGINT)"
+    assert any(message in line for line in iter(again.stderr.readline, ""))
     processes["plant"].send_signal(signal.SIGINT)  # the run ends without the plant
     finished = recording.finish()
     assert finished.status == 1

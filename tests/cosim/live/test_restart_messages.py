@@ -18,12 +18,14 @@ def test_a_restart_without_rows_is_listed(content: dict[str, Any]) -> None:
     record = simulate(resolve(validate(content, "")))
     rows = record[SENSOR_MEASUREMENT].copy()
     rows["input"][50:] = 2 * GENERATION + np.arange(len(rows) - 50)
-    said = [
+    notices = [
         {"process": "sensor", "level": RESTART, "t_ns": k * 10_000_000, "text": f"after {k}"}
         for k in (1, 2)
     ]
     tables = {table: record[table] for table in record.tables} | {SENSOR_MEASUREMENT: rows}
-    restarts = summarise(RunRecord(record.scenario, tables, said, {}), 0, "").to_json()["restarts"]
+    restarts = summarise(RunRecord(record.scenario, tables, notices, {}), 0, "").to_json()[
+        "restarts"
+    ]
     last_s = rows["now_ns"][49] * 1e-9
     found = {one["generation"]: (one["last_s"], one["first_s"], one["what"]) for one in restarts}
     assert found == {
@@ -41,9 +43,9 @@ def test_missing_first_rows_of_a_restart_are_counted(content: dict[str, Any], ne
     rows["input"][80:] = newest * GENERATION + 37 + np.arange(len(rows) - 80)
     if newest == 2:
         rows["input"][80:] -= 37
-    said = [{"process": "sensor", "level": RESTART, "t_ns": 0, "text": "newest"}]
+    notices = [{"process": "sensor", "level": RESTART, "t_ns": 0, "text": "newest"}]
     tables = {table: record[table] for table in record.tables} | {SENSOR_MEASUREMENT: rows}
-    summary = summarise(RunRecord(record.scenario, tables, said, {}), 0, "").to_json()
+    summary = summarise(RunRecord(record.scenario, tables, notices, {}), 0, "").to_json()
     assert summary["missing_by_table"]["sensor"] == 7
     if newest == 2:
         assert [one["what"] for one in summary["restarts"]] == [None, "newest"]

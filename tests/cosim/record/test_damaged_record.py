@@ -83,8 +83,8 @@ def test_the_readable_part_of_a_damaged_spool_is_read(run_dir: Path) -> None:
     writer.append(PLANT_STEP, 0, rows[:2].tobytes())
     writer.append(PLANT_STEP, 2, rows[2:4].tobytes()[:-1])
     writer.append(PLANT_STEP, 4, rows[4:].tobytes())
-    for number, said in enumerate(["[]", "{", json.dumps(NOTICE | {"text": "last"})]):
-        writer.append(notices_of("netem"), number, said.encode())
+    for number, line in enumerate(["[]", "{", json.dumps(NOTICE | {"text": "last"})]):
+        writer.append(notices_of("netem"), number, line.encode())
     writer.close()
     finished = finish_record(run_dir)
     kept = [*rows["input"][:2].tolist(), *rows["input"][4:].tolist()]

@@ -171,9 +171,9 @@ def test_a_restarted_process_applies_the_parameters_in_force() -> None:
     resolved = resolve(validate(CONTENT, "here"))
     change = ParameterChange(0, 500 * MS, {"trigger.beta": 0.5, "controller.setpoint": [2.0, 0.0]})
     sensor = sensor_of(resolved, Start(1, 2_000 * MS))
-    (said,) = sensor.announce(change, 2_000 * MS)
-    assert isinstance(said, Record)
-    assert said.row[4] == change.t_ns  # not late: the process had no time of its own yet
+    (setting,) = sensor.announce(change, 2_000 * MS)
+    assert isinstance(setting, Record)
+    assert setting.row[4] == change.t_ns  # not late: the process had no time of its own yet
     x = np.array([1.0, 0.0])
     sensor.handle(Message(Flow.MEASUREMENT, 0, 2_000 * MS, x), 2_000 * MS)
     outputs = sensor.handle(Message(Flow.MEASUREMENT, 1, 2_010 * MS, x), 2_010 * MS)

@@ -54,8 +54,8 @@ def test_a_run_with_an_outage_is_replayed_bit_for_bit(run: RunRecord) -> None:
 
 
 def test_the_beginning_and_end_of_a_trip_are_reported(run: RunRecord) -> None:
-    told = [(one["t_ns"], one["process"]) for one in run.notices if one["level"] == "watchdog"]
-    assert told == [(1_100_000_000, "plant"), (1_402_000_000, "plant")]
+    trips = [(one["t_ns"], one["process"]) for one in run.notices if one["level"] == "watchdog"]
+    assert trips == [(1_100_000_000, "plant"), (1_402_000_000, "plant")]
     summary = summarise(run, 0, "horizon").to_json()
     assert summary["watchdog"] == {
         "policy": run.scenario.plant.watchdog.policy, "timeout_s": pytest.approx(0.1), "trips": 1,

@@ -216,7 +216,7 @@ def test_words_and_their_meaning() -> None:
 
 
 def test_the_law_drops_copies_of_delivered_packets() -> None:
-    words = "duplicate 100% rate 8mbit 0 queue 5 codel target 1us interval 1us mtu 0"
+    words = "duplicate 100% rate 8mbit 0 codel target 1us interval 1us mtu 0"
     link, found = Link(settings_of(words), 0, "a"), set()
     for k in range(50):
         decision = link.decide(0, 100, 10_000 * k)

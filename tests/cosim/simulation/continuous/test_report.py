@@ -56,9 +56,9 @@ def test_the_json_document_agrees_with_the_run(resolved: Scenario) -> None:
 
 def test_the_command_prints_a_table_or_json() -> None:
     arguments = ("simulate", str(SCENARIOS / "lane_following.toml"), "--trigger", "continuous")
-    told = noack(*arguments)
-    assert told.exit_code == 0, told.output
-    completed, transmissions, *_ = told.stdout.splitlines()
+    done = noack(*arguments)
+    assert done.exit_code == 0, done.output
+    completed, transmissions, *_ = done.stdout.splitlines()
     assert completed == "completed 20 s"
     assert transmissions == "20 transmissions, 7 delivered"
     document = json.loads(noack(*arguments, "--json").stdout)
@@ -67,18 +67,18 @@ def test_the_command_prints_a_table_or_json() -> None:
 
 
 def test_long_lists_of_events_are_shortened() -> None:
-    told = noack("simulate", str(SCENARIOS / "lane_following.toml"), "--trigger", "continuous",
+    done = noack("simulate", str(SCENARIOS / "lane_following.toml"), "--trigger", "continuous",
                  "--set", 'mode="zoh"')  # fmt: skip
-    assert "more events: --json" in told.stdout
+    assert "more events: --json" in done.stdout
 
 
 def test_a_loop_that_diverges_fails() -> None:
     """The model equals the unstable loop: no event, and unlimited growth."""
-    told = noack("simulate", str(SCENARIOS / "unstable_pendulum.toml"), "--trigger", "continuous",
+    done = noack("simulate", str(SCENARIOS / "unstable_pendulum.toml"), "--trigger", "continuous",
                  "--set", 'plant.draw="nominal"', "--set", "model.gain=[[20.0, 20.0]]",
                  "--set", "model.allow_unstable=true",
                  "--set", "horizon_s=1000", "--json")  # fmt: skip
-    assert told.exit_code == 1
-    summary = json.loads(told.stdout)["summary"]
+    assert done.exit_code == 1
+    summary = json.loads(done.stdout)["summary"]
     assert summary["diverged_at_s"] == summary["reached_s"] < 1000
     assert "diverged" in summary["exit"]["reason"]

@@ -72,7 +72,7 @@ class Case(NamedTuple):
         for step in range(STEPS + 1):
             now_ns = step * PERIOD_NS
             states.append(z[:n])
-            error = self.trigger.error_norm(x_s - z[:n])
+            error = float(np.linalg.norm(x_s - z[:n]))
             if self.measured[step] and (not common or error > self.trigger.threshold(now_ns)):
                 x_s, common = z[:n], True
                 if self.delivered(len(events)):
