@@ -111,7 +111,7 @@ fuzz: setup-dev ## Fuzz every parser for MINUTES=10 in total; exit status 1 if a
 attack: setup-dev ## Send N=1000000 hostile datagrams to each port of a run (5 minutes)
 	$(BIN)/python -m tests.attacks --number $(N) $(ARGS)
 
-soak: setup-dev ## Soak test: one hour, then a day at speed 48; MINUTES=5 is short
+soak: setup-dev ## Soak test: one hour, then a simulated day at speed 48; MINUTES=5 for a short test
 	$(BIN)/python -m benchmarks.soak $(if $(filter file,$(origin MINUTES)),,--minutes $(MINUTES)) $(ARGS)
 
 check: setup-dev ## Lint, format, strict types, import rules

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from cosim.api import *  # noqa: F403
+    from cosim.api import __version__  # a star leaves it out
 else:
 
     def __getattr__(name: str) -> object:

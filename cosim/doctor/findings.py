@@ -161,7 +161,7 @@ def _wake_ups(
     if not found.beyond:
         near = found.max_us * 1e3 > wanted.allowance_ns / 2
         means = f"all within {allowed}" + (", some above half of it" if near else "")
-        return MachineFinding(what, GOOD, late, f"{means}; a longer run may have later ones")
+        return MachineFinding(what, GOOD, late, f"{means}; a longer run may exceed the maximum")
     share = 100 * found.beyond / found.wakes
     first_s = found.wakes / found.beyond / wanted.rate_hz
     means = (
@@ -195,7 +195,7 @@ def _buffer(machine: MachineFacts, wanted: RunRequirements) -> MachineFinding:
         return MachineFinding(what, BAD, found, "no process of a run can receive")
     text = f"{found.datagrams:,} datagrams ({found.granted_bytes // 1024:,} KiB)"
     if found.most_bytes is not None:
-        text += f"; net.core.rmem_max is {found.most_bytes:,}"
+        text += f"; net.core.rmem_max is {found.most_bytes:,} bytes"
     stall_s = found.datagrams / wanted.rate_hz
     means = f"the receive buffer covers a {stall_s:.2g} s stall before packets are lost"
     if found.datagrams >= PLENTY_OF_DATAGRAMS:

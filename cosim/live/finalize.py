@@ -88,7 +88,8 @@ def _with_reason(ending: RunEnding) -> Iterator[None]:
 
 def _write_summary(run_dir: Path, summary: RunSummary) -> None:
     try:
-        write_whole(run_dir / SUMMARY_FILE, summary.model_dump_json(indent=2))
+        text = summary.model_dump_json(indent=2)
+        write_whole(run_dir / SUMMARY_FILE, text, make_folder=False)
     except MachineError as error:
         raise MachineError(f"{error}; try `noack summary {run_dir}` later") from None
 

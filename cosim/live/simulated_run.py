@@ -55,7 +55,8 @@ def simulate_run(
             resolved = write_scenario(resolved, run_dir)
             write_environment(run_dir, "simulated")
             record = simulator(resolved, progress=progress)
-            write_whole(run_dir / REPORTS_FILE, json.dumps(record.reports, indent=2))
+            reports = json.dumps(record.reports, indent=2)
+            write_whole(run_dir / REPORTS_FILE, reports, make_folder=False)
             write_record(record, run_dir)
             if view:
                 from cosim.output.viewer.run_view import write_view  # imports rerun

@@ -22,6 +22,7 @@ def print_assumptions(console: Console, assumptions: Sequence[Mapping[str, str]]
     """Print assumptions with their verdicts."""
     table = Table.grid(padding=(0, 2))
     for one in assumptions:
-        text = escape(f"{one['what']} ({one['source']}): {one['why']}")
+        source = one["source"] if one["source"].startswith("(") else f"({one['source']})"
+        text = escape(f"{one['what']} {source}: {one['why']}")
         table.add_row(Text(one["verdict"], _COLOURS.get(one["verdict"], "")), text)
     console.print(table)

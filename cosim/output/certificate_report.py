@@ -262,7 +262,8 @@ def _in_words(found: Certificates) -> Iterator[str]:
             apart = f" The inter-event time is at least {_limit(spacing_s)}."
         yield (
             f"In words: for {plants}, under the assumptions above and for every pattern of at most "
-            f"{dropouts} consecutive losses: ‖x‖ ≤ {constants.state:.4g}{decay}{late}.{apart}"
+            f"M − 1 = {dropouts} consecutive losses: "
+            f"‖x‖ ≤ {constants.state:.4g}{decay}{late}.{apart}"
         )
 
 
@@ -271,7 +272,7 @@ def _print_constants(console: Console, found: Certificates) -> None:
     norm = "‖W·‖" if trigger.weight is not None else "‖·‖"
     table = Table(
         title=f"{found.scenario.name}: certified bounds, M − 1 = {found.scenario.network.mansd}, "
-        f"β = {trigger.beta:g}, α = {trigger.alpha_per_s:g} /s, errors in {norm}"
+        f"β = {trigger.beta:g}, α = {trigger.alpha_per_s:g} /s, norm {norm}"
     )
     table.add_column("")
     for under, certificate in found:
@@ -285,7 +286,8 @@ def _print_constants(console: Console, found: Certificates) -> None:
     console.print(
         "[dim]Each bound of a norm is multiplied by e^(−rate·t). paper: no sampling, no delay, no "
         "hold. schedule: the scenario's rates, plus the lateness that it allows. plant: the "
-        "scenario's plant. box: every plant of the uncertainty box.[/]"
+        "scenario's plant. box: every plant of the uncertainty box. updates outstanding: maximum "
+        "number of updates lost or in flight. inter-event time: minimum.[/]"
     )
     for under, certificate in found:
         if certificate.void:
@@ -328,12 +330,12 @@ def _constants(found: Certificates) -> Iterator[tuple[str, list[str], str]]:
     yield "loop gain (< 1)", constant("loop_gain"), NONE
     if any(c.floor_constants for c in certificates):
         yield "floor reached at, s", row(lambda c: c.floor_from_s), NONE
-        yield "from then on, ‖e_c‖/ε", after_floor("delta"), NONE
-        yield "from then on, ‖x‖", after_floor("state"), NONE
+        yield "bound of ‖e_c‖/ε from then on", after_floor("delta"), NONE
+        yield "bound of ‖x‖ from then on", after_floor("state"), NONE
 
 
 def _print_limits(console: Console, found: Certificates) -> None:
-    table = Table(title="schedule: largest value that is certified, one quantity at a time")
+    table = Table(title="schedule: largest certified value of each quantity, the others unchanged")
     for heading in ("", "sampling period", "delay of updates", "age of inputs"):
         table.add_column(heading, justify="right" if heading else "left")
     for scope, limits in found._limits.items():

@@ -15,7 +15,7 @@ def print_fidelity(console: Console, fidelity: Fidelity) -> None:
     """Print the effects from the ideal loop to the run, and the verdict."""
     table = Table(title=f"{fidelity.scenario}: difference in x to the ideal loop")
     table.add_column("effect", no_wrap=True)
-    for heading in ("RMS", "max", "share", "events", "Δt, ms", "split at"):
+    for heading in ("RMS", "max", "share", "events", "Δt, ms", "split at event"):
         table.add_column(heading, justify="right", no_wrap=True)
     table.add_row("(ideal loop)", "", "", "", str(fidelity.events_ideal), "", "")
     for stage in fidelity.stages:
@@ -39,9 +39,10 @@ def print_fidelity(console: Console, fidelity: Fidelity) -> None:
     console.print(table)
     console.print(_by_state(fidelity))
     console.print(
-        "Each row adds one effect to the rows above. Δt: largest change of an event's time. split "
-        "at: first event that moves by more than ten measurements; from there on, the recorded "
-        "losses fall on other events. A negative share partly cancels the other effects.",
+        "Each row adds one effect to the rows above. RMS, max: of the norm, in model units. Δt: "
+        "largest change of an event's time. split at event: number of the first event that moves "
+        "by more than ten measurement periods; from there on, the recorded losses fall on other "
+        "events. A negative share partly cancels the other effects.",
         highlight=False,
     )
     colour = "green" if fidelity.explained else "bold red"

@@ -207,8 +207,8 @@ def print_claims(console: Console, summary: Summary) -> None:
         return
     table = Table(title="claims checked against this run")
     parts = any(map(interval_of, claims))
-    for heading in ("source", "claim", *(["interval"] if parts else []), "used", "verdict"):
-        table.add_column(heading, justify="right" if heading == "used" else "left")
+    for heading in ("source", "claim", *(["interval"] if parts else []), "share used", "verdict"):
+        table.add_column(heading, justify="right" if heading == "share used" else "left")
     for claim in claims:
         since = "" if claim["since_s"] is None else f" since {claim['since_s']:.3f} s"
         table.add_row(
@@ -221,8 +221,9 @@ def print_claims(console: Console, summary: Summary) -> None:
     console.print(table)
     if any(claim["ratio"] is not None for claim in claims):
         console.print(
-            "[dim]used: largest share of the bound reached during the run; "
-            "bounds on ‖e_c‖ that are computed from the run itself are tight[/]"
+            "[dim]share used: largest share of the bound reached during the run; 100 % is normal "
+            "for a bound that is computed from the run itself. Sources: (I1) and certificates, "
+            "docs/theory.md; eq:... and theorems, the paper[/]"
         )
     sources: dict[tuple[str, str], list[str]] = {}
     for claim in claims:

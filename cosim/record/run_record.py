@@ -289,7 +289,8 @@ def write_reports(run_dir: Path, reports: Iterable[Mapping[str, Any]]) -> None:
     newest = {report["process"]: report for report in in_order}
     earlier = [report for report in in_order if report is not newest[report["process"]]]
     content = newest | ({_EARLIER: earlier} if earlier else {})
-    write_whole(run_dir / REPORTS_FILE, json.dumps(content, indent=2))
+    # A run directory that was deleted meanwhile is not created again.
+    write_whole(run_dir / REPORTS_FILE, json.dumps(content, indent=2), make_folder=False)
 
 
 def _reports(

@@ -83,7 +83,7 @@ def parser() -> Parser:
         "       %(prog)s --explain WORDS ...\n"
         "       %(prog)s show|set|watch [NAME] ...\n"
         "       %(prog)s [--session NAME]",
-        description="A UDP relay that emulates a network, configured in the words of `tc netem`. "
+        description="A UDP relay that emulates a network, configured in the syntax of `tc netem`. "
         "With mansd N, at most N consecutive datagrams of a flow are lost. Without --listen, it "
         "joins the run that `noack record SCENARIO` has opened.",
         epilog=_EPILOG.format(grammar="\n  ".join(GRAMMAR)),
@@ -97,20 +97,20 @@ def parser() -> Parser:
         ":9000 is 127.0.0.1:9000, and 0.0.0.0:9000 or [::]:9000 is any address of this machine",
     )  # fmt: skip
     alone.add_argument("--to", metavar="HOST:PORT", help="address of the server")
-    alone.add_argument("words", nargs="*", metavar="WORDS", help="from clients to the server")
+    alone.add_argument("words", nargs="*", metavar="WORDS", help="impairments, clients to server")
     alone.add_argument(
-        "--reverse", metavar="WORDS", nargs="+", help="from the server to clients (no impairment)"
+        "--reverse", metavar="WORDS", nargs="+", help="impairments, server to clients (none)"
     )
     alone.add_argument("--both", action="store_true", help="the words apply in both directions")
     alone.add_argument("--links", metavar="FILE", type=Path, help="several links, from a TOML file")
     alone.add_argument("--one-way", action="store_true", help="do not relay the server's answers")
     alone.add_argument(
-        "--idle", metavar="TIME", help="forget a client without datagrams for TIME (60s)"
+        "--idle", metavar="TIME", help="remove a client that sends nothing for TIME (60s)"
     )
     alone.add_argument("--seed", type=int, help="seed of the random streams (0)")
     alone.add_argument(
         "--explain", action="store_true",
-        help="explain the words, or the links of a file, and end",
+        help="explain the words, or the links of a file, and exit",
     )  # fmt: skip
     return parser
 

@@ -78,13 +78,12 @@ def settings_meaning(settings: LinkSettings) -> list[tuple[str, str]]:
         found.append((
             f"mansd {settings.mansd}",
             f"the cap (M − 1): at most {settings.mansd} consecutive packets of a flow are not "
-            "delivered; the next one passes, whatever the impairments say",
+            "delivered; the next one is always delivered",
         ))  # fmt: skip
     if settings.first_delivered:
         found.append((
             "first",
-            "the first packet of each flow is delivered, whatever the impairments say; the cap "
-            "for later packets is mansd",
+            "the first packet of each flow is always delivered; the cap for later packets is mansd",
         ))  # fmt: skip
     if any(one.delays for one in settings.impairments):
         found.append((

@@ -52,7 +52,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "poll during the last 50 µs before a delayed datagram is due",
     )  # fmt: skip
     group.add_argument(
-        "--compile", action="store_true", help="compile the fast engine for this machine, and end"
+        "--compile", action="store_true", help="compile the fast engine for this machine, and exit"
     )  # fmt: skip
     group = parser.add_argument_group("recording")
     group.add_argument(

@@ -45,7 +45,7 @@ class Options(NamedTuple):
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options for watching and changing a relay to a command line."""
-    group = parser.add_argument_group("watch it, and change it while it runs")
+    group = parser.add_argument_group("statistics and changes during operation")
     group.add_argument(
         "--control", metavar="NAME", help="accept `noack netem show|set|watch NAME`"
     )  # fmt: skip

@@ -93,10 +93,11 @@ class LinksFile(ScenarioSection):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        names = [link.name for link in self.link]
-        for number, name in enumerate(names):
-            if name in names[:number]:
+        names: set[str] = set()
+        for number, link in enumerate(self.link):
+            if link.name in names:
                 raise ValueError(f"link.{number}.name: another link has this name already")
+            names.add(link.name)
         return self
 
 

@@ -11,14 +11,16 @@ from typing import IO, Any
 from noack.core.errors import MachineError, why
 
 
-def write_whole(path: Path, content: str | bytes) -> Path:
-    """Write a file, or replace it, in one step; return its path. Missing folders are created.
+def write_whole(path: Path, content: str | bytes, *, make_folder: bool = True) -> Path:
+    """Write a file, or replace it, in one step; return its path.
 
-    Text is written as UTF-8. Raise MachineError if the file cannot be written.
+    Text is written as UTF-8. Missing folders are created with ``make_folder``. Raise MachineError
+    if the file cannot be written.
     """
     scratch = path.with_name(f".{path.name}.partial")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        if make_folder:
+            path.parent.mkdir(parents=True, exist_ok=True)
         scratch.write_bytes(content.encode() if isinstance(content, str) else content)
         scratch.replace(path)
     except OSError as error:

@@ -146,7 +146,7 @@ TABLES = (
     Table(PLANT_STEP, "plant", "step of the plant", (
         _state("x", "state at `t_ns`"),
         _input("u", "applied input from `t_ns` on"),
-        Column("actuation", "", "sequence number of the newest actuation, which u is from unless "
+        Column("actuation", "", "sequence number of the newest actuation; u is its input unless "
                "the watchdog replaced it"),
         _vector("z", "model units", lambda shape: shape.internal,
                 "the system's own state, for a system with more states than x"),

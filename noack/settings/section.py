@@ -54,8 +54,11 @@ class ScenarioSection(BaseModel):
 @cache
 def _docstrings(module: str) -> dict[str, dict[str, str]]:
     """Return the docstrings of the attributes of a module's classes, by class."""
-    statements = ast.parse(inspect.getsource(sys.modules[module])).body
     found: dict[str, dict[str, str]] = {}
+    try:
+        statements = ast.parse(inspect.getsource(sys.modules[module])).body
+    except OSError:  # installed without sources
+        return found
     for section in [one for one in statements if isinstance(one, ast.ClassDef)]:
         for pair in pairwise(section.body):
             match pair:

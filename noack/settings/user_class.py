@@ -60,10 +60,10 @@ def new_instance(settings: ClassSettings, place: str) -> tuple[Any, str]:
 
 @contextmanager
 def user_code(settings: ClassSettings, place: str, failure: type[NoackError]) -> Iterator[None]:
-    """Turn an error of the user's code in this context into a failure; noack's own errors pass."""
+    """Turn an error of the user's code in this context into a failure; failures pass."""
     try:
         yield
-    except NoackError:
+    except failure:
         raise
     except (Exception, SystemExit) as error:
         raise failure(_failure_text(settings, place, error)) from None

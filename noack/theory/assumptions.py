@@ -81,7 +81,7 @@ def _checked(what: str, source: str, holds: bool, why: str) -> Assumption:
 def _not_linear(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:
     nominal = spectral_abscissa(loop.A_model + loop.B_model @ loop.K)
     kind = f'it is of kind "{resolved.plant.system.kind}": {_NOT_COVERED}'
-    why = f"largest real part {nominal:.3g} /s with Â + B̂K{_other_sign(loop)}"
+    why = f"largest real part of an eigenvalue: {nominal:.3g} /s (Â + B̂K){_other_sign(loop)}"
     return [
         _violated("the plant is ẋ = Ax + Bu", "eq:plant", kind),
         _checked("the gain stabilises the model", "Theorem 2", nominal < 0, why),
@@ -141,7 +141,7 @@ def _closed_loop(loop: LoopMatrices) -> Assumption:
         "the gain stabilises the plant and the model",
         "Theorem 2",
         true < 0 and nominal < 0,
-        f"largest real part {true:.3g} /s with A + BK, {nominal:.3g} /s with Â + B̂K"
+        f"largest real part of an eigenvalue: {true:.3g} /s (A + BK), {nominal:.3g} /s (Â + B̂K)"
         f"{_other_sign(loop)}",
     )
 
@@ -197,7 +197,7 @@ def _mansd(resolved: Scenario) -> Assumption:
         "enforced by the network" if network.enforce_mansd else "not enforced (enforce_mansd)"
     )
     return _checked(
-        f"at most M − 1 = {network.mansd} consecutive losses after a delivered t_0",
+        f"at most M − 1 = {network.mansd} consecutive losses after a first delivery at t_0",
         "Section III",
         network.enforce_mansd,
         f"{enforced}; {start}",
@@ -253,7 +253,7 @@ def certificate_assumptions(
     if constants is None:
         found.append(_violated("there is a certificate", "certificate", void or ""))
     else:
-        why = f"met: the loop gain of the errors is {constants.loop_gain:.3g}, below 1"
+        why = f"the loop gain of the errors is {constants.loop_gain:.3g}, below 1"
         found.append(_checked("small-gain condition", "certificate", True, why))
     why = "the bounds rest on (I1), which holds for every plant"
     what, source = "A is unstable with distinct eigenvalues", "Proposition 1"
@@ -262,8 +262,8 @@ def certificate_assumptions(
 
 def _conditions(conditions: NetworkConditions, enforced: bool) -> list[Assumption]:
     losses = Assumption(
-        f"at most {conditions.dropouts} consecutive losses after a delivered t_0",
-        "conditions",
+        f"at most M − 1 = {conditions.dropouts} consecutive losses after a first delivery at t_0",
+        "certificate",
         AssumptionStatus.HOLDS if enforced else AssumptionStatus.ASSUMED,
         "enforced by the network" if enforced else "not enforced",
     )
@@ -277,7 +277,7 @@ def _conditions(conditions: NetworkConditions, enforced: bool) -> list[Assumptio
         f"the first input arrives within {1e3 * conditions.start_s:g} ms",
     )
     checked = AssumptionStatus.ASSUMED, "checked in each run"
-    return [losses, *(Assumption(what, "conditions", *checked) for what in schedule)]
+    return [losses, *(Assumption(what, "certificate", *checked) for what in schedule)]
 
 
 def below(alpha_per_s: float, decay_per_s: float) -> bool:

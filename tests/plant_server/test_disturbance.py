@@ -118,6 +118,24 @@ def test_the_plant_agrees_with_an_integrator_under_the_recorded_disturbance(
         np.testing.assert_allclose(rows["x"][k + 1], x, atol=1e-10)
 
 
+def test_an_input_disturbance_acts_on_a_nonlinear_plant(content: dict[str, Any]) -> None:
+    content["model"] = {
+        "A": [[0.0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1], [0, 0, 30, 0]],
+        "B": [[0.0], [1.0], [0.0], [-4.0]], "gain": [[1.0, 2.0, 60.0, 10.0]],
+    }  # fmt: skip
+    content["plant"] = {"system": {"kind": "cart_pole"}, "initial_state": [0.0, 0.0, 0.1, 0.0]}
+    plain = plant_of(resolved(content))
+    content["plant"]["disturbances"] = [{"kind": "step", "amplitude": [0.5]}]
+    disturbed = plant_of(resolved(content))
+    for k in range(20):
+        disturbed.handle(Message(Flow.ACTUATION, k, 0, np.array([0.1])), 0)
+        plain.handle(Message(Flow.ACTUATION, k, 0, np.array([0.6])), 0)
+        disturbed.on_timer(k * 2_000_000)
+        plain.on_timer(k * 2_000_000)
+    assert plain.x[2] != 0.1
+    np.testing.assert_array_equal(disturbed.x, plain.x)
+
+
 def test_measurements_carry_the_inputs_of_every_step_since_the_last(
     disturbed: dict[str, Any],
 ) -> None:

@@ -68,6 +68,13 @@ def test_the_watchdog_trips_when_the_actuation_is_older_than_the_timeout() -> No
         assert [(notice.t_ns, notice.level) for notice in said] == [(57 * MS + 1, "watchdog")]
 
 
+def test_the_default_timeout_is_50_controller_periods() -> None:
+    plant = {"initial_state": [1.0, 0.0], "rate_hz": 100.0}
+    default = scenario("hold", plant=plant, controller={"rate_hz": 200.0})
+    assert default.timing.actuation_timeout_ns == 250 * MS
+    assert default.plant.watchdog.policy == "hold"
+
+
 def test_before_the_first_actuation_its_age_counts_from_the_start() -> None:
     driven = Driven(plant_of(scenario("hold")))
     driven.until(50 * MS)

@@ -142,7 +142,7 @@ def print_worst(
         title=f"{resolved.name}: worst losses found, at most M − 1 = {resolved.network.mansd} "
         f"consecutive, {resolved.horizon_s:g} s"
     )
-    for heading in ("", "no loss", "own seed", "worst", "certified", "worst / certified"):
+    for heading in ("", "no loss", "scenario's seed", "worst", "certified", "share of bound used"):
         table.add_column(heading, justify="right" if heading else "left")
     for worst in found:
         values = (worst.lossless, worst.own, worst.value, worst.certified)
@@ -153,12 +153,12 @@ def print_worst(
         )
     console.print(table)
     for worst in found:
-        at = "" if worst.at_s is None else f"at {worst.at_s:.6f} s; "
+        at = "" if worst.at_s is None else f"worst at {worst.at_s:.6f} s; "
         how = "all patterns searched" if worst.exact else "not all patterns searched"
-        speed = f"{worst.nodes:,} segments, {worst.nodes / worst.elapsed_s:,.0f}/s"
+        speed = f"{worst.nodes:,} segments, {worst.nodes / worst.elapsed_s:,.0f} per second"
         console.print(f"{worst.objective.value}: {at}{how} ({speed})")
         console.print(f"  {worst.text}", soft_wrap=True, highlight=False)
-    console.print("[dim]D delivered, · lost; --json prints the times of the events[/]")
+    console.print("[dim]One letter per event: D delivered, · lost. --json prints their times[/]")
 
 
 def _quantity(objective: Objective, certificate: ScenarioCertificate) -> str:

@@ -12,9 +12,9 @@ from cosim.analysis.summary_model import ReplayDifference
 
 def print_replay(console: Console, found: Replay, changed: Sequence[str]) -> None:
     """Print the result of a replay, and what ``changed`` since the run on its computer."""
-    table = Table(title="replay, bit for bit")
-    for heading in ("process, leg", "recorded", "compared", "verdict"):
-        table.add_column(heading, justify="left" if heading == "process, leg" else "right")
+    table = Table(title="replay, compared bit for bit")
+    for heading in ("process or link", "recorded", "compared", "verdict"):
+        table.add_column(heading, justify="left" if heading == "process or link" else "right")
     rows = [(one.process, one.inputs, one.compared, one.difference) for one in found.processes]
     rows += [(one.leg, one.received, one.compared, one.difference) for one in found.messages]
     for name, recorded, compared, difference in rows:

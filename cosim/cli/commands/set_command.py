@@ -20,7 +20,7 @@ from noack.core.errors import CallerError, ExitStatus
     [
         ("noack set", "list the runtime parameters and their values"),
         ("noack set loss.p 0.9", "lose nine in ten packets from now on"),
-        ("noack set mansd 2 trigger.beta 0.3 --json", "change two at once"),
+        ("noack set mansd 2 trigger.beta 0.3 --json", "change M − 1 and β at once"),
     ],
     name="set",
     context_settings={"ignore_unknown_options": True},  # -0.5 is a value
@@ -30,8 +30,8 @@ def set_(
         list[str] | None,
         typer.Argument(
             metavar="[KEY VALUE]...",
-            help="Keys as in the scenario, or short, and new values: loss.p 0.9 mansd 2. "
-            "Without any, the runtime parameters are listed.",
+            help="Keys of the scenario, or their short forms, with new values: loss.p 0.9 mansd 2. "
+            "Without keys, list the runtime parameters.",
             autocompletion=completion.runtime_parameters,
         ),
     ] = None,
@@ -47,7 +47,7 @@ def set_(
     ] = None,
     json: cli.JsonOption = False,
 ) -> int:
-    """Change a live run: losses, M, trigger, set-point."""
+    """Change a live run: losses, M, trigger, set point."""
     from noack.runtime.run_registry import find, request_change
 
     wanted = parsed(settings or ())

@@ -129,7 +129,7 @@ def instability(A: Matrix, B: Matrix, K: Matrix) -> str | None:
     if growth_per_s < 0:
         return None
     remedy = (
-        "u = -K x does: give -K (control.lqr, and lqr and place of Matlab, give the K of u = -K x)"
+        "u = -K x does: give -K (python-control and Matlab return the K of u = -K x)"
         if opposite_per_s < 0
         else "give a gain for which all eigenvalues of A + BK have negative real parts"
     )

@@ -58,7 +58,7 @@ class PeriodicLoss(LossModel):
     words: ClassVar = (
         Word(
             "periodic", "loss periodic 2/100", _read,
-            grammar="periodic B/N [from N]  (B consecutive datagrams of every N)",
+            grammar="periodic B/N [from K]  (B consecutive datagrams of every N, from number K on)",
         ),
         Word("from", "loss periodic 2/100 from 3", after="loss periodic BURST/PERIOD"),
     )  # fmt: skip

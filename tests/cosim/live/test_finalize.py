@@ -3,7 +3,7 @@
 import json
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
@@ -18,12 +18,12 @@ from cosim.record.run_directory import (
     SUMMARY_FILE,
 )
 from cosim.record.run_ending import EndingFile, RunEnding
-from cosim.record.run_record import RunRecord, load_record, write_record
+from cosim.record.run_record import RunRecord, load_record, write_record, write_reports
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
 from noack.config.scenario_file import dumps, load
-from noack.core.errors import CallerError, ExitStatus
+from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.protocol.record_tables import PLANT_STEP
 from noack.runtime.spool import SPOOL, SpoolWriter
 
@@ -83,6 +83,21 @@ def test_the_summary_holds_the_replay(whole: Path) -> None:
     assert replayed["complete"]
     assert replayed["inputs"] > 1500
     assert reopen(whole).summary == summary_of(whole)
+
+
+def test_a_run_directory_that_was_deleted_is_not_created_again(
+    run_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def delete(*_: object) -> NoReturn:
+        shutil.rmtree(run_dir)
+        raise RuntimeError("the results need the directory")
+
+    monkeypatch.setattr(cosim.live.finalize, "replay", delete)
+    with pytest.raises(MachineError, match=r"summary\.json: cannot be written: No such file"):
+        finalize(ended_well(run_dir), report=False)
+    with pytest.raises(MachineError, match=r"reports\.json: cannot be written: No such file"):
+        write_reports(run_dir, [])
+    assert not run_dir.exists()
 
 
 def test_a_difference_in_the_replay_does_not_fail_the_run(run_dir: Path) -> None:

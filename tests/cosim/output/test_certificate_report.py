@@ -176,7 +176,7 @@ def test_the_text_states_the_bounds_and_their_conditions(document: dict[str, Any
     scheduled = [one for one in document["certificates"] if one["under"] == "schedule"]
     for sentence, one in zip(sentences, scheduled, strict=True):
         assert "under the assumptions above" in sentence
-        assert "at most 3 consecutive losses" in sentence
+        assert "at most M − 1 = 3 consecutive losses" in sentence
         assert f"‖x‖ ≤ {one['constants']['state']:.4g} e^(−0.3t); from" in sentence
         assert f"on, ‖x‖ ≤ {one['floor_constants']['state']:.4g}." in sentence
 

@@ -183,6 +183,7 @@ def run_of(tmp_path: Path, **methods: str) -> RunRecord:
         ({"on_tick": "x_c[0] = 1.0"}, "assignment destination is read-only (law.py, line 10)"),
         ({"on_update": "raise KeyError('x')"}, "KeyError: 'x' (law.py, line 7)"),
         ({"on_tick": "raise SystemExit(3)"}, "SystemExit: 3 (law.py, line 10)"),
+        ({"on_tick": "import noack; noack.load('no')"}, "CallerError: no: no such file"),
     ],
 )
 def test_the_safe_input_is_sent_after_a_control_law_fails(

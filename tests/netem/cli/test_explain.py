@@ -78,7 +78,7 @@ def test_words_are_explained(explain: Explain) -> None:
     assert (
         "mansd 2 the cap (M − 1): at most 2 consecutive packets of a flow are not delivered" in out
     )
-    assert "first the first packet of each flow is delivered" in out
+    assert "first the first packet of each flow is always delivered" in out
     assert "expected loss rate: 3.947% (without the cap 5%)" in out
     assert "tc qdisc add dev DEVICE root netem limit 16384 loss gemodel" in out
     assert "tc lacks: mansd 2 (a cap on consecutive losses), first (that the first" in out

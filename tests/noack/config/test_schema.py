@@ -1,15 +1,21 @@
 """The JSON Schema of scenario files, which editors use."""
 
+import inspect
 import json
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
+from netem.words.links_file import LinksFile
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import put, value_of
 from noack.config.toml_file import json_schema
+from noack.settings import section as section_module
+from noack.settings.section import ScenarioSection
 
 ROOT = Path(__file__).parents[3]
 SHIPPED = sorted((ROOT / "scenarios").glob("*.toml"))
@@ -73,3 +79,28 @@ def test_the_schema_refuses_mistakes(
 def test_the_schema_names_the_required_keys(validator: Any, content: dict[str, Any]) -> None:
     del content["trigger"]
     assert not validator.is_valid(content)
+
+
+def real_numbers(schema: Any) -> Iterator[Any]:
+    if isinstance(schema, dict):
+        if schema.get("type") == "float":
+            yield schema
+        schema = list(schema.values())
+    if isinstance(schema, list | tuple):
+        for part in schema:
+            yield from real_numbers(part)
+
+
+@pytest.mark.parametrize("file", [Scenario, LinksFile])
+def test_no_setting_accepts_infinity_or_nan(file: type[ScenarioSection]) -> None:
+    """The JSON Schema cannot express it."""
+    found = list(real_numbers(file.__pydantic_core_schema__))
+    assert len(found) > 20
+    assert {one.get("allow_inf_nan") for one in found} == {False}
+
+
+def test_sections_without_their_source_have_no_descriptions(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(inspect, "getsource", Mock(side_effect=OSError("no source")))
+    assert section_module._docstrings.__wrapped__("noack.config.scenario") == {}

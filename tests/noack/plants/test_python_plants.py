@@ -188,6 +188,7 @@ ADVANCE = """
     [
         (DERIVATIVE, 'raise KeyError("wind")', "KeyError: 'wind' (mine.py, line 7)"),
         (DERIVATIVE, "sys.exit(3)", "SystemExit: 3"),
+        (DERIVATIVE, 'import noack; noack.load("nowhere")', "CallerError: nowhere: no such file"),
         (DERIVATIVE, "z[0] = 7.0", "read-only"),
         (DERIVATIVE, "return [z[1] + 1e-3j, 0.0]",
          "TypeError: derivative(t_s, z, u) is not of real numbers"),

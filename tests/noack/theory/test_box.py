@@ -23,6 +23,8 @@ from tests.noack.theory.loops import (
     Plants,
     System,
     Trace,
+    assert_not_smaller,
+    certified_or_skipped,
     networks,
     seeds,
     simulate,
@@ -88,6 +90,24 @@ def test_no_plant_in_the_box_exceeds_a_bound(case: Case, seed: int) -> None:
     assume(certified is not None)
     assert certified is not None
     assert case.simulate(seed).exceeded(case.system, certified) == []
+
+
+@settings(SEARCH, max_examples=4)
+@given(cases(0.05), st.floats(0.1, 0.9))
+def test_a_larger_box_never_has_smaller_bounds(case: Case, share: float) -> None:
+    larger = case.constants()
+    assume(larger is not None)
+    assert larger is not None
+    smaller = Case(case.system, share * case.halfwidth_A, share * case.halfwidth_B)
+    assert_not_smaller(larger, smaller.certify(), case.system)
+
+
+@settings(SEARCH, max_examples=3)
+@given(systems(mismatch=0.0, hold_steps=0, delay_steps=0, step_share=0.01))
+def test_an_empty_box_has_the_bounds_of_the_model(system: System) -> None:
+    own = certified_or_skipped(system)
+    box = Case(system, np.zeros_like(system.A), np.zeros_like(system.B)).certify()
+    assert tuple(box) == pytest.approx(tuple(own), rel=1e-9, abs=1e-9)
 
 
 class NoModelErrorInSensorError(BoxGains):

@@ -16,6 +16,7 @@ from noack.theory.gains import Coefficients, ErrorGains, Output, PlantGains
 from tests.noack.theory.loops import (
     SEARCH,
     System,
+    assert_not_smaller,
     certified_or_skipped,
     networks,
     seeds,
@@ -30,6 +31,18 @@ def test_no_certified_bound_is_ever_exceeded(system: System, seed: int) -> None:
     """80 loops with 128 runs each: more than 10,000 runs."""
     certified = certified_or_skipped(system)
     assert simulate(system, *networks(seed, system)).exceeded(system, certified) == []
+
+
+@pytest.mark.parametrize("harder", ["dropouts", "sampling_s", "delay_s", "hold_s", "start_s"])
+@settings(SEARCH, max_examples=2)
+@given(systems(), st.floats(0.05, 2.0))
+def test_harder_conditions_never_have_smaller_bounds(
+    harder: str, system: System, share: float
+) -> None:
+    easy = system.conditions
+    more = 1 if harder == "dropouts" else share * system.step_s
+    hard = easy._replace(**{harder: getattr(easy, harder) + more})
+    assert_not_smaller(certified_or_skipped(system, hard), system.certify(easy), system)
 
 
 def without_condition(field: str) -> Callable[[System], Constants]:

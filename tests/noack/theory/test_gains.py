@@ -12,7 +12,7 @@ from scipy.linalg import expm
 from noack.core.linear_systems import Matrix
 from noack.theory.certificate import NetworkConditions, first_passage_s
 from noack.theory.gains import Output
-from tests.noack.theory.loops import SEARCH, System, systems
+from tests.noack.theory.loops import SEARCH, System, certified_or_skipped, systems
 
 SOME = settings(SEARCH, max_examples=6)
 ROUNDING = 1 - 1e-9
@@ -150,6 +150,42 @@ def test_growth_between_two_tests(system: System, reach: float) -> None:
         )  # fmt: skip
         area = float(np.trapezoid(norms(W, G, D @ v, t_s), t_s))
         assert area <= kernel.integral_on_grid() * size * (1 + 1e-4) + 1e-15
+
+
+@settings(SOME)
+@given(systems())
+def test_the_constants_solve_the_inequalities(system: System) -> None:
+    """Each bound satisfies its equation in the head of certificate.py with equality."""
+    conditions, plant = system.conditions, system.gains()
+    error, found = plant.error, certified_or_skipped(system)
+    assert found.inter_event_s is not None
+    spacing_s, hold_s = found.inter_event_s, conditions.hold_s
+    in_flight = math.ceil(conditions.delay_s / spacing_s - 1e-9)
+    assert found.missing_events == conditions.dropouts + in_flight
+    beta_tilde, p = found.overshoot * system.beta, found.input_error
+    before, start = plant.start_up(conditions.start_s)
+
+    def state(output: Output) -> float:
+        free, gain = plant.states[output]
+        return free + start[output] + gain * p
+
+    def controller_error(output: Output) -> float:
+        missing = error.missing(output, found.missing_events, spacing_s)
+        return (error.now(output) + missing) * beta_tilde
+
+    assert found.start_error == pytest.approx(before)
+    assert found.state == pytest.approx(state(Output.STATE))
+    assert found.mismatch == pytest.approx(state(Output.MISMATCH))
+    assert found.delta * system.beta == pytest.approx(controller_error(Output.WEIGHTED))
+    age = state(Output.GAIN_RATE) + controller_error(Output.GAIN_RATE)
+    bend = state(Output.WEIGHTED) + controller_error(Output.WEIGHTED)
+    rest = error.hold_remainder(hold_s)
+    assert p == pytest.approx(controller_error(Output.GAIN) + hold_s * age + rest * bend)
+    growth = plant.growth(conditions.sampling_s, 64)
+    grown = error.stretch(conditions.sampling_s) * system.beta
+    grown += growth.mismatch.integral_on_grid() * state(Output.MISMATCH)
+    grown += growth.input_error.integral_on_grid() * (p + before)
+    assert beta_tilde == pytest.approx(grown)
 
 
 @settings(SOME)
