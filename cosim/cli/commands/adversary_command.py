@@ -41,8 +41,8 @@ def adversary(
     nodes: Annotated[
         int,
         typer.Option(
-            help="Limit of the exhaustive search, in segments between events; beyond it, a beam "
-            "search is used.",
+            help="Limit of the exhaustive search, in segments between events; at the limit, the "
+            "result of the beam search may be better.",
             min=0,
         ),
     ] = 500_000,
