@@ -38,14 +38,13 @@ def verdict(summary: Summary) -> tuple[VerdictLine, VerdictLine, VerdictLine]:
 
 def _ending(summary: Summary) -> VerdictLine:
     end, reached = summary["exit"], f"{summary['reached_s']:g} s"
+    reached_of = f"{reached} of {summary['horizon_s']:g} s"
     if end["status"] == ExitStatus.OK:
         why = "" if end["reason"] == HORIZON else f": {end['reason']}"
         return VerdictLine(f"completed {reached}{why}", GOOD)
     if end["status"] == ExitStatus.FAILED:
-        return VerdictLine(f"failed after {reached}: {end['reason']}", BAD)
-    return VerdictLine(
-        f"stopped after {reached} of {summary['horizon_s']:g} s: {end['reason']}", DOUBTFUL
-    )
+        return VerdictLine(f"failed after {reached_of}: {end['reason']}", BAD)
+    return VerdictLine(f"stopped after {reached_of}: {end['reason']}", DOUBTFUL)
 
 
 def _transmissions(summary: Summary) -> str:

@@ -5,7 +5,7 @@ While the emulator runs, its file is in the user's runtime directory, readable b
 """
 
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -39,11 +39,12 @@ def _in_use(name: str) -> CallerError:
 @contextmanager
 def _locked(kind: str, name: str, content: Mapping[str, object]) -> Iterator[Path]:
     require_name(name, "emulator")
-    try:
-        with lock_file.lock_file(kind, name, content) as path:
-            yield path
-    except FileExistsError:
-        raise _in_use(name) from None
+    with ExitStack() as stack:
+        try:
+            path = stack.enter_context(lock_file.lock_file(kind, name, content))
+        except FileExistsError:
+            raise _in_use(name) from None
+        yield path
 
 
 def published(session: Session) -> AbstractContextManager[Path]:

@@ -2,7 +2,7 @@
 
 import ctypes
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, nullcontext, suppress
+from contextlib import closing, nullcontext
 from functools import cache
 
 import numpy as np
@@ -25,7 +25,7 @@ from noack.runtime.udp_sockets import LOOPBACK
 
 _COMPILING_S = 15.0
 _LONG_AGO_NS = -(2**62)
-_PR_SET_TIMERSLACK = 29
+_PR_SET_TIMERSLACK, _PR_GET_TIMERSLACK = 29, 30
 
 
 class BatchedRelay(Relay):
@@ -65,10 +65,14 @@ class BatchedRelay(Relay):
         self._rarely_ns = 0
 
     def run(self, stop: Callable[[], bool], housekeeping: Callable[[], None]) -> None:
-        """See :meth:`netem.engine.relay_base.Relay.run`; sets the thread's timer slack to 1 ns."""
-        with suppress(AttributeError):
-            ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
-        super().run(stop, housekeeping)
+        """See :meth:`netem.engine.relay_base.Relay.run`; the thread's timer slack is 1 ns."""
+        prctl = ctypes.CDLL(None).prctl
+        slack_ns = prctl(_PR_GET_TIMERSLACK, 0, 0, 0, 0)
+        prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
+        try:
+            super().run(stop, housekeeping)
+        finally:
+            prctl(_PR_SET_TIMERSLACK, slack_ns, 0, 0, 0)
 
     def _end(self) -> None:
         self._clients.query_all_drops()

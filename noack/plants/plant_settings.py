@@ -4,6 +4,7 @@ The loop uses x and u, the deviations from an operating point. The plant's own s
 other coordinates, and more of them.
 """
 
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -102,6 +103,7 @@ class PlantSettings(ScenarioSection):
             CallerError: a module that the plant needs is not installed.
         """
 
+    @abstractmethod
     def system(self, start: PlantStart) -> PlantSystem:
         """Return the system at x(0).
 
@@ -109,7 +111,6 @@ class PlantSettings(ScenarioSection):
             CallerError: a file or module that the plant needs is missing, or differs from the
                 settings.
         """
-        raise NotImplementedError
 
 
 def _same(values: Vector) -> Vector:
@@ -139,6 +140,7 @@ class PlantEquations:
 class EquationSettings(PlantSettings):
     """Settings of a plant that is given by differential equations."""
 
+    @abstractmethod
     def equations(self) -> PlantEquations:
         """Return the equations.
 
@@ -146,7 +148,6 @@ class EquationSettings(PlantSettings):
             CallerError: a module that the plant needs is not installed, or the settings exclude
                 each other.
         """
-        raise NotImplementedError
 
     def system(self, start: PlantStart) -> PlantSystem:
         """Return a system that integrates the equations from x(0) on."""

@@ -5,6 +5,7 @@ field ``policy``, and the behaviour that the settings describe;
 :mod:`noack.config.feature_kinds` finds it there.
 """
 
+from abc import abstractmethod
 from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -51,22 +52,22 @@ class PolicySettings(ScenarioSection):
             return None
 
     @classmethod
+    @abstractmethod
     def example(cls, n: int) -> Self | None:
         """Return settings for n states of size 1, for tests and benchmarks, if there are any."""
-        raise NotImplementedError
 
+    @abstractmethod
     def trigger_policy(self, model: ModelMatrices) -> Policy:
         """Return the behaviour that these settings describe.
 
         Raises:
             CallerError: the policy cannot be used with this model.
         """
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def description(self) -> str:
         """The condition under which the sensor transmits, in one line."""
-        raise NotImplementedError
 
     @property
     def beyond_exact(self) -> str | None:

@@ -148,7 +148,7 @@ class FmuSystem:
         initial = settings.initial_variables
         if initial is None:
             initial = settings.state_variables
-        start = port("initial_variables", initial, _not_settable)
+        start = port("initial_variables", initial, _not_initial)
         parameters = [variables.parameter(*entry) for entry in settings.parameters.items()]
         with quiet():
             if description.fmiVersion == "2.0":
@@ -304,7 +304,13 @@ def _not_settable(one: Any) -> str | None:
 
     if settable_in_instantiated(one):
         return None
-    return "cannot be set at the start; name variables whose initial is exact or approx, or none"
+    return "cannot be set at the start"
+
+
+def _not_initial(one: Any) -> str | None:
+    """Refuse a variable to which x(0) cannot be written."""
+    why = _not_settable(one)
+    return why and f"{why}; name variables whose initial is exact or approx, or none: []"
 
 
 def _about(description: Any) -> str:

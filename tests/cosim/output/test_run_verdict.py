@@ -74,7 +74,7 @@ def test_verbose_prints_all_tables_without_warnings(outcome: Outcome) -> None:
     ("status", "reason", "message"),
     [
         (0, "horizon", "completed 20 s"),
-        (1, "sensor died", "failed after 20 s: sensor died"),
+        (1, "sensor died", "failed after 20 s of 20 s: sensor died"),
         (130, "SIGINT", "stopped after 20 s of 20 s: SIGINT"),
         (0, "horizon; rows are missing", "completed 20 s: horizon; rows are missing"),
     ],

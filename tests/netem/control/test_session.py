@@ -34,6 +34,11 @@ def test_a_name_is_used_once() -> None:
         assert find("lab") == LAB
 
 
+def test_an_error_of_the_emulator_itself_is_not_taken_for_a_used_name() -> None:
+    with pytest.raises(FileExistsError, match="capture"), published(LAB):
+        raise FileExistsError("capture.pcapng")
+
+
 @pytest.mark.parametrize("name", ["", "a/b", "../up", ".hidden", "x" * 65])
 def test_unfit_names_are_refused(name: str) -> None:
     with pytest.raises(CallerError, match="use letters, digits"), published(Session(name, "", "")):

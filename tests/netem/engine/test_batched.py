@@ -1,8 +1,10 @@
 """Parts of the Linux engine only: client table, datagram store, cache of compiled code."""
 
+import ctypes
 import os
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from netem.engine.batched_engine import BatchedRelay
 from netem.engine.compiled_rules import compile_rule
 from netem.engine.pump.client_table import find, insert, key_of, remove
 from netem.engine.pump.payload_store import drop, keep, pop, push
@@ -83,6 +86,16 @@ def test_the_store_is_a_queue_by_time_and_arrival(steps: list[int], data: st.Dat
     for _, _, slot in model:
         do_drop(holder.memory, slot)
     assert (int(holder.pump["free_slots"]), int(holder.pump["free_blocks"])) == free
+
+
+def test_the_timer_slack_of_the_thread_is_restored() -> None:
+    def slack_ns() -> int:
+        return int(ctypes.CDLL(None).prctl(30, 0, 0, 0, 0))
+
+    before_ns, during_ns = slack_ns(), list[int]()
+    with closing(BatchedRelay([link(("127.0.0.1", 9), settings_of("loss none"))])) as relay:
+        relay.run(lambda: during_ns.append(slack_ns()) is None, lambda: None)
+    assert (during_ns, slack_ns()) == ([1], before_ns)
 
 
 def test_memory_is_used_again(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -138,7 +138,11 @@ def test_a_warning_is_not_a_failure_and_fmu_output_is_suppressed(
         ({"state_variables": ("x0", "u")}, '"u" is neither output nor local, but input'),
         ({"input_variables": ("x1",)}, '"x1" is no input, but output'),
         ({"input_variables": ("fail_status",)}, "real numbers are needed"),
-        ({"initial_variables": ("x0", "energy")}, '"energy" cannot be set at the start'),
+        (
+            {"initial_variables": ("x0", "energy")},
+            '"energy" cannot be set at the start; name variables whose initial is exact or approx, '
+            "or none: []",
+        ),
         ({"parameters": {"mu": "high"}}, "give a number, not 'high'"),
         ({"parameters": {"mu": True}}, "give a number, not True"),
         ({"parameters": {"linear": 1}}, "give true or false, not 1"),

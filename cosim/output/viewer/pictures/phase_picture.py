@@ -25,7 +25,7 @@ from cosim.output.viewer.pictures.picture import (
     outline,
     poses,
     strips,
-    style,
+    trail_style,
 )
 
 _RING = 0.035
@@ -68,7 +68,7 @@ class PhasePicture(Picture):
             ends.append((self._names[1], self._reach[1], (0.0, 1.17)))
         for i, (name, reach, at) in enumerate(ends):
             found[f"axes/{i}"] = label(f"{name} = {reach:.3g}", at, STILL)
-        for who, colour in WHO.items():
+        for who in WHO:
             width = _WIDTHS[who]
             if who == "plant":  # filled by its line width
                 found[f"{who}/point"] = body(who, [[(-1e-3, 0), (1e-3, 0)]], 0.06)
@@ -77,7 +77,7 @@ class PhasePicture(Picture):
                 ring = outline(circle(radius, 16), dash)
                 found[f"{who}/point"] = body(who, ring, 1.4 * width)
             if self.trails:
-                found[f"{who}/trail"] = style(colour, width)
+                found[f"{who}/trail"] = trail_style(who, width)
         return found | legend(1.95, 1.0, 0.3)
 
     def frames(self, frames: Frames) -> Mapping[str, Columns]:

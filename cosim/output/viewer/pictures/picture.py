@@ -167,6 +167,11 @@ def style(colour: Colour, width: float, *, order: float = 0.0) -> rr.LineStrips2
     return rr.LineStrips2D.from_fields(radii=width / 2, colors=colour, draw_order=order)
 
 
+def trail_style(who: str, width: float) -> rr.LineStrips2D:
+    """Return the style of the trail of one of ``WHO``; trails are behind the bodies."""
+    return style(WHO[who], width, order=_ORDERS[who] - 2)
+
+
 def label(
     text: str, at: tuple[float, float], colour: Colour, *, order: float = _FRONT
 ) -> rr.Points2D:

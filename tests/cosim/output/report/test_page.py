@@ -269,7 +269,7 @@ def test_every_run_gets_a_report(case: str, content: dict[str, Any]) -> None:
     ("exit_", "message"),
     [
         ({"status": 0, "reason": "horizon"}, "completed 1 s"),
-        ({"status": 1, "reason": "plant died"}, "failed after 1 s: plant died"),
+        ({"status": 1, "reason": "plant died"}, "failed after 1 s of 1 s: plant died"),
     ],
 )
 def test_the_verdict_comes_first(record: RunRecord, exit_: dict[str, Any], message: str) -> None:

@@ -151,6 +151,17 @@ def test_tank_levels_are_drawn_to_scale() -> None:
     np.testing.assert_allclose(-drawn, expected, rtol=1e-6)
 
 
+def test_a_trail_is_behind_its_body_and_does_not_share_a_layer() -> None:
+    scenery = PhasePicture(["a", "b"], np.ones(2)).scenery()
+
+    def layer(entity: str) -> float:
+        (order,) = scenery[entity].draw_order.as_arrow_array().to_pylist()
+        return float(order)
+
+    assert all(layer(f"{who}/trail") < layer(f"{who}/point") for who in WHO)
+    assert len({layer(f"{who}/trail") for who in WHO}) == len(WHO)
+
+
 def test_a_trail_continues_from_batch_to_batch() -> None:
     frames = frames_of(2, 0, k=12)
     whole = PhasePicture(["a", "b"], np.ones(2)).frames(frames)["plant/trail"]
