@@ -41,7 +41,6 @@ class Run:
             self.scenario,
             self.run_dir,
             plane,
-            view=None,
             start=start,  # type: ignore[arg-type]
         )
         for role in present:
