@@ -72,7 +72,7 @@ class Processes:
 
 def is_of(role: str, process: psutil.Process) -> bool:
     """Whether a process has a role in a run, by its title."""
-    return process.cmdline() == ["noack", role]
+    return process.cmdline()[:1] == [f"noack {role}"]
 
 
 def _sample(process: psutil.Process) -> Sample:

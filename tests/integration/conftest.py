@@ -59,7 +59,7 @@ def is_over(process: psutil.Process) -> bool:
 def child_of(parent: subprocess.Popen[str], role: str) -> psutil.Process | None:
     """Return the running process of a role, or None."""
     for child in psutil.Process(parent.pid).children():
-        if command_of(child) == ["noack", role]:
+        if command_of(child)[:1] == [f"noack {role}"]:
             return child
     return None
 
@@ -101,7 +101,7 @@ class Running:
 
     def child(self, role: str) -> psutil.Process:
         for child in self._children:
-            if command_of(child) == ["noack", role]:
+            if command_of(child)[:1] == [f"noack {role}"]:
                 return child
         raise AssertionError(f"no process of {role}")
 
