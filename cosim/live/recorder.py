@@ -130,7 +130,7 @@ class Recorder:
             try:
                 self._feed.advance()
             except MachineError as error:
-                self._give_up_view(error)
+                self.give_up_view(error)
 
     def note(self, notice: Notice) -> None:
         """Store a line of the recorder's own for the run's log."""
@@ -175,7 +175,7 @@ class Recorder:
             try:
                 self._feed.advance(final=True)
             except MachineError as error:
-                self._give_up_view(error)
+                self.give_up_view(error)
         return record
 
     def abandon(self) -> None:
@@ -269,7 +269,8 @@ class Recorder:
             else:
                 self._take(sample)
 
-    def _give_up_view(self, error: MachineError) -> None:
+    def give_up_view(self, error: MachineError) -> None:
+        """Show the run no longer; the view is written again at the end."""
         print_to_stderr(f"noack recorder: {error}; the numeric record goes on")
         self._feed = None
         self._out_of_order = True
@@ -295,18 +296,20 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
 def _record(process: RunProcess, live_view: "LiveView | None") -> None:
     """Record a run to its end."""
     run_dir, run_id = Path(process.ticket.run_dir), process.ticket.run_id
+    # A live view is ready when the run begins. The libraries of a recording take half a second to
+    # load: the other processes do not wait for them.
+    view = _open_view(process, live_view) if live_view else None
     status = live_view.status if live_view else None
     recorder = Recorder(process.scenario, run_dir, process.plane, status, start=process.start)
     if process.replaces is not None:
         recorder.note(Notice(process.start.from_ns, RESTART, f"restarted: {process.replaces}"))
     process.join(None)
-    # The view's libraries take half a second to load. The other processes do not wait for them.
-    from cosim.output.viewer.run_view import open_view, write_view
-
-    view = None
     if not process.start.is_restart:  # a restarted recorder writes the view again at the end
-        view = open_view(process.scenario, run_dir, run_id, live_view)
-        recorder.show_in(view)
+        try:
+            view = view or _open_view(process, None)
+            recorder.show_in(view)
+        except MachineError as error:
+            recorder.give_up_view(error)
     if not _poll_to_the_end(process, recorder):
         # The other processes spool their last rows now; `noack summary` completes the record.
         recorder.abandon()
@@ -322,9 +325,18 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
     except MachineError as error:
         print_to_stderr(f"noack recorder: {error}; the numeric record is complete")
     if recorder.view_is_incomplete:
+        from cosim.output.viewer.run_view import write_view
+
         write_view(record, run_dir, run_id)
     if recorder.lost is not None:
         raise recorder.lost
+
+
+def _open_view(process: RunProcess, live_view: "LiveView | None") -> "RunView":
+    from cosim.output.viewer.run_view import open_view
+
+    ticket = process.ticket
+    return open_view(ticket.scenario, Path(ticket.run_dir), ticket.run_id, live_view)
 
 
 def _poll_to_the_end(process: RunProcess, recorder: Recorder) -> bool:
