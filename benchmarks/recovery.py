@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable
 from functools import partial
 
-import numpy as np
 import psutil
 
 from benchmarks._faulted_run import FaultedRun, Processes, faulted_run, run_recovery_s
@@ -72,8 +71,9 @@ def killed(role: str) -> Figures:
     """
     run, at_s = suffer(role, kill)
     before, after = run.record.lives(role)
-    acted_s = np.concatenate([rows["now_ns"] for rows in after.rows.values()]).min() * 1e-9
-    wrote_s = np.concatenate([rows["now_ns"] for rows in before.rows.values()]).max() * 1e-9
+    if before.last_ns is None or after.first_ns is None:
+        raise MeasurementError(f"{role}: has no rows before or after")
+    acted_s, wrote_s = after.first_ns * 1e-9, before.last_ns * 1e-9
     deliveries = run.record[CONTROLLER_DELIVERY]
     fresh = deliveries["now_ns"] * 1e-9 >= acted_s
     if role == "sensor":
