@@ -14,7 +14,7 @@ import numpy as np
 from netem.duplex_link import ACKNOWLEDGEMENT_LINK
 from netem.engine.batched_directions import BatchedDirection
 from netem.engine.epoll_object import Epoll
-from netem.engine.native_code import NativeFunction
+from netem.engine.object_code import NativeFunction
 from netem.engine.pump import pump_layout
 from netem.engine.pump.client_table import insert
 from netem.engine.pump.pump_layout import Array

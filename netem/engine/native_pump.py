@@ -8,7 +8,7 @@ import numpy as np
 
 from netem.engine.batched_directions import BatchedDirection
 from netem.engine.compiled_rules import folder, prepare
-from netem.engine.native_code import NativeFunction, code_file, load, load_or_compile
+from netem.engine.object_code import NativeFunction, code_file, load, load_or_compile
 from netem.engine.pump_memory import PumpMemory
 from netem.rules.settings_change import carry
 from noack.impairments.link_records import PacketDecision, dtype_of
