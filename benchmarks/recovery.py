@@ -12,13 +12,12 @@ import time
 from collections.abc import Callable
 from functools import partial
 
-import numpy as np
 import psutil
 
 from benchmarks._faulted_run import FaultedRun, Processes, faulted_run, run_recovery_s
 from benchmarks._report import Benchmark, Figures, MeasurementError, Peer, Rounds, Row, median, say
 from benchmarks._runs import execute
-from benchmarks.soak.watch import MODULES
+from cosim.live.child_processes import MODULES
 from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, PLANT_STEP
 
@@ -72,8 +71,9 @@ def killed(role: str) -> Figures:
     """
     run, at_s = suffer(role, kill)
     before, after = run.record.lives(role)
-    acted_s = np.concatenate([rows["now_ns"] for rows in after.rows.values()]).min() * 1e-9
-    wrote_s = np.concatenate([rows["now_ns"] for rows in before.rows.values()]).max() * 1e-9
+    if before.last_ns is None or after.first_ns is None:
+        raise MeasurementError(f"{role}: has no rows before or after")
+    acted_s, wrote_s = after.first_ns * 1e-9, before.last_ns * 1e-9
     deliveries = run.record[CONTROLLER_DELIVERY]
     fresh = deliveries["now_ns"] * 1e-9 >= acted_s
     if role == "sensor":
@@ -96,7 +96,7 @@ def stopped_ms(role: str) -> float:
 
 def imported_s(role: str) -> float:
     """Return wall seconds from the start of a Python to the end of a process's imports."""
-    module = MODULES[role] + (".__main__" if role != "recorder" else "")
+    module = MODULES[role]
     command = [sys.executable, "-c", f"import {module}, sys; print('ready', file=sys.stderr)"]
     finished = execute(command)
     return finished.lines[-1].at_s - finished.begun_s

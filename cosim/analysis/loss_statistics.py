@@ -10,7 +10,6 @@ from cosim.analysis.summary_model import AcknowledgementsPart, ViolationPart
 from cosim.record.packet_outcomes import PacketOutcome, packet_outcomes
 from cosim.record.recorded_changes import NEVER_NS, changes_of
 from cosim.record.run_record import RunRecord
-from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
@@ -83,14 +82,11 @@ def missing_rows(record: RunRecord) -> Counter[str]:
     missing: Counter[str] = Counter()
     for role in LOOP_ROLES:
         for life in record.lives(role):
-            if life.report is not None:
-                for table, rows in life.rows.items():
-                    missing[table] += life.report["rows"][table] - len(rows)
+            if life.report is None:
+                missing[role] += life.missing_inputs
                 continue
-            inputs = np.concatenate([rows["input"] for rows in life.rows.values()])
-            for generation in np.unique(inputs // GENERATION):
-                numbers = inputs[inputs // GENERATION == generation] % GENERATION
-                missing[role] += int(numbers.max()) + 1 - len(numbers)
+            for table, count in life.rows.items():
+                missing[table] += life.report["rows"][table] - count
     return missing
 
 

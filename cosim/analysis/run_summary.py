@@ -33,7 +33,7 @@ from cosim.record.divergence import Divergence, divergence
 from cosim.record.estimation_error import disturbance_summary, estimation_summary, true_states
 from cosim.record.packet_outcomes import packet_outcomes
 from cosim.record.recorded_changes import changes_of
-from cosim.record.run_record import Life, Rows, RunRecord
+from cosim.record.run_record import Rows, RunRecord
 from netem.loss_prediction import predict
 from noack.config.runtime_parameters import text_of
 from noack.core.clock import NS_PER_S
@@ -245,7 +245,10 @@ def _restarts(record: RunRecord) -> list[RestartPart]:
                 for number, notice in enumerate(notices, 1)
             ]  # fmt: skip
             continue
-        active_s = {life.generation: _active_s(life) for life in record.lives(role)}
+        active_s = {
+            life.generation: (_seconds(life.first_ns), _seconds(life.last_ns))
+            for life in record.lives(role)
+        }
         # Each restart has one notice. It is lost only if the process ended soon after, so the
         # notices belong to the last generations.
         reported = dict(enumerate(notices, max(max(active_s) - len(notices), 0) + 1))
@@ -262,12 +265,8 @@ def _restarts(record: RunRecord) -> list[RestartPart]:
     return sorted(found, key=lambda one: one.first_s or one.last_s or math.inf)
 
 
-def _active_s(life: Life) -> tuple[float | None, float | None]:
-    """Return the times of a process's first and last row; None for a process without rows."""
-    now_ns = np.concatenate([rows["now_ns"] for rows in life.rows.values()])
-    if not len(now_ns):
-        return None, None
-    return float(now_ns.min()) * 1e-9, float(now_ns.max()) * 1e-9
+def _seconds(t_ns: int | None) -> float | None:
+    return None if t_ns is None else float(t_ns) * 1e-9
 
 
 def _last_s(rows: Rows) -> float:

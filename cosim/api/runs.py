@@ -100,7 +100,7 @@ class Run:
             NoackError: there is no such table, or its file is damaged.
         """
         from cosim.api.data_frames import with_seconds
-        from cosim.record.run_record import read_table
+        from cosim.record.table_files import read_table
 
         if name not in self.tables:
             known = ", ".join(self.tables)

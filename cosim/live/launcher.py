@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cosim.live.child_processes import ChildProcesses, Failure, signal_name
+from cosim.live.child_processes import ChildProcesses, Failure, fork_server, signal_name
 from cosim.live.coordinator import Coordinator
 from cosim.live.disk_space import require_disk_space
 from cosim.live.restart_policy import RestartPolicy
@@ -79,20 +79,24 @@ def launch(
         NeverStartedError: the run ended before all processes were ready.
     """
     began_ns = time.monotonic_ns()
-    resolved = resolve(scenario)
-    require_disk_space(resolved, runs)
-    control = resolved.ports.control
-    if control:
-        require_free_tcp_port(control, "ports.control")
-    if PLANT in spawn:
-        resolved.plant.system.prepare()  # compile now: the start barrier has a time limit
-    endpoint = f"tcp/{LOOPBACK}:{control or free_tcp_port()}"
-    run_dir = new_run_dir(runs, resolved.name)
-    resolved = write_scenario(resolved, run_dir)
-    write_environment(run_dir, "live")
-    ticket = new_ticket(resolved, endpoint, run_dir.resolve(), launched=True)
-    children = ChildProcesses(ticket, run_dir, spawn)
-    with Signals().handled() as signals, contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as stack:
+        server = fork_server()  # it imports while this function prepares the run
+        if server is not None:
+            stack.enter_context(server)
+        resolved = resolve(scenario)
+        require_disk_space(resolved, runs)
+        control = resolved.ports.control
+        if control:
+            require_free_tcp_port(control, "ports.control")
+        if PLANT in spawn:
+            resolved.plant.system.prepare()  # compile now: the start barrier has a time limit
+        endpoint = f"tcp/{LOOPBACK}:{control or free_tcp_port()}"
+        run_dir = new_run_dir(runs, resolved.name)
+        resolved = write_scenario(resolved, run_dir)
+        write_environment(run_dir, "live")
+        ticket = new_ticket(resolved, endpoint, run_dir.resolve(), launched=True)
+        children = ChildProcesses(ticket, run_dir, spawn, server)
+        signals = stack.enter_context(Signals().handled())
         stack.enter_context(active_run(run_dir))
         ending = stack.enter_context(EndingFile(run_dir))
         coordinator = Coordinator(ticket)

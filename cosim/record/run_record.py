@@ -1,38 +1,44 @@
-"""The numeric record of a run: spool in, Parquet out, structured arrays back.
+"""The numeric record of a run: spool in, Parquet out, rows back, all batch by batch.
 
 ``RUN/record/TABLE.parquet`` is the authoritative record; ``docs/record.md`` documents the columns.
-Vectors are stored as one column per entry (``x_1``, ``x_2``, …), so every Parquet reader can read
-them.
 """
 
 import contextlib
 import json
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cosim.record.environment import Kind, kind_of
+from cosim.record.process_lives import Life, LifeNumbers, generations, lives_of
+from cosim.record.record_source import (
+    BATCH_ROWS,
+    DerivedRows,
+    RecordSource,
+    RowsInMemory,
+    Slice,
+    slices,
+)
+from cosim.record.record_source import Rows as Rows
 from cosim.record.run_directory import RECORD, REPORTS_FILE, SCENARIO_FILE, read_object
+from cosim.record.spool_merge import merged, spool_segments
+from cosim.record.table_files import StoredTables, group_segments, write_table
 from noack.config.resolution import LoopMatrices, loop_of, tables_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
-from noack.core.errors import CallerError, MachineError, PeerError, one_line, why
+from noack.core.errors import CallerError, MachineError, PeerError, why
 from noack.core.file_access import write_whole
-from noack.protocol.machine_interface import GENERATION, RESTART
-from noack.protocol.record_tables import OWNER, entry_names
+from noack.protocol.machine_interface import RESTART
+from noack.protocol.record_tables import OWNER
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.protocol.wire_format import VERSION, Flow, read_header
 from noack.runtime.control_messages import LogLine, ProcessReport, parse_message
 from noack.runtime.spool import SPOOL, read_chunks
 from noack.runtime.telemetry import notices_of
-
-Rows = NDArray[np.void]
 
 _NOTICES_FILE = "notices.jsonl"
 _EARLIER = "earlier"
@@ -47,7 +53,7 @@ class RunRecord:
 
     Args:
         scenario: the resolved scenario.
-        rows: the rows of each table, in the order of the machine's inputs.
+        rows: the rows of each table, in the order of the machine's inputs, or where to read them.
         notices: the lines of the run's log, each with t_ns, level, text and process.
         reports: each process's final report; a process that died has none.
         kind: live or simulated.
@@ -57,7 +63,7 @@ class RunRecord:
     def __init__(
         self,
         scenario: Scenario,
-        rows: Mapping[str, Rows],
+        rows: Mapping[str, Rows] | RecordSource,
         notices: list[dict[str, Any]],
         reports: Mapping[str, dict[str, Any]],
         kind: Kind = "live",
@@ -69,72 +75,63 @@ class RunRecord:
         self.reports = reports
         self.earlier = earlier
         self.kind: Kind = kind
-        self._rows = rows
+        self.source = rows if isinstance(rows, RecordSource) else RowsInMemory(rows)
         self.tables = tables_of(scenario)
+        self._lives: dict[str, list[Life]] = {}
 
     def __getitem__(self, table: str) -> Rows:
-        """Rows of a table of ``noack.protocol.record_tables``."""
-        return self._rows[table]
+        """All rows of a table of ``noack.protocol.record_tables``; for a long run, see `slices`."""
+        return self.source.whole(table)
 
-    def owned_by(self, role: str) -> dict[str, Rows]:
-        """Return the tables that a process writes."""
-        return {table: self[table] for table in self.tables if OWNER[table] == role}
+    def count(self, table: str) -> int:
+        """Return the number of rows of a table."""
+        return self.source.count(table)
 
-    def lives(self, role: str) -> list["Life"]:
-        """The rows and reports of each generation of a process, in order."""
-        owned, newest = self.owned_by(role), self.reports.get(role)
-        reports = {} if newest is None else {newest.get("generation", 0): newest}
-        reports |= {one.get("generation", 0): one for one in self.earlier if one["process"] == role}
-        again = any((one["process"], one["level"]) == (role, RESTART) for one in self.notices)
-        begun = generations(owned) if again else [0]
-        which = {  # a row with an unexpected number belongs to the generation before
-            table: np.searchsorted(begun, rows["input"] // GENERATION, side="right") - 1
-            for table, rows in owned.items()
-        }
-        return [
-            Life(
-                number,
-                {table: rows[which[table].clip(min=0) == i] for table, rows in owned.items()},
-                reports.get(number),
+    def slices(self, *tables: str) -> Iterator[Slice]:
+        """Yield consecutive parts of some tables, or of all, each up to the same time.
+
+        A part holds at most ``BATCH_ROWS`` steps of the plant; a short run is one part.
+        """
+        return slices(self.source, tables or [*self.tables], self._slice_ns)
+
+    def derived(self, scenario: Scenario, derive: Callable[[str, Rows], Rows]) -> "RunRecord":
+        """Return a record with another scenario, and with rows derived from those of this one.
+
+        ``derive`` gets a table's name and some of its rows, in order.
+        """
+        rows = DerivedRows(self.source, derive)
+        return RunRecord(scenario, rows, self.notices, self.reports, self.kind, self.earlier)
+
+    def lives(self, role: str) -> list[Life]:
+        """The generations of a process, in order."""
+        if role not in self._lives:
+            newest = self.reports.get(role)
+            reports = {} if newest is None else {newest.get("generation", 0): newest}
+            earlier = [one for one in self.earlier if one["process"] == role]
+            reports |= {one.get("generation", 0): one for one in earlier}
+            self._lives[role] = lives_of(
+                self.source, self.owned_by(role), self.life_numbers(role), reports, self._slice_ns
             )
-            for i, number in enumerate(begun)
-        ]
+        return self._lives[role]
+
+    def life_numbers(self, role: str) -> LifeNumbers:
+        """The numbers of the generations of a process."""
+        again = any((one["process"], one["level"]) == (role, RESTART) for one in self.notices)
+        return LifeNumbers(generations(self.source, self.owned_by(role)) if again else [0])
+
+    def owned_by(self, role: str) -> list[str]:
+        """Return the tables that a process writes."""
+        return [table for table in self.tables if OWNER[table] == role]
 
     def restarted(self) -> str | None:
         """A role whose process was restarted; None if there is none."""
-        return next((role for role in LOOP_ROLES if len(self.lives(role)) > 1), None)
+        return next((role for role in LOOP_ROLES if len(self.life_numbers(role).begun) > 1), None)
 
-
-class Life(NamedTuple):
-    """The rows and the report of one generation of a process."""
-
-    generation: int
-    rows: Mapping[str, Rows]
-    """By table."""
-    report: Mapping[str, Any] | None
-
-    def hole_ns(self) -> int | None:
-        """Time of the last input before a gap in the rows; None if there is no known gap.
-
-        Rows that are missing at the end of a process without a report are unknown.
-        """
-        inputs = np.concatenate([rows["input"] for rows in self.rows.values()])
-        now_ns = np.concatenate([rows["now_ns"] for rows in self.rows.values()])
-        order = np.argsort(inputs, kind="stable")
-        inputs, now_ns = inputs[order], now_ns[order]
-        holes = np.flatnonzero(np.diff(inputs, prepend=self.generation * GENERATION - 1) > 1)
-        return None if not len(holes) else int(now_ns[max(holes[0] - 1, 0)])
-
-
-def generations(owned: Mapping[str, Rows]) -> list[int]:
-    """Return the generations of a role that wrote rows, from the number of each one's first input.
-
-    If that row is missing, the rows of a later generation prove that there were earlier ones.
-    """
-    inputs = np.concatenate([rows["input"] for rows in owned.values()])
-    first = inputs[(inputs % GENERATION == 0) & (inputs > 0)] // GENERATION
-    of = np.unique(inputs // GENERATION)
-    return [0, *of[(of > 0) & (of <= first.max(initial=0))].tolist()]
+    @property
+    def _slice_ns(self) -> int:
+        timing = self.scenario.timing
+        period_ns: int = min(timing.plant_period_ns, timing.controller_period_ns)
+        return BATCH_ROWS * period_ns
 
 
 def load_record(run_dir: Path) -> RunRecord:
@@ -151,10 +148,7 @@ def load_record(run_dir: Path) -> RunRecord:
             f"{run_dir}: has no numeric record; `noack summary` finalises an interrupted run"
         )
     scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
-    rows = {
-        table: _from_parquet(folder / f"{table}.parquet", dtype)
-        for table, dtype in tables_of(scenario).items()
-    }
+    rows = StoredTables(folder, tables_of(scenario))
     reports, earlier = _reports(run_dir, rows)
     return RunRecord(scenario, rows, _read_notices(folder), reports, kind_of(run_dir), earlier)
 
@@ -165,12 +159,22 @@ def write_record(record: RunRecord, run_dir: Path) -> None:
     Raises:
         OSError: they cannot be written.
     """
-    folder, loop = run_dir / RECORD, record.loop
+    tables = {table: record.source.batches(table) for table in record.tables}
+    _write(run_dir / RECORD, tables, record.tables, record.loop, record.notices)
+
+
+def _write(
+    folder: Path,
+    tables: Mapping[str, Iterable[Rows]],
+    types: Mapping[str, np.dtype[np.void]],
+    loop: LoopMatrices,
+    notices: Iterable[Mapping[str, Any]],
+) -> None:
     folder.mkdir(exist_ok=True)
-    for table in record.tables:
-        _to_parquet(record[table], folder / f"{table}.parquet", loop)
+    for table, batches in tables.items():
+        write_table(folder / f"{table}.parquet", batches, types[table], loop)
     with (folder / _NOTICES_FILE).open("w", encoding="utf-8") as file:
-        file.writelines(json.dumps(notice) + "\n" for notice in record.notices)
+        file.writelines(json.dumps(notice) + "\n" for notice in notices)
 
 
 def finish_record(run_dir: Path) -> RunRecord:
@@ -182,15 +186,11 @@ def finish_record(run_dir: Path) -> RunRecord:
         MachineError: the record cannot be written; the spool is kept.
     """
     scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
-    spool, folder = run_dir / SPOOL, run_dir / RECORD
-    rows = {
-        table: merge_rows([_recorded(folder, table, dtype), *_spooled(spool, table, dtype)], dtype)
-        for table, dtype in tables_of(scenario).items()
-    }
-    notices, (reports, earlier) = _notices(folder, spool), _reports(run_dir, rows)
-    record = RunRecord(scenario, rows, notices, reports, kind_of(run_dir), earlier)
+    spool, folder, types = run_dir / SPOOL, run_dir / RECORD, tables_of(scenario)
+    tables = {table: _merged(folder, spool, table, dtype) for table, dtype in types.items()}
+    notices = _notices(folder, spool)
     try:
-        write_record(record, run_dir)
+        _write(folder, tables, types, loop_of(scenario), notices)
         if spool.is_dir():  # moved in one step, so that an incomplete spool is never read
             shutil.rmtree(spool.rename(spool.with_name(f"{SPOOL}.done")), ignore_errors=True)
     except OSError as error:
@@ -198,14 +198,14 @@ def finish_record(run_dir: Path) -> RunRecord:
             f"{folder}: the record cannot be written: {why(error)}; what was recorded is kept "
             f"in {spool}, and `noack summary {run_dir}` finishes it"
         ) from None
-    return record
+    return load_record(run_dir)
 
 
-def merge_rows(parts: Sequence[Rows], dtype: np.dtype[np.void]) -> Rows:
-    """Return the rows of a table in the order of the machine's inputs, without duplicates."""
-    rows = np.concatenate([np.zeros(0, dtype), *parts])
-    _, first = np.unique(rows["input"], return_index=True)
-    return rows[first]
+def _merged(folder: Path, spool: Path, table: str, dtype: np.dtype[np.void]) -> Iterator[Rows]:
+    """Yield the rows of a table from an earlier record and from the spool."""
+    path = folder / f"{table}.parquet"
+    recorded = group_segments(path, dtype) if path.is_file() else ()
+    yield from merged([*recorded, *spool_segments(spool, table, dtype)], dtype)
 
 
 def updates_in(
@@ -234,26 +234,17 @@ def updates_in(
     )
 
 
-def _recorded(folder: Path, table: str, dtype: np.dtype[np.void]) -> Rows:
-    path = folder / f"{table}.parquet"
-    return _from_parquet(path, dtype) if path.is_file() else np.zeros(0, dtype)
-
-
-def _spooled(spool: Path, table: str, dtype: np.dtype[np.void]) -> Iterator[Rows]:
-    for _, data in read_chunks(spool, table):
-        if len(data) % dtype.itemsize == 0:  # the rows of a damaged chunk cannot be located
-            yield np.frombuffer(data, dtype)
-
-
 def _notices(folder: Path, spool: Path) -> list[dict[str, Any]]:
     notices = _read_notices(folder)
+    known = {json.dumps(notice, sort_keys=True) for notice in notices}
     for role in (*LOOP_ROLES, RECORDER):
         for _, data in read_chunks(spool, notices_of(role)):
             try:
                 notice = parse_message(LogLine, data) | {"process": role}
             except PeerError:  # damaged
                 continue
-            if notice not in notices:
+            if (text := json.dumps(notice, sort_keys=True)) not in known:
+                known.add(text)
                 notices.append(notice)
     return sorted(notices, key=lambda notice: int(notice["t_ns"]))
 
@@ -294,7 +285,7 @@ def write_reports(run_dir: Path, reports: Iterable[Mapping[str, Any]]) -> None:
 
 
 def _reports(
-    run_dir: Path, rows: Mapping[str, Rows]
+    run_dir: Path, source: RecordSource
 ) -> tuple[dict[str, dict[str, Any]], list[dict[str, Any]]]:
     """Return the reports of the last process of each role, and those of earlier processes."""
     try:
@@ -310,86 +301,10 @@ def _reports(
         with contextlib.suppress(PeerError, TypeError):  # an invalid report counts as missing
             if role not in LOOP_ROLES:
                 continue
-            report = report_of(role, json.dumps(entry), rows)
-            owned = {table: rows[table] for table in rows if OWNER[table] == role}
-            if report.get("generation", 0) < generations(owned)[-1] or role in reports:
+            report = report_of(role, json.dumps(entry), source.types)
+            owned = [table for table in source.types if OWNER[table] == role]
+            if report.get("generation", 0) < generations(source, owned)[-1] or role in reports:
                 earlier.append(report | {"process": role})
             else:
                 reports[role] = report
     return reports, earlier
-
-
-def _to_parquet(rows: Rows, path: Path, loop: LoopMatrices) -> None:
-    columns: dict[str, Any] = {}
-    for name in rows.dtype.names or ():
-        column = rows[name]
-        if column.ndim == 2:
-            for entry, values in zip(entry_names(name, column.shape[1]), column.T, strict=True):
-                columns[entry] = pa.array(np.ascontiguousarray(values))
-        elif column.dtype.kind == "V":
-            width = column.dtype.itemsize
-            raw = pa.py_buffer(np.ascontiguousarray(column).tobytes())
-            columns[name] = pa.Array.from_buffers(pa.binary(width), len(rows), [None, raw])
-        else:
-            columns[name] = pa.array(np.ascontiguousarray(column))
-    metadata = {
-        "noack_table": path.stem,
-        "process": OWNER[path.stem],
-        "state_names": json.dumps(loop.state_names),
-        "input_names": json.dumps(loop.input_names),
-    }
-    table = pa.table(columns).replace_schema_metadata(metadata)
-    scratch = path.with_suffix(".partial")
-    pq.write_table(table, scratch, compression="zstd")
-    scratch.replace(path)
-
-
-def _columns(dtype: np.dtype[np.void]) -> Iterator[tuple[str, pa.DataType]]:
-    """Yield the names of a table's columns in its file, and their types."""
-    for name in dtype.names or ():
-        field = dtype[name]
-        if field.shape:
-            kind = pa.from_numpy_dtype(field.base)
-            yield from ((entry, kind) for entry in entry_names(name, field.shape[0]))
-        elif field.kind == "V":
-            yield name, pa.binary(field.itemsize)
-        else:
-            yield name, pa.from_numpy_dtype(field)
-
-
-def read_table(path: Path, dtype: np.dtype[np.void]) -> pa.Table:
-    """Read a table's file as it is.
-
-    Raises:
-        CallerError: the file cannot be read, or does not have all columns of that type.
-    """
-    try:
-        table = pq.read_table(path)
-        table.validate(full=True)
-    except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
-        raise CallerError(f"{path}: cannot be read: {one_line(error)}") from None
-    for column, kind in _columns(dtype):
-        found = table.schema.get_all_field_indices(column)
-        if not found:
-            raise CallerError(f"{path}: has no column {column}, which this scenario's runs have")
-        if len(found) > 1 or table.schema.field(found[0]).type != kind:
-            raise CallerError(f"{path}: column {column} is not one of {kind}")
-        if table.column(found[0]).null_count:
-            raise CallerError(f"{path}: column {column} has holes")
-    return table
-
-
-def _from_parquet(path: Path, dtype: np.dtype[np.void]) -> Rows:
-    table = read_table(path, dtype)
-    rows = np.zeros(table.num_rows, dtype)
-    for name in dtype.names or ():
-        field = dtype[name]
-        if field.shape:
-            for i, entry in enumerate(entry_names(name, field.shape[0])):
-                rows[name][:, i] = table[entry].to_numpy()
-        elif field.kind == "V":
-            raw = b"".join(value or b"" for value in table[name].to_pylist())
-            rows[name] = np.frombuffer(raw, field)
-        else:
-            rows[name] = table[name].to_numpy()
-    return rows

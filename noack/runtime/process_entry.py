@@ -8,6 +8,8 @@ import traceback
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 
+from setproctitle import setproctitle
+
 from noack.core.errors import ExitStatus, NoackError, NoAnswerError
 from noack.runtime.command_line import Parser, failed
 from noack.runtime.control_plane import ControlPlane
@@ -36,6 +38,8 @@ def run_process(
     with Signals().handled() as signals:
         try:
             ticket = _ticket(role, session, signals)
+            if ticket.launched:
+                setproctitle(f"noack {role}")  # in lists of processes
             process = _admitted(role, ticket, signals)
             with process.plane:
                 try:

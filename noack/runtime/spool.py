@@ -10,12 +10,13 @@ import os
 import struct
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 from noack.core.errors import MachineError, why
 
 SPOOL = "spool"  # the spool's folder in the run directory
 _CHUNK = struct.Struct("<QQ")
+_READ_BYTES = 256 * 1024
 
 
 class SpoolWriter:
@@ -91,13 +92,36 @@ def _write_complete(file: BinaryIO, chunk: bytes) -> None:
         raise
 
 
+class Chunk(NamedTuple):
+    """One batch in a file of the spool."""
+
+    first: int
+    """Number of its first row."""
+    rows: bytes
+    end: int
+    """Offset of the byte after it."""
+
+
+def spool_files(folder: Path, table: str) -> list[Path]:
+    """Return the files of a table, one per writer."""
+    return sorted(folder.glob(f"{table}.*"))
+
+
+def chunks_in(path: Path, begin: int = 0, end: int | None = None) -> Iterator[Chunk]:
+    """Yield the complete batches of a file from the offset ``begin`` up to ``end``."""
+    with path.open("rb", buffering=_READ_BYTES) as file:
+        size = os.fstat(file.fileno()).st_size
+        end = size if end is None else end
+        file.seek(begin)
+        while begin < end and len(head := file.read(_CHUNK.size)) == _CHUNK.size:
+            first, length = _CHUNK.unpack(head)
+            begin += _CHUNK.size + length
+            if begin > size:  # incomplete, or damaged: a read could be endless
+                break
+            yield Chunk(first, file.read(length), begin)
+
+
 def read_chunks(folder: Path, table: str) -> Iterator[tuple[int, bytes]]:
     """Yield ``(first row, rows)`` of each complete batch of a table, from all writers."""
-    for path in sorted(folder.glob(f"{table}.*")):
-        with path.open("rb") as file:
-            size = os.fstat(file.fileno()).st_size
-            while len(head := file.read(_CHUNK.size)) == _CHUNK.size:
-                first, length = _CHUNK.unpack(head)
-                if file.tell() + length > size:  # incomplete, or damaged: a read could be endless
-                    break
-                yield first, file.read(length)
+    for path in spool_files(folder, table):
+        yield from ((chunk.first, chunk.rows) for chunk in chunks_in(path))

@@ -7,10 +7,11 @@ import pytest
 
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.record.align import align_tables
-from cosim.record.run_record import Rows, load_record
+from cosim.record.run_record import Rows, RunRecord, load_record
 from noack.config.resolution import tables_of
 from noack.config.scenario_file import load
 from noack.protocol.machine_interface import GENERATION
+from noack.protocol.record_tables import OWNER
 from noack.runtime.spool import read_chunks
 from tests.integration.conftest import (
     AT_RATE,
@@ -107,6 +108,12 @@ def test_the_run_continues_and_lists_its_restarts(restarted: Finished) -> None:
         assert f"{role} runs again at " in restarted.stderr
 
 
+def rows_of_life(record: RunRecord, table: str, place: int) -> Rows:
+    rows = record[table]
+    numbers: Rows = rows[record.life_numbers(OWNER[table]).places(rows) == place]
+    return numbers
+
+
 def test_no_recorded_row_is_lost_and_all_rows_are_replayed(restarted: Finished) -> None:
     assert restarted.summary["missing_samples"] == 0
     verdict = restarted.summary["replay"]
@@ -121,12 +128,10 @@ def test_a_restarted_sensor_and_network_begin_with_a_delivered_measurement(
     restarted: Finished,
 ) -> None:
     record = load_record(restarted.run_dir)
-    _, sensor = record.lives("sensor")
-    first = sensor.rows["sensor_measurement"][0]
+    first = rows_of_life(record, "sensor_measurement", 1)[0]
     assert first["event"] == GENERATION
     assert np.array_equal(first["x"], first["x_s"])
-    _, netem = record.lives("netem")
-    packets = netem.rows["netem_packet"]
+    packets = rows_of_life(record, "netem_packet", 1)
     assert packets["consecutive_losses"][0] == 0
     assert packets["consecutive_losses"].max() <= 1
 
@@ -135,8 +140,8 @@ def test_a_restarted_controller_outputs_zero_until_its_first_update(
     restarted: Finished,
 ) -> None:
     record = load_record(restarted.run_dir)
-    _, again = record.lives("controller")
-    ticks, deliveries = again.rows["controller_step"], again.rows["controller_delivery"]
+    ticks = rows_of_life(record, "controller_step", 1)
+    deliveries = rows_of_life(record, "controller_delivery", 1)
     waiting = ticks["input"] < deliveries["input"][0]
     assert not ticks["u"][waiting].any()
     assert (ticks["u"][~waiting] != 0).any()
@@ -151,11 +156,10 @@ def test_the_loop_converges_again_and_its_identity_holds(restarted: Finished) ->
     assert restarted.summary["identity_residual_relative"] < 1e-11
     joined = align_tables(record)
     away = np.isnan(joined.x_c).any(axis=1)
-    _, controller = record.lives("controller")
-    known_ns = controller.rows["controller_delivery"]["model_t_ns"][0]
+    known_ns = rows_of_life(record, "controller_delivery", 1)["model_t_ns"][0]
     gone = (joined.t_ns > known_ns - 100_000_000) & (joined.t_ns < known_ns)
     assert away[gone].all()
-    ended_ns = controller.rows["controller_step"]["t_ns"][-1]
+    ended_ns = rows_of_life(record, "controller_step", 1)["t_ns"][-1]
     assert not away[(joined.t_ns > known_ns) & (joined.t_ns <= ended_ns)].any()
     norms = np.linalg.norm(joined.x, axis=1)
     assert norms[-100:].max() < 0.1 * norms.max()
@@ -171,7 +175,6 @@ def test_claims_are_void_from_the_first_outage_on(restarted: Finished) -> None:
 def test_a_restarted_process_accepts_no_old_message(restarted: Finished) -> None:
     """A restarted process has lost the accepted numbers; the generation identifies old messages."""
     record = load_record(restarted.run_dir)
-    for role, table in (("sensor", "sensor_measurement"), ("controller", "controller_delivery")):
-        before, again = record.lives(role)
-        last_ns = before.rows[table]["t_ns"].max()
-        assert again.rows[table]["t_ns"].min() > last_ns
+    for table in ("sensor_measurement", "controller_delivery"):
+        last_ns = rows_of_life(record, table, 0)["t_ns"].max()
+        assert rows_of_life(record, table, 1)["t_ns"].min() > last_ns

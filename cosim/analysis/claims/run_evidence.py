@@ -129,7 +129,7 @@ class RunEvidence:
         found = [self.observed.first_violation(limit, ("sampling",))]
         whole = self.part.whole or self.record
         for role in LOOP_ROLES:
-            gaps_ns = filter(None, (life.hole_ns() for life in whole.lives(role)))
+            gaps_ns = filter(None, (life.hole_ns for life in whole.lives(role)))
             times_s = [ns * 1e-9 - self.part.from_s for ns in gaps_ns]
             why = f"rows of {role} are missing from the record"
             found += [VoidFrom(t_s, why) for t_s in times_s if t_s >= 0]

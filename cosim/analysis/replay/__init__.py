@@ -13,8 +13,8 @@ before the deadlines and does not decrease.
 
 import numpy as np
 
-from cosim.analysis.replay.machine_replay import replay_machine
-from cosim.analysis.replay.message_comparison import check_messages
+from cosim.analysis.replay.machine_replay import MachineReplay
+from cosim.analysis.replay.message_comparison import MessageComparison
 from cosim.analysis.replay.replay_result import Replay
 from cosim.record.run_record import RunRecord
 from noack.protocol.topology import LOOP_ROLES
@@ -23,9 +23,16 @@ __all__ = ["Replay", "replay"]
 
 
 def replay(record: RunRecord) -> Replay:
-    """Replay a run and compare it with its record; a process is replayed up to its first gap."""
+    """Replay a run and compare it with its record; a process is replayed up to its first gap.
+
+    The record is read part by part, so that memory does not grow with the length of the run.
+    """
     with np.errstate(all="ignore"):  # a diverging run overflows and is replayed all the same
-        replayed = {role: replay_machine(role, record) for role in LOOP_ROLES}
-        messages = check_messages(record, replayed)
-    results = tuple(result for one in replayed.values() for result in one.results)
-    return Replay(processes=results, messages=messages)
+        machines = {role: MachineReplay(role, record) for role in LOOP_ROLES}
+        messages = MessageComparison(record, machines)
+        for part in record.slices():
+            for machine in machines.values():
+                machine.take(part)
+            messages.take(part)
+    results = tuple(result for one in machines.values() for result in one.results)
+    return Replay(processes=results, messages=messages.results())

@@ -1,16 +1,18 @@
-"""Replays one machine from its recorded rows and compares the rows that it emits."""
+"""Replays machines from their recorded rows and compares the rows that they emit."""
 
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from controller_node.controller import controller_of
 from cosim.analysis.replay.replay_result import ProcessReplay, difference, rows_differ
 from cosim.analysis.summary_model import ReplayDifference
-from cosim.record.run_record import Life, Rows, RunRecord
+from cosim.record.process_lives import Life
+from cosim.record.record_source import Slice
+from cosim.record.run_record import Rows, RunRecord
 from netem.duplex_link import network_of
 from netem.link_machine import Datagram
 from noack.config.parameter_changes import ParameterChange, settings_of
@@ -45,17 +47,7 @@ _MOST_BYTES = 65_535
 """Largest size of a datagram; a damaged record may contain larger numbers."""
 
 
-@dataclass(frozen=True)
-class MachineReplay:
-    """The replay of a role's machines: the result of each, and the messages that they emitted."""
-
-    results: tuple[ProcessReplay, ...]
-    sent: Sequence[Any]
-
-    @property
-    def whole(self) -> bool:
-        """Whether every input was replayed."""
-        return all(result.whole for result in self.results)
+Numbers = NDArray[np.int64]
 
 
 def received_vectors(table: str, rows: Rows) -> tuple[Matrix, list[str]]:
@@ -73,97 +65,161 @@ def received_vectors(table: str, rows: Rows) -> tuple[Matrix, list[str]]:
     ]
 
 
-def replay_machine(role: str, record: RunRecord) -> MachineReplay:
-    """Feed a process's machine its recorded inputs, up to the first gap, and compare its rows.
+class MachineReplay:
+    """Replays the machines of a role, part by part of the record; one for each generation.
 
-    If the process was restarted, the machine of each restarted process is replayed too.
+    Each machine gets its recorded inputs, up to the first gap, and its rows are compared.
     """
-    sent: list[Any] = []
-    results = [_replay_life(role, record.scenario, life, sent) for life in record.lives(role)]
-    return MachineReplay(tuple(results), sent)
+
+    def __init__(self, role: str, record: RunRecord) -> None:
+        self._tables = record.owned_by(role)
+        self._numbers = record.life_numbers(role)
+        self._lives = [_LifeReplay(role, record.scenario, life) for life in record.lives(role)]
+        self.sent: list[Any] = []
+        """Messages that the machines emitted in the newest part."""
+
+    def take(self, part: Slice) -> None:
+        """Replay the next part of the record."""
+        self.sent = []
+        places = {table: self._numbers.places(part[table]) for table in self._tables}
+        for i, life in enumerate(self._lives):
+            owned = {table: part[table][places[table] == i] for table in self._tables}
+            if any(map(len, owned.values())):
+                self.sent += life.take(owned)
+
+    @property
+    def results(self) -> tuple[ProcessReplay, ...]:
+        """The result of each generation; final after the last part."""
+        return tuple(life.result() for life in self._lives)
+
+    @property
+    def whole(self) -> bool:
+        """Whether every input was replayed."""
+        return all(result.whole for result in self.results)
 
 
-def _replay_life(role: str, scenario: Scenario, life: Life, sent: list[Any]) -> ProcessReplay:
-    owned, first = life.rows, life.generation * GENERATION
-    inputs = _inputs(owned, life.report, first)
-    run = _Run(_MACHINES[role](scenario, _start(life)), owned)
-    compared = 0
-    for table, row in inputs.order:
-        if not run.step(table, row):
-            break
-        compared += 1
-    found = [one for one in (run.difference, inputs.damage) if one is not None]
-    sent += run.sent
-    return ProcessReplay(
-        process=f"{role} ({life.generation + 1})" if life.generation else role,
-        inputs=sum(map(len, owned.values())),
-        compared=compared,
-        missing_from=inputs.missing_from,
-        end_known=life.report is not None,
-        difference=min(found, key=lambda one: one.now_ns, default=None),
-    )
+class _LifeReplay:
+    """The replay of one generation."""
+
+    def __init__(self, role: str, scenario: Scenario, life: Life) -> None:
+        self._role, self._scenario, self._life = role, scenario, life
+        self._run: _Run | None = None
+        self._count = sum(life.rows.values())
+        report = life.report
+        self._written = None if report is None else sum(report["rows"][one] for one in life.rows)
+        ends_early = self._written is not None and self._written > self._count
+        self._missing_from = self._count if ends_early else None
+        self._damage: ReplayDifference | None = None
+        self._compared = 0
+        self._before = dict.fromkeys(life.rows, 0)
+        """Rows in the parts before, by table."""
+        self._stopped = False
+
+    def take(self, owned: Slice) -> list[Any]:
+        """Replay the next rows; return the messages that the machine emitted."""
+        if self._stopped:
+            return []
+        if self._run is None:
+            start = _start(self._life.generation, owned)
+            self._run = _Run(_MACHINES[self._role](self._scenario, start))
+        order = self._in_order(owned)
+        self._run.load(owned, self._before)
+        for table, row in order:
+            if not self._run.step(table, row):
+                self._stopped = True
+                break
+            self._compared += 1
+        for table, rows in owned.items():
+            self._before[table] += len(rows)
+        return self._run.take_sent()
+
+    def result(self) -> ProcessReplay:
+        generation, differs = (
+            self._life.generation,
+            None if self._run is None else self._run.difference,
+        )
+        found = [one for one in (differs, self._damage) if one is not None]
+        return ProcessReplay(
+            process=f"{self._role} ({generation + 1})" if generation else self._role,
+            inputs=self._count,
+            compared=self._compared,
+            missing_from=self._missing_from,
+            end_known=self._life.report is not None,
+            difference=min(found, key=lambda one: one.now_ns, default=None),
+        )
+
+    def _in_order(self, owned: Slice) -> list[tuple[str, int]]:
+        """Return table and row of each input in order, up to the first gap."""
+        numbers = np.concatenate([rows["input"] for rows in owned.values()])
+        numbers = numbers - self._life.generation * GENERATION
+        places = [(table, row) for table, rows in owned.items() for row in range(len(rows))]
+        order = np.argsort(numbers, kind="stable")
+        numbers = numbers[order]
+        in_order = [places[i] for i in order.tolist()]
+        unexpected = np.flatnonzero(numbers != self._compared + np.arange(len(numbers)))
+        if not len(unexpected):
+            return in_order
+        whole = int(unexpected[0])
+        self._stopped = True
+        self._explain(owned, in_order, numbers, whole)
+        return in_order[:whole]
+
+    def _explain(
+        self, owned: Slice, in_order: list[tuple[str, int]], numbers: Numbers, whole: int
+    ) -> None:
+        """Find out whether rows are missing before ``whole``, or its input number is wrong."""
+        expected, suspect = self._compared + whole, whole
+        complete = self._written == self._count
+        if numbers[whole] > expected:
+            if not complete:
+                self._missing_from = expected
+                return
+            # No row is missing, so an ``input`` number is wrong.
+            repeated = np.append(np.diff(numbers) == 0, False)
+            wrong = np.flatnonzero(repeated | (numbers >= self._count))
+            suspect = int(wrong[0]) if len(wrong) else whole
+        self._missing_from = None
+        table, row = in_order[suspect]
+        self._damage = difference(
+            table, self._before[table] + row, int(owned[table]["now_ns"][row]),
+            "the inputs are not numbered in turn", "input", int(numbers[suspect]), expected,
+        )  # fmt: skip
 
 
-def _start(life: Life) -> Start:
+def _start(generation: int, owned: Slice) -> Start:
     """Return the start of a process: for the controller, its first tick.
 
     If the controller died before its first tick, its first message determines the start.
     """
-    if not life.generation or CONTROLLER_STEP not in life.rows:
-        return Start(life.generation)
-    steps, deliveries = life.rows[CONTROLLER_STEP], life.rows[CONTROLLER_DELIVERY]
+    if not generation or CONTROLLER_STEP not in owned:
+        return Start(generation)
+    steps, deliveries = owned[CONTROLLER_STEP], owned[CONTROLLER_DELIVERY]
     first_ns = (*steps["t_ns"][:1], *deliveries["model_t_ns"][:1])
-    return Start(life.generation, int(min(first_ns, default=0)))
-
-
-class _Inputs(NamedTuple):
-    order: list[tuple[str, int]]
-    """Table and row of each input, up to the first gap."""
-    missing_from: int | None
-    damage: ReplayDifference | None
-
-
-def _inputs(owned: Mapping[str, Rows], report: Mapping[str, Any] | None, first: int) -> _Inputs:
-    """Put the rows of a process's tables in the order of their ``input`` numbers."""
-    numbers = np.concatenate([rows["input"] for rows in owned.values()]) - first
-    places = [(table, row) for table, rows in owned.items() for row in range(len(rows))]
-    order = np.argsort(numbers, kind="stable")
-    numbers, count = numbers[order], len(numbers)
-    written = None if report is None else sum(report["rows"][table] for table in owned)
-    missing_from = None if written is None or written <= count else count
-    damage = None
-    unexpected = np.flatnonzero(numbers != np.arange(count))
-    whole = int(unexpected[0]) if len(unexpected) else count
-    if whole < count:
-        suspect = whole
-        if numbers[whole] > whole:
-            missing_from = whole
-            if written == count:  # no row is missing, so an ``input`` number is wrong
-                repeated = np.append(np.diff(numbers) == 0, False)
-                suspect = int(np.flatnonzero(repeated | (numbers >= count))[0])
-        if numbers[whole] < whole or written == count:
-            missing_from = None
-            table, row = places[order[suspect]]
-            damage = difference(
-                table, row, int(owned[table]["now_ns"][row]), "the inputs are not numbered in turn",
-                "input", int(numbers[suspect]), whole,
-            )  # fmt: skip
-    return _Inputs([places[i] for i in order[:whole].tolist()], missing_from, damage)
+    return Start(generation, int(min(first_ns, default=0)))
 
 
 class _Run:
     """A machine under replay."""
 
-    def __init__(self, machine: Machine[Any], owned: Mapping[str, Rows]) -> None:
-        self.sent: list[Any] = []
+    def __init__(self, machine: Machine[Any]) -> None:
+        self._sent: list[Any] = []
         self.difference: ReplayDifference | None = None
         self._machine = machine
+        self._before_ns: int | None = None
+
+    def load(self, owned: Slice, before: Mapping[str, int]) -> None:
+        """Load the next rows; ``before`` are the numbers of rows before them, by table."""
+        self._offsets = dict(before)
         self._rows = {table: np.ascontiguousarray(rows) for table, rows in owned.items()}
         self._recorded = {table: rows.tobytes() for table, rows in self._rows.items()}
         self._now_ns = {table: rows["now_ns"].tolist() for table, rows in owned.items()}
         self._messages = {table: list(_messages(table, rows)) for table, rows in owned.items()}
         self._fresh = {table: np.zeros(1, rows.dtype) for table, rows in owned.items()}
-        self._before_ns: int | None = None
+
+    def take_sent(self) -> list[Any]:
+        """Return the messages that were emitted since the last call."""
+        sent, self._sent = self._sent, []
+        return sent
 
     def step(self, table: str, row: int) -> bool:
         """Feed one input; return whether the machine took it."""
@@ -190,7 +246,7 @@ class _Run:
 
     def _compare(self, table: str, row: int, outputs: Sequence[Any]) -> None:
         emitted = [output for output in outputs if isinstance(output, Record)]
-        self.sent += [output for output in outputs if not isinstance(output, Record | Notice)]
+        self._sent += [output for output in outputs if not isinstance(output, Record | Notice)]
         if [record.table for record in emitted] != [table]:
             self._differs(table, row, "the machine does not answer with one row of this table")
             return
@@ -199,12 +255,13 @@ class _Run:
         size = fresh.itemsize
         same = fresh.tobytes() == self._recorded[table][row * size : (row + 1) * size]
         if not same and self.difference is None:
-            self.difference = rows_differ(table, row, self._rows[table][row], fresh[0])
+            place = self._offsets[table] + row
+            self.difference = rows_differ(table, place, self._rows[table][row], fresh[0])
 
     def _differs(self, table: str, row: int, what: str, *values: Any) -> None:
         if self.difference is None:
-            now_ns = self._now_ns[table][row]
-            self.difference = difference(table, row, now_ns, what, *values)
+            now_ns, place = self._now_ns[table][row], self._offsets[table] + row
+            self.difference = difference(table, place, now_ns, what, *values)
 
 
 def _messages(table: str, rows: Rows) -> Iterator[Message | Datagram | ParameterChange | None]:

@@ -6,12 +6,14 @@ are not compared.
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
 from cosim.analysis.replay.machine_replay import MachineReplay, received_vectors
 from cosim.analysis.replay.replay_result import MessagesReplay, difference, first_entry
-from cosim.record.run_record import Rows, RunRecord
+from cosim.record.record_source import Slice
+from cosim.record.run_record import RunRecord
 from noack.protocol.record_tables import (
     ACKNOWLEDGEMENTS,
     CONTROLLER_DELIVERY,
@@ -23,7 +25,7 @@ from noack.protocol.record_tables import (
     SETTINGS,
     UPDATES,
 )
-from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Message, read_header
+from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Header, Message, read_header
 
 _HOPS = (
     ("plant → sensor", SENSOR_MEASUREMENT, "plant", Flow.MEASUREMENT),
@@ -34,28 +36,33 @@ _HOPS = (
     ("netem → sensor", SENSOR_ACKNOWLEDGEMENT, "controller", Flow.ACKNOWLEDGEMENT),
 )
 """Name, the receiver's table, the process that made the messages, and their kind."""
+_CONTENT, _SENT, _FORWARDED = "content", "sent", "forwarded"
+"""Kinds of differences."""
 
 
-def check_messages(
-    record: RunRecord, replayed: Mapping[str, MachineReplay]
-) -> tuple[MessagesReplay, ...]:
-    """Compare the messages of every hop of the loop."""
-    acknowledges = SENSOR_ACKNOWLEDGEMENT in record.tables
-    found = []
-    for leg, table, sender, flow in _HOPS:
-        if flow is Flow.ACKNOWLEDGEMENT and not acknowledges:
-            continue
-        hop = _Received(leg, table, record, replayed[sender], flow)
-        if table == NETEM_PACKET:
-            hop.compare_heads()
-            if not acknowledges:
-                hop.compare_flows()
-        else:
-            hop.compare_vectors()
-        if table in (CONTROLLER_DELIVERY, SENSOR_ACKNOWLEDGEMENT):
-            hop.compare_with_survivors(replayed["netem"])
-        found.append(hop.result())
-    return (*found, *_compare_changes(record))
+class MessageComparison:
+    """Compares the messages of every hop of the loop, part by part of the record."""
+
+    def __init__(self, record: RunRecord, machines: Mapping[str, MachineReplay]) -> None:
+        self._record, self._machines = record, machines
+        acknowledges = SENSOR_ACKNOWLEDGEMENT in record.tables
+        self._hops = [
+            _Hop(leg, table, machines[sender], flow, acknowledges=acknowledges)
+            for leg, table, sender, flow in _HOPS
+            if acknowledges or flow is not Flow.ACKNOWLEDGEMENT
+        ]
+
+    def take(self, part: Slice) -> None:
+        """Compare the messages of a part that the machines have just replayed."""
+        survivors = [(one.flow, read_header(one.data)) for one in self._machines["netem"].sent]
+        for hop in self._hops:
+            hop.take(part, survivors)
+
+    def results(self) -> tuple[MessagesReplay, ...]:
+        """Return the result of each hop after the last part."""
+        whole = self._machines["netem"].whole
+        found = [hop.result(network_is_whole=whole) for hop in self._hops]
+        return (*found, *_compare_changes(self._record))
 
 
 def _compare_changes(record: RunRecord) -> Iterator[MessagesReplay]:
@@ -79,46 +86,88 @@ def _compare_changes(record: RunRecord) -> Iterator[MessagesReplay]:
         )
 
 
-class _Received:
+class _Difference(NamedTuple):
+    """The first difference of one kind."""
+
+    row: int
+    """Number of the message among those of the hop."""
+    place: int
+    """Row of the table."""
+    now_ns: int
+    what: str
+    column: str
+    recorded: object
+    replayed: object
+
+
+class _Hop:
     """The messages of one hop, as received in the run and as sent in the replay."""
 
     def __init__(
-        self, leg: str, table: str, record: RunRecord, sender: MachineReplay, flow: Flow
+        self, leg: str, table: str, sender: MachineReplay, flow: Flow, *, acknowledges: bool
     ) -> None:
-        self._leg = leg
-        self._table = table
-        self._rows: Rows = record[table]
-        self._at = np.arange(len(self._rows))
+        self._leg, self._table, self._sender, self._flow = leg, table, sender, flow
         self._direction = ACKNOWLEDGEMENTS if flow is Flow.ACKNOWLEDGEMENT else UPDATES
-        if table == NETEM_PACKET and record.scenario.protocol.acknowledges:
-            self._at = np.flatnonzero(self._rows["flow"] == self._direction)
-            self._rows = self._rows[self._at]
-        self._sent: dict[int, Message] = {
-            message.sequence: message for message in sender.sent if message.flow is flow
-        }
-        self._all_sent = sender.whole
+        self._selects = table == NETEM_PACKET and acknowledges
+        self._sent: dict[int, Message] = {}
+        self._survivors: set[int] = set()
+        self._newest = -1
+        self._received = self._read = 0
+        self._encoder: Encoder | None = None
         self._compared = 0
-        self._first: tuple[int, str, str, object, object] | None = None
+        # Whether a message that was not sent, or not forwarded, is a difference is known at the
+        # end: then it is known whether the replay covers all messages.
+        self._first: dict[str, _Difference] = {}
 
-    def result(self) -> MessagesReplay:
-        found = None
-        if self._first is not None:
-            row, what, column, recorded, replayed = self._first
-            now_ns, place = int(self._rows["now_ns"][row]), int(self._at[row])
-            found = difference(self._table, place, now_ns, what, column, recorded, replayed)
+    def take(self, part: Slice, survivors: list[tuple[int, Header | None]]) -> None:
+        """Compare the messages received in a part with those sent up to its end."""
+        rows = part[self._table]
+        self._rows, self._at = rows, np.arange(len(rows))
+        if self._selects:
+            self._at = np.flatnonzero(rows["flow"] == self._direction)
+            self._rows = rows[self._at]
+        mine = (message for message in self._sender.sent if message.flow is self._flow)
+        self._sent.update((message.sequence, message) for message in mine)
+        if self._table == NETEM_PACKET:
+            self._compare_heads()
+            if not self._selects:
+                self._compare_flows()
+        else:
+            self._compare_vectors()
+        if self._table in (CONTROLLER_DELIVERY, SENSOR_ACKNOWLEDGEMENT):
+            self._survivors |= {
+                header.sequence
+                for flow, header in survivors
+                if flow == self._direction and header is not None
+            }
+            self._compare_with_survivors()
+        self._received += len(self._rows)
+        self._read += len(rows)
+        # Every receiver accepts only messages that are newer than those before.
+        self._sent = {k: one for k, one in self._sent.items() if k >= self._newest}
+        self._survivors = {k for k in self._survivors if k >= self._newest}
+
+    def result(self, *, network_is_whole: bool) -> MessagesReplay:
+        """Return the first difference of all messages."""
+        counts = {_SENT: self._sender.whole, _FORWARDED: network_is_whole}
+        kinds = [kind for kind in (_CONTENT, _SENT, _FORWARDED) if counts.get(kind, True)]
+        firsts = [self._first[kind] for kind in kinds if kind in self._first]
+        first, found = min(firsts, key=lambda one: one.row, default=None), None
+        if first is not None:
+            found = difference(self._table, *first[1:])
         return MessagesReplay(
-            leg=self._leg, received=len(self._rows), compared=self._compared, difference=found
+            leg=self._leg, received=self._received, compared=self._compared, difference=found
         )
 
-    def compare_vectors(self) -> None:
+    def _compare_vectors(self) -> None:
         """Compare sequence number, time and vector of the received messages."""
-        rows, newest = self._rows, -1
+        rows = self._rows
         vectors, entries = received_vectors(self._table, rows)
         fields = (rows["sequence"].tolist(), rows["t_ns"].tolist(), vectors)
         for row, (sequence, t_ns, vector) in enumerate(zip(*fields, strict=True)):
-            if sequence <= newest:
+            if sequence <= self._newest:
                 self._differs(row, "not newer than the message before", "sequence", sequence)
-            newest = max(newest, sequence)
+            self._newest = max(self._newest, sequence)
             message = self._find(row, sequence, "sequence", sequence)
             if message is None:
                 continue
@@ -130,15 +179,19 @@ class _Received:
                 place, *values = entry
                 self._differs(row, "differs from the message sent", entries[place], *values)
 
-    def compare_heads(self) -> None:
+    def _compare_heads(self) -> None:
         """Compare the part of a datagram that netem records: its first bytes and its size."""
         heads, sizes = self._rows["head"].tolist(), self._rows["size_bytes"].tolist()
         headers = [read_header(head) for head in heads]
         # The run number is random and recorded only here.
         ids = Counter(header.run_id for header in headers if header is not None)
-        encoder = Encoder(ids.most_common(1)[0][0] if ids else 0, bytes(KEY_BYTES))
+        if self._encoder is None and ids:
+            self._encoder = Encoder(ids.most_common(1)[0][0], bytes(KEY_BYTES))
+        encoder = self._encoder or Encoder(0, bytes(KEY_BYTES))
         for row, (head, size, header) in enumerate(zip(heads, sizes, headers, strict=True)):
-            message = self._find(row, -1 if header is None else header.sequence, "head", head)
+            sequence = -1 if header is None else header.sequence
+            self._newest = max(self._newest, sequence)
+            message = self._find(row, sequence, "head", head)
             if message is None:
                 continue
             data = encoder.encode(message)
@@ -148,36 +201,35 @@ class _Received:
             elif size != len(data):
                 self._differs(row, "differs from the message sent", "size_bytes", size, len(data))
 
-    def compare_flows(self) -> None:
+    def _compare_flows(self) -> None:
         """Check that only the sensor's flow was forwarded."""
         for row, flow in enumerate(self._rows["flow"].tolist()):
             if flow != 0:
                 self._differs(row, "netem serves only the sensor's flow", "flow", flow, 0)
 
-    def compare_with_survivors(self, network: MachineReplay) -> None:
+    def _compare_with_survivors(self) -> None:
         """Check that the network forwarded every received message."""
-        if not network.whole:
-            return
-        survivors = {
-            header.sequence
-            for datagram in network.sent
-            if datagram.flow == self._direction and (header := read_header(datagram.data))
-        }
         for row, sequence in enumerate(self._rows["sequence"].tolist()):
-            if sequence not in survivors:
-                self._differs(row, "netem did not forward it", "sequence", sequence)
+            if sequence not in self._survivors:
+                what = "netem did not forward it"
+                self._differs(row, what, "sequence", sequence, kind=_FORWARDED)
 
     def _find(self, row: int, sequence: int, column: str, value: object) -> Message | None:
         """Return the message of a number if its sender was replayed that far and sent it."""
         if (message := self._sent.get(sequence)) is not None:
             self._compared += 1
             return message
-        if sequence < 0 or self._all_sent:
-            self._differs(row, "was never sent", column, value)
+        kind = _CONTENT if sequence < 0 else _SENT
+        self._differs(row, "was never sent", column, value, kind=kind)
         return None
 
     def _differs(
-        self, row: int, what: str, column: str, recorded: object, replayed: object = None
-    ) -> None:
-        if self._first is None or row < self._first[0]:
-            self._first = (row, what, column, recorded, replayed)
+        self, row: int, what: str, column: str, recorded: object, replayed: object = None,
+        *, kind: str = "content",
+    ) -> None:  # fmt: skip
+        known = self._first.get(kind)
+        if known is None or self._received + row < known.row:
+            place, now_ns = self._read + int(self._at[row]), int(self._rows["now_ns"][row])
+            self._first[kind] = _Difference(
+                self._received + row, place, now_ns, what, column, recorded, replayed
+            )

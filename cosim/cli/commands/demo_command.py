@@ -6,7 +6,6 @@ import typer
 
 from cosim.cli import command as cli
 from cosim.cli.execute_run import RunOutput, run_processes
-from noack.protocol.topology import ROLES
 
 
 @cli.command(cli.RUNS, 10, [
@@ -29,4 +28,4 @@ def demo(
     """Run the paper's lane-following example live."""
     mode = ['mode="zoh"'] if zoh else []
     loaded = cli.load_scenario("lane_following", [*mode, *(settings or ())])
-    return run_processes(loaded, runs, RunOutput(report, verbose, json), spawn=ROLES, live=live)
+    return run_processes(loaded, runs, RunOutput(report, verbose, json), live=live)

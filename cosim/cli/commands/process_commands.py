@@ -4,7 +4,6 @@ import typer
 
 from cosim.cli import command as cli
 from cosim.cli.execute_run import RunOutput, run_processes
-from noack.protocol.topology import RECORDER
 
 
 def _examples(role: str) -> list[tuple[str, str]]:
@@ -30,6 +29,8 @@ def record(
     json: cli.JsonOption = False,
 ) -> int:
     """Open a run and record it; the other four processes join from other terminals."""
+    from noack.protocol.topology import RECORDER
+
     loaded = cli.load_scenario(scenario, settings)
     output = RunOutput(report, verbose, json)
     return run_processes(loaded, runs, output, spawn=(RECORDER,), session=session, live=live)

@@ -2,7 +2,6 @@
 
 from cosim.cli import command as cli
 from cosim.cli.execute_run import RunOutput, run_processes
-from noack.protocol.topology import ROLES
 
 
 @cli.command(cli.RUNS, 20, [
@@ -22,4 +21,4 @@ def run(
 ) -> int:
     """Run a scenario live: start all processes and record everything."""
     loaded = cli.load_scenario(scenario, settings)
-    return run_processes(loaded, runs, RunOutput(report, verbose, json), spawn=ROLES, live=live)
+    return run_processes(loaded, runs, RunOutput(report, verbose, json), live=live)

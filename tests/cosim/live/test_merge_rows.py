@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosim.record.run_record import merge_rows
+from cosim.record.spool_merge import in_memory, merged
 
 ROW = np.dtype([("input", "<i8"), ("value", "<f8")])
 
@@ -14,10 +14,15 @@ def batch(first: int, end: int) -> np.ndarray:
     return rows
 
 
+def merge_rows(batches: list[np.ndarray]) -> np.ndarray:
+    segments = [segment for rows in batches for segment in in_memory(rows)]
+    return np.concatenate([np.zeros(0, ROW), *merged(segments, ROW)])
+
+
 @given(st.lists(st.tuples(st.integers(0, 40), st.integers(0, 12)), max_size=12))
 def test_merged_rows_are_unique_and_ordered(ranges: list[tuple[int, int]]) -> None:
     """Batches in any order, overlapping, repeated, empty; gaps stay gaps."""
-    rows = merge_rows([batch(first, first + n) for first, n in ranges], ROW)
+    rows = merge_rows([batch(first, first + n) for first, n in ranges])
     present = sorted({k for first, n in ranges for k in range(first, first + n)})
     assert rows["input"].tolist() == present
     assert rows["value"].tolist() == [0.5 * k for k in present]
@@ -25,6 +30,6 @@ def test_merged_rows_are_unique_and_ordered(ranges: list[tuple[int, int]]) -> No
 
 
 def test_merging_no_batches_gives_an_empty_table() -> None:
-    rows = merge_rows([], ROW)
+    rows = merge_rows([])
     assert rows.shape == (0,)
     assert rows.dtype == ROW

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosim.record.run_record import merge_rows
+from cosim.record.spool_merge import merged, spool_segments
 from noack.core.errors import MachineError
 from noack.runtime.spool import SpoolWriter, read_chunks
 
@@ -70,7 +70,7 @@ def test_rows_spooled_twice_are_merged(
         edges = sorted({0, end, *(cut for cut in cuts if cut < end)})
         batches = [(a, numbers(a, b)) for a, b in itertools.pairwise(edges)]
         spool(folder, writer, "step", *batches)
-    rows = merge_rows([np.frombuffer(data, ROW) for _, data in read_chunks(folder, "step")], ROW)
+    rows = np.concatenate([*merged(spool_segments(folder, "step", ROW), ROW)])
     assert rows["input"].tolist() == list(range(20))
 
 

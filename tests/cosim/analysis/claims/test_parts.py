@@ -202,7 +202,7 @@ def test_a_violation_before_the_stop_voids_the_claims(make: Make) -> None:
     quick = scenario.model_copy(
         update={"controller": scenario.controller.model_copy(update={"rate_hz": 100.0})}
     )
-    record = RunRecord(quick, slow._rows, slow.notices, slow.reports)
+    record = RunRecord(quick, slow.source, slow.notices, slow.reports)
     cut = stopped(record, dict.fromkeys(LOOP_ROLES, STOP_NS))
     assert ClaimVerdict.VOID in {claim.verdict for claim in RunClaims(cut).judge()}
 
@@ -219,7 +219,7 @@ def test_rows_of_every_table_end_with_their_process(run: RunRecord) -> None:
         if table != "plant_actuation" and len(rows):
             assert rows["now_ns"][-1] <= end_ns + 10 * MS
     for role in LOOP_ROLES:
-        assert [life.hole_ns() for life in cut.lives(role)] == [None]
+        assert [life.hole_ns for life in cut.lives(role)] == [None]
 
 
 def test_a_complete_run_is_judged_to_its_end(run: RunRecord) -> None:
