@@ -10,7 +10,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import psutil
 
 from benchmarks._report import MeasurementError
-from benchmarks.soak.watch import MODULES
+from benchmarks.soak.watch import is_of
 from cosim.analysis.run_summary import summarise
 from cosim.analysis.timing_statistics import lateness_us
 from cosim.cli import find_scenario
@@ -20,6 +20,7 @@ from noack.config.scenario_file import load
 from noack.core.errors import ExitStatus
 from noack.core.linear_systems import Vector
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
+from noack.protocol.topology import ROLES
 
 STEPS = {"plant": PLANT_STEP, "sensor": SENSOR_MEASUREMENT, "controller": CONTROLLER_STEP}
 """Table of each process's steps."""
@@ -64,12 +65,7 @@ def faulted_run(
     def progress(account: Mapping[str, Any]) -> None:
         if account["t_s"] >= at_s and not threads:
             children = psutil.Process().children()
-            processes = {
-                role: child
-                for role, module in MODULES.items()
-                for child in children
-                if module in child.cmdline()
-            }
+            processes = {role: child for role in ROLES for child in children if is_of(role, child)}
             threads.append(threading.Thread(target=lambda: outcomes.append(fault(processes))))
             threads[0].start()
 

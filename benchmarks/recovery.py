@@ -17,7 +17,7 @@ import psutil
 from benchmarks._faulted_run import FaultedRun, Processes, faulted_run, run_recovery_s
 from benchmarks._report import Benchmark, Figures, MeasurementError, Peer, Rounds, Row, median, say
 from benchmarks._runs import execute
-from benchmarks.soak.watch import MODULES
+from cosim.live.child_processes import MODULES
 from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, PLANT_STEP
 
@@ -96,7 +96,7 @@ def stopped_ms(role: str) -> float:
 
 def imported_s(role: str) -> float:
     """Return wall seconds from the start of a Python to the end of a process's imports."""
-    module = MODULES[role] + (".__main__" if role != "recorder" else "")
+    module = MODULES[role]
     command = [sys.executable, "-c", f"import {module}, sys; print('ready', file=sys.stderr)"]
     finished = execute(command)
     return finished.lines[-1].at_s - finished.begun_s

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from noack.config import toml_file
 from noack.core.errors import CallerError, shortened
 
 KINDS = ("scenarios", "campaigns")
@@ -64,6 +63,8 @@ def shipped_names(folder: str) -> list[str]:
 def all_shipped(folder: str) -> list[ShippedFile]:
     """Return the scenarios or campaigns that come with noack, by name."""
     paths = (_path_of(name, folder) for name in shipped_names(folder))
+    from noack.config import toml_file
+
     return [ShippedFile(path.stem, toml_file.read(path)["description"], path) for path in paths]
 
 

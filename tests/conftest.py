@@ -62,6 +62,18 @@ def no_signal_is_ignored_by_children() -> Iterator[None]:
 
 
 @pytest.fixture
+def usual_signals() -> Iterator[None]:
+    """Let signals do what they usually do, also in a process that was started to ignore them."""
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    if hasattr(signal, "SIGHUP"):
+        usual[signal.SIGHUP] = signal.SIG_DFL
+    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.fixture
 def content() -> dict[str, Any]:
     """A minimal valid scenario of the double integrator, as parsed TOML."""
     return {

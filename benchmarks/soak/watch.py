@@ -2,20 +2,14 @@
 
 import contextlib
 import os
-from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 import psutil
 
+from noack.protocol.topology import ROLES
+
 LAUNCHER = "launcher"
-MODULES: Mapping[str, str] = {
-    "recorder": "cosim.live.recorder",
-    "netem": "netem",
-    "plant": "plant_server",
-    "sensor": "sensor_node",
-    "controller": "controller_node",
-}
 
 
 class Sample(NamedTuple):
@@ -67,13 +61,18 @@ class Processes:
                 process.kill()
 
     def _find(self) -> None:
-        if len(self._known) > len(MODULES):
+        if len(self._known) > len(ROLES):
             return
         with contextlib.suppress(psutil.Error):
-            for child in self._known[LAUNCHER].children(recursive=True):
-                for role, module in MODULES.items():
-                    if role not in self._known and module in child.cmdline():
+            for child in self._known[LAUNCHER].children():
+                for role in ROLES:
+                    if role not in self._known and is_of(role, child):
                         self._known[role] = child
+
+
+def is_of(role: str, process: psutil.Process) -> bool:
+    """Whether a process has a role in a run, by its title."""
+    return process.cmdline()[:1] == [f"noack {role}"]
 
 
 def _sample(process: psutil.Process) -> Sample:

@@ -7,10 +7,9 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from functools import wraps
 from importlib import import_module
-from importlib.metadata import version
 from json import dumps
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -19,10 +18,11 @@ from cosim.cli import commands, completion
 from cosim.cli.program import NAME, Program, be_patient
 from cosim.record.run_directory import DEFAULT_RUNS as DEFAULT_RUNS
 from cosim.shipped_files import find_shipped
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import load
 from noack.core.errors import ExitStatus, NoackError, why
 from noack.runtime.command_line import failed
+
+if TYPE_CHECKING:
+    from noack.config.scenario import Scenario
 
 _TOUR = (
     ("noack doctor", "check this machine"),
@@ -123,6 +123,8 @@ SessionOption = Annotated[str, SESSION]
 
 def _version(requested: bool) -> None:
     if requested:
+        from importlib.metadata import version
+
         print(f"noack {version('noack')}")
         raise typer.Exit
 
@@ -186,8 +188,10 @@ def find_scenario(name: str) -> Path:
     return find_shipped(name, "scenarios")
 
 
-def load_scenario(name: str, settings: Sequence[str] | None) -> Scenario:
+def load_scenario(name: str, settings: Sequence[str] | None) -> "Scenario":
     """Load a scenario given by path or name, with the values of ``--set``."""
+    from noack.config.scenario_file import load
+
     return load(find_scenario(name), settings or ())
 
 

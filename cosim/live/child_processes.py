@@ -7,35 +7,26 @@ import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 
+from cosim.live.fork_server import ENVIRONMENT, ForkedProcess, ForkServer
 from noack.core.errors import ExitStatus, MachineError
 from noack.core.python_process import python_command
 from noack.protocol.topology import RECORDER
 from noack.runtime.join_ticket import Ticket
-from noack.runtime.process_entry import TICKET_ON_STDIN
 
-_MODULES = {
+MODULES = {
     "recorder": "cosim.live.recorder",
-    "netem": "netem",
-    "plant": "plant_server",
-    "sensor": "sensor_node",
-    "controller": "controller_node",
-}
-_ENVIRONMENT = {
-    TICKET_ON_STDIN: "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "PYTHONUTF8": "1",
-    # Return memory to the system after a busy moment. Unless they are set, glibc raises these
-    # thresholds with each large block, and keeps an arena for each thread.
-    "MIMALLOC_PURGE_DELAY": "0",
-    "ARROW_DEFAULT_MEMORY_POOL": "system",
-    "MALLOC_ARENA_MAX": "2",
-    "MALLOC_MMAP_THRESHOLD_": "131072",
-    "MALLOC_TRIM_THRESHOLD_": "131072",
+    "netem": "netem.__main__",
+    "plant": "plant_server.__main__",
+    "sensor": "sensor_node.__main__",
+    "controller": "controller_node.__main__",
 }
 
 Failure = tuple[ExitStatus, str]
 """Exit status and reason."""
+
+Child = ForkedProcess | subprocess.Popen[str]
 
 
 class ChildProcesses:
@@ -44,11 +35,14 @@ class ChildProcesses:
     Each receives the ticket on its standard input, which stays open as a lifeline.
     """
 
-    def __init__(self, ticket: Ticket, run_dir: Path, roles: Sequence[str]) -> None:
+    def __init__(
+        self, ticket: Ticket, run_dir: Path, roles: Sequence[str], server: ForkServer | None = None
+    ) -> None:
+        self._server = server
         self._ticket = ticket
         self._run_dir = run_dir
-        self._roles = [role for role in _MODULES if role in roles]
-        self._children: dict[str, subprocess.Popen[str]] = {}
+        self._roles = [role for role in MODULES if role in roles]
+        self._children: dict[str, Child] = {}
 
     @contextmanager
     def started(self, *, live: bool) -> Iterator[None]:
@@ -92,21 +86,11 @@ class ChildProcesses:
         codes = {role: child.poll() for role, child in self._children.items()}
         return {role: self._failure(role, code, reported) for role, code in codes.items() if code}
 
-    def _start(self, role: str, *, live: bool) -> subprocess.Popen[str]:
-        command = python_command("-m", _MODULES[role])
-        if role == RECORDER and live:
-            command.append("--live")
+    def _start(self, role: str, *, live: bool) -> Child:
+        arguments = ["--live"] if role == RECORDER and live else []
         try:
             with (self._run_dir / "logs" / f"{role}.log").open("a") as log:
-                child = subprocess.Popen(
-                    command,
-                    stdin=subprocess.PIPE,
-                    stdout=log,
-                    stderr=log,
-                    encoding="utf-8",
-                    start_new_session=True,  # the launcher handles Ctrl-C
-                    env=os.environ | _ENVIRONMENT,
-                )
+                child = self._start_python(role, arguments, log)
         except OSError as error:
             raise MachineError(f"{role} cannot be started: {error}") from None
         assert child.stdin is not None
@@ -114,6 +98,19 @@ class ChildProcesses:
             child.stdin.write(self._ticket.model_dump_json() + "\n")
             child.stdin.flush()
         return child
+
+    def _start_python(self, role: str, arguments: list[str], log: IO[str]) -> Child:
+        if self._server is not None:
+            return self._server.start(MODULES[role], arguments, log)
+        return subprocess.Popen(
+            python_command("-m", MODULES[role], *arguments),
+            stdin=subprocess.PIPE,
+            stdout=log,
+            stderr=log,
+            encoding="utf-8",
+            start_new_session=True,  # the launcher handles Ctrl-C
+            env=os.environ | ENVIRONMENT,
+        )
 
     def _failure(self, role: str, code: int, reported: Callable[[str], str | None]) -> Failure:
         if code < 0:
@@ -135,7 +132,7 @@ class ChildProcesses:
             return []
 
 
-def _end(child: subprocess.Popen[str]) -> None:
+def _end(child: Child) -> None:
     """Kill a process if it still runs, and wait for its end."""
     if child.poll() is None:
         child.kill()

@@ -18,6 +18,7 @@ from typing import Any
 from cosim.live.child_processes import ChildProcesses, Failure, signal_name
 from cosim.live.coordinator import Coordinator
 from cosim.live.disk_space import require_disk_space
+from cosim.live.fork_server import ForkServer, fork_server
 from cosim.live.restart_policy import RestartPolicy
 from cosim.live.start_limit import DEFAULT_S, StartLimit
 from cosim.record.environment import write_environment
@@ -63,6 +64,7 @@ def launch(
     session: str | None = None,
     live: bool = False,
     watcher: Watcher | None = None,
+    server: ForkServer | None = None,
 ) -> RunEnding:
     """Run a scenario; :func:`cosim.live.finalize.finalize` completes its record.
 
@@ -73,26 +75,29 @@ def launch(
         session: session name for processes started by hand.
         live: show the run in a viewer while it runs.
         watcher: callbacks.
+        server: starts the processes; by default a new one.
 
     Raises:
         CallerError, MachineError: the run could not be prepared.
         NeverStartedError: the run ended before all processes were ready.
     """
     began_ns = time.monotonic_ns()
-    resolved = resolve(scenario)
-    require_disk_space(resolved, runs)
-    control = resolved.ports.control
-    if control:
-        require_free_tcp_port(control, "ports.control")
-    if PLANT in spawn:
-        resolved.plant.system.prepare()  # compile now: the start barrier has a time limit
-    endpoint = f"tcp/{LOOPBACK}:{control or free_tcp_port()}"
-    run_dir = new_run_dir(runs, resolved.name)
-    resolved = write_scenario(resolved, run_dir)
-    write_environment(run_dir, "live")
-    ticket = new_ticket(resolved, endpoint, run_dir.resolve(), launched=True)
-    children = ChildProcesses(ticket, run_dir, spawn)
-    with Signals().handled() as signals, contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as stack:
+        server = server or stack.enter_context(fork_server())
+        resolved = resolve(scenario)
+        require_disk_space(resolved, runs)
+        control = resolved.ports.control
+        if control:
+            require_free_tcp_port(control, "ports.control")
+        if PLANT in spawn:
+            resolved.plant.system.prepare()  # compile now: the start barrier has a time limit
+        endpoint = f"tcp/{LOOPBACK}:{control or free_tcp_port()}"
+        run_dir = new_run_dir(runs, resolved.name)
+        resolved = write_scenario(resolved, run_dir)
+        write_environment(run_dir, "live")
+        ticket = new_ticket(resolved, endpoint, run_dir.resolve(), launched=True)
+        children = ChildProcesses(ticket, run_dir, spawn, server)
+        signals = stack.enter_context(Signals().handled())
         stack.enter_context(active_run(run_dir))
         ending = stack.enter_context(EndingFile(run_dir))
         coordinator = Coordinator(ticket)

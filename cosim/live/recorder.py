@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
@@ -14,11 +14,6 @@ from cosim.analysis.claims.assumption_monitor import AssumptionMonitor
 from cosim.analysis.claims.observed_conditions import AssumptionViolation
 from cosim.live.progress_report import ProgressReport
 from cosim.live.telemetry_store import TelemetryStore
-from cosim.output.viewer.live_viewer import LiveView
-from cosim.output.viewer.recording import RunView
-from cosim.output.viewer.recording_file import ViewError
-from cosim.output.viewer.run_view import open_view, write_view
-from cosim.output.viewer.table_feed import ViewFeed
 from cosim.record.run_directory import active_run
 from cosim.record.run_record import Rows, RunRecord, finish_record, report_of, write_reports
 from noack.config.parameter_changes import ParameterChange, change_notice
@@ -34,6 +29,11 @@ from noack.runtime.life_cycle import LAUNCHER_GONE
 from noack.runtime.process_entry import run_process
 from noack.runtime.process_life import RunProcess
 from noack.runtime.telemetry import NOTICES, first_row
+
+if TYPE_CHECKING:
+    from cosim.output.viewer.live_viewer import LiveView
+    from cosim.output.viewer.recording import RunView
+    from cosim.output.viewer.table_feed import ViewFeed
 
 _POLL_S = 0.02
 _SHOW_S = 0.1
@@ -54,7 +54,6 @@ class Recorder:
         scenario: Scenario,
         run_dir: Path,
         plane: ControlPlane,
-        view: RunView | None,
         live: str | None = None,
         *,
         start: Start = BEGINNING,
@@ -62,7 +61,8 @@ class Recorder:
         self._run_dir = run_dir
         self._plane = plane
         self._store = TelemetryStore(scenario, run_dir, plane.instance, start)
-        self._feed = None if view is None else ViewFeed(scenario, view)
+        self._scenario = scenario
+        self._feed: ViewFeed | None = None
         self.lost: MachineError | None = None
         """Why some stored rows are no longer on disk; known at the end."""
         self._monitor = AssumptionMonitor(scenario)
@@ -98,6 +98,12 @@ class Recorder:
             for role in LOOP_ROLES
         )
 
+    def show_in(self, view: "RunView") -> None:
+        """Show the telemetry in a view, from the first batch that is handled afterwards."""
+        from cosim.output.viewer.table_feed import ViewFeed
+
+        self._feed = ViewFeed(self._scenario, view)
+
     def poll(self) -> None:
         """Handle all messages that have arrived."""
         while (sample := self._batches.try_recv()) is not None:
@@ -123,8 +129,8 @@ class Recorder:
         if self._feed is not None:
             try:
                 self._feed.advance()
-            except ViewError as error:
-                self._give_up_view(error)
+            except MachineError as error:
+                self.give_up_view(error)
 
     def note(self, notice: Notice) -> None:
         """Store a line of the recorder's own for the run's log."""
@@ -168,8 +174,8 @@ class Recorder:
         if self._feed is not None:
             try:
                 self._feed.advance(final=True)
-            except ViewError as error:
-                self._give_up_view(error)
+            except MachineError as error:
+                self.give_up_view(error)
         return record
 
     def abandon(self) -> None:
@@ -263,7 +269,8 @@ class Recorder:
             else:
                 self._take(sample)
 
-    def _give_up_view(self, error: ViewError) -> None:
+    def give_up_view(self, error: MachineError) -> None:
+        """Show the run no longer; the view is written again at the end."""
         print_to_stderr(f"noack recorder: {error}; the numeric record goes on")
         self._feed = None
         self._out_of_order = True
@@ -277,6 +284,8 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
         with active_run(Path(process.ticket.run_dir)), ExitStack() as stack:
             live_view = None
             if live and not process.start.is_restart:
+                from cosim.output.viewer.live_viewer import LiveView
+
                 live_view = LiveView()
                 stack.callback(live_view.close)  # it would not exit by itself
             _record(process, live_view)
@@ -284,17 +293,23 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     return run_process(RECORDER, body)
 
 
-def _record(process: RunProcess, live_view: LiveView | None) -> None:
+def _record(process: RunProcess, live_view: "LiveView | None") -> None:
     """Record a run to its end."""
     run_dir, run_id = Path(process.ticket.run_dir), process.ticket.run_id
-    view = None
-    if not process.start.is_restart:  # a restarted recorder writes the view again at the end
-        view = open_view(process.scenario, run_dir, run_id, live_view)
+    # A live view is ready when the run begins. The libraries of a recording take half a second to
+    # load: the other processes do not wait for them.
+    view = _open_view(process, live_view) if live_view else None
     status = live_view.status if live_view else None
-    recorder = Recorder(process.scenario, run_dir, process.plane, view, status, start=process.start)
+    recorder = Recorder(process.scenario, run_dir, process.plane, status, start=process.start)
     if process.replaces is not None:
         recorder.note(Notice(process.start.from_ns, RESTART, f"restarted: {process.replaces}"))
     process.join(None)
+    if not process.start.is_restart:  # a restarted recorder writes the view again at the end
+        try:
+            view = view or _open_view(process, None)
+            recorder.show_in(view)
+        except MachineError as error:
+            recorder.give_up_view(error)
     if not _poll_to_the_end(process, recorder):
         # The other processes spool their last rows now; `noack summary` completes the record.
         recorder.abandon()
@@ -307,12 +322,21 @@ def _record(process: RunProcess, live_view: LiveView | None) -> None:
     try:
         if view is not None:
             view.close()
-    except ViewError as error:
+    except MachineError as error:
         print_to_stderr(f"noack recorder: {error}; the numeric record is complete")
     if recorder.view_is_incomplete:
+        from cosim.output.viewer.run_view import write_view
+
         write_view(record, run_dir, run_id)
     if recorder.lost is not None:
         raise recorder.lost
+
+
+def _open_view(process: RunProcess, live_view: "LiveView | None") -> "RunView":
+    from cosim.output.viewer.run_view import open_view
+
+    ticket = process.ticket
+    return open_view(ticket.scenario, Path(ticket.run_dir), ticket.run_id, live_view)
 
 
 def _poll_to_the_end(process: RunProcess, recorder: Recorder) -> bool:

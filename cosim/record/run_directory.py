@@ -9,13 +9,13 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import dumps
 from noack.core.errors import CallerError, MachineError, why
 from noack.core.file_access import locked, read_regular, write_whole
-from noack.settings.named_file import file_tables, unchanged, with_tables
+
+if TYPE_CHECKING:
+    from noack.config.scenario import Scenario
 
 DEFAULT_RUNS = Path("runs")
 """Folder for run directories, relative to the current folder."""
@@ -59,7 +59,7 @@ def new_run_dir(runs: Path, name: str) -> Path:
     raise MachineError(f"{runs}: too many runs named {stamp}-{name}")
 
 
-def write_scenario(resolved: Scenario, run_dir: Path) -> Scenario:
+def write_scenario(resolved: "Scenario", run_dir: Path) -> "Scenario":
     """Write the scenario of a run into its directory, with the files that the run executes.
 
     The copies allow a replay after a file has changed, and the directory can be moved. The file of
@@ -72,6 +72,10 @@ def write_scenario(resolved: Scenario, run_dir: Path) -> Scenario:
         CallerError: a file has changed since the scenario was loaded.
         MachineError, OSError: the directory cannot be written.
     """
+    # The command line needs this module for shell completion, and not the settings.
+    from noack.config.scenario_file import dumps
+    from noack.settings.named_file import file_tables, unchanged, with_tables
+
     relative, absolute = {}, {}
     for place, table in file_tables(resolved):
         file = unchanged(table, place)

@@ -89,7 +89,7 @@ class DcMotor:
         """Advance through all changes of the friction's direction within the step."""
         angle, speed, current = self.x.tolist()
         voltage, left_s = float(u[0]), dt_ns * 1e-9
-        if not (np.isfinite(self.x).all() and math.isfinite(voltage)):
+        if not all(map(math.isfinite, (angle, speed, current, voltage))):
             self.x = np.full(3, np.nan)
             return
         for _ in range(_MAX_CHANGES):
@@ -97,8 +97,8 @@ class DcMotor:
             if direction == 0:
                 used_s, current = self._stick(current, voltage, left_s)
             else:
-                forced = np.array([-direction * self._deceleration, 0.0])
-                motion = self._turning.motion(np.array([speed, current]), voltage, forced)
+                forced = -direction * self._deceleration
+                motion = _Motion(self._turning, speed, current, voltage, forced)
                 stop_s = self._stop_s(motion, direction, left_s) if self._deceleration else None
                 used_s = left_s if stop_s is None else stop_s
                 angle += motion.turned(used_s)
@@ -145,6 +145,8 @@ class DcMotor:
             if direction * motion.at(high)[0] < 0.0:
                 for _ in range(_BISECTIONS):
                     middle = 0.5 * (low + high)
+                    if not low < middle < high:
+                        break
                     if direction * motion.at(middle)[0] < 0.0:
                         high = middle
                     else:
@@ -155,18 +157,27 @@ class DcMotor:
 
 
 class _LinearMotion:
-    """The linear dynamics of (ω, i): their matrix M and its eigenvalues."""
+    """The linear dynamics of (ω, i): their matrix M = [[a, b], [c, d]] and its eigenvalues.
+
+    All computations are with plain numbers: for two states, arrays would take ten times as long.
+    """
 
     def __init__(self, settings: DcMotorSettings) -> None:
-        self.M, self.voltage = settings.dynamics()
-        half, product = 0.5 * float(np.trace(self.M)), float(np.linalg.det(self.M))
-        self.fast = half - cmath.sqrt(half * half - product)
-        self.slow = product / self.fast
-        self.inverse = np.linalg.inv(self.M)
+        matrix, voltage = settings.dynamics()
+        (self.a, self.b), (self.c, self.d) = matrix.tolist()
+        self.per_voltage = float(voltage[1])
+        # No cancellation: a and d are not positive, and b and c have opposite signs.
+        self.determinant = self.a * self.d - self.b * self.c
+        half = 0.5 * (self.a + self.d)
+        self.fast = half - cmath.sqrt(half * half - self.determinant)
+        self.slow = self.determinant / self.fast
 
-    def motion(self, start: Vector, voltage: float, forced: Vector) -> "_Motion":
-        """Return the motion from (ω, i) under a voltage and a further acceleration."""
-        return _Motion(self, start, self.voltage * voltage + forced)
+    def solve(self, first: float, second: float) -> tuple[float, float]:
+        """Return M⁻¹ applied to a vector."""
+        return (
+            (self.d * first - self.b * second) / self.determinant,
+            (self.a * second - self.c * first) / self.determinant,
+        )
 
 
 class _Motion:
@@ -174,31 +185,43 @@ class _Motion:
 
     e^{Mt} = e^{λt} I + S(t) (M − λ I), where λ and λ' are the slow and the fast eigenvalue and
     S(t) = (e^{λt} − e^{λ't}) / (λ − λ'), which tends to t e^{λt} if they are equal.
+
+    Args:
+        linear: the dynamics.
+        speed: ω(0).
+        current: i(0).
+        voltage: the armature voltage.
+        forced: a further angular acceleration.
     """
 
-    def __init__(self, linear: _LinearMotion, start: Vector, c: Vector) -> None:
+    def __init__(
+        self, linear: _LinearMotion, speed: float, current: float, voltage: float, forced: float
+    ) -> None:
         self._linear = linear
-        self._steady = -linear.inverse @ c
-        self._deviation = start - self._steady
-        self._shifted = linear.M @ self._deviation - linear.slow * self._deviation
-        self._start_rate = linear.M @ self._deviation
+        self._speed, self._current = linear.solve(-forced, -linear.per_voltage * voltage)
+        self._deviation = x, y = speed - self._speed, current - self._current
+        self._rate = linear.a * x + linear.b * y, linear.c * x + linear.d * y
+        self._shifted = self._rate[0] - linear.slow * x, self._rate[1] - linear.slow * y
 
-    def _decayed(self, t_s: float) -> Vector:
-        slow, fast = self._linear.slow, self._linear.fast
-        gap = slow - fast
+    def _decayed(self, t_s: float) -> tuple[float, float]:
+        """Return e^{Mt} (start − w)."""
+        slow = self._linear.slow
+        gap = slow - self._linear.fast
         decay = cmath.exp(slow * t_s)
-        ratio = -np.expm1(-gap * t_s) / gap if gap != 0 else t_s
-        return np.real(decay * self._deviation + decay * ratio * self._shifted)
+        ratio = decay * (-_expm1(-gap * t_s) / gap if gap != 0 else t_s)
+        (x, y), (p, q) = self._deviation, self._shifted
+        return (decay * x + ratio * p).real, (decay * y + ratio * q).real
 
     def at(self, t_s: float) -> tuple[float, float]:
         """Return speed and current after a time."""
-        speed, current = (self._steady + self._decayed(t_s)).tolist()
-        return speed, current
+        speed, current = self._decayed(t_s)
+        return self._speed + speed, self._current + current
 
     def turned(self, t_s: float) -> float:
         """Return the angle by which the shaft has turned: the integral of ω."""
-        change = self._linear.inverse @ (self._decayed(t_s) - self._deviation)
-        return float(self._steady[0] * t_s + change[0])
+        speed, current = self._decayed(t_s)
+        x, y = self._deviation
+        return self._speed * t_s + self._linear.solve(speed - x, current - y)[0]
 
     def extrema(self, end_s: float) -> Iterator[float]:
         """Return the times in (0, end_s) at which dω/dt = 0, in order; then end_s.
@@ -206,8 +229,8 @@ class _Motion:
         dω/dt = e^{λt} (a + r (1 − e^{−(λ−λ')t}) / (λ − λ')) with a = dω/dt(0).
         """
         slow, gap = self._linear.slow, self._linear.slow - self._linear.fast
-        a = float(self._start_rate[0])
-        r = complex((self._linear.M @ self._start_rate)[0] - slow * a)
+        a = self._rate[0]
+        r = complex(self._linear.a * a + self._linear.b * self._rate[1] - slow * a)
         if r != 0 and (gap == 0 or 1 + a * gap / r != 0):
             first = -a / r if gap == 0 else -cmath.log(1 + a * gap / r) / gap
             if gap.imag:  # the speed oscillates: an extremum every half period
@@ -218,3 +241,11 @@ class _Motion:
             elif abs(first.imag) <= _REAL * abs(first) and 0.0 < first.real < end_s:
                 yield first.real
         yield end_s
+
+
+def _expm1(z: complex) -> complex:
+    """e^z − 1 without cancellation; the standard library has it for real numbers only."""
+    a, b = z.real, z.imag
+    return complex(
+        math.expm1(a) * math.cos(b) - 2.0 * math.sin(0.5 * b) ** 2, math.exp(a) * math.sin(b)
+    )

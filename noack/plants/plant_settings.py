@@ -21,6 +21,9 @@ from noack.settings.section import ScenarioSection
 Names = Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(max_length=MAX_DIMENSION)]
 Derivative = Callable[[float, Vector, Vector], Sequence[float] | Vector]
 """dz/dt = f(t, z, v), with t in seconds, z (N,) and the physical input v (m,)."""
+Advance = Callable[[Vector, Vector, float, float], tuple[int, float]]
+"""Advances z (N,) in place under a constant v from a time by a duration, in seconds; returns a
+status code of scipy's "dopri5", negative for a failure, and the time of the failure."""
 
 
 class PlantStart(NamedTuple):
@@ -135,6 +138,8 @@ class PlantEquations:
     """Absolute tolerance, in z's units."""
     is_recorded: bool = False
     """Whether z is recorded."""
+    advance: Advance | None = None
+    """The equations' own integrator."""
 
 
 class EquationSettings(PlantSettings):

@@ -18,7 +18,7 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from noack.plants.plant_settings import EquationSettings, PlantEquations
 from noack.plants.systems import vehicle_equations
-from noack.plants.systems.vehicle_equations import equations, library
+from noack.plants.systems.vehicle_equations import compiled_vehicle, equations, library
 from noack.settings.section import Positive
 
 _CORE = ("x_position", "y_position", "steering_angle", "speed", "yaw")
@@ -128,18 +128,30 @@ class VehicleSettings(EquationSettings):
                 f"{fastest:g} m/s; it cannot keep {speed:g}"
             )
         rates = equations(self.library_model, parameters)
+        compiled = compiled_vehicle(self.library_model, parameters)
         lowest, highest = parameters.steering.min, parameters.steering.max
+        tolerances = model.relative, 1e-3 * model.relative
+
+        def physical(u: Vector) -> Vector:
+            requested = min(max(float(u[0]), lowest), highest)
+            return np.array([requested / servo_s, -1.0 / servo_s, gain * speed, -gain])
 
         def derivative(t_s: float, z: Vector, v: Vector) -> Vector:
-            requested = min(max(float(v[0]), lowest), highest)
-            return rates(z, (requested - float(z[2])) / servo_s, gain * (speed - float(z[3])))
+            v0, v1, v2, v3 = v.tolist()
+            return rates(z, v0 + v1 * float(z[2]), v2 + v3 * float(z[3]))
+
+        def advance(z: Vector, v: Vector, t_s: float, duration_s: float) -> tuple[int, float]:
+            assert compiled is not None
+            return compiled.advance(z, v, duration_s, tolerances), t_s
 
         return PlantEquations(
             derivative,
+            physical=physical,
+            advance=advance if compiled else None,
             initial=lambda x0: np.array(model.start(x0, speed, parameters), dtype=np.float64),
             output=lambda z: model.output(z, parameters),
-            relative=model.relative,
-            absolute=1e-3 * model.relative,
+            relative=tolerances[0],
+            absolute=tolerances[1],
             is_recorded=True,
         )
 

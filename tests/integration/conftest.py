@@ -17,13 +17,6 @@ import pytest
 EPHEMERAL = ("--set", "ports={}")
 BARE = (*EPHEMERAL, "--no-report")
 """Without a report; tests that need one add ``--report``."""
-ROLE_MODULES = {
-    "recorder": "cosim.live.recorder",
-    "netem": "netem",
-    "plant": "plant_server",
-    "sensor": "sensor_node",
-    "controller": "controller_node",
-}
 PATIENCE_S = 150.0
 
 
@@ -66,7 +59,7 @@ def is_over(process: psutil.Process) -> bool:
 def child_of(parent: subprocess.Popen[str], role: str) -> psutil.Process | None:
     """Return the running process of a role, or None."""
     for child in psutil.Process(parent.pid).children():
-        if ROLE_MODULES[role] in command_of(child):
+        if command_of(child)[:1] == [f"noack {role}"]:
             return child
     return None
 
@@ -108,7 +101,7 @@ class Running:
 
     def child(self, role: str) -> psutil.Process:
         for child in self._children:
-            if ROLE_MODULES[role] in command_of(child):
+            if command_of(child)[:1] == [f"noack {role}"]:
                 return child
         raise AssertionError(f"no process of {role}")
 

@@ -16,11 +16,11 @@ import psutil
 import pytest
 
 from cosim.record.run_record import RunRecord, load_record
+from noack.protocol.topology import ROLES
 from tests.cosim.output.viewer.test_viewer import is_left, read
 from tests.integration.conftest import (
     AT_RATE,
     RATE_HZ,
-    ROLE_MODULES,
     Finished,
     Running,
     begun,
@@ -120,7 +120,7 @@ def disturbed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Disturbed]:
         viewers = viewers_of(running)
         (group,) = {os.getpgid(viewer.pid) for viewer in viewers}
         os.killpg(group, signal.SIGSTOP)
-        for hours, role in zip((1, -1, 0, 1, 0), ROLE_MODULES, strict=True):
+        for hours, role in zip((1, -1, 0, 1, 0), ROLES, strict=True):
             child = running.child(role)
             assert "stepped_clock" in Path(f"/proc/{child.pid}/maps").read_text()
             pause(child, PAUSE_S)

@@ -1,14 +1,16 @@
 """``noack check``: a scenario with everything made explicit, and the assumptions it meets."""
 
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
 from cosim.cli import command as cli
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import dumps as scenario_toml
 from noack.core.clock import NS_PER_S
 from noack.core.errors import ExitStatus
+
+if TYPE_CHECKING:
+    from noack.config.scenario import Scenario
 
 _COMMENT = "# "
 
@@ -28,6 +30,7 @@ def check(
     """
     from cosim.output.assumptions_table import print_assumptions
     from noack.config.resolution import policy_of, resolve
+    from noack.config.scenario_file import dumps as scenario_toml
     from noack.theory.assumptions import assumptions
     from noack.trigger.trigger_policy import new_trigger
 
@@ -49,7 +52,7 @@ def check(
     return ExitStatus.OK
 
 
-def _print_plant(console: Console, resolved: Scenario) -> None:
+def _print_plant(console: Console, resolved: "Scenario") -> None:
     """Print a nonlinear plant's linearisation, and the defaults that depend on other keys."""
     from controller_node.controller import law_of
     from cosim.analysis.model_comparison import linearisation, linearisation_rows
@@ -67,7 +70,7 @@ def _print_plant(console: Console, resolved: Scenario) -> None:
         console.print(line, highlight=False, markup=False)
 
 
-def _dependent_defaults(resolved: Scenario) -> Iterator[str]:
+def _dependent_defaults(resolved: "Scenario") -> Iterator[str]:
     """Yield the keys without a value whose default depends on other keys."""
     from cosim.live.restart_policy import RESTART_BY_HAND_S
     from cosim.live.start_limit import DEFAULT_S

@@ -5,19 +5,17 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 from rich.console import Console
 
 from cosim.cli import command as cli
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import dumps, value_of
 from noack.core.errors import CallerError, ExitStatus
 from noack.core.file_access import write_whole
-from noack.core.linear_systems import Matrix
 
 if TYPE_CHECKING:
     from cosim.studies.design.candidate_measures import DesignLimits
+    from noack.config.scenario import Scenario
+    from noack.core.linear_systems import Matrix
 
 Settling = Annotated[float, typer.Option(metavar="SECONDS", help="Largest settling time allowed.")]
 Quantile = Annotated[float, typer.Option(help="Share of the draws that must settle in time.")]
@@ -96,6 +94,7 @@ def design(
     from cosim.studies.design import design_page as pages
     from cosim.studies.design.design_search import design as designed
     from cosim.studies.design.loop_families import families_of
+    from noack.config.scenario_file import dumps
 
     loaded = cli.load_scenario(scenario, settings)
     loaded.decaying  # noqa: B018 - raises for another policy
@@ -155,8 +154,8 @@ def _bounds(given: list[str]) -> dict[Any, float]:
 
 
 def _regulator(
-    loaded: Scenario, gain: str, Q: str | None, R: str | None
-) -> tuple[Matrix, Matrix] | None:
+    loaded: "Scenario", gain: str, Q: str | None, R: str | None
+) -> "tuple[Matrix, Matrix] | None":
     """Return the LQR costs Q (n, n) and R (m, m); None for the scenario's gain."""
     if gain not in ("given", "lqr"):
         raise CallerError(f'--gain: given or lqr, not "{gain}"')
@@ -168,7 +167,11 @@ def _regulator(
     return None
 
 
-def _matrix(option: str, text: str | None, size: int) -> Matrix:
+def _matrix(option: str, text: str | None, size: int) -> "Matrix":
+    import numpy as np
+
+    from noack.config.scenario_file import value_of
+
     if text is None:
         return np.eye(size)
     try:

@@ -4,7 +4,6 @@ import typer
 
 from cosim.cli import command as cli
 from cosim.cli.execute_run import RunOutput, run_processes
-from noack.protocol.topology import RECORDER
 
 
 def _examples(role: str) -> list[tuple[str, str]]:
@@ -30,9 +29,13 @@ def record(
     json: cli.JsonOption = False,
 ) -> int:
     """Open a run and record it; the other four processes join from other terminals."""
-    loaded = cli.load_scenario(scenario, settings)
+    from noack.protocol.topology import RECORDER
+
     output = RunOutput(report, verbose, json)
-    return run_processes(loaded, runs, output, spawn=(RECORDER,), session=session, live=live)
+    return run_processes(
+        lambda: cli.load_scenario(scenario, settings), runs, output,
+        spawn=(RECORDER,), session=session, live=live,
+    )  # fmt: skip
 
 
 @cli.command(cli.PROCESSES, 20, _examples("plant"))

@@ -2,7 +2,6 @@
 
 from cosim.cli import command as cli
 from cosim.cli.execute_run import RunOutput, run_processes
-from noack.protocol.topology import ROLES
 
 
 @cli.command(cli.RUNS, 20, [
@@ -21,5 +20,5 @@ def run(
     json: cli.JsonOption = False,
 ) -> int:
     """Run a scenario live: start all processes and record everything."""
-    loaded = cli.load_scenario(scenario, settings)
-    return run_processes(loaded, runs, RunOutput(report, verbose, json), spawn=ROLES, live=live)
+    output = RunOutput(report, verbose, json)
+    return run_processes(lambda: cli.load_scenario(scenario, settings), runs, output, live=live)

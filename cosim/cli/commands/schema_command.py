@@ -5,8 +5,6 @@ from typing import Annotated
 import typer
 
 from cosim.cli import command as cli
-from noack.config.scenario import Scenario
-from noack.config.toml_file import json_schema
 from noack.core.errors import ExitStatus
 
 
@@ -35,5 +33,8 @@ def schema(
 
         cli.print_json(links_schema())
     else:
+        from noack.config.scenario import Scenario
+        from noack.config.toml_file import json_schema
+
         cli.print_json(json_schema(Scenario))
     return ExitStatus.OK

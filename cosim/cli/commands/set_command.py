@@ -10,8 +10,6 @@ from rich.table import Table
 
 from cosim.cli import command as cli
 from cosim.cli import completion
-from noack.config.runtime_parameters import SHORT, full_key, text_of
-from noack.config.scenario_file import value_of
 from noack.core.errors import CallerError, ExitStatus
 
 
@@ -48,6 +46,7 @@ def set_(
     json: cli.JsonOption = False,
 ) -> int:
     """Change a live run: losses, M, trigger, set point."""
+    from noack.config.runtime_parameters import text_of
     from noack.runtime.run_registry import find, request_change
 
     wanted = parsed(settings or ())
@@ -72,6 +71,9 @@ def parsed(words: list[str] | tuple[str, ...]) -> dict[str, Any]:
         CallerError: a value is missing, or a key is given twice.
     """
     found: dict[str, Any] = {}
+    from noack.config.runtime_parameters import full_key
+    from noack.config.scenario_file import value_of
+
     left = list(words)
     while left:
         word = left.pop(0)
@@ -88,6 +90,8 @@ def parsed(words: list[str] | tuple[str, ...]) -> dict[str, Any]:
 
 
 def _print_parameters(console: Console, answer: dict[str, Any]) -> None:
+    from noack.config.runtime_parameters import SHORT, text_of
+
     short = {key: name for name, key in SHORT.items()}
     table = Table(title=f"{answer['name']}, at {answer['t_s']:.1f} s")
     for heading in ("key", "short", "value"):

@@ -3,7 +3,6 @@
 from enum import StrEnum
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 from rich.console import Console
 from rich.table import Table
@@ -11,13 +10,13 @@ from rich.text import Text
 
 from cosim.cli import command as cli
 from cosim.cli.execute_run import RunOutput, finalize_run, warn_of_violations
-from noack.config.scenario import Scenario
 from noack.core.errors import ExitStatus
 from noack.core.number_format import number
 
 if TYPE_CHECKING:
     from cosim.analysis.run_summary import Summary
     from cosim.simulation.continuous.continuous_run import ContinuousRun
+    from noack.config.scenario import Scenario
 
 _EVENTS_SHOWN = 40
 
@@ -66,7 +65,9 @@ def simulate(
     return finalize_run(ending, RunOutput(report, verbose, json))
 
 
-def _simulate_continuously(scenario: Scenario, *, json: bool) -> int:
+def _simulate_continuously(scenario: "Scenario", *, json: bool) -> int:
+    import numpy as np
+
     from cosim.live.progress import PatientConsole
     from cosim.simulation.continuous.continuous_report import document, run_continuous, summary
     from noack.config.resolution import resolve
@@ -78,13 +79,15 @@ def _simulate_continuously(scenario: Scenario, *, json: bool) -> int:
     if json:
         cli.print_json(document(run, resolved))
     else:
-        _print_run(Console(), run, found)
+        with np.errstate(all="ignore"):  # a run may diverge
+            _print_run(Console(), run, found)
     return ExitStatus(found["exit"]["status"])
 
 
-@np.errstate(all="ignore")  # a run may diverge
 def _print_run(console: Console, run: "ContinuousRun", found: "Summary") -> None:
     """Print how the run ended, its key numbers, and its first 40 events."""
+    import numpy as np
+
     from cosim.output.run_tables import loss_and_interval_rows, number_table
     from cosim.output.run_verdict import verdict
 

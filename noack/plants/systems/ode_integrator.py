@@ -33,6 +33,7 @@ class OdeSystem:
         self._equations = equations
         self._state = np.array(equations.initial(x0), dtype=np.float64)
         self._raised: list[BaseException] = []
+        self._advance = equations.advance or self._advance_by_derivative
         self._integrator = ode(self._guarded)
         self._integrator.set_integrator(
             "dopri5", rtol=equations.relative, atol=equations.absolute, nsteps=_MAX_STEPS,
@@ -56,32 +57,41 @@ class OdeSystem:
             SystemFailedError: the tolerance cannot be met, although f is finite.
             BaseException: f raised an exception that is not an arithmetic error.
         """
-        t_s = t_ns * 1e-9
+        v = self._equations.physical(u)
         self._raised.clear()
-        self._integrator.set_f_params(self._equations.physical(u))
-        self._integrator.set_initial_value(self._state, t_s)
-        with warnings.catch_warnings(action="ignore"):  # the status has the same information
-            end = self._integrator.integrate(t_s + dt_ns * 1e-9)
-        reached = np.asarray(end, dtype=np.float64)
+        reached, code, t_s = self._state.copy(), 0, t_ns * 1e-9
+        try:
+            code, t_s = self._advance(reached, v, t_s, dt_ns * 1e-9)
+        except ArithmeticError as raised:  # from compiled code
+            self._raised.append(raised)
         for error in self._raised:
             # Far outside the equations' domain an arithmetic error is divergence.
             if not isinstance(error, ArithmeticError | ValueError):
                 raise error
             reached = np.full_like(self._state, np.nan)
-        if not self._integrator.successful():
-            self._require_divergence(reached)
+        if code < 0:
+            self._require_divergence(reached, v, t_s, code)
             reached = np.full_like(self._state, np.nan)
         self._state = reached
 
-    def _require_divergence(self, z: Vector) -> None:
+    def _advance_by_derivative(
+        self, z: Vector, v: Vector, t_s: float, duration_s: float
+    ) -> tuple[int, float]:
+        self._integrator.set_f_params(v)
+        self._integrator.set_initial_value(z, t_s)
+        with warnings.catch_warnings(action="ignore"):  # the status has the same information
+            z[:] = self._integrator.integrate(t_s + duration_s)
+        return self._integrator.get_return_code(), self._integrator.t
+
+    def _require_divergence(self, z: Vector, v: Vector, t_s: float, code: int) -> None:
         """Raise SystemFailedError if the integrator gave up although f is finite and z small."""
         with np.errstate(all="ignore"):
-            slope = np.asarray(self._guarded(self._integrator.t, z, *self._integrator.f_params))
+            slope = np.asarray(self._guarded(t_s, z, v))
             escaped = not np.linalg.norm(z) < _ESCAPE * np.linalg.norm(self._state)
         if np.isfinite(slope).all() and not escaped:
-            why = _GAVE_UP.get(self._integrator.get_return_code(), "the tolerance cannot be met")
+            why = _GAVE_UP.get(code, "the tolerance cannot be met")
             raise SystemFailedError(
-                f"the plant's equations cannot be integrated at {self._integrator.t:.6g} s: {why}"
+                f"the plant's equations cannot be integrated at {t_s:.6g} s: {why}"
             )
 
     def _guarded(self, t_s: float, z: Vector, v: Vector) -> Sequence[float] | Vector:

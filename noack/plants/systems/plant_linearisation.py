@@ -15,7 +15,8 @@ _SINGULAR = 1e-9
 """If the smallest singular value of the settled deviations is below this, x is not a state."""
 _AHEAD = 10
 _MISSED = 0.05
-"""If A and B predict x some steps ahead with a larger relative error, x is not a state."""
+"""If A and B predict x some steps after any deviation with a larger relative error, x is not a
+state."""
 
 
 def linearise(
@@ -68,7 +69,8 @@ def linearise(
         return unknown
     step = after @ np.linalg.inv(before)
     missed = np.linalg.matrix_power(step, ahead) @ before - later
-    if np.linalg.norm(missed) > _MISSED * np.linalg.norm(later[:n]):
+    sizes = np.maximum(*(np.linalg.norm(one[:n], axis=0) for one in (before, later)))
+    if (np.linalg.norm(missed, axis=0) > _MISSED * sizes).any():
         return unknown
     with warnings.catch_warnings(action="ignore"):  # a singular matrix: the result is checked next
         generator = np.real(logm(step)) / (_STEP_NS * 1e-9)

@@ -1,8 +1,9 @@
 """The equations of CommonRoad's vehicle models, unchanged; those with tyre models are compiled.
 
-As Python code, the multi-body model takes three times as long, which is too long for 500 Hz. The
-small models run as Python code. For them a call of compiled code costs more time than it saves,
-because it needs more of the processor's caches, which other code overwrites between two steps.
+Compiled equations are integrated by compiled code, which also locates their jumps: a tyre's lateral
+force jumps where the wheel's camber changes its sign. The small models run as Python code, with
+scipy's integrator. For them a call of compiled code costs more time than it saves, because it needs
+more of the processor's caches, which other code overwrites between two steps.
 """
 
 import inspect
@@ -21,12 +22,64 @@ from numpy.typing import NDArray
 
 from noack.core.code_cache import cache_folder, compiler, is_kept, while_compiling
 from noack.core.linear_systems import Vector
+from noack.plants.systems import jump_integrator
+from noack.plants.systems.jump_integrator import Work, advance, buffers
 
 _LIBRARY = "vehiclemodels"
 _COMPILED = ("std", "mb")
 
 Rates = Callable[[Vector, float, float], Vector]
 """ż as a function of z (N,), steering rate (rad/s) and acceleration (m/s²)."""
+_WHEELS = 4
+_TYRE_FIELDS = [
+    ("evaluations", np.int64, 0),
+    ("wheel", np.int64, 0),
+    ("signs", (np.float64, _WHEELS), np.zeros(_WHEELS)),
+    ("cambers", (np.float64, _WHEELS), np.zeros(_WHEELS)),
+]
+"""Fields, and their values, that a compiled vehicle has besides the library's tyre parameters."""
+
+
+class CompiledVehicle:
+    """A vehicle's compiled equations and their integrator."""
+
+    def __init__(self, advance: Any, parameters: Any) -> None:
+        self._advance = advance
+        self._parameters = _record(parameters)
+        self._work = buffers(0, _WHEELS)
+
+    @property
+    def evaluations(self) -> int:
+        """Number of evaluations of the equations so far."""
+        return int(self._parameters["tire"]["evaluations"][0])
+
+    @property
+    def cambers(self) -> Vector:
+        """The wheels' camber angles at the last evaluation, (4,), rad."""
+        return self._work.values.copy()
+
+    def rates(self, z: Vector, steering: float, acceleration: float) -> Vector:
+        """Return ż; see :data:`Rates`."""
+        v = np.array([steering, 0.0, acceleration, 0.0])
+        self.advance(z.copy(), v, 0.0, (1.0, 1.0))
+        slope: Vector = self._work.slopes[0].copy()
+        return slope
+
+    def advance(
+        self, z: Vector, v: Vector, duration_s: float, tolerances: tuple[float, float]
+    ) -> int:
+        """Advance z in place; return a status code of the integrator.
+
+        Args:
+            z: the state, (N,).
+            v: (4,) The steering rate is v₀ + v₁ δ, the acceleration v₂ + v₃ · speed.
+            duration_s: the time to advance by.
+            tolerances: relative and absolute tolerance of a step.
+        """
+        if len(self._work.point) != len(z):
+            self._work = buffers(len(z), _WHEELS)
+        code: int = self._advance(z, v, self._parameters, duration_s, tolerances, self._work)
+        return code
 
 
 def library(module: str, name: str | None = None) -> Any:
@@ -36,22 +89,21 @@ def library(module: str, name: str | None = None) -> Any:
 
 def equations(model: str, parameters: Any) -> Rates:
     """Return the equations of a model (the library's name, e.g. ``st``) for a vehicle."""
-    if (compiled := compiled_dynamics(model)) is None:
-        dynamics = _dynamics(model)
-        return lambda z, *inputs: np.array(dynamics(z.tolist(), list(inputs), parameters))
-    values = _record(parameters)
+    if (compiled := compiled_vehicle(model, parameters)) is not None:
+        return compiled.rates
+    dynamics = _dynamics(model)
+    return lambda z, *inputs: np.array(dynamics(z.tolist(), list(inputs), parameters))
 
-    def rates(z: Vector, steering: float, acceleration: float) -> Vector:
-        found = np.empty_like(z)
-        compiled(z, steering, acceleration, values, found)
-        return found
 
-    return rates
+def compiled_vehicle(model: str, parameters: Any) -> CompiledVehicle | None:
+    """Return a vehicle's compiled equations; None if they run as Python code."""
+    advance = compiled_dynamics(model)
+    return None if advance is None else CompiledVehicle(advance, parameters)
 
 
 @cache
 def compiled_dynamics(model: str) -> Any:
-    """Return a model's compiled equations; None if they run as Python code.
+    """Return a model's compiled integrator; None if its equations run as Python code.
 
     The first call on a machine compiles them, which takes long.
     """
@@ -63,11 +115,12 @@ def compiled_dynamics(model: str) -> Any:
     if not is_compiled(model):
         _print(while_compiling("the vehicle's equations", kept=_folder(model) is not None))
     compiled = _compiled(model)
-    vector = numba.types.Array(numba.float64, 1, "C")
-    dtype = _record(library("vehicle_parameters", "VehicleParameters")()).dtype
-    parameters = numba.types.Array(numba.from_dtype(dtype), 1, "C")
+    example = (
+        np.zeros(1), np.zeros(4), _record(library("vehicle_parameters", "VehicleParameters")()),
+        0.0, (0.0, 0.0), buffers(1, _WHEELS),
+    )  # fmt: skip
     try:
-        compiled.compile((vector, numba.float64, numba.float64, parameters, vector))
+        compiled.compile(tuple(map(numba.typeof, example)))
     except NumbaError as error:  # numba may not support another version of the library
         why = str(error).partition("\n")[0]
         _print(f"warning: the vehicle's equations stay slow, as they cannot be compiled: {why}")
@@ -77,7 +130,7 @@ def compiled_dynamics(model: str) -> Any:
 
 def is_compiled(model: str) -> bool:
     """Whether the equations of a model need no compilation on this machine."""
-    return model not in _COMPILED or is_kept(_folder(model), _of(_dynamics(model)))
+    return model not in _COMPILED or is_kept(_folder(model), _integrator(_dynamics(model)))
 
 
 def _dynamics(model: str) -> Any:
@@ -89,30 +142,87 @@ def _print(line: str) -> None:
         print(f"noack: {line}", file=sys.stderr, flush=True)
 
 
-def _of(dynamics: Callable[..., Any]) -> Callable[..., None]:
-    def compute(
-        z: Vector, steering: float, acceleration: float, parameters: Any, into: Vector
-    ) -> None:
-        rates = dynamics(z.copy(), (steering, acceleration), parameters[0])  # it modifies z
-        for number in range(len(rates)):
-            into[number] = rates[number]
+def _integrator(dynamics: Callable[..., Any]) -> Callable[..., int]:
+    def integrate(
+        z: Vector,
+        v: Vector,
+        parameters: Any,
+        duration_s: float,
+        tolerances: tuple[float, float],
+        work: Work,
+    ) -> int:
+        return advance(rates, dynamics, z, v, parameters, duration_s, tolerances, work)
 
-    return compute
+    return integrate
+
+
+def rates(
+    dynamics: Any,
+    z: Vector,
+    v: Vector,
+    parameters: Any,
+    signs: Vector,
+    cambers: Vector,
+    slope: Vector,
+) -> None:
+    """Write ż with the sign of each wheel's camber held, and the cambers; for compiled code."""
+    tyre = parameters[0].tire
+    tyre.evaluations += 1
+    tyre.wheel = 0
+    for k in range(_WHEELS):
+        tyre.signs[k] = signs[k]
+    inputs = (v[0] + v[1] * z[2], v[2] + v[3] * z[3])
+    found = dynamics(z.copy(), inputs, parameters[0])  # it modifies z
+    for n in range(len(found)):
+        slope[n] = found[n]
+    for k in range(_WHEELS):
+        cambers[k] = tyre.cambers[k]
 
 
 def _compiled(model: str) -> Any:
+    from numba.extending import overload, register_jitable
+
+    dynamics, lateral = _dynamics(model), library("utils.tire_model", "formula_lateral")
+    own = [one for _, one in inspect.getmembers(jump_integrator, inspect.isfunction)]
+    functions: set[Callable[..., Any]] = {*_needed(dynamics), *own, rates}
+    for function in functions - {lateral}:
+        register_jitable(error_model="python")(function)
+    overload(lateral, jit_options={"error_model": "python"})(_held)
+    return compiler(_folder(model), error_model="python")(_integrator(dynamics))
+
+
+def _held(alpha: Any, gamma: Any, F_z: Any, p: Any) -> Any:
+    """Return the library's formula for the lateral force, with the sign of the camber held.
+
+    The library calls it for one wheel after the other. Its shifts are s (p₁ + p₃ |γ|) with the sign
+    s of the camber γ. With −p₁ instead of p₁ it computes them for the other sign.
+    """
     from numba.extending import register_jitable
 
-    dynamics = _dynamics(model)
-    for function in _needed(dynamics):
-        register_jitable(error_model="python")(function)
-    return compiler(_folder(model), error_model="python")(_of(dynamics))
+    original = library("utils.tire_model", "formula_lateral")
+    formula = FunctionType(original.__code__, original.__globals__)
+    register_jitable(error_model="python")(formula)
+
+    def lateral(alpha: Any, gamma: Any, F_z: Any, p: Any) -> Any:
+        wheel = p.wheel
+        p.wheel = wheel + 1
+        p.cambers[wheel] = gamma
+        turned = p.signs[wheel] * gamma < 0.0
+        if turned:
+            p.p_hy1, p.p_vy1 = -p.p_hy1, -p.p_vy1
+        found = formula(alpha, gamma, F_z, p)
+        if turned:
+            p.p_hy1, p.p_vy1 = -p.p_hy1, -p.p_vy1
+        return found
+
+    return lateral
 
 
 @cache
 def _folder(model: str) -> Path | None:
     sources = {Path(inspect.getfile(function)) for function in _needed(_dynamics(model))}
-    return cache_folder(f"vehicle-{model}", sorted({*sources, Path(__file__)}))
+    sources |= {Path(__file__), Path(jump_integrator.__file__)}
+    return cache_folder(f"vehicle-{model}", sorted(sources))
 
 
 def _needed(function: FunctionType) -> list[FunctionType]:
@@ -146,6 +256,9 @@ def _record(parameters: Any) -> NDArray[np.void]:
                 kind, value = convert(value)
             types.append((field.name, kind))
             values.append(np.nan if value is None else value)
+        if type(section).__name__ == "TireParameters":
+            types += [(name, kind) for name, kind, _ in _TYRE_FIELDS]
+            values += [value for _, _, value in _TYRE_FIELDS]
         return types, tuple(values)
 
     dtype, values = convert(parameters)

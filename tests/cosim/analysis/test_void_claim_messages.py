@@ -47,7 +47,7 @@ class RecordingPlane(FakePlane):
 
 def recorder_of(scenario: Scenario, run_dir: Path, plane: FakePlane) -> Recorder:
     (run_dir / SCENARIO_FILE).write_text(dumps(scenario))
-    return Recorder(scenario, run_dir, plane, view=None)  # type: ignore[arg-type]
+    return Recorder(scenario, run_dir, plane)  # type: ignore[arg-type]
 
 
 def send(plane: FakePlane, record: RunRecord, until_ns: int, sent: dict[str, int]) -> None:

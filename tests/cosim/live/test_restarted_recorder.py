@@ -41,7 +41,6 @@ class Run:
             self.scenario,
             self.run_dir,
             plane,
-            view=None,
             start=start,  # type: ignore[arg-type]
         )
         for role in present:
@@ -146,7 +145,7 @@ def test_a_log_on_a_full_disk_does_not_stop_the_record(
 
     with monkeypatch.context() as patched:
         patched.setattr("sys.stderr", Full())
-        run.recorder._give_up_view(ViewError("no space left"))
+        run.recorder.give_up_view(ViewError("no space left"))
         run.send("junk", 0, b"", "plant")
     run.rows(PLANT_STEP, 3)
     assert len(list(read_chunks(run.run_dir / SPOOL, PLANT_STEP))) == 1

@@ -42,7 +42,7 @@ def one_input(data: bytes) -> None:
     run_dir.mkdir()
     (run_dir / SCENARIO_FILE).write_text(dumps(RESOLVED))
     plane = FakePlane()
-    recorder = Recorder(RESOLVED, run_dir, plane, view=None)
+    recorder = Recorder(RESOLVED, run_dir, plane)
     queries = []
     for _ in range(1 + choices.below(6)):
         match choices.below(5):

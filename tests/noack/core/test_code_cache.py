@@ -98,6 +98,7 @@ def test_on_a_full_disk_only_an_existing_cache_is_used(
     assert cache_folder("netem", SOURCES) == folder
 
 
+@pytest.mark.usefixtures("usual_signals")
 def test_ctrl_c_waits_for_the_compiler(folder: Path) -> None:
     """LLVM calls Python back, and does not survive an exception there."""
     function = compiler(folder)(doubled)

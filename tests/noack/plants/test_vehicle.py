@@ -1,6 +1,7 @@
 """Vehicles: CommonRoad's equations, and their states, inputs and outputs in the loop."""
 
 import math
+from dataclasses import replace
 from importlib import import_module
 from typing import Any
 
@@ -12,6 +13,7 @@ from noack.config.named_models import single_track_lane
 from noack.core.errors import CallerError
 from noack.plants.systems.ode_integrator import OdeSystem
 from noack.plants.systems.plant_linearisation import linearise
+from noack.plants.systems.vehicle_equations import CompiledVehicle, compiled_vehicle
 from noack.plants.vehicle import VehicleSettings
 from tests.noack.plants.motion import H_NS, motion
 
@@ -116,6 +118,37 @@ def test_the_motion_agrees_with_another_solver_of_the_librarys_equations(
         z = solve_ivp(whole, (0, steps * H_NS * 1e-9), z, args=(angle,), method="Radau",
                       rtol=1e-9, atol=1e-11).y[:, -1]  # fmt: skip
     np.testing.assert_allclose(system.z, z, atol=atol * max(1.0, np.abs(z).max()))
+
+
+def test_changes_of_a_cambers_sign_are_located_and_not_crept_over(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Both with few evaluations and closer to the exact motion than scipy's integrator."""
+    vehicles: list[CompiledVehicle] = []
+    monkeypatch.setattr(
+        "noack.plants.vehicle.compiled_vehicle",
+        lambda *args: vehicles.append(compiled_vehicle(*args)) or vehicles[-1],  # type: ignore
+    )
+    equations = settings(model="multi_body").equations()
+    (vehicle,) = vehicles
+    angles = 0.01 * np.sin(np.arange(400) * 0.05)
+    located = OdeSystem(equations, np.zeros(4))
+    crept = OdeSystem(replace(equations, advance=None), np.zeros(4))
+    exact, signs, changes, most = located.z.copy(), [], 0, 0
+    for step, angle in enumerate(angles):
+        before = vehicle.evaluations
+        located.advance(np.array([angle]), step * H_NS, H_NS)
+        most = max(most, vehicle.evaluations - before)
+        crept.advance(np.array([angle]), step * H_NS, H_NS)
+        vehicle.advance(exact, equations.physical(np.array([angle])), H_NS * 1e-9, (1e-11, 1e-14))
+        now = np.sign(vehicle.cambers).tolist()
+        changes += bool(signs) and now != signs
+        signs = now
+    assert changes >= 4
+    assert most < 100  # the integrator that reduces its steps takes up to 386
+    errors = [np.abs(one.z - exact).max() for one in (located, crept)]
+    assert errors[0] < 1e-6
+    assert errors[0] < errors[1]
 
 
 def test_steering_is_limited_to_the_vehicles_rate_and_angle() -> None:

@@ -125,6 +125,7 @@ def test_an_interrupted_and_then_killed_campaign_continues_where_it_stopped(
     assert files(folder).items() >= before.items()
 
 
+@pytest.mark.usefixtures("usual_signals")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_a_campaign_with_one_line(
     many: Path, tmp_path: Path, number: signal.Signals, run_command: Command,

@@ -1,0 +1,95 @@
+"""The fork server: processes that it starts are children of the launcher, and end as others do."""
+
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
+
+import psutil
+import pytest
+
+from cosim.live.fork_server import ForkedProcess, ForkServer
+from noack.core.errors import ExitStatus
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the fork server is for Linux")
+PLANT = "plant_server.__main__"
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[ForkServer]:
+    with closing(ForkServer()) as server:
+        yield server
+
+
+@contextmanager
+def started(server: ForkServer, folder: Path, *arguments: str) -> Iterator[ForkedProcess]:
+    with (folder / "log").open("a") as log:
+        process = server.start(PLANT, arguments, log)
+    with process.stdin:
+        yield process
+    process.kill()
+    process.wait()
+
+
+@pytest.mark.parametrize(
+    ("argument", "status", "text"),
+    [("--help", ExitStatus.OK, "usage: noack plant"), ("--no", ExitStatus.CALLER, "--no")],
+)
+def test_status_and_output_are_those_of_the_module(
+    server: ForkServer, tmp_path: Path, argument: str, status: int, text: str
+) -> None:
+    with started(server, tmp_path, argument) as process:
+        assert process.wait() == status
+    assert text in (tmp_path / "log").read_text()
+
+
+def test_a_process_reads_its_standard_input(server: ForkServer, tmp_path: Path) -> None:
+    with started(server, tmp_path) as process:
+        process.stdin.write("no ticket\n")
+        process.stdin.close()
+        assert process.wait() == ExitStatus.CALLER
+    assert "not a valid ticket" in (tmp_path / "log").read_text()
+
+
+def test_its_standard_input_ends_with_the_launchers_end(server: ForkServer, tmp_path: Path) -> None:
+    """No other process, and not the server, may hold a lifeline open."""
+    with ExitStack() as stack:
+        processes = [stack.enter_context(started(server, tmp_path)) for _ in range(3)]
+        for process in processes:
+            process.stdin.close()
+            assert process.wait() == ExitStatus.CALLER  # an empty ticket
+
+
+def test_a_process_is_a_child_in_a_session_of_its_own(server: ForkServer, tmp_path: Path) -> None:
+    with started(server, tmp_path) as process:
+        assert psutil.Process(process.pid).ppid() == os.getpid()
+        assert os.getsid(process.pid) == process.pid
+        assert process.poll() is None
+        process.kill()
+        assert process.wait() == -signal.SIGKILL
+        process.kill()  # it has ended: another process may have its pid
+
+
+def test_the_server_has_one_thread_when_it_forks(server: ForkServer, tmp_path: Path) -> None:
+    with started(server, tmp_path, "--help") as process:
+        process.wait()
+    assert psutil.Process(server._process.pid).num_threads() == 1
+
+
+def test_a_server_that_has_died_is_an_error(tmp_path: Path) -> None:
+    with closing(ForkServer()) as server:
+        server._process.kill()
+        server._process.wait()
+        with (
+            pytest.raises(OSError, match=r"fork server ended|Broken pipe|reset"),
+            started(server, tmp_path),
+        ):
+            pass
+
+
+def test_a_server_ends_with_its_launcher() -> None:
+    with closing(ForkServer()) as server:
+        server._socket.close()
+        assert server._process.wait() == ExitStatus.OK
