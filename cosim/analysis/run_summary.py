@@ -23,6 +23,7 @@ from cosim.analysis.summary_model import (
     DisturbancePart,
     EstimationPart,
     ExitPart,
+    RehearsalPart,
     RestartPart,
     RunSummary,
     WatchdogPart,
@@ -107,6 +108,11 @@ def summarise(
         latency_us=latency(record) if live else None,
         realtime={
             role: report.get("realtime") or {} for role, report in record.reports.items() if live
+        },
+        rehearsals={
+            role: RehearsalPart(rehearsals=int(found["rehearsals"]), cpu_share=found["cpu_share"])
+            for role, report in record.reports.items()
+            if live and (found := report.get("rehearsal"))
         },
         watchdog=_watchdog(record),
         estimation=_estimation(record, joined),
