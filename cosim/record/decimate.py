@@ -36,6 +36,14 @@ def decimate(t: Reals, y: Reals, columns: int) -> Indices:
     return np.unique(np.concatenate([first, last, low, high]))
 
 
+def decimate_all(t: Reals, values: Reals, columns: int) -> Indices:
+    """Select the points that plots of several curves need, values (k, n) over t."""
+    if len(t) <= _POINTS_PER_COLUMN * columns:
+        return np.arange(len(t))
+    kept = [decimate(t, np.ascontiguousarray(curve), columns) for curve in values.T]
+    return np.unique(np.concatenate(kept))
+
+
 def _where_first(
     extreme: Reals, y: Reals, column: Indices, first: Indices, last: Indices
 ) -> Indices:
