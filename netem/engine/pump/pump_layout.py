@@ -23,10 +23,11 @@ EVENTS_FULL = 3  # the event buffer is full: pass the events to the taps
 LEAVING_FULL = 4  # the list of departures is full and must be sent
 CARRY_ON = 5  # no reason to return
 
-# The destination of a direction's datagrams.
-NO_NAME = 0  # the address to which their socket is connected
-SERVER_NAME = 1  # the server, from a socket that is not connected
-CLIENT_NAME = 2
+# The socket that sends a direction's datagrams, and their destination.
+OWN_SOCKET = 0  # the client's socket, which is connected to the server
+SERVER_NAME = 1  # the link's sending socket, which is not connected, to the server
+CLIENT_NAME = 2  # the link's listening socket, to the client
+LINK_SOCKET = 3  # the link's sending socket, which is connected to the server
 
 PUMP = np.dtype(
     [
@@ -103,7 +104,7 @@ DIRECTION = np.dtype(
         ("limit", "<i8"),
         ("tracks", "<i8"),
         ("keeps", "<i8"),  # 1: datagrams can be delayed
-        ("sends", "<i8"),  # NO_NAME, SERVER_NAME or CLIENT_NAME
+        ("sends", "<i8"),  # OWN_SOCKET, SERVER_NAME, CLIENT_NAME or LINK_SOCKET
         ("name_bytes", "<i8"),
         ("name", "u1", (NAME_BYTES,)),  # forward: the server's
         ("listen", "u1", (NAME_BYTES,)),  # the link's address
