@@ -12,11 +12,19 @@ from noack.runtime.signals import quiet_interrupt
 
 with quiet_interrupt():
     from netem.duplex_link import network_of
-    from netem.run_relay import RelayShell
+    from netem.engine.compiled_network import CompiledNetwork
+    from netem.engine.native_pump import kept_pump
+    from netem.run_relay import CompiledShell, RelayShell
     from noack.core.errors import ExitStatus, NoackError
-    from noack.runtime.command_line import Parser, failed
+    from noack.runtime.command_line import Parser, failed, print_to_stderr
+    from noack.runtime.peer_sockets import has_peer_sockets
     from noack.runtime.process_entry import add_options, join_run
     from noack.runtime.process_life import RunProcess
+
+NOT_COMPILED = (
+    "noack netem: relays by plain Python, which delays each datagram longer; "
+    "`noack netem --compile` prepares the compiled emulator once for the next runs"
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
@@ -41,15 +49,26 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
 
 
 def _in_a_run(node: RunProcess) -> None:
+    """Relay by compiled code if it is in the cache: a run does not wait for a compilation."""
+    duplex = node.scenario.protocol.acknowledges
+    pump = kept_pump() if has_peer_sockets() else None
+    if pump is None:
+        print_to_stderr(NOT_COMPILED)
+        node.run(
+            network_of(node.scenario, node.start),
+            lambda endpoint, addresses: RelayShell(
+                endpoint, addresses["controller"], addresses["sensor"], duplex=duplex
+            ),
+        )
+        return
+    network = CompiledNetwork(node.scenario, node.start, pump)
     node.run(
-        network_of(node.scenario, node.start),
-        lambda endpoint, addresses: RelayShell(
-            endpoint,
-            addresses["controller"],
-            addresses["sensor"],
-            duplex=node.scenario.protocol.acknowledges,
+        network,
+        lambda endpoint, addresses: CompiledShell(
+            endpoint, addresses["controller"], addresses["sensor"], duplex=duplex,
+            network=network, clock=node.clock, spin_us=node.scenario.realtime.spin_us,
         ),
-    )
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ the loop, in simulation, in replay, and in the relay where the compiled engine i
 """
 
 import heapq
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from netem.rule_program import empty_state, new_flow, new_memory, program_of, recent_width
@@ -177,7 +177,9 @@ class Link:
     def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
         """Process a datagram; return it if it is neither lost nor delayed."""
         if self._schedule is not None:
-            self._apply_changes(self._schedule, now_ns)
+            for settings in due_settings(self._schedule, self._settings, now_ns):
+                self.change(settings)
+            self._reached_ns = now_ns
         decision = self.decide(message.flow, len(message.data), now_ns)
         head = message.data[:PACKET_HEAD_BYTES].ljust(PACKET_HEAD_BYTES, b"\0")
         row = (
@@ -201,14 +203,6 @@ class Link:
             row = self._add_flow(flow)
         admit(self._program, self._state, row, size_bytes, now_ns, self._decision)
         return self._decision
-
-    def _apply_changes(self, schedule: ChangeSchedule, now_ns: int) -> None:
-        while (change := schedule.take(now_ns)) is not None:
-            first = self._settings.first_delivered  # a restarted emulator has its own value
-            settings = change.prepared.model_copy(update={"first_delivered": first})
-            if settings != self._settings:
-                self.change(settings)
-        self._reached_ns = now_ns
 
     def _release(
         self, message: Datagram, release_ns: int, bit: int, *, copy: bool
@@ -267,13 +261,30 @@ def link_of(
     settings: LinkSettings, seed: int, name: str, start: Start,
     schedule: ChangeSchedule | None = None,
 ) -> Link:  # fmt: skip
-    """Return a link of a run.
+    """Return a link of a run."""
+    settings, names = at_start(settings, name, start)
+    return Link(settings, seed, *names, first_number=start.first_number, schedule=schedule)
+
+
+def at_start(settings: LinkSettings, name: str, start: Start) -> tuple[LinkSettings, list[str]]:
+    """Return the settings of a link of a run, and the names of its random streams.
 
     A restarted emulator has lost its count of consecutive losses. Therefore its first datagram
     passes, and later ones are drawn from other random streams than before.
     """
-    names: tuple[str, ...] = (name,)
-    if start.is_restart:
-        names = (name, f"again-{start.generation}")
-        settings = settings.model_copy(update={"first_delivered": True})
-    return Link(settings, seed, *names, first_number=start.first_number, schedule=schedule)
+    if not start.is_restart:
+        return settings, [name]
+    settings = settings.model_copy(update={"first_delivered": True})
+    return settings, [name, f"again-{start.generation}"]
+
+
+def due_settings(
+    schedule: ChangeSchedule, present: LinkSettings, now_ns: int
+) -> Iterator[LinkSettings]:
+    """Yield the settings that replace the present ones before a datagram that arrives now."""
+    while (change := schedule.take(now_ns)) is not None:
+        first = present.first_delivered  # a restarted emulator has its own value
+        settings = change.prepared.model_copy(update={"first_delivered": first})
+        if settings != present:
+            present = settings
+            yield settings

@@ -1,7 +1,7 @@
 """Functions of all commands that make a run: warnings, the run itself, its verdict."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -30,7 +30,7 @@ class RunOutput:
 
 
 def run_processes(
-    scenario: "Scenario",
+    load: Callable[[], "Scenario"],
     runs: Path,
     output: RunOutput,
     *,
@@ -41,32 +41,31 @@ def run_processes(
     """Run a scenario live; print its verdict and return the exit status.
 
     Args:
-        scenario: the scenario, not resolved.
+        load: loads the scenario.
         runs: folder of the run directories.
         output: what is printed and written at the end.
         spawn: roles of the processes to start, all by default; the others join by ``session``.
         session: name that the processes of the run share.
         live: show the run in the viewer.
     """
-    from cosim.live.launcher import launch
-    from cosim.live.progress import PatientConsole, progress_line
-    from noack.protocol.topology import ROLES
+    from cosim.live.fork_server import fork_server
 
-    warn_of_violations(scenario)
-    ending = None
-    try:
-        with progress_line(PatientConsole(stderr=True), scenario, session) as watcher:
-            ending = launch(
-                scenario,
-                runs,
-                spawn=spawn or ROLES,
-                session=session,
-                live=live,
-                watcher=watcher,
-            )
-    except OSError:  # a closed terminal must not end the run
-        if ending is None:
-            raise
+    with fork_server() as server:  # it imports while this process does
+        from cosim.live.launcher import launch
+        from cosim.live.progress import PatientConsole, progress_line
+        from noack.protocol.topology import ROLES
+
+        scenario, ending = load(), None
+        warn_of_violations(scenario)
+        try:
+            with progress_line(PatientConsole(stderr=True), scenario, session) as watcher:
+                ending = launch(
+                    scenario, runs, spawn=spawn or ROLES, session=session, live=live,
+                    watcher=watcher, server=server,
+                )  # fmt: skip
+        except OSError:  # a closed terminal must not end the run
+            if ending is None:
+                raise
     return finalize_run(ending, output)
 
 

@@ -77,6 +77,9 @@ class _Nothing:
     def append(self, record: Record) -> None:
         pass
 
+    def extend_table(self, table: str, rows: object) -> None:
+        pass
+
     def notice(self, notice: Notice) -> None:
         pass
 

@@ -4,18 +4,16 @@ import contextlib
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
-from cosim.live.fork_server import ForkedProcess, ForkServer
+from cosim.live.fork_server import ENVIRONMENT, ForkedProcess, ForkServer
 from noack.core.errors import ExitStatus, MachineError
 from noack.core.python_process import python_command
 from noack.protocol.topology import RECORDER
 from noack.runtime.join_ticket import Ticket
-from noack.runtime.process_entry import TICKET_ON_STDIN
 
 MODULES = {
     "recorder": "cosim.live.recorder",
@@ -24,28 +22,11 @@ MODULES = {
     "sensor": "sensor_node.__main__",
     "controller": "controller_node.__main__",
 }
-_ENVIRONMENT = {
-    TICKET_ON_STDIN: "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "PYTHONUTF8": "1",
-    # Return memory to the system after a busy moment. Unless they are set, glibc raises these
-    # thresholds with each large block, and keeps an arena for each thread.
-    "MIMALLOC_PURGE_DELAY": "0",
-    "ARROW_DEFAULT_MEMORY_POOL": "system",
-    "MALLOC_ARENA_MAX": "2",
-    "MALLOC_MMAP_THRESHOLD_": "131072",
-    "MALLOC_TRIM_THRESHOLD_": "131072",
-}
 
 Failure = tuple[ExitStatus, str]
 """Exit status and reason."""
 
 Child = ForkedProcess | subprocess.Popen[str]
-
-
-def fork_server() -> ForkServer | None:
-    """Start a fork server for the processes of a run; None where the system has none."""
-    return ForkServer(_ENVIRONMENT) if sys.platform == "linux" else None
 
 
 class ChildProcesses:
@@ -128,7 +109,7 @@ class ChildProcesses:
             stderr=log,
             encoding="utf-8",
             start_new_session=True,  # the launcher handles Ctrl-C
-            env=os.environ | _ENVIRONMENT,
+            env=os.environ | ENVIRONMENT,
         )
 
     def _failure(self, role: str, code: int, reported: Callable[[str], str | None]) -> Failure:

@@ -12,14 +12,31 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from importlib import import_module
-from types import TracebackType
-from typing import IO, Self
+from typing import IO
 
 from noack.core.python_process import python_command
+from noack.runtime.command_line import TICKET_ON_STDIN
 
-_IMPORTS = ("plant_server.__main__", "sensor_node.__main__", "controller_node.__main__", "zenoh")
+_IMPORTS = (
+    "plant_server.__main__", "sensor_node.__main__", "controller_node.__main__", "netem.__main__",
+    "scipy.linalg", "zenoh",
+)  # fmt: skip
+ENVIRONMENT = {
+    TICKET_ON_STDIN: "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "PYTHONUTF8": "1",
+    # Return memory to the system after a busy moment. Unless they are set, glibc raises these
+    # thresholds with each large block, and keeps an arena for each thread.
+    "MIMALLOC_PURGE_DELAY": "0",
+    "ARROW_DEFAULT_MEMORY_POOL": "system",
+    "MALLOC_ARENA_MAX": "2",
+    "MALLOC_MMAP_THRESHOLD_": "131072",
+    "MALLOC_TRIM_THRESHOLD_": "131072",
+}
+"""Environment variables of the processes of a run, beside the launcher's."""
 _MOST_BYTES = 65_536
 _START_TIMEOUT_S = 120.0
 _PR_SET_CHILD_SUBREAPER = 36
@@ -59,12 +76,9 @@ class ForkServer:
 
     The server forks twice. Linux gives a process whose parent has ended to its nearest ancestor
     that adopts orphans: while the server lives, this process does.
-
-    Args:
-        environment: variables of the processes, beside those of this process.
     """
 
-    def __init__(self, environment: Mapping[str, str]) -> None:
+    def __init__(self) -> None:
         self._socket, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._socket.settimeout(_START_TIMEOUT_S)
         _adopt_orphans(True)
@@ -74,18 +88,11 @@ class ForkServer:
                 pass_fds=[its.fileno()],
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,  # the launcher handles Ctrl-C
-                env=os.environ | environment,
+                env=os.environ | ENVIRONMENT,
             )
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
+        """End the server; its processes go on."""
         self._socket.close()
         self._process.kill()  # it has nothing to lose, and may still import
         self._process.wait()
@@ -115,6 +122,16 @@ class ForkServer:
         finally:
             os.close(its_stdin)
         return ForkedProcess(pid, os.fdopen(own_stdin, "w", encoding="utf-8"))
+
+
+@contextmanager
+def fork_server() -> Iterator[ForkServer | None]:
+    """Have a fork server while the context lasts; None where the system has none."""
+    if sys.platform != "linux":
+        yield None
+        return
+    with closing(ForkServer()) as server:
+        yield server
 
 
 def _adopt_orphans(adopt: bool) -> None:

@@ -15,9 +15,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cosim.live.child_processes import ChildProcesses, Failure, fork_server, signal_name
+from cosim.live.child_processes import ChildProcesses, Failure, signal_name
 from cosim.live.coordinator import Coordinator
 from cosim.live.disk_space import require_disk_space
+from cosim.live.fork_server import ForkServer, fork_server
 from cosim.live.restart_policy import RestartPolicy
 from cosim.live.start_limit import DEFAULT_S, StartLimit
 from cosim.record.environment import write_environment
@@ -63,6 +64,7 @@ def launch(
     session: str | None = None,
     live: bool = False,
     watcher: Watcher | None = None,
+    server: ForkServer | None = None,
 ) -> RunEnding:
     """Run a scenario; :func:`cosim.live.finalize.finalize` completes its record.
 
@@ -73,6 +75,7 @@ def launch(
         session: session name for processes started by hand.
         live: show the run in a viewer while it runs.
         watcher: callbacks.
+        server: starts the processes; by default a new one.
 
     Raises:
         CallerError, MachineError: the run could not be prepared.
@@ -80,9 +83,7 @@ def launch(
     """
     began_ns = time.monotonic_ns()
     with contextlib.ExitStack() as stack:
-        server = fork_server()  # it imports while this function prepares the run
-        if server is not None:
-            stack.enter_context(server)
+        server = server or stack.enter_context(fork_server())
         resolved = resolve(scenario)
         require_disk_space(resolved, runs)
         control = resolved.ports.control

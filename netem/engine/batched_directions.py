@@ -1,17 +1,16 @@
 """The directions of links in the pump's memory: programs, and states that grow with the flows."""
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.engine.compiled_rules import compile_rule, compiled_program, compiled_state, set_flow
+from netem.engine.compiled_rules import compiled_program, compiled_state, set_flow
 from netem.engine.pump.pump_layout import PER_FLOW, STATES, TABLES, Memory
 from netem.engine.pump_memory import doubled
-from netem.engine.relay_interface import DIRECTIONS, LinkSpec
 from netem.rule_program import empty_state, program_of, recent_width
-from netem.rules.settings_change import carry
-from noack.impairments.link_records import LinkMemory, LinkProgram
+from noack.impairments.link_records import LinkMemory, LinkProgram, RecordedDecision
 from noack.impairments.link_settings import LinkSettings
 
 _ROWS = 16
@@ -21,19 +20,27 @@ class BatchedDirection:
     """One direction of a link.
 
     Args:
-        spec: the link.
+        settings, seed, name, decisions: see :class:`netem.link_machine.Link`.
         number: number of the direction in the pump's memory; even: forward, odd: reverse.
         memory: the pump's memory.
+        carry_over: :func:`netem.rules.settings_change.carry`, compiled or not.
     """
 
-    def __init__(self, spec: LinkSpec, number: int, memory: Memory) -> None:
-        name = DIRECTIONS[number % 2]
-        self.settings: LinkSettings = getattr(spec, name)
-        self._seed, self._name = spec.seed, (spec.name, name)
+    def __init__(
+        self,
+        settings: LinkSettings,
+        seed: int,
+        name: Sequence[str],
+        number: int,
+        memory: Memory,
+        carry_over: Callable[..., None],
+        decisions: Sequence[Sequence[RecordedDecision]] = (),
+    ) -> None:
+        self.settings = settings
+        self._seed, self._name, self._carry = seed, name, carry_over
         self._row = memory.directions[number : number + 1]
         self._link_state, self._counters = memory.link_states[number], memory.counters[number]
-        decisions = spec.decisions.get(name, ())
-        plain = program_of(self.settings, self._seed, *self._name, decisions=decisions)
+        plain = program_of(settings, seed, *name, decisions=decisions)
         self.program = compiled_program(plain)
         self.state = self._state(plain, _ROWS)
         self._write_row()
@@ -67,7 +74,7 @@ class BatchedDirection:
         state = self._state(plain, self.rows)._replace(flows=self.state.flows)
         recent_ns: NDArray[np.int64] = state.recent_ns  # type: ignore[assignment]
         recent_ns[:] = -1
-        compile_rule(carry)(old, self.state, program, state, latest_ns)
+        self._carry(old, self.state, program, state, latest_ns)
         self.settings, self.program, self.state = settings, program, state
         self._write_row()
 

@@ -8,15 +8,16 @@ from functools import cache
 import numpy as np
 
 from netem.compile_notice import announced
-from netem.engine.batched_clients import ClientTable, Epoll
+from netem.engine.batched_clients import ClientTable
 from netem.engine.batched_directions import BatchedDirection
 from netem.engine.compiled_rules import compile_rule, is_kept, prepare
+from netem.engine.epoll_object import Epoll
+from netem.engine.native_pump import compiled_pump, kept_pump
 from netem.engine.pump import pump_layout
 from netem.engine.pump.client_table import insert, remove
-from netem.engine.pump.pump_loop import run_pump
 from netem.engine.pump_memory import PumpMemory
 from netem.engine.relay_base import RARE_PERIOD_NS, REPORTED_FLOWS, Relay
-from netem.engine.relay_interface import DirectionReport, FlowReport, LinkSpec, Tap
+from netem.engine.relay_interface import DIRECTIONS, DirectionReport, FlowReport, LinkSpec, Tap
 from netem.engine.relay_sockets import packed_name, stamp_arrivals
 from netem.rules.settings_change import carry
 from noack.impairments.link_records import Counters, PacketDecision, dtype_of
@@ -42,7 +43,7 @@ class BatchedRelay(Relay):
     ) -> None:
         super().__init__(specs)
         self._taps = tuple(taps)
-        self._run_compiled = compile_rule(run_pump)
+        self._run_compiled = compiled_pump()
         data = any(tap.wants_data for tap in self._taps)
         self._memory = PumpMemory(len(self.specs), segment, 1 + data if self._taps else 0)
         self._epoll = Epoll()
@@ -53,9 +54,13 @@ class BatchedRelay(Relay):
         for number in range(len(self.specs)):
             self._listen(number)
         self._directions = [
-            BatchedDirection(self.specs[number // 2], number, memory)
-            for number in range(2 * len(self.specs))
-        ]
+            BatchedDirection(
+                getattr(spec, side), spec.seed, (spec.name, side), 2 * number + reverse, memory,
+                compile_rule(carry), spec.decisions.get(side, ()),
+            )
+            for number, spec in enumerate(self.specs)
+            for reverse, side in enumerate(DIRECTIONS)
+        ]  # fmt: skip
         self._clients = ClientTable(
             self._open_links, self._warnings, self._directions, self._memory, self._epoll
         )
@@ -172,8 +177,7 @@ class BatchedRelay(Relay):
 
     def _run_pump(self, until_ns: int) -> int:
         memory, one = self._memory.memory, self._directions[0]
-        reason: int = self._run_compiled(memory, one.program, one.state, self._decisions, until_ns)
-        return reason
+        return self._run_compiled(memory, one.program, one.state, self._decisions, until_ns)
 
     def _report_events(self) -> None:
         """Pass the collected events to the taps."""
@@ -208,7 +212,9 @@ def load() -> None:
     """Load or compile the code once, before ports are open: else datagrams would wait for it."""
     nothing = LinkSettings()
     spec = LinkSpec("none", (LOOPBACK, 0), (LOOPBACK, 9), nothing, nothing)
-    kept = all(is_kept(function) for function in (run_pump, insert, remove, carry))
+    kept = (
+        all(is_kept(function) for function in (insert, remove, carry)) and kept_pump() is not None
+    )
     notice = nullcontext() if kept else announced("the relay", prepare(), _COMPILING_S)
     with notice, closing(BatchedRelay([spec])) as relay:
         relay.call_all()

@@ -38,6 +38,7 @@ from noack.impairments.stage_dispatch import (
     STAGE_RECORDS,
     apply_stage,
 )
+from noack.protocol import record_tables
 
 
 def compiled_program(program: LinkProgram) -> LinkProgram:
@@ -115,12 +116,18 @@ def prepare(name: str = "netem", modules: tuple[ModuleType, ...] = ()) -> Path |
     Returns:
         The cache folder of the compiled code; None if there is no cache.
     """
-    rules = tuple(_compiled_modules())
     if modules:
         prepare()
-    _register(modules or rules)
-    sources = (*rules, *modules, relay_events)
-    return cache_folder(name, (Path(str(module.__file__)) for module in sources))
+    _register(modules or [importlib.import_module(rule) for rule, _ in _compiled_modules()])
+    return folder(name, modules)
+
+
+@cache
+def folder(name: str = "netem", modules: tuple[ModuleType, ...] = ()) -> Path | None:
+    """Return the cache folder, without loading the compiler; see :func:`prepare`."""
+    more = (*modules, relay_events, record_tables)
+    sources = [*(path for _, path in _compiled_modules()), *(str(one.__file__) for one in more)]
+    return cache_folder(name, map(Path, sources))
 
 
 def is_kept(function: Callable[..., Any]) -> bool:
@@ -171,8 +178,10 @@ def _comparisons() -> Callable[..., None]:
     return chain
 
 
-def _compiled_modules() -> Iterator[ModuleType]:
+def _compiled_modules() -> Iterator[tuple[str, str]]:
+    """Yield the names and files of the modules with compiled functions."""
     for package in (noack.impairments, netem.rules, netem.engine.pump):
         for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-            yield importlib.import_module(found.name)
-    yield histogram
+            spec: Any = found.module_finder.find_spec(found.name)  # type: ignore[call-arg]
+            yield found.name, spec.origin
+    yield histogram.__name__, str(histogram.__file__)

@@ -27,9 +27,12 @@ _TABLE_SHARE = 4
 
 
 class PumpMemory:
-    """The pump's memory for a number of links; ``segment`` and ``taps`` as in its layout."""
+    """The pump's memory for a number of links; ``segment`` and ``taps`` as in its layout.
 
-    def __init__(self, links: int, segment: bool, taps: int) -> None:
+    ``row_count`` is the number of rows of the record that are kept for each table; 0: no record.
+    """
+
+    def __init__(self, links: int, segment: bool, taps: int, row_count: int = 0) -> None:
         directions = 2 * links
         self.first_path = 2 * links
         self._buffers = np.empty(_BUFFERS * pump_layout.SLOT_STRIDE + 64, np.uint8)
@@ -66,6 +69,8 @@ class PumpMemory:
             block_next=np.zeros(0, np.int32),
             events=np.zeros(_EVENTS if taps else 0, EVENT),
             data=np.zeros(_DATA_BYTES if taps == 2 else 0, np.uint8),
+            packets=np.zeros(row_count, pump_layout.PACKET_ROW),
+            releases=np.zeros(row_count, pump_layout.RELEASE_ROW),
             integers=np.zeros(1, np.int32),
         )
         self.memory.clients["number"] = -1
@@ -73,6 +78,8 @@ class PumpMemory:
         pump = self.pump
         pump["first_path"], pump["slots_in"], pump["taps"] = 2 * links, _BUFFERS, taps
         pump["segment"], pump["segment_below"] = segment, pump_layout.MOST_BYTES
+        pump["speed"], pump["records"] = 1.0, row_count > 0
+        pump["change_ns"] = np.iinfo(np.int64).max
         pump["free_slot"] = pump["free_block"] = -1
         self._lay_out_buffers()
         self._free_slots(0)

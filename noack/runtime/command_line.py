@@ -8,6 +8,9 @@ from typing import NoReturn
 
 from noack.core.errors import CallerError, ExitStatus
 
+TICKET_ON_STDIN = "NOACK_TICKET_ON_STDIN"
+"""Environment variable of a launched process: its first line of input is its ticket."""
+
 
 class Parser(argparse.ArgumentParser):
     """A parser that raises errors instead of printing usage and exiting."""

@@ -55,6 +55,14 @@ def open_beside(endpoint: socket.socket, peers: Iterable[Address]) -> tuple[sock
     return tuple(beside)
 
 
+def has_peer_sockets() -> bool:
+    """Whether the system supports sockets for peers."""
+    with ExitStack() as stack:
+        endpoint = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        endpoint.bind(("127.0.0.1", 0))
+        return bool([*map(stack.enter_context, open_beside(endpoint, [("127.0.0.1", 9)]))])
+
+
 @contextmanager
 def _shared(endpoint: socket.socket) -> Iterator[None]:
     """Let this user bind the port again for a moment; permanently, any of his programs could."""
@@ -129,13 +137,13 @@ class SourceCount:
         self._last: Address | None = None
         self._run = 0
 
-    def add(self, source: Address) -> None:
-        """Count one datagram."""
+    def add(self, source: Address, datagrams: int = 1) -> None:
+        """Count datagrams."""
         if source == self._last:
-            self._run += 1
+            self._run += datagrams
             return
         self._fold()
-        self._last, self._run = source, 1
+        self._last, self._run = source, datagrams
 
     def report(self) -> dict[str, int]:
         """Datagrams by source; the rare sources together are ``others``."""

@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from setproctitle import setproctitle
 
 from noack.core.errors import ExitStatus, NoackError, NoAnswerError
-from noack.runtime.command_line import Parser, failed
+from noack.runtime.command_line import TICKET_ON_STDIN, Parser, failed
 from noack.runtime.control_plane import ControlPlane
 from noack.runtime.join_ticket import DEFAULT_SESSION, Ticket, loads, wait_for_ticket
 from noack.runtime.life_cycle import HORIZON, Event
@@ -19,8 +19,6 @@ from noack.runtime.process_life import RunProcess, lifeline_cut
 from noack.runtime.signals import Signals
 
 _TICKET_TIMEOUT_S = 24 * 3600.0  # a person may start the recorder late; Ctrl-C ends the wait
-
-TICKET_ON_STDIN = "NOACK_TICKET_ON_STDIN"
 
 
 def run_process(

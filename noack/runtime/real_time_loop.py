@@ -2,22 +2,26 @@
 
 One thread waits in ``select`` for the socket or the next absolute deadline, whichever comes first.
 The timeout of select has microsecond steps; the timers of asyncio and epoll have millisecond steps.
-A missed deadline is served late and in order; none is skipped.
+A missed deadline is served late and in order; none is skipped. A :class:`SelfDrivenMachine` does
+all this itself between two turns of housekeeping.
 """
 
 import os
 import select
 import time
 from collections.abc import Callable, Sequence
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
-from noack.core.clock import RunClock
+from numpy.typing import NDArray
+
+from noack.core.clock import NS_PER_S, RunClock
 from noack.protocol.machine_interface import Machine, Notice, Record
 
 T = TypeVar("T")
 
 _HOUSEKEEPING_S = 0.05
 _OVERLOAD_PAUSE_S = 0.002
+_OVERLOAD_SHARE = 0.9  # of CPU time in the time since the last housekeeping
 _QUIET_S = 0.0005  # housekeeping takes 0.1 ms; it waits when the next deadline is nearer than this
 _yield_core: Callable[[], None] = getattr(os, "sched_yield", lambda: None)
 """After a rejected datagram: lets other threads of the same real-time priority run first."""
@@ -39,12 +43,20 @@ class Channel(Protocol[T]):
         """Send a message; never blocks, and never raises because of a peer."""
         ...
 
-    def tend(self, now_ns: int) -> Sequence[Notice]:
-        """Do its own housekeeping, every 50 ms; return lines for the log."""
+    def tend(self, now_ns: int) -> Sequence[Record | Notice]:
+        """Do its own housekeeping, every 50 ms; return rows, and lines for the log."""
         ...
 
 
-class RecordSink(Protocol):
+class RowSink(Protocol):
+    """Where rows of the record go."""
+
+    def extend_table(self, table: str, rows: NDArray[Any]) -> None:
+        """Add at most 256 rows of a table."""
+        ...
+
+
+class RecordSink(RowSink, Protocol):
     """Where a machine's records and notices go."""
 
     def append(self, record: Record) -> None:
@@ -57,6 +69,15 @@ class RecordSink(Protocol):
 
     def flush(self) -> None:
         """Publish the collected rows; called every 50 ms."""
+        ...
+
+
+@runtime_checkable
+class SelfDrivenMachine(Protocol):
+    """A machine that waits for its deadlines and messages itself, and sends its messages."""
+
+    def drive(self, until_ns: int, rows: RowSink) -> None:
+        """Work until about simulated time ``until_ns``; pass on its rows of the record."""
         ...
 
 
@@ -80,7 +101,8 @@ def run_loop(
     Returns:
         How late the machine's next deadline was at the end, in ns; 0 if it was not late.
     """
-    loop = _Loop(machine, channel, clock, telemetry, spin_us * 1e-6, news)
+    kind = _SelfDrivenLoop if isinstance(machine, SelfDrivenMachine) else _Loop
+    loop: _Loop[T] = kind(machine, channel, clock, telemetry, spin_us * 1e-6, news)
     # Looked up once: after milliseconds of sleep the code runs cold, and every step counts.
     step, housekeeping_is_due = loop.step, loop.housekeeping_is_due
     while True:
@@ -111,7 +133,7 @@ class _Loop(Generic[T]):
         self._now_ns, self._wall_s_until = clock.now_ns, clock.wall_s_until
         self._spin_s = spin_s
         self._slept = False
-        """Whether the loop has waited for a deadline since the last housekeeping."""
+        """Whether the loop has waited since the last housekeeping."""
         self._emit(news(clock.now_ns()))
         self.schedule_housekeeping()
 
@@ -170,3 +192,33 @@ class _Loop(Generic[T]):
                 self._telemetry.notice(output)
             else:
                 self._channel.send(output)
+
+
+class _SelfDrivenLoop(_Loop[T]):
+    """The loop of a machine that drives itself between two turns of housekeeping."""
+
+    def __init__(
+        self,
+        machine: Machine[T],
+        channel: Channel[T],
+        clock: RunClock,
+        telemetry: RecordSink,
+        spin_s: float,
+        news: Callable[[int], Sequence[Record | Notice]],
+    ) -> None:
+        super().__init__(machine, channel, clock, telemetry, spin_s, news)
+        assert isinstance(machine, SelfDrivenMachine)
+        self._drive = machine.drive
+        self._period_ns = int(_HOUSEKEEPING_S * NS_PER_S * clock.speed)
+        self._emit(channel.tend(clock.now_ns()))  # messages may have arrived before
+
+    def step(self) -> None:
+        """Let the machine work until the next housekeeping, which it puts off if it is busy."""
+        began_s, began_cpu_s = time.monotonic(), time.thread_time()
+        self._drive(self._now_ns() + self._period_ns, self._telemetry)
+        cpu_s = time.thread_time() - began_cpu_s
+        self._slept = cpu_s < _OVERLOAD_SHARE * (time.monotonic() - began_s)
+
+    def housekeeping_is_due(self) -> bool:
+        """Whether it is due: always after a step."""
+        return True

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from itertools import islice
 
 import numpy as np
+from numpy.typing import NDArray
 
 from noack.protocol.machine_interface import GENERATION, Notice, Record
 from noack.runtime.control_messages import BatchHeader, parse_message
@@ -90,6 +91,16 @@ class TelemetryBuffer:
         self._filled[table] = index + 1
         if index + 1 == _BATCH_ROWS:
             self.flush()  # all tables: a reader merges them in the order of publication
+
+    def extend_table(self, table: str, rows: NDArray[np.void]) -> None:
+        """Add at most 256 rows of a table."""
+        if self._filled[table] + len(rows) > _BATCH_ROWS:
+            self.flush()
+        begin = self._filled[table]
+        self._rows[table][begin : begin + len(rows)] = rows
+        self._filled[table] = begin + len(rows)
+        if begin + len(rows) == _BATCH_ROWS:
+            self.flush()
 
     def notice(self, notice: Notice) -> None:
         """Publish a line for the run's log at once."""

@@ -10,7 +10,7 @@ from contextlib import suppress
 from typing import Generic, TypeVar
 
 from noack.core.errors import CallerError
-from noack.protocol.machine_interface import Notice
+from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.wire_format import MAX_DATAGRAM_BYTES, Decoder, Encoder, Flow, Message, flow_of
 from noack.runtime.address import Address, text_of
 from noack.runtime.peer_sockets import FloodWatch, SourceCount, open_beside
@@ -180,7 +180,7 @@ class CountingSocket(ABC, Generic[T]):
         except OSError as error:
             self.send_errors[str(error)] += 1
 
-    def tend(self, now_ns: int) -> Sequence[Notice]:
+    def tend(self, now_ns: int) -> Sequence[Record | Notice]:
         """Begin the next interval of housekeeping; return log lines about the last one."""
         if self._unknown_fd is None:
             return ()

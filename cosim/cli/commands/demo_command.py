@@ -26,6 +26,8 @@ def demo(
     json: cli.JsonOption = False,
 ) -> int:
     """Run the paper's lane-following example live."""
-    mode = ['mode="zoh"'] if zoh else []
-    loaded = cli.load_scenario("lane_following", [*mode, *(settings or ())])
-    return run_processes(loaded, runs, RunOutput(report, verbose, json), live=live)
+    wanted = [*(['mode="zoh"'] if zoh else []), *(settings or ())]
+    output = RunOutput(report, verbose, json)
+    return run_processes(
+        lambda: cli.load_scenario("lane_following", wanted), runs, output, live=live
+    )

@@ -31,9 +31,11 @@ def record(
     """Open a run and record it; the other four processes join from other terminals."""
     from noack.protocol.topology import RECORDER
 
-    loaded = cli.load_scenario(scenario, settings)
     output = RunOutput(report, verbose, json)
-    return run_processes(loaded, runs, output, spawn=(RECORDER,), session=session, live=live)
+    return run_processes(
+        lambda: cli.load_scenario(scenario, settings), runs, output,
+        spawn=(RECORDER,), session=session, live=live,
+    )  # fmt: skip
 
 
 @cli.command(cli.PROCESSES, 20, _examples("plant"))

@@ -20,5 +20,5 @@ def run(
     json: cli.JsonOption = False,
 ) -> int:
     """Run a scenario live: start all processes and record everything."""
-    loaded = cli.load_scenario(scenario, settings)
-    return run_processes(loaded, runs, RunOutput(report, verbose, json), live=live)
+    output = RunOutput(report, verbose, json)
+    return run_processes(lambda: cli.load_scenario(scenario, settings), runs, output, live=live)

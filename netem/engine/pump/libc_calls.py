@@ -39,8 +39,6 @@ CLOCK_MONOTONIC = 1
 MSG_DONTWAIT = 0x40
 POLLIN = 1
 POLLOUT = 4
-SYS_EPOLL_PWAIT2 = 441
-"""The same number on every architecture; libc has it since glibc 2.35."""
 
 
 def _array_at(typing_context: Any, like: Any, address: Any, rows: Any, columns: Any) -> Any:

@@ -8,6 +8,7 @@ from netem.engine.pump.libc_calls import ENOMEM, array_at
 from netem.engine.pump.payload_store import blocks_for, keep, pop, push
 from netem.engine.pump.pump_events import has_room, report_arrival
 from netem.engine.pump.pump_layout import Memory
+from netem.engine.pump.pump_records import record_packet, record_release
 from netem.rules.link_rules import admit, leave
 from noack.impairments.link_records import NEVER_NS, LinkMemory, LinkProgram, PacketDecision
 
@@ -49,6 +50,8 @@ def release_due(memory: Memory, state_like: LinkMemory, until_ns: int) -> int:
         leaving.fate = slot.fate
         leaving.counts = slot.counts
         _line_up(memory, state_like)
+        if pump.records != 0:
+            record_release(memory, pump.leaving - 1, until_ns)
     return layout.CARRY_ON
 
 
@@ -79,6 +82,8 @@ def decide(
         if reason != layout.CARRY_ON:
             return reason
         pump.now_ns = now_ns
+        if now_ns >= pump.change_ns:
+            return layout.CHANGE_DUE
         size_bytes = header.size_bytes
         if pump.leaving + 2 > len(memory.leaving):
             return layout.LEAVING_FULL
@@ -96,6 +101,8 @@ def decide(
             address = memory.in_vectors[pump.batch_next].base
             if pump.taps != 0:
                 report_arrival(memory, number, client_row, address, decision)
+            if pump.records != 0:
+                record_packet(memory, number, address, decision)
             if decision.release_ns != NEVER_NS:
                 _release(memory, state_like, number, client_row, address, decision, 0)
             if decision.copy_ns != NEVER_NS:
@@ -202,7 +209,8 @@ def _release(
         slot.counts = counts
         slot.fate = decision.fate
         pump.put += 1
-        push(memory, release_ns, pump.put, number)
+        # At equal times, datagrams leave in order of direction, then of arrival.
+        push(memory, release_ns, ((direction & 1) << 62) + pump.put, number)
         memory.clients[client].in_flight += 1
         return
     leaving = memory.leaving[pump.leaving]

@@ -21,8 +21,15 @@ _AF_INET = 2
 
 
 def has_room(memory: Memory, size_bytes: int) -> bool:
-    """Whether three events fit: arrival of a datagram, its departure, its copy's departure."""
+    """Whether three events fit: arrival of a datagram, its departure, its copy's departure.
+
+    If there is a record: also whether a row of each table fits.
+    """
     pump = memory.pump[0]
+    if pump.records != 0 and (
+        pump.packet_rows == len(memory.packets) or pump.release_rows == len(memory.releases)
+    ):
+        return False
     if pump.taps == 0:
         return True
     if pump.events + pump.leaving + 3 > len(memory.events):

@@ -6,22 +6,26 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from noack.protocol.record_tables import PACKET_HEAD_BYTES
+
 NAME_BYTES = 32  # room for a socket address; those of IPv6 have 28 bytes
 BLOCK_BYTES = 512  # payloads of delayed datagrams are kept in chained blocks of this size
 CHUNK_BLOCKS = 4096  # number of blocks per allocation
 MOST_BYTES = 65_536  # no received datagram is longer
 SLOT_STRIDE = MOST_BYTES + 256
 """Distance of receive buffers: their first bytes are in different cache sets."""
+SYS_EPOLL_PWAIT2 = 441  # on every architecture; libc has the function since glibc 2.35
 READY_WORDS = 3 if platform.machine() in ("x86_64", "AMD64") else 4
 """32-bit words in struct epoll_event, which is packed on x86-64 only."""
 
-# Why the pump returned; the last two occur within the pump only.
+# Why the pump returned; LEAVING_FULL and CARRY_ON occur within the pump only.
 HOUSEKEEPING = 0  # the time for housekeeping has come
 NEW_CLIENT = 1  # the current datagram is from a new client
 STORE_FULL = 2  # there is no room to store the current datagram
-EVENTS_FULL = 3  # the event buffer is full: pass the events to the taps
+EVENTS_FULL = 3  # a buffer of events or of record rows is full and must be emptied
 LEAVING_FULL = 4  # the list of departures is full and must be sent
 CARRY_ON = 5  # no reason to return
+CHANGE_DUE = 6  # other settings apply from the current datagram on
 
 # The socket that sends a direction's datagrams, and their destination.
 OWN_SOCKET = 0  # the client's socket, which is connected to the server
@@ -34,7 +38,8 @@ PUMP = np.dtype(
         ("epoll", "<i8"),
         ("epoch_ns", "<i8"),  # the monotonic clock at the relay's start
         ("unix_ns", "<i8"),  # Unix time at the relay's start
-        # Times count from the relay's start; these two never decrease.
+        ("speed", "<f8"),  # simulated time per time of the monotonic clock
+        # Times are simulated and count from the relay's start; these two never decrease.
         ("now_ns", "<i8"),  # arrival of the current datagram, or its release time
         ("read_ns", "<i8"),  # the last reading of the clock
         ("real_ns", "<i8"),  # offset of the real-time clock
@@ -61,6 +66,12 @@ PUMP = np.dtype(
         ("taps", "<i8"),  # 0: none, 1: without data, 2: with data
         ("events", "<i8"),
         ("data", "<i8"),
+        ("records", "<i8"),  # 1: write rows of the record
+        ("inputs", "<i8"),  # number of the next row of the record
+        ("first_number", "<i8"),  # number of the first packet in the record
+        ("packet_rows", "<i8"),  # rows written so far
+        ("release_rows", "<i8"),
+        ("change_ns", "<i8"),  # time from which other settings apply
         ("segment", "<i8"),  # 1: send datagrams of equal size as one message
         ("segment_below", "<i8"),  # the kernel does not segment datagrams of this size
         ("control_bytes", "<i8"),  # buffer for received control messages, 0: none
@@ -68,6 +79,20 @@ PUMP = np.dtype(
         ("spin_ns", "<i8"),  # time before a departure in which the pump does not sleep
     ]
 )
+PACKET_ROW = np.dtype(
+    [
+        *((name, "<i8") for name in (
+            "input", "sequence", "t_ns", "now_ns", "flow", "fate", "consecutive_losses",
+            "release_ns", "copy_ns", "bit", "size_bytes",
+        )),
+        ("head", "u1", (PACKET_HEAD_BYTES,)),
+    ]
+)  # fmt: skip
+"""A row of the record's table ``netem_packet``, byte for byte; numba has no type ``V``."""
+RELEASE_ROW = np.dtype(
+    [(name, "<i8") for name in ("input", "sequence", "t_ns", "now_ns", "flow", "copy", "stale")]
+)
+"""A row of the table ``netem_release``."""
 SOCKET = np.dtype(
     [("fd", "<i4"), ("error", "<i4"), ("head", "<i4"), ("tail", "<i4"), ("stamp", "<i8")]
 )
@@ -211,4 +236,6 @@ class Memory(NamedTuple):
     block_next: Array  # (k · CHUNK_BLOCKS,) int32
     events: Array
     data: Array  # (k,) uint8
+    packets: Array  # rows of the record
+    releases: Array
     integers: Array  # (1,) int32; only its type matters

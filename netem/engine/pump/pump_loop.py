@@ -3,8 +3,9 @@
 from netem.engine.pump import libc_calls as libc
 from netem.engine.pump import pump_layout as layout
 from netem.engine.pump.error_queue import take_errors
+from netem.engine.pump.pump_clock import relay_time_ns, wall_ns_of
 from netem.engine.pump.pump_decisions import decide, release_due
-from netem.engine.pump.pump_layout import READY_WORDS, Memory
+from netem.engine.pump.pump_layout import READY_WORDS, SYS_EPOLL_PWAIT2, Memory
 from netem.engine.pump.pump_send import send
 from noack.impairments.link_records import LinkMemory, LinkProgram, PacketDecision
 
@@ -51,14 +52,14 @@ def run_pump(
             pump.batch_next = 0
             pump.batch_end = 0
         if all_taken:
-            pump.read_ns = libc.clock_ns(libc.CLOCK_MONOTONIC, memory.time) - pump.epoch_ns
+            pump.read_ns = relay_time_ns(memory)
             wait_until_ns = until_ns
             if pump.read_ns >= until_ns:
                 if not _is_soon_due(memory, until_ns):
                     pump.ready = 0
                     pump.ready_next = 0
                     return layout.HOUSEKEEPING
-                wait_until_ns = pump.read_ns + _HOUSEKEEPING_NS
+                wait_until_ns = pump.read_ns + int(_HOUSEKEEPING_NS * pump.speed)
             if not _wait(memory, wait_until_ns):
                 return layout.HOUSEKEEPING
         if pump.ready_next < pump.ready:
@@ -70,24 +71,25 @@ def _is_soon_due(memory: Memory, until_ns: int) -> bool:
     pump = memory.pump[0]
     return (
         pump.heap > 0
-        and memory.heap[0].release_ns - pump.read_ns < _HOUSEKEEPING_NS
-        and pump.read_ns - until_ns < _MOST_PUT_OFF_NS
+        and memory.heap[0].release_ns - pump.read_ns < _HOUSEKEEPING_NS * pump.speed
+        and pump.read_ns - until_ns < _MOST_PUT_OFF_NS * pump.speed
     )
 
 
 def _wait(memory: Memory, until_ns: int) -> bool:
     """Wait for a datagram or the next release time; return False if a signal interrupted it."""
     pump = memory.pump[0]
-    wait_ns = until_ns - pump.read_ns
+    wait_ns = wall_ns_of(memory, until_ns - pump.read_ns)
     if pump.heap > 0:
-        wait_ns = max(min(wait_ns, memory.heap[0].release_ns - pump.spin_ns - pump.read_ns), 0)
+        due_ns = wall_ns_of(memory, memory.heap[0].release_ns - pump.read_ns)
+        wait_ns = max(min(wait_ns, due_ns - pump.spin_ns), 0)
     events = len(memory.ready) // READY_WORDS
     address = libc.address_of(memory.ready)
     memory.time[0] = wait_ns // _NS
     memory.time[1] = wait_ns % _NS
     if pump.sleeps == 0:
         found = libc.syscall(
-            libc.SYS_EPOLL_PWAIT2, pump.epoll, address, events, libc.address_of(memory.time), 0, 0
+            SYS_EPOLL_PWAIT2, pump.epoll, address, events, libc.address_of(memory.time), 0, 0
         )
     else:
         memory.poll[0] = pump.epoll
@@ -98,7 +100,7 @@ def _wait(memory: Memory, until_ns: int) -> bool:
     pump.ready = max(found, 0)
     pump.ready_next = 0
     if pump.ready == 0:
-        pump.read_ns = libc.clock_ns(libc.CLOCK_MONOTONIC, memory.time) - pump.epoch_ns
+        pump.read_ns = relay_time_ns(memory)
     return found >= 0
 
 
@@ -114,7 +116,7 @@ def _receive(memory: Memory) -> None:
     headers = libc.address_of(memory.in_headers) + begin * _HEADER_BYTES
     fd = memory.sockets[socket].fd
     taken = libc.recvmmsg(fd, headers, pump.slots_in - begin, libc.MSG_DONTWAIT, 0)
-    pump.read_ns = libc.clock_ns(libc.CLOCK_MONOTONIC, memory.time) - pump.epoch_ns
+    pump.read_ns = relay_time_ns(memory)
     if pump.stamps != 0:
         pump.real_ns = libc.clock_ns(libc.CLOCK_REALTIME, memory.time) - pump.read_ns
     if taken > 0:

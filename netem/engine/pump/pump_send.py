@@ -5,6 +5,7 @@ from netem.engine.pump import libc_calls as libc
 from netem.engine.pump import pump_layout as layout
 from netem.engine.pump.error_queue import take_errors
 from netem.engine.pump.payload_store import block_address, blocks_for, drop
+from netem.engine.pump.pump_clock import relay_time_ns
 from netem.engine.pump.pump_events import report_departure
 from netem.engine.pump.pump_layout import Memory
 
@@ -63,7 +64,7 @@ def send(memory: Memory) -> None:
                     memory.leaving[memory.out_first[k]].error = socket.error
             if done < headers:
                 following = memory.out_first[done]
-            now_ns = libc.clock_ns(libc.CLOCK_MONOTONIC, memory.time) - pump.epoch_ns
+            now_ns = relay_time_ns(memory)
             while number != following:
                 _account(memory, number, now_ns)
                 number = memory.leaving[number].next

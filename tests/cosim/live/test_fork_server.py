@@ -4,7 +4,7 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 import psutil
@@ -12,7 +12,6 @@ import pytest
 
 from cosim.live.fork_server import ForkedProcess, ForkServer
 from noack.core.errors import ExitStatus
-from noack.runtime.process_entry import TICKET_ON_STDIN
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the fork server is for Linux")
 PLANT = "plant_server.__main__"
@@ -20,7 +19,7 @@ PLANT = "plant_server.__main__"
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[ForkServer]:
-    with ForkServer({TICKET_ON_STDIN: "1"}) as server:
+    with closing(ForkServer()) as server:
         yield server
 
 
@@ -80,7 +79,7 @@ def test_the_server_has_one_thread_when_it_forks(server: ForkServer, tmp_path: P
 
 
 def test_a_server_that_has_died_is_an_error(tmp_path: Path) -> None:
-    with ForkServer({}) as server:
+    with closing(ForkServer()) as server:
         server._process.kill()
         server._process.wait()
         with (
@@ -91,6 +90,6 @@ def test_a_server_that_has_died_is_an_error(tmp_path: Path) -> None:
 
 
 def test_a_server_ends_with_its_launcher() -> None:
-    with ForkServer({}) as server:
+    with closing(ForkServer()) as server:
         server._socket.close()
         assert server._process.wait() == ExitStatus.OK

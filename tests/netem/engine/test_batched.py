@@ -138,16 +138,16 @@ def carry(old, before, program, state, latest_ns):
 """
 FIRST_START = """
 import tiny_pump
-from netem.engine import batched_clients, batched_directions, batched_engine, relay_base
-from netem.engine.compiled_rules import compile_rule
+from netem.engine import batched_clients, batched_engine, native_pump, relay_base
+from netem.engine.pump import pump_loop
 from netem.engine.engine_choice import open_relay
 from netem.engine.relay_interface import LinkSpec
 from noack.impairments.link_settings import LinkSettings
-for module in (batched_clients, batched_directions, batched_engine):
+for module in (batched_clients, batched_engine, pump_loop):
     vars(module).update(vars(tiny_pump))  # it compiles faster
 def checked(specs, open_links=relay_base.open_links):
     # A datagram to an open port would wait for the compilation.
-    assert specs[0].name == "none" or compile_rule(tiny_pump.run_pump).signatures
+    assert specs[0].name == "none" or native_pump.compiled_pump.cache_info().currsize
     return open_links(specs)
 relay_base.open_links = checked
 nothing = LinkSettings()

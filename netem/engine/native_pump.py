@@ -1,0 +1,46 @@
+"""The pump as compiled code, from the user's cache."""
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from netem.engine.batched_directions import BatchedDirection
+from netem.engine.compiled_rules import folder, prepare
+from netem.engine.object_code import NativeFunction, code_file, load, load_or_compile
+from netem.engine.pump_memory import PumpMemory
+from netem.rules.settings_change import carry
+from noack.impairments.link_records import PacketDecision, dtype_of
+from noack.impairments.link_settings import LinkSettings
+
+_NAME = "run_pump"
+
+
+@cache
+def kept_pump() -> NativeFunction | None:
+    """Return the pump if it has been compiled on this machine, else None."""
+    file = _file()
+    return None if file is None else load(file)
+
+
+@cache
+def compiled_pump() -> NativeFunction:
+    """Return the pump; compile it if that has not happened on this machine."""
+    from netem.engine.pump.pump_loop import run_pump
+
+    prepare()
+    return load_or_compile(_file(), run_pump, _examples)
+
+
+def _file() -> Path | None:
+    kept = folder()
+    return None if kept is None else code_file(kept, _NAME)
+
+
+def _examples() -> tuple[Any, ...]:
+    """Return arguments of the pump; only their types matter."""
+    memory = PumpMemory(1, segment=False, taps=0).memory
+    direction = BatchedDirection(LinkSettings(), 0, (), 0, memory, carry)
+    decisions = np.zeros(1, dtype_of(PacketDecision))
+    return memory, direction.program, direction.state, decisions, 0

@@ -1,0 +1,175 @@
+"""The compiled network of a run records and forwards the same as the machine that replays it."""
+
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from netem.duplex_link import network_of
+from netem.engine.compiled_network import CompiledNetwork
+from netem.engine.native_pump import compiled_pump
+from netem.link_machine import Datagram
+from noack.config.parameter_changes import ParameterChange
+from noack.config.resolution import resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import load
+from noack.core.clock import RunClock
+from noack.impairments.link_settings import LinkSettings
+from noack.protocol.loop_protocol import PROTOCOLS
+from noack.protocol.machine_interface import BEGINNING, Machine, Record, Start
+from tests.netem import any_settings
+from tests.netem.engine.relays import drain, endpoints, name_of
+
+NEVER_NS = 2**61
+Arrival = tuple[int, int, int]
+"""Time since the arrival before, size, and flow."""
+arrivals = st.lists(
+    st.tuples(
+        st.sampled_from([0, 1, 10_000, 1_000_000, 30_000_000]) | st.integers(0, 10**8),
+        st.sampled_from([0, 1, 8, 31, 32, 72, 1472, 9000]),
+        st.integers(0, 1),
+    ),
+    min_size=1, max_size=60,
+)  # fmt: skip
+
+
+DELAYING: Scenario = resolve(
+    load(
+        Path(__file__).parents[3] / "scenarios" / "lane_following.toml",
+        ['network.impairments=[{kind="delay", delay_s=0.02, jitter_s=0.02},'
+         ' {kind="duplicate", probability=0.3}]'],
+    )
+)  # fmt: skip
+
+
+class Both:
+    """Both machines; each input is given to both."""
+
+    def __init__(self, resolved: Any, start: Start, sockets: list[socket.socket]) -> None:
+        self.plain: Machine[Datagram] = network_of(resolved, start)
+        self.compiled: Any = CompiledNetwork(resolved, start, compiled_pump())
+        sender, self._sensor, self._controller, *receivers = sockets
+        peers = {name_of(self._sensor): receivers[0], name_of(self._controller): receivers[1]}
+        # A clock that stays far behind the times that the test passes.
+        clock = RunClock(time.monotonic_ns() + NEVER_NS)
+        self.compiled.open(clock, sender, peers, name_of(self._controller))
+        self._expected: dict[int, list[bytes]] = {0: [], 1: []}
+        self.rows: list[Record] = []
+
+    def arrive(self, data: bytes, flow: int, now_ns: int) -> None:
+        rows = self._release(now_ns)
+        rows += self._taken(self.plain.handle(Datagram(flow, data), now_ns))
+        self._compare(rows, self.compiled.handle(Datagram(flow, data), now_ns))
+
+    def let_out(self, now_ns: int) -> None:
+        self._compare(self._release(now_ns), self.compiled.on_timer(now_ns))
+
+    def announce(self, change: ParameterChange, now_ns: int) -> None:
+        machine: Any = self.plain
+        self._compare(machine.announce(change, now_ns), self.compiled.announce(change, now_ns))
+
+    def received(self) -> tuple[list[bytes], list[bytes]]:
+        """Return what the controller and the sensor should have received; check that they did."""
+        found = {0: drain(self._controller), 1: drain(self._sensor)}
+        assert {flow: [data for data, _ in found[flow]] for flow in found} == self._expected
+        return self._expected[0], self._expected[1]
+
+    def _release(self, now_ns: int) -> list[Any]:
+        rows = []
+        while (due_ns := self.plain.next_deadline_ns()) is not None and due_ns <= now_ns:
+            rows += self._taken(self.plain.on_timer(now_ns))
+        return rows
+
+    def _taken(self, outputs: Any) -> list[Any]:
+        for output in outputs:
+            if isinstance(output, Datagram):
+                self._expected[output.flow].append(output.data)
+        return [output for output in outputs if not isinstance(output, Datagram)]
+
+    def _compare(self, expected: Any, found: Any) -> None:
+        assert list(found) == list(expected)
+        assert self.compiled.next_deadline_ns() == self.plain.next_deadline_ns()
+        self.rows += expected
+
+
+@contextmanager
+def both(resolved: Any, start: Start = BEGINNING) -> Iterator[Both]:
+    with endpoints(*["127.0.0.1"] * 5) as sockets:
+        machines = Both(resolved, start, sockets)
+        with closing(machines.compiled):
+            yield machines
+
+
+def network(
+    forward: LinkSettings, reverse: LinkSettings, protocol: str, seed: int = 0
+) -> SimpleNamespace:
+    """Return what the machines read of a scenario."""
+    links = SimpleNamespace(link=forward, reverse=SimpleNamespace(link=reverse))
+    seeds = SimpleNamespace(loss=seed)
+    return SimpleNamespace(protocol=PROTOCOLS[protocol], network=links, seeds=seeds)
+
+
+@settings(max_examples=150)
+@given(
+    any_settings.harsh, any_settings.harsh, st.sampled_from(["none", "ack"]), arrivals,
+    st.integers(0, 2),
+)  # fmt: skip
+def test_any_arrivals_give_the_same_rows_and_datagrams(
+    forward: LinkSettings, reverse: LinkSettings, protocol: str, steps: list[Arrival], lives: int
+) -> None:
+    now_ns = 0
+    with both(network(forward, reverse, protocol), Start(generation=lives)) as machines:
+        for number, (gap_ns, size, flow) in enumerate(steps):
+            now_ns += gap_ns
+            if gap_ns % 3 == 1:
+                machines.let_out(now_ns - gap_ns // 2)
+            data = (number.to_bytes(4, "big") * (size // 4 + 1))[:size]
+            machines.arrive(data, flow if protocol == "ack" else 0, now_ns)
+        machines.let_out(NEVER_NS)
+        machines.received()
+    inputs = [record.row[0] for record in machines.rows]
+    assert inputs == list(range(inputs[0], inputs[0] + len(inputs)))
+
+
+@pytest.mark.parametrize("generation", [0, 1])
+@settings(max_examples=60)
+@given(
+    st.lists(
+        st.tuples(
+            st.integers(0, 10**9), st.integers(-10**8, 10**9),
+            st.sampled_from([
+                {"network.mansd": 1},
+                {"network.mansd": 0},
+                {"network.loss": {"model": "worst_case"}},
+                {"network.loss": {"model": "bernoulli", "probability": 0.7}},
+                {"network.mansd": 6, "network.loss": {"model": "lossless"}},
+            ]),
+        ),
+        max_size=4,
+    ),
+    arrivals,
+)  # fmt: skip
+def test_changes_during_the_run_apply_from_the_same_datagram_on(
+    generation: int, changes: list[tuple[int, int, dict[str, Any]]], steps: list[Arrival]
+) -> None:
+    """Some changes are announced too late."""
+    announcements = sorted(changes, key=lambda change: change[0])
+    now_ns, numbers = 0, iter(range(len(changes)))
+    with both(DELAYING, Start(generation=generation)) as machines:
+        for gap_ns, size, _ in steps:
+            now_ns += gap_ns
+            while announcements and announcements[0][0] <= now_ns:
+                announced_ns, ahead_ns, change = announcements.pop(0)
+                when_ns = max(announced_ns + ahead_ns, 0)
+                machines.let_out(now_ns)
+                machines.announce(ParameterChange(next(numbers), when_ns, change), now_ns)
+            machines.arrive(bytes(size), 0, now_ns)
+        machines.let_out(NEVER_NS)
+        machines.received()
