@@ -51,6 +51,7 @@ PUMP = np.dtype(
         ("batch_socket", "<i8"),
         ("batch_next", "<i8"),  # the current receive buffer
         ("batch_end", "<i8"),
+        ("loaded", "<i8"),  # a sum of what was loaded into the caches, so that it is loaded
         ("ready", "<i8"),  # number of sockets that are ready
         ("ready_next", "<i8"),
         ("stamp", "<i8"),
