@@ -1,4 +1,4 @@
-"""Loads the data of a batch's clients into the processor's caches, before their packets are decided.
+"""Loads the data of a batch's clients into the processor's caches before the decisions.
 
 Thousands of clients do not fit into the caches. One datagram after the other would wait for the
 memory at each of its clients' tables. Here the same loads of all datagrams wait together.

@@ -15,7 +15,9 @@ MOST_BYTES = 65_536  # no received datagram is longer
 SLOT_STRIDE = MOST_BYTES + 256
 """Distance of receive buffers: their first bytes are in different cache sets."""
 SYS_EPOLL_PWAIT2 = 441  # on every architecture; libc has the function since glibc 2.35
-READY_WORDS = 3 if platform.machine() in ("x86_64", "AMD64") else 4
+_ON_X86 = platform.machine() in ("x86_64", "AMD64")
+SYS_SENDTO = 44 if _ON_X86 else 206
+READY_WORDS = 3 if _ON_X86 else 4
 """32-bit words in struct epoll_event, which is packed on x86-64 only."""
 
 # Why the pump returned; LEAVING_FULL and CARRY_ON occur within the pump only.
