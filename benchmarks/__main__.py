@@ -19,6 +19,7 @@ from benchmarks import (
     simulation,
     startup,
 )
+from benchmarks._programs import provide
 from benchmarks._report import run
 
 MODULES = (
@@ -27,4 +28,5 @@ MODULES = (
 )  # fmt: skip
 
 if __name__ == "__main__":
+    provide()
     sys.exit(run([module.BENCHMARK for module in MODULES]))

@@ -13,18 +13,13 @@ from noack.runtime.signals import quiet_interrupt
 with quiet_interrupt():
     from netem.duplex_link import network_of
     from netem.engine.compiled_network import CompiledNetwork
-    from netem.engine.native_pump import kept_pump
+    from netem.engine.native_pump import NOT_COMPILED, kept_pump
     from netem.run_relay import CompiledShell, RelayShell
     from noack.core.errors import ExitStatus, NoackError
     from noack.runtime.command_line import Parser, failed, print_to_stderr
     from noack.runtime.peer_sockets import has_peer_sockets
     from noack.runtime.process_entry import add_options, join_run
     from noack.runtime.process_life import RunProcess
-
-NOT_COMPILED = (
-    "noack netem: relays by plain Python, which delays each datagram longer; "
-    "`noack netem --compile` prepares the compiled emulator once for the next runs"
-)
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:

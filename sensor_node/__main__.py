@@ -15,7 +15,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the sensor in the run that a recorder or launcher has opened."""
     return process_entry.main(
         "sensor",
-        lambda member: member.run_messages(sensor_of(member.scenario, member.start)),
+        lambda member: member.run_messages(lambda: sensor_of(member.scenario, member.start)),
         arguments,
     )
 

@@ -156,7 +156,7 @@ class Fidelity:
 
 def fidelity_for_summary(record: RunRecord) -> FidelityPart | NoFidelityPart:
     """The comparison for a run's summary, or the reason why there is none."""
-    if len(record[PLANT_STEP]) > _STEPS_AT_THE_END:
+    if record.count(PLANT_STEP) > _STEPS_AT_THE_END:
         return NoFidelityPart(reason="the run is long; `noack fidelity` compares it")
     try:
         return compute_fidelity(record, _EVENTS_AT_THE_END).summary()

@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cosim.analysis.claims.observed_conditions import AssumptionViolation
 from cosim.analysis.summary_model import AcknowledgementsPart, ViolationPart
@@ -13,7 +14,6 @@ from cosim.record.run_record import RunRecord
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
-    NO_SEQUENCE,
     PLANT_ACTUATION,
     PLANT_STEP,
     SENSOR_ACKNOWLEDGEMENT,
@@ -31,7 +31,7 @@ VIOLATION = "violation"
 
 def drops_by_cause(outcomes: PacketOutcome) -> dict[str, int]:
     """Return the number of lost updates by cause, without causes of no losses."""
-    fates = outcomes.rows["fate"]
+    fates = outcomes.fate
     causes = {one.name.lower(): int((fates == one).sum()) for one in Fate if not one.effective}
     causes["delivered_out_of_order"] = int((effective(fates) & outcomes.lost).sum())
     return {cause: n for cause, n in causes.items() if n}
@@ -41,37 +41,56 @@ def acknowledgements(record: RunRecord) -> AcknowledgementsPart:
     """The outcome of the acknowledgements; the controller sends one for each update."""
     outcomes = packet_outcomes(record, Flow.ACKNOWLEDGEMENT)
     return AcknowledgementsPart(
-        sent=len(record[CONTROLLER_DELIVERY]),
+        sent=record.count(CONTROLLER_DELIVERY),
         lost=int(outcomes.lost.sum()),
         longest_loss_burst=outcomes.longest_loss_burst(),
-        received=len(record[SENSOR_ACKNOWLEDGEMENT]),
+        received=record.count(SENSOR_ACKNOWLEDGEMENT),
     )
 
 
 def unintended_losses(record: RunRecord) -> dict[str, int]:
     """Return the number of datagrams lost without a decision of the emulator, by hop."""
-    sensor, outcomes = record[SENSOR_MEASUREMENT], packet_outcomes(record)
+    outcomes, events = packet_outcomes(record), record.events()["event"]
+    received = record.columns(CONTROLLER_DELIVERY, "sequence")["sequence"]
     every = record.scenario.plant.measure_every
-    sent = record[PLANT_STEP]["sequence"]
-    received = record[CONTROLLER_DELIVERY]["sequence"]
+    measured, actuated = _Unmatched(), _Unmatched()
+    for part in record.slices(PLANT_STEP, SENSOR_MEASUREMENT, CONTROLLER_STEP, PLANT_ACTUATION):
+        sent = part[PLANT_STEP]["sequence"]
+        measured.take(sent[sent % every == 0] // every, part[SENSOR_MEASUREMENT]["sequence"])
+        actuated.take(part[CONTROLLER_STEP]["sequence"], part[PLANT_ACTUATION]["sequence"])
     legs = {
-        "measurement": (sent[sent % every == 0] // every, sensor["sequence"]),
-        "update to netem": (sensor["event"][sensor["event"] != NO_SEQUENCE], outcomes.sequence),
-        "update to controller": (outcomes.sequence[outcomes.forwarded], received),
-        "actuation": (record[CONTROLLER_STEP]["sequence"], record[PLANT_ACTUATION]["sequence"]),
+        "measurement": measured,
+        "update to netem": _Unmatched().take(events, outcomes.sequence),
+        "update to controller": _Unmatched().take(outcomes.sequence[outcomes.forwarded], received),
+        "actuation": actuated,
     }
     if record.scenario.protocol.acknowledges:
         answers = packet_outcomes(record, Flow.ACKNOWLEDGEMENT)
-        arrived = record[SENSOR_ACKNOWLEDGEMENT]["sequence"]
-        legs["acknowledgement to netem"] = (received, answers.sequence)
-        legs["acknowledgement to sensor"] = (answers.sequence[answers.forwarded], arrived)
+        arrived = record.columns(SENSOR_ACKNOWLEDGEMENT, "sequence")["sequence"]
+        legs["acknowledgement to netem"] = _Unmatched().take(received, answers.sequence)
+        legs["acknowledgement to sensor"] = _Unmatched().take(
+            answers.sequence[answers.forwarded], arrived
+        )
     complete = all(record.reports.get(role, {}).get("ended") == HORIZON for role in LOOP_ROLES)
-    lost: dict[str, int] = {}
-    for leg, (out, arrived) in legs.items():
-        if not complete:  # a datagram in flight when a process ended is not lost
-            out = out[out <= arrived.max(initial=-1)]
-        lost[leg] = int(np.setdiff1d(out, arrived).size)
-    return lost
+    return {leg: one.count(complete=complete) for leg, one in legs.items()}
+
+
+class _Unmatched:
+    """Finds the sent numbers that were not received, part by part; both ascend."""
+
+    def __init__(self) -> None:
+        self._sent = np.zeros(0, np.int64)
+        self._newest = -1
+
+    def take(self, sent: NDArray[np.int64], arrived: NDArray[np.int64]) -> "_Unmatched":
+        """Add the next numbers; one is received in the same part as it is sent, or later."""
+        self._newest = max(self._newest, int(arrived.max(initial=-1)))
+        self._sent = np.setdiff1d(np.concatenate([self._sent, sent]), arrived)
+        return self
+
+    def count(self, *, complete: bool) -> int:
+        """Return how many were lost; in a run that was stopped, one in flight is not lost."""
+        return int((complete | (self._sent <= self._newest)).sum())
 
 
 def missing_rows(record: RunRecord) -> Counter[str]:

@@ -17,40 +17,32 @@ from cosim.analysis.loss_statistics import (
     reported_violations,
     unintended_losses,
 )
+from cosim.analysis.signal_statistics import SignalStatistics, disturbances, watchdog_actions
 from cosim.analysis.summary_model import (
     AssumptionPart,
     ChangePart,
-    DisturbancePart,
-    EstimationPart,
     ExitPart,
+    RehearsalPart,
     RestartPart,
     RunSummary,
-    WatchdogPart,
 )
 from cosim.analysis.timing_statistics import latency, lateness
-from cosim.record.align import AlignedRun, align_tables, identity_residual
 from cosim.record.divergence import Divergence, divergence
-from cosim.record.estimation_error import disturbance_summary, estimation_summary, true_states
 from cosim.record.packet_outcomes import packet_outcomes
 from cosim.record.recorded_changes import changes_of
-from cosim.record.run_record import Rows, RunRecord
+from cosim.record.run_record import RunRecord
 from netem.loss_prediction import predict
 from noack.config.runtime_parameters import text_of
 from noack.core.clock import NS_PER_S
 from noack.core.errors import ExitStatus
-from noack.core.linear_systems import row_norms
 from noack.protocol.machine_interface import FAILED, RESTART
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
-    NO_SEQUENCE,
-    PLANT_ACTUATION,
     PLANT_STEP,
-    SENSOR_MEASUREMENT,
     Fate,
 )
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.theory.assumptions import assumptions
-from plant_server.watchdog import too_old
 
 Summary = dict[str, Any]
 """The content of ``summary.json``: :class:`~cosim.analysis.summary_model.RunSummary` as JSON."""
@@ -78,7 +70,7 @@ def summarise(
     missing, lost, diverged = missing_rows(record), unintended_losses(record), _divergence(record)
     if exit_status == ExitStatus.OK and (why := _why_failed(record, missing, diverged)):
         exit_status, reason = ExitStatus.FAILED, why
-    joined = align_tables(record)
+    signals = SignalStatistics(record)
     return RunSummary(
         kind=record.kind,
         startup_s=startup_s,
@@ -87,9 +79,9 @@ def summarise(
         mansd=scenario.network.mansd,
         horizon_s=scenario.horizon_s,
         speed=scenario.speed,
-        reached_s=_last_s(record[PLANT_STEP]),
+        reached_s=_seconds(record.last_ns(PLANT_STEP)) or 0.0,
         **_transmissions(record),
-        **_signals(record, joined),
+        **signals.for_summary(),
         assumption_violations=reported_violations(record),
         assumptions=[AssumptionPart(**one._asdict()) for one in assumptions(scenario)],
         restarts=_restarts(record),
@@ -108,9 +100,14 @@ def summarise(
         realtime={
             role: report.get("realtime") or {} for role, report in record.reports.items() if live
         },
-        watchdog=_watchdog(record),
-        estimation=_estimation(record, joined),
-        disturbances=[DisturbancePart(**one) for one in disturbance_summary(record)],
+        rehearsals={
+            role: RehearsalPart(rehearsals=int(found["rehearsals"]), cpu_share=found["cpu_share"])
+            for role, report in record.reports.items()
+            if live and (found := report.get("rehearsal"))
+        },
+        watchdog=watchdog_actions(record),
+        estimation=signals.estimation(),
+        disturbances=disturbances(record),
         diverged_at_s=None if diverged is None else diverged.at_s,
         exit=ExitPart(status=int(exit_status), reason=reason),
     )
@@ -118,10 +115,8 @@ def summarise(
 
 def _transmissions(record: RunRecord) -> dict[str, Any]:
     """Counts and intervals of transmissions."""
-    scenario, sensor = record.scenario, record[SENSOR_MEASUREMENT]
-    outcomes = packet_outcomes(record)
-    deliveries = record[CONTROLLER_DELIVERY]
-    events = sensor[sensor["event"] != NO_SEQUENCE]
+    scenario, events, outcomes = record.scenario, record.events(), packet_outcomes(record)
+    deliveries = record.columns(CONTROLLER_DELIVERY, "t_ns", "dropouts")
     intervals_s = np.diff(events["t_ns"]) * 1e-9
     longest = int(deliveries["dropouts"].max(initial=0))
     return {
@@ -130,61 +125,13 @@ def _transmissions(record: RunRecord) -> dict[str, Any]:
         "drops": int(outcomes.lost.sum()),
         "loss_expected": None if scenario.changes else predict(scenario.network.link).rate,
         "drops_by_cause": drops_by_cause(outcomes),
-        "forced_deliveries": int((outcomes.rows["fate"] == Fate.FORCED).sum()),
+        "forced_deliveries": int((outcomes.fate == Fate.FORCED).sum()),
         "longest_loss_burst": max(outcomes.longest_loss_burst(), longest),
         "acknowledgements": acknowledgements(record) if scenario.protocol.acknowledges else None,
         "inter_event_min_s": _or_none(np.min, intervals_s),
         "inter_event_median_s": _or_none(np.median, intervals_s),
         "inter_delivery_median_s": _or_none(np.median, np.diff(deliveries["t_ns"]) * 1e-9),
     }
-
-
-def _signals(record: RunRecord, joined: AlignedRun) -> dict[str, Any]:
-    """Norms of the state, of the errors, and of the residual of (I1)."""
-    states = record[PLANT_STEP]["x"]
-    common = joined.since_delivery(record.scenario)
-    common_s, e_c_norm = joined.t_ns[common] * 1e-9, joined.e_c_norm[common]
-    residual = identity_residual(record, joined)
-    largest = _or_none(np.max, residual[~np.isnan(residual)])
-    scale = max(float(np.abs(joined.x_s).max(initial=0.0)), np.finfo(float).tiny)
-    return {
-        "initial_state_norm": float(row_norms(states[:1])[0]) if len(states) else None,
-        "final_state_norm": float(row_norms(states[-1:])[0]) if len(states) else None,
-        "sup_e_s_norm": _or_none(np.max, joined.e_s_norm),
-        "sup_e_c_norm": _or_none(np.max, e_c_norm),
-        "sup_e_c_at_s": _or_none(lambda e_c: common_s[np.argmax(e_c)], e_c_norm),
-        "identity_residual_max": largest,
-        "identity_residual_relative": None if largest is None else float(largest / scale),
-    }
-
-
-def _estimation(record: RunRecord, joined: AlignedRun) -> EstimationPart | None:
-    # ‖x_c − x‖_W with the plant's own x, from the controller's first update on
-    e_c = joined.x_c - true_states(record[PLANT_STEP], joined.t_ns)
-    norms = row_norms(e_c if record.loop.weight is None else e_c @ record.loop.weight.T)
-    norms = norms[np.isfinite(norms) & joined.since_delivery(record.scenario)]
-    found = estimation_summary(record, _or_none(np.max, norms))
-    return None if found is None else EstimationPart(**found)
-
-
-def _watchdog(record: RunRecord) -> WatchdogPart:
-    """Return the watchdog's actions (the newest actuation was too old) from the recorded steps."""
-    scenario, steps, received = record.scenario, record[PLANT_STEP], record[PLANT_ACTUATION]
-    found = np.searchsorted(received["sequence"], steps["actuation"])
-    there = np.append(received["sequence"], NO_SEQUENCE)[found] == steps["actuation"]
-    newest_ns = np.where(
-        steps["actuation"] != NO_SEQUENCE, np.append(received["t_ns"], 0)[found], 0
-    )
-    # If an actuation is not recorded, its age is unknown.
-    old = there & too_old(steps["t_ns"], newest_ns, scenario.timing.actuation_timeout_ns)
-    trips = np.flatnonzero(old & ~np.append(False, old[:-1]))
-    return WatchdogPart(
-        policy=scenario.plant.watchdog.policy,
-        timeout_s=scenario.timing.actuation_timeout_ns * 1e-9,
-        trips=len(trips),
-        first_s=float(steps["t_ns"][trips[0]]) * 1e-9 if len(trips) else None,
-        total_s=int(old.sum()) * scenario.timing.plant_period_ns * 1e-9,
-    )
 
 
 def _rejected(channel: Mapping[str, Any]) -> dict[str, int]:
@@ -210,8 +157,9 @@ def _why_failed(
 
 def _divergence(record: RunRecord) -> Divergence | None:
     scenarios = [record.scenario, *(made.scenario for made in changes_of(record))]
-    steps = record[PLANT_STEP]
-    found = divergence(steps["t_ns"] * 1e-9, steps["x"], scenarios)
+    batches = record.source.batches(PLANT_STEP, ("t_ns", "x"))
+    parts = ((steps["t_ns"] * 1e-9, steps["x"]) for steps in batches)
+    found = divergence(parts, record.count(PLANT_STEP), scenarios)
     for notice in record.notices:
         if found is not None and notice["level"] == FAILED:
             text = f"the plant failed at {found.at_s:g} s: {notice['text']}"
@@ -267,10 +215,6 @@ def _restarts(record: RunRecord) -> list[RestartPart]:
 
 def _seconds(t_ns: int | None) -> float | None:
     return None if t_ns is None else float(t_ns) * 1e-9
-
-
-def _last_s(rows: Rows) -> float:
-    return float(rows["t_ns"][-1]) * 1e-9 if len(rows) else 0.0
 
 
 def _or_none(statistic: Callable[..., Any], values: NDArray[np.float64]) -> float | None:

@@ -1,33 +1,43 @@
 """Lateness of the processes of a live run, in wall time."""
 
+from collections.abc import Iterable, Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.analysis.quantile_sketch import QuantileSketch
 from cosim.analysis.summary_model import LatencyPart, LatenessPart
 from cosim.record.packet_outcomes import packet_outcomes
 from cosim.record.run_record import RunRecord
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
-    NO_SEQUENCE,
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
 
+_STEPS = {"plant": PLANT_STEP, "sensor": SENSOR_MEASUREMENT, "controller": CONTROLLER_STEP}
 
-def lateness_us(record: RunRecord, role: str) -> NDArray[np.float64]:
-    """Wall time between a process's actions and their nominal times, (k,).
+
+def lateness_parts(record: RunRecord, role: str) -> Iterator[NDArray[np.float64]]:
+    """Yield the wall time between a process's actions and their nominal times in µs, in order.
 
     The nominal time is the deadline for plant and controller, the time of the measurement for the
     sensor, and the time of the event for the network.
     """
     if role == "netem":
         outcomes = packet_outcomes(record)
-        late_ns = outcomes.rows["now_ns"] - outcomes.event_ns
+        parts_ns: Iterable[NDArray[np.int64]] = [outcomes.now_ns - outcomes.event_ns]
     else:
-        steps = {"plant": PLANT_STEP, "sensor": SENSOR_MEASUREMENT, "controller": CONTROLLER_STEP}
-        late_ns = record[steps[role]]["now_ns"] - record[steps[role]]["t_ns"]
-    return np.asarray(late_ns / (1e3 * record.scenario.speed))
+        batches = record.source.batches(_STEPS[role], ("now_ns", "t_ns"))
+        parts_ns = (rows["now_ns"] - rows["t_ns"] for rows in batches)
+    for late_ns in parts_ns:
+        yield np.asarray(late_ns / (1e3 * record.scenario.speed))
+
+
+def lateness_us(record: RunRecord, role: str) -> NDArray[np.float64]:
+    """Return the lateness of all actions of a process, (k,)."""
+    return np.concatenate([np.zeros(0), *lateness_parts(record, role)])
 
 
 def lateness(record: RunRecord, role: str) -> LatenessPart:
@@ -39,9 +49,11 @@ def lateness(record: RunRecord, role: str) -> LatenessPart:
         "controller": timing.controller_period_ns,
         "netem": timing.plant_period_ns,
     }[role]
-    late_us = lateness_us(record, role)
-    late_steps = int((late_us * 1e3 * record.scenario.speed > period_ns).sum())
-    return LatenessPart(**_quantiles(late_us), steps=len(late_us), late_steps=late_steps)
+    sketch, late_steps = QuantileSketch(), 0
+    for late_us in lateness_parts(record, role):
+        sketch.add(late_us)
+        late_steps += int((late_us * 1e3 * record.scenario.speed > period_ns).sum())
+    return LatenessPart(**_quantiles(sketch), steps=sketch.count, late_steps=late_steps)
 
 
 def latency_us(record: RunRecord) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -50,8 +62,8 @@ def latency_us(record: RunRecord) -> tuple[NDArray[np.int64], NDArray[np.float64
     Returns:
         Event times in ns (d,) and latencies in µs (d,), of the delivered updates.
     """
-    sensor, deliveries = record[SENSOR_MEASUREMENT], record[CONTROLLER_DELIVERY]
-    events = sensor[sensor["event"] != NO_SEQUENCE]
+    events = record.events()
+    deliveries = record.columns(CONTROLLER_DELIVERY, "sequence", "now_ns")
     _, at_sensor, at_controller = np.intersect1d(
         events["event"], deliveries["sequence"], return_indices=True
     )
@@ -62,10 +74,11 @@ def latency_us(record: RunRecord) -> tuple[NDArray[np.int64], NDArray[np.float64
 def latency(record: RunRecord) -> LatencyPart:
     """Quantiles of the latency."""
     _, passed_us = latency_us(record)
-    return LatencyPart(**_quantiles(passed_us), updates=len(passed_us))
+    sketch = QuantileSketch()
+    sketch.add(passed_us)
+    return LatencyPart(**_quantiles(sketch), updates=len(passed_us))
 
 
-def _quantiles(times_us: NDArray[np.float64]) -> dict[str, float | None]:
+def _quantiles(sketch: QuantileSketch) -> dict[str, float | None]:
     shares = {"p50": 0.5, "p99": 0.99, "p999": 0.999, "max": 1.0}
-    known = len(times_us) > 0
-    return {key: float(np.quantile(times_us, q)) if known else None for key, q in shares.items()}
+    return {key: sketch.quantile(share) for key, share in shares.items()}

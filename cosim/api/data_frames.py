@@ -49,9 +49,9 @@ def events(record: RunRecord) -> pa.Table:
     sent = measurements[measurements["event"] != NO_SEQUENCE]
     t_s = _seconds(sent["t_ns"])
     crossed = packet_outcomes(record)
-    fates = np.array([fate.name.lower() for fate in Fate], dtype=object)[crossed.rows["fate"]]
+    fates = np.array([fate.name.lower() for fate in Fate], dtype=object)[crossed.fate]
     # The emulator forwarded them, but they were not delivered.
-    fates[effective(crossed.rows["fate"]) & crossed.lost] = _OUT_OF_ORDER
+    fates[effective(crossed.fate) & crossed.lost] = _OUT_OF_ORDER
     fates[crossed.in_flight] = _IN_FLIGHT
     known = dict(zip(crossed.sequence.tolist(), fates.tolist(), strict=True))
     columns = {

@@ -11,11 +11,13 @@ At each measurement time t:
 If a controller dies, there is no x_c until the restarted controller has its first update.
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.record.estimation_error import true_states
 from cosim.record.recorded_changes import model_flow_of
 from cosim.record.run_record import Rows, RunRecord
 from noack.config.resolution import LoopMatrices, loop_of
@@ -27,6 +29,7 @@ from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
     NO_SEQUENCE,
+    PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
 from noack.theory.identities import ModelDifference
@@ -210,35 +213,87 @@ def _at(
     return x_c, received
 
 
+class AlignedPart(NamedTuple):
+    """Consecutive measurements, aligned."""
+
+    rows: Rows
+    """Their rows of ``sensor_measurement``, (k,)."""
+    aligned: AlignedRun
+    true_x: Reals | None
+    """(k, n) the plant's own state, NaN where missing; None if the sensor measures it."""
+
+
+def aligned_parts(record: RunRecord) -> Iterator[AlignedPart]:
+    """Align a run part by part; a run without measurements has one empty part."""
+    scenario, loop, flow = record.scenario, record.loop, model_flow_of(record)
+    acknowledged = scenario.protocol.acknowledges
+    track = initial_track(scenario)
+    waiting = np.zeros(0, record.tables[SENSOR_MEASUREMENT])
+    steps = np.zeros(0, record.tables[PLANT_STEP])
+    reads_steps = not scenario.coverage.knows_state
+    tables = (SENSOR_MEASUREMENT, CONTROLLER_STEP, CONTROLLER_DELIVERY)
+
+    def part(rows: Rows, until_ns: int) -> AlignedPart:
+        aligned = join(loop, rows, track, until_ns, flow=flow, acknowledged=acknowledged)
+        true_x = true_states(steps, rows["t_ns"]) if reads_steps else None
+        return AlignedPart(rows, aligned, true_x)
+
+    for taken in record.slices(*tables, *((PLANT_STEP,) if reads_steps else ())):
+        # A later state of the controller proves that all states up to a time are there.
+        later = waiting["t_ns"] >= track.model_ns[-1]
+        ready = int(np.argmax(later)) if later.any() else len(waiting)
+        if ready:
+            yield part(waiting[:ready], int(track.model_ns[-1]))
+            last_ns = waiting["t_ns"][ready - 1]
+            keep = max(int(np.searchsorted(track.model_ns, last_ns, "right")) - 1, 0)
+            track, steps = track.since(keep), steps[steps["t_ns"] > last_ns]
+        waiting = np.concatenate([waiting[ready:], taken[SENSOR_MEASUREMENT]])
+        track = controller_track(track, taken[CONTROLLER_STEP], taken[CONTROLLER_DELIVERY])
+        if reads_steps:
+            steps = np.concatenate([steps, taken[PLANT_STEP]])
+    yield part(waiting, int(track.model_ns[-1]) + scenario.timing.controller_period_ns)
+
+
 def align_tables(record: RunRecord) -> AlignedRun:
-    """Align a whole run."""
-    steps = record[CONTROLLER_STEP]
-    track = controller_track(initial_track(record.scenario), steps, record[CONTROLLER_DELIVERY])
-    reach_ns = int(track.model_ns[-1]) + record.scenario.timing.controller_period_ns
-    acknowledged = record.scenario.protocol.acknowledges
-    return join(
-        record.loop, record[SENSOR_MEASUREMENT], track, reach_ns,
-        flow=model_flow_of(record), acknowledged=acknowledged,
-    )  # fmt: skip
+    """Align a whole run; for a long run, see :func:`aligned_parts`."""
+    parts = [one.aligned for one in aligned_parts(record)]
+    return (
+        parts[0] if len(parts) == 1 else AlignedRun(*map(np.concatenate, zip(*parts, strict=True)))
+    )
 
 
-def identity_residual(record: RunRecord, joined: AlignedRun) -> Reals:
-    """Return max |x_c − x_s − Σ e^{H(t−t_k)} e_s(t_k⁻)| at each measurement, (k,).
+class IdentityResidual:
+    """Computes max |x_c − x_s − Σ e^{H(t−t_k)} e_s(t_k⁻)| at the measurements of a run, in order.
 
     This is the residual of (I1). It is zero up to rounding on every run, for all losses. It is NaN
     if x_c is not recorded, and before the first delivery unless x(0) is known. In a run with
     acknowledgements all are NaN, since (I1) assumes that x_s is reset at every event.
     """
-    residual = np.full(len(joined.t_ns), np.nan)
-    if record.scenario.protocol.acknowledges:
-        return residual
-    missed = ModelDifference(loop_of(record.scenario).H)
-    common = in_common(record.scenario, joined)
-    for i, row in enumerate(record[SENSOR_MEASUREMENT]):
-        missed.advance_to(int(row["t_ns"]))
-        if row["event"] != NO_SEQUENCE:
-            missed.event(int(row["event"]), row["x_s"] - row["x"])
-        missed.received(int(joined.received[i]))
-        if common[i]:
-            residual[i] = np.max(np.abs(joined.x_c[i] - joined.x_s[i] - missed.total()))
-    return residual
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._scenario = scenario
+        self._missed = ModelDifference(loop_of(scenario).H)
+
+    @np.errstate(over="ignore", invalid="ignore")
+    def take(self, part: AlignedPart) -> Reals:
+        """Return the residuals at the next k measurements, (k,)."""
+        rows, aligned = part.rows, part.aligned
+        if self._scenario.protocol.acknowledges or not len(rows):
+            return np.full(len(rows), np.nan)
+        missed, e_s = self._missed, rows["x_s"] - rows["x"]
+        totals = []
+        fields = rows["t_ns"].tolist(), rows["event"].tolist(), aligned.received.tolist()
+        for t_ns, event, received, jump in zip(*fields, e_s, strict=True):
+            missed.advance_to(t_ns)
+            if event != NO_SEQUENCE:
+                missed.event(event, jump)
+            missed.received(received)
+            totals.append(missed.total())
+        residual = np.abs(aligned.x_c - aligned.x_s - np.array(totals)).max(axis=1)
+        return np.where(in_common(self._scenario, aligned), residual, np.nan)
+
+
+def identity_residual(record: RunRecord) -> Reals:
+    """Return the residual of (I1) at each measurement of a run, (k,)."""
+    residual = IdentityResidual(record.scenario)
+    return np.concatenate([residual.take(part) for part in aligned_parts(record)])

@@ -40,27 +40,40 @@ class Divergence(NamedTuple):
 
 
 @np.errstate(all="ignore")
-def divergence(t_s: Vector, x: Matrix, scenarios: Iterable[Scenario]) -> Divergence | None:
+def divergence(
+    parts: Iterable[tuple[Vector, Matrix]], count: int, scenarios: Iterable[Scenario]
+) -> Divergence | None:
     """Return the divergence of a run; None if the run did not diverge.
 
     Args:
-        t_s: times of the samples, (k,), ascending.
-        x: the plant's state, (k, n).
+        parts: times of the samples in s, (k,), ascending, and the plant's state, (k, n).
+        count: number of samples in all parts.
         scenarios: the resolved scenario, and the scenarios after each change of settings.
     """
-    lost = np.flatnonzero(~np.isfinite(x).all(axis=1))
-    if len(lost):
-        at_s = float(t_s[lost[0]])
-        return Divergence(at_s, f"diverged: x is not finite at {at_s:g} s")
-    if len(t_s) < _LEAST_SAMPLES:
+    tenth, seventh, ninth = (round(share * count) for share in (0.1, 0.7, 0.9))
+    early = middle = last = highest = 0.0
+    peaks: list[tuple[float, float]] = []  # each ‖x‖ above all before, with its time
+    place = 0
+    for t_s, x in parts:
+        lost = np.flatnonzero(~np.isfinite(x).all(axis=1))
+        if len(lost):
+            at_s = float(t_s[lost[0]])
+            return Divergence(at_s, f"diverged: x is not finite at {at_s:g} s")
+        norms = row_norms(x)
+        index = place + np.arange(len(norms))
+        early = float(norms[index < tenth].max(initial=early))
+        middle = float(norms[index < seventh].max(initial=middle))
+        last = float(norms[index >= ninth].max(initial=last))
+        before = np.maximum.accumulate(np.append(highest, norms))
+        above = np.flatnonzero(norms > before[:-1])
+        peaks += zip(t_s[above].tolist(), norms[above].tolist(), strict=True)
+        highest, place = float(before[-1]), place + len(norms)
+    if count < _LEAST_SAMPLES:
         return None
-    norms = row_norms(x)
-    tenth, seventh, ninth = (round(share * len(norms)) for share in (0.1, 0.7, 0.9))
-    scale = max(float(norms[:tenth].max()), *map(_scale, scenarios))
-    last = float(norms[ninth:].max())
-    if not scale or last <= max(GROWTH * scale, _STILL_GROWING * float(norms[:seventh].max())):
+    scale = max(early, *map(_scale, scenarios))
+    if not scale or last <= max(GROWTH * scale, _STILL_GROWING * middle):
         return None
-    at_s = float(t_s[np.argmax(norms > GROWTH * scale)])
+    at_s = next(t_s for t_s, size in peaks if size > GROWTH * scale)
     return Divergence(
         at_s,
         f"diverged: ‖x‖ passed {GROWTH * scale:.3g} ({GROWTH:g} times its expected size) at "

@@ -19,10 +19,11 @@ from noack.protocol.wire_format import Flow
 class PacketOutcome(NamedTuple):
     """The outcomes of k updates."""
 
-    rows: Rows
-    """Their rows of ``netem_packet``, (k,)."""
     sequence: NDArray[np.int64]
     event_ns: NDArray[np.int64]
+    now_ns: NDArray[np.int64]
+    """Time of arrival at the network emulator."""
+    fate: NDArray[np.int8]
     lost: NDArray[np.bool_]
     """Dropped, corrupted, or delivered out of order (stale)."""
     in_flight: NDArray[np.bool_]
@@ -44,17 +45,33 @@ class PacketOutcome(NamedTuple):
 
 def packet_outcomes(record: RunRecord, flow: Flow = Flow.UPDATE) -> PacketOutcome:
     """Return the outcomes of the updates or acknowledgements that reached the network emulator."""
-    rows, sequence, event_ns = updates_in(record[NETEM_PACKET], flow)
-    releases = record[NETEM_RELEASE]
-    if record.scenario.protocol.acknowledges:
-        direction = ACKNOWLEDGEMENTS if flow is Flow.ACKNOWLEDGEMENT else UPDATES
-        releases = releases[releases["flow"] == direction]
+    released = _released(record, flow)
+    parts = [_outcomes(rows, flow, *released) for rows in record.source.batches(NETEM_PACKET)]
+    parts.append(_outcomes(np.zeros(0, record.tables[NETEM_PACKET]), flow, *released))
+    return PacketOutcome(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def _released(record: RunRecord, flow: Flow) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the numbers of the delayed datagrams that left, with whether each was stale."""
+    direction = ACKNOWLEDGEMENTS if flow is Flow.ACKNOWLEDGEMENT else UPDATES
+    every = not record.scenario.protocol.acknowledges
+    releases = record.columns(
+        NETEM_RELEASE, "sequence", "flow", "copy", "stale",
+        where=lambda rows: np.full(len(rows), every) | (rows["flow"] == direction),
+    )  # fmt: skip
+    return 2 * releases["sequence"] + releases["copy"], releases["stale"] != 0
+
+
+def _outcomes(
+    packets: Rows, flow: Flow, forwarded: NDArray[np.int64], was_stale: NDArray[np.bool_]
+) -> PacketOutcome:
+    rows, sequence, event_ns = updates_in(packets, flow)
     # Of a datagram and its copy, the first intact one counts; it may be the copy.
     which = (rows["bit"] >= 0).astype(np.int64)
     numbers = 2 * rows["sequence"] + which
-    forwarded = 2 * releases["sequence"] + releases["copy"]
     effectively = effective(rows["fate"])
-    stale = np.isin(numbers, forwarded[releases["stale"] != 0])
+    stale = np.isin(numbers, forwarded[was_stale])
     delayed = np.where(which == 1, rows["copy_ns"], rows["release_ns"]) > rows["now_ns"]
     in_flight = effectively & delayed & ~np.isin(numbers, forwarded)
-    return PacketOutcome(rows, sequence, event_ns, ~effectively | stale, in_flight)
+    fate, lost = rows["fate"].astype(np.int8), ~effectively | stale
+    return PacketOutcome(sequence, event_ns, rows["now_ns"].copy(), fate, lost, in_flight)

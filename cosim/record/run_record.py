@@ -22,6 +22,7 @@ from cosim.record.record_source import (
     RowsInMemory,
     Slice,
     slices,
+    with_columns,
 )
 from cosim.record.record_source import Rows as Rows
 from cosim.record.run_directory import RECORD, REPORTS_FILE, SCENARIO_FILE, read_object
@@ -33,7 +34,7 @@ from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, MachineError, PeerError, why
 from noack.core.file_access import write_whole
 from noack.protocol.machine_interface import RESTART
-from noack.protocol.record_tables import OWNER
+from noack.protocol.record_tables import NO_SEQUENCE, OWNER, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.protocol.wire_format import VERSION, Flow, read_header
 from noack.runtime.control_messages import LogLine, ProcessReport, parse_message
@@ -42,6 +43,8 @@ from noack.runtime.telemetry import notices_of
 
 _NOTICES_FILE = "notices.jsonl"
 _EARLIER = "earlier"
+_COLUMNS = 6_000
+"""Columns of a whole run: short runs are not reduced, and figures have far fewer columns."""
 
 
 class _Notice(LogLine):
@@ -94,6 +97,33 @@ class RunRecord:
         """
         return slices(self.source, tables or [*self.tables], self._slice_ns)
 
+    def columns(
+        self, table: str, *names: str, where: Callable[[Rows], NDArray[np.bool_]] | None = None
+    ) -> Rows:
+        """Return some columns of a table, of all rows or of those that ``where`` selects.
+
+        For a long run, only tables of few rows and selections of few rows fit into memory.
+        """
+        batches = self.source.batches(table, names)
+        chosen = (rows if where is None else rows[where(rows)] for rows in batches)
+        empty = np.zeros(0, with_columns(self.tables[table], names))
+        found = [*(empty.dtype.names or ())]
+        return np.concatenate([empty, *(rows[found] for rows in chosen)])
+
+    def events(self) -> Rows:
+        """Return number, nominal and actual time of each event: ``event``, ``t_ns``, ``now_ns``."""
+        return self.columns(
+            SENSOR_MEASUREMENT, "event", "t_ns", "now_ns",
+            where=lambda rows: rows["event"] != NO_SEQUENCE,
+        )  # fmt: skip
+
+    def last_ns(self, table: str) -> int | None:
+        """Return the nominal time of the last row of a table; None if it has none."""
+        found = None
+        for rows in self.source.batches(table, ("t_ns",)):
+            found = int(rows["t_ns"][-1]) if len(rows) else found
+        return found
+
     def derived(self, scenario: Scenario, derive: Callable[[str, Rows], Rows]) -> "RunRecord":
         """Return a record with another scenario, and with rows derived from those of this one.
 
@@ -126,6 +156,11 @@ class RunRecord:
     def restarted(self) -> str | None:
         """A role whose process was restarted; None if there is none."""
         return next((role for role in LOOP_ROLES if len(self.life_numbers(role).begun) > 1), None)
+
+    @property
+    def slice_columns(self) -> int:
+        """Columns to which a figure may reduce a slice, so that the whole run has many enough."""
+        return max(_COLUMNS * BATCH_ROWS // max(self.count(PLANT_STEP), BATCH_ROWS), 1)
 
     @property
     def _slice_ns(self) -> int:

@@ -28,6 +28,7 @@ from noack.config.resolution import LoopMatrices
 from noack.core.errors import CallerError, one_line
 from noack.protocol.record_tables import OWNER, entry_names
 
+_GROUP_ROWS = 4 * BATCH_ROWS
 RowType = np.dtype[np.void]
 
 
@@ -136,7 +137,7 @@ def _read_group(path: Path, group: int, dtype: RowType) -> Rows:
 
 
 def write_table(path: Path, batches: Iterable[Rows], dtype: RowType, loop: LoopMatrices) -> None:
-    """Write a table's file from batches of rows, in row groups of ``BATCH_ROWS``.
+    """Write a table's file from batches of rows, in row groups of ``_GROUP_ROWS``.
 
     Raises:
         OSError: the file cannot be written.
@@ -156,17 +157,17 @@ def write_table(path: Path, batches: Iterable[Rows], dtype: RowType, loop: LoopM
 
 
 def _regrouped(batches: Iterable[Rows], dtype: RowType) -> Iterator[Rows]:
-    """Yield the same rows in batches of ``BATCH_ROWS``; only the last one may be shorter."""
+    """Yield the same rows in batches of ``_GROUP_ROWS``; only the last one may be shorter."""
     waiting: list[Rows] = []
     count = 0
     for batch in batches:
         waiting.append(batch)
         count += len(batch)
-        if count >= BATCH_ROWS:
+        if count >= _GROUP_ROWS:
             rows = np.concatenate(waiting)
-            whole = count - count % BATCH_ROWS
-            for first in range(0, whole, BATCH_ROWS):
-                yield rows[first : first + BATCH_ROWS]
+            whole = count - count % _GROUP_ROWS
+            for first in range(0, whole, _GROUP_ROWS):
+                yield rows[first : first + _GROUP_ROWS]
             waiting, count = [rows[whole:].copy()], count - whole
     if count:
         yield np.concatenate([np.zeros(0, dtype), *waiting])

@@ -19,7 +19,7 @@ import netem.engine.pump
 import netem.rules
 import noack.impairments
 from netem import relay_events
-from netem.engine import histogram
+from netem.engine import histogram, object_code
 from netem.rule_program import new_flow
 from noack.core import code_cache
 from noack.core.code_cache import cache_folder, compiler
@@ -125,7 +125,7 @@ def prepare(name: str = "netem", modules: tuple[ModuleType, ...] = ()) -> Path |
 @cache
 def folder(name: str = "netem", modules: tuple[ModuleType, ...] = ()) -> Path | None:
     """Return the cache folder, without loading the compiler; see :func:`prepare`."""
-    more = (*modules, relay_events, record_tables)
+    more = (*modules, relay_events, record_tables, object_code)
     sources = [*(path for _, path in _compiled_modules()), *(str(one.__file__) for one in more)]
     return cache_folder(name, map(Path, sources))
 

@@ -15,6 +15,11 @@ from noack.impairments.link_records import PacketDecision, dtype_of
 from noack.impairments.link_settings import LinkSettings
 
 _NAME = "run_pump"
+NOT_COMPILED = (
+    "noack netem: relays by plain Python, which delays each datagram longer; "
+    "`noack netem --compile` prepares the compiled emulator once for the next runs"
+)
+"""The line for a run before which the pump has not been compiled: compiling takes too long."""
 
 
 @cache
@@ -31,6 +36,12 @@ def compiled_pump() -> NativeFunction:
 
     prepare()
     return load_or_compile(_file(), run_pump, _examples)
+
+
+def is_pump_kept() -> bool:
+    """Whether :func:`kept_pump` may find it; this does not load the linker."""
+    kept = folder()
+    return kept is not None and next(kept.glob(f"{_NAME}-*"), None) is not None
 
 
 def _file() -> Path | None:

@@ -7,16 +7,14 @@ integer. Its code is kept as an object file for this kind of processor, which ll
 import ctypes
 import hashlib
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from noack.core.file_access import locked, write_whole
-
-_CODE_BYTES = 64 * 1024 * 1024
-_ENTRY = b"entry "
+from noack.core.code_cache import compiling_alone
+from noack.core.file_access import write_whole
 
 
 def code_file(folder: Path, name: str) -> Path:
@@ -43,7 +41,7 @@ class NativeFunction:
         import llvmlite.binding as llvm
 
         head, _, objects = code.partition(b"\n")
-        if not head.startswith(_ENTRY) or not objects:
+        if head[: len(_sum(objects))] != _sum(objects):  # LLVM ends the process at damaged code
             raise ValueError("not the object code of a function")
         llvm.initialize_native_target()
         llvm.initialize_native_asmprinter()
@@ -51,7 +49,7 @@ class NativeFunction:
         self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
         self._engine.add_object_file(llvm.ObjectFileRef.from_data(objects))
         self._engine.finalize_object()
-        address = self._engine.get_function_address(head.removeprefix(_ENTRY).decode())
+        address = self._engine.get_function_address(head[len(_sum(objects)) :].decode())
         kind = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)
         self._function = kind(address)
         self._result, self._error = ctypes.c_int64(), ctypes.c_void_p()
@@ -100,19 +98,17 @@ def load_or_compile(
         function: the function; numba must know the functions that it calls.
         arguments: returns arguments of the types that it will be called with.
     """
-    with ExitStack() as stack:
-        if file is not None:
-            if (kept := load(file)) is not None:
-                return kept
-            with suppress(OSError):  # without file locks every process compiles
-                stack.enter_context(locked(file.parent / ".lock", wait=True))
-            if (kept := load(file)) is not None:
-                return kept
+    if file is None:
+        return NativeFunction(compile_native(function, arguments()))
+    if (kept := load(file)) is not None:
+        return kept
+    with compiling_alone(file.parent / ".lock"):
+        if (kept := load(file)) is not None:
+            return kept
         code = compile_native(function, arguments())
-        if file is not None:
-            with suppress(OSError):
-                write_whole(file, code, make_folder=False)
-        return NativeFunction(code)
+        with suppress(OSError):
+            write_whole(file, code, make_folder=False)
+    return NativeFunction(code)
 
 
 def load(file: Path) -> NativeFunction | None:
@@ -146,7 +142,12 @@ def compile_native(function: Callable[..., Any], arguments: tuple[Any, ...]) -> 
     name = compiled.fndesc.llvm_func_name
     compiled.library.get_pointer_to_function(name)
     objects: Any = compiled.library._get_compiled_object()
-    return _ENTRY + bytes(name.encode()) + b"\n" + bytes(objects)
+    return _sum(objects) + bytes(name.encode()) + b"\n" + bytes(objects)
+
+
+def _sum(objects: bytes) -> bytes:
+    """Return a check sum of object code."""
+    return hashlib.blake2b(objects, digest_size=16).hexdigest().encode() + b" "
 
 
 def _unpacker(kinds: Any) -> Any:

@@ -127,13 +127,20 @@ def _one_at_a_time(compiling: Callable[[Any], Any], lock: Path) -> Callable[[Any
     """Allow one process to compile at a time; the others then read the cache."""
 
     def compile_alone(signature: Any) -> Any:
-        with ExitStack() as stack:
-            with suppress(OSError):  # without file locks every process compiles
-                stack.enter_context(locked(lock, wait=True))
-            with _to_the_end():
-                return compiling(signature)
+        with compiling_alone(lock):
+            return compiling(signature)
 
     return compile_alone
+
+
+@contextmanager
+def compiling_alone(lock: Path) -> Iterator[None]:
+    """Exclude other processes that compile for the same folder; delay Ctrl-C."""
+    with ExitStack() as stack:
+        with suppress(OSError):  # without file locks every process compiles
+            stack.enter_context(locked(lock, wait=True))
+        with _to_the_end():
+            yield
 
 
 @contextmanager

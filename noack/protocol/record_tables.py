@@ -57,7 +57,7 @@ class Fate(IntEnum):
         return self in (Fate.DELIVERED, Fate.FORCED)
 
 
-def effective(fates: NDArray[np.int64]) -> NDArray[np.bool_]:
+def effective(fates: NDArray[np.integer]) -> NDArray[np.bool_]:
     """Whether each datagram was effectively delivered, unless it is out of order (stale), (k,)."""
     return np.isin(fates, [fate for fate in Fate if fate.effective])
 

@@ -10,7 +10,7 @@ import signal
 import socket
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from itertools import chain, repeat
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, cast
@@ -38,6 +38,7 @@ from noack.runtime.life_cycle import HORIZON, LAUNCHER_GONE, Event, LifeCycle, S
 from noack.runtime.real_time_loop import Channel, run_loop
 from noack.runtime.real_time_settings import realtime
 from noack.runtime.record_handover import deliver_report, persisted_rows, spool_rows
+from noack.runtime.rehearsal import Rehearsal, can_rehearse
 from noack.runtime.signals import Signals
 from noack.runtime.telemetry import TelemetryBuffer
 from noack.runtime.udp_sockets import MessageSocket, bind
@@ -87,6 +88,7 @@ class RunProcess:
         self.replaces: str | None = None
         """Of a restarted process: how the one before it ended."""
         self.report: dict[str, Any] = {}
+        self._rehearsal: Rehearsal | None = None
 
     def request_admission(self) -> None:
         """Ask the coordinator for admission to the run.
@@ -133,36 +135,53 @@ class RunProcess:
             raise PeerError(self.life.reason) if self.life.reason else error from None
         return parse_message(answer, message)
 
-    def run_messages(self, machine: Machine[Message]) -> None:
-        """Run a machine of the loop's wire format with the process's route in the topology."""
-        route, ticket = ROUTES[self.role], self.ticket
-        decoder = Decoder(
-            route.receives,
-            self.scenario.message_sizes.entries(route.receives),
-            ticket.run_id,
-            ticket.key,
-            not_before_ns=self._admitted_ns,
-        )
-        encoder = Encoder(ticket.run_id, ticket.key)
-        protocol = self.scenario.protocol
+    def run_messages(self, new_machine: Callable[[], Machine[Message]]) -> None:
+        """Run a machine of the loop's wire format with the process's route in the topology.
+
+        Args:
+            new_machine: returns a new machine; another is made for rehearsals.
+        """
+        route, protocol = ROUTES[self.role], self.scenario.protocol
         acknowledged_by = protocol.acknowledged_by(self.role)
         acknowledges_to = protocol.acknowledgement_routes.get(self.role)
-        acknowledgements = Decoder(Flow.ACKNOWLEDGEMENT, 0, ticket.run_id, ticket.key)
 
         def channel(endpoint: socket.socket, addresses: Mapping[str, Address]) -> MessageSocket:
             by = addresses[acknowledged_by] if acknowledged_by else None
             return MessageSocket(
                 endpoint,
-                decoder,
-                encoder,
+                self._decoder(route.receives, not_before_ns=self._admitted_ns),
+                self._encoder(),
                 route.sends,
                 source=addresses[SENDER[self.role]],
                 destination=addresses[route.to],
-                acknowledgements=(acknowledgements, by) if by else None,
+                acknowledgements=(self._decoder(Flow.ACKNOWLEDGEMENT), by) if by else None,
                 acknowledges_to=addresses[acknowledges_to] if acknowledges_to else None,
             )
 
-        self.run(machine, channel)
+        with ExitStack() as stack:
+            if can_rehearse(self.role, self.scenario):
+                endpoint = stack.enter_context(closing(bind(0, "realtime.rehearse")))
+                own: Address = endpoint.getsockname()
+                copy = MessageSocket(
+                    endpoint, self._decoder(route.receives), self._encoder(), route.sends,
+                    source=own, destination=own,
+                )  # fmt: skip
+                entries = self.scenario.message_sizes.entries(route.receives)
+                self._rehearsal = stack.enter_context(
+                    closing(
+                        Rehearsal(new_machine(), copy, self._encoder(), route.receives, entries)
+                    )
+                )
+            self.run(new_machine(), channel)
+
+    def _encoder(self) -> Encoder:
+        return Encoder(self.ticket.run_id, self.ticket.key)
+
+    def _decoder(self, flow: Flow, *, not_before_ns: int = 0) -> Decoder:
+        entries = self.scenario.message_sizes.entries(flow) if flow != Flow.ACKNOWLEDGEMENT else 0
+        return Decoder(
+            flow, entries, self.ticket.run_id, self.ticket.key, not_before_ns=not_before_ns
+        )
 
     def run(self, machine: Machine[T], open_channel: OpenChannel[T]) -> None:
         """Join, drive the machine to the horizon, hand over the remaining rows, and report.
@@ -194,6 +213,7 @@ class RunProcess:
                     "pid": os.getpid(),
                     "ended": self.ended,
                     "realtime": applied,
+                    "rehearsal": self._rehearsal.report() if self._rehearsal else {},
                     "channel": channel.report(),
                     "rows": telemetry.totals(),
                     "generation": self.start.generation,
@@ -226,6 +246,7 @@ class RunProcess:
             end_ns=self.scenario.timing.horizon_ns + int(_GRACE_S * NS_PER_S * self.scenario.speed),
             stop=lambda: self.stopping,
             spin_us=self.scenario.realtime.spin_us,
+            rehearse=self._rehearsal,
             news=lambda now_ns: self._announce(changeable, now_ns, next(limits)),
         )
         reached_ns = self.clock.now_ns() - late_ns

@@ -22,7 +22,8 @@ T = TypeVar("T")
 _HOUSEKEEPING_S = 0.05
 _OVERLOAD_PAUSE_S = 0.002
 _OVERLOAD_SHARE = 0.9  # of CPU time in the time since the last housekeeping
-_QUIET_S = 0.0005  # housekeeping takes 0.1 ms; it waits when the next deadline is nearer than this
+_QUIET_S = 0.0005
+"""Housekeeping and rehearsals take 0.1 to 0.2 ms; they wait when the deadline is nearer."""
 _yield_core: Callable[[], None] = getattr(os, "sched_yield", lambda: None)
 """After a rejected datagram: lets other threads of the same real-time priority run first."""
 
@@ -90,19 +91,22 @@ def run_loop(
     end_ns: int | None,
     stop: Callable[[], bool],
     spin_us: float = 0.0,
+    rehearse: Callable[[], None] | None = None,
     news: Callable[[int], Sequence[Record | Notice]] = lambda now_ns: (),
 ) -> int:
     """Drive ``machine`` until simulated time ``end_ns`` (None: no end), or until ``stop()``.
 
     Every 50 ms of wall time ``stop`` is asked. Before the first step and every 50 ms, ``news``
     passes input from outside the socket to the machine and returns the machine's outputs. The
-    loop busy-waits for the last ``spin_us`` before a deadline.
+    loop busy-waits for the last ``spin_us`` before a deadline. It calls ``rehearse`` after a step
+    and after a message without an answer, unless a deadline is near.
 
     Returns:
         How late the machine's next deadline was at the end, in ns; 0 if it was not late.
     """
     kind = _SelfDrivenLoop if isinstance(machine, SelfDrivenMachine) else _Loop
     loop: _Loop[T] = kind(machine, channel, clock, telemetry, spin_us * 1e-6, news)
+    loop.rehearse = rehearse
     # Looked up once: after milliseconds of sleep the code runs cold, and every step counts.
     step, housekeeping_is_due = loop.step, loop.housekeeping_is_due
     while True:
@@ -132,6 +136,7 @@ class _Loop(Generic[T]):
         self._next_deadline_ns = machine.next_deadline_ns
         self._now_ns, self._wall_s_until = clock.now_ns, clock.wall_s_until
         self._spin_s = spin_s
+        self.rehearse: Callable[[], None] | None = None
         self._slept = False
         """Whether the loop has waited since the last housekeeping."""
         self._emit(news(clock.now_ns()))
@@ -147,6 +152,7 @@ class _Loop(Generic[T]):
         deadline_ns = self._next_deadline_ns()
         if deadline_ns is not None and self._now_ns() >= deadline_ns:
             self._emit(self._on_timer(self._now_ns()))
+            self._rehearse()
             wait_s = 0.0  # the socket is read between late steps, so that it never starves
         else:
             wait_s = self._housekeeping_s - time.monotonic()
@@ -159,20 +165,29 @@ class _Loop(Generic[T]):
         if readable:
             message = self._channel.receive(readable[0])
             if message is not None:
-                self._emit(self._handle(message, self._now_ns()))
+                sends = self._emit(self._handle(message, self._now_ns()))
+                if not sends:  # who receives it may wait for this core
+                    self._rehearse()
             else:
                 _yield_core()
         elif wait_s > 0:
             self._slept = True
+
+    def _rehearse(self) -> None:
+        if self.rehearse is not None and self._is_quiet():
+            self.rehearse()
+
+    def _is_quiet(self) -> bool:
+        """Whether no deadline is near."""
+        deadline_ns = self._next_deadline_ns()
+        return deadline_ns is None or self._wall_s_until(deadline_ns) > _QUIET_S
 
     def housekeeping_is_due(self) -> bool:
         """Whether its time has come and no deadline is near, or it is a whole period late."""
         overdue_s = time.monotonic() - self._housekeeping_s
         if overdue_s < 0:
             return False
-        deadline_ns = self._next_deadline_ns()
-        quiet = deadline_ns is None or self._wall_s_until(deadline_ns) > _QUIET_S
-        return quiet or overdue_s > _HOUSEKEEPING_S
+        return self._is_quiet() or overdue_s > _HOUSEKEEPING_S
 
     def do_housekeeping(self) -> None:
         """Look after the channel, pass news on, publish the rows."""
@@ -184,7 +199,9 @@ class _Loop(Generic[T]):
             # that keeps this process's connection to the control plane alive.
             time.sleep(_OVERLOAD_PAUSE_S)
 
-    def _emit(self, outputs: Sequence[T | Record | Notice]) -> None:
+    def _emit(self, outputs: Sequence[T | Record | Notice]) -> bool:
+        """Pass the outputs on; return whether one was a message."""
+        sends = False
         for output in outputs:
             if isinstance(output, Record):
                 self._telemetry.append(output)
@@ -192,6 +209,8 @@ class _Loop(Generic[T]):
                 self._telemetry.notice(output)
             else:
                 self._channel.send(output)
+                sends = True
+        return sends
 
 
 class _SelfDrivenLoop(_Loop[T]):

@@ -40,6 +40,7 @@ class ErrorMonitor:
         self._trigger = trigger
         self._propagate = Propagator(H)
         self._weight = np.eye(n) if trigger.weight is None else trigger.weight
+        self._is_unweighted = trigger.weight is None
         self._inverse = np.linalg.inv(self._weight)
         self._t_ns = 0
         # One entry per missing event, in order of the events:
@@ -68,6 +69,58 @@ class ErrorMonitor:
             identity + float(row_norms(self._jumps @ self._weight.T).sum()),
             self._threshold(t_ns) + float(growths @ self._thresholds),
         )
+
+    def samples(
+        self,
+        t_ns: NDArray[np.int64],
+        e_s: Matrix,
+        events: NDArray[np.int64],
+        received: NDArray[np.int64],
+    ) -> Matrix:
+        """Add k measurements as :meth:`sample` does; return both bounds, (k, 2)."""
+        found = np.zeros((len(t_ns), 2))
+        changes = [*np.flatnonzero(events >= 0).tolist(), len(t_ns)]
+        place = 0
+        for event in changes:
+            while place < event:
+                arrived = np.flatnonzero(received[place:event] >= self._oldest)
+                end = place + int(arrived[0]) if len(arrived) else event
+                if place < end:
+                    found[place:end] = self._stretch(t_ns[place:end], e_s[place:end])
+                if end < event:
+                    found[end] = self.sample(int(t_ns[end]), e_s[end], -1, int(received[end]))
+                place = end + 1
+            if event < len(t_ns):
+                number, newest = int(events[event]), int(received[event])
+                found[event] = self.sample(int(t_ns[event]), e_s[event], number, newest)
+            place = event + 1
+        return found
+
+    @property
+    def _oldest(self) -> int:
+        """The oldest missing event; without one, a number that no update has."""
+        return int(self._sequences[0]) if len(self._sequences) else 2**63 - 1
+
+    def _stretch(self, t_ns: NDArray[np.int64], e_s: Matrix) -> Matrix:
+        """Return the bounds at k measurements between which the missing events are the same."""
+        times_ns = t_ns.tolist()
+        weighted = e_s if self._is_unweighted else np.array([self._weight @ e for e in e_s])
+        identity = np.array([math.hypot(*e) for e in weighted.tolist()])
+        printed = np.array([self._threshold(one_ns) for one_ns in times_ns])
+        if missing := len(self._sequences):
+            jumps = []
+            for one_ns in times_ns:
+                self._jumps = self._propagate(self._jumps.T, one_ns - self._t_ns).T
+                self._t_ns = one_ns
+                jumps.append(self._jumps)
+            norms = row_norms(np.concatenate(jumps) @ self._weight.T)
+            identity += norms.reshape(-1, missing).sum(axis=1)
+            if isinstance(self._trigger, DecayingTrigger):
+                thens_ns = self._thens_ns.tolist()
+                growths = [[self._grown(one - then) for then in thens_ns] for one in times_ns]
+                printed += [float(row @ self._thresholds) for row in np.array(growths)]
+        self._t_ns = times_ns[-1]
+        return np.column_stack([identity, printed])
 
     def _append(self, event: int, e_s: Vector) -> None:
         self._sequences = np.append(self._sequences, event)

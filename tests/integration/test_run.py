@@ -201,7 +201,7 @@ def test_the_fates_depend_on_the_seed_only(record: RunRecord) -> None:
 
 def test_identity_i1_holds_to_rounding_at_every_sample(record: RunRecord) -> None:
     joined = align_tables(record)
-    residual = identity_residual(record, joined)
+    residual = identity_residual(record)
     in_common = joined.t_ns >= 0
     if record.scenario.network.initial_sync == "first_packet":
         in_common = joined.t_ns >= record["controller_delivery"]["model_t_ns"][0]

@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from cosim.analysis.claims.observed_conditions import Reals, VoidFrom, earliest
-from cosim.analysis.claims.run_evidence import RunEvidence
+from cosim.analysis.claims.run_evidence import RunEvidence, Samples
 from noack.core.linear_systems import row_norms
 from noack.theory.scenario_certificates import ScenarioCertificate
 
@@ -49,9 +49,9 @@ class ClaimDefinition:
     statement: str
     source: str
     assumes: str
-    bound: Callable[[RunEvidence], Bound | None]
-    """Returns the bound; None if there is no claim about this run."""
-    envelope: Callable[[RunEvidence], Envelope | None] = lambda run: None
+    bound: Callable[[RunEvidence, Samples], Bound | None]
+    """Returns the bound at some samples; None if there is no claim about this run."""
+    envelope: Callable[[RunEvidence, Samples], Envelope | None] = lambda run, samples: None
     needs_ideal_loop: bool = False
     """A run that exceeds the bound does not refute it."""
 
@@ -61,8 +61,10 @@ class CertifiedClaim:
     """A claim of a certificate; evaluated for each certificate of the scenario."""
 
     statement: str
-    bound: Callable[[RunEvidence, ScenarioCertificate], Bound | None]
-    envelope: Callable[[RunEvidence, ScenarioCertificate], Envelope | None] = lambda run, one: None
+    bound: Callable[[RunEvidence, Samples, ScenarioCertificate], Bound | None]
+    envelope: Callable[[RunEvidence, Samples, ScenarioCertificate], Envelope | None] = (
+        lambda run, samples, one: None
+    )
     assumes: str = "the conditions of the certificate"
 
 
@@ -74,22 +76,23 @@ def upper_shares(observed: Reals, bound: Reals) -> Reals:
 
 def controller_error_bound(
     run: RunEvidence,
+    samples: Samples,
     formula: str,
     values: Reals,
     constant: float | None = None,
     void: VoidFrom | None = None,
 ) -> Bound:
     """Return a bound of ‖e_c‖_W at the measurements, (k,); it is void from a record's first gap."""
-    here = run.in_common
+    here = samples.in_common
     # Allow for the rounding of x, which matters for a bound of that size.
-    slack = ROUNDING * row_norms(run.joined.x[here])
-    shares = upper_shares(run.joined.e_c_norm[here], values[here] + slack)
-    return Bound(formula, run.t_s[here], shares, earliest([void, run.first_gap]), constant)
+    slack = ROUNDING * row_norms(samples.joined.x[here])
+    shares = upper_shares(samples.joined.e_c_norm[here], values[here] + slack)
+    return Bound(formula, samples.t_s[here], shares, earliest([void, run.first_gap]), constant)
 
 
-def inter_event_bound(run: RunEvidence, least_s: float, void: VoidFrom | None) -> Bound:
+def inter_event_bound(samples: Samples, least_s: float, void: VoidFrom | None) -> Bound:
     """Return a lower bound of the inter-event time."""
-    t_s, passed_s = run.inter_event_s
+    t_s, passed_s = samples.inter_event_s
     formula = "t_(i+1) − t_i ≥ {:.4g} s"
     return Bound(formula, t_s, least_s / passed_s, void, least_s, is_lower=True)
 

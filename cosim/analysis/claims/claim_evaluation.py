@@ -3,6 +3,8 @@
 import importlib
 import math
 import pkgutil
+from collections.abc import Iterator
+from functools import cache
 from typing import TypeVar
 
 import numpy as np
@@ -16,9 +18,10 @@ from cosim.analysis.claims.claim_definition import (
     Envelope,
 )
 from cosim.analysis.claims.observed_conditions import VoidFrom
-from cosim.analysis.claims.run_evidence import RunEvidence
+from cosim.analysis.claims.run_evidence import RunEvidence, Samples
 from cosim.analysis.summary_model import Claim, ClaimVerdict
-from noack.theory.scenario_certificates import OWN_PLANT, ScenarioCertificate, outside_box
+from cosim.record.decimate import decimate
+from noack.theory.scenario_certificates import OWN_PLANT, outside_box
 
 _IDEAL_LOOP = (
     "assumes a continuous trigger, and a network and input without delay, which no sampled loop has"
@@ -27,9 +30,11 @@ _ACKNOWLEDGED = (
     'network.protocol = "ack": x_s is reset when an update is acknowledged, and not at every '
     "event as (I1), and every claim that follows from it, assumes"
 )
+_CERTIFIED = "certificate "
 _Kind = TypeVar("_Kind", ClaimDefinition, CertifiedClaim)
 
 
+@cache
 def definitions(kind: type[_Kind]) -> list[_Kind]:
     """Return the claims ``CLAIM`` of a kind in the files of ``catalogue/``, in alphabetical order.
 
@@ -50,37 +55,69 @@ def void_claim(
     )  # fmt: skip
 
 
-def check(
-    bound: Bound, statement: str, source: str, until_s: float = math.inf, unmet: str = ""
-) -> Claim:
-    """Check a run against a bound up to the end of the claim.
+class ClaimCheck:
+    """Checks a run against a bound, part by part, up to the end of the claim.
 
     If the run cannot meet an assumption, ``unmet`` names it.
     """
-    void = bound.void if bound.void is not None and bound.void.t_s < until_s else None
-    end_s = until_s if void is None else void.t_s
-    t_s, shares = bound.t_s[bound.t_s < end_s], bound.shares[bound.t_s < end_s]
-    exceeded = np.flatnonzero(~(shares <= 1 + ROUNDING))
-    ratio = float(shares.max()) if len(shares) else None
-    why = unmet
-    if len(exceeded):
-        verdict = ClaimVerdict.NOT_APPLICABLE if unmet else ClaimVerdict.VIOLATED
-        since_s: float | None = float(t_s[exceeded[0]])
-    elif void is not None:
-        verdict, since_s = ClaimVerdict.VOID, void.t_s
-        why = "; ".join(filter(None, [unmet, void.why]))
-    else:
-        verdict, since_s = ClaimVerdict.HELD, None
-    observed, constant = None, bound.constant
-    if constant is not None and ratio is not None:
-        observed = constant * ratio
-        if bound.is_lower:
-            observed = constant / ratio if ratio else None
-    formula = bound.formula if constant is None else bound.formula.format(constant)
-    return Claim(
-        what=statement, source=source, bound=formula, certified=constant, observed=observed,
-        ratio=ratio, verdict=verdict, since_s=since_s, why=why, from_s=0.0, until_s=None,
-    )  # fmt: skip
+
+    def __init__(
+        self, statement: str, source: str, until_s: float = math.inf, unmet: str = ""
+    ) -> None:
+        self._statement, self._source, self._until_s, self._unmet = (
+            statement, source, until_s, unmet
+        )  # fmt: skip
+        self._ratio: float | None = None
+        self._exceeded_s: float | None = None
+        self._bound: Bound | None = None
+
+    def add(self, bound: Bound) -> None:
+        """Add the bound at the next samples; formula and constants are the same in every part."""
+        self._bound = bound
+        before_end = bound.t_s < self._end_s
+        t_s, shares = bound.t_s[before_end], bound.shares[before_end]
+        if not len(shares):
+            return
+        largest = float(shares.max())
+        self._ratio = largest if self._ratio is None else float(np.maximum(self._ratio, largest))
+        exceeded = np.flatnonzero(~(shares <= 1 + ROUNDING))
+        if len(exceeded) and self._exceeded_s is None:
+            self._exceeded_s = float(t_s[exceeded[0]])
+
+    @property
+    def _void(self) -> VoidFrom | None:
+        """The violated assumption that ends the claim early."""
+        assert self._bound is not None
+        void = self._bound.void
+        return void if void is not None and void.t_s < self._until_s else None
+
+    @property
+    def _end_s(self) -> float:
+        return self._until_s if (void := self._void) is None else void.t_s
+
+    def result(self) -> Claim:
+        """Return the claim with its verdict, after the last part."""
+        bound, void, why, ratio = self._bound, self._void, self._unmet, self._ratio
+        assert bound is not None
+        since_s = self._exceeded_s
+        if since_s is not None:
+            verdict = ClaimVerdict.NOT_APPLICABLE if self._unmet else ClaimVerdict.VIOLATED
+        elif void is not None:
+            verdict, since_s = ClaimVerdict.VOID, void.t_s
+            why = "; ".join(filter(None, [self._unmet, void.why]))
+        else:
+            verdict = ClaimVerdict.HELD
+        observed, constant = None, bound.constant
+        if constant is not None and ratio is not None:
+            observed = constant * ratio
+            if bound.is_lower:
+                observed = constant / ratio if ratio else None
+        formula = bound.formula if constant is None else bound.formula.format(constant)
+        return Claim(
+            what=self._statement, source=self._source, bound=formula, certified=constant,
+            observed=observed, ratio=ratio, verdict=verdict, since_s=since_s, why=why, from_s=0.0,
+            until_s=None,
+        )  # fmt: skip
 
 
 class ClaimEvaluation(RunEvidence):
@@ -88,43 +125,73 @@ class ClaimEvaluation(RunEvidence):
 
     def judge(self) -> list[Claim]:
         """Return every claim with its verdict."""
-        if not len(self.joined.t_ns) or not self.in_common.any():
+        if not self.facts.any_in_common:
             return []
         if self.record.scenario.protocol.acknowledges:
             what = "x_c − x_s is the sum of the missed jumps"
             return [void_claim(what, "(I1)", 0.0, _ACKNOWLEDGED)]
-        found: list[Claim] = []
-        for claim in definitions(ClaimDefinition):
-            if (bound := claim.bound(self)) is not None:
-                unmet = _IDEAL_LOOP if claim.needs_ideal_loop else ""
-                found.append(check(bound, claim.statement, claim.source, self.part.until_s, unmet))
-        for certificate in self.certificates:
-            found += self._certified(certificate)
+        checks: dict[str, ClaimCheck] = {}
+        for samples in self.samples():
+            for key, check, bound in self._bounds(samples):
+                checks.setdefault(key, check).add(bound)
+        found = [checks[key].result() for key in checks if not key.startswith(_CERTIFIED)]
+        for i, certificate in enumerate(self.certificates):
+            if certificate.constants is None:
+                what = f"a certificate for {certificate.scope}"
+                found.append(void_claim(what, certificate.source, 0.0, certificate.void or ""))
+            mine = f"{_CERTIFIED}{i} "
+            found += [checks[key].result() for key in checks if key.startswith(mine)]
         return found
 
-    def _certified(self, certificate: ScenarioCertificate) -> list[Claim]:
-        source = certificate.source
-        if certificate.constants is None:
-            what = f"a certificate for {certificate.scope}"
-            return [void_claim(what, source, 0.0, certificate.void or "")]
-        outside = outside_box(self.record.scenario) if certificate.scope != OWN_PLANT else None
-        found = []
-        for claim in definitions(CertifiedClaim):
-            if (bound := claim.bound(self, certificate)) is not None:
-                if outside is not None:
-                    bound = bound._replace(void=VoidFrom(0.0, outside))
-                found.append(check(bound, claim.statement, source, self.part.until_s))
-        return found
+    def _bounds(self, samples: Samples) -> Iterator[tuple[str, ClaimCheck, Bound]]:
+        """Yield each claim's name, a new check, and its bound at some samples."""
+        until_s = self.part.until_s
+        for number, claim in enumerate(definitions(ClaimDefinition)):
+            if (bound := claim.bound(self, samples)) is not None:
+                unmet = _IDEAL_LOOP if claim.needs_ideal_loop else ""
+                check = ClaimCheck(claim.statement, claim.source, until_s, unmet)
+                yield f"{number}", check, bound
+        for i, certificate in enumerate(self.certificates):
+            if certificate.constants is None:
+                continue
+            scenario = self.record.scenario
+            outside = outside_box(scenario) if certificate.scope != OWN_PLANT else None
+            for number, one in enumerate(definitions(CertifiedClaim)):
+                if (bound := one.bound(self, samples, certificate)) is not None:
+                    if outside is not None:
+                        bound = bound._replace(void=VoidFrom(0.0, outside))
+                    check = ClaimCheck(one.statement, certificate.source, until_s)
+                    yield f"{_CERTIFIED}{i} {number}", check, bound
 
     def envelopes(self) -> list[Envelope]:
-        """The curves of all bounds."""
+        """The curves of all bounds; those of a long run are thinned."""
         if self.record.scenario.protocol.acknowledges:
             return []
-        found = [
-            claim.envelope(self, certificate)
-            for certificate in self.certificates
-            if certificate.constants is not None
-            for claim in definitions(CertifiedClaim)
+        curves: dict[str, list[Envelope]] = {}
+        columns = self.record.slice_columns
+        for samples in self.samples():
+            for key, envelope in self._envelopes(samples):
+                if envelope.quantity == "inter_event":  # the same line in every part
+                    curves.setdefault(key, [envelope])
+                    continue
+                keep = decimate(envelope.t_s, envelope.values, columns)
+                thin = envelope._replace(t_s=envelope.t_s[keep], values=envelope.values[keep])
+                curves.setdefault(key, []).append(thin)
+        return [
+            parts[0]._replace(
+                t_s=np.concatenate([one.t_s for one in parts]),
+                values=np.concatenate([one.values for one in parts]),
+            )
+            for parts in curves.values()
         ]
-        found += [claim.envelope(self) for claim in definitions(ClaimDefinition)]
-        return [envelope for envelope in found if envelope is not None]
+
+    def _envelopes(self, samples: Samples) -> Iterator[tuple[str, Envelope]]:
+        for i, certificate in enumerate(self.certificates):
+            if certificate.constants is None:
+                continue
+            for number, one in enumerate(definitions(CertifiedClaim)):
+                if (envelope := one.envelope(self, samples, certificate)) is not None:
+                    yield f"{_CERTIFIED}{i} {number}", envelope
+        for number, claim in enumerate(definitions(ClaimDefinition)):
+            if (envelope := claim.envelope(self, samples)) is not None:
+                yield f"{number}", envelope

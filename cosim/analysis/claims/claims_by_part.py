@@ -97,6 +97,9 @@ class RunClaims:
     @property
     def conditions(self) -> dict[str, float | None]:
         """Largest observed value of each condition, over the whole run."""
+        first = self.parts[0]
+        if isinstance(first, ClaimEvaluation) and first.record is self._judged:
+            return first.conditions
         return ClaimEvaluation(self._judged).conditions
 
     def violations(self) -> list[AssumptionViolation]:
@@ -140,9 +143,12 @@ class RunClaims:
     def _after(self, made: RecordedChange, until_ns: int) -> ClaimEvaluation | Claim:
         """The claims about the part of the run that follows a change."""
         record = self._judged
-        deliveries = record[CONTROLLER_DELIVERY]
-        after = deliveries[deliveries["t_ns"] >= made.everywhere_ns]
-        after = after[np.isin(after["sequence"], record[SENSOR_MEASUREMENT]["event"])]
+        known = record.events()["event"]
+        after = record.columns(
+            CONTROLLER_DELIVERY, "t_ns", "sequence",
+            where=lambda rows: rows["t_ns"] >= made.everywhere_ns,
+        )  # fmt: skip
+        after = after[np.isin(after["sequence"], known)]
         if made.everywhere_ns == NEVER_NS:
             return _nothing_after(made, until_ns, "not every process received the change")
         if not len(after) or after["t_ns"][0] >= until_ns:
@@ -188,9 +194,8 @@ def _part_of(
     setpoint = setpoint_of(scenario)
     loop = loop_of(scenario)
     x_r, u_r = (np.zeros(loop.n), np.zeros(loop.m)) if setpoint is None else setpoint
-    rows: dict[str, Rows] = {}
-    for table in record.tables:
-        part = record[table]
+
+    def derive(table: str, part: Rows) -> Rows:
         if table in SETTINGS:
             part = part[:0]
         elif table in (SENSOR_MEASUREMENT, PLANT_STEP, CONTROLLER_STEP):
@@ -199,13 +204,14 @@ def _part_of(
             part = part[part["now_ns"] >= origin_ns]
         elif table == CONTROLLER_DELIVERY and sequence is not None:
             part = part[part["sequence"] >= sequence]
-        rows[table] = _shifted(part, origin_ns, x_r, u_r)
-    sensor = rows[SENSOR_MEASUREMENT]
-    if sequence is not None and len(sensor):  # the state before the reset belongs to the last part
-        sensor["x_s"][0] = sensor["x"][0]
-        sensor["e_s_norm"][0] = sensor["compared"][0] = 0.0
-        rows[CONTROLLER_DELIVERY]["dropouts"][:1] = 0
-    x_0 = sensor["x"][0] if len(sensor) else np.array(scenario.plant.initial_state) - x_r
+        rows = _shifted(part, origin_ns, x_r, u_r)
+        if sequence is not None:  # the state before the reset belongs to the last part
+            _begin(table, rows, sequence)
+        return rows
+
+    batches = record.source.batches(SENSOR_MEASUREMENT)
+    first = next(filter(len, (derive(SENSOR_MEASUREMENT, rows) for rows in batches)), None)
+    x_0 = np.array(scenario.plant.initial_state) - x_r if first is None else first["x"][0]
     update = {
         "plant": scenario.plant.model_copy(update={"initial_state": tuple(x_0.tolist())}),
         "controller": scenario.controller.model_copy(update={"setpoint": None}),
@@ -218,8 +224,17 @@ def _part_of(
         faded = math.exp(-trigger.alpha_per_s * origin_ns / NS_PER_S)
         beta = max(trigger.beta * faded, _LEAST_BETA)
         update["trigger"] = trigger.model_copy(update={"beta": beta})
-    own = scenario.model_copy(update=update)
-    return RunRecord(own, rows, record.notices, record.reports, record.kind, record.earlier)
+    return record.derived(scenario.model_copy(update=update), derive)
+
+
+def _begin(table: str, rows: Rows, sequence: int) -> None:
+    """Change the row of the event at which a part of a run begins: it has no error before it."""
+    if table == SENSOR_MEASUREMENT:
+        first = np.flatnonzero(rows["t_ns"] == 0)[:1]
+        rows["x_s"][first] = rows["x"][first]
+        rows["e_s_norm"][first] = rows["compared"][first] = 0.0
+    elif table == CONTROLLER_DELIVERY:
+        rows["dropouts"][rows["sequence"] == sequence] = 0
 
 
 def _shifted(rows: Rows, origin_ns: int, x_r: Vector, u_r: Vector) -> Rows:
@@ -240,18 +255,29 @@ def _start_error(own: RunRecord, started_s: float) -> float:
     u is constant within a step. So ‖u − Kx‖ is at most the larger of its values at both ends, plus
     a term for the curvature of x: Δt²/8 sup‖K A ẋ‖, with ẋ = e^{As}(Ax + Bu).
     """
-    loop, steps = own.loop, own[PLANT_STEP]
-    steps = steps[: int(np.searchsorted(steps["t_ns"] * 1e-9, started_s)) + 1]
-    if len(steps) < 2:
-        return 0.0
+    trigger = own.scenario.trigger
+    alpha = trigger.alpha_per_s if isinstance(trigger, DecayingSettings) else 0.0
+    largest, last = 0.0, np.zeros(0, own.tables[PLANT_STEP])
+    for batch in own.source.batches(PLANT_STEP):
+        steps = np.concatenate([last, batch])
+        ended = int(np.searchsorted(steps["t_ns"] * 1e-9, started_s)) + 1
+        if len(steps[:ended]) > 1:
+            largest = max(largest, _input_error(own, steps[:ended], alpha))
+        if ended < len(steps):
+            break
+        last = steps[-1:]
+    return largest
+
+
+def _input_error(own: RunRecord, steps: Rows, alpha_per_s: float) -> float:
+    """Return the bound of ‖u − Kx‖ e^{αt} over at least two steps."""
+    loop = own.loop
     x, u, dt_s = steps["x"], steps["u"][:-1], own.scenario.timing.plant_period_ns * 1e-9
     ends = np.maximum(row_norms(u - x[:-1] @ loop.K.T), row_norms(u - x[1:] @ loop.K.T))
     speed = x[:-1] @ loop.A.T + u @ loop.B.T
     grown = math.exp(min(float(np.linalg.norm(loop.A, 2)) * dt_s, 700.0))
     bend = dt_s**2 / 8 * grown * row_norms(speed @ (loop.K @ loop.A).T)
-    trigger = own.scenario.trigger
-    alpha = trigger.alpha_per_s if isinstance(trigger, DecayingSettings) else 0.0
-    return float(((ends + bend) * np.exp(alpha * steps["t_ns"][1:] * 1e-9)).max())
+    return float(((ends + bend) * np.exp(alpha_per_s * steps["t_ns"][1:] * 1e-9)).max())
 
 
 def _void(record: RunRecord, scenario: Scenario) -> Mapping[str, str]:
@@ -287,11 +313,11 @@ def common_end_ns(record: RunRecord) -> int | None:
         return None
     reached_ns = [report.get("reached_ns") for report in reports]
     known_ns = [int(one) for one in reached_ns if one is not None]
-    measured_ns = record[SENSOR_MEASUREMENT]["t_ns"]
-    if len(known_ns) < len(reports) or not len(measured_ns):
+    measured_ns = record.last_ns(SENSOR_MEASUREMENT)
+    if len(known_ns) < len(reports) or measured_ns is None:
         return None
     # A sensor has no deadlines, so its time is that of its last measurement.
-    return int(min(*known_ns, measured_ns[-1]))
+    return int(min(*known_ns, measured_ns))
 
 
 def up_to_common_end(record: RunRecord) -> RunRecord:
@@ -302,13 +328,11 @@ def up_to_common_end(record: RunRecord) -> RunRecord:
     end_ns = common_end_ns(record)
     if end_ns is None:
         return record
-    rows: dict[str, Rows] = {}
+    before: dict[str, int] = {}
     for role, (pace, column) in _PACES.items():
-        beyond = record[pace]["input"][record[pace][column] > end_ns]
-        first = int(beyond[0]) if len(beyond) else np.iinfo(np.int64).max
-        for table in record.tables:
-            if OWNER[table] == role:
-                rows[table] = record[table][record[table]["input"] < first]
-    return RunRecord(
-        record.scenario, rows, record.notices, record.reports, record.kind, record.earlier
+        found = (rows["input"][rows[column] > end_ns] for rows in record.source.batches(pace))
+        first = next(filter(len, found), None)
+        before[role] = int(np.iinfo(np.int64).max if first is None else first[0])
+    return record.derived(
+        record.scenario, lambda table, rows: rows[rows["input"] < before[OWNER[table]]]
     )

@@ -17,6 +17,7 @@ from cosim.analysis.claims.observed_conditions import (
     ObservedConditions,
     PacketLosses,
     SampledSeries,
+    combined,
 )
 from cosim.record.run_record import Rows, RunRecord, updates_in
 from noack.config.scenario import Scenario
@@ -41,15 +42,24 @@ _Batches = list[tuple[NDArray[Any], ...]]
 _KEPT_TICKS = 512
 """A process sends its tables one after the other, up to 256 rows of each."""
 _NEVER = 2**63 - 1
+READ = (
+    SENSOR_MEASUREMENT, PLANT_STEP, PLANT_ACTUATION, CONTROLLER_STEP, CONTROLLER_DELIVERY,
+    NETEM_PACKET,
+)  # fmt: skip
+"""The tables that the conditions depend on."""
 _NO_TIMES: Times = np.zeros(0, np.int64)
 
 
 def read_conditions(record: RunRecord) -> ObservedConditions:
     """Read the conditions from the record of a run; missing updates and inputs count as late."""
     reader = ConditionReader(record.scenario)
-    for table in record.tables:
-        reader.take(table, record[table])
-    return reader.end()
+    parts: list[ObservedConditions] = []
+    for i, part in enumerate(record.slices(*READ)):
+        if i:
+            parts.append(combined([reader.observed()]))
+        for table, rows in part.items():
+            reader.take(table, rows)
+    return combined([*parts, reader.end()])
 
 
 class ConditionReader:

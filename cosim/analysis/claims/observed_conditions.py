@@ -1,6 +1,6 @@
 """The conditions under which a run took place, in the plant's time."""
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -44,6 +44,19 @@ class SampledSeries(NamedTuple):
     def largest(self) -> float | None:
         """The largest value; None if there is none."""
         return float(self.value.max()) if len(self.value) else None
+
+    def peaks(self, since_s: float = 0.0) -> "SampledSeries":
+        """Return the values that exceed all values before; those from ``since_s`` on start anew.
+
+        Of these series, the first value above any limit and the largest value are the same.
+        """
+        found = []
+        for part in (self.t_s < since_s, self.t_s >= since_s):
+            t_s, value = self.t_s[part], self.value[part]
+            before = np.append(-np.inf, np.fmax.accumulate(value)[:-1]) if len(value) else value
+            found.append((t_s[value > before], value[value > before]))
+        (early_s, early), (late_s, late) = found
+        return SampledSeries(np.append(early_s, late_s), np.append(early, late))
 
 
 class PacketLosses(NamedTuple):
@@ -147,6 +160,25 @@ class ObservedConditions(NamedTuple):
             "hold_s": self.hold.largest(),
             "start_s": self.start_s if np.isfinite(self.start_s) else None,
         }
+
+
+def combined(parts: Sequence[ObservedConditions]) -> ObservedConditions:
+    """Return the conditions of a run from those of its parts, in order; series are peaks."""
+    last = parts[-1]
+
+    def joined(series: Iterable[tuple[Reals, Reals]]) -> tuple[Reals, Reals]:
+        t_s, values = zip(*series, strict=True)
+        return np.concatenate(t_s), np.concatenate(values)
+
+    return last._replace(
+        losses=PacketLosses(*joined(one.losses for one in parts)),
+        sampling=SampledSeries(*joined(one.sampling for one in parts)).peaks(),
+        delay=SampledSeries(*joined(one.delay for one in parts)).peaks(),
+        hold=SampledSeries(*joined(one.hold for one in parts)).peaks(),
+        watchdog=SampledSeries(*joined(one.watchdog for one in parts)).peaks(),
+        safe_input=SampledSeries(*joined(one.safe_input for one in parts)).peaks(last.start_s),
+        restarts=SampledSeries(*joined(one.restarts for one in parts)),
+    )
 
 
 def earliest(found: Iterable[VoidFrom | None]) -> VoidFrom | None:

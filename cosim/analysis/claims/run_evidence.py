@@ -2,7 +2,7 @@
 
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -20,11 +20,12 @@ from cosim.analysis.claims.observed_conditions import (
     causes_of,
     earliest,
 )
-from cosim.record.align import AlignedRun, align_tables, in_common
+from cosim.analysis.claims.trajectory_delta import trajectory_delta
+from cosim.record.align import AlignedRun, IdentityResidual, aligned_parts, in_common
 from cosim.record.run_record import RunRecord
 from noack.config.resolution import policy_of
 from noack.config.scenario import Scenario
-from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT
+from noack.protocol.record_tables import NO_SEQUENCE
 from noack.protocol.topology import LOOP_ROLES
 from noack.theory.certificate import NetworkConditions
 from noack.theory.error_bounds import ErrorMonitor
@@ -53,6 +54,38 @@ class RunPart(NamedTuple):
 
 
 @dataclass(frozen=True)
+class Samples:
+    """Consecutive measurements of a run, (k,), aligned, with bounds of the controller's error."""
+
+    joined: AlignedRun
+    in_common: NDArray[np.bool_]
+    """Where sensor and controller share an update, so that ‖e_c‖ is bounded, (k,)."""
+    error_bounds: tuple[Reals, Reals]
+    """Bounds of ‖e_c‖_W from (I1) and from eq:LossEv3, (k,) each; NaN before the start."""
+    residual: Reals
+    """Residual of (I1), (k,)."""
+    inter_event_s: tuple[Reals, Reals]
+    """Times of the events, without the run's first, and the times since the event before."""
+
+    @cached_property
+    def t_s(self) -> Reals:
+        """Times of the measurements, (k,)."""
+        return np.asarray(self.joined.t_ns * 1e-9)
+
+
+class SampleFacts(NamedTuple):
+    """What claims need to know about all samples of a run before they are checked."""
+
+    any_in_common: bool = False
+    gap_s: float | None = None
+    """First time at which the controller's error is not known, although it was before."""
+    largest_state: float = 0.0
+    """Largest entry of x_s, and of x_c where it is known, before the end of the claims."""
+    longest_update_ns: int = 0
+    """Longest time between two updates of the controller, or to the end of the run."""
+
+
+@dataclass(frozen=True)
 class RunEvidence:
     """The data of a run for checking claims; each property is computed once, when first used.
 
@@ -62,21 +95,62 @@ class RunEvidence:
     record: RunRecord
     part: RunPart = field(default_factory=RunPart)
 
-    @cached_property
-    def joined(self) -> AlignedRun:
-        """The run's samples on the measurement grid."""
-        return align_tables(self.record)
+    def samples(self) -> Iterator[Samples]:
+        """Yield all measurements in order, part by part."""
+        scenario = self.record.scenario
+        monitor = ErrorMonitor(self.record.loop.H, policy_of(scenario))
+        residual = IdentityResidual(scenario)
+        last_ns = np.zeros(0, np.int64)
+        for part in aligned_parts(self.record):
+            rows, joined = part.rows, part.aligned
+            common = _common(scenario, joined)
+            bounds = monitor.samples(
+                rows["t_ns"], rows["x_s"] - rows["x"], rows["event"], joined.received
+            )
+            bounds[~common] = np.nan
+            event_ns = np.append(last_ns, rows["t_ns"][rows["event"] != NO_SEQUENCE])
+            passed = event_ns[1:] * 1e-9, np.diff(event_ns) * 1e-9
+            last_ns = event_ns[-1:]
+            both = bounds[:, 0], bounds[:, 1]
+            yield Samples(joined, common, both, residual.take(part), passed)
 
     @cached_property
-    def t_s(self) -> Reals:
-        """Times of the measurements, (k,)."""
-        return np.asarray(self.joined.t_ns * 1e-9)
+    def facts(self) -> SampleFacts:
+        """What must be known about all samples before the claims are checked."""
+        found, fresh_ns, newest, last_ns = SampleFacts(), None, -1, 0
+        for part in aligned_parts(self.record):
+            joined = part.aligned
+            if not len(joined.t_ns):
+                continue
+            common, t_s = _common(self.record.scenario, joined), joined.t_ns * 1e-9
+            started = np.logical_or.accumulate(common) | found.any_in_common
+            gaps = np.flatnonzero(started & ~common)
+            if found.gap_s is None and len(gaps):
+                found = found._replace(gap_s=float(t_s[gaps[0]]))
+            until = t_s < self.part.until_s
+            both = np.concatenate([joined.x_s[until], joined.x_c[common & until]])
+            changes = joined.t_ns[np.flatnonzero(np.diff(joined.received, prepend=newest))]
+            ends_ns = changes if fresh_ns is None else np.append(fresh_ns, changes)
+            longest_ns = int(np.diff(ends_ns).max(initial=found.longest_update_ns))
+            fresh_ns = ends_ns[-1] if len(ends_ns) else None
+            newest, last_ns = int(joined.received[-1]), int(joined.t_ns[-1])
+            largest = float(np.abs(both).max(initial=found.largest_state))
+            found = found._replace(
+                any_in_common=bool(started[-1]),
+                largest_state=largest,
+                longest_update_ns=longest_ns,
+            )
+        if fresh_ns is not None:
+            longest_ns = max(found.longest_update_ns, int(last_ns - fresh_ns))
+            found = found._replace(longest_update_ns=longest_ns)
+        return found
 
     @cached_property
-    def in_common(self) -> NDArray[np.bool_]:
-        """Where sensor and controller share an update, so that ‖e_c‖ is bounded, (k,)."""
-        common = in_common(self.record.scenario, self.joined)
-        return np.asarray(np.isfinite(self.joined.e_c_norm) & common)
+    def trajectory_delta(self) -> float | None:
+        """Theorem 1's Δ from the trajectory, up to the first violation of its assumptions."""
+        void = self.paper_violation
+        until_s = self.part.until_s if void is None else min(self.part.until_s, void.t_s)
+        return trajectory_delta(self.record, until_s)
 
     @cached_property
     def certificates(self) -> list[ScenarioCertificate]:
@@ -103,7 +177,7 @@ class RunEvidence:
             restarts=SampledSeries(restarts.t_s[restarted], restarts.value[restarted]),
         )
 
-    @property
+    @cached_property
     def conditions(self) -> dict[str, float | None]:
         """Largest observed value of each condition."""
         return self.observed.summary()
@@ -111,7 +185,7 @@ class RunEvidence:
     @property
     def started_s(self) -> float:
         """When the plant applied the first input of the controller; infinite if never."""
-        return read_conditions(self.record).start_s
+        return self.observed.start_s
 
     def violations(self) -> list[AssumptionViolation]:
         """The assumptions that the run violated, M − 1 included, each at the first time."""
@@ -133,11 +207,9 @@ class RunEvidence:
             times_s = [ns * 1e-9 - self.part.from_s for ns in gaps_ns]
             why = f"rows of {role} are missing from the record"
             found += [VoidFrom(t_s, why) for t_s in times_s if t_s >= 0]
-        first = np.argmax(self.in_common)
-        gaps = np.flatnonzero(~self.in_common[first:])
-        if len(gaps):
+        if (gap_s := self.facts.gap_s) is not None:
             why = "the controller's error is not on record, or not finite"
-            found.append(VoidFrom(float(self.t_s[first + gaps[0]]), why))
+            found.append(VoidFrom(gap_s, why))
         return earliest(found)
 
     @cached_property
@@ -149,28 +221,19 @@ class RunEvidence:
 
     def violation_of(self, certificate: ScenarioCertificate) -> VoidFrom | None:
         """Return the time at which the run first violated the conditions of a certificate."""
-        return self.observed.first_violation(certificate.conditions)
+        known = self._violations
+        if id(certificate) not in known:
+            known[id(certificate)] = self.observed.first_violation(certificate.conditions)
+        return known[id(certificate)]
+
+    @cached_property
+    def _violations(self) -> dict[int, VoidFrom | None]:
+        """First violations that are known already, by certificate."""
+        return {}
 
     @cached_property
     def _schedule(self) -> NetworkConditions:
         return nominal_conditions(self.record.scenario)
-
-    @cached_property
-    def error_bounds(self) -> tuple[Reals, Reals]:
-        """Bounds of ‖e_c‖_W from (I1) and from eq:LossEv3, (k,) each; NaN before the start."""
-        monitor = ErrorMonitor(self.record.loop.H, policy_of(self.record.scenario))
-        rows = self.record[SENSOR_MEASUREMENT]
-        found = np.array(
-            [
-                monitor.sample(int(t_ns), e_s, int(event), int(received))
-                for t_ns, e_s, event, received in zip(
-                    rows["t_ns"], rows["x_s"] - rows["x"], rows["event"], self.joined.received,
-                    strict=True,
-                )
-            ]
-        ).reshape(-1, 2)  # fmt: skip
-        found[~self.in_common] = np.nan
-        return found[:, 0], found[:, 1]
 
     @cached_property
     def theorem_2(self) -> Theorem2 | None:
@@ -187,12 +250,10 @@ class RunEvidence:
             return None
         return theorem_2(loop, trigger.beta, trigger.alpha_per_s, ideal.delta)
 
-    @cached_property
-    def inter_event_s(self) -> tuple[Reals, Reals]:
-        """Times of the events from the second on, and the times since the event before."""
-        rows = self.record[SENSOR_MEASUREMENT]
-        event_ns = rows["t_ns"][rows["event"] != NO_SEQUENCE]
-        return event_ns[1:] * 1e-9, np.diff(event_ns) * 1e-9
+
+def _common(scenario: Scenario, joined: AlignedRun) -> NDArray[np.bool_]:
+    """Return where sensor and controller share an update, and ‖e_c‖ is finite, (k,)."""
+    return np.asarray(np.isfinite(joined.e_c_norm) & in_common(scenario, joined))
 
 
 def scheduled_certificates(

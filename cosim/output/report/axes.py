@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 
 from cosim.output import palette
-from cosim.output.report.decimate import Reals, decimate
 from cosim.output.report.figure_style import NotebookFigure, printed
+from cosim.record.decimate import Reals, decimate
 
 BoundKind = Literal["certified", "identity", "printed"]
 """Source of a bound: a certificate, identity (I1), or a formula of the paper."""

@@ -7,12 +7,12 @@ from typing import Literal, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from cosim.analysis.timing_statistics import latency_us, lateness_us
+from cosim.analysis.quantile_sketch import QuantileSketch
+from cosim.analysis.timing_statistics import latency_us, lateness_parts
 from cosim.output.report import signal_figures
 from cosim.output.report.axes import Bound, BoundKind
-from cosim.output.report.decimate import Reals
-from cosim.record.align import AlignedRun, align_tables
-from cosim.record.estimation_error import true_states
+from cosim.record.align import AlignedRun, aligned_parts
+from cosim.record.decimate import Reals, decimate, decimate_all
 from cosim.record.packet_outcomes import packet_outcomes
 from cosim.record.run_record import RunRecord
 from noack.config.scenario import Scenario
@@ -20,9 +20,7 @@ from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
-    NO_SEQUENCE,
     PLANT_STEP,
-    SENSOR_MEASUREMENT,
     Fate,
 )
 from noack.protocol.topology import LOOP_ROLES
@@ -57,13 +55,13 @@ def pictures(
     """
 
     @cache
-    def joined() -> AlignedRun:
+    def aligned() -> _Thinned:
         with np.errstate(all="ignore"):  # a diverged run has figures, too
-            return align_tables(record)
+            return _thinned(record)
 
     found = {
-        "states": lambda: _states(record, joined()),
-        "errors": lambda: _errors(record, joined(), _bounding(envelopes, "e_c")),
+        "states": lambda: _states(record, aligned()),
+        "errors": lambda: _errors(record, aligned().run, _bounding(envelopes, "e_c")),
         "state-norm": lambda: _state_norm(record, _bounding(envelopes, "x")),
         "input": lambda: _input(record),
         "inter-event": lambda: _inter_event(record, _bounding(envelopes, "inter_event")),
@@ -81,21 +79,52 @@ def _bounding(envelopes: Sequence[Envelope], quantity: str) -> list[Bound]:
     ]
 
 
-def _states(record: RunRecord, joined: AlignedRun) -> RunFigure:
-    crossed = packet_outcomes(record)
-    measurements, deliveries = record[SENSOR_MEASUREMENT], record[CONTROLLER_DELIVERY]
-    events = measurements[measurements["event"] != NO_SEQUENCE]
+class _Thinned(NamedTuple):
+    """The samples of a run that its figures need: all of a short run."""
+
+    run: AlignedRun
+    true_x: Reals | None
+
+
+def _thinned(record: RunRecord) -> _Thinned:
+    """Align a run; of each part, keep the extremes of all curves at the resolution of a figure."""
+    found = []
+    for part in aligned_parts(record):
+        run, true_x = part.aligned, part.true_x
+        curves = [run.x, run.x_s, run.x_c, run.e_s_norm, run.threshold, run.e_c_norm]
+        curves += [] if true_x is None else [true_x]
+        keep = decimate_all(_seconds(run.t_ns), np.column_stack(curves), record.slice_columns)
+        thin = AlignedRun._make(values[keep] for values in run)
+        found.append(_Thinned(thin, None if true_x is None else true_x[keep]))
+    whole = AlignedRun._make(map(np.concatenate, zip(*(one.run for one in found), strict=True)))
+    true_states = [one.true_x for one in found if one.true_x is not None]
+    return _Thinned(whole, np.concatenate(true_states) if true_states else None)
+
+
+def _reduced(record: RunRecord, table: str, column: str) -> tuple[Reals, Reals]:
+    """Return times in s (k,) and a vector column (k, n), reduced like the aligned samples."""
+    t_s, values = [np.zeros(0)], [np.zeros((0, record.tables[table][column].shape[0]))]
+    for rows in record.source.batches(table, ("t_ns", column)):
+        part_s = _seconds(rows["t_ns"])
+        keep = decimate_all(part_s, rows[column], record.slice_columns)
+        t_s.append(part_s[keep])
+        values.append(rows[column][keep])
+    return np.concatenate(t_s), np.concatenate(values)
+
+
+def _states(record: RunRecord, aligned: _Thinned) -> RunFigure:
+    crossed, joined = packet_outcomes(record), aligned.run
+    events = record.events()
+    deliveries = record.columns(CONTROLLER_DELIVERY, "t_ns", "sequence")
     dropped = np.isin(events["event"], crossed.sequence[crossed.lost])
-    forced = np.isin(deliveries["sequence"], crossed.sequence[crossed.rows["fate"] == Fate.FORCED])
+    forced = np.isin(deliveries["sequence"], crossed.sequence[crossed.fate == Fate.FORCED])
     scenario, names = record.scenario, record.loop.state_names
     known = "x" if scenario.coverage.knows_state else "x̂"
     figure = signal_figures.paper_figure(
         mode=scenario.mode,
         t_s=_seconds(joined.t_ns),
-        x=joined.x
-        if scenario.coverage.knows_state
-        else true_states(record[PLANT_STEP], joined.t_ns),
-        x_hat=None if scenario.coverage.knows_state else joined.x,
+        x=joined.x if aligned.true_x is None else aligned.true_x,
+        x_hat=None if aligned.true_x is None else joined.x,
         x_s=joined.x_s,
         x_c=joined.x_c,
         state_names=names,
@@ -152,23 +181,33 @@ def _errors(record: RunRecord, joined: AlignedRun, bounds: list[Bound]) -> RunFi
 
 
 def _state_norm(record: RunRecord, bounds: list[Bound]) -> RunFigure:
-    steps = record[PLANT_STEP]
-    with np.errstate(all="ignore"):
-        x_norm = np.linalg.norm(steps["x"], axis=1)
+    t_s, x_norm = _state_norms(record)
     return RunFigure(
         "state-norm",
-        signal_figures.state_norm_figure(_seconds(steps["t_ns"]), x_norm, bounds),
+        signal_figures.state_norm_figure(t_s, x_norm, bounds),
         "Norm of the plant's state." + _dashed(bounds),
         "Norm of the state over time on a logarithmic axis"
         + (f", from {x_norm[0]:.3g} to {x_norm[-1]:.3g}." if len(x_norm) else "."),
     )
 
 
+@np.errstate(all="ignore")
+def _state_norms(record: RunRecord) -> tuple[Reals, Reals]:
+    """Return times in s, (k,), and norms of the plant's state, (k,), reduced."""
+    t_s, norms = [np.zeros(0)], [np.zeros(0)]
+    for steps in record.source.batches(PLANT_STEP, ("t_ns", "x")):
+        part_s, x_norm = _seconds(steps["t_ns"]), np.linalg.norm(steps["x"], axis=1)
+        keep = decimate(part_s, x_norm, record.slice_columns)
+        t_s.append(part_s[keep])
+        norms.append(x_norm[keep])
+    return np.concatenate(t_s), np.concatenate(norms)
+
+
 def _input(record: RunRecord) -> RunFigure:
-    steps, names = record[CONTROLLER_STEP], record.loop.input_names
+    (t_s, u), names = _reduced(record, CONTROLLER_STEP, "u"), record.loop.input_names
     return RunFigure(
         "input",
-        signal_figures.input_figure(_seconds(steps["t_ns"]), steps["u"], names),
+        signal_figures.input_figure(t_s, u, names),
         "Control input u = K x_c, held between the controller's ticks. Equal inputs are drawn one "
         "inside the other.",
         f"Control inputs {', '.join(names)} over time.",
@@ -176,8 +215,7 @@ def _input(record: RunRecord) -> RunFigure:
 
 
 def _inter_event(record: RunRecord, lower_bounds: list[Bound]) -> RunFigure:
-    measurements = record[SENSOR_MEASUREMENT]
-    event_s = _seconds(measurements["t_ns"][measurements["event"] != NO_SEQUENCE])
+    event_s = _seconds(record.events()["t_ns"])
     return RunFigure(
         "inter-event",
         signal_figures.inter_event_figure(event_s, lower_bounds, record.scenario.horizon_s),
@@ -190,8 +228,11 @@ def _inter_event(record: RunRecord, lower_bounds: list[Bound]) -> RunFigure:
 def _lateness(record: RunRecord) -> RunFigure:
     scenario = record.scenario
     period_us = scenario.timing.plant_period_ns / (1e3 * scenario.speed)
-    late_us = {role: lateness_us(record, role) for role in LOOP_ROLES}
-    longest = ", ".join(f"{role} {_largest(late)} µs" for role, late in late_us.items())
+    late_us = {role: QuantileSketch.of(lateness_parts(record, role)) for role in LOOP_ROLES}
+    maxima = {role: sketch.quantile(1.0) for role, sketch in late_us.items()}
+    longest = ", ".join(
+        f"{role} {'unknown' if most is None else f'{most:.3g}'} µs" for role, most in maxima.items()
+    )
     return RunFigure(
         "lateness",
         signal_figures.lateness_figure(late_us, period_us),

@@ -16,10 +16,11 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from cosim.analysis.fidelity import Fidelity
+from cosim.analysis.quantile_sketch import QuantileSketch
 from cosim.output import palette
 from cosim.output.report import axes as draw
-from cosim.output.report.decimate import Reals
 from cosim.output.report.figure_style import PAPER, NotebookFigure, printed, styled
+from cosim.record.decimate import Reals
 
 Flags = NDArray[np.bool_]
 
@@ -266,11 +267,13 @@ def input_figure(t_s: Reals, u: Reals, input_names: Sequence[str]) -> Figure:
 
 
 @styled
-def lateness_figure(lateness_us: Mapping[str, Reals], period_us: float | None = None) -> Figure:
+def lateness_figure(
+    lateness_us: Mapping[str, QuantileSketch], period_us: float | None = None
+) -> Figure:
     """Share of steps with at least a given lateness, per process.
 
     Args:
-        lateness_us: by process, (k,) lateness of each of its steps in wall µs.
+        lateness_us: by process, the lateness of its steps in wall µs.
         period_us: the plant's period in wall µs, beyond which a step counts as late.
     """
     figure, (axes,) = draw.single(2.5, [*lateness_us, _PERIOD])
@@ -293,18 +296,16 @@ def lateness_figure(lateness_us: Mapping[str, Reals], period_us: float | None = 
     return figure
 
 
-def _later_than(values: Reals) -> tuple[Reals, Reals]:
+def _later_than(values: QuantileSketch) -> tuple[Reals, Reals]:
     """Return values in ascending order, and for each the share of values at least as large."""
-    values = draw.finite(values)
-    values = np.maximum(np.sort(values[np.isfinite(values)]), _SHORTEST_US)
-    k = len(values)
+    k = values.count
     if not k:
-        return values, values
+        return np.zeros(0), np.zeros(0)
     # k values are at least as large as the k-th largest. The same number of points in each decade
     # of shares, and linearly spaced ones, which resolve the median.
     rank = np.concatenate([np.geomspace(1, k, _RANKS), np.linspace(1, k, _RANKS)])
     rank = np.unique(rank.round().astype(np.intp))[::-1]
-    return values[k - rank], rank / k
+    return np.maximum(draw.finite(values.largest(rank)), _SHORTEST_US), rank / k
 
 
 @styled

@@ -100,7 +100,7 @@ def summary(run: ContinuousRun, resolved: Scenario) -> dict[str, Any]:
 def _divergence(run: ContinuousRun, samples: Samples, resolved: Scenario) -> Divergence | None:
     if run.diverged_at_s is not None:
         return Divergence(run.diverged_at_s, f"diverged at {run.diverged_at_s:g} s")
-    return divergence(samples.t_s, samples.x, [resolved])
+    return divergence([(samples.t_s, samples.x)], len(samples.t_s), [resolved])
 
 
 def _or_none(statistic: Any, values: Vector) -> float | None:

@@ -11,11 +11,11 @@ from matplotlib.figure import Figure
 
 from cosim.output import palette
 from cosim.output.report import axes as draw
-from cosim.output.report.decimate import Reals
 from cosim.output.report.figure_files import inline, save_figure
 from cosim.output.report.figure_style import NotebookFigure, printed, styled
 from cosim.output.report.report_page import templates
 from cosim.record.align import AlignedRun, align_tables
+from cosim.record.decimate import Reals
 from cosim.studies.comparison.run_comparison import ComparedRun, RunComparison
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError

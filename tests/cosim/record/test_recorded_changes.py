@@ -88,7 +88,7 @@ def test_whatever_changes_the_run_is_replayed_and_the_identity_holds(
     assert found.bit_exact
     assert found.gaps == []
     joined = align_tables(record)
-    residual = identity_residual(record, joined)
+    residual = identity_residual(record)
     scale = float(np.abs(joined.x_s).max())
     assert np.nanmax(residual) <= 1e-12 * max(scale, 1.0)
     # The number of consecutive losses never exceeds the largest cap in force meanwhile.
@@ -227,7 +227,7 @@ def test_a_change_received_too_late_is_reported_and_voids_its_claims() -> None:
     # In between, only one of the two models had the change.
     joined = align_tables(record)
     between = (joined.t_ns > 910 * MS) & (joined.t_ns < claims[-1].from_s * 1e9)
-    assert np.nanmax(identity_residual(record, joined)[between]) > 1e-3
+    assert np.nanmax(identity_residual(record)[between]) > 1e-3
 
 
 def test_a_sensor_with_an_observer_applies_a_change() -> None:
@@ -240,7 +240,7 @@ def test_a_sensor_with_an_observer_applies_a_change() -> None:
     record = simulate(resolve(validate(content, "here")))
     assert len(record[SENSOR_SETTING]) == 2
     assert replay(record).bit_exact
-    residual = identity_residual(record, align_tables(record))
+    residual = identity_residual(record)
     assert np.nanmax(residual) < 1e-12
 
 

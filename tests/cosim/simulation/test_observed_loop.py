@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
@@ -12,7 +13,7 @@ from cosim.analysis.run_summary import summarise
 from cosim.analysis.step_schedule import live_run
 from cosim.output.certificate_report import Certificates
 from cosim.record.align import align_tables
-from cosim.record.estimation_error import estimation_error, expected_rms, true_states
+from cosim.record.estimation_error import expected_rms, true_states
 from cosim.record.run_record import RunRecord
 from cosim.simulation.batch.batch_interface import setting_of
 from cosim.simulation.continuous.continuous_loop import continuous_loop_of
@@ -35,6 +36,13 @@ NOISE = {"C": [[1.0, 0.0]], "noise_std": [0.02]}
 KALMAN = {"kind": "kalman", "initial_std": [0.4, 0.4]}
 GUSTS = {"kind": "gaussian", "std": [0.5]}
 CHANGE = {"at_s": 0.4, "set": {"trigger.floor": 0.02}}
+
+
+def estimation_error(record: RunRecord) -> NDArray[np.float64]:
+    """x̂ − x at each measurement."""
+    rows = record["sensor_measurement"]
+    found: NDArray[np.float64] = rows["x"] - true_states(record["plant_step"], rows["t_ns"])
+    return found
 
 
 @pytest.fixture

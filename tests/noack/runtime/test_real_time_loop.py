@@ -89,3 +89,50 @@ def test_deadlines_are_served_while_junk_arrives(always_readable: int) -> None:
     assert channel.looks > 0
     assert channel.passed_over == 0
     assert set(log.lines) == {"tended"}
+
+
+class Counting:
+    """A channel whose n-th message is n, and a machine that answers the even ones.
+
+    Its deadline is always ``left_ns`` ahead; None: it has none.
+    """
+
+    def __init__(self, readable: int, clock: RunClock, left_ns: int | None) -> None:
+        self.watched = (readable,)
+        self._clock, self._left_ns = clock, left_ns
+        self.received = 0
+        self.sent: list[int] = []
+
+    def receive(self, readable: int) -> int:
+        self.received += 1
+        return self.received
+
+    def send(self, message: int) -> None:
+        self.sent.append(message)
+
+    def tend(self, now_ns: int) -> Sequence[Notice]:
+        return ()
+
+    def next_deadline_ns(self) -> int | None:
+        return None if self._left_ns is None else self._clock.now_ns() + self._left_ns
+
+    def on_timer(self, now_ns: int) -> Sequence[Record]:
+        raise AssertionError("nothing was due")
+
+    def handle(self, message: int, now_ns: int) -> Sequence[int]:
+        return (message,) if message % 2 == 0 else ()
+
+
+@pytest.mark.parametrize("left_ns", [None, 10**9, 100_000])
+def test_a_loop_rehearses_after_a_message_without_an_answer(
+    always_readable: int, left_ns: int | None
+) -> None:
+    clock, log, after = RunClock(time.monotonic_ns()), Log(), list[int]()
+    both = Counting(always_readable, clock, left_ns)
+    run_loop(
+        both, both, clock, log, end_ns=None, stop=lambda: both.received > 1,
+        rehearse=lambda: after.append(both.received),
+    )  # fmt: skip
+    assert both.sent == [number for number in range(1, both.received + 1) if number % 2 == 0]
+    odd = [number for number in range(1, both.received + 1) if number % 2]
+    assert after == ([] if left_ns == 100_000 else odd)

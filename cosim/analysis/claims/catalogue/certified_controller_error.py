@@ -6,23 +6,23 @@ from cosim.analysis.claims.claim_definition import (
     Envelope,
     controller_error_bound,
 )
-from cosim.analysis.claims.run_evidence import RunEvidence
+from cosim.analysis.claims.run_evidence import RunEvidence, Samples
 from noack.theory.scenario_certificates import ScenarioCertificate
 
 
-def _bound(run: RunEvidence, certificate: ScenarioCertificate) -> Bound | None:
+def _bound(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> Bound | None:
     if certificate.constants is None:
         return None
     formula = f"‖e_c‖ ≤ {{:.4g}} {certificate.level}"
     if (late := certificate.floor_constants) is not None:
         formula += f", from {certificate.floor_from_s:.4g} s on {late.delta:.4g} ε"
-    values, void = certificate.controller_error(run.t_s), run.violation_of(certificate)
-    return controller_error_bound(run, formula, values, certificate.constants.delta, void)
+    values, void = certificate.controller_error(samples.t_s), run.violation_of(certificate)
+    return controller_error_bound(run, samples, formula, values, certificate.constants.delta, void)
 
 
-def _envelope(run: RunEvidence, certificate: ScenarioCertificate) -> Envelope:
-    values = certificate.controller_error(run.t_s)
-    return Envelope(f"certified for {certificate.scope}", "e_c", run.t_s, values)
+def _envelope(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> Envelope:
+    values = certificate.controller_error(samples.t_s)
+    return Envelope(f"certified for {certificate.scope}", "e_c", samples.t_s, values)
 
 
 CLAIM = CertifiedClaim("the controller's error is bounded", _bound, _envelope)

@@ -7,17 +7,19 @@ from cosim.analysis.claims.claim_definition import (
     inter_event_bound,
     inter_event_envelope,
 )
-from cosim.analysis.claims.run_evidence import RunEvidence
+from cosim.analysis.claims.run_evidence import RunEvidence, Samples
 from noack.theory.scenario_certificates import ScenarioCertificate
 
 
-def _bound(run: RunEvidence, certificate: ScenarioCertificate) -> Bound | None:
+def _bound(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> Bound | None:
     if certificate.inter_event_s is None:
         return None
-    return inter_event_bound(run, certificate.inter_event_s, run.violation_of(certificate))
+    return inter_event_bound(samples, certificate.inter_event_s, run.violation_of(certificate))
 
 
-def _envelope(run: RunEvidence, certificate: ScenarioCertificate) -> Envelope | None:
+def _envelope(
+    run: RunEvidence, samples: Samples, certificate: ScenarioCertificate
+) -> Envelope | None:
     if certificate.inter_event_s is None:
         return None
     label = f"certified for {certificate.scope}"

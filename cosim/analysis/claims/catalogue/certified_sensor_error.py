@@ -1,19 +1,19 @@
 """A certificate's bound of ‖e_s‖ with a sampled trigger: a multiple of the threshold."""
 
 from cosim.analysis.claims.claim_definition import Bound, CertifiedClaim
-from cosim.analysis.claims.run_evidence import RunEvidence
+from cosim.analysis.claims.run_evidence import RunEvidence, Samples
 from noack.theory.scenario_certificates import ScenarioCertificate
 
 
-def _bound(run: RunEvidence, certificate: ScenarioCertificate) -> Bound | None:
+def _bound(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> Bound | None:
     if certificate.constants is None:
         return None
     formula = f"‖e_s‖ ≤ {{:.4g}} {certificate.level}"
     if (late := certificate.floor_constants) is not None:
         formula += f", from {certificate.floor_from_s:.4g} s on {late.overshoot:.4g} ε"
-    shares = run.joined.e_s_norm / certificate.sensor_error(run.t_s)
+    shares = samples.joined.e_s_norm / certificate.sensor_error(samples.t_s)
     void, overshoot = run.violation_of(certificate), certificate.constants.overshoot
-    return Bound(formula, run.t_s, shares, void, overshoot)
+    return Bound(formula, samples.t_s, shares, void, overshoot)
 
 
 CLAIM = CertifiedClaim("the sensor's error is bounded", _bound)

@@ -1,12 +1,12 @@
 """A certificate's bound of ‖x‖: X e^{−rt}, and a constant from the time of the floor on."""
 
 from cosim.analysis.claims.claim_definition import Bound, CertifiedClaim, Envelope, upper_shares
-from cosim.analysis.claims.run_evidence import RunEvidence
+from cosim.analysis.claims.run_evidence import RunEvidence, Samples
 from noack.core.linear_systems import row_norms
 from noack.theory.scenario_certificates import ScenarioCertificate
 
 
-def _bound(run: RunEvidence, certificate: ScenarioCertificate) -> Bound | None:
+def _bound(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> Bound | None:
     if (constants := certificate.constants) is None:
         return None
     formula = "‖x‖ ≤ {:.4g}"
@@ -14,13 +14,13 @@ def _bound(run: RunEvidence, certificate: ScenarioCertificate) -> Bound | None:
         formula += f" e^(−{constants.rate_per_s:.3g}t)"
     if (late := certificate.floor_constants) is not None:
         formula += f", from {certificate.floor_from_s:.4g} s on {late.state:.4g}"
-    shares = upper_shares(row_norms(run.joined.x), certificate.state(run.t_s))
-    return Bound(formula, run.t_s, shares, run.violation_of(certificate), constants.state)
+    shares = upper_shares(row_norms(samples.joined.x), certificate.state(samples.t_s))
+    return Bound(formula, samples.t_s, shares, run.violation_of(certificate), constants.state)
 
 
-def _envelope(run: RunEvidence, certificate: ScenarioCertificate) -> Envelope:
-    values = certificate.state(run.t_s)
-    return Envelope(f"certified for {certificate.scope}", "x", run.t_s, values)
+def _envelope(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> Envelope:
+    values = certificate.state(samples.t_s)
+    return Envelope(f"certified for {certificate.scope}", "x", samples.t_s, values)
 
 
 CLAIM = CertifiedClaim("the state is bounded", _bound, _envelope)

@@ -7,16 +7,16 @@ from cosim.analysis.claims.claim_definition import (
     inter_event_bound,
     inter_event_envelope,
 )
-from cosim.analysis.claims.run_evidence import RunEvidence
+from cosim.analysis.claims.run_evidence import RunEvidence, Samples
 
 
-def _bound(run: RunEvidence) -> Bound | None:
+def _bound(run: RunEvidence, samples: Samples) -> Bound | None:
     if not run.record.scenario.coverage.knows_state or run.theorem_2 is None:
         return None
-    return inter_event_bound(run, run.theorem_2.inter_event_s, run.paper_violation)
+    return inter_event_bound(samples, run.theorem_2.inter_event_s, run.paper_violation)
 
 
-def _envelope(run: RunEvidence) -> Envelope | None:
+def _envelope(run: RunEvidence, samples: Samples) -> Envelope | None:
     if run.theorem_2 is None:
         return None
     least_s = run.theorem_2.inter_event_s

@@ -1,23 +1,26 @@
 """Theorem 2, eq:normXt of the paper: ‖x‖ ≤ c x₀ e^{−ᾱt} + g (e^{−αt} − e^{−ᾱt})."""
 
 from cosim.analysis.claims.claim_definition import Bound, ClaimDefinition, Envelope, upper_shares
-from cosim.analysis.claims.run_evidence import RunEvidence
+from cosim.analysis.claims.run_evidence import RunEvidence, Samples
 from noack.core.linear_systems import row_norms
 
 
-def _envelope(run: RunEvidence) -> Envelope | None:
+def _envelope(run: RunEvidence, samples: Samples) -> Envelope | None:
     if run.theorem_2 is None:
         return None
-    values = run.theorem_2.state(run.t_s, run.record.scenario.decaying.alpha_per_s)
-    return Envelope("Theorem 2 (eq:normXt)", "x", run.t_s, values, "printed")
+    values = run.theorem_2.state(samples.t_s, run.record.scenario.decaying.alpha_per_s)
+    return Envelope("Theorem 2 (eq:normXt)", "x", samples.t_s, values, "printed")
 
 
-def _bound(run: RunEvidence) -> Bound | None:
-    if not run.record.scenario.coverage.knows_state or (envelope := _envelope(run)) is None:
+def _bound(run: RunEvidence, samples: Samples) -> Bound | None:
+    if (
+        not run.record.scenario.coverage.knows_state
+        or (envelope := _envelope(run, samples)) is None
+    ):
         return None
-    shares = upper_shares(row_norms(run.joined.x), envelope.values)
+    shares = upper_shares(row_norms(samples.joined.x), envelope.values)
     formula = "‖x‖ ≤ c x₀ e^(−ᾱt) + g (e^(−αt) − e^(−ᾱt))"
-    return Bound(formula, run.t_s, shares, run.paper_violation)
+    return Bound(formula, samples.t_s, shares, run.paper_violation)
 
 
 CLAIM = ClaimDefinition(

@@ -9,10 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosim.analysis.claims.catalogue.theorem_1_controller_error import (
-    trajectory_delta,
-    undominated,
-)
+from cosim.analysis.claims.trajectory_delta import trajectory_delta, undominated
 from cosim.record.align import AlignedRun, align_tables
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
@@ -21,7 +18,7 @@ from tests.cosim.analysis.claims.conftest import MS, Make, network_of, of_scenar
 
 
 def delta_of(record: RunRecord) -> float | None:
-    return trajectory_delta(record, align_tables(record))
+    return trajectory_delta(record)
 
 
 def by_hand(record: RunRecord, joined: AlignedRun, horizon: int = 10**9) -> float:
@@ -57,7 +54,7 @@ def test_theorem_1_bounds_the_error_and_the_sum_over_the_real_intervals(
     )  # fmt: skip
     record = simulate(fast)
     joined = align_tables(record)
-    delta = trajectory_delta(record, joined)
+    delta = trajectory_delta(record)
     assert delta is not None
     assert delta >= by_hand(record, joined) * (1 - 1e-6)
     trigger = record.scenario.trigger
@@ -75,7 +72,7 @@ def test_a_late_update_is_missing_exactly_until_it_arrives(make: Make) -> None:
     joined = align_tables(record)
     starts = np.flatnonzero(record[SENSOR_MEASUREMENT]["event"] != NO_SEQUENCE)
     assert (joined.received[starts[1:]] == np.arange(len(starts) - 1)).all()
-    delta, alone = trajectory_delta(record, joined), by_hand(record, joined)
+    delta, alone = trajectory_delta(record), by_hand(record, joined)
     assert delta is not None
     # Each stretch has one event; δ̄_j is a few times the real interval.
     assert alone < 4

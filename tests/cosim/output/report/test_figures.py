@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import ImageColor
 
+from cosim.analysis.quantile_sketch import QuantileSketch
 from cosim.output import palette
 from cosim.output.report import signal_figures
 from cosim.output.report.axes import Bound, BoundKind
@@ -61,7 +62,11 @@ def drawn_for(case: str) -> dict[str, Figure]:
         "norm": signal_figures.state_norm_figure(t_s, values(case, k), bound),
         "input": signal_figures.input_figure(t_s, values(case, k, n), [f"u_{i}" for i in range(n)]),
         "lateness": signal_figures.lateness_figure(
-            {"plant": values(case, k), "sensor": values(case, k) - 0.2}, 2000.0
+            {
+                "plant": QuantileSketch.of([values(case, k)]),
+                "sensor": QuantileSketch.of([values(case, k) - 0.2]),
+            },
+            2000.0,
         ),
         "latency": signal_figures.latency_figure(t_s, values(case, k), 1.0),
         "inter": signal_figures.inter_event_figure(event_s, bound, 1.0),
@@ -225,7 +230,7 @@ def test_a_legend_has_as_few_rows_as_its_width_permits() -> None:
 
 def test_the_distribution_of_lateness_is_exact_at_its_ends() -> None:
     late_us = np.random.default_rng(1).lognormal(3, 1, 5000)
-    (axes,) = signal_figures.lateness_figure({"plant": late_us}).axes
+    (axes,) = signal_figures.lateness_figure({"plant": QuantileSketch.of([late_us])}).axes
     (line,) = axes.lines
     found_us, share = line.get_xdata(), line.get_ydata()
     assert found_us[-1] == late_us.max()

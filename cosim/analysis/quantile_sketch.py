@@ -1,0 +1,88 @@
+"""Quantiles of any number of values in bounded memory: exact at first, then to 0.1 %.
+
+The sketch keeps all values up to ``EXACT``. Beyond that it counts them in bins whose width is
+``RESOLUTION`` of their distance from 0, as an HDR histogram does. The smallest and the largest
+value stay exact.
+"""
+
+from collections.abc import Iterable
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+EXACT = 2**20
+"""Number of values up to which quantiles are exact."""
+RESOLUTION = 1e-3
+"""Largest relative error of a quantile of more values."""
+_SMALLEST = 1e-6
+"""Values closer to 0 than this count as 0."""
+
+
+class QuantileSketch:
+    """Collects values in parts."""
+
+    def __init__(self) -> None:
+        self._values: list[NDArray[np.float64]] | None = []
+        self._counts: dict[int, int] = {}
+        self._low, self._high = np.inf, -np.inf
+        self.count = 0
+        """Number of values."""
+
+    @classmethod
+    def of(cls, parts: Iterable[NDArray[np.float64]]) -> Self:
+        """Return a sketch of values in parts."""
+        found = cls()
+        for values in parts:
+            found.add(values)
+        return found
+
+    def add(self, values: NDArray[np.float64]) -> None:
+        """Add values, (k,); those that are not finite are ignored."""
+        values = values[np.isfinite(values)]
+        if not len(values):
+            return
+        self.count += len(values)
+        self._low = min(self._low, float(values.min()))
+        self._high = max(self._high, float(values.max()))
+        if self._values is not None:
+            self._values.append(values)
+            if self.count <= EXACT:
+                return
+            values, self._values = np.concatenate(self._values), None
+        places, counts = np.unique(_bins(values), return_counts=True)
+        for place, count in zip(places.tolist(), counts.tolist(), strict=True):
+            self._counts[place] = self._counts.get(place, 0) + count
+
+    def quantile(self, share: float) -> float | None:
+        """Return the value below which a share of all values is; None without values."""
+        if not self.count:
+            return None
+        if self._values is not None:
+            return float(np.quantile(np.concatenate(self._values), share))
+        return float(self.largest(np.array([self.count - share * (self.count - 1)]))[0])
+
+    def largest(self, ranks: NDArray[Any]) -> NDArray[np.float64]:
+        """Return the values of some ranks, (k,); that of rank 1 is the largest one."""
+        if self._values is not None:
+            values = np.sort(np.concatenate([np.zeros(0), *self._values]))
+            return values[self.count - np.asarray(ranks, np.intp)]
+        places = np.array(sorted(self._counts))
+        below = np.cumsum([self._counts[place] for place in places.tolist()])
+        at = np.searchsorted(below, self.count - np.asarray(ranks), side="right")
+        values = _middle(places[at.clip(max=len(places) - 1)])
+        values = np.where(np.asarray(ranks) <= 1, self._high, values)
+        return np.asarray(np.clip(values, self._low, self._high))
+
+
+def _bins(values: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the number of each value's bin; 0 is that of 0."""
+    sizes = np.abs(values)
+    with np.errstate(divide="ignore"):
+        places = 1 + np.floor(np.log(sizes / _SMALLEST) / np.log1p(RESOLUTION))
+    return (np.sign(values) * np.where(sizes < _SMALLEST, 0, places)).astype(np.int64)
+
+
+def _middle(places: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the geometric middle of each bin."""
+    return np.sign(places) * _SMALLEST * (1 + RESOLUTION) ** (np.abs(places) - 0.5)

@@ -1,0 +1,149 @@
+"""Sizes of a run's signals: states, errors, disturbances, part by part of the record."""
+
+from typing import Any
+
+import numpy as np
+
+from cosim.analysis.summary_model import DisturbancePart, EstimationPart, WatchdogPart
+from cosim.record.align import AlignedPart, IdentityResidual, aligned_parts
+from cosim.record.estimation_error import Reals, SizeStatistics, expected_rms
+from cosim.record.run_record import RunRecord
+from noack.core.linear_systems import row_norms
+from noack.protocol.record_tables import (
+    NO_SEQUENCE,
+    PLANT_ACTUATION,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+)
+from plant_server.watchdog import too_old
+
+
+def _larger(before: float | None, values: Reals) -> float | None:
+    """Return the largest of the values and of those before; NaN if one is NaN."""
+    if not len(values):
+        return before
+    largest = values.max()
+    return float(largest if before is None else np.maximum(before, largest))
+
+
+class SignalStatistics:
+    """Reads the signals of a run once, aligned."""
+
+    def __init__(self, record: RunRecord) -> None:
+        self._record = record
+        self._sup_e_s: float | None = None
+        self._sup_e_c: float | None = None
+        self._sup_e_c_at_s: float | None = None
+        self._residual: float | None = None
+        self._sup_true_e_c: float | None = None
+        self._errors, self._late_errors = SizeStatistics(), SizeStatistics()
+        self._scale, self._read = 0.0, 0
+        self._half = record.count(SENSOR_MEASUREMENT) // 2
+        residual = IdentityResidual(record.scenario)
+        for part in aligned_parts(record):
+            self._add(part)
+            left = residual.take(part)
+            self._residual = _larger(self._residual, left[~np.isnan(left)])
+            self._estimation_error(part)
+            self._read += len(part.rows)
+
+    def _add(self, part: AlignedPart) -> None:
+        aligned = part.aligned
+        common = aligned.since_delivery(self._record.scenario)
+        t_s, e_c = aligned.t_ns[common] * 1e-9, aligned.e_c_norm[common]
+        self._sup_e_s = _larger(self._sup_e_s, aligned.e_s_norm)
+        if len(e_c) and (self._sup_e_c is None or e_c.max() > self._sup_e_c):
+            self._sup_e_c, self._sup_e_c_at_s = float(e_c.max()), float(t_s[np.argmax(e_c)])
+        self._scale = float(np.maximum(self._scale, np.abs(aligned.x_s).max(initial=0.0)))
+
+    def _estimation_error(self, part: AlignedPart) -> None:
+        if part.true_x is None:
+            return
+        # ‖x_c − x‖_W with the plant's own x, from the controller's first update on
+        aligned, weight = part.aligned, self._record.loop.weight
+        e_c = aligned.x_c - part.true_x
+        norms = row_norms(e_c if weight is None else e_c @ weight.T)
+        counted = np.isfinite(norms) & aligned.since_delivery(self._record.scenario)
+        self._sup_true_e_c = _larger(self._sup_true_e_c, norms[counted])
+        errors = row_norms(part.rows["x"] - part.true_x)
+        self._errors.add(errors)
+        self._late_errors.add(errors[max(self._half - self._read, 0) :])
+
+    def for_summary(self) -> dict[str, Any]:
+        """Return norms of the state, of the errors, and of the residual of (I1)."""
+        first, last = None, None
+        for steps in self._record.source.batches(PLANT_STEP, ("x",)):
+            first = float(row_norms(steps["x"][:1])[0]) if first is None else first
+            last = float(row_norms(steps["x"][-1:])[0])
+        scale = max(self._scale, float(np.finfo(float).tiny))
+        return {
+            "initial_state_norm": first,
+            "final_state_norm": last,
+            "sup_e_s_norm": self._sup_e_s,
+            "sup_e_c_norm": self._sup_e_c,
+            "sup_e_c_at_s": self._sup_e_c_at_s,
+            "identity_residual_max": self._residual,
+            "identity_residual_relative": None
+            if self._residual is None
+            else self._residual / scale,
+        }
+
+    def estimation(self) -> EstimationPart | None:
+        """Return the estimation error; None if the sensor measures x itself."""
+        scenario = self._record.scenario
+        if scenario.coverage.knows_state:
+            return None
+        return EstimationPart(
+            observer=None if scenario.observer is None else scenario.observer.kind,
+            outputs=scenario.message_sizes.outputs,
+            noise_std=np.sqrt(scenario.plant.measurement.variance(self._record.loop.n)).tolist(),
+            rms=self._errors.rms,
+            rms_second_half=self._late_errors.rms,
+            expected_rms=expected_rms(scenario),
+            max=self._errors.max,
+            sup_e_c_norm=self._sup_true_e_c,
+        )
+
+
+def disturbances(record: RunRecord) -> list[DisturbancePart]:
+    """The disturbances of u and of ẋ."""
+    found = []
+    for place, column in (("input", "d"), ("state", "w")):
+        if column not in (record.tables[PLANT_STEP].names or ()):
+            continue
+        sizes = SizeStatistics()
+        for steps in record.source.batches(PLANT_STEP, (column,)):
+            sizes.add(row_norms(steps[column]))
+        kinds = [one.kind for one in record.scenario.plant.disturbances if one.at == place]
+        found.append(DisturbancePart(at=place, kinds=kinds, rms=sizes.rms, max=sizes.max))
+    return found
+
+
+def watchdog_actions(record: RunRecord) -> WatchdogPart:
+    """Return the watchdog's actions (the newest actuation was too old) from the recorded steps."""
+    timing = record.scenario.timing
+    received = np.zeros(0, record.tables[PLANT_ACTUATION])
+    trips, steps_old, first_s, was_old = 0, 0, None, False
+    for part in record.slices(PLANT_STEP, PLANT_ACTUATION):
+        steps = part[PLANT_STEP]
+        received = np.concatenate([received, part[PLANT_ACTUATION]])
+        found = np.searchsorted(received["sequence"], steps["actuation"])
+        there = np.append(received["sequence"], NO_SEQUENCE)[found] == steps["actuation"]
+        newest_ns = np.where(
+            steps["actuation"] != NO_SEQUENCE, np.append(received["t_ns"], 0)[found], 0
+        )
+        # If an actuation is not recorded, its age is unknown.
+        old = there & too_old(steps["t_ns"], newest_ns, timing.actuation_timeout_ns)
+        begun = np.flatnonzero(old & ~np.append(was_old, old[:-1])[: len(old)])
+        if len(begun) and first_s is None:
+            first_s = float(steps["t_ns"][begun[0]]) * 1e-9
+        trips, steps_old = trips + len(begun), steps_old + int(old.sum())
+        if len(steps):  # a later step has the newest of these actuations, or a later one
+            was_old, received = bool(old[-1]), received[int(found[-1]) :]
+    return WatchdogPart(
+        policy=record.scenario.plant.watchdog.policy,
+        timeout_s=timing.actuation_timeout_ns * 1e-9,
+        trips=trips,
+        first_s=first_s,
+        total_s=steps_old * timing.plant_period_ns * 1e-9,
+    )

@@ -1,0 +1,96 @@
+"""Both channels of a run's emulator accept the peers' datagrams only, and count the others."""
+
+import socket
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from netem.duplex_link import network_of
+from netem.engine.compiled_network import CompiledNetwork
+from netem.engine.native_pump import compiled_pump
+from netem.run_relay import CompiledShell, RelayShell
+from noack.config.resolution import resolve, tables_of
+from noack.config.scenario_file import load
+from noack.core.clock import RunClock
+from noack.protocol.machine_interface import BEGINNING, Notice
+from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, OWNER
+from noack.runtime.address import text_of
+from noack.runtime.real_time_loop import run_loop
+from noack.runtime.telemetry import TelemetryBuffer
+from noack.runtime.udp_sockets import bind
+from tests.netem.engine.relays import PATIENCE_S, Received, drain, endpoints, name_of
+
+SCENARIO = resolve(
+    load(
+        Path(__file__).parents[2] / "scenarios" / "lane_following.toml",
+        ['network.loss={model="lossless"}', "speed=2.0",
+         'network.impairments=[{kind="delay", delay_s=0.001}]'],
+    )
+)  # fmt: skip
+EARLY, LATER, FOREIGN = 3, 700, 5
+
+
+@pytest.mark.parametrize("engine", ["plain", "batched"])
+def test_early_and_later_datagrams_are_relayed_and_foreign_ones_counted(engine: str) -> None:
+    published: list[tuple[str, bytes]] = []
+    tables = {table: dtype for table, dtype in tables_of(SCENARIO).items()
+              if OWNER[table] == "netem"}  # fmt: skip
+    telemetry = TelemetryBuffer(tables, lambda table, _, rows: published.append((table, rows)))
+    with (
+        endpoints(*["127.0.0.1"] * 3) as (sensor, controller, foreign),
+        closing(bind(0, "test")) as endpoint,
+    ):
+        sensor_name, foreign_name = text_of(name_of(sensor)), text_of(name_of(foreign))
+        for number in range(EARLY):  # before there is a socket for the sensor
+            sensor.sendto(b"%d" % number, endpoint.getsockname())
+        for _ in range(FOREIGN):
+            foreign.sendto(b"?", endpoint.getsockname())
+        clock = RunClock(time.monotonic_ns(), SCENARIO.speed)
+        machine, shell = opened(engine, endpoint, controller, sensor, clock)
+        received: Received = []
+        sent = iter(range(EARLY, EARLY + LATER))
+
+        def news(now_ns: int) -> list[Notice]:
+            for _ in range(100):
+                if (number := next(sent, None)) is not None:
+                    sensor.sendto(b"%d" % number, endpoint.getsockname())
+            return []
+
+        def stop() -> bool:
+            received.extend(drain(controller))
+            late = clock.now_ns() > PATIENCE_S * 1e9 * SCENARIO.speed
+            return late or len(received) == EARLY + LATER
+
+        with closing(shell):
+            run_loop(machine, shell, clock, telemetry, end_ns=None, stop=stop, news=news)
+            telemetry.flush()
+            report = shell.report()
+    assert [int(data) for data, _ in received] == list(range(EARLY + LATER))
+    assert {text_of(source) for _, source in received} == {report["local"]}
+    assert report["engine"] == engine
+    assert report["sent"] == EARLY + LATER
+    assert report["send_errors"] == {}
+    assert report["rejected"] == {"source": FOREIGN}
+    assert report["received_from"] == {sensor_name: EARLY + LATER, foreign_name: FOREIGN}
+    counts = {table: sum(len(rows) for one, rows in published if one == table) for table in tables}
+    for table in (NETEM_PACKET, NETEM_RELEASE):
+        assert counts[table] == (EARLY + LATER) * tables[table].itemsize
+
+
+def opened(
+    engine: str,
+    endpoint: socket.socket,
+    controller: socket.socket,
+    sensor: socket.socket,
+    clock: RunClock,
+) -> tuple[Any, Any]:
+    addresses = endpoint, name_of(controller), name_of(sensor)
+    if engine == "plain":
+        return network_of(SCENARIO), RelayShell(*addresses, duplex=False)
+    network = CompiledNetwork(SCENARIO, BEGINNING, compiled_pump())
+    return network, CompiledShell(
+        *addresses, duplex=False, network=network, clock=clock, spin_us=0.0
+    )
