@@ -20,6 +20,7 @@ from benchmarks import (
     simulation,
     startup,
 )
+from benchmarks._programs import provide
 from benchmarks._report import run
 
 MODULES = (
@@ -28,4 +29,5 @@ MODULES = (
 )  # fmt: skip
 
 if __name__ == "__main__":
+    provide()
     sys.exit(run([module.BENCHMARK for module in MODULES]))

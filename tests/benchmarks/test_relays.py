@@ -41,6 +41,7 @@ def test_the_goals_of_the_rates() -> None:
         ("ours: drained", "socat", True),
         ("ours: drained", "C relay", False),
         ("ours, segments: drained", "socat", True),
+        ("ours, segments: drained", "C relay, segments", False),
     ]
 
 
