@@ -39,12 +39,12 @@ OURS = {
 DIRECT = "direct, no relay"
 RATES = (
     (PLAIN, "socat", Goal(">=", 2)),
-    (PLAIN, "C relay", Goal(">=", 0.8)),
+    (PLAIN, "C relay", Goal(">=", 0.95)),
     (SEGMENTS, "socat", Goal(">=", 5)),
     (PLAIN, "socat, connected", None),
     (PLAIN, "asyncio relay", None),
     (PLAIN, DIRECT, None),
-    (SEGMENTS, "C relay, segments", None),
+    (SEGMENTS, "C relay, segments", Goal(">=", 0.95)),
     (SOCKETS, "socat", None),
 )
 COSTS = (
@@ -78,7 +78,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
             "socat": socat(),
             "socat, connected": socat(connected=True),
             "C relay": c_relay(tools),
-            "C relay, segments": c_relay(tools, segment=True),
+            "C relay, segments": c_relay(tools, "segment"),
             "asyncio relay": asyncio_relay(),
             **{name: our_relay(name, ours) for name, ours in OURS.items()},
         }

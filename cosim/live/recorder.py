@@ -14,6 +14,7 @@ from cosim.analysis.claims.assumption_monitor import AssumptionMonitor
 from cosim.analysis.claims.observed_conditions import AssumptionViolation
 from cosim.live.progress_report import ProgressReport
 from cosim.live.telemetry_store import TelemetryStore
+from cosim.record.decimate import is_long
 from cosim.record.run_directory import active_run
 from cosim.record.run_record import Rows, RunRecord, finish_record, report_of, write_reports
 from noack.config.parameter_changes import ParameterChange, change_notice
@@ -304,7 +305,9 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
     if process.replaces is not None:
         recorder.note(Notice(process.start.from_ns, RESTART, f"restarted: {process.replaces}"))
     process.join(None)
-    if not process.start.is_restart:  # a restarted recorder writes the view again at the end
+    # A restarted recorder, and that of a long run, write the view at the end.
+    at_end = process.start.is_restart or is_long(process.scenario)
+    if view is not None or not at_end:
         try:
             view = view or _open_view(process, None)
             recorder.show_in(view)
@@ -324,7 +327,7 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
             view.close()
     except MachineError as error:
         print_to_stderr(f"noack recorder: {error}; the numeric record is complete")
-    if recorder.view_is_incomplete:
+    if recorder.view_is_incomplete or at_end:
         from cosim.output.viewer.run_view import write_view
 
         write_view(record, run_dir, run_id)

@@ -3,10 +3,14 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from noack.config.scenario import Scenario
+
 Reals = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 _POINTS_PER_COLUMN = 4
+_MOST_STEPS = 2**20
+"""Steps of the plant that a recording for the viewer shows one by one."""
 
 
 def decimate(t: Reals, y: Reals, columns: int) -> Indices:
@@ -52,3 +56,11 @@ def _where_first(
     _, which = np.unique(column[equal], return_index=True)
     found: Indices = equal[which]
     return found
+
+
+def is_long(scenario: Scenario) -> bool:
+    """Whether a run has too many steps to show all of them.
+
+    Its recording is written from the record, reduced to the extremes of short intervals.
+    """
+    return scenario.timing.horizon_ns // scenario.timing.plant_period_ns > _MOST_STEPS

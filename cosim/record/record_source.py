@@ -10,7 +10,7 @@ Rows = NDArray[np.void]
 Slice = Mapping[str, Rows]
 """Consecutive rows of several tables, up to the same time."""
 
-BATCH_ROWS = 65_536
+BATCH_ROWS = 16_384
 """Largest number of rows of a table that are read at a time."""
 
 

@@ -37,8 +37,10 @@ def new_run_dir(runs: Path, name: str) -> Path:
     """Create a fresh run directory below ``runs``.
 
     Raises:
+        CallerError: the path is not UTF-8.
         MachineError: the directory cannot be created.
     """
+    _require_utf8(runs)
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
     try:
         runs.mkdir(parents=True, exist_ok=True)
@@ -57,6 +59,14 @@ def new_run_dir(runs: Path, name: str) -> Path:
     except OSError as error:
         raise MachineError(f"{runs}: no run directory can be created: {why(error)}") from None
     raise MachineError(f"{runs}: too many runs named {stamp}-{name}")
+
+
+def _require_utf8(path: Path) -> None:
+    """Refuse a path that pyarrow, rerun and JSON cannot represent."""
+    try:
+        os.fspath(path.absolute()).encode()
+    except UnicodeEncodeError:
+        raise CallerError(f"{path}: the name of a folder is not UTF-8; rename it") from None
 
 
 def write_scenario(resolved: "Scenario", run_dir: Path) -> "Scenario":
@@ -137,8 +147,10 @@ def chosen_run(run_dir: Path | None, runs: Path) -> Path:
     """Return the given run directory, or the newest below ``runs`` if none is given.
 
     Raises:
-        CallerError: as :func:`latest_run`, which also resolves a given ``latest``.
+        CallerError: as :func:`latest_run`, which also resolves a given ``latest``; or the path is
+            not UTF-8.
     """
+    _require_utf8(run_dir or runs)
     if run_dir is None:
         return latest_run(runs)
     if run_dir.name == LATEST and run_dir.is_symlink():

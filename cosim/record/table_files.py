@@ -28,6 +28,7 @@ from noack.config.resolution import LoopMatrices
 from noack.core.errors import CallerError, one_line
 from noack.protocol.record_tables import OWNER, entry_names
 
+_GROUP_ROWS = 2 * BATCH_ROWS
 RowType = np.dtype[np.void]
 
 
@@ -105,9 +106,11 @@ def read_batches(path: Path, dtype: RowType) -> Iterator[Rows]:
     names = [column for column, _ in _columns(dtype)]
     with _readable(path), pq.ParquetFile(path) as file:
         _require_columns(path, file.schema_arrow, dtype)
-        for batch in file.iter_batches(BATCH_ROWS, columns=names):
-            batch.validate(full=True)
-            yield _rows(path, batch, dtype)
+        for group in range(file.num_row_groups):
+            # A reader of several groups would keep the memory of all of them to the end.
+            for batch in file.iter_batches(BATCH_ROWS, row_groups=[group], columns=names):
+                batch.validate(full=True)
+                yield _rows(path, batch, dtype)
 
 
 def group_segments(path: Path, dtype: RowType) -> Iterator[Segment]:
@@ -136,7 +139,7 @@ def _read_group(path: Path, group: int, dtype: RowType) -> Rows:
 
 
 def write_table(path: Path, batches: Iterable[Rows], dtype: RowType, loop: LoopMatrices) -> None:
-    """Write a table's file from batches of rows, in row groups of ``BATCH_ROWS``.
+    """Write a table's file from batches of rows, in row groups of ``_GROUP_ROWS``.
 
     Raises:
         OSError: the file cannot be written.
@@ -156,17 +159,17 @@ def write_table(path: Path, batches: Iterable[Rows], dtype: RowType, loop: LoopM
 
 
 def _regrouped(batches: Iterable[Rows], dtype: RowType) -> Iterator[Rows]:
-    """Yield the same rows in batches of ``BATCH_ROWS``; only the last one may be shorter."""
+    """Yield the same rows in batches of ``_GROUP_ROWS``; only the last one may be shorter."""
     waiting: list[Rows] = []
     count = 0
     for batch in batches:
         waiting.append(batch)
         count += len(batch)
-        if count >= BATCH_ROWS:
+        if count >= _GROUP_ROWS:
             rows = np.concatenate(waiting)
-            whole = count - count % BATCH_ROWS
-            for first in range(0, whole, BATCH_ROWS):
-                yield rows[first : first + BATCH_ROWS]
+            whole = count - count % _GROUP_ROWS
+            for first in range(0, whole, _GROUP_ROWS):
+                yield rows[first : first + _GROUP_ROWS]
             waiting, count = [rows[whole:].copy()], count - whole
     if count:
         yield np.concatenate([np.zeros(0, dtype), *waiting])

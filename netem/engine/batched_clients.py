@@ -23,7 +23,7 @@ from netem.engine.relay_sockets import (
 )
 from noack.runtime.udp_sockets import drops_of
 
-_QUERIED_AT_ONCE = 256
+_QUERIED_AT_ONCE = 64
 
 
 class ClientTable:

@@ -2,7 +2,7 @@
 
 import ctypes
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, nullcontext
+from contextlib import closing, nullcontext, suppress
 from functools import cache
 
 import numpy as np
@@ -156,7 +156,13 @@ class BatchedRelay(Relay):
         server, both["name_bytes"] = packed_name(link.server)
         both["name"] = np.frombuffer(server, np.uint8)
         both["listen"] = np.frombuffer(packed_name(link.name)[0], np.uint8)
-        sends = pump_layout.NO_NAME if link.path is None else pump_layout.SERVER_NAME
+        sends = pump_layout.OWN_SOCKET
+        if link.path is not None:
+            sends = pump_layout.SERVER_NAME
+            with suppress(OSError):  # there is no route now; perhaps later
+                # For a connected socket, the kernel looks up the route once, not per datagram.
+                link.path.connect(link.server)
+                sends = pump_layout.LINK_SOCKET
         both["sends"] = sends, pump_layout.CLIENT_NAME
 
     def _stamp_arrivals(self, direction: int) -> None:
@@ -196,8 +202,9 @@ class BatchedRelay(Relay):
 
     def _send_errors(self) -> Iterator[tuple[int, int, int]]:
         errors = self._memory.memory.errors
-        for direction, error in np.argwhere(errors).tolist():
-            yield direction, error, int(errors[direction, error])
+        if errors.any():
+            for direction, error in np.argwhere(errors).tolist():
+                yield direction, error, int(errors[direction, error])
 
 
 @cache

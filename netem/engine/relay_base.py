@@ -21,7 +21,7 @@ from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.udp_sockets import drops_of
 
-_PERIOD_NS = 20_000_000
+_PERIOD_NS = 40_000_000
 RARE_PERIOD_NS = 250_000_000
 STALL_NS = 1_000_000_000
 """An engine that has not checked for idle clients for this time was stopped, or got no CPU time."""

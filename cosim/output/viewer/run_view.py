@@ -7,6 +7,7 @@ from cosim.output.viewer.pictures.network_picture import LEG_S, NetworkDiagram
 from cosim.output.viewer.pictures.picture_choice import picture_of
 from cosim.output.viewer.recording import RunView
 from cosim.output.viewer.table_feed import ViewFeed
+from cosim.record.decimate import is_long
 from cosim.record.environment import Kind
 from cosim.record.run_directory import RECORDING_FILE
 from cosim.record.run_record import RunRecord
@@ -39,18 +40,25 @@ def open_view(
         processes=LOOP_ROLES if kind == "live" else (),
         horizon_s=scenario.horizon_s,
         picture=picture_of(scenario),
-        diagram=NetworkDiagram(acknowledged=scenario.protocol.acknowledges),
+        diagram=None
+        if at_once and is_long(scenario)
+        else NetworkDiagram(acknowledged=scenario.protocol.acknowledges),
         live=live,
         indexed=at_once or scenario.horizon_s <= _INDEXED_S * scenario.speed,
     )
 
 
 def write_view(record: RunRecord, run_dir: Path, run_id: int) -> None:
-    """Write a run's recording from its finished record."""
-    with open_view(record.scenario, run_dir, run_id, None, record.kind, at_once=True) as view:
-        feed = ViewFeed(record.scenario, view)
-        for table in record.tables:
-            feed.add(table, record[table])
+    """Write a run's recording from its record; that of a long run shows extremes only."""
+    scenario = record.scenario
+    columns = record.slice_columns if is_long(scenario) else None
+    with open_view(scenario, run_dir, run_id, None, record.kind, at_once=True) as view:
+        feed = ViewFeed(scenario, view, columns)
+        for i, part in enumerate(record.slices()):
+            if i:
+                feed.advance()
+            for table, rows in part.items():
+                feed.add(table, rows)
         for notice in record.notices:
             feed.log(notice)
         feed.advance(final=True)

@@ -17,6 +17,7 @@ from cosim.record.align import (
     initial_track,
     join,
 )
+from cosim.record.decimate import decimate_all
 from cosim.record.estimation_error import true_states
 from cosim.record.recorded_changes import claimed_until_s, model_flow
 from cosim.record.run_record import Rows, updates_in
@@ -59,9 +60,11 @@ class ViewFeed:
     Args:
         scenario: the resolved scenario.
         view: receives the aligned batches.
+        columns: reduce each batch to the extremes in so many columns; None keeps all rows.
     """
 
-    def __init__(self, scenario: Scenario, view: RunView) -> None:
+    def __init__(self, scenario: Scenario, view: RunView, columns: int | None = None) -> None:
+        self._columns = columns
         self._scenario = scenario
         self._loop = loop_of(scenario)
         self._view = view
@@ -153,11 +156,18 @@ class ViewFeed:
         )
         if not self._scenario.protocol.acknowledges:
             bounds[~in_common(self._scenario, joined)] = np.nan
-        self._view.samples(joined, bounds, self._certified(t_s, "state"))
-        self._view.move(joined.t_ns, Frames(t_s, joined.x, joined.x_s, joined.x_c, z))
+        curves = [joined.x, joined.x_s, joined.x_c, joined.e_s_norm, joined.e_c_norm, bounds]
+        kept = self._kept(joined.t_ns, np.column_stack(curves))
+        thin = AlignedRun._make(values[kept] for values in joined)
+        self._view.samples(thin, bounds[kept], self._certified(t_s[kept], "state"))
+        frames = Frames(t_s, joined.x, joined.x_s, joined.x_c, z)
+        shown = self._kept_frames(len(t_s))
+        self._view.move(joined.t_ns[shown], frames.at(shown))
         event_ns = rows["t_ns"][rows["event"] != NO_SEQUENCE]
         if len(event_ns):
-            self._view.broadcasts(event_ns, _intervals_s(event_ns, self._last_event_ns))
+            passed_s = _intervals_s(event_ns, self._last_event_ns)
+            kept = self._kept(event_ns, passed_s)
+            self._view.broadcasts(event_ns[kept], passed_s[kept])
             self._last_event_ns = int(event_ns[-1])
         self._lateness("sensor", rows)
         keep = max(int(np.searchsorted(self._track.model_ns, rows["t_ns"][-1], "right")) - 1, 0)
@@ -187,11 +197,22 @@ class ViewFeed:
         """Return the bound of ‖e_c‖ from (I1), (k,); NaN if updates are acknowledged."""
         if self._scenario.protocol.acknowledges:
             return np.full(len(rows), np.nan)
-        samples = zip(
-            rows["t_ns"].tolist(), rows["x_s"] - rows["x"], rows["event"].tolist(),
-            joined.received.tolist(), strict=True,
-        )  # fmt: skip
-        return np.array([self._monitor.sample(*sample).identity for sample in samples])
+        e_s = rows["x_s"] - rows["x"]
+        return self._monitor.samples(rows["t_ns"], e_s, rows["event"], joined.received)[:, 0]
+
+    def _kept(self, t_ns: Times, values: Reals) -> NDArray[np.intp]:
+        """Return the rows to show of curves, (k,) or (k, n)."""
+        if self._columns is None:
+            return np.arange(len(t_ns))
+        t_s = np.asarray(t_ns * 1e-9, np.float64)
+        return decimate_all(t_s, values.reshape(len(t_ns), -1), self._columns)
+
+    def _kept_frames(self, count: int) -> NDArray[np.bool_]:
+        """Return at which of some measurements the plant's picture is drawn."""
+        shown = np.ones(count, np.bool_)
+        if self._columns is not None:
+            shown[np.arange(count) % max(count // self._columns, 1) != 0] = False
+        return shown
 
     def _deliveries(self, until_ns: int | None) -> None:
         """Draw deliveries once the rows of the network process about them must have arrived."""
@@ -205,7 +226,9 @@ class ViewFeed:
         newest = int(rows["sequence"][-1])
         self._forced = {sequence for sequence in self._forced if sequence > newest}
         event_ns = rows["t_ns"]
-        self._view.receptions(event_ns, _intervals_s(event_ns, self._last_delivery_ns), forced)
+        passed_s = _intervals_s(event_ns, self._last_delivery_ns)
+        keep = self._kept(event_ns, passed_s)
+        self._view.receptions(event_ns[keep], passed_s[keep], forced[keep])
         self._last_delivery_ns = int(event_ns[-1])
 
     def _packets(self, rows: Rows) -> None:
@@ -221,21 +244,24 @@ class ViewFeed:
         self._forced.update(sequence[rows["fate"] == Fate.FORCED].tolist())
         dropped = ~effective(rows["fate"])
         if dropped.any():
-            self._view.drops(event_ns[dropped])
-        self._view.lateness("netem", event_ns, self._wall_us(rows["now_ns"] - event_ns))
+            lost_ns = event_ns[dropped]
+            self._view.drops(lost_ns[self._kept(lost_ns, np.zeros(len(lost_ns)))])
+        self._show_lateness("netem", event_ns, rows["now_ns"])
 
     def _inputs(self, steps: Rows) -> None:
         if len(steps):
-            self._view.inputs(steps["t_ns"], steps["u"])
+            keep = self._kept(steps["t_ns"], steps["u"])
+            self._view.inputs(steps["t_ns"][keep], steps["u"][keep])
             self._lateness("controller", steps)
 
     def _lateness(self, process: str, rows: Rows) -> None:
         if len(rows):
-            late_us = self._wall_us(rows["now_ns"] - rows["t_ns"])
-            self._view.lateness(process, rows["t_ns"], late_us)
+            self._show_lateness(process, rows["t_ns"], rows["now_ns"])
 
-    def _wall_us(self, simulated_ns: Times) -> NDArray[np.float64]:
-        return np.asarray(simulated_ns / (1e3 * self._scenario.speed), dtype=np.float64)
+    def _show_lateness(self, process: str, t_ns: Times, now_ns: Times) -> None:
+        late_us = np.asarray((now_ns - t_ns) / (1e3 * self._scenario.speed), dtype=np.float64)
+        keep = self._kept(t_ns, late_us)
+        self._view.lateness(process, t_ns[keep], late_us[keep])
 
 
 def _intervals_s(t_ns: Times, before_ns: int | None) -> NDArray[np.float64]:

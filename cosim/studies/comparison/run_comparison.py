@@ -10,6 +10,7 @@ import numpy as np
 
 from cosim.analysis.run_summary import Summary
 from cosim.live.finalize import reopen
+from cosim.record.run_directory import chosen_run
 from cosim.record.run_record import RunRecord, load_record
 from noack.core.errors import CallerError, shortened
 from noack.protocol.record_tables import PLANT_STEP
@@ -160,7 +161,9 @@ def compare_runs(directories: Sequence[Path]) -> RunComparison:
         )
     runs = tuple(
         ComparedRun(label, path, reopen(path).summary, load_record(path))
-        for label, path in zip(LABELS, directories, strict=False)
+        for label, path in zip(
+            LABELS, (chosen_run(one, one.parent) for one in directories), strict=False
+        )
     )
     first = runs[0].record.loop.n
     for run in runs[1:]:

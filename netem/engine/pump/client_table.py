@@ -21,7 +21,7 @@ def key_of(name: Array, link: int) -> tuple[int, int, int, int]:
 def find(table: Array, clients: Array, key0: int, key1: int, key2: int, key3: int) -> int:
     """Return the row of the client with a key; −1 if there is none."""
     mask = len(table) - 1
-    place = _hash(key0, key1, key2, key3) & mask
+    place = home_of(table, key0, key1, key2, key3)
     while table[place] >= 0:
         client = clients[table[place]]
         if (
@@ -44,7 +44,7 @@ def insert(table: Array, clients: Array, row: int, name: Array) -> None:
     client.key2 = key2
     client.key3 = key3
     mask = len(table) - 1
-    place = _home(clients, row) & mask
+    place = _home(table, clients, row)
     while table[place] >= 0:
         place = (place + 1) & mask
     table[place] = row
@@ -53,7 +53,7 @@ def insert(table: Array, clients: Array, row: int, name: Array) -> None:
 def remove(table: Array, clients: Array, row: int) -> None:
     """Remove a client from the table, and close the gap."""
     mask = len(table) - 1
-    gap = _home(clients, row) & mask
+    gap = _home(table, clients, row)
     while table[gap] != row:
         gap = (gap + 1) & mask
     place = gap
@@ -61,7 +61,7 @@ def remove(table: Array, clients: Array, row: int) -> None:
         place = (place + 1) & mask
         if table[place] < 0:
             break
-        home = _home(clients, table[place]) & mask
+        home = _home(table, clients, table[place])
         # An entry may move into the gap unless its home is cyclically after the gap.
         if ((place - home) & mask) >= ((place - gap) & mask):
             table[gap] = table[place]
@@ -69,15 +69,15 @@ def remove(table: Array, clients: Array, row: int) -> None:
     table[gap] = -1
 
 
-def _home(clients: Array, row: int) -> int:
+def _home(table: Array, clients: Array, row: int) -> int:
     client = clients[row]
-    return _hash(client.key0, client.key1, client.key2, client.key3)
+    return home_of(table, client.key0, client.key1, client.key2, client.key3)
 
 
-def _hash(key0: int, key1: int, key2: int, key3: int) -> int:
-    """Return a hash of four words; the product overflows on purpose."""
+def home_of(table: Array, key0: int, key1: int, key2: int, key3: int) -> int:
+    """Return the first place in the table for a key, its hash; the product overflows on purpose."""
     mixed = 0
     for word in (key0, key1, key2, key3):
         mixed = (mixed ^ word) * _GOLDEN
         mixed ^= mixed >> 29
-    return mixed
+    return mixed & (len(table) - 1)

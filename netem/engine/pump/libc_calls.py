@@ -29,7 +29,6 @@ poll = _function("poll", _int, _word, _word, _int)
 ppoll = _function("ppoll", _int, _word, _word, _word, _word)
 recvmmsg = _function("recvmmsg", _int, _int, _word, types.uint32, _int, _word)
 sendmmsg = _function("sendmmsg", _int, _int, _word, types.uint32, _int)
-sendto = _function("sendto", types.int64, _int, _word, _word, _int, _word, types.uint32)
 syscall = _function("syscall", types.int64, *[types.int64] * 7)
 
 ECONNREFUSED = 111

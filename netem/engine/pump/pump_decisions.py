@@ -248,9 +248,9 @@ def _line_up(memory: Memory, state_like: LinkMemory) -> None:
     leaving.error = 0
     pump.leaving += 1
     pump.leaving_bytes += leaving.size_bytes
-    if direction.sends == layout.NO_NAME:
+    if direction.sends == layout.OWN_SOCKET:
         leaving.socket = pump.first_path + leaving.client
-    elif direction.sends == layout.SERVER_NAME:
-        leaving.socket = len(memory.directions) // 2 + link
-    else:
+    elif direction.sends == layout.CLIENT_NAME:
         leaving.socket = link
+    else:
+        leaving.socket = len(memory.directions) // 2 + link

@@ -15,7 +15,9 @@ MOST_BYTES = 65_536  # no received datagram is longer
 SLOT_STRIDE = MOST_BYTES + 256
 """Distance of receive buffers: their first bytes are in different cache sets."""
 SYS_EPOLL_PWAIT2 = 441  # on every architecture; libc has the function since glibc 2.35
-READY_WORDS = 3 if platform.machine() in ("x86_64", "AMD64") else 4
+_ON_X86 = platform.machine() in ("x86_64", "AMD64")
+SYS_SENDTO = 44 if _ON_X86 else 206
+READY_WORDS = 3 if _ON_X86 else 4
 """32-bit words in struct epoll_event, which is packed on x86-64 only."""
 
 # Why the pump returned; LEAVING_FULL and CARRY_ON occur within the pump only.
@@ -27,10 +29,11 @@ LEAVING_FULL = 4  # the list of departures is full and must be sent
 CARRY_ON = 5  # no reason to return
 CHANGE_DUE = 6  # other settings apply from the current datagram on
 
-# The destination of a direction's datagrams.
-NO_NAME = 0  # the address to which their socket is connected
-SERVER_NAME = 1  # the server, from a socket that is not connected
-CLIENT_NAME = 2
+# The socket that sends a direction's datagrams, and their destination.
+OWN_SOCKET = 0  # the client's socket, which is connected to the server
+SERVER_NAME = 1  # the link's sending socket, which is not connected, to the server
+CLIENT_NAME = 2  # the link's listening socket, to the client
+LINK_SOCKET = 3  # the link's sending socket, which is connected to the server
 
 PUMP = np.dtype(
     [
@@ -50,6 +53,7 @@ PUMP = np.dtype(
         ("batch_socket", "<i8"),
         ("batch_next", "<i8"),  # the current receive buffer
         ("batch_end", "<i8"),
+        ("loaded", "<i8"),  # a sum of what was loaded into the caches, so that it is loaded
         ("ready", "<i8"),  # number of sockets that are ready
         ("ready_next", "<i8"),
         ("stamp", "<i8"),
@@ -128,7 +132,7 @@ DIRECTION = np.dtype(
         ("limit", "<i8"),
         ("tracks", "<i8"),
         ("keeps", "<i8"),  # 1: datagrams can be delayed
-        ("sends", "<i8"),  # NO_NAME, SERVER_NAME or CLIENT_NAME
+        ("sends", "<i8"),  # OWN_SOCKET, SERVER_NAME, CLIENT_NAME or LINK_SOCKET
         ("name_bytes", "<i8"),
         ("name", "u1", (NAME_BYTES,)),  # forward: the server's
         ("listen", "u1", (NAME_BYTES,)),  # the link's address

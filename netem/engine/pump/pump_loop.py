@@ -2,6 +2,7 @@
 
 from netem.engine.pump import libc_calls as libc
 from netem.engine.pump import pump_layout as layout
+from netem.engine.pump.cache_warming import warm_clients
 from netem.engine.pump.error_queue import take_errors
 from netem.engine.pump.pump_clock import relay_time_ns, wall_ns_of
 from netem.engine.pump.pump_decisions import decide, release_due
@@ -64,6 +65,7 @@ def run_pump(
                 return layout.HOUSEKEEPING
         if pump.ready_next < pump.ready:
             _receive(memory)
+            warm_clients(memory, state_like)
 
 
 def _is_soon_due(memory: Memory, until_ns: int) -> bool:

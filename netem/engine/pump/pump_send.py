@@ -131,7 +131,7 @@ def _address(memory: Memory, header: int, number: int, client: int) -> None:
     if direction.sends == layout.CLIENT_NAME:
         name = libc.address_of(memory.clients) + client * _CLIENT_BYTES + _CLIENT_NAME
         name_bytes = memory.clients[client].name_bytes
-    elif direction.sends != layout.NO_NAME:
+    elif direction.sends == layout.SERVER_NAME:
         name = libc.address_of(memory.directions) + number * _DIRECTION_BYTES + _DIRECTION_NAME
         name_bytes = direction.name_bytes
     memory.out_headers[header].name = name
@@ -169,11 +169,12 @@ def _transmit(memory: Memory, socket: int, headers: int, following: int) -> int:
     while done < headers:
         header = memory.out_headers[done]
         if headers - done == 1 and header.n_vectors == 1 and header.control_bytes == 0:
-            # For a single datagram, sendto is cheaper.
+            # For a single datagram, sendto is cheaper; libc's own also handles thread cancellation.
             vector = memory.out_vectors[(header.vectors - vectors) // _VECTOR_BYTES]
-            sent = libc.sendto(
-                fd, vector.base, vector.size_bytes, _NO_WAIT, header.name, header.name_bytes
-            )
+            sent = libc.syscall(
+                layout.SYS_SENDTO, fd, vector.base, vector.size_bytes, _NO_WAIT, header.name,
+                header.name_bytes,
+            )  # fmt: skip
             sent = min(sent + 1, 1)
         else:
             sent = libc.sendmmsg(fd, base + done * _HEADER_BYTES, headers - done, _NO_WAIT)

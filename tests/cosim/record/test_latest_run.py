@@ -13,6 +13,7 @@ from cosim.record.run_directory import (
     SCENARIO_FILE,
     chosen_run,
     latest_run,
+    new_run_dir,
     point_to_latest,
 )
 from noack.core.errors import CallerError
@@ -82,3 +83,10 @@ def test_a_link_that_cannot_be_replaced_is_reported(runs: Path) -> None:
     )
     assert (runs / LATEST).readlink() == Path("first")
     assert sorted(path.name for path in runs.iterdir()) == ["first", "latest", "second"]
+
+
+def test_a_folder_whose_name_is_not_utf_8_is_refused(tmp_path: Path) -> None:
+    folder = tmp_path / os.fsdecode(b"r\xff")
+    for refused in (lambda: new_run_dir(folder, "x"), lambda: chosen_run(folder, tmp_path)):
+        with pytest.raises(CallerError, match="is not UTF-8; rename it"):
+            refused()

@@ -112,6 +112,31 @@ def test_answers_from_another_address_of_the_server_do_not_make_it_a_client(engi
             assert one.report().clients_ever == 1
 
 
+def test_seven_hundred_clients_keep_their_flows_and_answers_apart(engine: Engine) -> None:
+    """For so many, the compiled engine loads the clients' data before the decisions."""
+    with endpoints(V4) as (server,), endpoints(*[V4] * 700) as clients:
+        ports = [name_of(client)[1] for client in clients]
+        with running([link(name_of(server), THIRD_LOST)], engine) as one:
+            for number in range(3):
+                for client, port in zip(clients, ports, strict=True):
+                    client.sendto(b"%d %d" % (port, number), one.address())
+                one.settle(700 * (number + 1))
+            arrived: dict[int, list[int]] = {}
+            for data, path in one.receive(server, 1400):
+                port, number = map(int, data.split())
+                arrived.setdefault(port, []).append(number)
+                if len(arrived[port]) == 2:
+                    server.sendto(b"%d" % port, path)
+            for client, port in zip(clients, ports, strict=True):
+                assert [data for data, _ in one.receive(client)] == [b"%d" % port]
+            report = one.report()
+    (order,) = set(map(tuple, arrived.values()))  # each flow has the same loss pattern
+    assert list(order) == sorted(order)
+    assert sorted(arrived) == sorted(ports)
+    counters = report.forward.counters
+    assert (report.clients, counters.received, counters.dropped) == (700, 2100, 700)
+
+
 def test_the_same_port_of_two_addresses_is_two_flows_with_a_path_each(engine: Engine) -> None:
     with endpoints(V4, "127.0.0.2") as (server, first), ExitStack() as stack:
         second = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
@@ -192,13 +217,13 @@ def test_datagrams_of_any_size_and_their_copies_arrive(engine: Engine, delay: st
 
 
 def test_a_change_keeps_flows_and_datagrams_in_flight(engine: Engine) -> None:
-    late, lossy = settings_of("delay 50ms mansd 1"), settings_of("loss worst mansd 1")
+    late, lossy = settings_of("delay 500ms mansd 1"), settings_of("loss worst mansd 1")
     with (
         endpoints(V4, V4) as (server, client),
         running([link(name_of(server), late)], engine) as one,
     ):
         send_numbers(client, one.address(), 0, 4)
-        one.until(lambda: one.report().forward.in_flight == 4)
+        one.until(lambda: one.report().forward.counters.received == 4)
         one.relay.change("test", "forward", lossy)
         send_numbers(client, one.address(), 4, 8)
         one.settle(8)

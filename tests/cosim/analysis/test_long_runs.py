@@ -1,0 +1,114 @@
+"""A run that is read in many parts has the results of one that is read at once."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
+from cosim.analysis.claims.claims_by_part import RunClaims
+from cosim.analysis.quantile_sketch import EXACT, RESOLUTION, QuantileSketch
+from cosim.analysis.replay import replay
+from cosim.analysis.run_summary import summarise
+from cosim.record import run_record
+from cosim.record.align import align_tables
+from cosim.record.run_directory import write_scenario
+from cosim.record.run_record import RunRecord, load_record, write_record
+from cosim.simulation.virtual_time import simulate
+from noack.config.resolution import resolve
+from noack.config.scenario_file import validate
+from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
+
+PART_ROWS = 37
+NOISE = {"C": [[1.0, 0.0]], "noise_std": [0.02]}
+ROUNDED = ("rms", "rms_second_half")
+"""Sums: their last bits depend on the order of the terms."""
+
+
+@pytest.fixture(params=["plain", "disturbed", "observed", "acknowledged", "changed"])
+def record(request: pytest.FixtureRequest, content: dict[str, Any]) -> RunRecord:
+    content |= {"horizon_s": 3.0}
+    if request.param in ("disturbed", "observed"):
+        content["plant"] |= {"disturbances": [{"kind": "gaussian", "std": [0.5]}]}
+    if request.param == "observed":
+        content["plant"]["measurement"] = NOISE
+        content["observer"] = {"kind": "kalman", "initial_std": [0.4, 0.4]}
+        content["trigger"] |= {"beta": 0.1, "floor": 0.1}
+    if request.param == "acknowledged":
+        content["network"] |= {"protocol": "ack"}
+    if request.param == "changed":
+        content["changes"] = [{"at_s": 1.0, "set": {"trigger.floor": 0.05}}]
+    found = simulate(resolve(validate(content, "test")))
+    assert len(found[PLANT_STEP]) > 5 * PART_ROWS
+    return found
+
+
+def results(record: RunRecord) -> dict[str, Any]:
+    claims = RunClaims(record)
+    return {
+        "summary": summarise(record, 0, "horizon").model_dump(mode="json"),
+        "replay": replay(record).document(),
+        "claims": [claim.model_dump(mode="json") for claim in claims.judge()],
+        "violations": claims.violations(),
+        "conditions": claims.conditions,
+        "envelopes": [
+            (one.label, one.t_s.tobytes(), one.values.tobytes()) for one in claims.envelopes()
+        ],
+        "inter_event_s": [
+            passed_s
+            for part in ClaimEvaluation(record).samples()
+            for passed_s in part.inter_event_s[1].tolist()
+        ],
+        "aligned": [column.tobytes() for column in align_tables(record)],
+    }
+
+
+def without_sums(found: Any) -> Any:
+    if isinstance(found, dict):
+        return {k: without_sums(v) for k, v in found.items() if k not in ROUNDED}
+    return [without_sums(one) for one in found] if isinstance(found, list) else found
+
+
+def test_the_results_do_not_depend_on_the_parts(
+    record: RunRecord, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = results(record)
+    monkeypatch.setattr(run_record, "BATCH_ROWS", PART_ROWS)
+    monkeypatch.setattr(RunRecord, "slice_columns", 10**6)
+    in_parts = RunRecord(record.scenario, record.source, record.notices, record.reports, "live")
+    in_parts.kind = record.kind
+    assert len(list(in_parts.slices())) > 5
+    assert without_sums(results(in_parts)) == without_sums(whole)
+
+
+def test_slices_are_the_tables_in_order(
+    record: RunRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_scenario(record.scenario, tmp_path)
+    write_record(record, tmp_path)
+    monkeypatch.setattr(run_record, "BATCH_ROWS", PART_ROWS)
+    stored = load_record(tmp_path)
+    parts = list(stored.slices())
+    for table in record.tables:
+        assert np.concatenate([part[table] for part in parts]).tobytes() == record[table].tobytes()
+    ends_ns = [part[PLANT_STEP]["now_ns"][-1] for part in parts[:-1]]
+    begins_ns = [part[SENSOR_MEASUREMENT]["now_ns"][0] for part in parts[1:]]
+    assert all(end < begin for end, begin in zip(ends_ns, begins_ns, strict=True))
+
+
+def test_quantiles_of_many_values_have_the_stated_error() -> None:
+    values = np.random.default_rng(1).lognormal(3, 2, EXACT + 5000)
+    values[:1000] *= -1
+    sketch = QuantileSketch.of(np.array_split(values, 40))
+    for share in (0.0, 0.0005, 0.01, 0.5, 0.99, 0.999, 0.999999):
+        exact = float(np.quantile(values, share, method="lower"))
+        assert sketch.quantile(share) == pytest.approx(exact, rel=RESOLUTION)
+    assert sketch.quantile(1.0) == values.max()
+
+
+def test_quantiles_of_few_values_are_exact() -> None:
+    values = np.random.default_rng(1).lognormal(3, 2, 5000)
+    sketch = QuantileSketch.of(np.array_split(values, 7))
+    assert sketch.quantile(0.99) == np.quantile(values, 0.99)
+    assert QuantileSketch().quantile(0.5) is None
