@@ -25,6 +25,7 @@ from noack.core.clock import RunClock
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.loop_protocol import PROTOCOLS
 from noack.protocol.machine_interface import BEGINNING, Machine, Record, Start
+from noack.protocol.record_tables import NETEM_RELEASE
 from tests.netem import any_settings
 from tests.netem.engine.relays import drain, endpoints, name_of
 
