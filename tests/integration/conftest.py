@@ -108,7 +108,8 @@ class Running:
     def udp_port(self, role: str) -> int:
         """Return the receiving port of a process of the loop."""
         connections = self.child(role).net_connections("udp4")
-        (port,) = {one.laddr.port for one in connections if not one.raddr}
+        rehearsing = {one.laddr.port for one in connections if one.raddr == one.laddr}
+        (port,) = {one.laddr.port for one in connections if not one.raddr} - rehearsing
         return int(port)
 
     def finish(self) -> Finished:
