@@ -56,7 +56,7 @@ def is_over(process: psutil.Process) -> bool:
         return True
 
 
-def child_of(parent: subprocess.Popen[str], role: str) -> psutil.Process | None:
+def child_of(parent: subprocess.Popen[Any], role: str) -> psutil.Process | None:
     """Return the running process of a role, or None."""
     for child in psutil.Process(parent.pid).children():
         if command_of(child)[:1] == [f"noack {role}"]:
@@ -106,9 +106,12 @@ class Running:
         raise AssertionError(f"no process of {role}")
 
     def udp_port(self, role: str) -> int:
-        """Return the receiving port of a process of the loop."""
+        """Return the receiving port of a process of the loop, not that of its rehearsals."""
         connections = self.child(role).net_connections("udp4")
-        (port,) = {one.laddr.port for one in connections if not one.raddr}
+        rehearsals = {one.laddr for one in connections if one.laddr == one.raddr}
+        (port,) = {
+            one.laddr.port for one in connections if not one.raddr and one.laddr not in rehearsals
+        }
         return int(port)
 
     def finish(self) -> Finished:
