@@ -14,6 +14,8 @@ from typing import Any
 import psutil
 import pytest
 
+from benchmarks.soak.watch import is_of, udp_port
+
 EPHEMERAL = ("--set", "ports={}")
 BARE = (*EPHEMERAL, "--no-report")
 """Without a report; tests that need one add ``--report``."""
@@ -59,7 +61,7 @@ def is_over(process: psutil.Process) -> bool:
 def child_of(parent: subprocess.Popen[Any], role: str) -> psutil.Process | None:
     """Return the running process of a role, or None."""
     for child in psutil.Process(parent.pid).children():
-        if command_of(child)[:1] == [f"noack {role}"]:
+        if is_of(role, child):
             return child
     return None
 
@@ -101,18 +103,13 @@ class Running:
 
     def child(self, role: str) -> psutil.Process:
         for child in self._children:
-            if command_of(child)[:1] == [f"noack {role}"]:
+            if is_of(role, child):
                 return child
         raise AssertionError(f"no process of {role}")
 
     def udp_port(self, role: str) -> int:
-        """Return the receiving port of a process of the loop, not that of its rehearsals."""
-        connections = self.child(role).net_connections("udp4")
-        rehearsals = {one.laddr for one in connections if one.laddr == one.raddr}
-        (port,) = {
-            one.laddr.port for one in connections if not one.raddr and one.laddr not in rehearsals
-        }
-        return int(port)
+        """Return the receiving port of a process of the loop."""
+        return udp_port(self.child(role))
 
     def finish(self) -> Finished:
         stdout, stderr = self.process.communicate(timeout=PATIENCE_S)
