@@ -9,6 +9,7 @@ from benchmarks import (
     flood,
     latency,
     lateness,
+    long_run,
     machines,
     plants,
     recovery,
@@ -24,7 +25,7 @@ from benchmarks._report import run
 
 MODULES = (
     demo_run, flood, latency, lateness, startup, recovery, machines, plants, simulation, batch,
-    campaign, relays, relay_delay, relay_flows, relay_soak,
+    campaign, long_run, relays, relay_delay, relay_flows, relay_soak,
 )  # fmt: skip
 
 if __name__ == "__main__":

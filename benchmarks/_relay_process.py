@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -50,10 +50,11 @@ class Kind:
     lossy: bool = False
 
 
-def c_relay(built: Built, *, segment: bool = False) -> Kind:
-    """Return ``relay.c``."""
-    name, words = ("C relay, segments", ["segment"]) if segment else ("C relay", [])
-    return Kind(name, lambda to, _: [str(built.relay), str(to), *words])
+def c_relay(built: Built, mode: Literal["", "segment", "paths"] = "") -> Kind:
+    """Return ``relay.c`` in one of its modes."""
+    names = {"": "C relay", "segment": "C relay, segments", "paths": "C relay, a socket per client"}
+    words = [mode] if mode else []
+    return Kind(names[mode], lambda to, _: [str(built.relay), str(to), *words])
 
 
 def socat(*, connected: bool = False) -> Kind | str:

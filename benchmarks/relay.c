@@ -2,7 +2,9 @@
  *
  * Receives up to 64 datagrams with one recvmmsg and sends them with one sendmmsg through a connected
  * socket, to one destination on loopback. With "segment", successive datagrams of equal size are
- * sent as one message, which the kernel segments (UDP_SEGMENT). Prints its listening port.
+ * sent as one message, which the kernel segments (UDP_SEGMENT). With "paths", each source has a
+ * connected socket of its own, which the last 16 bits of its address select. Prints its listening
+ * port.
  */
 #define _GNU_SOURCE
 #include <arpa/inet.h>
@@ -14,6 +16,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/resource.h>
 #include <sys/socket.h>
 
 enum { BATCH = 64, MAX_BYTES = 2048, BUFFER_BYTES = 4 * 1024 * 1024 };
@@ -55,6 +58,36 @@ static void forward_segments(int out, int count)
     }
 }
 
+static struct sockaddr_in names[BATCH];
+
+/* The socket of the source of datagram k; the first time, open it. */
+static int path_of(int k, const struct sockaddr_in *server)
+{
+    static int paths[1 << 16];
+    int *path = &paths[ntohl(names[k].sin_addr.s_addr) & 0xffff];
+    if (*path == 0) {
+        *path = socket(AF_INET, SOCK_DGRAM, 0);
+        if (*path < 0 || connect(*path, (const struct sockaddr *)server, sizeof *server) != 0)
+            fail("path");
+    }
+    return *path;
+}
+
+static void forward_paths(const struct sockaddr_in *server, int count)
+{
+    for (int k = 0; k < count; k++)
+        batch[k].msg_hdr.msg_name = NULL;
+    for (int first = 0, next; first < count; first = next) {
+        int path = path_of(first, server);
+        for (next = first + 1; next < count && path_of(next, server) == path;)
+            next++;
+        if (next - first == 1)
+            send(path, parts[first].iov_base, parts[first].iov_len, 0);
+        else
+            sendmmsg(path, batch + first, (unsigned)(next - first), 0);
+    }
+}
+
 int main(int argc, char **argv)
 {
     struct sockaddr_in here = {.sin_family = AF_INET, .sin_addr.s_addr = htonl(INADDR_LOOPBACK)};
@@ -63,10 +96,16 @@ int main(int argc, char **argv)
     int in = socket(AF_INET, SOCK_DGRAM, 0), out = socket(AF_INET, SOCK_DGRAM, 0);
     int bytes = BUFFER_BYTES;
     bool segment = argc == 3 && strcmp(argv[2], "segment") == 0;
+    bool by_path = argc == 3 && strcmp(argv[2], "paths") == 0;
+    struct rlimit files;
 
-    if (argc != 2 && !segment) {
-        fprintf(stderr, "usage: %s PORT [segment]\n", argv[0]);
+    if (argc != 2 && !segment && !by_path) {
+        fprintf(stderr, "usage: %s PORT [segment | paths]\n", argv[0]);
         return 2;
+    }
+    if (getrlimit(RLIMIT_NOFILE, &files) == 0) {
+        files.rlim_cur = files.rlim_max;
+        setrlimit(RLIMIT_NOFILE, &files);
     }
     there.sin_port = htons((uint16_t)atoi(argv[1]));
     if (setsockopt(in, SOL_SOCKET, SO_RCVBUFFORCE, &bytes, sizeof bytes) != 0)
@@ -86,8 +125,11 @@ int main(int argc, char **argv)
         batch[k].msg_hdr.msg_iovlen = 1;
     }
     for (;;) {
-        for (int k = 0; k < BATCH; k++)
+        for (int k = 0; k < BATCH; k++) {
             parts[k].iov_len = MAX_BYTES;
+            batch[k].msg_hdr.msg_name = by_path ? &names[k] : NULL;
+            batch[k].msg_hdr.msg_namelen = by_path ? sizeof names[k] : 0;
+        }
         int taken = recvmmsg(in, batch, BATCH, MSG_WAITFORONE, NULL);
         if (taken < 0) {
             if (errno == EINTR)
@@ -98,6 +140,8 @@ int main(int argc, char **argv)
             parts[k].iov_len = batch[k].msg_len;
         if (segment)
             forward_segments(out, taken);
+        else if (by_path)
+            forward_paths(&there, taken);
         else
             forward(out, taken);
     }

@@ -2,8 +2,9 @@
 
 Flows differ in the sender's address (127.1.0.0 and on); datagrams come from them in turn. The cost
 is the relay's CPU time per datagram while it empties a full receive buffer, as in
-:mod:`benchmarks.relays`. The C relay, which ignores addresses, shows the kernel's share of it. The
-loss bursts of the decisions are counted from the fates only.
+:mod:`benchmarks.relays`. The C relay, which ignores addresses, shows the kernel's share of it; with
+a socket per client, it shows that of our relay with the reverse direction. The loss bursts of the
+decisions are counted from the fates only.
 """
 
 import argparse
@@ -36,6 +37,7 @@ KINDS = {
     "ours": Ours(WORDS),
     "ours, with the reverse direction": Ours(WORDS, reverse=True),
 }
+PEER, PATHS = "C relay", "C relay, a socket per client"
 _PACKETS = 10
 """Packets of each flow in a call."""
 
@@ -43,13 +45,16 @@ _PACKETS = 10
 def flow_rows(rounds: Rounds) -> list[Row]:
     """Return the rows of the relays: the cost of many flows compared with the cost of one."""
     rows = []
-    for name in (*KINDS, "C relay"):
+    for name in (*KINDS, PEER, PATHS):
         many, one = f"{name}, {FLOWS:,} flows", f"{name}, one flow"
         if name in rounds.missing:
             rounds.add(many, rounds.missing[name])
         goal = COST_GOAL if name in KINDS else None
         row = rounds.row(f"{many}: cost", "µs CPU each", "cpu_us", many, one, goal, paired=True)
         rows.append(row)
+    many = f"ours, with the reverse direction, {FLOWS:,} flows"
+    peer = f"{PATHS}, {FLOWS:,} flows"
+    rows.append(rounds.row(f"{many}: cost", "µs CPU each", "cpu_us", many, peer, paired=True))
     return rows
 
 
@@ -98,7 +103,7 @@ def _decisions(name: str, make: Callable[[int], Decide], count: int) -> list[Row
 def _measure_flows() -> list[Row]:
     rounds = Rounds()
     with built() as tools, on_core(LOAD_CORE), scheduled(BEFORE_OTHERS), ExitStack() as stack:
-        kinds = {"C relay": c_relay(tools)} | {
+        kinds = {PEER: c_relay(tools), PATHS: c_relay(tools, "paths")} | {
             name: our_relay(name, ours) for name, ours in KINDS.items()
         }
         relays = start_all(kinds, tools, stack, rounds)

@@ -78,7 +78,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
             "socat": socat(),
             "socat, connected": socat(connected=True),
             "C relay": c_relay(tools),
-            "C relay, segments": c_relay(tools, segment=True),
+            "C relay, segments": c_relay(tools, "segment"),
             "asyncio relay": asyncio_relay(),
             **{name: our_relay(name, ours) for name, ours in OURS.items()},
         }

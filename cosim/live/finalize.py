@@ -16,6 +16,7 @@ from cosim.analysis.model_comparison import linearisation
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import Outcome, Summary, summarise
 from cosim.analysis.summary_model import ExitPart, RunSummary, can_be_shown
+from cosim.record.decimate import is_long
 from cosim.record.run_directory import (
     ENDING_FILE,
     RECORD,
@@ -42,13 +43,13 @@ def finalize(ending: RunEnding, *, report: bool = True) -> Outcome:
     """
     run_dir = ending.run_dir
     with _with_reason(ending), finished_run(run_dir):
-        if (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir():
-            record = finish_record(run_dir)
+        unfinished = (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir()
+        record = finish_record(run_dir) if unfinished else load_record(run_dir)
+        # A stopped recorder has no time to write the recording of a long run.
+        if unfinished or (record.kind == "live" and is_long(record.scenario)):
             from cosim.output.viewer.run_view import write_view
 
             write_view(record, run_dir, ending.run_id)
-        else:
-            record = load_record(run_dir)
         summary = summarise(record, int(ending.status), ending.reason, ending.startup_s)
         _write_summary(run_dir, summary)
         # Written again with the results below, so that none of them can cost the summary.

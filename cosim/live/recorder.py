@@ -305,9 +305,9 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
     if process.replaces is not None:
         recorder.note(Notice(process.start.from_ns, RESTART, f"restarted: {process.replaces}"))
     process.join(None)
-    # A restarted recorder, and that of a long run, write the view at the end.
-    at_end = process.start.is_restart or is_long(process.scenario)
-    if view is not None or not at_end:
+    # A restarted recorder writes the view at the end; the launcher writes that of a long run.
+    long = is_long(process.scenario)
+    if view is not None or not (process.start.is_restart or long):
         try:
             view = view or _open_view(process, None)
             recorder.show_in(view)
@@ -327,7 +327,7 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
             view.close()
     except MachineError as error:
         print_to_stderr(f"noack recorder: {error}; the numeric record is complete")
-    if recorder.view_is_incomplete or at_end:
+    if recorder.view_is_incomplete and not long:
         from cosim.output.viewer.run_view import write_view
 
         write_view(record, run_dir, run_id)

@@ -28,7 +28,7 @@ from noack.config.resolution import LoopMatrices
 from noack.core.errors import CallerError, one_line
 from noack.protocol.record_tables import OWNER, entry_names
 
-_GROUP_ROWS = 4 * BATCH_ROWS
+_GROUP_ROWS = 2 * BATCH_ROWS
 RowType = np.dtype[np.void]
 
 
@@ -106,9 +106,11 @@ def read_batches(path: Path, dtype: RowType) -> Iterator[Rows]:
     names = [column for column, _ in _columns(dtype)]
     with _readable(path), pq.ParquetFile(path) as file:
         _require_columns(path, file.schema_arrow, dtype)
-        for batch in file.iter_batches(BATCH_ROWS, columns=names):
-            batch.validate(full=True)
-            yield _rows(path, batch, dtype)
+        for group in range(file.num_row_groups):
+            # A reader of several groups would keep the memory of all of them to the end.
+            for batch in file.iter_batches(BATCH_ROWS, row_groups=[group], columns=names):
+                batch.validate(full=True)
+                yield _rows(path, batch, dtype)
 
 
 def group_segments(path: Path, dtype: RowType) -> Iterator[Segment]:

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from benchmarks import __main__ as all_benchmarks
-from benchmarks import demo_run, lateness, machines, plants, startup
+from benchmarks import demo_run, lateness, long_run, machines, plants, startup
 from benchmarks._report import MeasurementError, Rounds
 from benchmarks._runs import Line, execute, first_step_s
 from benchmarks._ticks import LOOPS
@@ -92,6 +92,14 @@ def test_startup_has_a_row_for_the_goal_and_one_for_the_peer() -> None:
     assert peer.ratio == pytest.approx(4.0)
     assert launch.value == 0.9
     assert len(startup.rows_of([1.0], [], [0.2])) == 2
+
+
+def test_the_end_of_a_long_run_is_judged_by_its_memory_and_its_additional_time() -> None:
+    ends = {60.0: long_run.End(4.0, 5.0, 200.0), 660.0: long_run.End(20.0, 17.0, 500.0)}
+    peak, growth, _, speed = long_run.rows_of(ends)
+    assert (peak.value, peak.holds) == (500.0, False)
+    assert growth.ratio == 2.5
+    assert (speed.value, speed.holds) == (50.0, False)
 
 
 def test_a_failed_program_is_reported_with_its_last_output() -> None:

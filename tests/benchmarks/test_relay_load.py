@@ -119,7 +119,8 @@ def test_a_steady_load_continues_its_numbering(ends: Ends) -> None:
 
 PEERS: dict[str, Callable[[Built], Kind | str]] = {
     "C relay": c_relay,
-    "C relay, segments": lambda tools: c_relay(tools, segment=True),
+    "C relay, segments": lambda tools: c_relay(tools, "segment"),
+    "C relay, a socket per client": lambda tools: c_relay(tools, "paths"),
     "socat": lambda tools: socat(),
     "socat, connected": lambda tools: socat(connected=True),
     "asyncio relay": lambda tools: asyncio_relay(),

@@ -16,6 +16,7 @@ from netem.duplex_link import network_of
 from netem.engine.compiled_network import CompiledNetwork
 from netem.engine.native_pump import compiled_pump
 from netem.link_machine import Datagram
+from netem.words.words_to_settings import settings_of
 from noack.config.parameter_changes import ParameterChange
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
@@ -24,6 +25,7 @@ from noack.core.clock import RunClock
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.loop_protocol import PROTOCOLS
 from noack.protocol.machine_interface import BEGINNING, Machine, Record, Start
+from noack.protocol.record_tables import NETEM_RELEASE
 from tests.netem import any_settings
 from tests.netem.engine.relays import drain, endpoints, name_of
 
@@ -136,6 +138,17 @@ def test_any_arrivals_give_the_same_rows_and_datagrams(
         machines.received()
     inputs = [record.row[0] for record in machines.rows]
     assert inputs == list(range(inputs[0], inputs[0] + len(inputs)))
+
+
+def test_at_equal_times_updates_leave_before_acknowledgements() -> None:
+    delay = settings_of("delay 1ms")
+    with both(network(delay, delay, "ack")) as machines:
+        for flow in (1, 0, 1, 0):
+            machines.arrive(b"%d" % flow, flow, 5)
+        machines.let_out(NEVER_NS)
+        assert [len(data) for data in machines.received()] == [2, 2]
+        flows = [row[4] for table, row in machines.rows if table == NETEM_RELEASE]
+    assert flows == [0, 0, 1, 1]
 
 
 @pytest.mark.parametrize("generation", [0, 1])

@@ -3,12 +3,16 @@
 import os
 import time
 from collections.abc import Iterator, Sequence
+from itertools import count
+from typing import Any
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from noack.core.clock import RunClock
 from noack.protocol.machine_interface import Notice, Record
-from noack.runtime.real_time_loop import run_loop
+from noack.runtime.real_time_loop import RowSink, run_loop
 
 PERIOD_NS = 1_000_000
 STEPS = 200
@@ -63,11 +67,15 @@ class Log:
 
     def __init__(self) -> None:
         self.lines: list[str] = []
+        self.rows: list[int] = []
 
     def append(self, record: Record) -> None: ...
 
     def notice(self, notice: Notice) -> None:
         self.lines.append(notice.text)
+
+    def extend_table(self, table: str, rows: NDArray[Any]) -> None:
+        self.rows.append(len(rows))
 
     def flush(self) -> None: ...
 
@@ -117,7 +125,7 @@ class Counting:
         return None if self._left_ns is None else self._clock.now_ns() + self._left_ns
 
     def on_timer(self, now_ns: int) -> Sequence[Record]:
-        raise AssertionError("nothing was due")
+        return ()  # nothing is due, unless this thread did not run for a while
 
     def handle(self, message: int, now_ns: int) -> Sequence[int]:
         return (message,) if message % 2 == 0 else ()
@@ -136,3 +144,58 @@ def test_a_loop_rehearses_after_a_message_without_an_answer(
     assert both.sent == [number for number in range(1, both.received + 1) if number % 2 == 0]
     odd = [number for number in range(1, both.received + 1) if number % 2]
     assert after == ([] if left_ns == 100_000 else odd)
+
+
+class SelfDriven:
+    """A machine that drives itself, and the channel that it uses."""
+
+    watched: Sequence[int] = ()
+
+    def __init__(self, steps: list[str]) -> None:
+        self.steps = steps
+        self.periods_ns: list[int] = []
+        self.clock = RunClock(time.monotonic_ns(), 3.0)
+
+    def drive(self, until_ns: int, rows: RowSink) -> None:
+        self.steps.append("drive")
+        self.periods_ns.append(until_ns - self.clock.now_ns())
+        rows.extend_table("table", np.zeros(len(self.periods_ns), np.int64))
+
+    def tend(self, now_ns: int) -> Sequence[Notice]:
+        self.steps.append("tend")
+        return ()
+
+    def next_deadline_ns(self) -> int | None:
+        return -5
+
+    def receive(self, readable: int) -> None: ...
+
+    def send(self, message: None) -> None: ...
+
+    def on_timer(self, now_ns: int) -> Sequence[None]:
+        raise AssertionError("it drives itself")
+
+    def handle(self, message: None, now_ns: int) -> Sequence[None]:
+        raise AssertionError("it drives itself")
+
+
+@pytest.mark.parametrize("busy", [False, True])
+def test_a_machine_may_drive_itself_between_two_turns_of_housekeeping(
+    busy: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps, pauses, log = list[str](), list[float](), Log()
+    monkeypatch.setattr(time, "sleep", pauses.append)
+    cpu_s = count(0, 10**6 if busy else 0)
+    monkeypatch.setattr(time, "thread_time", lambda: next(cpu_s))
+    one = SelfDriven(steps)
+    late_ns = run_loop(
+        one, one, one.clock, log, end_ns=None, stop=lambda: steps.append("stop") or len(steps) > 9,
+        news=lambda now_ns: steps.append("news") or (),
+    )  # fmt: skip
+    turn = ["drive", "tend", "news", "stop"]
+    assert steps == ["news", "tend", *turn, *turn]
+    assert log.rows == [1, 2]
+    assert all(period_ns <= 0.05e9 * 3.0 for period_ns in one.periods_ns)
+    assert late_ns > 5
+    # A busy machine leaves the core to the other threads for a moment.
+    assert len(pauses) == (2 if busy else 0)

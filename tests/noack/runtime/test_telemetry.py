@@ -91,6 +91,21 @@ def test_a_full_batch_publishes_all_tables() -> None:
     assert len(wire.batches) == 2
 
 
+def test_rows_of_a_table_may_be_added_at_once() -> None:
+    wire = Wire()
+    buffer = TelemetryBuffer(TABLES, wire)
+    rows = np.array([row(number) for number in range(BATCH)], ROW)
+    buffer.append(Record("two", row(0)))
+    for part in (rows[:100], rows[100:BATCH], rows[:1], rows):
+        buffer.extend_table("one", part)
+    buffer.flush()
+    assert [(table, count) for table, _, count, _ in wire.batches] == [
+        ("one", BATCH), ("two", 1), ("one", 1), ("one", BATCH),
+    ]  # fmt: skip
+    sent = np.concatenate([found for _, found in wire.rows("one")])
+    assert sent["number"].tolist() == [*range(BATCH), 0, *range(BATCH)]
+
+
 def test_a_row_is_copied_when_it_is_appended() -> None:
     wire, x = Wire(), np.array([1.0, 2.0])
     buffer = TelemetryBuffer(TABLES, wire)

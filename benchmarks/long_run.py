@@ -1,0 +1,89 @@
+"""The end of a run against its length: peak memory, and time as a multiple of real time.
+
+Simulated runs are spooled as a live run spools its rows. ``noack summary`` then completes each: it
+writes the record, recording, summary and report, replays the run and judges its claims. The
+alternative is the end of a short run: memory should not grow with the length.
+"""
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+from benchmarks._report import Benchmark, Goal, MeasurementError, Peer, Row, say
+from benchmarks._runs import execute
+
+LENGTHS_S = (60.0, 600.0)
+MOST_MIB = Goal("<=", 400)
+LEAST_SPEED = Goal(">=", 100)
+
+
+class End(NamedTuple):
+    """What the end of one run cost."""
+
+    wall_s: float
+    cpu_s: float
+    peak_mib: float
+
+
+def end_of(horizon_s: float, folder: Path) -> End:
+    """Simulate, spool and complete a run.
+
+    Raises:
+        MeasurementError: a step failed.
+    """
+    arguments = ["-m", "benchmarks._spooled_run", f"{horizon_s:g}", str(folder)]
+    run_dir = Path(execute([sys.executable, *arguments]).stdout.strip())
+    begun_s = time.monotonic()
+    command = [sys.executable, "-m", "cosim.cli", "summary", str(run_dir)]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+    wall_s = time.monotonic() - begun_s
+    if process.returncode != 0:
+        raise MeasurementError(f"noack summary ended with {process.returncode}")
+    shutil.rmtree(run_dir)
+    return End(wall_s, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024)
+
+
+def rows_of(ends: Mapping[float, End]) -> list[Row]:
+    """Return the rows from the ends of runs, by length in s."""
+    shortest_s, longest_s = min(ends), max(ends)
+    short, long = ends[shortest_s], ends[longest_s]
+    # Start and end of the program cost the same for every length.
+    more_s = max(long.cpu_s - short.cpu_s, 1e-9)
+    return [
+        Row(f"peak memory, end of {longest_s:g} s", long.peak_mib, "MiB", goal=MOST_MIB),
+        Row("the same, against a short run", long.peak_mib, "MiB",
+            Peer(f"end of {shortest_s:g} s", short.peak_mib)),
+        Row(f"end of {longest_s:g} s", long.wall_s, "s"),
+        Row("CPU time of the end, as a multiple of real time", (longest_s - shortest_s) / more_s,
+            "×", goal=LEAST_SPEED, note="of the additional length"),
+    ]  # fmt: skip
+
+
+def measure(options: argparse.Namespace) -> list[Row]:
+    """Complete runs of several lengths."""
+    ends = {}
+    with tempfile.TemporaryDirectory(prefix="noack-long-run-") as folder:
+        for horizon_s in options.long_run or LENGTHS_S:
+            say(f"a run of {horizon_s:g} s")
+            ends[horizon_s] = end_of(horizon_s, Path(folder))
+    return rows_of(ends)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare ``--long-run``."""
+    parser.add_argument(
+        "--long-run", type=float, nargs="+", metavar="SECONDS",
+        help="long_run: lengths of the runs (default: 60 600)",
+    )  # fmt: skip
+
+
+BENCHMARK = Benchmark("long_run", "The end of a long run", measure, add_arguments)
