@@ -48,8 +48,8 @@ rounding does so too."""
 _SPLIT_PERIODS = 10
 """Two event sequences differ from the first event that is further apart, in measurements."""
 _LARGEST = 1e100
-_STEPS_AT_THE_END, _EVENTS_AT_THE_END = 500_000, 10_000
-"""Longer runs are compared only on request, so that the end of a run takes seconds."""
+_STEPS_AT_THE_END, _EVENTS_AT_THE_END = 100_000, 10_000
+"""Longer runs are compared only on request: a comparison keeps over a kilobyte for each step."""
 _STAGES = ("sampling", "delay", "held actuation", "residual")
 
 

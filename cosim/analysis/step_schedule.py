@@ -53,7 +53,12 @@ def live_run(record: RunRecord) -> LiveRun:
     _require(not changed, "the ideal loop has no changes of settings, as this run has")
     record.scenario.coverage.require_unchanging()
     record.scenario.coverage.require_exact()
-    steps, sensor = record[PLANT_STEP], record[SENSOR_MEASUREMENT]
+    steps = record.columns(PLANT_STEP, "sequence", "actuation", "x")
+    sensor = record.columns(SENSOR_MEASUREMENT, "input", "t_ns", "event")
+    ticks, deliveries = (
+        record.columns(table, "input", "sequence", "model_t_ns")
+        for table in (CONTROLLER_STEP, CONTROLLER_DELIVERY)
+    )
     restarted, count = record.restarted(), len(sensor)
     why = f"the ideal loop has no restarts: {restarted} was restarted during the run"
     _require(restarted is None, why)
@@ -68,12 +73,15 @@ def live_run(record: RunRecord) -> LiveRun:
     _require(whole, "steps of the plant are missing from the record")
     whole = np.array_equal(sensor["input"], np.arange(count))
     _require(whole, "measurements are missing from the sensor's record")
-    _require_times(record)
+    horizon_ns = record.scenario.timing.horizon_ns
+    _require_times(SENSOR_MEASUREMENT, sensor["t_ns"], horizon_ns)
+    _require_times(CONTROLLER_STEP, ticks["model_t_ns"], horizon_ns)
+    _require_times(CONTROLLER_DELIVERY, deliveries["model_t_ns"], horizon_ns)
     _require(bool(np.abs(steps["x"]).max() < _LARGEST), "the run diverged")  # also for NaN
     measured = np.zeros(last + 1, dtype=np.bool_)
     measured[sensor["t_ns"] // period_ns] = True
-    ticks, accepted = _ticks(record[CONTROLLER_STEP], record[CONTROLLER_DELIVERY])
-    latched = _latched(steps["actuation"], ticks)
+    origins, accepted = _ticks(ticks, deliveries)
+    latched = _latched(steps["actuation"], origins)
     seen = read_conditions(record)
     _require(
         not (len(seen.watchdog.t_s) or len(seen.safe_input.t_s)),
@@ -81,9 +89,9 @@ def live_run(record: RunRecord) -> LiveRun:
     )
     events = sensor[sensor["event"] != NO_SEQUENCE]
     numbers, event_ns = np.arange(len(events)), events["t_ns"]
-    acts_at_tick = np.searchsorted(ticks.newest, numbers)
+    acts_at_tick = np.searchsorted(origins.newest, numbers)
     acts_at_step = np.searchsorted(latched.newest, numbers)
-    act_ns = np.append(ticks.model_ns, _NEVER_NS)[acts_at_tick]
+    act_ns = np.append(origins.model_ns, _NEVER_NS)[acts_at_tick]
     network = network_fates(record.scenario)
     schedule = StepSchedule(
         period_ns=period_ns,
@@ -101,18 +109,11 @@ def _require(met: bool, why: str) -> None:
         raise IncomparableError(why)
 
 
-def _require_times(record: RunRecord) -> None:
+def _require_times(table: str, times_ns: NDArray[np.int64], horizon_ns: int) -> None:
     """Require possible times: with others, as in a damaged record, a simulation would not end."""
-    horizon_ns = record.scenario.timing.horizon_ns
-    for table, column in (
-        (SENSOR_MEASUREMENT, "t_ns"),
-        (CONTROLLER_STEP, "model_t_ns"),
-        (CONTROLLER_DELIVERY, "model_t_ns"),
-    ):
-        times_ns = record[table][column]
-        possible = (times_ns >= 0).all() and (times_ns <= horizon_ns).all()
-        possible = possible and (np.diff(times_ns) >= 0).all()
-        _require(bool(possible), f"the record's {table} has times that no run has")
+    possible = (times_ns >= 0).all() and (times_ns <= horizon_ns).all()
+    possible = possible and (np.diff(times_ns) >= 0).all()
+    _require(bool(possible), f"the record's {table} has times that no run has")
 
 
 class _Ticks(NamedTuple):
