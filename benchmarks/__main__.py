@@ -6,6 +6,7 @@ from benchmarks import (
     batch,
     campaign,
     demo_run,
+    emulator,
     flood,
     latency,
     lateness,
@@ -24,8 +25,8 @@ from benchmarks._programs import provide
 from benchmarks._report import run
 
 MODULES = (
-    demo_run, flood, latency, lateness, startup, recovery, machines, plants, simulation, batch,
-    campaign, long_run, relays, relay_delay, relay_flows, relay_soak,
+    demo_run, emulator, flood, latency, lateness, startup, recovery, machines, plants, simulation,
+    batch, campaign, long_run, relays, relay_delay, relay_flows, relay_soak,
 )  # fmt: skip
 
 if __name__ == "__main__":

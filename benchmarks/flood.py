@@ -21,6 +21,7 @@ import numpy as np
 from benchmarks._faulted_run import STEPS, FaultedRun, Processes, faulted_run, run_recovery_s
 from benchmarks._flood import Flood
 from benchmarks._report import Benchmark, Figures, MeasurementError, Rounds, Row, say
+from benchmarks.soak.watch import udp_port
 from cosim.analysis.timing_statistics import lateness_us
 from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.topology import LOOP_ROLES
@@ -110,10 +111,7 @@ def _environment(shielded: bool) -> Iterator[None]:
 
 
 def _flood(case: Case, processes: Processes) -> Flood:
-    ports = []
-    for role in case.roles:
-        connections = processes[role].net_connections("udp4")
-        ports += sorted({c.laddr.port for c in connections if not c.raddr})
+    ports = [udp_port(processes[role]) for role in case.roles]
     rate = [] if case.rate_hz is None else ["--rate", str(case.rate_hz)]
     command = [
         sys.executable, "-m", "benchmarks._flood", "--ports", *map(str, ports),

@@ -71,8 +71,20 @@ class Processes:
 
 
 def is_of(role: str, process: psutil.Process) -> bool:
-    """Whether a process has a role in a run, by its title."""
-    return process.cmdline()[:1] == [f"noack {role}"]
+    """Whether a process has a role in a run, by its title; not if it has ended."""
+    try:
+        return process.cmdline()[:1] == [f"noack {role}"]
+    except psutil.NoSuchProcess:
+        return False
+
+
+def udp_port(process: psutil.Process) -> int:
+    """Return the port of a process in the loop, not that of its rehearsals."""
+    connections = process.net_connections("udp4")
+    rehearsals = {one.laddr for one in connections if one.laddr == one.raddr}
+    own = {one.laddr for one in connections if not one.raddr} - rehearsals
+    (port,) = {address.port for address in own}
+    return int(port)
 
 
 def _sample(process: psutil.Process) -> Sample:

@@ -16,6 +16,7 @@ from typing import Any, Self
 
 import psutil
 
+from benchmarks.soak.watch import udp_port
 from cosim.record.run_record import RunRecord, load_record
 from noack.config.resolution import loop_of
 from noack.protocol.record_tables import (
@@ -105,7 +106,9 @@ class Run:
         for table in (PLANT_ACTUATION, SENSOR_MEASUREMENT, CONTROLLER_DELIVERY):
             spooled = run_dir / "spool" / f"{table}.recorder"
             self._wait(lambda spooled=spooled: spooled.exists() and spooled.stat().st_size > 0)
-        ports = {role: _port(process.pid) for role, process in self.processes.items()}
+        ports = {
+            role: udp_port(psutil.Process(process.pid)) for role, process in self.processes.items()
+        }
         loop = loop_of(ticket.scenario)
         return [
             Target(
@@ -136,15 +139,6 @@ class Run:
             assert self._recording.poll() is None, self._recording.communicate()
             assert time.monotonic() < deadline_s, "waited in vain"
             time.sleep(0.02)
-
-
-def _port(pid: int) -> int:
-    (port,) = {
-        connection.laddr.port
-        for connection in psutil.Process(pid).net_connections("udp4")
-        if not connection.raddr
-    }
-    return port
 
 
 def attack(

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from benchmarks import __main__ as all_benchmarks
-from benchmarks import demo_run, lateness, long_run, machines, plants, startup
+from benchmarks import demo_run, emulator, lateness, long_run, machines, plants, startup
 from benchmarks._report import MeasurementError, Rounds
 from benchmarks._runs import Line, execute, first_step_s
 from benchmarks._ticks import LOOPS
@@ -157,3 +157,22 @@ def test_the_repository_is_copied_without_generated_files(tmp_path: Path) -> Non
     assert (tmp_path / "noack" / "protocol" / "wire_format.py").is_file()
     assert not (tmp_path / ".git").exists()
     assert not list(tmp_path.rglob("*.pyc"))
+
+
+@pytest.mark.parametrize("kind", ["compiled", "plain"])
+def test_an_emulator_relays_and_records_every_datagram_of_the_bursts(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reports, totals = [], []
+    close, flush = emulator.RelayShell.close, emulator.TelemetryBuffer.flush
+    monkeypatch.setattr(
+        emulator.RelayShell, "close", lambda one: (reports.append(one.report()), close(one))
+    )
+    monkeypatch.setattr(
+        emulator.TelemetryBuffer, "flush", lambda one: (flush(one), totals.append(one.totals()))
+    )
+    monkeypatch.setattr(emulator, "BURSTS", 2)
+    assert emulator.cpu_us(kind) > 0
+    assert sum(reports[0]["received_from"].values()) == 2 * emulator.BURST
+    assert 0 < reports[0]["sent"] < 2 * emulator.BURST
+    assert totals[-1]["netem_packet"] >= 2 * emulator.BURST - 256  # the rest is not yet a batch

@@ -14,6 +14,8 @@ from typing import Any
 import psutil
 import pytest
 
+from benchmarks.soak.watch import is_of, udp_port
+
 EPHEMERAL = ("--set", "ports={}")
 BARE = (*EPHEMERAL, "--no-report")
 """Without a report; tests that need one add ``--report``."""
@@ -56,10 +58,10 @@ def is_over(process: psutil.Process) -> bool:
         return True
 
 
-def child_of(parent: subprocess.Popen[str], role: str) -> psutil.Process | None:
+def child_of(parent: subprocess.Popen[Any], role: str) -> psutil.Process | None:
     """Return the running process of a role, or None."""
     for child in psutil.Process(parent.pid).children():
-        if command_of(child)[:1] == [f"noack {role}"]:
+        if is_of(role, child):
             return child
     return None
 
@@ -101,16 +103,13 @@ class Running:
 
     def child(self, role: str) -> psutil.Process:
         for child in self._children:
-            if command_of(child)[:1] == [f"noack {role}"]:
+            if is_of(role, child):
                 return child
         raise AssertionError(f"no process of {role}")
 
     def udp_port(self, role: str) -> int:
         """Return the receiving port of a process of the loop."""
-        connections = self.child(role).net_connections("udp4")
-        rehearsing = {one.laddr.port for one in connections if one.raddr == one.laddr}
-        (port,) = {one.laddr.port for one in connections if not one.raddr} - rehearsing
-        return int(port)
+        return udp_port(self.child(role))
 
     def finish(self) -> Finished:
         stdout, stderr = self.process.communicate(timeout=PATIENCE_S)

@@ -15,11 +15,13 @@ from cosim.record.run_record import load_record
 from cosim.shipped_files import find_shipped
 from noack.config.scenario_file import load
 from noack.core.errors import MachineError
+from noack.protocol.topology import ROLES
 from tests.integration.conftest import (
     AT_RATE,
     BARE,
     PATIENCE_S,
     RATE_HZ,
+    child_of,
     is_over,
     noack_command,
     settings,
@@ -64,7 +66,8 @@ def test_a_full_and_then_closed_pipe_does_not_disturb_the_run(tmp_path: Path) ->
     try:
         latest = tmp_path / "latest"
         wait_for(lambda: latest.exists() or process.poll() is not None)
-        loop = psutil.Process(process.pid).children()
+        loop = [child for role in ROLES if (child := child_of(process, role)) is not None]
+        assert len(loop) == len(ROLES)
         # The loop and the recorder end although the pipe is not read.
         wait_for(lambda: all(is_over(child) for child in loop))
         assert process.poll() is None
