@@ -246,7 +246,7 @@ class RunProcess:
             end_ns=self.scenario.timing.horizon_ns + int(_GRACE_S * NS_PER_S * self.scenario.speed),
             stop=lambda: self.stopping,
             spin_us=self.scenario.realtime.spin_us,
-            rehearse=self._rehearsal,
+            rehearsal=self._rehearsal,
             news=lambda now_ns: self._announce(changeable, now_ns, next(limits)),
         )
         reached_ns = self.clock.now_ns() - late_ns

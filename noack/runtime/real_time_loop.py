@@ -73,6 +73,18 @@ class RecordSink(RowSink, Protocol):
         ...
 
 
+class Rehearsing(Protocol):
+    """Rehearses what a process does rarely; see :mod:`noack.runtime.rehearsal`."""
+
+    def rehearse(self) -> None:
+        """Rehearse, unless it was a moment ago."""
+        ...
+
+    def postpone(self) -> None:
+        """Rehearse no more for a while."""
+        ...
+
+
 @runtime_checkable
 class SelfDrivenMachine(Protocol):
     """A machine that waits for its deadlines and messages itself, and sends its messages."""
@@ -91,22 +103,22 @@ def run_loop(
     end_ns: int | None,
     stop: Callable[[], bool],
     spin_us: float = 0.0,
-    rehearse: Callable[[], None] | None = None,
+    rehearsal: Rehearsing | None = None,
     news: Callable[[int], Sequence[Record | Notice]] = lambda now_ns: (),
 ) -> int:
     """Drive ``machine`` until simulated time ``end_ns`` (None: no end), or until ``stop()``.
 
     Every 50 ms of wall time ``stop`` is asked. Before the first step and every 50 ms, ``news``
     passes input from outside the socket to the machine and returns the machine's outputs. The
-    loop busy-waits for the last ``spin_us`` before a deadline. It calls ``rehearse`` after a step
-    and after a message without an answer, unless a deadline is near.
+    loop busy-waits for the last ``spin_us`` before a deadline. It rehearses between
+    its steps, unless a deadline is near.
 
     Returns:
         How late the machine's next deadline was at the end, in ns; 0 if it was not late.
     """
     kind = _SelfDrivenLoop if isinstance(machine, SelfDrivenMachine) else _Loop
     loop: _Loop[T] = kind(machine, channel, clock, telemetry, spin_us * 1e-6, news)
-    loop.rehearse = rehearse
+    loop.rehearsal = rehearsal
     # Looked up once: after milliseconds of sleep the code runs cold, and every step counts.
     step, housekeeping_is_due = loop.step, loop.housekeeping_is_due
     while True:
@@ -136,7 +148,7 @@ class _Loop(Generic[T]):
         self._next_deadline_ns = machine.next_deadline_ns
         self._now_ns, self._wall_s_until = clock.now_ns, clock.wall_s_until
         self._spin_s = spin_s
-        self.rehearse: Callable[[], None] | None = None
+        self.rehearsal: Rehearsing | None = None
         self._slept = False
         """Whether the loop has waited since the last housekeeping."""
         self._emit(news(clock.now_ns()))
@@ -166,7 +178,9 @@ class _Loop(Generic[T]):
             message = self._channel.receive(readable[0])
             if message is not None:
                 sends = self._emit(self._handle(message, self._now_ns()))
-                if not sends:  # who receives it may wait for this core
+                if sends or self._next_deadline_ns() is not None:
+                    self._postpone()
+                else:
                     self._rehearse()
             else:
                 _yield_core()
@@ -174,8 +188,13 @@ class _Loop(Generic[T]):
             self._slept = True
 
     def _rehearse(self) -> None:
-        if self.rehearse is not None and self._is_quiet():
-            self.rehearse()
+        if self.rehearsal is not None and self._is_quiet():
+            self.rehearsal.rehearse()
+
+    def _postpone(self) -> None:
+        """The rare path was taken: a sensor has sent, or a process with a deadline has received."""
+        if self.rehearsal is not None:
+            self.rehearsal.postpone()
 
     def _is_quiet(self) -> bool:
         """Whether no deadline is near."""

@@ -19,6 +19,7 @@ from noack.runtime.udp_sockets import MessageSocket
 from noack.settings.named_file import file_tables
 
 PERIOD_S = 0.002
+POSTPONED_S = 0.02
 _ROLES = ("sensor", "controller")
 _DISTANCE = 1e3
 """Distance of two successive rehearsed states: a measurement so far from the model is an event."""
@@ -49,7 +50,11 @@ class Rehearsal:
         self._rehearsals = self._cpu_ns = 0
         self._began_ns = time.monotonic_ns()
 
-    def __call__(self) -> None:
+    def postpone(self) -> None:
+        """Rehearse no more for a while: the process has just done what is rehearsed."""
+        self._next_s = time.monotonic() + POSTPONED_S
+
+    def rehearse(self) -> None:
         """Rehearse once, unless the last time was a moment ago."""
         now_s = time.monotonic()
         if now_s < self._next_s:

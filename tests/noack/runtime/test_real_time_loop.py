@@ -39,7 +39,7 @@ class Flooded:
     """A channel that always has datagrams and never a valid message."""
 
     def __init__(self, readable: int, clock: RunClock, ticker: Ticker) -> None:
-        self.watched = (readable,)
+        self.watched: Sequence[int] = (readable,)
         self._clock = clock
         self._ticker = ticker
         self._overdue: int | None = None
@@ -106,7 +106,7 @@ class Counting:
     """
 
     def __init__(self, readable: int, clock: RunClock, left_ns: int | None) -> None:
-        self.watched = (readable,)
+        self.watched: Sequence[int] = (readable,)
         self._clock, self._left_ns = clock, left_ns
         self.received = 0
         self.sent: list[int] = []
@@ -131,19 +131,65 @@ class Counting:
         return (message,) if message % 2 == 0 else ()
 
 
-@pytest.mark.parametrize("left_ns", [None, 10**9, 100_000])
-def test_a_loop_rehearses_after_a_message_without_an_answer(
+class Rehearsed:
+    """Keeps the numbers of the messages after which it was called."""
+
+    def __init__(self, both: Counting) -> None:
+        self._both = both
+        self.rehearsed, self.postponed = list[int](), list[int]()
+
+    def rehearse(self) -> None:
+        self.rehearsed.append(self._both.received)
+
+    def postpone(self) -> None:
+        self.postponed.append(self._both.received)
+
+
+@pytest.mark.parametrize("left_ns", [None, 10**9])
+def test_a_loop_rehearses_unless_it_has_just_done_what_is_rare(
     always_readable: int, left_ns: int | None
 ) -> None:
-    clock, log, after = RunClock(time.monotonic_ns()), Log(), list[int]()
+    """An answer is rare; in a process with deadlines, each message is."""
+    clock, log = RunClock(time.monotonic_ns()), Log()
     both = Counting(always_readable, clock, left_ns)
+    rehearsal = Rehearsed(both)
     run_loop(
-        both, both, clock, log, end_ns=None, stop=lambda: both.received > 1,
-        rehearse=lambda: after.append(both.received),
-    )  # fmt: skip
-    assert both.sent == [number for number in range(1, both.received + 1) if number % 2 == 0]
-    odd = [number for number in range(1, both.received + 1) if number % 2]
-    assert after == ([] if left_ns == 100_000 else odd)
+        both, both, clock, log, end_ns=None, stop=lambda: both.received > 1, rehearsal=rehearsal
+    )
+    numbers = range(1, both.received + 1)
+    assert both.sent == [number for number in numbers if number % 2 == 0]
+    odd = [number for number in numbers if number % 2 and left_ns is None]
+    assert rehearsal.rehearsed == odd
+    assert rehearsal.postponed == [number for number in numbers if number not in odd]
+
+
+class Stepping(Counting):
+    """A channel without messages, and a machine whose next step is always ``left_ns`` ahead."""
+
+    def __init__(self, readable: int, clock: RunClock, left_ns: int) -> None:
+        super().__init__(readable, clock, left_ns)
+        self.watched = ()
+
+    def next_deadline_ns(self) -> int | None:
+        return super().next_deadline_ns() if self.received else 0
+
+    def on_timer(self, now_ns: int) -> Sequence[Record]:
+        self.received += 1
+        return ()
+
+
+@pytest.mark.parametrize(("left_ns", "rehearsed"), [(10**10, [1]), (100_000, [])])
+def test_a_loop_rehearses_after_a_step_unless_the_next_is_near(
+    left_ns: int, rehearsed: list[int]
+) -> None:
+    clock, log = RunClock(time.monotonic_ns()), Log()
+    both = Stepping(0, clock, left_ns)
+    rehearsal = Rehearsed(both)
+    run_loop(
+        both, both, clock, log, end_ns=None, stop=lambda: both.received > 0, rehearsal=rehearsal
+    )
+    assert rehearsal.rehearsed == rehearsed
+    assert rehearsal.postponed == []
 
 
 class SelfDriven:

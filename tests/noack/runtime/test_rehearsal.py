@@ -62,7 +62,7 @@ def test_each_rehearsal_passes_the_machine(
     monkeypatch.setattr(rehearsal, "PERIOD_S", 0.0)
     with rehearsal_of(role, scenario) as (rehearse, machine):
         for _ in range(20):
-            rehearse()
+            rehearse.rehearse()
         report = rehearse.report()
     assert report["rehearsals"] == 20
     assert 0 < report["cpu_share"] <= 1
@@ -74,10 +74,18 @@ def test_each_rehearsal_passes_the_machine(
 
 def test_a_rehearsal_follows_another_after_a_while(scenario: Scenario) -> None:
     with rehearsal_of("sensor", scenario) as (rehearse, _):
-        rehearse()
+        rehearse.rehearse()
         rehearse._next_s += 3600.0
-        rehearse()
+        rehearse.rehearse()
         assert rehearse.report()["rehearsals"] == 1
+
+
+def test_a_rehearsal_can_be_postponed(scenario: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rehearsal, "POSTPONED_S", 3600.0)
+    with rehearsal_of("sensor", scenario) as (rehearse, _):
+        rehearse.postpone()
+        rehearse.rehearse()
+        assert rehearse.report()["rehearsals"] == 0
 
 
 @pytest.mark.parametrize(
