@@ -24,13 +24,11 @@ from cosim.live.start_limit import DEFAULT_S, StartLimit
 from cosim.record.environment import write_environment
 from cosim.record.run_directory import active_run, new_run_dir, point_to_latest, write_scenario
 from cosim.record.run_ending import EndingFile, RunEnding
-from netem.engine.native_pump import NOT_COMPILED, is_pump_kept
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError, ExitStatus, NeverStartedError
 from noack.protocol.topology import PLANT, RECORDER, ROLES
 from noack.runtime import run_registry
-from noack.runtime.command_line import print_to_stderr
 from noack.runtime.join_ticket import Ticket, new_ticket, published
 from noack.runtime.life_cycle import HORIZON
 from noack.runtime.signals import Signals
@@ -93,8 +91,6 @@ def launch(
             require_free_tcp_port(control, "ports.control")
         if PLANT in spawn:
             resolved.plant.system.prepare()  # compile now: the start barrier has a time limit
-        if "netem" in spawn and sys.platform == "linux" and not is_pump_kept():
-            print_to_stderr(NOT_COMPILED)
         endpoint = f"tcp/{LOOPBACK}:{control or free_tcp_port()}"
         run_dir = new_run_dir(runs, resolved.name)
         resolved = write_scenario(resolved, run_dir)

@@ -38,12 +38,6 @@ def compiled_pump() -> NativeFunction:
     return load_or_compile(_file(), run_pump, _examples)
 
 
-def is_pump_kept() -> bool:
-    """Whether :func:`kept_pump` may find it; this does not load the linker."""
-    kept = folder()
-    return kept is not None and next(kept.glob(f"{_NAME}-*"), None) is not None
-
-
 def _file() -> Path | None:
     kept = folder()
     return None if kept is None else code_file(kept, _NAME)
