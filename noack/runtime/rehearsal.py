@@ -2,10 +2,11 @@
 
 Events come every few seconds. Meanwhile the code that handles them leaves the caches, and then
 takes several times as long. Therefore sensor and controller send themselves a message between two
-steps of the loop: through a socket of its own, it passes a copy of the machine, whose answer goes
+steps of the loop, through a second socket. A copy of the machine receives it, and sends its answer
 to the same socket. Nothing of it is recorded or reaches another process.
 """
 
+import math
 import time
 from typing import Any
 
@@ -52,16 +53,27 @@ class Rehearsal:
 
     def postpone(self) -> None:
         """Rehearse no more for a while: the process has just done what is rehearsed."""
-        self._next_s = time.monotonic() + POSTPONED_S
+        self._next_s = max(self._next_s, time.monotonic() + POSTPONED_S)
 
     def rehearse(self) -> None:
-        """Rehearse once, unless the last time was a moment ago."""
+        """Rehearse once, unless the last time was a moment ago.
+
+        An error, such as an overflow of the copy's unstable model, ends the rehearsals, not the run.
+        """
         now_s = time.monotonic()
         if now_s < self._next_s:
             return
         self._next_s = now_s + PERIOD_S
         began_ns = time.thread_time_ns()
-        number, self._rehearsals = self._rehearsals, self._rehearsals + 1
+        try:
+            with np.errstate(all="ignore"):
+                self._pass_message(self._rehearsals)
+            self._rehearsals += 1
+        except Exception:
+            self._next_s = math.inf
+        self._cpu_ns += time.thread_time_ns() - began_ns
+
+    def _pass_message(self, number: int) -> None:
         self._vector = -self._vector
         t_ns = int(number * PERIOD_S * NS_PER_S)
         message = Message(self._receives, number, t_ns, self._vector)
@@ -71,7 +83,6 @@ class Rehearsal:
             for output in self._machine.handle(received, t_ns):
                 if isinstance(output, Message):
                     self._channel.send(output)
-        self._cpu_ns += time.thread_time_ns() - began_ns
 
     def report(self) -> dict[str, Any]:
         """Number of rehearsals, and their share of a core's time."""

@@ -88,6 +88,25 @@ def test_a_rehearsal_can_be_postponed(scenario: Scenario, monkeypatch: pytest.Mo
         assert rehearse.report()["rehearsals"] == 0
 
 
+def test_an_error_ends_the_rehearsals_and_nothing_else(
+    scenario: Scenario, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rehearsal, "PERIOD_S", 0.0)
+    calls = list[Message]()
+
+    def fail(message: Message, now_ns: int) -> list[Output]:
+        calls.append(message)
+        raise OverflowError
+
+    with rehearsal_of("sensor", scenario) as (rehearse, machine):
+        monkeypatch.setattr(machine, "handle", fail)
+        for _ in range(3):
+            rehearse.rehearse()
+            rehearse.postpone()
+        assert rehearse.report()["rehearsals"] == 0
+    assert len(calls) == 1
+
+
 @pytest.mark.parametrize(
     ("role", "changed", "expected"),
     [
