@@ -58,7 +58,7 @@ class Rehearsal:
     def rehearse(self) -> None:
         """Rehearse once, unless the last time was a moment ago.
 
-        An error, such as an overflow of the copy's unstable model, ends the rehearsals, not the run.
+        An error, such as an overflow of the copy's model, ends the rehearsals, not the run.
         """
         now_s = time.monotonic()
         if now_s < self._next_s:
