@@ -7,6 +7,7 @@ from pydantic import Field, FiniteFloat, model_validator
 from noack.impairments.kinds import AnyImpairment
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings, Mansd, require_scores
+from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.loss_models import Loss
 from noack.impairments.loss_models.lossless import NoLoss
 from noack.settings.section import ScenarioSection
@@ -86,3 +87,8 @@ class NetworkSection(ScenarioSection):
             first_delivered=self.initial_sync == "first_packet",
             limit=self.limit,
         )
+
+    @property
+    def guarantee(self) -> LossGuarantee:
+        """What is assumed of the losses of updates: mansd and the constraints."""
+        return LossGuarantee((LongestBurst(self.mansd),))
