@@ -19,7 +19,7 @@ _FORBIDDEN, _UNKNOWN = -1, -2
 
 
 class LossRule(Protocol):
-    """One rule of a guarantee."""
+    """One rule of a guarantee, as a counter; states and values are integers."""
 
     @property
     def limit(self) -> int:
@@ -49,8 +49,13 @@ class LongestBurst(NamedTuple):
 
     limit: int
 
-    start = 0
-    name = "dropouts"
+    @property
+    def start(self) -> int:
+        return 0
+
+    @property
+    def name(self) -> str:
+        return "dropouts"
 
     @property
     def meaning(self) -> str:
@@ -73,7 +78,9 @@ class LossesInWindow(NamedTuple):
     limit: int
     window: int
 
-    start = 0
+    @property
+    def start(self) -> int:
+        return 0
 
     @property
     def name(self) -> str:
@@ -101,7 +108,9 @@ class Recovery(NamedTuple):
 
     deliveries: int
 
-    limit = 0
+    @property
+    def limit(self) -> int:
+        return 0
 
     @property
     def start(self) -> int:
@@ -213,7 +222,7 @@ class LossAutomaton:
         return self._after(states, 0)
 
     def _after(self, states: Indices, lost: int) -> Indices:
-        found = self._next[states, lost]
+        found: Indices = self._next[states, lost]
         if (unknown := found == _UNKNOWN).any():
             for state in np.unique(states[unknown]).tolist():
                 self._next[state, lost] = self._number(self._states[state], bool(lost))
