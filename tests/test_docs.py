@@ -26,8 +26,8 @@ from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
 from noack.config.toml_file import json_schema
 from noack.controllers.controller_settings import ControllerSettings
-from noack.impairments.disciplines import DISCIPLINES
 from noack.impairments.constraints import CONSTRAINTS
+from noack.impairments.disciplines import DISCIPLINES
 from noack.impairments.kinds import IMPAIRMENTS
 from noack.impairments.loss_models import LOSS_MODELS
 
