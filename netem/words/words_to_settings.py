@@ -97,10 +97,10 @@ def parse(words: str | Sequence[str]) -> LinkWords:
         else:
             _validated(_LINK, {_SETTINGS[word]: settings[word]}, reader)
     seed = settings.pop("seed", None)
-    given = {_SETTINGS[word]: value for word, value in settings.items()}
+    given: Table = {_SETTINGS[word]: value for word, value in settings.items()}
+    given |= {"impairments": tuple(impairments), "constraints": tuple(constraints)}
     try:
-        both = {"impairments": tuple(impairments), "constraints": tuple(constraints)}
-        return LinkWords(LinkSettings(**both, **given), seed)
+        return LinkWords(LinkSettings(**given), seed)
     except ValidationError as error:
         # Each setting is valid by itself; the error is a combination of settings.
         key, _, message = _message(error).partition(": ")

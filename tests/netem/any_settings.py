@@ -86,13 +86,13 @@ constraints = st.lists(st.one_of([varied(kind) for kind in CONSTRAINTS]), max_si
 def _settings(
     impairments: st.SearchStrategy[Impairment], most: int = 5
 ) -> st.SearchStrategy[LinkSettings]:
-    return st.fixed_dictionaries(dict(
-        impairments=st.lists(impairments, max_size=5).filter(_goes_together).map(tuple),
-        mansd=st.none() | st.sampled_from([0, 1, 2, 5]) | st.integers(0, most),
-        constraints=constraints,
-        first_delivered=st.booleans(),
-        limit=st.sampled_from([1, 20, 16_384]),
-    )).filter(_consistent).map(lambda given: LinkSettings(**given))  # fmt: skip
+    return st.fixed_dictionaries({
+        "impairments": st.lists(impairments, max_size=5).filter(_goes_together).map(tuple),
+        "mansd": st.none() | st.sampled_from([0, 1, 2, 5]) | st.integers(0, most),
+        "constraints": constraints,
+        "first_delivered": st.booleans(),
+        "limit": st.sampled_from([1, 20, 16_384]),
+    }).filter(_consistent).map(lambda given: LinkSettings(**given))  # fmt: skip
 
 
 def _names_no_file(one: Impairment) -> bool:
