@@ -30,19 +30,26 @@ def write_whole(path: Path, content: str | bytes, *, make_folder: bool = True) -
     return path
 
 
-def read_regular(path: Path, most_bytes: int) -> bytes:
-    """Return the bytes of a regular file.
-
-    Raise ValueError if it is a device, a FIFO or a directory, or larger than ``most_bytes``.
-    """
+@contextmanager
+def open_regular(path: Path) -> Iterator[IO[bytes]]:
+    """Open a regular file; raise ValueError if it is a device, a FIFO or a directory."""
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # so that a FIFO does not block
     try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             raise ValueError("not a regular file")
         with open(descriptor, "rb", closefd=False) as file:
-            content = file.read(most_bytes + 1)
+            yield file
     finally:
         os.close(descriptor)
+
+
+def read_regular(path: Path, most_bytes: int) -> bytes:
+    """Return the bytes of a regular file.
+
+    Raise ValueError if it is a device, a FIFO or a directory, or larger than ``most_bytes``.
+    """
+    with open_regular(path) as file:
+        content = file.read(most_bytes + 1)
     if len(content) > most_bytes:
         raise ValueError(f"larger than {most_bytes // 2**20} MiB")
     return content

@@ -1,0 +1,1 @@
+"""Packets recorded on real networks: sending times, receiving times, losses."""

@@ -1,0 +1,133 @@
+"""A packet trace: when each packet of a flow was sent, and when it was received, if it was.
+
+Times are whole nanoseconds since the first sending. All packets are in the trace: a number that no
+record has is a lost packet, for whose sending time the neighbours' are interpolated.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Int64s = NDArray[np.int64]
+LOST_NS = -1
+"""Receiving time of a lost packet."""
+MAX_PACKETS = 50_000_000
+"""Most packets of a trace."""
+LONGEST_NS = 10**18
+"""Longest time after the first sending: 31 years."""
+
+
+class TraceRecordError(ValueError):
+    """A record contradicts the others; ``row`` is its place among the records, from 0."""
+
+    def __init__(self, row: int, message: str) -> None:
+        super().__init__(message)
+        self.row = row
+
+
+@dataclass(frozen=True, eq=False)
+class PacketTrace:
+    """k packets of one flow; :func:`packet_trace` makes one from records."""
+
+    sequence: Int64s
+    """(k,) Numbers, each greater than the one before by 1."""
+    sent_ns: Int64s
+    """(k,) Since the first sending; not descending."""
+    received_ns: Int64s
+    """(k,) Since the first sending; −1 for a lost packet."""
+
+    def __len__(self) -> int:
+        return len(self.sequence)
+
+    @property
+    def lost(self) -> NDArray[np.bool_]:
+        """(k,) Whether a packet was lost."""
+        return np.equal(self.received_ns, LOST_NS)
+
+    @property
+    def delay_ns(self) -> Int64s:
+        """(k,) From sending to receiving; −1 for a lost packet."""
+        return np.where(self.lost, LOST_NS, self.received_ns - self.sent_ns)
+
+
+def packet_trace(
+    sent_ns: Int64s,
+    received_ns: Int64s,
+    lost: NDArray[np.bool_],
+    sequence: Int64s | None = None,
+    *,
+    clocks_differ: bool = False,
+    most_packets: int = MAX_PACKETS,
+) -> PacketTrace:
+    """Return a trace from n records in any order, with the missing packets added as lost.
+
+    Args:
+        sent_ns: (n,) Sending times, from any origin.
+        received_ns: (n,) Receiving times; ignored for lost packets.
+        lost: (n,) Which of them were lost.
+        sequence: (n,) Their numbers; None: 0, 1, …
+        clocks_differ: The two times were read on different clocks. The delays are then known up
+            to a constant; it is chosen so that the smallest delay is 0.
+        most_packets: Most packets, including missing ones.
+
+    Raises:
+        TraceRecordError: a number occurs twice, a packet was sent before its predecessor or
+            received before it was sent, or a time or the number of packets is too large.
+        ValueError: there are no records.
+    """
+    if not len(sent_ns):
+        raise ValueError("has no packets")
+    row = np.arange(len(sent_ns)) if sequence is None else np.argsort(sequence, kind="stable")
+    number = row if sequence is None else sequence[row]
+    _check_numbers(number, row, most_packets)
+    sent, received, lost = sent_ns[row], received_ns[row], lost[row]
+    _refuse(
+        np.flatnonzero(np.diff(sent) < 0) + 1, row,
+        "is sent before the packet that precedes it; sending times must not descend",
+    )  # fmt: skip
+    if int(sent[-1]) - int(sent[0]) > LONGEST_NS:
+        raise TraceRecordError(int(row[-1]), "is sent more than 31 years after the first packet")
+    origin_ns = sent[0]
+    apart = np.abs(received // 2 - origin_ns // 2) > LONGEST_NS // 2  # halves do not overflow
+    _refuse(np.flatnonzero(apart & ~lost), row, "is received 31 years from the first sending")
+    sent = sent - origin_ns
+    received = np.where(lost, sent, received - origin_ns)
+    if clocks_differ and not lost.all():
+        received = received - (received - sent)[~lost].min()
+    early = (
+        "is received before it is sent; if the two clocks differ, only relative delays are known"
+    )
+    _refuse(np.flatnonzero(received < sent), row, early)
+    return _with_missing(number, sent, np.where(lost, LOST_NS, received))
+
+
+def _refuse(places: NDArray[Any], row: NDArray[Any], message: str) -> None:
+    if len(places):
+        raise TraceRecordError(int(row[places[0]]), message)
+
+
+def _check_numbers(number: Int64s, row: NDArray[Any], most_packets: int) -> None:
+    again = np.flatnonzero(number[1:] == number[:-1]) + 1
+    _refuse(again, row, "has a sequence number that an earlier record has")
+    packets = int(number[-1]) - int(number[0]) + 1
+    if packets > most_packets:
+        raise TraceRecordError(
+            int(row[-1]), f"makes the trace {packets} packets long; at most {most_packets} can be"
+        )
+
+
+def _with_missing(number: Int64s, sent_ns: Int64s, received_ns: Int64s) -> PacketTrace:
+    """Return the trace with the missing packets; ``number`` ascends."""
+    place = number - number[0]
+    k = int(place[-1]) + 1
+    received = np.full(k, LOST_NS)
+    received[place] = received_ns
+    before = np.searchsorted(place, np.arange(k), side="right") - 1
+    after = np.minimum(before + 1, len(place) - 1)
+    gap = np.maximum(place[after] - place[before], 1)
+    steps = np.arange(k) - place[before]
+    each, rest = np.divmod(sent_ns[after] - sent_ns[before], gap)
+    sent = sent_ns[before] + each * steps + rest * steps // gap
+    return PacketTrace(np.arange(k) + number[0], sent, received)

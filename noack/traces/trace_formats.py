@@ -1,0 +1,71 @@
+"""Formats of packet traces, one module of this folder each; :func:`read_trace` finds the format."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from pkgutil import iter_modules
+from typing import IO
+
+from noack.core.errors import CallerError, one_line, why
+from noack.core.file_access import open_regular
+from noack.traces.packet_trace import MAX_PACKETS, PacketTrace
+
+_HEAD_BYTES = 4096
+
+
+@dataclass(frozen=True)
+class TraceFormat:
+    """A format of files; a module of this folder adds it by defining one."""
+
+    name: str
+    """For messages, e.g. ``CSV``."""
+    recognises: Callable[[bytes], bool]
+    """Whether a file that begins with these bytes has the format."""
+    read: Callable[[IO[bytes], int, bool], PacketTrace]
+    """Reads a file, given the most packets, and whether the clocks differ.
+
+    Raises:
+        ValueError: one line without the file's name: where, what is wrong, what would be right.
+    """
+
+
+def _formats() -> Sequence[TraceFormat]:
+    entries = iter_modules(import_module(__package__).__path__, f"{__package__}.")
+    modules = (vars(import_module(entry.name)) for entry in entries if entry.name != __name__)
+    return [one for module in modules for one in module.values() if isinstance(one, TraceFormat)]
+
+
+def read_trace(
+    path: Path,
+    *,
+    place: str = "",
+    clocks_differ: bool = False,
+    most_packets: int = MAX_PACKETS,
+    formats: Sequence[TraceFormat] = (),
+) -> PacketTrace:
+    """Return the trace in a file.
+
+    Args:
+        path: the file.
+        place: what messages begin with; by default the path.
+        clocks_differ: see :func:`noack.traces.packet_trace.packet_trace`.
+        most_packets: most packets of the trace.
+        formats: further formats, beside those of this folder.
+
+    Raises:
+        CallerError: one line; the file cannot be read, or is not a trace.
+    """
+    known = [*formats, *_formats()]
+    try:
+        with open_regular(path) as file:
+            head = file.read(_HEAD_BYTES)
+            file.seek(0)
+            found = next((one for one in known if one.recognises(head)), None)
+            if found is None:
+                names = ", ".join(one.name for one in known)
+                raise ValueError(f"not a packet trace; known formats: {names}")
+            return found.read(file, most_packets, clocks_differ)
+    except (OSError, ValueError) as error:
+        reason = f"cannot be read: {why(error)}" if isinstance(error, OSError) else one_line(error)
+        raise CallerError(f"{place or path}: {reason}") from None

@@ -1,0 +1,129 @@
+"""Packet traces and the CSV format: against a reader of a few lines, and on wrong files."""
+
+import csv
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from noack.core.errors import CallerError
+from noack.traces.packet_trace import TraceRecordError, packet_trace
+from noack.traces.trace_formats import read_trace
+
+CICV5G = Path(__file__).parents[3] / "scenarios/traces/cicv5g"
+
+
+@pytest.mark.parametrize("path", sorted(CICV5G.glob("*.csv")), ids=lambda path: path.stem)
+def test_shipped_traces_are_read_as_they_are_written(path: Path) -> None:
+    rows = list(csv.DictReader(path.read_text().splitlines()))
+    trace = read_trace(path)
+    assert trace.sequence.tolist() == list(range(len(rows)))
+    assert trace.sent_ns.tolist() == [int(row["sent_ms"]) * 10**6 for row in rows]
+    assert trace.received_ns.tolist() == [int(row["received_ms"]) * 10**6 for row in rows]
+    assert not trace.lost.any()
+
+
+def test_units_order_and_lost_packets(tmp_path: Path) -> None:
+    file = tmp_path / "trace.csv"
+    file.write_text(
+        "\ufeffsent_s, note,received_us,sequence\r\n"
+        "1700000000.123456789,a,1700000000123457.9994,12\r\n\r\n"
+        '1700000000.1,"b, c",,10\r\n'
+        "17000000009e-1,x,1.7000000009e15,17\r\n"
+        "1700000000.5,x,-1.0,16\r\n"
+    )
+    trace = read_trace(file)
+    assert trace.sequence.tolist() == [10, 11, 12, 13, 14, 15, 16, 17]
+    assert trace.sent_ns.tolist() == [
+        0, 11_728_394, 23_456_789, 117_592_591, 211_728_394, 305_864_197, 400_000_000, 8 * 10**8,
+    ]  # fmt: skip
+    assert trace.received_ns.tolist() == [-1, -1, 23_457_999, -1, -1, -1, -1, 8 * 10**8]
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 10**15), st.integers(-1, 10**15)), min_size=1, max_size=20),
+    st.data(),
+)
+def test_any_records_are_read_exactly(records: list[tuple[int, int]], data: st.DataObject) -> None:
+    numbers = sorted(
+        data.draw(st.sets(st.integers(0, 60), min_size=len(records), max_size=len(records)))
+    )
+    sent = sorted(time_ns for time_ns, _ in records)
+    received = [
+        -1 if delay < 0 else at + delay for at, (_, delay) in zip(sent, records, strict=True)
+    ]
+    order = data.draw(st.permutations(range(len(records))))
+    columns = (np.array(column)[list(order)] for column in (sent, received, numbers))
+    sent_ns, received_ns, sequence = columns
+    trace = packet_trace(sent_ns, received_ns, received_ns < 0, sequence)
+    known = dict(zip(numbers, zip(sent, received, strict=True), strict=True))
+    assert trace.sequence.tolist() == list(range(numbers[0], numbers[-1] + 1))
+    assert (np.diff(trace.sent_ns) >= 0).all()
+    for number, at, until in zip(trace.sequence, trace.sent_ns, trace.received_ns, strict=True):
+        if number in known:
+            assert at == known[number][0] - sent[0]
+            assert until == (-1 if known[number][1] < 0 else known[number][1] - sent[0])
+        else:
+            a = max(one for one in numbers if one < number)
+            b = min(one for one in numbers if one > number)
+            share = Fraction(int(number) - a, b - a)
+            exact = known[a][0] + share * (known[b][0] - known[a][0]) - sent[0]
+            assert until == -1
+            assert 0 <= exact - int(at) < 1
+
+
+def test_clocks_that_differ_give_relative_delays() -> None:
+    sent, received = np.array([0, 10, 20, 30]), np.array([-995, -1, -970, -967])
+    lost = np.array([False, True, False, False])
+    with pytest.raises(TraceRecordError, match="clocks differ"):
+        packet_trace(sent, received, lost)
+    trace = packet_trace(sent, received, lost, clocks_differ=True)
+    assert trace.delay_ns.tolist() == [2, -1, 7, 0]
+
+
+WRONG = {
+    "": "not a packet trace; known formats: CSV",
+    "\x00\x01": "not a packet trace",
+    "sent_ms,received_ms\n": "has no packets",
+    "sent_ms,received\n1,2\n": "line 1: has no column received_ms (or _s, _us, _ns); its columns: ",
+    "sent_ms,sent_s,received_ms\n": "line 1: has the columns sent_ms and sent_s; one is needed",
+    "sequence,sequence,sent_s,received_s\n": "line 1: has the columns sequence and sequence",
+    "sent_ms,received_ms\n1,2\n\n1,2,3\n": "line 4: has 3 columns; the header has 2",
+    "sent_ms,received_ms\n1,2\nx,2\n": "line 3: sent_ms is 'x', not a number",
+    "sent_ms,received_ms\n1,nan\n": "line 2: received_ms is 'nan', not a number",
+    "sent_ms,received_ms\n1,-2\n": "line 2: is received before it is sent",
+    "sent_ms,received_ms\n,2\n": "line 2: sent_ms is '', not a number",
+    "sent_s,received_s\n1e10,1\n": "line 2: sent_s is '1e10', too large",
+    "sent_s,received_s\n1e9999,1\n": "too large",
+    "sent_s,received_s\n0,1e9999999999\n": "not a number",
+    "sent_s,received_s\n0,1\n2e9,\n": "line 3: is sent more than 31 years after",
+    "sent_s,received_s\n0,1\n1,2e9\n": "line 3: is received 31 years from",
+    "sent_ms,received_ms\n5,6\n4,6\n": "line 3: is sent before the packet that precedes it",
+    "sequence,sent_s,received_s\n1,1,1\n\n2,2,2\n1,3,3\n": "line 5: has a sequence number that an",
+    "sequence,sent_s,received_s\n1,1,1\n99999999999,2,2\n": "line 3: makes the trace 99999999999 p",
+    "sequence,sent_s,received_s\n1.5,1,1\n": "line 2: sequence is '1.5', not a whole number",
+    'sent_ms,received_ms\n"' + "1\n" * 100_000: "line ",
+    "sent_ms,received_ms\n" + "1" * 100_000: "a line of more than",
+}
+
+
+@pytest.mark.parametrize("content", WRONG, ids=range(len(WRONG)))
+def test_wrong_files(content: str, tmp_path: Path) -> None:
+    file = tmp_path / "trace.csv"
+    file.write_text(content)
+    with pytest.raises(CallerError) as refused:
+        read_trace(file)
+    message = str(refused.value)
+    assert message.startswith(f"{file}: ")
+    assert "\n" not in message
+    assert WRONG[content] in message
+    assert len(message) < len(str(file)) + 160
+
+
+def test_other_things_than_files(tmp_path: Path) -> None:
+    for path in (tmp_path, tmp_path / "missing", Path("/dev/zero")):
+        with pytest.raises(CallerError, match=str(path)):
+            read_trace(path)
