@@ -62,7 +62,7 @@ class Propagator:
         """Return e^{G dt} ``state``, shape (n,)."""
         if dt_ns == 0 or self._static:
             return state
-        # The same bits as the operator @, in half the time.
+        # For vectors of a few entries, ``dot`` takes half the time of ``@``.
         advanced: Vector = self.transition(dt_ns).dot(state)
         return advanced
 

@@ -113,8 +113,8 @@ class TriggerCondition(NamedTuple):
             return ComparisonSides(left, right)  # the same bits as below, in less time
         z = np.concatenate([x, e_s])
         if len(self.form.down) or auxiliary > 0:
-            right = math.hypot(right, norm(self.form.down @ z), math.sqrt(max(auxiliary, 0.0)))
-        return ComparisonSides(norm(self.form.up @ z), right)
+            right = math.hypot(right, norm(self.form.down.dot(z)), math.sqrt(max(auxiliary, 0.0)))
+        return ComparisonSides(norm(self.form.up.dot(z)), right)
 
     def exceeds(
         self, t_ns: NDArray[Any], z: Matrix, auxiliary: Vector | float = 0.0
