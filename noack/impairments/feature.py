@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
 from noack.impairments.link_records import QueueState, RuleStage
+from noack.impairments.loss_guarantee import LossRule
 from noack.impairments.markov_chain import Chain, Pattern
 from noack.impairments.word_reader import WordReader
 from noack.settings.section import ScenarioSection
@@ -153,8 +154,8 @@ class Constraint(Feature):
 
     @property
     @abstractmethod
-    def longest_burst(self) -> int | None:
-        """Return the maximum number of consecutive losses that it allows; None: any number."""
+    def rule(self) -> LossRule:
+        """Return the constraint as a counter over the outcomes of packets."""
 
     @property
     @abstractmethod
