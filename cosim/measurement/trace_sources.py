@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from cosim.measurement.relative_delay import relative_delays
+from noack.traces.relative_delay import relative_delays
 from noack.core.errors import CallerError
 from noack.traces.packet_trace import PacketTrace
 from noack.traces.trace_formats import read_trace

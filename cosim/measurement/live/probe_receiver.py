@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from cosim.measurement.live.probe_result import ProbeResult, counted, late_sends
-from cosim.measurement.relative_delay import relative_delays
+from noack.traces.relative_delay import relative_delays
 from noack.core.clock import NS_PER_S
 from noack.protocol.probe_format import (
     MAX_PROBES,
