@@ -99,11 +99,7 @@ def matched_trace(
     trace = packet_trace(
         sent.t_ns, received_ns, lost, clocks_differ=clocks_differ, most_packets=most
     )
-    if not clocks_differ:
-        return trace
-    trace, comparison = relative_delays(trace)
-    notes += comparison.lines()
-    return trace
+    return relative_delays(trace) if clocks_differ else trace
 
 
 def _where(payloads: Payloads, flags: NDArray[np.bool_]) -> Payloads:

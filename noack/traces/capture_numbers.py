@@ -109,9 +109,7 @@ def trace_of_probe(
         found.sent_ns, found.received_ns, np.zeros(len(found.number), bool), found.number,
         clocks_differ=True, most_packets=most_packets,
     )  # fmt: skip
-    trace, comparison = relative_delays(trace)
-    notes += comparison.lines()
-    return trace
+    return relative_delays(trace)
 
 
 def trace_of_numbers(

@@ -11,7 +11,7 @@ A flow is a pair of addresses at an interface. The largest is taken, unless the 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import IO, NamedTuple
+from typing import IO
 
 from noack.traces.capture_blocks import is_capture
 from noack.traces.capture_flows import CaptureFlows
@@ -19,6 +19,7 @@ from noack.traces.capture_matching import matched_trace, one_capture, two_captur
 from noack.traces.capture_numbers import SequenceField, trace_of_numbers, trace_of_probe
 from noack.traces.packet_trace import MAX_PACKETS, PacketTrace, TraceRecordError
 from noack.traces.trace_formats import TraceFormat
+from noack.traces.udp_headers import CapturedFlow
 
 
 @dataclass(frozen=True)
@@ -33,44 +34,50 @@ class CaptureOptions:
     most_packets: int = MAX_PACKETS
 
 
-class CaptureTrace(NamedTuple):
-    """A packet trace, and lines about how it was obtained."""
-
-    trace: PacketTrace
-    notes: Sequence[str]
-
-
-def read_captures(files: Sequence[IO[bytes]], options: CaptureOptions) -> CaptureTrace:
+def read_captures(files: Sequence[IO[bytes]], options: CaptureOptions) -> PacketTrace:
     """Return the trace in one capture, or in those of the sender's and of the receiver's end.
 
     Raises:
         ValueError: one line; it is not a capture, or the datagrams cannot be matched.
     """
     flows = CaptureFlows(files[0])
-    notes, most = flows.notes, options.most_packets
     flow = flows.choose(options.flow)
+    notes = flows.notes
     try:
-        if options.sequence_at is not None:
-            trace = trace_of_numbers(flows, flow, options.sequence_at, most, notes)
-            return CaptureTrace(trace, notes)
-        if len(files) == 2:
-            receiver = CaptureFlows(files[1])
-            notes += receiver.notes
-            ends = two_captures(flows, flow, receiver)
-        else:
-            found = one_capture(flows, flow, notes)
-            if found is None:
-                return CaptureTrace(trace_of_probe(flows, flow, most, notes), notes)
-            ends = found
-        differ = len(files) == 2 if options.clocks_differ is None else options.clocks_differ
-        return CaptureTrace(matched_trace(*ends, differ, most, notes), notes)
+        trace = _trace(flows, flow, files[1:], options, notes)
     except TraceRecordError as error:
         raise ValueError(f"datagram {error.row + 1} of the flow {error}") from None
+    return trace.noted(*notes)
+
+
+def _trace(
+    flows: CaptureFlows,
+    flow: CapturedFlow,
+    others: Sequence[IO[bytes]],
+    options: CaptureOptions,
+    notes: list[str],
+) -> PacketTrace:
+    most = options.most_packets
+    if options.sequence_at is not None:
+        if others:
+            raise ValueError("--sequence-at needs the receiver's capture only")
+        return trace_of_numbers(flows, flow, options.sequence_at, most, notes)
+    if others:
+        receiver = CaptureFlows(others[0])
+        notes += receiver.notes
+        ends = two_captures(flows, flow, receiver)
+    else:
+        found = one_capture(flows, flow, notes)
+        if found is None:
+            return trace_of_probe(flows, flow, most, notes)
+        ends = found
+    differ = bool(others) if options.clocks_differ is None else options.clocks_differ
+    return matched_trace(*ends, differ, most, notes)
 
 
 def _read(file: IO[bytes], most_packets: int, clocks_differ: bool) -> PacketTrace:
     options = CaptureOptions(clocks_differ=clocks_differ or None, most_packets=most_packets)
-    return read_captures([file], options).trace
+    return read_captures([file], options)
 
 
 CAPTURE = TraceFormat("pcap", is_capture, _read)
