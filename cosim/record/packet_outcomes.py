@@ -44,10 +44,10 @@ class PacketOutcome(NamedTuple):
         return int(self.loss_bursts().max(initial=0))
 
     def losses_in(self, packets: int) -> NDArray[np.int64]:
-        """The number of losses in each ``packets`` consecutive updates; in all, if they are fewer."""
+        """The number of losses in each ``packets`` consecutive updates; or in all, if fewer."""
         lost = np.append(0, np.cumsum(self.lost))
         width = min(packets, len(self.lost))
-        return lost[width:] - lost[: len(lost) - width]
+        return np.asarray(lost[width:] - lost[: len(lost) - width])
 
 
 def packet_outcomes(record: RunRecord, flow: Flow = Flow.UPDATE) -> PacketOutcome:
