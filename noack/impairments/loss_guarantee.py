@@ -1,0 +1,247 @@
+"""The guarantee of a network, as rules on the outcomes (delivered or lost) of successive packets.
+
+A rule is a counter: from its state and the next outcome follow its next state and a value. The
+outcome keeps the rule if the value is at most the rule's limit; a delivery always does. These
+counters are the one definition of the guarantee for the checks of records, for the controller and
+for the adversary.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Indices = NDArray[np.int64]
+
+_FORBIDDEN, _UNKNOWN = -1, -2
+
+
+class LossRule(Protocol):
+    """One rule of a guarantee, as a counter; states and values are integers."""
+
+    @property
+    def limit(self) -> int:
+        """The largest value that is allowed."""
+
+    @property
+    def start(self) -> int:
+        """The state before the first packet."""
+
+    @property
+    def name(self) -> str:
+        """Short name, in the words of the settings."""
+
+    @property
+    def meaning(self) -> str:
+        """The rule as part of a sentence."""
+
+    def after(self, state: int, lost: bool) -> tuple[int, int]:
+        """Return the state after an outcome, and the value that is compared with the limit."""
+
+    def violation(self, value: float) -> str:
+        """Return how a value violates the rule, as part of a sentence."""
+
+
+class LongestBurst(NamedTuple):
+    """At most ``limit`` consecutive losses; the state is the number of consecutive losses."""
+
+    limit: int
+
+    @property
+    def start(self) -> int:
+        return 0
+
+    @property
+    def name(self) -> str:
+        return "dropouts"
+
+    @property
+    def meaning(self) -> str:
+        return f"at most M − 1 = {self.limit} consecutive losses"
+
+    def after(self, state: int, lost: bool) -> tuple[int, int]:
+        count = state + 1 if lost else 0
+        return count, count
+
+    def violation(self, value: float) -> str:
+        return f"{value:.0f} consecutive updates lost, {self.limit} allowed"
+
+
+class LossesInWindow(NamedTuple):
+    """At most ``limit`` losses in ``window`` consecutive packets.
+
+    The state has one bit for each of the last ``window`` − 1 packets: 1 if it was lost.
+    """
+
+    limit: int
+    window: int
+
+    @property
+    def start(self) -> int:
+        return 0
+
+    @property
+    def name(self) -> str:
+        return f"atmost {self.limit} in {self.window}"
+
+    @property
+    def meaning(self) -> str:
+        losses = "1 loss" if self.limit == 1 else f"{self.limit} losses"
+        return f"at most {losses} in {self.window} consecutive packets"
+
+    def after(self, state: int, lost: bool) -> tuple[int, int]:
+        recent = state << 1 | lost
+        return recent & ((1 << (self.window - 1)) - 1), recent.bit_count()
+
+    def violation(self, value: float) -> str:
+        return f"{value:.0f} of {self.window} consecutive updates lost, {self.limit} allowed"
+
+
+class DeliveriesBetweenBursts(NamedTuple):
+    """At least ``deliveries`` consecutive deliveries between two bursts of losses.
+
+    The state is the number of deliveries since the last loss, up to ``deliveries``; the value is
+    the number of deliveries that were too few.
+    """
+
+    deliveries: int
+
+    @property
+    def limit(self) -> int:
+        return 0
+
+    @property
+    def start(self) -> int:
+        return self.deliveries
+
+    @property
+    def name(self) -> str:
+        return f"recover {self.deliveries}"
+
+    @property
+    def meaning(self) -> str:
+        count = "1 delivery" if self.deliveries == 1 else f"{self.deliveries} deliveries"
+        return f"at least {count} in a row between two bursts of losses"
+
+    def after(self, state: int, lost: bool) -> tuple[int, int]:
+        if not lost:
+            return min(state + 1, self.deliveries), 0
+        return 0, self.deliveries - state if state else 0
+
+    def violation(self, value: float) -> str:
+        found = self.deliveries - value
+        return f"only {found:.0f} delivered between two bursts, at least {self.deliveries} required"
+
+
+class LossWindow(NamedTuple):
+    """At most ``losses`` losses in ``packets`` consecutive packets."""
+
+    losses: int
+    packets: int
+
+
+@dataclass(frozen=True)
+class LossGuarantee:
+    """All rules that a network keeps; without any, every packet may be lost."""
+
+    rules: tuple[LossRule, ...] = ()
+
+    @property
+    def longest_burst(self) -> int | None:
+        """The largest number of consecutive losses; None without a limit."""
+        bursts = [
+            rule.limit
+            for rule in self.rules
+            if isinstance(rule, LongestBurst)
+            or (isinstance(rule, LossesInWindow) and rule.limit < rule.window)
+        ]
+        return min(bursts, default=None)
+
+    @property
+    def windows(self) -> tuple[LossWindow, ...]:
+        """What the rules say about the number of losses in windows; each follows from them.
+
+        With at most b consecutive losses and h deliveries between bursts, b + h packets contain one
+        burst, or parts of two with h deliveries between them: at most b losses.
+        """
+        burst = self.longest_burst
+        if burst is None:
+            return ()
+        found = [LossWindow(burst, burst + 1)]
+        for rule in self.rules:
+            if isinstance(rule, LossesInWindow):
+                found.append(LossWindow(rule.limit, rule.window))
+            elif isinstance(rule, DeliveriesBetweenBursts):
+                found.append(LossWindow(burst, burst + rule.deliveries))
+        return tuple(found)
+
+    @property
+    def meaning(self) -> str:
+        """All rules, as part of a sentence."""
+        return ", ".join(rule.meaning for rule in self.rules) or "any number of losses"
+
+
+class LossHistory:
+    """Follows the outcomes of successive packets and finds violated rules."""
+
+    def __init__(self, rules: Iterable[LossRule]) -> None:
+        self._rules = tuple(rules)
+        self._states = [rule.start for rule in self._rules]
+
+    def add(self, lost: bool) -> list[tuple[LossRule, int]]:
+        """Add an outcome; return the rules that it violates, each with its value."""
+        violated = []
+        for i, rule in enumerate(self._rules):
+            self._states[i], value = rule.after(self._states[i], lost)
+            if value > rule.limit:
+                violated.append((rule, value))
+        return violated
+
+
+class LossAutomaton:
+    """The states of a guarantee, numbered from 0 (the start) as they are reached.
+
+    It follows many sequences of outcomes at once.
+    """
+
+    def __init__(self, guarantee: LossGuarantee) -> None:
+        self._rules = guarantee.rules
+        start = tuple(rule.start for rule in self._rules)
+        self._states = [start]
+        self._numbers = {start: 0}
+        self._next: Indices = np.full((1, 2), _UNKNOWN)
+
+    def after_loss(self, states: Indices) -> Indices:
+        """Return the states after the loss of the next packet; −1 where it is not allowed."""
+        return self._after(states, 1)
+
+    def after_delivery(self, states: Indices) -> Indices:
+        """Return the states after the delivery of the next packet."""
+        return self._after(states, 0)
+
+    def _after(self, states: Indices, lost: int) -> Indices:
+        found: Indices = self._next[states, lost]
+        if (unknown := found == _UNKNOWN).any():
+            for state in np.unique(states[unknown]).tolist():
+                self._next[state, lost] = self._number(self._states[state], bool(lost))
+            found = self._next[states, lost]
+        return found
+
+    def _number(self, state: tuple[int, ...], lost: bool) -> int:
+        """Return the number of the state after an outcome; −1 if it is not allowed."""
+        following = []
+        for rule, own in zip(self._rules, state, strict=True):
+            after, value = rule.after(own, lost)
+            if value > rule.limit:
+                return _FORBIDDEN
+            following.append(after)
+        key = tuple(following)
+        if key not in self._numbers:
+            self._numbers[key] = len(self._states)
+            self._states.append(key)
+            if len(self._states) > len(self._next):
+                room = np.full((len(self._next), 2), _UNKNOWN)
+                self._next = np.concatenate([self._next, room])
+        return self._numbers[key]
