@@ -1,7 +1,7 @@
 """Base classes of a link's features: settings, behaviour, words, description, prediction.
 
-A feature is a loss model, a kind of impairment, or a queue discipline: one class in its own file,
-derived from one of the three classes at the end.
+A feature is a loss model, a kind of impairment, a queue discipline, or a constraint on losses: one
+class in its own file, derived from one of the classes at the end.
 """
 
 from abc import abstractmethod
@@ -144,6 +144,27 @@ class StageFeature(Feature):
     def tc_notes(self) -> Sequence[str]:
         """Return the differences of ``tc netem`` in behaviour."""
         return ()
+
+
+class Constraint(Feature):
+    """Base class of constraints on the losses of a flow; each has its own first word."""
+
+    kind: str
+
+    @property
+    @abstractmethod
+    def longest_burst(self) -> int | None:
+        """Return the maximum number of consecutive losses that it allows; None: any number."""
+
+    @property
+    @abstractmethod
+    def scope(self) -> object:
+        """Return what two constraints of a link must not have in common."""
+
+    @property
+    @abstractmethod
+    def twice(self) -> str:
+        """Return the name of that, for messages."""
 
 
 class LossModel(StageFeature):

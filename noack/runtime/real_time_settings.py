@@ -18,6 +18,7 @@ from typing import Any
 _PR_SET_TIMERSLACK = 29
 _MCL_CURRENT = 1
 _MCL_FUTURE = 2
+_LAST_PLACE = 3
 _CPU_DMA_LATENCY = Path("/dev/cpu_dma_latency")
 
 
@@ -27,8 +28,10 @@ def realtime(
 ) -> Iterator[dict[str, str]]:
     """Apply the real-time settings to the calling thread, and undo them with the context.
 
-    Neighbours along the loop have consecutive numbers (``place``) and get different cores, so that
-    a process does not block the one that it wakes. None leaves the choice to the system.
+    ``place`` counts the processes along the loop from 0, the plant. The plant has the first core,
+    the others share the second: a message between them then needs no wake-up of another core. Each
+    has a higher priority than the one before it, so that a receiver runs at once; the last has
+    ``fifo_priority``. None leaves the core to the system.
 
     Yields:
         For each setting ``"applied"``, ``"not permitted: why"`` or ``"not requested"``.
@@ -44,7 +47,7 @@ def realtime(
             # Locking memory takes 0.1 s: at real-time priority it would block this core.
             applied["memory_lock"] = _attempt(_call_system, "mlockall", _MCL_CURRENT | _MCL_FUTURE)
             applied["timer_slack"] = _attempt(_call_system, "prctl", _PR_SET_TIMERSLACK, 1, 0, 0, 0)
-            applied["sched_fifo"] = _attempt(_fifo, fifo_priority, undo)
+            applied["sched_fifo"] = _attempt(_fifo, fifo_priority, place, undo)
             if place is not None and applied["sched_fifo"] == "applied":
                 applied["affinity"] = _attempt(_affinity, place, undo)
             applied["cpu_dma_latency"] = _attempt(_cpu_dma_latency, undo)
@@ -60,7 +63,7 @@ def _attempt(apply: Callable[..., None], *arguments: Any) -> str:
     return "applied"
 
 
-def _fifo(priority: int, undo: ExitStack) -> None:
+def _fifo(priority: int, place: int | None, undo: ExitStack) -> None:
     if sys.platform != "linux":
         raise OSError(0, "not available on this system")
     loop = threading.get_native_id()
@@ -68,7 +71,9 @@ def _fifo(priority: int, undo: ExitStack) -> None:
     # preempted while it holds a lock would keep the loop waiting for milliseconds.
     for task in Path("/proc/self/task").iterdir():
         thread = int(task.name)
-        rank = priority if thread == loop else priority - 1
+        rank = priority - _LAST_PLACE - 1
+        if thread == loop:
+            rank = priority if place is None else priority - _LAST_PLACE + place
         ended = () if thread == loop else (ProcessLookupError,)
         with suppress(*ended):
             os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(max(rank, 1)))
@@ -79,7 +84,7 @@ def _affinity(place: int, undo: ExitStack) -> None:
     cores = sorted(os.sched_getaffinity(0))
     if len(cores) < 2:
         raise OSError(0, "there is only one core")
-    os.sched_setaffinity(0, {cores[place % len(cores)]})
+    os.sched_setaffinity(0, {cores[min(place, 1)]})
     undo.callback(os.sched_setaffinity, 0, set(cores))
 
 

@@ -91,9 +91,11 @@ class RealtimeSection(ScenarioSection):
     enabled: bool = True
     """Ask for SCHED_FIFO, locked memory, the shortest timer slack and no deep idle states."""
     fifo_priority: Annotated[int, Field(ge=1, le=98)] = 50
-    """SCHED_FIFO priority."""
+    """SCHED_FIFO priority of the controller; with ``pin_cores`` the emulator, the sensor and the
+    plant have 1, 2 and 3 less, at least 1."""
     pin_cores: bool = True
-    """With SCHED_FIFO: neighbours in the loop run on different cores."""
+    """With SCHED_FIFO: the plant runs on the first core, sensor, emulator and controller on the
+    second; a receiver interrupts its sender."""
     spin_us: Annotated[FiniteFloat, Field(ge=0, le=1000)] = 0.0
     """Busy-wait this long before each deadline; this takes time from other processes on the
     core."""
