@@ -30,6 +30,8 @@ class QuadraticForm(NamedTuple):
     """P, shape (p, 2n)."""
     down: Matrix
     """N, shape (q, 2n); q = 0 for none."""
+    is_error: bool = False
+    """Whether P z = e_s, and N has no rows."""
 
     @np.errstate(over="ignore", invalid="ignore")  # a run may diverge
     def values(self, z: Matrix) -> Vector:
@@ -104,6 +106,10 @@ class TriggerCondition(NamedTuple):
         right = self.threshold(t_ns)
         if self.integrates:
             return ComparisonSides(auxiliary, right)
+        if self.form.is_error and auxiliary <= 0:
+            left = norm(e_s)
+            if left < math.inf:  # else x may be infinite, and P z NaN
+                return ComparisonSides(left, right)
         z = np.concatenate([x, e_s])
         if len(self.form.down) or auxiliary > 0:
             right = math.hypot(right, norm(self.form.down.dot(z)), math.sqrt(max(auxiliary, 0.0)))
@@ -142,6 +148,11 @@ def error_map(n: int, weight: Matrix | None = None) -> Matrix:
 def state_map(n: int, weight: Matrix | None = None) -> Matrix:
     """[W 0], which takes z to W x, shape (n, 2n)."""
     return np.hstack([np.eye(n) if weight is None else weight, np.zeros((n, n))])
+
+
+def error_form(n: int, weight: Matrix | None = None) -> QuadraticForm:
+    """The form ‖W e_s‖²."""
+    return QuadraticForm(error_map(n, weight), empty_map(n), weight is None)
 
 
 def empty_map(n: int) -> Matrix:
