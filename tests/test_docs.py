@@ -26,6 +26,7 @@ from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
 from noack.config.toml_file import json_schema
 from noack.controllers.controller_settings import ControllerSettings
+from noack.impairments.constraints import CONSTRAINTS
 from noack.impairments.disciplines import DISCIPLINES
 from noack.impairments.kinds import IMPAIRMENTS
 from noack.impairments.loss_models import LOSS_MODELS
@@ -189,7 +190,7 @@ def test_every_key_of_disturbances_and_observers_is_documented(table: type[BaseM
     assert set(named) - {"disturbances", "measurement"} == table.model_fields.keys() - {"kind"}
 
 
-@pytest.mark.parametrize("table", [*LOSS_MODELS, *IMPAIRMENTS, *DISCIPLINES])
+@pytest.mark.parametrize("table", [*LOSS_MODELS, *IMPAIRMENTS, *DISCIPLINES, *CONSTRAINTS])
 def test_every_key_of_losses_and_impairments_is_documented(table: type[BaseModel]) -> None:
     text = (ROOT / "docs/scenarios.md").read_text().partition("## Loss models")[2]
     (chosen,) = get_args(next(iter(table.model_fields.values())).annotation)

@@ -80,6 +80,7 @@ def settings_meaning(settings: LinkSettings) -> list[tuple[str, str]]:
             f"the cap (M − 1): at most {settings.mansd} consecutive packets of a flow are not "
             "delivered; the next one is always delivered",
         ))  # fmt: skip
+    found += [(one.text(), one.meaning()) for one in settings.constraints]
     if settings.first_delivered:
         found.append((
             "first",

@@ -41,6 +41,7 @@ def tc_command(settings: LinkSettings) -> TcCommand:
             supported.append(one)
     if settings.mansd is not None:
         lacks.append(f"mansd {settings.mansd} (a cap on consecutive losses)")
+    lacks += [f"{one.text()} (a constraint on losses)" for one in settings.constraints]
     if settings.first_delivered:
         lacks.append("first (that the first packet of each flow is delivered)")
     if wanted and not supported:

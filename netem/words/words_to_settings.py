@@ -2,8 +2,8 @@
 
     delay 10ms 2ms distribution normal loss gemodel 1% 10% mansd 4
 
-The order of the words is the order of the impairments; the position of ``mansd``, ``first``,
-``limit`` and ``seed`` does not matter. Words cannot be abbreviated.
+The order of the words is the order of the impairments; the position of ``mansd``, ``atmost``,
+``recover``, ``first``, ``limit`` and ``seed`` does not matter. Words cannot be abbreviated.
 """
 
 import json
@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 from pydantic import TypeAdapter, ValidationError
 
 from noack.core.errors import CallerError
-from noack.impairments.feature import Impairment, Table
+from noack.impairments.constraints import CONSTRAINTS, AnyConstraint
+from noack.impairments.feature import Constraint, Feature, Impairment, Table
 from noack.impairments.kinds import IMPAIRMENTS, AnyImpairment
 from noack.impairments.kinds.reorder import Reorder
 from noack.impairments.link_settings import LinkSettings
@@ -25,19 +26,20 @@ _REFUSED = {
     "slot": "this emulator does not gather packets into slots; it has rate and blackout",
     "ecn": "this emulator cannot mark packets: it sees payloads, not IP headers",
 }
-_FEATURES = {word.name: (kind, word) for kind in IMPAIRMENTS for word in kind.words if word.read}
+_KINDS: Sequence[type[Feature]] = (*IMPAIRMENTS, *CONSTRAINTS)
+_FEATURES = {word.name: (kind, word) for kind in _KINDS for word in kind.words if word.read}
 _SETTINGS = {"mansd": "mansd", "first": "first_delivered", "limit": "limit"}
 KEYWORDS = (*_FEATURES, *_SETTINGS, "seed")
 """Words that begin a clause."""
 _AFTER: dict[str, str] = {}
 """For each word that begins no clause: the words after which it is allowed."""
-for _kind in IMPAIRMENTS:
+for _kind in _KINDS:
     for _word in _kind.words:
         if _word.name not in _FEATURES:
             places = [_AFTER[_word.name]] if _word.name in _AFTER else []
             _AFTER[_word.name] = ", or after ".join([*places, _word.after])
 EXAMPLES: Mapping[str, str] = {
-    **{word.name: word.example for kind in IMPAIRMENTS for word in kind.words},
+    **{word.name: word.example for kind in _KINDS for word in kind.words},
     "mansd": "mansd 4",
     "first": "first",
     "limit": "limit 1000",
@@ -46,6 +48,7 @@ EXAMPLES: Mapping[str, str] = {
 GRAMMAR = [word.grammar for kind in IMPAIRMENTS for word in kind.words if word.grammar]
 """The words of each impairment, for ``--help``."""
 _IMPAIRMENT: TypeAdapter[Any] = TypeAdapter(AnyImpairment)
+_CONSTRAINT: TypeAdapter[Any] = TypeAdapter(AnyConstraint)
 _LINK, _SEED = TypeAdapter(LinkSettings), TypeAdapter[int](Seed)
 _LIMIT = LinkSettings.model_fields["limit"].default
 
@@ -66,6 +69,7 @@ def parse(words: str | Sequence[str]) -> LinkWords:
     """
     reader = WordReader(words)
     impairments: list[Impairment] = []
+    constraints: list[Constraint] = []
     settings: Table = {}
     while (word := reader.begin()) is not None:
         if word in _REFUSED:
@@ -78,6 +82,9 @@ def parse(words: str | Sequence[str]) -> LinkWords:
             kind, found = _FEATURES[word]
             assert found.read is not None
             table = {"kind": kind.model_fields["kind"].default, **found.read(reader)}
+            if issubclass(kind, Constraint):
+                constraints.append(_validated(_CONSTRAINT, table, reader))
+                continue
             impairment: Impairment = _validated(_IMPAIRMENT, table, reader)
             _check_place(reader, impairment, impairments, bare_gap=word == "gap")
             impairments.append(impairment)
@@ -90,12 +97,15 @@ def parse(words: str | Sequence[str]) -> LinkWords:
         else:
             _validated(_LINK, {_SETTINGS[word]: settings[word]}, reader)
     seed = settings.pop("seed", None)
-    given = {_SETTINGS[word]: value for word, value in settings.items()}
+    given: Table = {_SETTINGS[word]: value for word, value in settings.items()}
+    given |= {"impairments": tuple(impairments), "constraints": tuple(constraints)}
     try:
-        return LinkWords(LinkSettings(impairments=tuple(impairments), **given), seed)
+        return LinkWords(LinkSettings(**given), seed)
     except ValidationError as error:
         # Each setting is valid by itself; the error is a combination of settings.
-        raise CallerError(f"lossrel: {_message(error).partition(': ')[2]}") from None
+        key, _, message = _message(error).partition(": ")
+        word = "lossrel: " if key.endswith("loss_correlation") else ""
+        raise CallerError(f"{word}{message}") from None
 
 
 def settings_of(words: str | Sequence[str]) -> LinkSettings:
@@ -115,6 +125,7 @@ def text_of(settings: LinkSettings, seed: int | None = None) -> str:
     words = [impairment.text() for impairment in settings.impairments]
     if settings.mansd is not None:
         words.append(f"mansd {settings.mansd}")
+    words += [constraint.text() for constraint in settings.constraints]
     if settings.first_delivered:
         words.append("first")
     if settings.limit != _LIMIT:

@@ -14,7 +14,14 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 
 from pydantic import ValidationError
 
-from noack.config.runtime_parameters import LOSS, MANSD, SETPOINT, text_of, trigger_parameters
+from noack.config.runtime_parameters import (
+    CONSTRAINTS,
+    LOSS,
+    MANSD,
+    SETPOINT,
+    text_of,
+    trigger_parameters,
+)
 from noack.config.scenario import Scenario
 from noack.config.scenario_changes import content_with_settings, with_settings
 from noack.config.toml_file import validated
@@ -80,7 +87,12 @@ def current_parameters(scenario: Scenario) -> dict[str, Any]:
     }
     n, _ = scenario.model.dimensions
     setpoint = list(scenario.controller.setpoint or [0.0] * n)
-    return {LOSS: loss, MANSD: scenario.network.mansd, **values, SETPOINT: setpoint}
+    network = {
+        LOSS: loss,
+        MANSD: scenario.network.mansd,
+        CONSTRAINTS: [one.model_dump(mode="json") for one in scenario.network.constraints],
+    }
+    return {**network, **values, SETPOINT: setpoint}
 
 
 def scheduled(scenario: Scenario) -> list[ParameterChange]:

@@ -12,11 +12,13 @@ from typing import Any, get_args
 from noack.trigger.policy_settings import PolicySettings
 
 LOSS, MANSD, SETPOINT = "network.loss", "network.mansd", "controller.setpoint"
+CONSTRAINTS = "network.constraints"
 
 SHORT: Mapping[str, str] = {
     "loss": LOSS,
     "loss.p": f"{LOSS}.probability",
     "mansd": MANSD,
+    "constraints": CONSTRAINTS,
     "beta": "trigger.beta",
     "alpha": "trigger.alpha_per_s",
     "floor": "trigger.floor",
@@ -43,7 +45,7 @@ def trigger_parameters(trigger: PolicySettings) -> tuple[str, ...]:
 
 def require_runtime_parameters(settings: Mapping[str, Any], trigger: PolicySettings) -> None:
     """Raise ValueError unless all keys are runtime parameters; the message lists these."""
-    known = (LOSS, MANSD, *trigger_parameters(trigger), SETPOINT)
+    known = (LOSS, MANSD, CONSTRAINTS, *trigger_parameters(trigger), SETPOINT)
     for key, value in settings.items():
         if key not in known and not key.startswith(f"{LOSS}."):
             short = ", ".join(SHORT)

@@ -8,11 +8,18 @@ from typing import TYPE_CHECKING, Any
 from pydantic import TypeAdapter, ValidationError
 
 from noack.config.feature_kinds import AnyController, AnyTrigger
-from noack.config.runtime_parameters import LOSS, MANSD, put_settings, require_runtime_parameters
+from noack.config.runtime_parameters import (
+    CONSTRAINTS,
+    LOSS,
+    MANSD,
+    put_settings,
+    require_runtime_parameters,
+)
 from noack.config.scenario_checks import check_setpoint, check_trigger
 from noack.config.sections.network_section import NetworkSection
 from noack.config.validation_messages import brief
-from noack.impairments.link_settings import Mansd, require_scores
+from noack.impairments.constraints import require_consistent
+from noack.impairments.link_settings import Constraints, Mansd, require_scores
 from noack.impairments.loss_models import Loss
 from noack.impairments.loss_models.trace import TraceLoss
 
@@ -22,6 +29,7 @@ if TYPE_CHECKING:
 _CHANGEABLE: Mapping[str, TypeAdapter[Any]] = {
     LOSS: TypeAdapter(Loss),
     MANSD: TypeAdapter(Mansd),
+    CONSTRAINTS: TypeAdapter(Constraints),
     "trigger": TypeAdapter(AnyTrigger),
     "controller": TypeAdapter(AnyController),
 }
@@ -94,6 +102,9 @@ def _changed_network(
     update: dict[str, Any] = {}
     if "mansd" in content:
         update["mansd"] = _validated(MANSD, content["mansd"])
+    if "constraints" in content:
+        update["constraints"] = _validated(CONSTRAINTS, content["constraints"])
+        require_consistent(scenario.network.mansd, update["constraints"])
     if changes_loss:
         update["loss"] = _validated(LOSS, content["loss"])
         if isinstance(update["loss"], TraceLoss):

@@ -1,7 +1,7 @@
 """Base classes of a link's features: settings, behaviour, words, description, prediction.
 
-A feature is a loss model, a kind of impairment, or a queue discipline: one class in its own file,
-derived from one of the three classes at the end.
+A feature is a loss model, a kind of impairment, a queue discipline, or a constraint on losses: one
+class in its own file, derived from one of the classes at the end.
 """
 
 from abc import abstractmethod
@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
 from noack.impairments.link_records import QueueState, RuleStage
+from noack.impairments.loss_guarantee import LossRule
 from noack.impairments.markov_chain import Chain, Pattern
 from noack.impairments.word_reader import WordReader
 from noack.settings.section import ScenarioSection
@@ -52,6 +53,8 @@ class StageTables:
     def __init__(self, *, scored: bool = False) -> None:
         self.scored = scored
         """A delay is correlated with loss, and needs a score of the link's state."""
+        self.key = 0, 0
+        """Key of the random stream of the stage that is being made."""
         self.integers: list[int] = []
         self.reals: list[float] = []
 
@@ -144,6 +147,27 @@ class StageFeature(Feature):
     def tc_notes(self) -> Sequence[str]:
         """Return the differences of ``tc netem`` in behaviour."""
         return ()
+
+
+class Constraint(Feature):
+    """Base class of constraints on the losses of a flow; each has its own first word."""
+
+    kind: str
+
+    @property
+    @abstractmethod
+    def rule(self) -> LossRule:
+        """Return the constraint as a counter over the outcomes of packets."""
+
+    @property
+    @abstractmethod
+    def scope(self) -> object:
+        """Return what two constraints of a link must not have in common."""
+
+    @property
+    @abstractmethod
+    def twice(self) -> str:
+        """Return the name of that, for messages."""
 
 
 class LossModel(StageFeature):

@@ -1,4 +1,4 @@
-"""The settings of one direction of a link: impairments, the cap, and the limit.
+"""The settings of one direction of a link: impairments, the guarantee, and the limit.
 
 The ``correlation`` of a probability is the correlation of a latent first-order Gaussian process
 between successive packets of a flow. The probability itself stays exact, unlike in ``tc netem``.
@@ -10,12 +10,14 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
+from noack.impairments.constraints import AnyConstraint, longest_burst_of, require_consistent
 from noack.impairments.feature import LossModel
 from noack.impairments.kinds import AnyImpairment
 from noack.impairments.kinds.loss import LossOf
 from noack.settings.section import ScenarioSection
 
 Mansd = Annotated[int, Field(ge=0, le=1_000_000)]
+Constraints = Annotated[tuple[AnyConstraint, ...], Field(max_length=8)]
 
 
 class LinkSettings(ScenarioSection):
@@ -25,6 +27,8 @@ class LinkSettings(ScenarioSection):
     """The impairments, applied in this order."""
     mansd: Mansd | None = None
     """M − 1: maximum number of consecutive packets of a flow not effectively delivered."""
+    constraints: Constraints = ()
+    """Further constraints on the losses of a flow; with mansd they are the guarantee."""
     first_delivered: bool = False
     """Deliver the first packet of each flow, regardless of the impairments."""
     limit: Annotated[int, Field(ge=1, le=1_000_000)] = 16_384
@@ -43,8 +47,14 @@ class LinkSettings(ScenarioSection):
         """Whether that is a true bound; packets that must pass a rate limit may take longer."""
         return all(one.is_bounded for one in self.impairments)
 
+    @property
+    def longest_burst(self) -> int | None:
+        """Maximum number of consecutive losses that the guarantee allows; None: no maximum."""
+        return longest_burst_of(self.mansd, self.constraints)
+
     @model_validator(mode="after")
     def _check(self) -> Self:
+        require_consistent(self.mansd, self.constraints)
         require_scores(self.impairments)
         return self
 

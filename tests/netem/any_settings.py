@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
+from noack.impairments.constraints import CONSTRAINTS, require_consistent
 from noack.impairments.feature import Feature, Impairment
 from noack.impairments.kinds import IMPAIRMENTS
 from noack.impairments.kinds.delay import SHAPES
@@ -71,16 +72,27 @@ def _goes_together(chain: list[Impairment]) -> bool:
     return True
 
 
+def _consistent(settings: dict[str, Any]) -> bool:
+    try:
+        require_consistent(settings["mansd"], settings["constraints"])
+    except ValueError:
+        return False
+    return True
+
+
+constraints = st.lists(st.one_of([varied(kind) for kind in CONSTRAINTS]), max_size=3).map(tuple)
+
+
 def _settings(
     impairments: st.SearchStrategy[Impairment], most: int = 5
 ) -> st.SearchStrategy[LinkSettings]:
-    return st.builds(
-        LinkSettings,
-        impairments=st.lists(impairments, max_size=5).filter(_goes_together).map(tuple),
-        mansd=st.none() | st.sampled_from([0, 1, 2, 5]) | st.integers(0, most),
-        first_delivered=st.booleans(),
-        limit=st.sampled_from([1, 20, 16_384]),
-    )
+    return st.fixed_dictionaries({
+        "impairments": st.lists(impairments, max_size=5).filter(_goes_together).map(tuple),
+        "mansd": st.none() | st.sampled_from([0, 1, 2, 5]) | st.integers(0, most),
+        "constraints": constraints,
+        "first_delivered": st.booleans(),
+        "limit": st.sampled_from([1, 20, 16_384]),
+    }).filter(_consistent).map(lambda given: LinkSettings(**given))  # fmt: skip
 
 
 def _names_no_file(one: Impairment) -> bool:

@@ -1,0 +1,51 @@
+"""Constraints on the losses of a flow, one kind per file; with the cap they are the guarantee.
+
+A constraint allows every delivery, whatever was lost before. So a network can always keep it.
+"""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from noack.impairments.feature import Constraint
+from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
+from noack.settings.registry import kinds_in, union_of
+
+_KINDS = kinds_in(__name__, Constraint)
+CONSTRAINTS = tuple(_KINDS.values())
+
+if TYPE_CHECKING:
+    AnyConstraint = Constraint
+else:
+    AnyConstraint = union_of(_KINDS)
+
+
+def longest_burst_of(mansd: int | None, constraints: Sequence[AnyConstraint]) -> int | None:
+    """Return the maximum number of consecutive losses that cap and constraints allow together.
+
+    None: there is no maximum.
+    """
+    return guarantee_of(mansd, constraints).longest_burst
+
+
+def guarantee_of(mansd: int | None, constraints: Sequence[AnyConstraint]) -> LossGuarantee:
+    """Return the rules of cap and constraints together."""
+    cap = () if mansd is None else (LongestBurst(mansd),)
+    return LossGuarantee((*cap, *(one.rule for one in constraints)))
+
+
+def require_consistent(mansd: int | None, constraints: Sequence[AnyConstraint]) -> None:
+    """Check that the constraints can be enforced together.
+
+    Raises:
+        ValueError: they cannot; the message begins with the key.
+    """
+    seen: set[object] = set()
+    for number, one in enumerate(constraints):
+        if one.scope in seen:
+            raise ValueError(f"constraints.{number}: {one.text()}: there is a {one.twice} already")
+        seen.add(one.scope)
+    if constraints and longest_burst_of(mansd, constraints) is None:
+        raise ValueError(
+            f"constraints: {constraints[0].text()}: needs a maximum of losses, too: "
+            "mansd or at_most (atmost)"
+        )
