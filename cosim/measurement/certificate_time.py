@@ -2,12 +2,12 @@
 
 Each packet of the trace is taken as an update of the scenario, sent when it was sent. The
 conditions are those of the scenario's certificates
-(:func:`noack.theory.run_conditions.allowed_conditions`), and losses are counted as the claims about
-a run count them (:class:`cosim.analysis.claims.observed_conditions.PacketLosses`). A condition is
-violated
+(:func:`noack.theory.run_conditions.allowed_conditions`). Losses are counted as the claims about a
+run count them: by the rules of the guarantee, and
+:class:`cosim.analysis.claims.observed_conditions.PacketLosses`. A condition is violated
 
-* by consecutive losses: from the sending of the packet that is one too many, until a later packet
-  is received;
+* by losses: from the sending of the packet whose loss is one too many, until a later packet is
+  received;
 * by a delay: from the end of the longest time that the certificate allows an update in the network,
   until it is received.
 
@@ -25,15 +25,15 @@ from numpy.typing import NDArray
 
 from cosim.analysis.claims.observed_conditions import PacketLosses, causes_of
 from cosim.analysis.claims.run_evidence import scheduled_certificates
-from cosim.measurement.loss_bursts import Flags, outcomes
+from cosim.measurement.loss_bursts import outcomes
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
+from noack.theory.certificate import NetworkConditions
 from noack.theory.run_conditions import allowed_conditions, network_delay_ns
 from noack.traces.packet_trace import PacketTrace
 
 Times = NDArray[np.int64]
-LOSSES, ORDER, DELAY = "consecutive losses", "out of order", "delay"
-_NEVER_NS = np.iinfo(np.int64).max
+DELAY, ORDER = "delay", " (out of order)"
 
 
 @dataclass(frozen=True)
@@ -41,13 +41,16 @@ class VoidShare:
     """How long one condition was violated."""
 
     cause: str
+    """``delay``, or the name of a rule of the guarantee; with ``(out of order)`` if the rule would
+    hold without the overtaken packets."""
     share: float
     """Of the trace's time."""
     first_s: float
     """When it was first violated, since the first sending."""
     worst: float
-    """Largest number of consecutive losses, or the longest delay in seconds."""
-    allowed: float
+    """The worst value: losses, or the longest delay in seconds."""
+    text: str
+    """In words, with the allowed value."""
 
 
 @dataclass(frozen=True)
@@ -58,15 +61,14 @@ class CertificateTime:
     certificates: dict[str, str | None]
     """By the plants that it covers: None, or why there is no certificate."""
     allowed_losses: int
-    """M − 1 of the scenario."""
+    """The most consecutive losses that the guarantee of the scenario allows."""
     allowed_delay_s: float
     """In the network."""
     observed_s: float
     share: float
     """Share of the time in which any of the conditions was violated."""
     causes: tuple[VoidShare, ...]
-    """Those that were violated. ``out of order``: too many consecutive losses, of which without the
-    overtaken packets there would not have been too many."""
+    """Those that were violated."""
 
     @property
     def first_s(self) -> float | None:
@@ -89,73 +91,82 @@ def certificate_time(trace: PacketTrace, scenario: Scenario) -> CertificateTime:
     allowed = allowed_conditions(resolved)
     delay_ns = network_delay_ns(resolved, resolved.certificate.late_periods)
     end_ns = int(max(trace.sent_ns[-1], trace.received_ns.max()))
-    spans = dict(_violations(trace, allowed.dropouts, delay_ns))
-    every = [span.clipped(end_ns) for span in spans.values()]
-    union = _covered_ns(*(np.concatenate(ends) for ends in zip(*every, strict=True)))
+    spans = [one for one in _violations(trace, allowed, delay_ns, end_ns) if len(one.begin_ns)]
+    whole = max(end_ns, 1)
+    union_ns = _covered_ns(
+        np.concatenate([_NONE, *(one.begin_ns for one in spans)]),
+        np.concatenate([_NONE, *(one.end_ns for one in spans)]),
+    )
     return CertificateTime(
         scenario=resolved.name,
         certificates=found or {"every plant": "the scenario cannot have a certificate"},
         allowed_losses=allowed.dropouts,
         allowed_delay_s=delay_ns * 1e-9,
         observed_s=end_ns * 1e-9,
-        share=union / end_ns if end_ns else 0.0,
+        share=union_ns / whole,
         causes=tuple(
             VoidShare(
-                cause,
-                _covered_ns(*span.clipped(end_ns)) / end_ns if end_ns else 0.0,
-                float(span.begin_ns.min()) * 1e-9,
-                span.worst,
-                delay_ns * 1e-9 if cause == DELAY else float(allowed.dropouts),
+                one.cause,
+                _covered_ns(one.begin_ns, one.end_ns) / whole,
+                float(one.begin_ns.min()) * 1e-9,
+                one.worst,
+                one.text,
             )
-            for cause, span in spans.items()
-            if len(span.begin_ns)
+            for one in spans
         ),
     )
 
 
 @dataclass(frozen=True, eq=False)
 class _Spans:
-    """The intervals in which a condition is violated, (k,), and the worst value."""
+    """The k intervals in which a condition is violated."""
 
+    cause: str
     begin_ns: Times
+    """(k,)"""
     end_ns: Times
+    """(k,) At most the end of the trace."""
     worst: float
-
-    def clipped(self, end_ns: int) -> tuple[Times, Times]:
-        """Return the intervals within the trace."""
-        return self.begin_ns, np.minimum(self.end_ns, end_ns)
+    text: str
 
 
-def _violations(trace: PacketTrace, allowed: int, delay_ns: int) -> Iterator[tuple[str, _Spans]]:
+def _violations(
+    trace: PacketTrace, allowed: NetworkConditions, delay_ns: int, end_ns: int
+) -> Iterator[_Spans]:
     """Yield the intervals of each cause."""
-    found, sent_ns = outcomes(trace), trace.sent_ns
-    sent_s, replaced_s = np.asarray(sent_ns * 1e-9), np.where(found.lost, np.inf, 0.0)
-    dropped = PacketLosses(sent_s, replaced_s).consecutive(delay_ns * 1e-9).value
-    overtaken = found.out_of_order
+    found, sent_ns, allowed_s = outcomes(trace), trace.sent_ns, delay_ns * 1e-9
+    sent_s, dropped_s = np.asarray(sent_ns * 1e-9), np.where(found.lost, np.inf, 0.0)
+    overtaken, replaced_s = found.out_of_order, dropped_s.copy()
     replaced_s[overtaken] = (found.newer_ns - sent_ns)[overtaken] * 1e-9
-    missed = PacketLosses(sent_s, replaced_s).consecutive(delay_ns * 1e-9).value
-    # The packets of a burst: it is too long even without those that were overtaken, or not.
-    for cause, counts, which in (
-        (LOSSES, missed, dropped > allowed),
-        (ORDER, missed, (missed > allowed) & ~(dropped > allowed)),
-    ):
-        yield cause, _Spans(sent_ns[which], found.newer_ns[which], _largest(counts, which))
-    delay = trace.received_ns - sent_ns
-    beyond = ~found.lost & ~overtaken & (delay > delay_ns)
-    worst_s = _largest(delay, beyond) * 1e-9
-    yield DELAY, _Spans(sent_ns[beyond] + delay_ns, trace.received_ns[beyond], worst_s)
-
-
-def _largest(values: NDArray[Any], which: Flags) -> float:
-    return float(values[which].max(initial=0))
+    # A violation by a lost packet lasts until a newer one is received; else, to the next packet.
+    until_ns = np.where(replaced_s > 0, found.newer_ns, np.append(sent_ns[1:], end_ns))
+    until_ns = np.minimum(until_ns, end_ns)
+    for rule in allowed.guarantee.rules:
+        every, dropped = (
+            PacketLosses(sent_s, times_s).values(rule, allowed_s, rule.start)[0].value
+            for times_s in (replaced_s, dropped_s)
+        )
+        which = dropped > rule.limit
+        for suffix, these in (("", which), (ORDER, (every > rule.limit) & ~which)):
+            worst = float(every[these].max(initial=0))
+            yield _Spans(
+                rule.name + suffix, sent_ns[these], until_ns[these], worst, rule.violation(worst)
+            )
+    delays = trace.received_ns - sent_ns
+    beyond = ~found.lost & ~overtaken & (delays > delay_ns)
+    worst = float(delays[beyond].max(initial=0)) * 1e-9
+    yield _Spans(
+        DELAY, sent_ns[beyond] + delay_ns, trace.received_ns[beyond], worst,
+        f"an update was in the network for {worst:.4g} s, {allowed_s:.4g} s allowed",
+    )  # fmt: skip
 
 
 def _covered_ns(begin_ns: Times, end_ns: Times) -> int:
     """Return the length of the union of intervals."""
     order = np.argsort(begin_ns, kind="stable")
     begin_ns, end_ns = begin_ns[order], end_ns[order]
-    before_ns = np.concatenate([[_LOWEST_NS], np.maximum.accumulate(end_ns)[:-1]])[: len(begin_ns)]
-    return int(np.maximum(end_ns - np.maximum(begin_ns, before_ns), 0).sum())
+    latest_ns = np.append(-1, np.maximum.accumulate(end_ns))[:-1]
+    return int(np.maximum(end_ns - np.maximum(begin_ns, latest_ns), 0).sum())
 
 
-_LOWEST_NS = -1
+_NONE: Times = np.zeros(0, np.int64)

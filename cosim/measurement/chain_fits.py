@@ -83,7 +83,7 @@ class ChainFits:
         """Independent losses."""
         estimate = binomial_estimate(self.lost, self.packets)
         share = 0.0 if estimate is None else estimate.value
-        rates = ChainRates(0.5, 0.5, share, share)
+        rates = ChainRates(0.5, 0.5, _inside(share), _inside(share))
         delivered = self.packets - self.lost
         value = float(xlogy(self.lost, share) + xlogy(delivered, 1 - share))
         return ChainFit("bernoulli", rates, {"probability": estimate}, value, 1)

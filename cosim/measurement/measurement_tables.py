@@ -9,7 +9,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from cosim.measurement.burst_statistics import histogram
-from cosim.measurement.certificate_time import DELAY, CertificateTime
+from cosim.measurement.certificate_time import CertificateTime
 from cosim.measurement.confidence_interval import Estimate
 from cosim.measurement.network_measurement import Measurement
 from noack.core.number_format import NONE, duration, number, percent
@@ -75,8 +75,8 @@ def measurement_tables(
     )
     if void is not None:
         yield TextTable(
-            f"certificate of {void.scenario} on this network",
-            ("condition", "share of the time violated", "first", "worst", "allowed"),
+            f"certificate of {void.scenario}: share of the time in which it is void",
+            ("condition", "void", "first", "worst"),
             [*_void_rows(void)],
         )
 
@@ -87,7 +87,8 @@ def print_measurement(
     """Print the tables and the remarks."""
     console.print(found.name, markup=False, highlight=False, soft_wrap=True)
     for table in measurement_tables(found, void):
-        shown = Table(title=escape(table.title), title_justify="left")
+        console.print(f"\n[bold]{escape(table.title)}[/]", highlight=False)
+        shown = Table()
         for place, heading in enumerate(table.headings):
             shown.add_column(escape(heading), justify="right" if place else "left")
         for row in table.rows:
@@ -179,20 +180,11 @@ def _outage_rows(found: Measurement) -> Iterator[tuple[str, str, str]]:
         yield "fit", fit.text, ""
 
 
-def _void_rows(void: CertificateTime) -> Iterator[tuple[str, str, str, str, str]]:
+def _void_rows(void: CertificateTime) -> Iterator[tuple[str, str, str, str]]:
     for one in void.causes:
-        shown = duration if one.cause == DELAY else "{:.0f}".format
-        yield (
-            one.cause, percent(one.share), f"{one.first_s:.3f} s",
-            shown(one.worst), shown(one.allowed),
-        )  # fmt: skip
-    yield (
-        "any of them",
-        percent(void.share),
-        "" if void.first_s is None else (f"{void.first_s:.3f} s"),
-        "",
-        "",
-    )
+        yield one.cause, percent(one.share), f"{one.first_s:.3f} s", one.text
+    first = NONE if void.first_s is None else f"{void.first_s:.3f} s"
+    yield "any of them", percent(void.share), first, ""
 
 
 def void_remarks(void: CertificateTime | None) -> Iterator[str]:

@@ -188,7 +188,7 @@ class Measurement:
         found = list(self.notes)
         count = int((~self.is_outage).sum())
         if 0 < count < _FEW_BURSTS:
-            found.append(f"only {count} loss bursts: the fits and quantiles have little to rest on")
+            found.append(f"loss bursts: only {count}; the fits and quantiles have a weak basis")
         if len(self.bursts.length) > MOST_FITTED:
             found.append(f"chains are fitted to the first {MOST_FITTED} loss bursts")
         cut = ~self.bursts.complete

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import noack
-from cosim.measurement.certificate_time import DELAY, LOSSES, ORDER, certificate_time
+from cosim.measurement.certificate_time import DELAY, ORDER, certificate_time
 from noack.config.scenario import Scenario
 from noack.traces.packet_trace import packet_trace
 from noack.traces.trace_formats import read_trace
@@ -28,7 +28,7 @@ def share(found: object, cause: str) -> float:
     return next((one.share for one in found.causes if one.cause == cause), 0.0)  # type: ignore[attr-defined]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(st.lists(st.one_of(st.none(), st.integers(0, 40)), min_size=2, max_size=14))
 def test_shares_are_those_of_a_step_through_the_time(delays: list[int | None]) -> None:
     """In every millisecond: are more than two packets missing, is one overdue?"""
@@ -56,7 +56,8 @@ def test_shares_are_those_of_a_step_through_the_time(delays: list[int | None]) -
         late += overdue
         void += overdue or missing
     found = certificate_time(trace, LANE)
-    assert found.allowed_delay_s == 0.004 and found.allowed_losses == 2
+    assert found.allowed_delay_s == 0.004
+    assert found.allowed_losses == 2
     if end:
         assert found.share == pytest.approx(void / end)
         assert share(found, DELAY) == pytest.approx(late / end)
@@ -69,11 +70,22 @@ def test_losses_and_reordering_are_told_apart() -> None:
     lost[2:5] = True  # three in a row: one too many, from 40 to 51 ms
     delay[7:10] = [50, 40, 30]  # 10 overtakes three
     found = certificate_time(packet_trace(sent * MS, (sent + delay) * MS, lost), LANE)
-    assert [one.cause for one in found.causes] == [LOSSES, ORDER]
+    assert [one.cause for one in found.causes] == ["dropouts", f"dropouts{ORDER}"]
     assert [one.first_s for one in found.causes] == pytest.approx([0.04, 0.09])
     assert [one.share for one in found.causes] == pytest.approx([11 / 120, 11 / 120])
     assert [one.worst for one in found.causes] == [3, 3]
     assert found.first_s == pytest.approx(0.04)
+
+
+def test_every_rule_of_the_guarantee_counts() -> None:
+    """Two losses in any five packets, at 10 ms a packet: one too many from 60 to 71 ms."""
+    scenario = lane(mansd=2, constraints=[{"kind": "at_most", "losses": 2, "window": 5}])
+    sent, lost = 10 * np.arange(15), np.zeros(15, bool)
+    lost[[2, 4, 6]] = True
+    found = certificate_time(packet_trace(sent * MS, (sent + 1) * MS, lost), scenario)
+    (one,) = found.causes
+    assert (one.cause, one.worst, one.first_s) == ("atmost 2 in 5", 3, pytest.approx(0.06))
+    assert one.share == pytest.approx(11 / 141)
 
 
 def test_the_certificates_of_the_scenario_are_named() -> None:

@@ -138,9 +138,11 @@ def test_poisson_intervals_are_garwoods(count: int, low: float, high: float) -> 
 
 
 def test_binomial_and_exponential_intervals_at_their_edges() -> None:
-    assert binomial_estimate(0, 0) is None and exponential_estimate(0, 3.0) is None
+    assert binomial_estimate(0, 0) is None
+    assert exponential_estimate(0, 3.0) is None
     none, every = binomial_estimate(0, 50), binomial_estimate(50, 50)
-    assert none is not None and every is not None
+    assert none is not None
+    assert every is not None
     limit = 1 - math.exp(-1.920729 / 50)  # (1 − p)^50 = e^(−χ²/2)
     assert (none.low, every.high) == (0.0, 1.0)
     assert (none.high, every.low) == pytest.approx((limit, 1 - limit))

@@ -1,7 +1,6 @@
 """``noack measure``: tables, JSON, page, ``[network]`` section, mistakes."""
 
 import json
-import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from cosim.measurement.delay_statistics import autocorrelation, normal_scores
 from cosim.measurement.loss_likelihood import ChainRates
 from cosim.measurement.network_file import trace_csv
 from cosim.measurement.network_measurement import Measurement
+from noack.config import toml_file
 from noack.config.sections.network_section import NetworkSection
 from noack.traces.packet_trace import packet_trace
 from noack.traces.trace_formats import read_trace
@@ -24,6 +24,10 @@ RURAL = Path(__file__).parents[3] / "scenarios" / "traces" / "cicv5g" / "rural_n
 
 def measure(*words: object) -> Result:
     return CliRunner().invoke(app, ["measure", *map(str, words)], prog_name="noack")
+
+
+def section(path: Path) -> NetworkSection:
+    return toml_file.validated(NetworkSection, toml_file.read(path)["network"], "network")
 
 
 @pytest.fixture(scope="module")
@@ -57,8 +61,9 @@ def test_the_written_trace_is_the_measured_one(tmp_path: Path) -> None:
     again, first = read_trace(path.with_suffix(".csv")), read_trace(RURAL)
     assert (again.sent_ns == first.sent_ns).all()
     assert (again.received_ns == first.received_ns).all()
-    section = tomllib.loads(path.read_text())["network"]
-    assert section["impairments"] == [{"kind": "replay", "file": "network.csv", "by": "time"}]
+    assert toml_file.read(path)["network"]["impairments"] == [
+        {"kind": "replay", "file": "network.csv", "by": "time"}
+    ]
 
 
 def test_the_written_model_is_a_network_with_the_fitted_parameters(
@@ -66,15 +71,14 @@ def test_the_written_model_is_a_network_with_the_fitted_parameters(
 ) -> None:
     path = tmp_path / "network.toml"
     assert measure(chain_csv, "--write", path, "--as", "model").exit_code == 0
-    network = NetworkSection.model_validate(tomllib.loads(path.read_text())["network"])
+    network = section(path)
     assert network.link.impairments[0].loss.transitions == pytest.approx((0.05, 0.5), rel=0.2)  # type: ignore[union-attr]
     assert network.link.longest_delay_s == 0.001
     assert not network.enforce_mansd
     assert measure(RURAL, "--deadline", "100ms", "--write", path, "--as", "model").exit_code == 0
-    text = path.read_text()
-    network = NetworkSection.model_validate(tomllib.loads(text)["network"])
+    network = section(path)
     assert [one.kind for one in network.impairments] == ["loss", "delay"]
-    assert "outages" in text
+    assert "outages" in path.read_text()
     scenario = noack.load("lane_following", {"network": network.model_dump(exclude_none=True)})
     assert noack.simulate(noack.with_settings(scenario, {"horizon_s": 1.0}), runs=tmp_path).summary
 
@@ -120,7 +124,7 @@ def test_correlation_is_that_of_an_autoregressive_delay() -> None:
         ([RURAL, "--out", "page.pdf"], "--out page.pdf: a measurement is written as .html"),
         ([RURAL, "--write", "n.json"], "--write n.json: the name of a [network] section ends in"),
         ([RURAL, "--for-scenario", "nothing"], "nothing"),
-        ([RURAL, "--write", "/nowhere/n.toml", "--as", "model"], "/nowhere"),
+        ([RURAL, "--write", f"{RURAL}/n.toml", "--as", "model"], "n.toml"),
     ],
 )
 def test_mistakes_are_one_line(words: list[object], message: str) -> None:

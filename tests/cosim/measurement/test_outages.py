@@ -56,7 +56,7 @@ def test_networks_without_outages_have_none_and_added_ones_are_found(truth: Chai
     for outages in (1, 2, 4):
         lost = chain_losses(5000, truth, seed=outages)
         starts = np.sort(rng.choice(np.arange(2, 48), outages, replace=False)) * 100
-        for start in starts:
+        for start in starts[::-1]:
             lost = np.insert(lost, start, np.ones(rng.integers(220, 260), bool))
         bursts = loss_bursts(~lost)
         found = find_outages(bursts).flags
@@ -93,18 +93,19 @@ def test_outages_by_hand() -> None:
 
 def test_the_outage_fit_covers_rate_and_duration() -> None:
     rng, covered = np.random.default_rng(4), np.zeros(2)
-    for _ in range(300):
-        starts = np.cumsum(rng.exponential(20.0, 200))
-        count = int((starts < 300).sum())
+    for _ in range(200):
+        starts = np.cumsum(rng.exponential(20.0, 100))
+        count = int((starts < 100).sum())
         durations_s = rng.exponential(3.0, count)
         every = np.ones(count, bool)
-        fit = fit_outages(durations_s, every, 300 + durations_s.sum())
+        fit = fit_outages(durations_s, every, 100 + durations_s.sum())
         for place, (one, truth) in enumerate(((fit.rate_per_s, 1 / 20), (fit.duration_s, 3.0))):
             covered[place] += one is not None and one.low <= truth <= one.high
-    assert (covered / 300 > 0.92).all()  # exact intervals cover at least 95 %
+    assert (covered / 200 > 0.92).all()  # exact intervals cover at least 95 %
     many = np.full(40, 2.0) + 0.01 * np.arange(40)
     assert "rejected" in fit_outages(many, np.ones(40, bool), 500.0).text
     assert "not rejected" in fit_outages(rng.exponential(2.0, 40), np.ones(40, bool), 500.0).text
     none = fit_outages(np.zeros(0), np.zeros(0, bool), 100.0)
-    assert none.rate_per_s is not None and none.duration_s is None
+    assert none.rate_per_s is not None
+    assert none.duration_s is None
     assert none.rate_per_s.high == pytest.approx(0.0369, rel=1e-3)
