@@ -9,6 +9,7 @@ from rich.console import Console
 
 from cosim.cli import command as cli
 from cosim.cli import completion
+from cosim.shipped_files import find_trace
 from noack.core.errors import CallerError, ExitStatus
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ class NetworkForm(StrEnum):
     MODEL = "model"
 
 
-_TRACE = "scenarios/traces/cicv5g/rural_n8_10kmh.csv"
+_TRACE = "rural_n8_10kmh"
 
 
 @cli.command(cli.MEASURING, 10, [
@@ -32,16 +33,19 @@ _TRACE = "scenarios/traces/cicv5g/rural_n8_10kmh.csv"
     (f"noack measure {_TRACE} --write network.toml", "the network for a scenario file"),
 ])  # fmt: skip
 def measure(
-    files: Annotated[
-        list[Path],
-        typer.Argument(metavar="FILE...", help="A packet trace, or files that belong together."),
+    sources: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="FILE...",
+            help="A packet trace, the name of a shipped one, or files that belong together.",
+        ),
     ],
     *,
     deadline: Annotated[
         str | None,
         typer.Option(metavar="TIME", help="Packets that take longer count as lost, e.g. 100ms."),
     ] = None,
-    quantile: Annotated[
+    share: Annotated[
         list[float] | None,
         typer.Option(help="Share of loss bursts and packets for which M is given; repeatable."),
     ] = None,
@@ -83,12 +87,11 @@ def measure(
     from cosim.measurement.network_measurement import Measurement
     from cosim.measurement.trace_sources import read_source
 
-    options = _options(deadline, quantile, window, outage)
+    options = _options(deadline, share, window, outage)
     scenario = None if for_scenario is None else cli.load_scenario(for_scenario, settings)
     request = OutputRequest(out, write, form.value, scenario)
-    name = " ".join(map(str, files))
-    trace, notes = read_source(files)
-    found = Measurement(trace, options, name, notes)
+    trace, notes = read_source([*map(find_trace, sources)])
+    found = Measurement(trace, options, " ".join(sources), notes)
     document = report(found, request, None if json else Console())
     if json:
         cli.print_json(document)
@@ -96,17 +99,17 @@ def measure(
 
 
 def _options(
-    deadline: str | None, quantile: list[float] | None, window: list[int] | None, outage: str | None
+    deadline: str | None, shares: list[float] | None, window: list[int] | None, outage: str | None
 ) -> "MeasurementOptions":
     from cosim.measurement.burst_statistics import WINDOWS
     from cosim.measurement.network_measurement import QUANTILES, MeasurementOptions
 
-    for share in quantile or ():
+    for share in shares or ():
         if not 0 < share <= 1:
-            raise CallerError(f"--quantile {share:g}: expected a share above 0 up to 1, e.g. 0.99")
+            raise CallerError(f"--share {share:g}: expected a share above 0 up to 1, e.g. 0.99")
     return MeasurementOptions(
         deadline_s=_time_s("--deadline", deadline),
-        quantiles=tuple(quantile or QUANTILES),
+        quantiles=tuple(shares or QUANTILES),
         windows=tuple(sorted(set(window or WINDOWS))),
         outage_s=_time_s("--outage", outage),
     )

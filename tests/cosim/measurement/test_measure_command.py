@@ -120,7 +120,7 @@ def test_correlation_is_that_of_an_autoregressive_delay() -> None:
         ([RURAL, "--deadline", "100"], "--deadline 100: expected a time in s, ms, us or ns"),
         ([RURAL, "--deadline", "0s"], "--deadline 0s: expected a time"),
         ([RURAL, "--outage", "-1s"], "--outage -1s: expected a time"),
-        ([RURAL, "--quantile", "99"], "--quantile 99: expected a share above 0 up to 1, e.g. 0.99"),
+        ([RURAL, "--share", "99"], "--share 99: expected a share above 0 up to 1, e.g. 0.99"),
         ([RURAL, "--out", "page.pdf"], "--out page.pdf: a measurement is written as .html"),
         ([RURAL, "--write", "n.json"], "--write n.json: the name of a [network] section ends in"),
         ([RURAL, "--for-scenario", "nothing"], "nothing"),
