@@ -112,22 +112,14 @@ class Sensor:
             self._trigger.start(t_ns, x)
         self.x_s = x if event else x_s
         self._model_ns = self._reached_ns = t_ns
-        return self._outputs(message, now_ns, (x_s, e_s), decision, event=event)
+        return self._outputs(message, now_ns, x_s, e_s, decision, event=event)
 
     def _outputs(
-        self,
-        message: Message,
-        now_ns: int,
-        model: tuple[Vector, Vector],
-        decision: TriggerDecision,
-        *,
-        event: bool,
-    ) -> Sequence[Output]:
-        """Return the record of a measurement, and at an event the update before it.
-
-        ``model`` is x_s, before a reset, and e_s.
-        """
-        t_ns, x, (x_s, e_s) = message.t_ns, message.vector, model
+        self, message: Message, now_ns: int, x_s: Vector, e_s: Vector,
+        decision: TriggerDecision, *, event: bool,
+    ) -> Sequence[Output]:  # fmt: skip
+        """Return the record of a measurement, and at an event the update before it."""
+        t_ns, x = message.t_ns, message.vector
         row = (
             self._count(), message.sequence, t_ns, now_ns, x, x_s,
             norm(e_s if self._weight is None else self._weight @ e_s),
@@ -195,7 +187,7 @@ class AcknowledgedSensor(Sensor):
         if event:
             self._sent[self._events] = x
             self._wait_until_ns = t_ns + self._timeout_ns
-        return self._outputs(message, now_ns, (x_s, e_s), decision, event=event)
+        return self._outputs(message, now_ns, x_s, e_s, decision, event=event)
 
     def _acknowledged(self, message: Message, now_ns: int) -> Sequence[Output]:
         """Reset x_s to the acknowledged update; an acknowledgement is newer than all before it."""

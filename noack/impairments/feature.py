@@ -53,6 +53,8 @@ class StageTables:
     def __init__(self, *, scored: bool = False) -> None:
         self.scored = scored
         """A delay is correlated with loss, and needs a score of the link's state."""
+        self.key = 0, 0
+        """Key of the random stream of the stage that is being made."""
         self.integers: list[int] = []
         self.reals: list[float] = []
 

@@ -69,7 +69,8 @@ class DecayingTrigger:
     initial_dynamic_variable = 0.0
 
     def trigger_rule(self, n: int) -> TriggerRule:
-        return TriggerRule(error_form(n, self.weight), self.beta, self.alpha_per_s, self.floor)
+        form = error_form(n, self.weight)
+        return TriggerRule(form, self.beta, self.alpha_per_s, self.floor)
 
     def threshold(self, t_ns: float) -> float:
         """max(β e^{−αt}, ε)."""

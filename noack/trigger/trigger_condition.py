@@ -30,8 +30,6 @@ class QuadraticForm(NamedTuple):
     """P, shape (p, 2n)."""
     down: Matrix
     """N, shape (q, 2n); q = 0 for none."""
-    is_error: bool = False
-    """Whether P z = e_s, and N has no rows."""
 
     @np.errstate(over="ignore", invalid="ignore")  # a run may diverge
     def values(self, z: Matrix) -> Vector:
@@ -39,6 +37,10 @@ class QuadraticForm(NamedTuple):
         up, down = (np.einsum("ij,ij->i", part, part) for part in (z @ self.up.T, z @ self.down.T))
         values: Vector = up - down
         return values
+
+
+class ErrorForm(QuadraticForm):
+    """‖e_s‖²: P z = e_s, and N is empty."""
 
 
 class DynamicVariable(NamedTuple):
@@ -106,10 +108,9 @@ class TriggerCondition(NamedTuple):
         right = self.threshold(t_ns)
         if self.integrates:
             return ComparisonSides(auxiliary, right)
-        if self.form.is_error and auxiliary <= 0:
-            left = norm(e_s)
-            if left < math.inf:  # else x may be infinite, and P z NaN
-                return ComparisonSides(left, right)
+        is_error = isinstance(self.form, ErrorForm) and auxiliary <= 0
+        if is_error and math.isfinite(left := norm(e_s)):
+            return ComparisonSides(left, right)  # the same bits as below, in less time
         z = np.concatenate([x, e_s])
         if len(self.form.down) or auxiliary > 0:
             right = math.hypot(right, norm(self.form.down.dot(z)), math.sqrt(max(auxiliary, 0.0)))
@@ -145,14 +146,15 @@ def error_map(n: int, weight: Matrix | None = None) -> Matrix:
     return np.hstack([np.zeros((n, n)), np.eye(n) if weight is None else weight])
 
 
+def error_form(n: int, weight: Matrix | None = None) -> QuadraticForm:
+    """‖W e_s‖²."""
+    kind = ErrorForm if weight is None else QuadraticForm
+    return kind(error_map(n, weight), empty_map(n))
+
+
 def state_map(n: int, weight: Matrix | None = None) -> Matrix:
     """[W 0], which takes z to W x, shape (n, 2n)."""
     return np.hstack([np.eye(n) if weight is None else weight, np.zeros((n, n))])
-
-
-def error_form(n: int, weight: Matrix | None = None) -> QuadraticForm:
-    """The form ‖W e_s‖²."""
-    return QuadraticForm(error_map(n, weight), empty_map(n), weight is None)
 
 
 def empty_map(n: int) -> Matrix:

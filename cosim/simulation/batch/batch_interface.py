@@ -275,7 +275,7 @@ def _check(setting: Setting, population: Population) -> None:
         )
     rule = setting.trigger.trigger_rule(n)
     for form in (rule.form, *([rule.dynamic_variable.gain] if rule.dynamic_variable else [])):
-        for part in (form.up, form.down):
+        for part in form:
             if part.shape[1] != 2 * n:
                 raise ValueError(f"trigger: expected {2 * n} columns, found {part.shape[1]}")
     if rule.integrates and squares_of(setting.trigger, n) is not None:
