@@ -47,9 +47,8 @@ def program_of(
     tables = StageTables(scored=scored)
     stages = []
     places = 0
-    for number, (stage, stream) in enumerate(_stages(settings, tables, name)):
+    for number, (stage, _) in enumerate(_stages(settings, tables, seed, name)):
         stage.place = number
-        stage.key0, stage.key1 = stream_key(seed, *stream)
         stage.queue_begin = places
         places += stage.queue_places
         stages.append(stage)
@@ -68,23 +67,26 @@ def program_of(
 
 def stream_names(settings: LinkSettings, *name: str) -> list[tuple[str, ...]]:
     """Return the names of the random streams of a program's stages, in their order."""
-    return [stream for _, stream in _stages(settings, StageTables(), name)]
+    return [stream for _, stream in _stages(settings, StageTables(), 0, name)]
 
 
 def _stages(
-    settings: LinkSettings, tables: StageTables, name: Sequence[str]
+    settings: LinkSettings, tables: StageTables, seed: int, name: Sequence[str]
 ) -> Iterator[tuple[RuleStage, tuple[str, ...]]]:
     """Return the stages, each with the name of its random stream."""
     numbers: Counter[str] = Counter()
     for impairment in settings.impairments:
+        number = numbers[impairment.kind] + 1
+        own = impairment.kind if number == 1 else f"{impairment.kind} {number}"
+        stream = ("netem", *name, own)
+        tables.key = stream_key(seed, *stream)
         stage, rule = impairment.stage(tables), impairment.rule
         if stage is None or rule is None:
             continue
         stage.kind = BEHAVIOURS.index(rule)
-        numbers[impairment.kind] += 1
-        number = numbers[impairment.kind]
-        own = impairment.kind if number == 1 else f"{impairment.kind} {number}"
-        yield stage, ("netem", *name, own)
+        stage.key0, stage.key1 = tables.key
+        numbers[impairment.kind] = number
+        yield stage, stream
 
 
 def empty_state(program: LinkProgram) -> LinkMemory:

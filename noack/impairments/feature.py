@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
 from noack.impairments.link_records import QueueState, RuleStage
+from noack.impairments.loss_guarantee import LossRule
 from noack.impairments.markov_chain import Chain, Pattern
 from noack.impairments.word_reader import WordReader
 from noack.settings.section import ScenarioSection
@@ -52,6 +53,8 @@ class StageTables:
     def __init__(self, *, scored: bool = False) -> None:
         self.scored = scored
         """A delay is correlated with loss, and needs a score of the link's state."""
+        self.key = 0, 0
+        """Key of the random stream of the stage that is being made."""
         self.integers: list[int] = []
         self.reals: list[float] = []
 
@@ -153,8 +156,8 @@ class Constraint(Feature):
 
     @property
     @abstractmethod
-    def longest_burst(self) -> int | None:
-        """Return the maximum number of consecutive losses that it allows; None: any number."""
+    def rule(self) -> LossRule:
+        """Return the constraint as a counter over the outcomes of packets."""
 
     @property
     @abstractmethod

@@ -6,6 +6,7 @@ from typing import Annotated, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from noack.impairments.feature import Constraint, Table, Word
+from noack.impairments.loss_guarantee import LossesInWindow
 from noack.impairments.quantities import COUNT
 from noack.impairments.word_reader import WordReader
 
@@ -45,8 +46,8 @@ class AtMost(Constraint):
         return [cls(losses=losses, window=window) for losses, window in pairs]
 
     @property
-    def longest_burst(self) -> int:
-        return self.losses
+    def rule(self) -> LossesInWindow:
+        return LossesInWindow(self.losses, self.window)
 
     @property
     def scope(self) -> object:
