@@ -353,11 +353,11 @@ def _messages(table: str, rows: Rows) -> Iterator[Message | Datagram | Parameter
         ):
             yield ParameterChange(number, t_ns, _settings(data))
     elif table == NETEM_PACKET:
-        for flow, size, head in zip(
-            rows["flow"].tolist(), rows["size_bytes"].tolist(), rows["head"].tolist(), strict=True
+        for flow, size, head, t_ns in zip(
+            *(rows[name].tolist() for name in ("flow", "size_bytes", "head", "t_ns")), strict=True
         ):
             size_bytes = min(max(size, 0), _MOST_BYTES)
-            yield Datagram(flow, head.ljust(size_bytes, b"\0")[:size_bytes])
+            yield Datagram(flow, head.ljust(size_bytes, b"\0")[:size_bytes], t_ns)
     else:
         acknowledges = table == SENSOR_ACKNOWLEDGEMENT
         flow = Flow.ACKNOWLEDGEMENT if acknowledges else ROUTES[OWNER[table]].receives

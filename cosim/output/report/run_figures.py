@@ -263,8 +263,8 @@ def _lateness(record: RunRecord) -> RunFigure:
         "lateness",
         signal_figures.lateness_figure(late_us, period_us),
         "Share of a process's steps with at least this lateness. Lateness is measured from the "
-        "deadline (plant, controller), the time of the measurement (sensor), or the event "
-        "(network).",
+        "deadline (plant, controller), the time of the measurement (sensor), or the arrival "
+        "of the datagram at the socket (network).",
         f"Complementary distribution of lateness on logarithmic axes; maximum: {longest}.",
     )
 
