@@ -3,19 +3,16 @@
 The same check must detect each broken copy of the certificates.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import pytest
 from hypothesis import find, given, settings
 from hypothesis import strategies as st
 
-from noack.impairments.loss_guarantee import LossWindow
 from noack.theory.certificate import Constants, VoidError
 from noack.theory.gains import Coefficients, ErrorGains, Output, PlantGains
-from noack.theory.loss_accumulation import LossAccumulation
 from tests.noack.theory.loops import (
     SEARCH,
     System,
@@ -54,36 +51,6 @@ def without_condition(field: str) -> Callable[[System], Constants]:
 
 def without_one_loss(system: System) -> Constants:
     return system.certify(system.conditions._replace(dropouts=system.mansd - 1))
-
-
-def with_losses(kind: type[LossAccumulation]) -> Callable[[System], Constants]:
-    def certify(system: System) -> Constants:
-        with patch("noack.theory.certificate.LossAccumulation", kind):
-            return system.certify()
-
-    return certify
-
-
-class NoLosses(LossAccumulation):
-    """Neglects what is lost."""
-
-    def total(self, output: Output, spacing_s: float, windows: Sequence[LossWindow]) -> float:
-        return 0.0
-
-
-class OneLossOfEachWindow(LossAccumulation):
-    """Counts one loss in each window, whatever their number."""
-
-    def total(self, output: Output, spacing_s: float, windows: Sequence[LossWindow]) -> float:
-        return super().total(output, spacing_s, [LossWindow(1, w.packets) for w in windows])
-
-
-class EachLossOnce(LossAccumulation):
-    """Counts the newest window only."""
-
-    def total(self, output: Output, spacing_s: float, windows: Sequence[LossWindow]) -> float:
-        most = self._effects[output].max()
-        return float(min(super().total(output, spacing_s, windows), windows[0].losses * most))
 
 
 def with_gains(error: type[ErrorGains], plant: type[PlantGains]) -> Callable[[System], Constants]:
@@ -133,8 +100,6 @@ class ConstantThreshold(ErrorGains):
 INSTANT = {"sample_steps": 1, "delay_steps": 0, "hold_steps": 0, "step_share": 0.01}
 EVENTFUL = {"mismatch": 0.5, "beta": 0.01, **INSTANT}
 
-ACCUMULATING = {"n": 1, "m": 1, "beta": 1.0, "mismatch": 0.5, "alpha_share": 0.8, "recovery": 0}
-
 MUTANTS: dict[str, tuple[Callable[[System], Constants], dict[str, Any]]] = {
     "one loss less": (without_one_loss, {"mansd": 1, **INSTANT}),
     "no sampling period": (without_condition("sampling_s"), {"step_share": 0.03}),
@@ -166,16 +131,6 @@ MUTANTS: dict[str, tuple[Callable[[System], Constants], dict[str, Any]]] = {
     "constant threshold": (
         with_gains(ConstantThreshold, PlantGains),
         {"n": 1, "m": 1, "mansd": 6, "alpha_share": 0.8, **EVENTFUL},
-    ),
-    "no losses": (
-        with_losses(NoLosses), {**ACCUMULATING, "mansd": 6, "window": (5, 6), **INSTANT},
-    ),
-    "one loss of each window": (
-        with_losses(OneLossOfEachWindow),
-        {**ACCUMULATING, "mansd": 6, "window": (5, 6), **INSTANT},
-    ),
-    "each loss once": (
-        with_losses(EachLossOnce), {**ACCUMULATING, "mansd": 6, "window": (5, 6), **INSTANT},
     ),
 }  # fmt: skip
 
