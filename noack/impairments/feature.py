@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
-from noack.impairments.link_records import QueueState, RuleStage
+from noack.impairments.link_records import LossWindow, QueueState, RuleStage
 from noack.impairments.markov_chain import Chain, Pattern
 from noack.impairments.word_reader import WordReader
 from noack.settings.section import ScenarioSection
@@ -152,19 +152,24 @@ class Constraint(Feature):
     kind: str
 
     @property
-    @abstractmethod
     def longest_burst(self) -> int | None:
-        """Return the maximum number of consecutive losses that it allows; None: any number."""
+        """Maximum number of consecutive losses that it allows; None: any number."""
+        return None
+
+    @property
+    def loss_window(self) -> LossWindow | None:
+        """The constraint, if it is a maximum of losses among consecutive packets."""
+        return None
+
+    @property
+    def least_deliveries(self) -> int:
+        """Minimum number of consecutive deliveries between two loss bursts; 0: none."""
+        return 0
 
     @property
     @abstractmethod
-    def scope(self) -> object:
-        """Return what two constraints of a link must not have in common."""
-
-    @property
-    @abstractmethod
-    def twice(self) -> str:
-        """Return the name of that, for messages."""
+    def scope(self) -> str:
+        """What two constraints of a link must not have in common."""
 
 
 class LossModel(StageFeature):

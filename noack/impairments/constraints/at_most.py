@@ -6,6 +6,7 @@ from typing import Annotated, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from noack.impairments.feature import Constraint, Table, Word
+from noack.impairments.link_records import LossWindow
 from noack.impairments.quantities import COUNT
 from noack.impairments.word_reader import WordReader
 
@@ -49,11 +50,11 @@ class AtMost(Constraint):
         return self.losses
 
     @property
-    def scope(self) -> object:
-        return self.kind, self.window
+    def loss_window(self) -> LossWindow:
+        return LossWindow(self.losses, self.window)
 
     @property
-    def twice(self) -> str:
+    def scope(self) -> str:
         return f"maximum for {self.window} packets"
 
     def text(self) -> str:

@@ -31,15 +31,11 @@ class Recovery(Constraint):
         return [cls(deliveries=deliveries) for deliveries in (1, 2, 3, 7)]
 
     @property
-    def longest_burst(self) -> None:
-        return None
+    def least_deliveries(self) -> int:
+        return self.deliveries
 
     @property
-    def scope(self) -> object:
-        return self.kind
-
-    @property
-    def twice(self) -> str:
+    def scope(self) -> str:
         return "recovery"
 
     def text(self) -> str:
