@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from controller_node.loss_check import LossCheck, lost_between
 from noack.config.parameter_changes import ChangeSchedule, ParameterChange
 from noack.config.resolution import loop_of, setpoint_of
 from noack.config.scenario import Scenario
@@ -19,10 +20,10 @@ from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.model_flow import ModelFlow
+from noack.impairments.loss_guarantee import LossGuarantee
 from noack.protocol.machine_interface import (
     BEGINNING,
     FAILED,
-    GENERATION,
     Notice,
     Output,
     Record,
@@ -42,7 +43,7 @@ class Controller:
         period_ns: time between two control inputs.
         phase_ns: time of the first.
         horizon_ns: no tick is due after this time.
-        mansd: M − 1; more consecutive losses violate the assumption.
+        guarantee: losses that it does not allow violate the assumption.
         x0: x(0), if sensor and controller start from it; else None.
         acknowledges: whether it acknowledges each update, as the acknowledgement baseline does.
         start: the beginning of the run, or a restart during the run.
@@ -61,7 +62,7 @@ class Controller:
         period_ns: int,
         phase_ns: int,
         horizon_ns: int,
-        mansd: int,
+        guarantee: LossGuarantee,
         x0: Vector | None = None,
         acknowledges: bool = False,
         start: Start = BEGINNING,
@@ -75,13 +76,11 @@ class Controller:
         self._setpoint = setpoint
         self._schedule = schedule
         self._reached_ns = -1
-        self._newest_ns = 0
         self._law: ControlLaw | None = law
         self._period_ns = period_ns
         self._phase_ns = phase_ns
         self._horizon_ns = horizon_ns
-        self._mansd = mansd
-        self._known_start = x0 is not None
+        self._losses = LossCheck(guarantee, schedule, known_start=x0 is not None)
         self._acknowledges = acknowledges
         self._safe_input = np.zeros(inputs) if safe_input is None else safe_input
         self._predictive = predictive
@@ -115,15 +114,9 @@ class Controller:
     def _change(self, t_ns: int) -> None:
         """Apply the changes that are due at a time."""
         while self._schedule is not None and (due := self._schedule.take(t_ns)) is not None:
-            self._mansd = due.scenario.network.mansd
+            self._losses.change(due.scenario.network.guarantee, due.since_ns)
             self._setpoint = due.prepared
             self._flow.change(due.since_ns, self._setpoint and self._setpoint[0])
-
-    def _allowed(self, since_ns: int, now_ns: int) -> int:
-        """The largest cap on consecutive losses that was in force since a time."""
-        if self._schedule is None:
-            return self._mansd
-        return max(one.network.mansd for one in self._schedule.between(since_ns, now_ns))
 
     def handle(self, message: Message, now_ns: int) -> Sequence[Output]:
         """Process an update x(t_i); count the losses before it from the sequence numbers."""
@@ -136,7 +129,7 @@ class Controller:
         self._model_ns = self._reached_ns = model_ns
         self._knows_state = True
         newest, self._newest = self._newest, message.sequence
-        losses = 0 if newest is None else _between(newest, message.sequence)
+        losses = 0 if newest is None else lost_between(newest, message.sequence)
         row = (
             self._count(), message.sequence, event_ns, now_ns, model_ns,
             message.vector, before, self.x_c, losses,
@@ -148,26 +141,8 @@ class Controller:
         _, failed = self._apply(
             event_ns, lambda law: law.update(event_ns / NS_PER_S, message.vector)
         )
-        newest_ns, self._newest_ns = self._newest_ns, event_ns
-        return [*outputs, *failed, *self._violations(message, newest, losses, newest_ns, now_ns)]
-
-    def _violations(
-        self, message: Message, newest: int | None, losses: int, newest_ns: int, now_ns: int
-    ) -> Sequence[Notice]:
-        """Compare the losses before an update with the cap that was in force."""
-        event_ns, allowed = message.t_ns, self._mansd
-        if losses > allowed:  # a larger cap may have been in force when they happened
-            allowed = self._allowed(newest_ns, max(now_ns, event_ns))
-        if losses > allowed:
-            text = (
-                f"MANSD violated: {losses} successive dropouts before update "
-                f"{message.sequence}, at most {allowed} assumed"
-            )
-        elif newest == -1 and losses > 0 and not self._known_start:
-            text = f"no delivered t_0: {losses} updates were lost before the first delivery"
-        else:
-            return ()
-        return (Notice(event_ns, "violation", text),)
+        violations = self._losses.add(message.sequence, newest, losses, event_ns, now_ns)
+        return [*outputs, *failed, *violations]
 
     def on_timer(self, now_ns: int) -> Sequence[Output]:
         """Advance x_c to the tick and send the control input, with the model's time."""
@@ -209,12 +184,6 @@ class Controller:
         return self._inputs - 1
 
 
-def _between(newest: int, sequence: int) -> int:
-    """The number of updates lost between two; losses before a restart of the sensor are unknown."""
-    restarted = sequence // GENERATION != newest // GENERATION
-    return sequence % GENERATION if restarted else sequence - newest - 1
-
-
 def law_of(resolved: Scenario) -> ControlLaw:
     """Return the control law of a resolved scenario.
 
@@ -237,7 +206,7 @@ def controller_of(resolved: Scenario, start: Start = BEGINNING) -> Controller:
         period_ns=resolved.timing.controller_period_ns,
         phase_ns=resolved.timing.controller_phase_ns,
         horizon_ns=resolved.timing.horizon_ns,
-        mansd=resolved.network.mansd,
+        guarantee=resolved.network.guarantee,
         x0=loop.x0 if known else None,
         acknowledges=resolved.protocol.acknowledges,
         start=start,

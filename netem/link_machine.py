@@ -39,6 +39,8 @@ class Datagram(NamedTuple):
 
     flow: int
     data: bytes
+    arrival_ns: int = 2**62
+    """Arrival at the socket, for the record; later than its handling: unknown."""
 
 
 class _InFlight(NamedTuple):
@@ -177,9 +179,9 @@ class Link:
         decision = self.decide(message.flow, len(message.data), now_ns)
         head = message.data[:PACKET_HEAD_BYTES].ljust(PACKET_HEAD_BYTES, b"\0")
         row = (
-            self._inputs, self._first_number + decision.packet, now_ns, now_ns, message.flow,
-            Fate(decision.fate), decision.consecutive_losses, decision.release_ns,
-            decision.copy_ns, decision.bit, len(message.data), head,
+            self._inputs, self._first_number + decision.packet, min(message.arrival_ns, now_ns),
+            now_ns, message.flow, Fate(decision.fate), decision.consecutive_losses,
+            decision.release_ns, decision.copy_ns, decision.bit, len(message.data), head,
         )  # fmt: skip
         self._inputs += 1
         record = Record(NETEM_PACKET, row)

@@ -22,8 +22,10 @@ from noack.impairments.link_records import (
     RecordedDecision,
     RuleStage,
     StageMemory,
+    WindowRule,
 )
 from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_guarantee import DeliveriesBetweenBursts, LossesInWindow
 from noack.impairments.stage_dispatch import BEHAVIOURS
 
 
@@ -50,21 +52,27 @@ def program_of(
     tables = StageTables(scored=scored)
     stages = []
     places = 0
-    for number, (stage, stream) in enumerate(_stages(settings, tables, name)):
+    for number, (stage, _) in enumerate(_stages(settings, tables, seed, name)):
         stage.place = number
-        stage.key0, stage.key1 = stream_key(seed, *stream)
         stage.queue_begin = places
         places += stage.queue_places
         stages.append(stage)
     delays = any(one.delays for one in settings.impairments)
+    rules = [one.rule for one in settings.constraints]
     return LinkProgram(
         stages=stages,
         integers=tables.integers,
         reals=tables.reals,
         decisions=[decision for flow in decisions for decision in flow],
         decisions_begin=list(accumulate(map(len, decisions), initial=0)) if decisions else [],
-        windows=[one.loss_window for one in settings.constraints if one.loss_window is not None],
-        recovery=max((one.least_deliveries for one in settings.constraints), default=0),
+        windows=[
+            WindowRule(rule.limit, rule.window)
+            for rule in rules
+            if isinstance(rule, LossesInWindow)
+        ],
+        recovery=sum(
+            rule.deliveries for rule in rules if isinstance(rule, DeliveriesBetweenBursts)
+        ),
         mansd=-1 if settings.longest_burst is None else settings.longest_burst,
         limit=settings.limit,
         tracks=tracks or delays or bool(decisions),
@@ -73,23 +81,26 @@ def program_of(
 
 def stream_names(settings: LinkSettings, *name: str) -> list[tuple[str, ...]]:
     """Return the names of the random streams of a program's stages, in their order."""
-    return [stream for _, stream in _stages(settings, StageTables(), name)]
+    return [stream for _, stream in _stages(settings, StageTables(), 0, name)]
 
 
 def _stages(
-    settings: LinkSettings, tables: StageTables, name: Sequence[str]
+    settings: LinkSettings, tables: StageTables, seed: int, name: Sequence[str]
 ) -> Iterator[tuple[RuleStage, tuple[str, ...]]]:
     """Return the stages, each with the name of its random stream."""
     numbers: Counter[str] = Counter()
     for impairment in settings.impairments:
+        number = numbers[impairment.kind] + 1
+        own = impairment.kind if number == 1 else f"{impairment.kind} {number}"
+        stream = ("netem", *name, own)
+        tables.key = stream_key(seed, *stream)
         stage, rule = impairment.stage(tables), impairment.rule
         if stage is None or rule is None:
             continue
         stage.kind = BEHAVIOURS.index(rule)
-        numbers[impairment.kind] += 1
-        number = numbers[impairment.kind]
-        own = impairment.kind if number == 1 else f"{impairment.kind} {number}"
-        yield stage, ("netem", *name, own)
+        stage.key0, stage.key1 = tables.key
+        numbers[impairment.kind] = number
+        yield stage, stream
 
 
 def empty_state(program: LinkProgram) -> LinkMemory:

@@ -10,6 +10,7 @@ diverges, and a notice gives the reason.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -97,8 +98,10 @@ class Plant:
         self._step += 1
         newest = self._watchdog.newest.sequence
         x, z = self._x, self._z
-        row = (self._count(), step, t_ns, now_ns, x, self.u, newest)
-        record = Record(PLANT_STEP, (*row, *(part for part in (z, *disturbed) if len(part))))
+        row: tuple[Any, ...] = (self._count(), step, t_ns, now_ns, x, self.u, newest)
+        if len(z) or disturbed:
+            row = (*row, *(part for part in (z, *disturbed) if len(part)))
+        record = Record(PLANT_STEP, row)
         if step % self._measure_every:
             return (record, *failed, *notices)
         y = x if self._measuring is None else self._measuring(x, self._measurements)

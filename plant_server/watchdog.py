@@ -105,6 +105,9 @@ class Watchdog:
 
     def take(self, vector: Vector, t_ns: int, sequence: int) -> Actuation:
         """Store the vector of an actuation, u or [u; x_c]."""
+        if len(vector) == self._inputs:
+            self.newest = Actuation(vector, NO_VECTOR, t_ns, sequence)
+            return self.newest
         u, x_c = vector[: self._inputs], vector[self._inputs :]
         # Slices are copied: a slice may have another memory layout than the vectors of a replay.
         self.newest = Actuation(u.copy(), x_c.copy(), t_ns, sequence)

@@ -105,20 +105,21 @@ class Sensor:
         x_s = x if self.x_s is None else self._flow(self.x_s, self._model_ns, t_ns)
         if first:
             self._trigger.start(t_ns, x)
-        decision = self._trigger.test(t_ns, x, x_s - x)
+        e_s = x_s - x
+        decision = self._trigger.test(t_ns, x, e_s)
         event = first or decision.event
         if event:
             self._trigger.start(t_ns, x)
         self.x_s = x if event else x_s
         self._model_ns = self._reached_ns = t_ns
-        return self._outputs(message, now_ns, x_s, decision, event=event)
+        return self._outputs(message, now_ns, x_s, e_s, decision, event=event)
 
     def _outputs(
-        self, message: Message, now_ns: int, x_s: Vector, decision: TriggerDecision, *, event: bool
-    ) -> Sequence[Output]:
+        self, message: Message, now_ns: int, x_s: Vector, e_s: Vector,
+        decision: TriggerDecision, *, event: bool,
+    ) -> Sequence[Output]:  # fmt: skip
         """Return the record of a measurement, and at an event the update before it."""
         t_ns, x = message.t_ns, message.vector
-        e_s = x_s - x
         row = (
             self._count(), message.sequence, t_ns, now_ns, x, x_s,
             norm(e_s if self._weight is None else self._weight @ e_s),
@@ -179,13 +180,14 @@ class AcknowledgedSensor(Sensor):
             self._trigger.start(t_ns, x)
         self.x_s = x_s = self._flow(self.x_s, self._model_ns, t_ns)
         self._model_ns = t_ns
-        decision = self._trigger.test(t_ns, x, x_s - x)
+        e_s = x_s - x
+        decision = self._trigger.test(t_ns, x, e_s)
         waits = self._wait_until_ns is not None and t_ns < self._wait_until_ns
         event = first or (decision.event and not waits)
         if event:
             self._sent[self._events] = x
             self._wait_until_ns = t_ns + self._timeout_ns
-        return self._outputs(message, now_ns, x_s, decision, event=event)
+        return self._outputs(message, now_ns, x_s, e_s, decision, event=event)
 
     def _acknowledged(self, message: Message, now_ns: int) -> Sequence[Output]:
         """Reset x_s to the acknowledged update; an acknowledgement is newer than all before it."""

@@ -18,6 +18,7 @@ from noack.config.resolution import resolve
 from noack.config.scenario_file import load
 from noack.controllers.linear_feedback import LinearFeedback
 from noack.core.linear_systems import Matrix, Vector
+from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.plants.linear import LinearSystem
 from noack.protocol.machine_interface import Machine, Notice, Record
 from noack.protocol.record_tables import (
@@ -116,7 +117,7 @@ class Case(NamedTuple):
                 period_ns=PERIOD_NS,
                 phase_ns=self.phase_ns,
                 horizon_ns=horizon_ns,
-                mansd=2,
+                guarantee=LossGuarantee((LongestBurst(2),)),
                 x0=known,
             ),
             len(self.A),

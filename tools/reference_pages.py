@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-from rich.text import Text
 from typer.main import get_command
 
 from cosim.cli import app
@@ -55,7 +54,7 @@ def _command(name: str, command: Any, parent: Any) -> str:
 
 
 def _plain(markup: str | None) -> str:
-    return Text.from_markup((markup or "").replace("\b", "")).plain.strip()
+    return (markup or "").replace("\b", "").strip()
 
 
 def _meaning(record: str) -> str:
@@ -70,7 +69,7 @@ def _cell(text: str) -> str:
 
 def _examples(epilog: str) -> str:
     lines = _plain(epilog).splitlines()
-    if lines and lines[0].strip() == "Examples":
+    if lines and lines[0].strip() == "Examples:":
         del lines[0]
     return "\n".join(line.removeprefix("  ") for line in lines)
 

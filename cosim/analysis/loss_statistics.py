@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.claims.observed_conditions import AssumptionViolation
+from cosim.analysis.claims.observed_conditions import DROPOUTS, AssumptionViolation
 from cosim.analysis.summary_model import AcknowledgementsPart, ViolationPart
 from cosim.record.packet_outcomes import PacketOutcome, packet_outcomes
 from cosim.record.recorded_changes import NEVER_NS, changes_of
@@ -118,7 +118,7 @@ def reported_violations(record: RunRecord) -> list[ViolationPart]:
         ViolationPart(
             t_s=notice["t_ns"] * 1e-9,
             process=notice["process"],
-            cause="change" if "a change" in notice["text"] else "dropouts",
+            cause=_cause(notice["text"]),
             what=notice["text"],
         )
         for notice in record.notices
@@ -132,8 +132,16 @@ def reported_violations(record: RunRecord) -> list[ViolationPart]:
     if dropped > mansd:
         what = f"MANSD violated: the last {dropped} updates were lost, at most {mansd} assumed"
         at_s = float(outcomes.event_ns[first + mansd]) * 1e-9
-        found.append(ViolationPart(t_s=at_s, process="netem", cause="dropouts", what=what))
+        found.append(ViolationPart(t_s=at_s, process="netem", cause=DROPOUTS, what=what))
     return found
+
+
+def _cause(text: str) -> str:
+    """Return the cause of a violation from a process's message."""
+    if "a change" in text:
+        return "change"
+    rule, violated, _ = text.partition(" violated: ")
+    return rule if violated and rule != "MANSD" else DROPOUTS
 
 
 def list_violations(

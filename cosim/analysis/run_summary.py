@@ -77,6 +77,7 @@ def summarise(
         scenario=scenario.name,
         mode=scenario.mode,
         mansd=scenario.network.mansd,
+        constraints=[one.text() for one in scenario.network.constraints],
         horizon_s=scenario.horizon_s,
         speed=scenario.speed,
         reached_s=_seconds(record.last_ns(PLANT_STEP)) or 0.0,
@@ -119,6 +120,7 @@ def _transmissions(record: RunRecord) -> dict[str, Any]:
     deliveries = record.columns(CONTROLLER_DELIVERY, "t_ns", "dropouts")
     intervals_s = np.diff(events["t_ns"]) * 1e-9
     longest = int(deliveries["dropouts"].max(initial=0))
+    bursts = outcomes.loss_bursts().tolist()
     return {
         "events": len(events),
         "deliveries": len(deliveries),
@@ -127,6 +129,7 @@ def _transmissions(record: RunRecord) -> dict[str, Any]:
         "drops_by_cause": drops_by_cause(outcomes),
         "forced_deliveries": int((outcomes.fate == Fate.FORCED).sum()),
         "longest_loss_burst": max(outcomes.longest_loss_burst(), longest),
+        "loss_bursts": {str(n): count for n, count in sorted(Counter(bursts).items())},
         "acknowledgements": acknowledgements(record) if scenario.protocol.acknowledges else None,
         "inter_event_min_s": _or_none(np.min, intervals_s),
         "inter_event_median_s": _or_none(np.median, intervals_s),

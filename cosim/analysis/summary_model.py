@@ -290,6 +290,8 @@ class RunSummary(SummaryPart):
     scenario: Text
     mode: str
     mansd: Count
+    constraints: list[str] = []
+    """Further constraints of the guarantee, in the words of the settings."""
     horizon_s: float
     speed: float
     reached_s: float
@@ -300,6 +302,7 @@ class RunSummary(SummaryPart):
     drops_by_cause: Counts
     forced_deliveries: Count
     longest_loss_burst: Count
+    loss_bursts: Counts = {}
     acknowledgements: AcknowledgementsPart | None = None
     assumption_violations: list[ViolationPart]
     assumptions: list[AssumptionPart]

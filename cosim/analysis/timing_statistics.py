@@ -1,38 +1,37 @@
 """Lateness of the processes of a live run, in wall time."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.quantile_sketch import QuantileSketch
 from cosim.analysis.summary_model import LatencyPart, LatenessPart
-from cosim.record.packet_outcomes import packet_outcomes
 from cosim.record.run_record import RunRecord
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
+    NETEM_PACKET,
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
 
-_STEPS = {"plant": PLANT_STEP, "sensor": SENSOR_MEASUREMENT, "controller": CONTROLLER_STEP}
+_STEPS = {
+    "plant": PLANT_STEP,
+    "sensor": SENSOR_MEASUREMENT,
+    "netem": NETEM_PACKET,
+    "controller": CONTROLLER_STEP,
+}
 
 
 def lateness_parts(record: RunRecord, role: str) -> Iterator[NDArray[np.float64]]:
     """Yield the wall time between a process's actions and their nominal times in µs, in order.
 
     The nominal time is the deadline for plant and controller, the time of the measurement for the
-    sensor, and the time of the event for the network.
+    sensor, and the arrival of the datagram at its socket for the network.
     """
-    if role == "netem":
-        outcomes = packet_outcomes(record)
-        parts_ns: Iterable[NDArray[np.int64]] = [outcomes.now_ns - outcomes.event_ns]
-    else:
-        batches = record.source.batches(_STEPS[role], ("now_ns", "t_ns"))
-        parts_ns = (rows["now_ns"] - rows["t_ns"] for rows in batches)
-    for late_ns in parts_ns:
-        yield np.asarray(late_ns / (1e3 * record.scenario.speed))
+    for rows in record.source.batches(_STEPS[role], ("now_ns", "t_ns")):
+        yield np.asarray((rows["now_ns"] - rows["t_ns"]) / (1e3 * record.scenario.speed))
 
 
 def lateness_us(record: RunRecord, role: str) -> NDArray[np.float64]:

@@ -1,21 +1,38 @@
 """The command line ``noack``: one file per command in :mod:`cosim.cli.commands`."""
 
-import os
-import signal
+import sys
+from typing import TYPE_CHECKING, Any
 
-_usual = signal.getsignal(signal.SIGINT)
-_replaced = _usual is signal.default_int_handler
-if _replaced:
-    try:
-        # Ctrl-C during the imports: exit status 130, no traceback.
-        signal.signal(signal.SIGINT, lambda *_: os._exit(130))
-    except ValueError:  # imported by another thread than the main one
-        _replaced = False
+if TYPE_CHECKING:
+    from cosim.cli.command import app, find_scenario
+else:
 
-from cosim.cli.command import app, find_scenario, main, register_commands  # noqa: E402
+    def __getattr__(name: str) -> Any:
+        """Import the program with all its commands when a name of it is first used (PEP 562)."""
+        if name not in __all__:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        from cosim.cli import command
 
-register_commands()
-if _replaced:
-    signal.signal(signal.SIGINT, _usual)
+        command.register_commands()
+        return getattr(command, name)
+
 
 __all__ = ["app", "find_scenario", "main"]
+_LIVE = ("run", "demo", "record")
+
+
+def main() -> None:
+    """Entry point."""
+    from noack.runtime.signals import quiet_interrupt
+
+    words = sys.argv[1:]
+    with quiet_interrupt():
+        server = None
+        if sys.platform == "linux" and words[:1] and words[0] in _LIVE and "--help" not in words:
+            from cosim.live.fork_server import ForkServer
+
+            server = ForkServer()  # it imports while this process does
+        from cosim.cli.command import register_commands, run_program
+
+        register_commands(*words[:1])
+    run_program(server)

@@ -1,6 +1,6 @@
 """``python -m cosim.cli`` is ``noack``."""
 
-from cosim.cli.command import main
+from cosim.cli import main
 
 if __name__ == "__main__":
     main()

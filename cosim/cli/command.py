@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.markup import escape
 
 from cosim.cli import commands, completion
 from cosim.cli.program import NAME, Program, be_patient
@@ -22,6 +21,9 @@ from noack.core.errors import ExitStatus, NoackError, why
 from noack.runtime.command_line import failed
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
+    from cosim.live.fork_server import ForkServer
     from noack.config.scenario import Scenario
 
 _TOUR = (
@@ -39,9 +41,10 @@ _TOUR = (
 _MOST_COLUMNS = 78
 
 RUNS, THEORY, CAMPAIGNS = "Runs", "Theory", "Campaigns"
+MEASURING = "Real networks"
 FILES = "Scenario files and this machine"
 PROCESSES = "One terminal per process"
-PANELS = (RUNS, THEORY, CAMPAIGNS, FILES, PROCESSES)
+PANELS = (RUNS, THEORY, CAMPAIGNS, MEASURING, FILES, PROCESSES)
 """The panels of the help, in order."""
 
 _order: dict[Any, tuple[int, int]] = {}
@@ -49,32 +52,31 @@ _order: dict[Any, tuple[int, int]] = {}
 
 
 def _columns(rows: Iterable[tuple[str, str]]) -> list[str]:
-    """Return commands and their descriptions as lines of rich markup, at most 78 columns wide."""
+    """Return commands and their descriptions as lines, at most 78 columns wide."""
     rows = list(rows)
     width = max(len(command) for command, _ in rows)
     wide = width + max(len(what) for _, what in rows) + len("     ") > _MOST_COLUMNS
     lines: list[str] = []
     for command, what in rows:
         gap = f"\n{'':6}" if wide else " " * (width - len(command) + 3)
-        lines.append(f"  [cyan]{escape(command)}[/]{gap if what else ''}{escape(what)}")
+        lines.append(f"  {command}{gap if what else ''}{what}")
     return lines
 
 
 app = typer.Typer(
     name=NAME,
     cls=Program,
-    no_args_is_help=True,
     pretty_exceptions_enable=False,
-    rich_markup_mode="rich",
-    # \b keeps the lines as they are; an empty line would end the paragraph that it applies to.
+    rich_markup_mode=None,  # importing rich takes 0.1 s
+    # \b keeps the lines of a paragraph as they are.
     help="\n".join([
-        "\b",
         "A laboratory for event-triggered control over lossy networks without acknowledgements. "
         "The loop runs as real processes over UDP; the network loses at most M − 1 consecutive "
         "packets.",
-        " ",
+        "",
+        "\b",
         *_columns(_TOUR),
-        " ",
+        "",
         "Each command has --help, with examples at the end. A scenario is a TOML file, or the name "
         "of a shipped one. `noack --install-completion` installs shell completion.",
     ]),
@@ -165,8 +167,7 @@ def command(
                 status = failed(what, ExitStatus.FAILED, who=NAME, as_json=as_json)
             raise typer.Exit(int(status))
 
-        # The empty first line keeps the indentation of the lines that follow.
-        epilog = "\n".join(["", "[bold]Examples[/]", *_columns(examples)]) if examples else None
+        epilog = "\n".join(["\b", "Examples:", *_columns(examples)]) if examples else None
         _order[reported] = PANELS.index(panel), place
         registered: Callable[..., None] = app.command(
             rich_help_panel=panel, epilog=epilog, **settings
@@ -176,10 +177,12 @@ def command(
     return register
 
 
-def register_commands() -> None:
-    """Import every module of :mod:`cosim.cli.commands`, and sort the commands for the help."""
-    for module in pkgutil.iter_modules(commands.__path__):
-        import_module(f"{commands.__name__}.{module.name}")
+def register_commands(wanted: str = "") -> None:
+    """Import the module of a command; without such a module import all, sorted for the help."""
+    modules = [module.name for module in pkgutil.iter_modules(commands.__path__)]
+    own = f"{wanted}_command"
+    for module in [own] if own in modules else modules:
+        import_module(f"{commands.__name__}.{module}")
     app.registered_commands.sort(key=lambda one: _order[one.callback])
 
 
@@ -200,6 +203,13 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
+def console() -> "Console":
+    """Return a console on standard output; importing rich takes 0.05 s."""
+    from rich.console import Console
+
+    return Console()
+
+
 def print_json(document: object) -> None:
     """Print the document of ``--json``; a number that is not finite becomes null."""
     print(dumps(_finite(document), indent=2, allow_nan=False))
@@ -213,11 +223,11 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def main() -> None:
-    """Entry point."""
+def run_program(server: "ForkServer | None" = None) -> None:
+    """Run the command of the command line; a live run uses the server."""
     if sys.argv[1:2] != ["netem"]:  # the emulator ends when its output is closed
         be_patient()
     try:
-        app(prog_name=NAME)
+        app(prog_name=NAME, obj=server)
     except KeyboardInterrupt:
         sys.exit(ExitStatus.INTERRUPTED)

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console
-
-from cosim.cli.command import print_json
+from cosim.cli.command import console, print_json
 
 if TYPE_CHECKING:
+    from cosim.live.fork_server import ForkServer
     from cosim.record.run_ending import RunEnding
     from noack.config.scenario import Scenario
 
@@ -37,6 +36,7 @@ def run_processes(
     spawn: Sequence[str] | None = None,
     session: str | None = None,
     live: bool = False,
+    server: "ForkServer | None" = None,
 ) -> int:
     """Run a scenario live; print its verdict and return the exit status.
 
@@ -47,10 +47,11 @@ def run_processes(
         spawn: roles of the processes to start, all by default; the others join by ``session``.
         session: name that the processes of the run share.
         live: show the run in the viewer.
+        server: starts the processes, and ends with the run; by default a new one.
     """
     from cosim.live.fork_server import fork_server
 
-    with fork_server() as server:  # it imports while this process does
+    with fork_server(server) as server:
         from cosim.live.launcher import launch
         from cosim.live.progress import PatientConsole, progress_line
         from noack.protocol.topology import ROLES
@@ -91,5 +92,5 @@ def finalize_run(ending: "RunEnding", output: RunOutput) -> int:
     if output.json:
         print_json(outcome.summary)
     else:
-        print_outcome(Console(), outcome, verbose=output.verbose)
+        print_outcome(console(), outcome, verbose=output.verbose)
     return outcome.status

@@ -2,11 +2,11 @@
 
 import io
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import groupby
 from typing import Any
 
 import typer
-from rich.text import Text
 from typer.core import TyperGroup
 
 from noack.core.errors import ExitStatus, printable, why
@@ -19,12 +19,27 @@ _COMPLETION = ("install_completion", "show_completion")
 class Program(TyperGroup):
     """All commands; a usage error is printed as one line with a suggestion."""
 
+    _words: Sequence[str] = ()
+
     def get_params(self, ctx: Any) -> list[Any]:
-        """Return the options before the command; the help hides those of shell completion."""
+        """Return the options before the command; the help hides those of shell completion.
+
+        If the command comes first, none is needed: for their values typer would import pydantic,
+        which takes 0.1 s.
+        """
+        if self._words and not self._words[0].startswith("-"):
+            return []
         found: list[Any] = super().get_params(ctx)
         for one in found:
             one.hidden = one.hidden or one.name in _COMPLETION
         return found
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the commands, a section for each panel."""
+        commands: Mapping[str, Any] = self.commands
+        for panel, some in groupby(commands.values(), lambda one: one.rich_help_panel):
+            with formatter.section(panel):
+                formatter.write_dl([(one.name, one.get_short_help_str(200)) for one in some])
 
     def main(
         self,
@@ -36,11 +51,12 @@ class Program(TyperGroup):
         **extra: Any,
     ) -> Any:
         """Run the program; the arguments are those of :class:`typer.core.TyperGroup`."""
-        words = list(sys.argv[1:] if args is None else args)
+        words = self._words = list(sys.argv[1:] if args is None else args)
         try:
             status = super().main(
-                words, prog_name, complete_var, False, windows_expand_args, **extra
+                words or ["--help"], prog_name, complete_var, False, windows_expand_args, **extra
             )
+            status = status if words else ExitStatus.CALLER
         except typer.TyperException as error:
             status = ExitStatus.CALLER
             if message := self._line(error, words):
@@ -75,7 +91,7 @@ class Program(TyperGroup):
 
 def examples_of(command: Any) -> list[str]:
     """Return the commands of the examples at the end of a help page."""
-    lines = Text.from_markup(command.epilog or "").plain.splitlines()
+    lines = (command.epilog or "").splitlines()
     commands = (line.strip().partition("   ")[0] for line in lines)
     return [line for line in commands if line.startswith(f"{NAME} ")]
 

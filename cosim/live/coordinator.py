@@ -25,7 +25,7 @@ from noack.runtime.control_plane import ControlPlane
 from noack.runtime.join_ticket import Ticket
 from noack.runtime.life_cycle import HORIZON, Event, LifeCycle, Side, State
 
-_START_DELAY_NS = 150_000_000
+_START_DELAY_NS = 100_000_000
 """From the last arrival to the common epoch: time for the message to reach all processes."""
 _RESTART_DELAY_S = 0.3
 """Wall time from the admission of a restarted process to its first deadline."""

@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from cosim.analysis.model_comparison import linearisation
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import Outcome, Summary, summarise
 from cosim.analysis.summary_model import ExitPart, RunSummary, can_be_shown
+from cosim.live.replay_process import ReplayProcess
 from cosim.record.decimate import is_long
 from cosim.record.run_directory import (
     ENDING_FILE,
@@ -42,9 +43,10 @@ def finalize(ending: RunEnding, *, report: bool = True) -> Outcome:
         MachineError: record or summary cannot be written.
     """
     run_dir = ending.run_dir
-    with _with_reason(ending), finished_run(run_dir):
+    with _with_reason(ending), finished_run(run_dir), ExitStack() as stack:
         unfinished = (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir()
         record = finish_record(run_dir) if unfinished else load_record(run_dir)
+        replaying = stack.enter_context(ReplayProcess(record, run_dir))
         # A stopped recorder has no time to write the recording of a long run.
         if unfinished or (record.kind == "live" and is_long(record.scenario)):
             from cosim.output.viewer.run_view import write_view
@@ -54,7 +56,7 @@ def finalize(ending: RunEnding, *, report: bool = True) -> Outcome:
         _write_summary(run_dir, summary)
         # Written again with the results below, so that none of them can cost the summary.
         claims = RunClaims(record)
-        summary = _with_results(record, claims, summary)
+        summary = _with_results(record, claims, summary, replaying)
         _write_summary(run_dir, summary)
         status, reason = ExitStatus(summary.exit.status), summary.exit.reason
         if (ending.status, ending.reason) != (status, reason):
@@ -95,15 +97,11 @@ def _write_summary(run_dir: Path, summary: RunSummary) -> None:
         raise MachineError(f"{error}; try `noack summary {run_dir}` later") from None
 
 
-def _with_results(record: RunRecord, claims: RunClaims, summary: RunSummary) -> RunSummary:
+def _with_results(
+    record: RunRecord, claims: RunClaims, summary: RunSummary, replaying: ReplayProcess
+) -> RunSummary:
     """Add the results of replay, fidelity and claims; a failure of one is a line or a warning."""
     results: dict[str, Any] = {"fidelity": fidelity_for_summary(record)}
-    if record.kind == "live":
-        try:
-            results["replay"] = replay(record).verdict()
-        except Exception as error:  # the run itself did not fail
-            results["replay"] = {"bit_exact": None, "error": repr(error)}
-        results["exit"] = _exit(summary.exit, results["replay"])
     try:
         results["linearisation"] = linearisation(record.scenario)
     except Exception as error:  # likewise
@@ -122,6 +120,12 @@ def _with_results(record: RunRecord, claims: RunClaims, summary: RunSummary) -> 
         }
     except Exception as error:  # likewise
         print(f"noack: warning: the claims were not judged: {error!r}", file=sys.stderr)
+    if record.kind == "live":
+        try:
+            results["replay"] = replaying.verdict() or replay(record).verdict()
+        except Exception as error:  # the run itself did not fail
+            results["replay"] = {"bit_exact": None, "error": repr(error)}
+        results["exit"] = _exit(summary.exit, results["replay"])
     return summary.with_results(**results)
 
 

@@ -125,12 +125,12 @@ class ForkServer:
 
 
 @contextmanager
-def fork_server() -> Iterator[ForkServer | None]:
-    """Have a fork server while the context lasts; None where the system has none."""
+def fork_server(server: ForkServer | None = None) -> Iterator[ForkServer | None]:
+    """Have a fork server while the context lasts, this or a new one; None without Linux."""
     if sys.platform != "linux":
         yield None
         return
-    with closing(ForkServer()) as server:
+    with closing(server or ForkServer()) as server:
         yield server
 
 

@@ -1,12 +1,18 @@
 """Packet traces from all that can be measured: files of known formats, run directories."""
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from cosim.measurement.relative_delay import relative_delays
-from noack.core.errors import CallerError
+from cosim.measurement.fate_source import is_fate_file, read_fate_file
+from cosim.measurement.run_source import read_run
+from noack.core.errors import CallerError, one_line, why
+from noack.core.file_access import open_regular
+from noack.traces.capture_blocks import is_capture
+from noack.traces.capture_numbers import SequenceField
+from noack.traces.capture_trace import CaptureOptions, read_captures
 from noack.traces.packet_trace import PacketTrace
 from noack.traces.trace_formats import read_trace
 
@@ -16,29 +22,68 @@ class SourceOptions:
     """How to read a source."""
 
     clocks_differ: bool | None = None
-    """Whether sending and receiving times were read on different clocks; None: the usual for the
-    source, which is only for captures of both ends that they do."""
+    """Whether sending and receiving times were read on different clocks; None: what is usual for
+    the source: only in captures of both ends they were."""
+    flow: int = 1
+    """Which flow of a capture or a fate file, by its number of packets; 1 is the largest."""
+    sequence_at: str | None = None
+    """Where the payloads of a capture have sequence numbers: ``OFFSET:BYTES[:little]``."""
 
 
 class SourcedTrace(NamedTuple):
     """A packet trace, and lines about how it was obtained."""
 
     trace: PacketTrace
-    notes: Sequence[str] = ()
+    notes: Sequence[str]
 
 
 def read_source(paths: Sequence[Path], options: SourceOptions | None = None) -> SourcedTrace:
-    """Return the packet trace in a file or in files that belong together.
+    """Return the packet trace in a file, or in the captures of the sender's and receiver's ends.
 
     Raises:
-        CallerError: one line; it cannot be read, or is not a trace.
+        NoackError: one line; it cannot be read, or is not a trace.
     """
-    options = options or SourceOptions()
-    if len(paths) != 1:
-        raise CallerError(f"expected one file, found {len(paths)}")
-    differ = bool(options.clocks_differ)
-    trace = read_trace(paths[0], clocks_differ=differ)
-    if not differ:
-        return SourcedTrace(trace)
-    trace, comparison = relative_delays(trace)
-    return SourcedTrace(trace, comparison.lines())
+    trace = _read(paths, options or SourceOptions())
+    return SourcedTrace(trace, trace.notes)
+
+
+def _read(paths: Sequence[Path], options: SourceOptions) -> PacketTrace:
+    first = paths[0]
+    if len(paths) == 1 and first.is_dir():
+        return read_run(first)
+    heads = [_head(path) for path in paths]
+    if all(map(is_capture, heads)) and len(paths) < 3:
+        return _from_captures(paths, options)
+    if len(paths) > 1:
+        raise CallerError(
+            "expected one file, or two captures (pcap, pcapng): that of the sender's end, then "
+            "that of the receiver's"
+        )
+    if options.sequence_at is not None:
+        raise CallerError(f"{first}: not a capture, and only captures have --sequence-at")
+    if is_fate_file(heads[0]):
+        return read_fate_file(first, options.flow)
+    return read_trace(first, clocks_differ=bool(options.clocks_differ))
+
+
+def _head(path: Path) -> bytes:
+    try:
+        with open_regular(path) as file:
+            return file.read(4)
+    except (OSError, ValueError) as error:
+        reason = f"cannot be read: {why(error)}" if isinstance(error, OSError) else str(error)
+        raise CallerError(f"{path}: {reason}") from None
+
+
+def _from_captures(paths: Sequence[Path], options: SourceOptions) -> PacketTrace:
+    try:
+        field = None if options.sequence_at is None else SequenceField.parse(options.sequence_at)
+    except ValueError as error:
+        raise CallerError(f"--sequence-at: {error}") from None
+    try:
+        with ExitStack() as stack:
+            files = [stack.enter_context(open_regular(path)) for path in paths]
+            return read_captures(files, CaptureOptions(options.flow, field, options.clocks_differ))
+    except (OSError, ValueError) as error:
+        names = ", ".join(map(str, paths))
+        raise CallerError(f"{names}: {one_line(error)}") from None

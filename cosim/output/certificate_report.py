@@ -178,8 +178,8 @@ def with_weight(
         trigger = resolved.decaying
         try:
             weight = choose_weight(
-                loop_of(resolved), trigger.beta, trigger.alpha_per_s, resolved.network.mansd,
-                progress,
+                loop_of(resolved), trigger.beta, trigger.alpha_per_s,
+                resolved.network.longest_burst, progress,
             )  # fmt: skip
         except NotDecayingError as error:
             raise CallerError(f"weight chosen: {error}") from None
@@ -249,7 +249,7 @@ def print_certificates(console: Console, found: Certificates) -> None:
 def _in_words(found: Certificates) -> Iterator[str]:
     """Yield sentences with the certified bounds for the scenario's schedule."""
     for under, certificate in found:
-        constants, dropouts = certificate.constants, certificate.conditions.dropouts
+        constants = certificate.constants
         if under != SCHEDULE or constants is None:
             continue
         plants = "every plant of the box" if certificate.scope == BOX else "the scenario's plant"
@@ -261,8 +261,8 @@ def _in_words(found: Certificates) -> Iterator[str]:
         if (spacing_s := certificate.inter_event_s) is not None:
             apart = f" The inter-event time is at least {_limit(spacing_s)}."
         yield (
-            f"In words: for {plants}, under the assumptions above and for every pattern of at most "
-            f"M − 1 = {dropouts} consecutive losses: "
+            f"In words: for {plants}, under the assumptions above and for every pattern of losses "
+            f"with {certificate.conditions.guarantee.meaning}: "
             f"‖x‖ ≤ {constants.state:.4g}{decay}{late}.{apart}"
         )
 
@@ -271,8 +271,9 @@ def _print_constants(console: Console, found: Certificates) -> None:
     trigger = found.scenario.decaying
     norm = "‖W·‖" if trigger.weight is not None else "‖·‖"
     table = Table(
-        title=f"{found.scenario.name}: certified bounds, M − 1 = {found.scenario.network.mansd}, "
-        f"β = {trigger.beta:g}, α = {trigger.alpha_per_s:g} /s, norm {norm}"
+        title=f"{found.scenario.name}: certified bounds, "
+        f"{found.scenario.network.guarantee.meaning}, β = {trigger.beta:g}, "
+        f"α = {trigger.alpha_per_s:g} /s, norm {norm}"
     )
     table.add_column("")
     for under, certificate in found:

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from typing import NamedTuple
 
+from cosim.analysis.claims.observed_conditions import CAUSES
 from cosim.analysis.run_summary import Summary
 from cosim.output.run_tables import away, changes_in
 from noack.theory.assumptions import AssumptionStatus
@@ -24,7 +25,7 @@ def remarks(summary: Summary) -> Iterator[Remark]:
     violations = summary["assumption_violations"]
     for one in violations[:_MOST]:
         where = f"t = {one['t_s']:.3f} s (reported by {one['process']})"
-        severe = one["cause"] in ("dropouts", "change")
+        severe = one["cause"] not in CAUSES  # the guarantee, or a change
         yield Remark(f"assumption violated at {where}: {one['what']}", severe=severe)
     if len(violations) > _MOST:
         yield Remark(f"{len(violations) - _MOST} more violations of this kind", severe=True)

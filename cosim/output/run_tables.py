@@ -38,7 +38,8 @@ def number_table(summary: Summary, rows: Numbers) -> Table:
     """Return a run's numbers as a table; its title names scenario, mode and cap."""
     mode = "model-based" if summary["mode"] == "model" else "zero-order hold"
     kind = "" if summary["kind"] == "live" else f", {summary['kind']}"
-    title = f"{summary['scenario']}, {mode}, M − 1 = {summary['mansd']}{kind}"
+    further = "".join(f", {constraint}" for constraint in summary.get("constraints", ()))
+    title = f"{summary['scenario']}, {mode}, M − 1 = {summary['mansd']}{further}{kind}"
     table = Table(title=escape(title))
     table.add_column("quantity")
     table.add_column("value", justify="right")
@@ -100,8 +101,10 @@ def _losses(summary: Summary) -> Iterator[tuple[str, str]]:
         yield "  lost", f"{sent['lost']} ({ratio(sent['lost'], sent['sent'])})"
         yield "  longest loss burst", str(sent["longest_loss_burst"])
     yield _longest_burst(summary)
-    beyond = sum(one["cause"] == "dropouts" for one in summary["assumption_violations"])
-    yield "loss bursts beyond M − 1", str(beyond)
+    causes = [one["cause"] for one in summary["assumption_violations"]]
+    yield "loss bursts beyond M − 1", str(causes.count("dropouts"))
+    for constraint in summary.get("constraints", ()):
+        yield f"violations of {constraint}", str(causes.count(constraint))
 
 
 def _lost(summary: Summary) -> tuple[str, str]:

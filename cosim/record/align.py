@@ -12,6 +12,7 @@ If a controller dies, there is no x_c until the restarted controller has its fir
 """
 
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -281,15 +282,22 @@ class IdentityResidual:
         if self._scenario.protocol.acknowledges or not len(rows):
             return np.full(len(rows), np.nan)
         missed, e_s = self._missed, rows["x_s"] - rows["x"]
-        totals = []
-        fields = rows["t_ns"].tolist(), rows["event"].tolist(), aligned.received.tolist()
-        for t_ns, event, received, jump in zip(*fields, e_s, strict=True):
-            missed.advance_to(t_ns)
-            if event != NO_SEQUENCE:
-                missed.event(event, jump)
-            missed.received(received)
-            totals.append(missed.total())
-        residual = np.abs(aligned.x_c - aligned.x_s - np.array(totals)).max(axis=1)
+        totals = np.zeros_like(e_s)
+        t_ns, events, received = (
+            column.tolist() for column in (rows["t_ns"], rows["event"], aligned.received)
+        )
+        begins = np.flatnonzero(rows["event"] != NO_SEQUENCE).tolist()
+        for begin, end in pairwise([0, *begins, len(rows)]):
+            for i in range(begin, end):
+                is_event = events[i] != NO_SEQUENCE
+                if missed.is_empty and not is_event:
+                    break  # nothing is missed until the next event
+                missed.advance_to(t_ns[i])
+                if is_event:
+                    missed.event(events[i], e_s[i])
+                missed.received(received[i])
+                totals[i] = missed.total()
+        residual = np.abs(aligned.x_c - aligned.x_s - totals).max(axis=1)
         return np.where(in_common(self._scenario, aligned), residual, np.nan)
 
 

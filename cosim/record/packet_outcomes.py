@@ -34,13 +34,20 @@ class PacketOutcome(NamedTuple):
         """Forwarded intact, and before every newer update."""
         return ~self.lost & ~self.in_flight
 
+    def loss_bursts(self) -> NDArray[np.int64]:
+        """The lengths of all bursts of consecutive losses, in order."""
+        steps = np.diff(self.lost.astype(np.int8), prepend=0, append=0)
+        return np.flatnonzero(steps < 0) - np.flatnonzero(steps > 0)
+
     def longest_loss_burst(self) -> int:
         """Largest number of consecutive losses."""
-        longest = count = 0
-        for lost in self.lost.tolist():
-            count = count + 1 if lost else 0
-            longest = max(longest, count)
-        return longest
+        return int(self.loss_bursts().max(initial=0))
+
+    def losses_in(self, packets: int) -> NDArray[np.int64]:
+        """The number of losses in each ``packets`` consecutive updates; or in all, if fewer."""
+        lost = np.append(0, np.cumsum(self.lost))
+        width = min(packets, len(self.lost))
+        return np.asarray(lost[width:] - lost[: len(lost) - width])
 
 
 def packet_outcomes(record: RunRecord, flow: Flow = Flow.UPDATE) -> PacketOutcome:

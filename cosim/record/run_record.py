@@ -27,7 +27,6 @@ from cosim.record.record_source import (
 from cosim.record.record_source import Rows as Rows
 from cosim.record.run_directory import RECORD, REPORTS_FILE, SCENARIO_FILE, read_object
 from cosim.record.spool_merge import merged, spool_segments
-from cosim.record.table_files import StoredTables, group_segments, write_table
 from noack.config.resolution import LoopMatrices, loop_of, tables_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
@@ -175,6 +174,9 @@ def load_record(run_dir: Path) -> RunRecord:
     Raises:
         CallerError: the path is no run directory, or the record is unfinished or damaged.
     """
+    # Imported here because pyarrow takes 0.1 s: a run does not wait for it.
+    from cosim.record.table_files import StoredTables
+
     folder = run_dir / RECORD
     if not (run_dir / SCENARIO_FILE).is_file():
         raise CallerError(f"{run_dir}: not a run directory (no {SCENARIO_FILE})")
@@ -205,6 +207,8 @@ def _write(
     loop: LoopMatrices,
     notices: Iterable[Mapping[str, Any]],
 ) -> None:
+    from cosim.record.table_files import write_table
+
     folder.mkdir(exist_ok=True)
     for table, batches in tables.items():
         write_table(folder / f"{table}.parquet", batches, types[table], loop)
@@ -238,6 +242,8 @@ def finish_record(run_dir: Path) -> RunRecord:
 
 def _merged(folder: Path, spool: Path, table: str, dtype: np.dtype[np.void]) -> Iterator[Rows]:
     """Yield the rows of a table from an earlier record and from the spool."""
+    from cosim.record.table_files import group_segments
+
     path = folder / f"{table}.parquet"
     recorded = group_segments(path, dtype) if path.is_file() else ()
     yield from merged([*recorded, *spool_segments(spool, table, dtype)], dtype)

@@ -31,10 +31,7 @@ from netem.engine.relay_interface import DIRECTIONS, Direction
 from netem.words.words_to_settings import settings_of, text_of
 from noack.config.validation_messages import brief
 from noack.core.errors import CallerError, MachineError, NoackError
-from noack.impairments.kinds.delay import Delay
-from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_models.trace import TraceLoss
 from noack.runtime.udp_sockets import LOOPBACK, free_tcp_port
 from noack.runtime.zenoh_session import SessionSecret, cause_of, open_session
 
@@ -195,10 +192,6 @@ def _settings(settings: LinkSettings) -> object:
 
 def _require_read(settings: LinkSettings) -> None:
     for impairment in settings.impairments:
-        if isinstance(impairment, LossOf) and isinstance(impairment.loss, TraceLoss):
-            file = impairment.loss.file
-        elif isinstance(impairment, Delay) and impairment.file is not None:
-            file = impairment.file
-        else:
-            continue
-        raise CallerError(f"{file}: read the file first, and send its content as settings")
+        file = getattr(getattr(impairment, "loss", impairment), "file", None)
+        if file is not None:
+            raise CallerError(f"{file}: read the file first, and send its content as settings")

@@ -19,7 +19,7 @@ from netem.engine.pump import pump_layout
 from netem.engine.pump.client_table import insert
 from netem.engine.pump.pump_layout import Array
 from netem.engine.pump_memory import PumpMemory
-from netem.engine.relay_sockets import packed_name
+from netem.engine.relay_sockets import packed_name, stamp_arrivals
 from netem.link_machine import UPDATE_LINK, Datagram, at_start, due_settings
 from netem.rules.settings_change import carry
 from noack.config.parameter_changes import ChangeSchedule, ParameterChange
@@ -106,8 +106,11 @@ class CompiledNetwork:
         pump["epoch_ns"], pump["speed"], pump["spin_ns"] = clock.epoch_ns, clock.speed, spin_ns
         memory.sockets["fd"][1] = sender.fileno()
         for place, endpoint in zip((0, self._memory.first_path), receivers.values(), strict=False):
+            stamp_arrivals(endpoint)
             memory.sockets["fd"][place] = endpoint.fileno()
             self._epoll.add(endpoint.fileno(), place)
+        pump["stamps"] = 1
+        self._memory.read_controls()
         self._sensor, name_bytes = packed_name(next(iter(receivers)))
         memory.clients["name_bytes"][0] = name_bytes
         memory.clients["name"][0] = np.frombuffer(self._sensor, np.uint8)
@@ -149,6 +152,7 @@ class CompiledNetwork:
         memory, pump = self._memory.memory, self._memory.pump
         ctypes.memmove(int(memory.in_vectors["base"][0]), message.data, len(message.data))
         memory.in_headers["size_bytes"][0] = len(message.data)
+        memory.in_headers["control_bytes"][0] = 0  # the arrival is unknown
         memory.in_names[0] = np.frombuffer(self._sensor, np.int64)
         pump["batch_socket"] = self._memory.first_path if message.flow else 0
         pump["batch_next"], pump["batch_end"], pump["ready"], pump["ready_next"] = 0, 1, 0, 0

@@ -44,7 +44,7 @@ def compiled_program(program: LinkProgram) -> LinkProgram:
     """Return a program as arrays, for compiled rules; ``stages`` rows have all stages' fields."""
     tables: dict[str, Any] = {
         "stages": array_of(union_dtype(STAGE_RECORDS), program.stages),
-        "windows": array_of(dtype_of(link_records.LossWindow), program.windows),
+        "windows": array_of(dtype_of(link_records.WindowRule), program.windows),
         "decisions": array_of(dtype_of(link_records.RecordedDecision), program.decisions),
         "reals": np.array(program.reals, dtype=np.float64),
     }

@@ -1,6 +1,7 @@
 """Reads fate traces: the decisions that a link repeats in a replay."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -66,27 +67,42 @@ def read_fates(path: Path, links: Sequence[str] | None = None) -> Fates:
     return Fates(found, caps)
 
 
-def _read(path: Path) -> tuple[pa.Table, Mapping[str, "_Link"]]:
-    """Return a trace's table, and the settings of its links at the start, by name."""
+@contextmanager
+def opened_fates(path: Path) -> Iterator[tuple[pq.ParquetFile, Mapping[str, "_Link"]]]:
+    """Open a trace; yields it, and the settings of its links at the start, by name.
+
+    Raises:
+        CallerError: the file is not a trace, has missing events, or cannot be read.
+    """
     try:
         with pq.ParquetFile(path) as file:
             document = _document(path, (file.metadata.metadata or {}).get(METADATA.encode()))
             if not file.schema_arrow.equals(SCHEMA):
                 raise CallerError(f"{path}: not a fate trace: it has other columns")
-            table = file.read()
-            table.validate(full=True)
+            if document.missing_events:
+                raise _missing(path, document.missing_events)
+            yield file, {link.name: link for link in document.links}
     except pa.ArrowInvalid:
         raise CallerError(
             f"{path}: not a fate trace, or incomplete because the emulator was killed"
         ) from None
     except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
         raise CallerError(f"{path}: cannot be read ({one_line(error)})") from None
-    if document.missing_events or any(column.null_count for column in table.columns):
-        raise CallerError(
-            f"{path}: {document.missing_events or 'some'} events are missing; "
-            "an incomplete trace cannot be replayed"
-        )
-    return table, {link.name: link for link in document.links}
+
+
+def _read(path: Path) -> tuple[pa.Table, Mapping[str, "_Link"]]:
+    with opened_fates(path) as (file, links):
+        table = file.read()
+        table.validate(full=True)
+    if any(column.null_count for column in table.columns):
+        raise _missing(path, "some")
+    return table, links
+
+
+def _missing(path: Path, count: int | str) -> CallerError:
+    return CallerError(
+        f"{path}: {count} events are missing; an incomplete trace cannot be replayed"
+    )
 
 
 class _Direction(BaseModel):

@@ -31,6 +31,6 @@ class LinearFeedback:
 
     def input(self, t_s: float, x_c: Vector, setpoint: tuple[Vector, Vector] | None) -> Vector:
         if setpoint is None:
-            return np.asarray(self.K @ x_c)
+            return np.asarray(self.K.dot(x_c))
         x_r, u_r = setpoint
         return np.asarray(self.K @ (x_c - x_r) + u_r)

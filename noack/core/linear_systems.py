@@ -62,7 +62,8 @@ class Propagator:
         """Return e^{G dt} ``state``, shape (n,)."""
         if dt_ns == 0 or self._static:
             return state
-        advanced: Vector = self.transition(dt_ns) @ state
+        # For vectors of a few entries, ``dot`` takes half the time of ``@``.
+        advanced: Vector = self.transition(dt_ns).dot(state)
         return advanced
 
 
@@ -79,7 +80,7 @@ class HeldInputPropagator:
         if dt_ns == 0:
             return x
         Ad, Bd = self.step(dt_ns)
-        advanced: Vector = Ad @ x + Bd @ u
+        advanced: Vector = Ad.dot(x) + Bd.dot(u)
         return advanced
 
 

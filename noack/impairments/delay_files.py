@@ -49,16 +49,8 @@ def read_samples(
     return tuple(samples_s)
 
 
-def _lines(file: NamedFile) -> Iterator[tuple[int, str]]:
-    """Yield the numbered lines that are neither empty nor comments."""
-    text = file.content().decode("utf-8", errors="replace")
-    for number, line in enumerate(text.splitlines(), 1):
-        if line.strip() and not line.startswith("#"):
-            yield number, line.strip()
-
-
 def _table(file: NamedFile) -> Iterator[int]:
-    for number, line in _lines(file):
+    for number, line in file.lines():
         for word in line.split():
             if not re.fullmatch("-?[0-9]{1,5}", word):
                 file.wrong(f"line {number}: {word[:20]}: expected whole numbers, 8192 for 1")
@@ -66,7 +58,7 @@ def _table(file: NamedFile) -> Iterator[int]:
 
 
 def _observed_s(file: NamedFile) -> Iterator[float]:
-    for number, line in _lines(file):
+    for number, line in file.lines():
         found = _DELAY.fullmatch(line)
         scale = _UNITS_S.get(found[2]) if found else None
         if found is None or scale is None:

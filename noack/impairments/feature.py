@@ -9,7 +9,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
-from noack.impairments.link_records import LossWindow, QueueState, RuleStage
+from noack.impairments.link_records import QueueState, RuleStage
+from noack.impairments.loss_guarantee import LossRule
 from noack.impairments.markov_chain import Chain, Pattern
 from noack.impairments.word_reader import WordReader
 from noack.settings.section import ScenarioSection
@@ -52,6 +53,8 @@ class StageTables:
     def __init__(self, *, scored: bool = False) -> None:
         self.scored = scored
         """A delay is correlated with loss, and needs a score of the link's state."""
+        self.key = 0, 0
+        """Key of the random stream of the stage that is being made."""
         self.integers: list[int] = []
         self.reals: list[float] = []
 
@@ -152,24 +155,14 @@ class Constraint(Feature):
     kind: str
 
     @property
-    def longest_burst(self) -> int | None:
-        """Maximum number of consecutive losses that it allows; None: any number."""
-        return None
-
-    @property
-    def loss_window(self) -> LossWindow | None:
-        """The constraint, if it is a maximum of losses among consecutive packets."""
-        return None
-
-    @property
-    def least_deliveries(self) -> int:
-        """Minimum number of consecutive deliveries between two loss bursts; 0: none."""
-        return 0
+    @abstractmethod
+    def rule(self) -> LossRule:
+        """Return the constraint as a counter over the outcomes of packets."""
 
     @property
     @abstractmethod
     def scope(self) -> str:
-        """What two constraints of a link must not have in common."""
+        """Return what two constraints of a link must not have in common."""
 
 
 class LossModel(StageFeature):

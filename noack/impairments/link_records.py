@@ -83,7 +83,7 @@ class RecordedDecision:
 
 
 @dataclass(slots=True)
-class LossWindow:
+class WindowRule:
     """A maximum of losses among any ``packets`` consecutive packets of a flow."""
 
     losses: int
@@ -212,7 +212,7 @@ class LinkProgram(NamedTuple):
     """Recorded decisions to be repeated, flow by flow."""
     decisions_begin: Sequence[int]
     """(flows + 1,) Begin of each recorded flow's decisions, and the end of the last; or empty."""
-    windows: Sequence[LossWindow]
+    windows: Sequence[WindowRule]
     """Further maxima of losses."""
     recovery: int
     """Minimum number of consecutive deliveries between two loss bursts; 0: none."""

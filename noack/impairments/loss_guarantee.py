@@ -99,7 +99,7 @@ class LossesInWindow(NamedTuple):
         return f"{value:.0f} of {self.window} consecutive updates lost, {self.limit} allowed"
 
 
-class Recovery(NamedTuple):
+class DeliveriesBetweenBursts(NamedTuple):
     """At least ``deliveries`` consecutive deliveries between two bursts of losses.
 
     The state is the number of deliveries since the last loss, up to ``deliveries``; the value is
@@ -173,7 +173,7 @@ class LossGuarantee:
         for rule in self.rules:
             if isinstance(rule, LossesInWindow):
                 found.append(LossWindow(rule.limit, rule.window))
-            elif isinstance(rule, Recovery):
+            elif isinstance(rule, DeliveriesBetweenBursts):
                 found.append(LossWindow(burst, burst + rule.deliveries))
         return tuple(found)
 

@@ -98,6 +98,17 @@ def _own_time_s(text: str) -> float:
     return 0.0 if scale is None else _float(number * scale)
 
 
+def _own_time_ns(text: str) -> int:
+    number, unit = _split(text)
+    scale = _TIME_UNITS.get(unit.lower())
+    if scale is None and (unit or number != 0):
+        raise ValueError
+    time_ns = number * (scale or 0) * 10**9
+    if not -(2**62) < time_ns < 2**62 or time_ns % 1:
+        raise ValueError
+    return int(time_ns)
+
+
 def _rate_bps(text: str) -> int:
     number, unit = _split(text)
     scale = _RATE_UNITS.get(unit.lower())
@@ -131,6 +142,8 @@ TIME_S = Quantity("a time in s, ms, us or ns, e.g. 10ms (a bare number is in us)
 """A time of tc: a number without a unit is in microseconds."""
 OWN_TIME_S = Quantity("a time in s, ms, us or ns, e.g. 10ms", _own_time_s)
 """A time of a word that tc does not have: requires a unit, may be negative."""
+OWN_TIME_NS = Quantity("a time in s, ms, us or ns, in whole ns, e.g. 10ms", _own_time_ns)
+"""The same, exactly."""
 RATE_BPS = Quantity("a rate in bit, kbit, mbit, gbit, kbps (bytes!), ..., e.g. 1mbit", _rate_bps)
 COUNT = Quantity("a whole number, e.g. 5", _integer("[0-9]{1,20}"))
 SIGNED_COUNT = Quantity("a whole number, e.g. 28 or -14", _integer("-?[0-9]{1,20}"))
@@ -169,7 +182,15 @@ def percents_text(shares: Sequence[float], defaults: Sequence[float | None]) -> 
 
 def time_text(time_s: float) -> str:
     """``10ms`` for 0.01, in the unit that makes it shortest; read back, it is the same float."""
-    exact = Decimal(repr(time_s))
+    return _time_text(Decimal(repr(time_s)))
+
+
+def time_ns_text(time_ns: int) -> str:
+    """``10ms`` for 10,000,000; read back, it is the same number."""
+    return _time_text(Decimal(time_ns).scaleb(-9))
+
+
+def _time_text(exact: Decimal) -> str:
     if exact == 0:
         return "0s"
     units = (("s", 0), ("ms", 3), ("us", 6), ("ns", 9))

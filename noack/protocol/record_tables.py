@@ -192,7 +192,8 @@ TABLES = (
                "point; the safe input while the controller has no state"),
     )),
     Table(NETEM_PACKET, "netem", "datagram received by the network emulator; `sequence` counts "
-          "the datagrams of its flow", (
+          "the datagrams of its flow, `t_ns` is the arrival at the socket if it is known, else "
+          "`now_ns`", (
         Column("flow", "", "source: 0 the sensor; 1 the controller, with `network.protocol = "
                "\"ack\"`"),
         Column("fate", "", ", ".join(f"{fate.value} {fate.name.lower()}" for fate in Fate)),

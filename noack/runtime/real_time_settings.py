@@ -15,9 +15,9 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from noack.runtime.memory_lock import lock_memory
+
 _PR_SET_TIMERSLACK = 29
-_MCL_CURRENT = 1
-_MCL_FUTURE = 2
 _LAST_PLACE = 3
 _CPU_DMA_LATENCY = Path("/dev/cpu_dma_latency")
 
@@ -45,7 +45,7 @@ def realtime(
         undo.callback(gc.enable)
         if enabled:
             # Locking memory takes 0.1 s: at real-time priority it would block this core.
-            applied["memory_lock"] = _attempt(_call_system, "mlockall", _MCL_CURRENT | _MCL_FUTURE)
+            applied["memory_lock"] = _attempt(lock_memory)
             applied["timer_slack"] = _attempt(_call_system, "prctl", _PR_SET_TIMERSLACK, 1, 0, 0, 0)
             applied["sched_fifo"] = _attempt(_fifo, fifo_priority, place, undo)
             if place is not None and applied["sched_fifo"] == "applied":

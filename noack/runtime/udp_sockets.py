@@ -1,6 +1,7 @@
 """UDP sockets: bound to loopback, with large kernel buffers, never blocking."""
 
 import errno
+import select
 import socket
 import struct
 from abc import ABC, abstractmethod
@@ -125,6 +126,12 @@ class CountingSocket(ABC, Generic[T]):
             for one in self._beside:
                 enlarge_buffer(one)
         self._sockets = {one.fileno(): one for one in (*self._beside, endpoint)}
+        self._source_of = {
+            one.fileno(): peer
+            for one, peer in zip(self._beside, dict.fromkeys(peers), strict=False)
+            if not select.select([one], (), (), 0)[0]
+        }
+        """Peers, by sockets that were empty when already connected: no other source is in them."""
         self._everyone = list(self._sockets)
         self._only_peers = [one.fileno() for one in self._beside]
         self._flood = FloodWatch()
@@ -151,9 +158,13 @@ class CountingSocket(ABC, Generic[T]):
         A few rejected datagrams before it are skipped; None if the next few have no message.
         """
         endpoint, unknown = self._sockets[readable], readable == self._unknown_fd
+        peer = self._source_of.get(readable)
         for _ in range(_READ_AT_ONCE):
             try:
-                data, source = endpoint.recvfrom(self.most_bytes)
+                if peer is None:
+                    data, source = endpoint.recvfrom(self.most_bytes)
+                else:  # takes half the time
+                    data, source = endpoint.recv(self.most_bytes), peer
             except OSError:  # empty, or an ICMP error of an earlier send
                 return None
             self._sources.add(source)

@@ -34,11 +34,11 @@ class NamedFile:
 
     def __init__(self, name: str, folder: Path, place: str = "") -> None:
         self.path = folder / name
-        self._named = f'{place}.file = "{name}"' if place else name
+        self.named = f'{place}.file = "{name}"' if place else name
 
     def wrong(self, message: str) -> NoReturn:
         """Refuse the file's content by a CallerError."""
-        raise CallerError(f"{self._named}: {message}")
+        raise CallerError(f"{self.named}: {message}")
 
     def content(self) -> bytes:
         """Return the file's bytes; raise CallerError if it cannot be read."""
@@ -46,6 +46,13 @@ class NamedFile:
             return read_regular(self.path, MOST_BYTES)
         except (OSError, ValueError) as error:
             self._unreadable(error)
+
+    def lines(self) -> Iterator[tuple[int, str]]:
+        """Yield the lines that are neither empty nor comments (#), with their numbers from 1."""
+        text = self.content().decode("utf-8", errors="replace")
+        for number, line in enumerate(text.splitlines(), 1):
+            if line.strip() and not line.startswith("#"):
+                yield number, line.strip()
 
     def sha256(self) -> str:
         """Return the SHA-256 of the file in hexadecimal; raise CallerError if it cannot be read."""
@@ -59,7 +66,7 @@ class NamedFile:
 
     def _unreadable(self, error: OSError | ValueError) -> NoReturn:
         reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise CallerError(f"{self._named}: cannot be read: {reason}") from None
+        raise CallerError(f"{self.named}: cannot be read: {reason}") from None
 
 
 class FileSettings(ScenarioSection):

@@ -197,7 +197,7 @@ def _mansd(resolved: Scenario) -> Assumption:
         "enforced by the network" if network.enforce_mansd else "not enforced (enforce_mansd)"
     )
     return _checked(
-        f"at most M − 1 = {network.mansd} consecutive losses after a first delivery at t_0",
+        f"{network.guarantee.meaning} after a first delivery at t_0",
         "Section III",
         network.enforce_mansd,
         f"{enforced}; {start}",
@@ -262,7 +262,7 @@ def certificate_assumptions(
 
 def _conditions(conditions: NetworkConditions, enforced: bool) -> list[Assumption]:
     losses = Assumption(
-        f"at most M − 1 = {conditions.dropouts} consecutive losses after a first delivery at t_0",
+        f"{conditions.guarantee.meaning} after a first delivery at t_0",
         "certificate",
         AssumptionStatus.HOLDS if enforced else AssumptionStatus.ASSUMED,
         "enforced by the network" if enforced else "not enforced",

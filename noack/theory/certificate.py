@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, LossRule
 from noack.theory.gains import Coefficients, ErrorGains, Output, PlantGains
 
 _SHORTEST_S, _LONGEST_S = 1e-9, 1e6
@@ -43,6 +44,13 @@ class NetworkConditions(NamedTuple):
     """σ, the largest difference between the time and the model time of the applied input."""
     start_s: float = 0.0
     """Time from which the plant applies the controller's input; before, its input is 0."""
+    constraints: tuple[LossRule, ...] = ()
+    """Further rules of the guarantee."""
+
+    @property
+    def guarantee(self) -> LossGuarantee:
+        """All rules that the network keeps."""
+        return LossGuarantee((LongestBurst(self.dropouts), *self.constraints))
 
 
 class Constants(NamedTuple):

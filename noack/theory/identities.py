@@ -23,8 +23,14 @@ class ModelDifference:
 
     def advance_to(self, t_ns: int) -> None:
         """Propagate the sum of the missed jumps to time ``t_ns``."""
-        self._total = self.propagate(self._total, t_ns - self._t_ns)
+        if self._jumps:
+            self._total = self.propagate(self._total, t_ns - self._t_ns)
         self._t_ns = t_ns
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no event is missed, so that the sum is 0."""
+        return not self._jumps
 
     def event(self, sequence: int, e_s: Vector) -> None:
         """Add event ``sequence`` at the present time with sensor error e_s(t_k⁻), shape (n,)."""

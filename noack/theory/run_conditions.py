@@ -1,9 +1,11 @@
 """The conditions of a scenario's run: those of its own schedule, and the paper's ideal ones."""
 
 import math
+from typing import Any
 
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
+from noack.impairments.loss_guarantee import LongestBurst
 from noack.theory.certificate import NetworkConditions
 
 
@@ -27,19 +29,25 @@ def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> NetworkCond
     common_ns = math.gcd(sample_ns, tick_ns)
     wait_ns = tick_ns - common_ns + phase_ns % common_ns
     late_ns = late_periods * step_ns
-    under_way_ns = late_ns + math.ceil(resolved.network.link.longest_delay_s * NS_PER_S)
+    under_way_ns = network_delay_ns(resolved, late_periods)
     if under_way_ns > 0:  # an update in flight for up to this time may just miss a tick
         wait_ns = under_way_ns + tick_ns - 1
     delay_ns, first_ns = ((t_ns // step_ns + 1) * step_ns for t_ns in (wait_ns, phase_ns))
     start_ns = first_ns if under_way_ns == 0 else max(first_ns + late_ns, delay_ns)
     return NetworkConditions(
-        dropouts=resolved.network.mansd,
+        **_losses(resolved),
         sampling_s=sample_ns / NS_PER_S,
         spacing_s=sample_ns / NS_PER_S,
         delay_s=delay_ns / NS_PER_S,
         hold_s=(newest_ns + step_ns + late_ns) / NS_PER_S,
         start_s=start_ns / NS_PER_S,
     )
+
+
+def network_delay_ns(resolved: Scenario, late_periods: int) -> int:
+    """Return the longest time for which the network may delay an update under these conditions."""
+    late_ns = late_periods * resolved.timing.plant_period_ns
+    return late_ns + math.ceil(resolved.network.link.longest_delay_s * NS_PER_S)
 
 
 def allowed_conditions(resolved: Scenario) -> NetworkConditions:
@@ -49,4 +57,11 @@ def allowed_conditions(resolved: Scenario) -> NetworkConditions:
 
 def ideal_conditions(resolved: Scenario) -> NetworkConditions:
     """The paper's conditions: a continuous trigger, a network and input without delay."""
-    return NetworkConditions(dropouts=resolved.network.mansd)
+    return NetworkConditions(**_losses(resolved))
+
+
+def _losses(resolved: Scenario) -> dict[str, Any]:
+    """Return what the guarantee says: its longest burst, and its rules except the cap M − 1."""
+    guarantee = resolved.network.guarantee
+    further = [rule for rule in guarantee.rules if not isinstance(rule, LongestBurst)]
+    return {"dropouts": guarantee.longest_burst, "constraints": tuple(further)}

@@ -101,7 +101,8 @@ class ScenarioCertificate:
         """Return all fields for JSON."""
         constants, late = self.constants, self.floor_constants
         return asdict(self) | {
-            "conditions": self.conditions._asdict(),
+            "conditions": self.conditions._asdict()
+            | {"constraints": [rule.name for rule in self.conditions.constraints]},
             "assumptions": [assumption._asdict() for assumption in self.assumptions],
             "constants": None if constants is None else constants._asdict(),
             "floor_constants": None if late is None else late._asdict(),

@@ -27,10 +27,12 @@ def choose_weight(
     loop: LoopMatrices,
     beta: float,
     alpha_per_s: float,
-    mansd: int,
+    longest_burst: int,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Matrix:
-    """Return W, upper triangular, (n, n), for a loop of any weight; ``mansd`` is M − 1.
+    """Return W, upper triangular, (n, n), for a loop of any weight.
+
+    ``longest_burst`` is the largest number of consecutive losses.
 
     ``progress`` receives the completed share of the work.
 
@@ -57,7 +59,7 @@ def choose_weight(
         error = ErrorGains(loop.H, loop.K, weight, alpha_per_s)
         plant = PlantGains(error, loop.A, loop.B, loop.x0[:, None], alpha_per_s)
         try:
-            found = solve(error, plant, NetworkConditions(mansd), Level(beta, beta))
+            found = solve(error, plant, NetworkConditions(longest_burst), Level(beta, beta))
         except (VoidError, NotDecayingError):
             return 0.0
         return -(found.inter_event_s or 0.0)

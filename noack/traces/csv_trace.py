@@ -3,7 +3,8 @@
 ``sequence`` (optional: otherwise the packets are numbered in the order of the lines), ``sent_ms``
 and ``received_ms``, or with the units ``_s``, ``_us``, ``_ns``; other columns are ignored. A packet
 whose receiving time is empty or −1 was lost, as was one whose number is missing. Times are read as
-decimals, and rounded to a whole nanosecond only.
+decimals, and rounded to a whole nanosecond only. ``received_other_clock_ns`` says that the two
+times were read on different clocks.
 """
 
 import csv
@@ -17,12 +18,14 @@ import numpy as np
 
 from noack.core.errors import shortened
 from noack.traces.packet_trace import PacketTrace, TraceRecordError, packet_trace
+from noack.traces.relative_delay import relative_delays
 from noack.traces.trace_formats import TraceFormat
 
 _UNITS_NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
-_TIME_COLUMN = re.compile(f"(sent|received)_({'|'.join(_UNITS_NS)})")
+_TIME_COLUMN = re.compile(f"(sent|received(?:_other_clock)?)_({'|'.join(_UNITS_NS)})")
 _HEADER = re.compile(rb"(\xef\xbb\xbf)?[^\r\n]*(sent|received|sequence)")
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,4})?")
+_OTHER = "_other_clock"
 _LOST = re.compile(r"(-1(\.0*)?)?")
 _MOST = 2**62
 _LINE_BYTES = 2**16
@@ -52,7 +55,7 @@ def _columns(header: Sequence[str]) -> tuple[_Column | None, _Column, _Column]:
     found: dict[str, _Column] = {}
     for place, name in enumerate(header):
         time = _TIME_COLUMN.fullmatch(name)
-        what = time[1] if time else name
+        what = time[1].removesuffix(_OTHER) if time else name
         if what in found and (time or what == "sequence"):
             raise ValueError(
                 f"line 1: has the columns {found[what].name} and {name}; one is needed"
@@ -77,12 +80,19 @@ def _lines(file: IO[bytes]) -> Iterator[str]:
 
 def read_csv_trace(file: IO[bytes], most_packets: int, clocks_differ: bool) -> PacketTrace:
     """Read a CSV trace; see :class:`noack.traces.trace_formats.TraceFormat`."""
+    trace, differ = _read(file, most_packets, clocks_differ)
+    return relative_delays(trace) if differ else trace
+
+
+def _read(file: IO[bytes], most_packets: int, clocks_differ: bool) -> tuple[PacketTrace, bool]:
+    """Return the trace, and whether the clocks differ."""
     rows = csv.reader(_lines(file), skipinitialspace=True)
     lines, numbers, sent_ns, received_ns = (array("q") for _ in range(4))
     lost = bytearray()
     try:
         header = [name.strip() for name in next(rows, [])]
         sequence, sent, received = _columns(header)
+        clocks_differ |= _OTHER in received.name
         for row in rows:
             line = rows.line_num
             if not row:
@@ -100,11 +110,12 @@ def read_csv_trace(file: IO[bytes], most_packets: int, clocks_differ: bool) -> P
             sent_ns.append(sent.number(line, row[sent.place].strip()))
             if sequence is not None:
                 numbers.append(sequence.number(line, row[sequence.place].strip()))
-        return packet_trace(
+        trace = packet_trace(
             np.array(sent_ns), np.array(received_ns), np.array(lost, np.bool_),
             np.array(numbers) if sequence is not None else None,
             clocks_differ=clocks_differ, most_packets=most_packets,
         )  # fmt: skip
+        return trace, clocks_differ
     except csv.Error as error:
         raise ValueError(f"line {rows.line_num}: {error}") from None
     except TraceRecordError as error:

@@ -4,7 +4,7 @@ Times are whole nanoseconds since the first sending. All packets are in the trac
 record has is a lost packet, for whose sending time the neighbours' are interpolated.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -37,6 +37,8 @@ class PacketTrace:
     """(k,) Since the first sending; not descending."""
     received_ns: Int64s
     """(k,) Since the first sending; −1 for a lost packet."""
+    notes: tuple[str, ...] = ()
+    """Lines for a report about how the trace was obtained."""
 
     def __len__(self) -> int:
         return len(self.sequence)
@@ -45,6 +47,10 @@ class PacketTrace:
     def lost(self) -> NDArray[np.bool_]:
         """(k,) Whether a packet was lost."""
         return np.equal(self.received_ns, LOST_NS)
+
+    def noted(self, *lines: str) -> "PacketTrace":
+        """Return the trace with further notes."""
+        return replace(self, notes=(*self.notes, *lines))
 
     @property
     def delay_ns(self) -> Int64s:

@@ -9,7 +9,7 @@ from typing import Literal, Self
 
 from noack.core.linear_systems import Matrix
 from noack.trigger.policy_settings import ModelMatrices, Size, WeightedSettings
-from noack.trigger.trigger_condition import QuadraticForm, empty_map, error_map
+from noack.trigger.trigger_condition import error_form
 from noack.trigger.trigger_rule import TriggerRule
 
 
@@ -49,4 +49,4 @@ class AbsoluteTrigger:
     initial_dynamic_variable = 0.0
 
     def trigger_rule(self, n: int) -> TriggerRule:
-        return TriggerRule(QuadraticForm(error_map(n, self.weight), empty_map(n)), floor=self.delta)
+        return TriggerRule(error_form(n, self.weight), floor=self.delta)

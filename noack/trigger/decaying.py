@@ -13,7 +13,7 @@ from typing import Literal, Self
 from noack.core.linear_systems import Matrix
 from noack.settings.section import NonNegative, Positive
 from noack.trigger.policy_settings import ModelMatrices, WeightedSettings
-from noack.trigger.trigger_condition import QuadraticForm, empty_map, error_map
+from noack.trigger.trigger_condition import error_form
 from noack.trigger.trigger_rule import TriggerRule
 
 
@@ -69,7 +69,7 @@ class DecayingTrigger:
     initial_dynamic_variable = 0.0
 
     def trigger_rule(self, n: int) -> TriggerRule:
-        form = QuadraticForm(error_map(n, self.weight), empty_map(n))
+        form = error_form(n, self.weight)
         return TriggerRule(form, self.beta, self.alpha_per_s, self.floor)
 
     def threshold(self, t_ns: float) -> float:

@@ -14,7 +14,7 @@ from typing import Literal, Self
 
 from noack.core.linear_systems import Matrix
 from noack.trigger.policy_settings import ModelMatrices, Size, WeightedSettings
-from noack.trigger.trigger_condition import QuadraticForm, empty_map, error_map
+from noack.trigger.trigger_condition import error_form
 from noack.trigger.trigger_rule import TriggerRule
 
 
@@ -46,5 +46,5 @@ class SendOnAreaTrigger:
     initial_dynamic_variable = 0.0
 
     def trigger_rule(self, n: int) -> TriggerRule:
-        form = QuadraticForm(error_map(n, self.weight), empty_map(n))
+        form = error_form(n, self.weight)
         return TriggerRule(form, floor=self.delta_s, integrates=True)

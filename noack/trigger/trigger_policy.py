@@ -84,6 +84,7 @@ class Trigger:
 
     def __init__(self, policy: Policy) -> None:
         self._policy = policy
+        self._rule: TriggerRule | None = None
         self._condition: TriggerCondition | None = None
         self._auxiliary = policy.initial_dynamic_variable
         self._rate = 0.0
@@ -104,17 +105,16 @@ class Trigger:
         An integral begins at 0 now.
         """
         self._event = (t_ns, x)
-        self._condition = condition = self._policy.trigger_rule(len(x)).after(t_ns, x)
+        self._condition = condition = self._condition_after(t_ns, x)
         if condition.integrates:
             self._auxiliary = self._rate = 0.0
         return condition
 
     def change(self, policy: Policy) -> None:
         """Continue with another policy, as if it had been in force at the last event."""
-        self._policy = policy
+        self._policy, self._rule = policy, None
         if self._event is not None:
-            t_ns, x = self._event
-            self._condition = policy.trigger_rule(len(x)).after(t_ns, x)
+            self._condition = self._condition_after(*self._event)
 
     def test(self, t_ns: int, x: Vector, e_s: Vector) -> TriggerDecision:
         """Decide whether a measurement is an event; call :meth:`start` first."""
@@ -157,6 +157,11 @@ class Trigger:
             self._auxiliary = float(auxiliary[last_index])
             self._rate = float(rates[last_index])
         return last_index if len(events) else None
+
+    def _condition_after(self, t_ns: int, x: Vector) -> TriggerCondition:
+        if self._rule is None:
+            self._rule = self._policy.trigger_rule(len(x))
+        return self._rule.after(t_ns, x)
 
     def _started(self) -> TriggerCondition:
         if self._condition is None:

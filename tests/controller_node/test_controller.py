@@ -12,6 +12,13 @@ from controller_node.controller import Controller, controller_of
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
 from noack.controllers.linear_feedback import LinearFeedback
+from noack.impairments.loss_guarantee import (
+    DeliveriesBetweenBursts,
+    LongestBurst,
+    LossesInWindow,
+    LossGuarantee,
+    LossRule,
+)
 from noack.protocol.machine_interface import Notice, Output, Record
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, tables
 from noack.protocol.wire_format import Flow, Message
@@ -26,6 +33,7 @@ def new_controller(
     x0: np.ndarray | None = None,
     phase_ns: int = MS,
     horizon_ns: int = 10**9,
+    constraints: Sequence[LossRule] = (),
     **more: Any,
 ) -> Controller:
     return Controller(
@@ -35,7 +43,7 @@ def new_controller(
         period_ns=2 * MS,
         phase_ns=phase_ns,
         horizon_ns=horizon_ns,
-        mansd=mansd,
+        guarantee=LossGuarantee((LongestBurst(mansd), *constraints)),
         x0=x0,
         **more,
     )
@@ -147,6 +155,23 @@ def test_a_violation_is_reported_exactly_when_losses_exceed_m_minus_1(mansd: int
         )
     # the count starts again
     assert notices(controller.handle(update(2 + gap, 78 * MS), 91 * MS)) == []
+
+
+@given(st.lists(st.booleans(), max_size=25))
+def test_further_constraints_are_checked_over_all_updates_so_far(delivered: list[bool]) -> None:
+    """At most 2 losses in 5, and 2 deliveries between bursts; each against its definition."""
+    window, recovery = LossesInWindow(2, 5), DeliveriesBetweenBursts(2)
+    controller = new_controller(mansd=30, x0=np.ones(2), constraints=(window, recovery))
+    last = -1
+    for i in (number for number, arrives in enumerate(delivered) if arrives):
+        found = notices(controller.handle(update(i, i * MS), i * MS))
+        ends = range(last + 1, i)  # the losses that this update shows
+        too_many = any(sum(not one for one in delivered[max(j - 4, 0) : j + 1]) > 2 for j in ends)
+        too_soon = i - last > 1 and delivered[last - 1 : last + 1] == [False, True]
+        assert [one.text.partition(" violated")[0] for one in found] == [
+            rule.name for rule, broken in ((window, too_many), (recovery, too_soon)) if broken
+        ]
+        last = i
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,11 @@
 """Beam search: if there are too many patterns, only the most promising of each kind are continued.
 
 All runs pass through the same time windows. At the end of each window the runs are thinned out. Of
-runs that nearly coincide, one remains. The runs are grouped by their number of consecutive losses
-and their part of the window; from each group first the best run is selected, then the second best,
-and so on. One half of the selection ranks runs by their value so far, the other half by their
-promise: the integral of the output's square over the next window, for the loop without events.
+runs that nearly coincide, one remains. The runs are grouped by the state of the guarantee's
+automaton and their part of the window; from each group first the best run is selected, then the
+second best, and so on. One half of the selection ranks runs by their value so far, the other half
+by their promise: the integral of the output's square over the next window, for the loop without
+events.
 """
 
 import numpy as np
@@ -70,13 +71,13 @@ class _Choice:
     def _kind(self, nodes: Nodes) -> Indices:
         since_s = nodes.t_s - nodes.t_s.min()
         part = np.minimum(since_s * _PARTS / self._window_s, _PARTS).astype(int)
-        return np.asarray(nodes.dropouts * (_PARTS + 1) + part)
+        return np.asarray(nodes.state * (_PARTS + 1) + part)
 
     def _distinct(self, nodes: Nodes) -> Indices:
         """Return, for each group of nearly equal runs, the one with the largest value."""
         z = self._scaled(nodes)
         size = np.abs(z).max() or 1.0
-        features = np.column_stack([nodes.t_s / self._window_s, z / size, nodes.dropouts])
+        features = np.column_stack([nodes.t_s / self._window_s, z / size, nodes.state])
         order = np.argsort(-nodes.value, kind="stable")
         _, first = np.unique(np.round(features[order] / _ALIKE), axis=0, return_index=True)
         return np.asarray(order[np.sort(first)])

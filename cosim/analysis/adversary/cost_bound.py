@@ -5,7 +5,8 @@ From x' = (A+BK) x + B p, p = K e_c, and the triangle inequality in L₂[t, ∞)
     ‖x‖_{L₂} ≤ √(x(t)ᵀ P x(t)) + ∫₀^∞‖e^{(A+BK)s}B U‖ds · ‖p‖_{L₂},  (A+BK)ᵀP + P(A+BK) = −I
 
 by Young's inequality for the convolution, with K = U R. By identity (I1) every pattern has
-‖R e_c‖ ≤ D level(t): D sums the gains of the present e_s and of M − 1 missed ones, at any distance.
+‖R e_c‖ ≤ D level(t): D sums the gains of the present e_s and of the longest burst of missed ones,
+at any distance.
 The bound is cheap and prunes the late part of the search tree. There is no comparable bound for
 suprema: they may occur at any time, and a bound from growth rates prunes only the last fraction of
 a second.
@@ -22,14 +23,18 @@ from noack.theory.enclosure import NotDecayingError, response
 from noack.theory.gains import ErrorGains, Output
 
 
-def cost_ceiling(system: ContinuousLoop, mansd: int, horizon_s: float) -> Ceiling | None:
-    """Return the bound for a loop; None if A + BK is not stable."""
+def cost_ceiling(
+    system: ContinuousLoop, longest_burst: int | None, horizon_s: float
+) -> Ceiling | None:
+    """Return the bound for a loop; None if A + BK is not stable, or bursts may be of any length."""
     from scipy.linalg import solve_continuous_lyapunov
 
+    if longest_burst is None:
+        return None
     loop, trigger = system.loop, system.decaying
     closed = loop.A + loop.B @ loop.K
     models = _models(system)
-    missing = models.now(Output.GAIN) + models.missing(Output.GAIN, mansd, 0.0)
+    missing = models.now(Output.GAIN) + models.missing(Output.GAIN, longest_burst, 0.0)
     try:
         pushed = response(closed, loop.B @ models.split_K[0])
     except NotDecayingError:

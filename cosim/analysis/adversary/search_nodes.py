@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from cosim.analysis.adversary.segments import SegmentFlow, Segments
 from cosim.simulation.continuous.continuous_run import TooManyEventsError
 from noack.core.linear_systems import Matrix, Vector
+from noack.impairments.loss_guarantee import LossAutomaton, LossGuarantee
 
 Indices = NDArray[np.int64]
 Flags = NDArray[np.bool_]
@@ -30,8 +31,8 @@ class Nodes(NamedTuple):
     """(N,)"""
     z: Matrix
     """(x, e_s, e_c), (N, 3n)."""
-    dropouts: Indices
-    """Current number of consecutive losses, (N,)."""
+    state: Indices
+    """State of the guarantee's automaton, (N,); under a cap alone, the consecutive losses."""
     value: Vector
     """The objective's value of the run up to ``t_s``, (N,)."""
     entry: Indices
@@ -83,12 +84,16 @@ class DecisionLog:
 
 
 class PatternSearch:
-    """A search through the patterns with at most ``mansd`` = M − 1 consecutive losses."""
+    """A search through the loss patterns that a guarantee allows."""
 
     def __init__(
-        self, flow: SegmentFlow, mansd: int, report: SearchReport = lambda step, nodes, value: None
+        self,
+        flow: SegmentFlow,
+        guarantee: LossGuarantee,
+        report: SearchReport = lambda step, nodes, value: None,
     ) -> None:
-        self.flow, self.mansd = flow, mansd
+        self.flow, self.guarantee = flow, guarantee
+        self.automaton = LossAutomaton(guarantee)
         self.step = ""
         """Name of the current step, for the report."""
         self.value = -np.inf
@@ -129,20 +134,24 @@ class PatternSearch:
         self.nodes += len(nodes.t_s)
         self._report(self.step, self.nodes, self.value)
         events = np.flatnonzero(segments.is_event)
-        losable = events[nodes.dropouts[events] < self.mansd]
-        these = np.concatenate([losable, events])
-        delivered = np.repeat([False, True], [len(losable), len(events)])
-        return after_events(nodes, segments, value, these, delivered, self._log)
+        after_loss = self.automaton.after_loss(nodes.state[events])
+        may = after_loss >= 0
+        these = np.concatenate([events[may], events])
+        delivered = np.repeat([False, True], [int(may.sum()), len(events)])
+        after_delivery = self.automaton.after_delivery(nodes.state[events])
+        state = np.concatenate([after_loss[may], after_delivery])
+        return after_events(nodes, segments, value, these, delivered, state, self._log)
 
 
 def after_events(
     nodes: Nodes, segments: Segments, value: Vector, these: Indices, delivered: Flags,
-    log: DecisionLog,
+    state: Indices, log: DecisionLog,
 ) -> Nodes:  # fmt: skip
     """Return the runs ``these``, (k,), just after the events at the end of their segments.
 
     ``delivered``, (k,), tells whether the update of each run arrives; the ``log`` receives that.
-    ``value``, (N,), has the values of the runs at the end of the segments.
+    ``state``, (k,), is the automaton's state after it. ``value``, (N,), has the values of the runs
+    at the end of the segments.
 
     Raises:
         TooManyEventsError: two events at the same time.
@@ -154,5 +163,4 @@ def after_events(
     z, n = segments.z[these], segments.z.shape[1] // 3
     z[:, n : 2 * n] = 0.0
     z[delivered, 2 * n :] = 0.0
-    dropouts = np.where(delivered, 0, nodes.dropouts[these] + 1)
-    return Nodes(t_s, z, dropouts, value[these], log.add(nodes.entry[these], delivered))
+    return Nodes(t_s, z, state, value[these], log.add(nodes.entry[these], delivered))

@@ -43,13 +43,13 @@ def find_worst(
     certificate: ScenarioCertificate | None = None,
     report: SearchReport = lambda step, nodes, value: None,
 ) -> Worst:
-    """Find the pattern with at most M − 1 consecutive losses that maximises the objective.
+    """Find the loss pattern that maximises the objective, of all that the guarantee allows.
 
     The loop is the paper's, in exact continuous time without network delay; the first update is
     delivered. The same arguments give the same result.
 
     Args:
-        resolved: the scenario; its ``network.mansd`` is used, its loss model only for comparison.
+        resolved: the scenario; its guarantee is used, its loss model only for comparison.
         objective: the objective.
         most_nodes: largest number of nodes of the search through all patterns; 0 for no search.
         beam: width of the beam search; 0 for no search.
@@ -76,7 +76,7 @@ def find_worst(
 
     own = simulated(network_fates(resolved))
     flow = SegmentFlow(system, measure, horizon_s, known_start=known_start)
-    search = PatternSearch(flow, resolved.network.mansd, report)
+    search = PatternSearch(flow, resolved.network.guarantee, report)
     exact = _search(search, tuple(own.delivered.tolist())[len(first) :], beam, most_nodes)
     run = simulated((*first, *search.pattern))
     valued = evaluate(run, measure)
@@ -105,7 +105,7 @@ def _search(search: PatternSearch, own: Pattern, beam: int, most_nodes: int) -> 
     if most_nodes > 0:
         ceiling = None
         if flow.measure.additive:
-            ceiling = cost_ceiling(flow.system, search.mansd, flow.horizon_s)
+            ceiling = cost_ceiling(flow.system, search.guarantee.longest_burst, flow.horizon_s)
         if search_tree(search, most_nodes, ceiling):
             return True
     search.step = "changes"

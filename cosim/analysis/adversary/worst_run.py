@@ -128,6 +128,7 @@ def document(
         "scenario": resolved.name,
         "mode": resolved.mode,
         "mansd": resolved.network.mansd,
+        "guarantee": resolved.network.guarantee.meaning,
         "horizon_s": resolved.horizon_s,
         "certificate": certificate.to_json(),
         "worst": {worst.objective.value: worst.to_json() for worst in found},
@@ -139,8 +140,8 @@ def print_worst(
 ) -> None:
     """Print the results and their loss patterns."""
     table = Table(
-        title=f"{resolved.name}: worst losses found, at most M − 1 = {resolved.network.mansd} "
-        f"consecutive, {resolved.horizon_s:g} s"
+        title=f"{resolved.name}: worst losses found, {resolved.network.guarantee.meaning}, "
+        f"{resolved.horizon_s:g} s"
     )
     for heading in ("", "no loss", "scenario's seed", "worst", "certified", "share of bound used"):
         table.add_column(heading, justify="right" if heading else "left")

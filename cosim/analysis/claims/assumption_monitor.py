@@ -32,7 +32,8 @@ class AssumptionMonitor:
         self._conditions = allowed_conditions(scenario)
         self._causes = {*causes_of(scenario)}
         """The assumptions that the run has not violated yet."""
-        self._lost = 0
+        self._states: dict[str, int] = {}
+        """States of the rules of the guarantee."""
         self._until_s = math.inf
         self.stopped: str | None = None
         """Reason why the monitor stopped; None while it is active."""
@@ -73,9 +74,7 @@ class AssumptionMonitor:
 
     @np.errstate(all="ignore")  # a run may diverge
     def _new_violations(self, seen: ObservedConditions) -> list[AssumptionViolation]:
-        found = seen.violations(self._conditions, self._causes, self._lost)
+        found = seen.violations(self._conditions, self._causes, self._states)
         new = [one for one in found if one.t_s < self._until_s]
         self._causes -= {one.cause for one in new}
-        counts = seen.losses.consecutive(self._conditions.delay_s, self._lost).value
-        self._lost = int(counts[-1]) if len(counts) else self._lost
         return new

@@ -4,7 +4,7 @@ import importlib
 import math
 import pkgutil
 from collections.abc import Iterator
-from functools import cache
+from functools import cache, cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -130,10 +130,7 @@ class ClaimEvaluation(RunEvidence):
         if self.record.scenario.protocol.acknowledges:
             what = "x_c − x_s is the sum of the missed jumps"
             return [void_claim(what, "(I1)", 0.0, _ACKNOWLEDGED)]
-        checks: dict[str, ClaimCheck] = {}
-        for samples in self.samples():
-            for key, check, bound in self._bounds(samples):
-                checks.setdefault(key, check).add(bound)
+        checks, _ = self._checked
         found = [checks[key].result() for key in checks if not key.startswith(_CERTIFIED)]
         for i, certificate in enumerate(self.certificates):
             if certificate.constants is None:
@@ -142,6 +139,24 @@ class ClaimEvaluation(RunEvidence):
             mine = f"{_CERTIFIED}{i} "
             found += [checks[key].result() for key in checks if key.startswith(mine)]
         return found
+
+    @cached_property
+    def _checked(self) -> tuple[dict[str, ClaimCheck], dict[str, list[Envelope]]]:
+        """The checks of all claims, and the curves of all bounds, from one pass over the run."""
+        checks: dict[str, ClaimCheck] = {}
+        curves: dict[str, list[Envelope]] = {}
+        columns, counts = self.record.slice_columns, self.facts.any_in_common
+        for samples in self.samples():
+            for key, check, bound in self._bounds(samples) if counts else ():
+                checks.setdefault(key, check).add(bound)
+            for key, envelope in self._envelopes(samples):
+                if envelope.quantity == "inter_event":  # the same line in every part
+                    curves.setdefault(key, [envelope])
+                    continue
+                keep = decimate(envelope.t_s, envelope.values, columns)
+                thin = envelope._replace(t_s=envelope.t_s[keep], values=envelope.values[keep])
+                curves.setdefault(key, []).append(thin)
+        return checks, curves
 
     def _bounds(self, samples: Samples) -> Iterator[tuple[str, ClaimCheck, Bound]]:
         """Yield each claim's name, a new check, and its bound at some samples."""
@@ -167,16 +182,7 @@ class ClaimEvaluation(RunEvidence):
         """The curves of all bounds; those of a long run are thinned."""
         if self.record.scenario.protocol.acknowledges:
             return []
-        curves: dict[str, list[Envelope]] = {}
-        columns = self.record.slice_columns
-        for samples in self.samples():
-            for key, envelope in self._envelopes(samples):
-                if envelope.quantity == "inter_event":  # the same line in every part
-                    curves.setdefault(key, [envelope])
-                    continue
-                keep = decimate(envelope.t_s, envelope.values, columns)
-                thin = envelope._replace(t_s=envelope.t_s[keep], values=envelope.values[keep])
-                curves.setdefault(key, []).append(thin)
+        _, curves = self._checked
         return [
             parts[0]._replace(
                 t_s=np.concatenate([one.t_s for one in parts]),

@@ -7,7 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.config.scenario import Scenario
+from noack.impairments.loss_guarantee import LongestBurst, LossRule
 from noack.theory.certificate import NetworkConditions
+from noack.theory.run_conditions import ideal_conditions
 
 _TOLERANCE_S = 1e-9
 
@@ -22,7 +24,6 @@ class VoidFrom(NamedTuple):
 
 
 CAUSES = {
-    "dropouts": "{:.0f} consecutive updates lost, {:.0f} allowed",
     "sampling": "no measurement for {:.4g} s, {:.4g} s allowed",
     "delay": "an update took effect after {:.4g} s, {:.4g} s allowed",
     "hold": "an input was {:.4g} s old, {:.4g} s allowed",
@@ -32,7 +33,11 @@ CAUSES = {
     "safe input": "the controller had no state and sent its safe input, largest entry {:.4g}",
     "restart": "the sensor was restarted: its first transmission is no event of the trigger",
 }
-"""The assumptions that a run can violate, each with its message: worst value and limit."""
+"""The assumptions about the schedule, each with the message of a violation: worst value and limit.
+
+The other assumptions are the rules of the guarantee, under their own names; "dropouts" is the limit
+of consecutive losses."""
+DROPOUTS = LongestBurst(0).name
 
 
 class SampledSeries(NamedTuple):
@@ -44,6 +49,13 @@ class SampledSeries(NamedTuple):
     def largest(self) -> float | None:
         """The largest value; None if there is none."""
         return float(self.value.max()) if len(self.value) else None
+
+    def excess(self, limit: float) -> tuple[float, float] | None:
+        """Return the first time above a limit, and the largest value; None if it is kept."""
+        beyond = np.flatnonzero(self.value > limit + _TOLERANCE_S)
+        if not len(beyond):
+            return None
+        return float(self.t_s[beyond[0]]), float(self.value.max())
 
     def peaks(self, since_s: float = 0.0) -> "SampledSeries":
         """Return the values that exceed all values before; those from ``since_s`` on start anew.
@@ -68,17 +80,22 @@ class PacketLosses(NamedTuple):
     """(k,) Time until a newer update took effect instead: infinite if the update was dropped, 0 if
     it was delivered or in flight, in between if it was delivered out of order (stale)."""
 
-    def consecutive(self, delay_s: float, before: int = 0) -> SampledSeries:
-        """Consecutive losses up to every event, with ``before`` losses before the first of them.
+    def consecutive(self, delay_s: float) -> SampledSeries:
+        """Consecutive losses up to every event."""
+        rule = LongestBurst(0)
+        return self.values(rule, delay_s, rule.start)[0]
+
+    def values(self, rule: LossRule, delay_s: float, state: int) -> tuple[SampledSeries, int]:
+        """The values of a rule at every event, and its state after them, from its ``state``.
 
         An update that was replaced within the allowed delay is not lost.
         """
-        counts, count = [], before
+        values = []
         for replaced_s in self.replaced_after_s.tolist():
             lost = replaced_s == np.inf or replaced_s > delay_s + _TOLERANCE_S
-            count = count + 1 if lost else 0
-            counts.append(count)
-        return SampledSeries(self.t_s, np.array(counts, dtype=np.float64))
+            state, value = rule.after(state, lost)
+            values.append(value)
+        return SampledSeries(self.t_s, np.array(values, dtype=np.float64)), state
 
 
 class AssumptionViolation(NamedTuple):
@@ -86,14 +103,10 @@ class AssumptionViolation(NamedTuple):
 
     t_s: float
     cause: str
-    """One of ``CAUSES``."""
+    """One of ``CAUSES``, or the name of a rule of the guarantee."""
     worst: float
-    limit: float
-
-    @property
-    def text(self) -> str:
-        """In words."""
-        return CAUSES[self.cause].format(self.worst, self.limit)
+    text: str
+    """In words."""
 
 
 class ObservedConditions(NamedTuple):
@@ -120,15 +133,27 @@ class ObservedConditions(NamedTuple):
     """Age at which the watchdog acts."""
 
     def violations(
-        self, conditions: NetworkConditions, causes: Collection[str] = tuple(CAUSES), lost: int = 0
+        self,
+        conditions: NetworkConditions,
+        causes: Collection[str] | None = None,
+        states: dict[str, int] | None = None,
     ) -> list[AssumptionViolation]:
-        """The conditions that the run violated, among the ``causes``.
+        """The conditions that the run violated, among the ``causes``; by default, among all.
 
-        ``lost`` is the number of consecutive losses before the first event.
+        ``states`` has the rules' states before the first event, by name, and receives those after
+        the last; by default the run begins here.
         """
+        found: list[AssumptionViolation] = []
+        states = {} if states is None else states
+        for rule in conditions.guarantee.rules:
+            state = states.get(rule.name, rule.start)
+            values, states[rule.name] = self.losses.values(rule, conditions.delay_s, state)
+            if (excess := values.excess(rule.limit)) is not None:
+                first_s, worst = excess
+                text = rule.violation(worst)
+                found.append(AssumptionViolation(first_s, rule.name, worst, text))
         start = SampledSeries(np.zeros(1), np.array([self.start_s]))
         every: dict[str, tuple[SampledSeries, float]] = {
-            "dropouts": (self.losses.consecutive(conditions.delay_s, lost), conditions.dropouts),
             "sampling": (self.sampling, conditions.sampling_s),
             "delay": (self.delay, conditions.delay_s),
             "hold": (self.hold, conditions.hold_s),
@@ -137,16 +162,15 @@ class ObservedConditions(NamedTuple):
             "safe input": (self.safe_input, -1.0),  # every value is a violation
             "restart": (self.restarts, 0.0),
         }
-        found = []
         for cause, (series, limit) in every.items():
-            beyond = np.flatnonzero(series.value > limit + _TOLERANCE_S)
-            if cause in causes and len(beyond):
-                first_s, worst = float(series.t_s[beyond[0]]), float(series.value.max())
-                found.append(AssumptionViolation(first_s, cause, worst, limit))
-        return found
+            if (excess := series.excess(limit)) is not None:
+                first_s, worst = excess
+                text = CAUSES[cause].format(worst, limit)
+                found.append(AssumptionViolation(first_s, cause, worst, text))
+        return [one for one in found if causes is None or one.cause in causes]
 
     def first_violation(
-        self, conditions: NetworkConditions, causes: Collection[str] = tuple(CAUSES)
+        self, conditions: NetworkConditions, causes: Collection[str] | None = None
     ) -> VoidFrom | None:
         """Return the time at which the run first violated a condition; None if never."""
         return earliest(VoidFrom(one.t_s, one.text) for one in self.violations(conditions, causes))
@@ -154,7 +178,7 @@ class ObservedConditions(NamedTuple):
     def summary(self) -> dict[str, float | None]:
         """The largest value of each condition."""
         return {
-            "dropouts": self.losses.consecutive(0.0).largest(),
+            DROPOUTS: self.losses.consecutive(0.0).largest(),
             "sampling_s": self.sampling.largest(),
             "delay_s": self.delay.largest(),
             "hold_s": self.hold.largest(),
@@ -194,4 +218,11 @@ def causes_of(scenario: Scenario) -> Collection[str]:
     """
     if scenario.protocol.acknowledges:
         return ()
-    return tuple(CAUSES) if scenario.coverage.is_certifiable else ("sampling",)
+    if not scenario.coverage.is_certifiable:
+        return ("sampling",)
+    return (*guarantee_causes(scenario), *CAUSES)
+
+
+def guarantee_causes(scenario: Scenario) -> Collection[str]:
+    """The names of the rules of a resolved scenario's guarantee."""
+    return [rule.name for rule in ideal_conditions(scenario).guarantee.rules]

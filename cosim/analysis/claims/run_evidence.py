@@ -19,6 +19,7 @@ from cosim.analysis.claims.observed_conditions import (
     VoidFrom,
     causes_of,
     earliest,
+    guarantee_causes,
 )
 from cosim.analysis.claims.trajectory_delta import trajectory_delta
 from cosim.record.align import AlignedRun, IdentityResidual, aligned_parts, in_common
@@ -34,7 +35,7 @@ from noack.theory.run_conditions import allowed_conditions, ideal_conditions, no
 from noack.theory.scenario_certificates import ScenarioCertificate, certify, certify_box
 
 _LONG_S = 1e300  # finite: the delay of an input that never arrived is infinite
-_ANY = NetworkConditions(sys.maxsize, *[_LONG_S] * 5)
+_ANY = NetworkConditions(sys.maxsize, _LONG_S, _LONG_S, _LONG_S, _LONG_S, _LONG_S)
 
 
 class RunPart(NamedTuple):
@@ -188,12 +189,13 @@ class RunEvidence:
         return self.observed.start_s
 
     def violations(self) -> list[AssumptionViolation]:
-        """The assumptions that the run violated, M − 1 included, each at the first time."""
+        """The assumptions that the run violated, the guarantee included, each at the first time."""
         scenario = self.record.scenario
         conditions = allowed_conditions(scenario)
         if self.part.start_error is not None:
             conditions = conditions._replace(start_s=0.0)
-        found = self.observed.violations(conditions, {*causes_of(scenario), "dropouts"})
+        causes = {*causes_of(scenario), *guarantee_causes(scenario)}
+        found = self.observed.violations(conditions, causes)
         return [one for one in found if one.t_s < self.part.until_s]
 
     @cached_property
@@ -214,9 +216,10 @@ class RunEvidence:
 
     @cached_property
     def paper_violation(self) -> VoidFrom | None:
-        """First violation of M − 1 or of u = K x_c, which the paper's theorems assume."""
-        limit = _ANY._replace(dropouts=self._schedule.dropouts)
-        causes = ("dropouts", "watchdog", "safe input", "restart")
+        """First violation of the guarantee or of u = K x_c, which the paper's theorems assume."""
+        schedule, rules = self._schedule, guarantee_causes(self.record.scenario)
+        limit = _ANY._replace(dropouts=schedule.dropouts, constraints=schedule.constraints)
+        causes = (*rules, "watchdog", "safe input", "restart")
         return earliest([self.observed.first_violation(limit, causes), self.first_gap])
 
     def violation_of(self, certificate: ScenarioCertificate) -> VoidFrom | None:

@@ -11,6 +11,10 @@ No output depends on the exact value of ``now_ns``. So it is only checked that `
 before the deadlines and does not decrease.
 """
 
+import gc
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
 
 from cosim.analysis.replay.machine_replay import MachineReplay
@@ -27,7 +31,8 @@ def replay(record: RunRecord) -> Replay:
 
     The record is read part by part, so that memory does not grow with the length of the run.
     """
-    with np.errstate(all="ignore"):  # a diverging run overflows and is replayed all the same
+    # A diverging run overflows and is replayed all the same.
+    with np.errstate(all="ignore"), _without_collection():
         machines = {role: MachineReplay(role, record) for role in LOOP_ROLES}
         messages = MessageComparison(record, machines)
         for part in record.slices():
@@ -36,3 +41,15 @@ def replay(record: RunRecord) -> Replay:
             messages.take(part)
     results = tuple(result for one in machines.values() for result in one.results)
     return Replay(processes=results, messages=messages.results())
+
+
+@contextmanager
+def _without_collection() -> Iterator[None]:
+    """Suspend the collection of cycles: a part has many objects, but no cycles."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()

@@ -47,6 +47,11 @@ _MOST_BYTES = 65_535
 """Largest size of a datagram; a damaged record may contain larger numbers."""
 
 
+_NOT_SENT = (Record, Notice)
+_LAST_RANK = 3  # of the differences at one input, those before count
+_DAMAGE = (ArithmeticError, LookupError, ValueError, CallerError)
+"""Errors of a machine that gets an input from a damaged record, which no run can have."""
+
 Numbers = NDArray[np.int64]
 
 
@@ -123,15 +128,12 @@ class _LifeReplay:
             start = _start(self._life.generation, owned)
             self._run = _Run(_MACHINES[self._role](self._scenario, start))
         order = self._in_order(owned)
-        self._run.load(owned, self._before)
-        for table, row in order:
-            if not self._run.step(table, row):
-                self._stopped = True
-                break
-            self._compared += 1
+        taken = self._run.replay(owned, order, self._before)
+        self._stopped |= taken < len(order)
+        self._compared += taken
         for table, rows in owned.items():
             self._before[table] += len(rows)
-        return self._run.take_sent()
+        return self._run.sent
 
     def result(self) -> ProcessReplay:
         generation, differs = (
@@ -148,25 +150,21 @@ class _LifeReplay:
             difference=min(found, key=lambda one: one.now_ns, default=None),
         )
 
-    def _in_order(self, owned: Slice) -> list[tuple[str, int]]:
-        """Return table and row of each input in order, up to the first gap."""
+    def _in_order(self, owned: Slice) -> Numbers:
+        """Return the places of the inputs in order, among the rows of all tables, up to a gap."""
         numbers = np.concatenate([rows["input"] for rows in owned.values()])
         numbers = numbers - self._life.generation * GENERATION
-        places = [(table, row) for table, rows in owned.items() for row in range(len(rows))]
         order = np.argsort(numbers, kind="stable")
         numbers = numbers[order]
-        in_order = [places[i] for i in order.tolist()]
         unexpected = np.flatnonzero(numbers != self._compared + np.arange(len(numbers)))
         if not len(unexpected):
-            return in_order
+            return order
         whole = int(unexpected[0])
         self._stopped = True
-        self._explain(owned, in_order, numbers, whole)
-        return in_order[:whole]
+        self._explain(owned, order, numbers, whole)
+        return order[:whole]
 
-    def _explain(
-        self, owned: Slice, in_order: list[tuple[str, int]], numbers: Numbers, whole: int
-    ) -> None:
+    def _explain(self, owned: Slice, order: Numbers, numbers: Numbers, whole: int) -> None:
         """Find out whether rows are missing before ``whole``, or its input number is wrong."""
         expected, suspect = self._compared + whole, whole
         complete = self._written == self._count
@@ -179,11 +177,20 @@ class _LifeReplay:
             wrong = np.flatnonzero(repeated | (numbers >= self._count))
             suspect = int(wrong[0]) if len(wrong) else whole
         self._missing_from = None
-        table, row = in_order[suspect]
+        table, row = _table_and_row(owned, int(order[suspect]))
         self._damage = difference(
             table, self._before[table] + row, int(owned[table]["now_ns"][row]),
             "the inputs are not numbered in turn", "input", int(numbers[suspect]), expected,
         )  # fmt: skip
+
+
+def _table_and_row(owned: Slice, place: int) -> tuple[str, int]:
+    """Return table and row of a place among the rows of all tables."""
+    for table, rows in owned.items():
+        if place < len(rows):
+            return table, place
+        place -= len(rows)
+    raise IndexError("the tables have fewer rows")
 
 
 def _start(generation: int, owned: Slice) -> Start:
@@ -202,66 +209,138 @@ class _Run:
     """A machine under replay."""
 
     def __init__(self, machine: Machine[Any]) -> None:
-        self._sent: list[Any] = []
         self.difference: ReplayDifference | None = None
+        self.sent: list[Any] = []
+        """Messages that the machine emitted in the newest part."""
         self._machine = machine
         self._before_ns: int | None = None
 
-    def load(self, owned: Slice, before: Mapping[str, int]) -> None:
-        """Load the next rows; ``before`` are the numbers of rows before them, by table."""
-        self._offsets = dict(before)
-        self._rows = {table: np.ascontiguousarray(rows) for table, rows in owned.items()}
-        self._recorded = {table: rows.tobytes() for table, rows in self._rows.items()}
-        self._now_ns = {table: rows["now_ns"].tolist() for table, rows in owned.items()}
-        self._messages = {table: list(_messages(table, rows)) for table, rows in owned.items()}
-        self._fresh = {table: np.zeros(1, rows.dtype) for table, rows in owned.items()}
+    def replay(self, owned: Slice, order: Numbers, before: Mapping[str, int]) -> int:
+        """Feed the next inputs, and compare the rows.
 
-    def take_sent(self) -> list[Any]:
-        """Return the messages that were emitted since the last call."""
-        sent, self._sent = self._sent, []
-        return sent
+        Args:
+            owned: the next rows by table.
+            order: places of the inputs among the rows of all tables, in order.
+            before: numbers of rows before them, by table.
 
-    def step(self, table: str, row: int) -> bool:
-        """Feed one input; return whether the machine took it."""
-        now_ns, message = self._now_ns[table][row], self._messages[table][row]
-        if self._before_ns is not None and now_ns < self._before_ns:
-            self._differs(table, row, "time runs backward", "now_ns", now_ns, self._before_ns)
-        self._before_ns = now_ns
-        try:
-            if isinstance(message, ParameterChange):
-                outputs = self._machine.announce(message, now_ns)  # type: ignore[attr-defined]
-            elif message is None:
-                due_ns = self._machine.next_deadline_ns()
-                if due_ns is None or now_ns < due_ns:
-                    self._differs(table, row, "acted before its deadline", "now_ns", now_ns, due_ns)
-                outputs = self._machine.on_timer(now_ns)
-            else:
-                outputs = self._machine.handle(message, now_ns)
-            self._compare(table, row, outputs)
-        except (ArithmeticError, LookupError, ValueError, CallerError) as error:
-            # A damaged record has values that no run can have.
-            self._differs(table, row, f"the machine cannot take this input: {error}")
-            return False
-        return True
-
-    def _compare(self, table: str, row: int, outputs: Sequence[Any]) -> None:
-        emitted = [output for output in outputs if isinstance(output, Record)]
-        self._sent += [output for output in outputs if not isinstance(output, Record | Notice)]
-        if [record.table for record in emitted] != [table]:
-            self._differs(table, row, "the machine does not answer with one row of this table")
-            return
-        fresh = self._fresh[table]
-        fresh[0] = emitted[0].row
-        size = fresh.itemsize
-        same = fresh.tobytes() == self._recorded[table][row * size : (row + 1) * size]
-        if not same and self.difference is None:
-            place = self._offsets[table] + row
-            self.difference = rows_differ(table, place, self._rows[table][row], fresh[0])
-
-    def _differs(self, table: str, row: int, what: str, *values: Any) -> None:
+        Returns:
+            How many inputs the machine took; it stops at one that it cannot take.
+        """
+        self._owned, self._order, self._offsets = owned, order.tolist(), before
+        self._found: list[tuple[int, int, ReplayDifference]] = []
+        outputs = self._feed(order)
+        taken = self._compare(outputs)
         if self.difference is None:
-            now_ns, place = self._now_ns[table][row], self._offsets[table] + row
-            self.difference = difference(table, place, now_ns, what, *values)
+            self.difference = min(self._found, key=lambda one: one[:2], default=(0, 0, None))[2]
+        self.sent = [
+            one for each in outputs[:taken] for one in each if not isinstance(one, _NOT_SENT)
+        ]
+        return taken
+
+    def _feed(self, order: Numbers) -> list[Sequence[Any]]:
+        """Return the machine's outputs by input."""
+        machine, outputs, before_ns = self._machine, list[Sequence[Any]](), self._before_ns
+        times = np.concatenate([rows["now_ns"] for rows in self._owned.values()])[order].tolist()
+        messages = [*itertools.chain(*itertools.starmap(_messages, self._owned.items()))]
+        try:
+            for i, now_ns in zip(self._order, times, strict=True):
+                if before_ns is not None and now_ns < before_ns:
+                    self._differs(
+                        len(outputs), 0, "time runs backward", "now_ns", now_ns, before_ns
+                    )
+                before_ns = now_ns
+                message = messages[i]
+                if message is None:
+                    due_ns = machine.next_deadline_ns()
+                    if due_ns is None or now_ns < due_ns:
+                        what = "acted before its deadline"
+                        self._differs(len(outputs), 1, what, "now_ns", now_ns, due_ns)
+                    outputs.append(machine.on_timer(now_ns))
+                elif isinstance(message, ParameterChange):
+                    outputs.append(machine.announce(message, now_ns))  # type: ignore[attr-defined]
+                else:
+                    outputs.append(machine.handle(message, now_ns))
+        except _DAMAGE as error:
+            self._cannot_take(len(outputs), error)
+        self._before_ns = before_ns
+        return outputs
+
+    def _compare(self, outputs: Sequence[Sequence[Any]]) -> int:
+        """Compare the emitted rows; return how many inputs the machine took."""
+        taken = len(outputs)
+        places: dict[str, list[int]] = {table: [] for table in self._owned}
+        emitted: dict[str, list[tuple[Any, ...]]] = {table: [] for table in self._owned}
+        tables = [*itertools.chain(*([table] * len(rows) for table, rows in self._owned.items()))]
+        for place, (i, each) in enumerate(zip(self._order, outputs, strict=False)):
+            table = tables[i]
+            answers = [one for one in each if isinstance(one, Record)]
+            if len(answers) == 1 and answers[0].table == table:
+                places[table].append(place)
+                emitted[table].append(answers[0].row)
+            else:
+                what = "the machine does not answer with one row of this table"
+                self._differs(place, 2, what)
+        begin = 0
+        for table, rows in self._owned.items():
+            at = np.array(places[table], np.int64)
+            recorded = rows[np.array(self._order, np.int64)[at] - begin]
+            begin += len(rows)
+            fresh, error = rows_of(emitted[table], rows.dtype)
+            if error is not None:
+                self._cannot_take(place := int(at[len(fresh)]), error)
+                taken = min(taken, place)
+            if (first := first_other(recorded[: len(fresh)], fresh)) is not None:
+                _, row = self._row(place := int(at[first]))
+                row += self._offsets[table]
+                found = rows_differ(table, row, recorded[first], fresh[first])
+                self._found.append((place, 2, found))
+        return taken
+
+    def _row(self, place: int) -> tuple[str, int]:
+        return _table_and_row(self._owned, self._order[place])
+
+    def _cannot_take(self, place: int, error: Exception) -> None:
+        # A damaged record has values that no run can have.
+        self._differs(place, _LAST_RANK, f"the machine cannot take this input: {error}")
+
+    def _differs(self, place: int, rank: int, what: str, *values: Any) -> None:
+        """Store a difference at an input; of several there, that of the least rank counts."""
+        if rank < _LAST_RANK and any(known == rank for _, known, _ in self._found):
+            return
+        table, row = self._row(place)
+        now_ns = int(self._owned[table]["now_ns"][row])
+        found = difference(table, self._offsets[table] + row, now_ns, what, *values)
+        self._found.append((place, rank, found))
+
+
+def rows_of(
+    emitted: Sequence[tuple[Any, ...]], dtype: np.dtype[np.void]
+) -> tuple[Rows, Exception | None]:
+    """Return emitted rows as rows of a table, up to the first that does not fit; and the error."""
+    rows = np.zeros(len(emitted), dtype)
+    try:
+        for name, values in zip(dtype.names or (), zip(*emitted, strict=True), strict=True):
+            field = dtype[name]
+            if field.shape:
+                rows[name] = np.concatenate(values).reshape(len(rows), *field.shape)
+            else:
+                rows[name] = np.array(values, field)
+    except _DAMAGE:
+        for i, row in enumerate(emitted):
+            try:
+                rows[i] = row
+            except _DAMAGE as error:
+                return rows[:i], error
+    return rows, None
+
+
+def first_other(one: Rows, other: Rows) -> int | None:
+    """Return the first of k rows that differs in any bit; None if they are equal."""
+    first, second = one.tobytes(), other.tobytes()
+    if first == second:
+        return None
+    bits = (np.frombuffer(data, np.uint8).reshape(len(one), -1) for data in (first, second))
+    return int(np.argmax((next(bits) != next(bits)).any(axis=1)))
 
 
 def _messages(table: str, rows: Rows) -> Iterator[Message | Datagram | ParameterChange | None]:
@@ -274,20 +353,19 @@ def _messages(table: str, rows: Rows) -> Iterator[Message | Datagram | Parameter
         ):
             yield ParameterChange(number, t_ns, _settings(data))
     elif table == NETEM_PACKET:
-        for flow, size, head in zip(
-            rows["flow"].tolist(), rows["size_bytes"].tolist(), rows["head"].tolist(), strict=True
+        for flow, size, head, t_ns in zip(
+            *(rows[name].tolist() for name in ("flow", "size_bytes", "head", "t_ns")), strict=True
         ):
             size_bytes = min(max(size, 0), _MOST_BYTES)
-            yield Datagram(flow, head.ljust(size_bytes, b"\0")[:size_bytes])
+            yield Datagram(flow, head.ljust(size_bytes, b"\0")[:size_bytes], t_ns)
     else:
         acknowledges = table == SENSOR_ACKNOWLEDGEMENT
         flow = Flow.ACKNOWLEDGEMENT if acknowledges else ROUTES[OWNER[table]].receives
         vectors, _ = received_vectors(table, rows)
-        for sequence, t_ns, vector in zip(
-            rows["sequence"].tolist(), rows["t_ns"].tolist(), vectors, strict=True
-        ):
-            # The copy has the memory layout of the decoder's vector: rounding may depend on it.
-            yield Message(flow, sequence, t_ns, vector.copy())
+        # The copy has the memory layout of the decoder's vector: rounding may depend on it.
+        copies = (vector.copy() for vector in vectors)
+        fields = rows["sequence"].tolist(), rows["t_ns"].tolist(), copies
+        yield from map(Message, itertools.repeat(flow), *fields)
 
 
 def _settings(data: bytes) -> dict[str, Any]:

@@ -109,7 +109,10 @@ class _Hop:
         self._leg, self._table, self._sender, self._flow = leg, table, sender, flow
         self._direction = ACKNOWLEDGEMENTS if flow is Flow.ACKNOWLEDGEMENT else UPDATES
         self._selects = table == NETEM_PACKET and acknowledges
-        self._sent: dict[int, Message] = {}
+        self._sent: list[Message] = []
+        """Messages that may still be received, in order of their numbers."""
+        self._numbers = np.zeros(0, np.int64)
+        """Their numbers."""
         self._survivors: set[int] = set()
         self._newest = -1
         self._received = self._read = 0
@@ -126,8 +129,8 @@ class _Hop:
         if self._selects:
             self._at = np.flatnonzero(rows["flow"] == self._direction)
             self._rows = rows[self._at]
-        mine = (message for message in self._sender.sent if message.flow is self._flow)
-        self._sent.update((message.sequence, message) for message in mine)
+        mine = [message for message in self._sender.sent if message.flow is self._flow]
+        self._add(mine)
         if self._table == NETEM_PACKET:
             self._compare_heads()
             if not self._selects:
@@ -144,7 +147,8 @@ class _Hop:
         self._received += len(self._rows)
         self._read += len(rows)
         # Every receiver accepts only messages that are newer than those before.
-        self._sent = {k: one for k, one in self._sent.items() if k >= self._newest}
+        first = int(np.searchsorted(self._numbers, self._newest))
+        self._sent, self._numbers = self._sent[first:], self._numbers[first:]
         self._survivors = {k for k in self._survivors if k >= self._newest}
 
     def result(self, *, network_is_whole: bool) -> MessagesReplay:
@@ -159,23 +163,43 @@ class _Hop:
             leg=self._leg, received=self._received, compared=self._compared, difference=found
         )
 
+    def _add(self, sent: list[Message]) -> None:
+        """Add messages; of several with the same number, the last one counts."""
+        numbers = np.array([message.sequence for message in sent], np.int64)
+        self._sent += sent
+        self._numbers = np.append(self._numbers, numbers)
+        if (np.diff(self._numbers) < 0).any():
+            order = np.argsort(self._numbers, kind="stable")
+            self._numbers = self._numbers[order]
+            self._sent = [self._sent[i] for i in order.tolist()]
+
     def _compare_vectors(self) -> None:
         """Compare sequence number, time and vector of the received messages."""
         rows = self._rows
         vectors, entries = received_vectors(self._table, rows)
-        fields = (rows["sequence"].tolist(), rows["t_ns"].tolist(), vectors)
-        for row, (sequence, t_ns, vector) in enumerate(zip(*fields, strict=True)):
-            if sequence <= self._newest:
+        numbers = rows["sequence"]
+        newest = np.maximum.accumulate(np.append(self._newest, numbers))
+        places = np.searchsorted(self._numbers, numbers, "right") - 1
+        known = np.flatnonzero((places >= 0) & (np.append(self._numbers, 0)[places] == numbers))
+        self._compared += len(known)
+        sent = [self._sent[place] for place in places[known].tolist()]
+        equal = np.zeros(len(rows), np.bool_)
+        if sent:
+            sent_ns = np.array([message.t_ns for message in sent], np.int64)
+            bits = np.array([message.vector for message in sent]).view(np.int64)
+            same = (vectors[known].view(np.int64) == bits).all(axis=1)
+            equal[known] = same & (rows["t_ns"][known] == sent_ns) & (numbers > newest[:-1])[known]
+        self._newest = int(newest[-1])
+        for row in np.flatnonzero(~equal).tolist():
+            sequence, t_ns = int(numbers[row]), int(rows["t_ns"][row])
+            if sequence <= newest[row]:
                 self._differs(row, "not newer than the message before", "sequence", sequence)
-            self._newest = max(self._newest, sequence)
             message = self._find(row, sequence, "sequence", sequence)
             if message is None:
                 continue
             if t_ns != message.t_ns:
                 self._differs(row, "differs from the message sent", "t_ns", t_ns, message.t_ns)
-            elif vector.tobytes() != message.vector.tobytes() and (
-                entry := first_entry(vector, message.vector)
-            ):
+            elif entry := first_entry(vectors[row], message.vector):
                 place, *values = entry
                 self._differs(row, "differs from the message sent", entries[place], *values)
 
@@ -194,6 +218,7 @@ class _Hop:
             message = self._find(row, sequence, "head", head)
             if message is None:
                 continue
+            self._compared += 1
             data = encoder.encode(message)
             expected = data[:PACKET_HEAD_BYTES].ljust(PACKET_HEAD_BYTES, b"\0")
             if head != expected:
@@ -216,9 +241,9 @@ class _Hop:
 
     def _find(self, row: int, sequence: int, column: str, value: object) -> Message | None:
         """Return the message of a number if its sender was replayed that far and sent it."""
-        if (message := self._sent.get(sequence)) is not None:
-            self._compared += 1
-            return message
+        place = int(np.searchsorted(self._numbers, sequence, "right")) - 1
+        if place >= 0 and self._numbers[place] == sequence:
+            return self._sent[place]
         kind = _CONTENT if sequence < 0 else _SENT
         self._differs(row, "was never sent", column, value, kind=kind)
         return None

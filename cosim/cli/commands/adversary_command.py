@@ -4,7 +4,6 @@ from enum import StrEnum
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from cosim.cli import command as cli
 from noack.core.errors import ExitStatus
@@ -76,5 +75,5 @@ def adversary(
     if json:
         cli.print_json(document(found, resolved, certificate))
     else:
-        print_worst(Console(), found, resolved, certificate)
+        print_worst(cli.console(), found, resolved, certificate)
     return ExitStatus.FAILED if any(worst.breaches for worst in found) else ExitStatus.OK

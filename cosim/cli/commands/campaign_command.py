@@ -2,14 +2,16 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 
 from cosim.cli import command as cli
 from cosim.cli import completion
 from noack.core.errors import CallerError, ExitStatus
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 _PER_CORE = 4
 """Maximum worker processes per core; more gain nothing, and use memory."""
@@ -68,7 +70,7 @@ def campaign(
     if json:
         cli.print_json(summary.document() | {"made": made, "files": [str(file) for file in files]})
     else:
-        print_summary(Console(), summary)
+        print_summary(cli.console(), summary)
         for written in files:
             print(written)
     return ExitStatus.FAILED if summary.breaches else ExitStatus.OK
@@ -89,7 +91,7 @@ def _worker_pool(workers: int | None, scheduler: str | None) -> Callable[[Any], 
 
 
 def _run(
-    console: Console, path: Path, start: Callable[[Any], Any], *, draws: int | None,
+    console: "Console", path: Path, start: Callable[[Any], Any], *, draws: int | None,
     out: Path | None,
 ) -> tuple[Any, int, list[Path]]:  # fmt: skip
     """Run or continue a campaign; return its summary, the number of new runs, the written files."""

@@ -3,7 +3,6 @@
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from cosim.cli import command as cli
 from noack.core.errors import ExitStatus
@@ -47,6 +46,6 @@ def certify(
     if json:
         cli.print_json(found.to_json())
     else:
-        print_certificates(Console(), found)
+        print_certificates(cli.console(), found)
     certified = any(certificate.constants for _, certificate in found)
     return ExitStatus.OK if certified else ExitStatus.FAILED

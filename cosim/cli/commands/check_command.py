@@ -3,13 +3,13 @@
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from rich.console import Console
-
 from cosim.cli import command as cli
 from noack.core.clock import NS_PER_S
 from noack.core.errors import ExitStatus
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from noack.config.scenario import Scenario
 
 _COMMENT = "# "
@@ -37,7 +37,7 @@ def check(
     resolved = resolve(cli.load_scenario(scenario, settings))
     new_trigger(policy_of(resolved))  # some need a stable loop, others a user's class
     verdicts = [assumption._asdict() for assumption in assumptions(resolved)]
-    console = Console()
+    console = cli.console()
     console.width -= len(_COMMENT)
     with console.capture() as captured:  # printed last: the plant may be rejected
         console.print("the paper's assumptions for this scenario:")
@@ -52,7 +52,7 @@ def check(
     return ExitStatus.OK
 
 
-def _print_plant(console: Console, resolved: "Scenario") -> None:
+def _print_plant(console: "Console", resolved: "Scenario") -> None:
     """Print a nonlinear plant's linearisation, and the defaults that depend on other keys."""
     from controller_node.controller import law_of
     from cosim.analysis.model_comparison import linearisation, linearisation_rows

@@ -1,16 +1,16 @@
 """``noack compare``: two or more runs, side by side."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from cosim.cli import command as cli
 from cosim.cli import completion
 from noack.core.errors import ExitStatus
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 
 @cli.command(cli.RUNS, 80, [
@@ -44,7 +44,7 @@ def compare(
     if json:
         cli.print_json(found.to_json() | {"overlay": str(out)})
         return ExitStatus.OK
-    console = Console()
+    console = cli.console()
     for run in found.runs:
         console.print(f"{run.label}  {run.title}  {run.directory}",
                       markup=False, highlight=False, soft_wrap=True)  # fmt: skip
@@ -56,7 +56,10 @@ def compare(
     return ExitStatus.OK
 
 
-def _table(title: str, labels: list[str], rows: list[tuple[str, ...]]) -> Table:
+def _table(title: str, labels: list[str], rows: list[tuple[str, ...]]) -> "Table":
+    from rich.markup import escape
+    from rich.table import Table
+
     table = Table(title=title)
     table.add_column("")
     for label in labels:

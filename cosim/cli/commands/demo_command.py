@@ -14,6 +14,7 @@ from cosim.cli.execute_run import RunOutput, run_processes
     ("noack demo --set speed=4 --set horizon_s=8", "takes 2 s of wall time"),
 ])  # fmt: skip
 def demo(
+    context: typer.Context,
     *,
     zoh: Annotated[
         bool, typer.Option("--zoh", help="Hold the last update (ZOH) instead of using a model.")
@@ -29,5 +30,6 @@ def demo(
     wanted = [*(['mode="zoh"'] if zoh else []), *(settings or ())]
     output = RunOutput(report, verbose, json)
     return run_processes(
-        lambda: cli.load_scenario("lane_following", wanted), runs, output, live=live
-    )
+        lambda: cli.load_scenario("lane_following", wanted), runs, output,
+        live=live, server=context.obj,
+    )  # fmt: skip

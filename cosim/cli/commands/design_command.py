@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 
 from cosim.cli import command as cli
 from noack.core.errors import CallerError, ExitStatus
@@ -114,7 +113,7 @@ def design(
     if json:
         cli.print_json(found.document() | {"files": [str(path) for path in written]})
     else:
-        pages.print_found(Console(), found)
+        pages.print_found(cli.console(), found)
         for path in written:
             print(path)
     if not found.confirmed:

@@ -3,7 +3,6 @@
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from cosim.cli import command as cli
 from cosim.cli.completion import scenarios
@@ -56,5 +55,5 @@ def doctor(
     if json:
         cli.print_json(document(machine, wanted, findings))
     else:
-        print_findings(Console(), wanted, findings)
+        print_findings(cli.console(), wanted, findings)
     return ExitStatus.FAILED if worst(findings) is FindingStatus.BAD else ExitStatus.OK

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from cosim.cli import command as cli
 from cosim.record.run_directory import chosen_run
@@ -42,5 +41,5 @@ def fidelity(
     if json:
         cli.print_json(found.as_json())
     else:
-        print_fidelity(Console(), found)
+        print_fidelity(cli.console(), found)
     return ExitStatus.OK if found.explained else ExitStatus.FAILED

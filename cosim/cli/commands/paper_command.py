@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from cosim.cli import command as cli
 from noack.core.errors import ExitStatus
@@ -35,5 +34,5 @@ def paper(
     if json:
         cli.print_json(found)
     else:
-        paper_run.print_claims(Console(), found)
+        paper_run.print_claims(cli.console(), found)
     return ExitStatus.OK

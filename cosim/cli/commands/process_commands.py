@@ -18,6 +18,7 @@ def _examples(role: str) -> list[tuple[str, str]]:
     ("noack record lane_following --session two --live", "beside another run"),
 ])  # fmt: skip
 def record(
+    context: typer.Context,
     scenario: cli.ScenarioArgument,
     *,
     settings: cli.SetOption = None,
@@ -34,7 +35,7 @@ def record(
     output = RunOutput(report, verbose, json)
     return run_processes(
         lambda: cli.load_scenario(scenario, settings), runs, output,
-        spawn=(RECORDER,), session=session, live=live,
+        spawn=(RECORDER,), session=session, live=live, server=context.obj,
     )  # fmt: skip
 
 

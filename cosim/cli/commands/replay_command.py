@@ -1,7 +1,5 @@
 """``noack replay``: repeats a run's recorded inputs and compares the outputs."""
 
-from rich.console import Console
-
 from cosim.cli import command as cli
 from cosim.record.run_directory import chosen_run
 from noack.core.errors import ExitStatus
@@ -31,5 +29,5 @@ def replay(
     if json:
         cli.print_json(found.document() | {"changed_since": changed})
     else:
-        print_replay(Console(), found, changed)
+        print_replay(cli.console(), found, changed)
     return ExitStatus.OK if found.bit_exact else ExitStatus.FAILED

@@ -1,5 +1,7 @@
 """``noack run``: a live run."""
 
+import typer
+
 from cosim.cli import command as cli
 from cosim.cli.execute_run import RunOutput, run_processes
 
@@ -10,6 +12,7 @@ from cosim.cli.execute_run import RunOutput, run_processes
     ("noack run lane_following --set network.mansd=9 --json", "M − 1 = 9; print JSON"),
 ])  # fmt: skip
 def run(
+    context: typer.Context,
     scenario: cli.ScenarioArgument,
     *,
     settings: cli.SetOption = None,
@@ -21,4 +24,7 @@ def run(
 ) -> int:
     """Run a scenario live: start all processes and record everything."""
     output = RunOutput(report, verbose, json)
-    return run_processes(lambda: cli.load_scenario(scenario, settings), runs, output, live=live)
+    return run_processes(
+        lambda: cli.load_scenario(scenario, settings), runs, output,
+        live=live, server=context.obj,
+    )  # fmt: skip

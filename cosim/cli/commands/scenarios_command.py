@@ -1,16 +1,17 @@
 """``noack scenarios``: the scenarios and campaigns that come with noack."""
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from cosim.cli import command as cli
 from cosim.cli import completion
 from cosim.shipped_files import KINDS, ShippedFile, all_shipped, text_of
 from noack.core.errors import ExitStatus
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 
 @cli.command(cli.FILES, 20, [
@@ -38,20 +39,22 @@ def scenarios(
             for kind, some in shipped.items()
         })  # fmt: skip
         return ExitStatus.OK
-    console = Console()
+    console = cli.console()
     for kind, some in shipped.items():
         console.print(kind, style="bold", highlight=False)
         _print_shipped(console, some)
     return ExitStatus.OK
 
 
-def _print_shipped(console: Console, some: Sequence[ShippedFile]) -> None:
+def _print_shipped(console: "Console", some: Sequence[ShippedFile]) -> None:
     """Print one line per file to a pipe, or a wrapped table to a terminal."""
     width = max(len(one.name) for one in some)
     if not console.is_terminal:
         for one in some:
             print(f"{one.name:{width}}  {one.description}")
         return
+    from rich.table import Table
+
     table = Table.grid(padding=(0, 2))
     table.add_column(min_width=width, no_wrap=True, style="cyan")
     table.add_column()

@@ -1,16 +1,16 @@
 """``noack set``: change the runtime parameters of a running run."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from cosim.cli import command as cli
 from cosim.cli import completion
 from noack.core.errors import CallerError, ExitStatus
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 
 @cli.command(
@@ -54,13 +54,13 @@ def set_(
     if json:
         cli.print_json(answer)
     elif wanted:
-        console = Console()
+        console = cli.console()
         console.print(
             f"{answer['name']}: {text_of(wanted)} from {answer['from_s']:.3f} s on",
             markup=False, highlight=False, soft_wrap=True,
         )  # fmt: skip
     else:
-        _print_parameters(Console(), answer)
+        _print_parameters(cli.console(), answer)
     return ExitStatus.OK
 
 
@@ -89,7 +89,10 @@ def parsed(words: list[str] | tuple[str, ...]) -> dict[str, Any]:
     return found
 
 
-def _print_parameters(console: Console, answer: dict[str, Any]) -> None:
+def _print_parameters(console: "Console", answer: dict[str, Any]) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
     from noack.config.runtime_parameters import SHORT, text_of
 
     short = {key: name for name, key in SHORT.items()}

@@ -4,9 +4,6 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from cosim.cli import command as cli
 from cosim.cli.execute_run import RunOutput, finalize_run, warn_of_violations
@@ -14,6 +11,8 @@ from noack.core.errors import ExitStatus
 from noack.core.number_format import number
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from cosim.analysis.run_summary import Summary
     from cosim.simulation.continuous.continuous_run import ContinuousRun
     from noack.config.scenario import Scenario
@@ -80,13 +79,15 @@ def _simulate_continuously(scenario: "Scenario", *, json: bool) -> int:
         cli.print_json(document(run, resolved))
     else:
         with np.errstate(all="ignore"):  # a run may diverge
-            _print_run(Console(), run, found)
+            _print_run(cli.console(), run, found)
     return ExitStatus(found["exit"]["status"])
 
 
-def _print_run(console: Console, run: "ContinuousRun", found: "Summary") -> None:
+def _print_run(console: "Console", run: "ContinuousRun", found: "Summary") -> None:
     """Print how the run ended, its key numbers, and its first 40 events."""
     import numpy as np
+    from rich.table import Table
+    from rich.text import Text
 
     from cosim.output.run_tables import loss_and_interval_rows, number_table
     from cosim.output.run_verdict import verdict

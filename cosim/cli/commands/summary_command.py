@@ -1,7 +1,5 @@
 """``noack summary``: the verdict and the tables of an earlier run."""
 
-from rich.console import Console
-
 from cosim.cli import command as cli
 from cosim.record.run_directory import chosen_run
 from noack.core.errors import ExitStatus
@@ -30,5 +28,5 @@ def summary(
     if json:
         cli.print_json(outcome.summary)
     else:
-        print_outcome(Console(), outcome, verbose=verbose)
+        print_outcome(cli.console(), outcome, verbose=verbose)
     return ExitStatus.OK

@@ -7,7 +7,6 @@ from collections.abc import Callable
 import numpy as np
 
 from cosim.measurement.live.probe_result import ProbeResult, counted, late_sends
-from cosim.measurement.relative_delay import relative_delays
 from noack.core.clock import NS_PER_S
 from noack.protocol.probe_format import (
     MAX_PROBES,
@@ -18,6 +17,7 @@ from noack.protocol.probe_format import (
     encode_probe,
 )
 from noack.traces.packet_trace import packet_trace
+from noack.traces.relative_delay import relative_delays
 
 _AFTER_END_NS = 2 * NS_PER_S
 _AFTER_SCHEDULE_NS = 5 * NS_PER_S
@@ -170,8 +170,8 @@ class ProbeReceiver:
         )
         notes = [self._ending()]
         if not self.is_same_host:
-            trace, comparison = relative_delays(trace)
-            notes += comparison.lines()
+            trace = relative_delays(trace)
+            notes += trace.notes
         notes += counted(self.ignored)
         return ProbeResult(trace, tuple(notes), kernel_drops)
 

@@ -11,6 +11,7 @@ from cosim.analysis.quantile_sketch import QuantileSketch
 from cosim.analysis.timing_statistics import latency_us, lateness_parts
 from cosim.output.report import signal_figures
 from cosim.output.report.axes import Bound, BoundKind
+from cosim.output.report.loss_figure import LossPanel, loss_figure
 from cosim.record.align import AlignedRun, aligned_parts
 from cosim.record.decimate import Reals, decimate, decimate_all
 from cosim.record.packet_outcomes import packet_outcomes
@@ -65,6 +66,7 @@ def pictures(
         "state-norm": lambda: _state_norm(record, _bounding(envelopes, "x")),
         "input": lambda: _input(record),
         "inter-event": lambda: _inter_event(record, _bounding(envelopes, "inter_event")),
+        "losses": lambda: _losses(record),
     }
     if record.kind == "live" if timed is None else timed:
         found |= {"lateness": lambda: _lateness(record), "latency": lambda: _latency(record)}
@@ -225,6 +227,30 @@ def _inter_event(record: RunRecord, lower_bounds: list[Bound]) -> RunFigure:
     )
 
 
+def _losses(record: RunRecord) -> RunFigure:
+    outcomes, network = packet_outcomes(record), record.scenario.network
+    bursts = outcomes.loss_bursts()
+    kept = "the guarantee" if network.enforce_mansd else "the assumption (not enforced)"
+    panels = [
+        LossPanel("Consecutive losses", "consecutive losses", "bursts", bursts,
+                  network.longest_burst)
+    ]  # fmt: skip
+    panels += [
+        LossPanel(f"Losses in {window.packets} updates", f"losses in {window.packets} consecutive "
+                  "updates", "positions", outcomes.losses_in(window.packets), window.losses)
+        for window in network.guarantee.windows[1:3]
+    ]  # fmt: skip
+    longest = int(bursts.max(initial=0))
+    return RunFigure(
+        "losses",
+        loss_figure(panels),
+        "Effective losses of updates: dropped, corrupted, or delivered out of order. "
+        f"Dashed: the largest number that {kept} allows: {network.guarantee.meaning}.",
+        f"{len(bursts)} bursts of losses, the longest of {longest}; at most "
+        f"{network.longest_burst} consecutive losses are allowed.",
+    )
+
+
 def _lateness(record: RunRecord) -> RunFigure:
     scenario = record.scenario
     period_us = scenario.timing.plant_period_ns / (1e3 * scenario.speed)
@@ -237,8 +263,8 @@ def _lateness(record: RunRecord) -> RunFigure:
         "lateness",
         signal_figures.lateness_figure(late_us, period_us),
         "Share of a process's steps with at least this lateness. Lateness is measured from the "
-        "deadline (plant, controller), the time of the measurement (sensor), or the event "
-        "(network).",
+        "deadline (plant, controller), the time of the measurement (sensor), or the arrival "
+        "of the datagram at the socket (network).",
         f"Complementary distribution of lateness on logarithmic axes; maximum: {longest}.",
     )
 

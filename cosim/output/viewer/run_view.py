@@ -78,8 +78,9 @@ def about(scenario: Scenario, kind: Kind = "live") -> str:
 
 Sensor and controller run **{hold}** between updates. The sensor transmits when
 {scenario.trigger.description}.
-The network ({network.loss.model.replace("_", "-")} loss) loses at most
-M − 1 = {network.mansd} consecutive packets. {scenario.protocol.summary}
+The network ({network.loss.model.replace("_", "-")} loss) guarantees:
+{network.guarantee.meaning}.
+{scenario.protocol.summary}
 
 * A finished run opens at its largest ‖e_c‖. **Colours** explains the colours.
 * **Picture**: the plant (solid), the sensor's model (outline) and the controller's model (dashed

@@ -246,7 +246,7 @@ class ViewFeed:
         if dropped.any():
             lost_ns = event_ns[dropped]
             self._view.drops(lost_ns[self._kept(lost_ns, np.zeros(len(lost_ns)))])
-        self._show_lateness("netem", event_ns, rows["now_ns"])
+        self._lateness("netem", rows)
 
     def _inputs(self, steps: Rows) -> None:
         if len(steps):
@@ -256,12 +256,10 @@ class ViewFeed:
 
     def _lateness(self, process: str, rows: Rows) -> None:
         if len(rows):
-            self._show_lateness(process, rows["t_ns"], rows["now_ns"])
-
-    def _show_lateness(self, process: str, t_ns: Times, now_ns: Times) -> None:
-        late_us = np.asarray((now_ns - t_ns) / (1e3 * self._scenario.speed), dtype=np.float64)
-        keep = self._kept(t_ns, late_us)
-        self._view.lateness(process, t_ns[keep], late_us[keep])
+            t_ns, late_ns = rows["t_ns"], rows["now_ns"] - rows["t_ns"]
+            late_us = np.asarray(late_ns / (1e3 * self._scenario.speed), dtype=np.float64)
+            keep = self._kept(t_ns, late_us)
+            self._view.lateness(process, t_ns[keep], late_us[keep])
 
 
 def _intervals_s(t_ns: Times, before_ns: int | None) -> NDArray[np.float64]:

@@ -84,10 +84,10 @@ def measured(columns: Mapping[str, NDArray[Any]], certified: float | None) -> di
 def certified_error(resolved: Scenario) -> float | None:
     """Return Δβ with ‖e_c‖_W ≤ Δβe^{−αt} for every plant and every x(0); None if there is none.
 
-    By identity (I1), Δ is the sum of the gains of the present error and of M − 1 lost ones, for any
-    inter-event times. It depends on the models only. It exists if the models decay faster than the
-    threshold (a zero-order hold does not), the threshold has no floor, and the network enforces the
-    cap.
+    By identity (I1), Δ is the sum of the gains of the present error and of the longest burst of
+    lost ones, for any inter-event times. It depends on the models only. It exists if the models
+    decay faster than the threshold (a zero-order hold does not), the threshold has no floor, and
+    the network enforces the guarantee.
     """
     network = resolved.network
     if not resolved.coverage.is_decaying or not network.enforce_mansd:
@@ -97,7 +97,7 @@ def certified_error(resolved: Scenario) -> float | None:
         return None
     models = error_gains(loop_of(resolved), trigger.alpha_per_s)
     try:
-        missing = models.missing(Output.WEIGHTED, network.mansd, 0.0)
+        missing = models.missing(Output.WEIGHTED, network.longest_burst, 0.0)
     except NotDecayingError:
         return None
     return (models.now(Output.WEIGHTED) + missing) * trigger.beta

@@ -104,7 +104,7 @@ def _normed(scenario: Scenario, norm: str, progress: Callable[[float], None]) ->
     alpha_per_s = MOST_RATE * decay_rate(scenario) / RATE_STEP
     beta = _LEVEL * float(np.linalg.norm(loop.x0))
     try:
-        weight = choose_weight(nominal, beta, alpha_per_s, scenario.network.mansd, progress)
+        weight = choose_weight(nominal, beta, alpha_per_s, scenario.network.longest_burst, progress)
     except NotDecayingError as error:
         raise CallerError(f"--weights chosen: {error}") from None
     return with_norm(scenario, weight)

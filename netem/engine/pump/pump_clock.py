@@ -7,8 +7,13 @@ from netem.engine.pump.pump_layout import Memory
 def relay_time_ns(memory: Memory) -> int:
     """Read the clock; the same as :meth:`noack.core.clock.RunClock.now_ns`."""
     pump = memory.pump[0]
-    wall_ns = clock_ns(CLOCK_MONOTONIC, memory.time) - pump.epoch_ns
-    return wall_ns if pump.speed == 1.0 else int(wall_ns * pump.speed)
+    return simulated_ns_of(memory, clock_ns(CLOCK_MONOTONIC, memory.time) - pump.epoch_ns)
+
+
+def simulated_ns_of(memory: Memory, wall_ns: int) -> int:
+    """Return the simulated time of a wall time."""
+    speed = memory.pump[0].speed
+    return wall_ns if speed == 1.0 else int(wall_ns * speed)
 
 
 def wall_ns_of(memory: Memory, simulated_ns: int) -> int:

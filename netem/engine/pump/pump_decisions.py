@@ -6,6 +6,7 @@ from netem.engine.pump import pump_layout as layout
 from netem.engine.pump.client_table import find, key_of
 from netem.engine.pump.libc_calls import ENOMEM, array_at
 from netem.engine.pump.payload_store import blocks_for, keep, pop, push
+from netem.engine.pump.pump_clock import simulated_ns_of
 from netem.engine.pump.pump_events import has_room, report_arrival
 from netem.engine.pump.pump_layout import Memory
 from netem.engine.pump.pump_records import record_packet, record_release
@@ -76,8 +77,10 @@ def decide(
         header = memory.in_headers[pump.batch_next]
         _read_arrival(memory)
         # Decision times ascend, so that a packet that is due between two arrivals leaves
-        # between them.
-        now_ns = max(pump.now_ns, min(pump.arrival_ns, pump.read_ns))
+        # between them. In a record, the time of the decision is the machine's input.
+        now_ns = max(pump.now_ns, pump.read_ns)
+        if pump.records == 0:
+            now_ns = max(pump.now_ns, min(pump.arrival_ns, pump.read_ns))
         reason = release_due(memory, state_like, now_ns)
         if reason != layout.CARRY_ON:
             return reason
@@ -178,7 +181,8 @@ def _read_arrival(memory: Memory) -> None:
     while left_bytes >= _HEAD_BYTES and place + 3 < len(words):
         used_bytes = (words[place] + 7) & ~7
         if words[place + 1] == _STAMP:
-            pump.arrival_ns = words[place + 2] * _NS + words[place + 3] - pump.real_ns
+            waited_ns = pump.real_ns - (words[place + 2] * _NS + words[place + 3])
+            pump.arrival_ns = pump.read_ns - simulated_ns_of(memory, waited_ns)
         left_bytes -= used_bytes
         place += used_bytes >> 3
 

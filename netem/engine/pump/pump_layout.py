@@ -44,7 +44,7 @@ PUMP = np.dtype(
         # Times are simulated and count from the relay's start; these two never decrease.
         ("now_ns", "<i8"),  # arrival of the current datagram, or its release time
         ("read_ns", "<i8"),  # the last reading of the clock
-        ("real_ns", "<i8"),  # offset of the real-time clock
+        ("real_ns", "<i8"),  # the real-time clock at the last receiving of datagrams
         ("stamps", "<i8"),  # 1: the kernel adds arrival timestamps
         ("arrival_ns", "<i8"),  # arrival of the datagram in the current receive buffer
         ("first_path", "<i8"),  # first row of the clients' return paths among the sockets

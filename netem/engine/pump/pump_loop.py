@@ -120,7 +120,7 @@ def _receive(memory: Memory) -> None:
     taken = libc.recvmmsg(fd, headers, pump.slots_in - begin, libc.MSG_DONTWAIT, 0)
     pump.read_ns = relay_time_ns(memory)
     if pump.stamps != 0:
-        pump.real_ns = libc.clock_ns(libc.CLOCK_REALTIME, memory.time) - pump.read_ns
+        pump.real_ns = libc.clock_ns(libc.CLOCK_REALTIME, memory.time)
     if taken > 0:
         pump.batch_socket = socket
         pump.batch_next = begin

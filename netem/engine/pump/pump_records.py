@@ -19,7 +19,7 @@ def record_packet(memory: Memory, direction: int, payload: int, decision: Packet
     row = memory.packets[pump.packet_rows]
     row.input = pump.inputs
     row.sequence = pump.first_number + decision.packet
-    row.t_ns = decision.arrival_ns
+    row.t_ns = min(pump.arrival_ns, decision.arrival_ns)
     row.now_ns = decision.arrival_ns
     row.flow = direction
     row.fate = decision.fate

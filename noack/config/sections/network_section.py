@@ -4,10 +4,11 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, FiniteFloat, model_validator
 
-from noack.impairments.constraints import longest_burst_of, require_consistent
+from noack.impairments.constraints import guarantee_of, require_consistent
 from noack.impairments.kinds import AnyImpairment
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import Constraints, LinkSettings, Mansd, require_scores
+from noack.impairments.loss_guarantee import LossGuarantee
 from noack.impairments.loss_models import Loss
 from noack.impairments.loss_models.lossless import NoLoss
 from noack.settings.section import ScenarioSection
@@ -86,7 +87,7 @@ class NetworkSection(ScenarioSection):
     @property
     def longest_burst(self) -> int:
         """Maximum number of consecutive losses that mansd and the constraints allow together."""
-        longest = longest_burst_of(self.mansd, self.constraints)
+        longest = self.guarantee.longest_burst
         assert longest is not None  # at most mansd
         return longest
 
@@ -105,3 +106,8 @@ class NetworkSection(ScenarioSection):
             first_delivered=self.initial_sync == "first_packet",
             limit=self.limit,
         )
+
+    @property
+    def guarantee(self) -> LossGuarantee:
+        """What mansd and the constraints say, also if the network does not enforce it."""
+        return guarantee_of(self.mansd, self.constraints)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from noack.impairments.feature import Constraint
+from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.settings.registry import kinds_in, union_of
 
 _KINDS = kinds_in(__name__, Constraint)
@@ -23,8 +24,13 @@ def longest_burst_of(mansd: int | None, constraints: Sequence[AnyConstraint]) ->
 
     None: there is no maximum.
     """
-    limits = [mansd, *(one.longest_burst for one in constraints)]
-    return min((limit for limit in limits if limit is not None), default=None)
+    return guarantee_of(mansd, constraints).longest_burst
+
+
+def guarantee_of(mansd: int | None, constraints: Sequence[AnyConstraint]) -> LossGuarantee:
+    """Return the rules of cap and constraints together."""
+    cap = () if mansd is None else (LongestBurst(mansd),)
+    return LossGuarantee((*cap, *(one.rule for one in constraints)))
 
 
 def require_consistent(mansd: int | None, constraints: Sequence[AnyConstraint]) -> None:

@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from noack.impairments.feature import Constraint, Table, Word
-from noack.impairments.link_records import LossWindow
+from noack.impairments.loss_guarantee import LossesInWindow
 from noack.impairments.quantities import COUNT
 from noack.impairments.word_reader import WordReader
 
@@ -46,12 +46,8 @@ class AtMost(Constraint):
         return [cls(losses=losses, window=window) for losses, window in pairs]
 
     @property
-    def longest_burst(self) -> int:
-        return self.losses
-
-    @property
-    def loss_window(self) -> LossWindow:
-        return LossWindow(self.losses, self.window)
+    def rule(self) -> LossesInWindow:
+        return LossesInWindow(self.losses, self.window)
 
     @property
     def scope(self) -> str:

@@ -6,6 +6,7 @@ from typing import Annotated, ClassVar, Literal, Self
 from pydantic import Field
 
 from noack.impairments.feature import Constraint, Word
+from noack.impairments.loss_guarantee import DeliveriesBetweenBursts
 from noack.impairments.quantities import COUNT
 
 
@@ -31,8 +32,8 @@ class Recovery(Constraint):
         return [cls(deliveries=deliveries) for deliveries in (1, 2, 3, 7)]
 
     @property
-    def least_deliveries(self) -> int:
-        return self.deliveries
+    def rule(self) -> DeliveriesBetweenBursts:
+        return DeliveriesBetweenBursts(self.deliveries)
 
     @property
     def scope(self) -> str:

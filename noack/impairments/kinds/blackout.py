@@ -1,14 +1,17 @@
 """Blackouts: intervals of time in which all packets are lost."""
 
 import re
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, FiniteFloat, model_validator
 
 from noack.core.clock import NS_PER_S
+from noack.core.errors import shortened
 from noack.impairments.feature import Behaviour, Impairment, StageTables, Table, Word, add_numbers
 from noack.impairments.link_records import (
     BLACKED_OUT,
@@ -20,9 +23,12 @@ from noack.impairments.link_records import (
 from noack.impairments.markov_chain import Chain, NotPredictableError
 from noack.impairments.quantities import OWN_TIME_S, TIME, time_text
 from noack.impairments.word_reader import WordReader
+from noack.settings.named_file import NamedFile
 
 _EXPECTED = "intervals of time, e.g. 2s-3s,5s-5500ms"
-_TimeS = Annotated[FiniteFloat, Field(ge=0, le=1e9)]
+MOST_INTERVALS = 1_000_000
+MOST_S = 1e9
+_TimeS = Annotated[FiniteFloat, Field(ge=0, le=MOST_S)]
 
 
 @dataclass(slots=True, kw_only=True)
@@ -41,12 +47,16 @@ def apply(packet: PacketContext, stage: BlackoutStage, memory: StageMemory) -> N
     times_ns, now_ns = packet.program.integers, decision.arrival_ns
     if stage.period_ns > 0 and now_ns >= 0:
         now_ns %= stage.period_ns
-    for place in range(stage.begin, stage.end, 2):
-        if now_ns < times_ns[place]:
-            return
-        if now_ns < times_ns[place + 1]:
-            refuse(decision, BLACKED_OUT)
-            return
+    low, high = 0, (stage.end - stage.begin) // 2  # low: the first interval that ends later
+    while low < high:
+        middle = (low + high) // 2
+        if times_ns[stage.begin + 2 * middle + 1] <= now_ns:
+            low = middle + 1
+        else:
+            high = middle
+    place = stage.begin + 2 * low
+    if place < stage.end and times_ns[place] <= now_ns:
+        refuse(decision, BLACKED_OUT)
 
 
 def _read(reader: WordReader) -> Table:
@@ -56,57 +66,107 @@ def _read(reader: WordReader) -> Table:
         if found is None:
             reader.wrong(f"expected {_EXPECTED}")
         intervals.append(tuple(reader.read(time, OWN_TIME_S) for time in found.groups()))
-    table: Table = {"intervals_s": intervals}
-    if reader.accept("every"):
-        table["every_s"] = reader.value(OWN_TIME_S)
-    return table
+    return {"intervals_s": intervals, **_read_every(reader)}
+
+
+def _read_outages(reader: WordReader) -> Table:
+    return {"file": reader.file("a file of outages"), **_read_every(reader)}
+
+
+def _read_every(reader: WordReader) -> Table:
+    return {"every_s": reader.value(OWN_TIME_S)} if reader.accept("every") else {}
 
 
 class Blackout(Impairment):
     """All packets that arrive during given intervals of time are lost."""
 
     kind: Literal["blackout"] = "blackout"
-    intervals_s: Annotated[tuple[tuple[_TimeS, _TimeS], ...], Field(min_length=1)]
+    intervals_s: Annotated[
+        tuple[tuple[_TimeS, _TimeS], ...], Field(min_length=1, max_length=MOST_INTERVALS)
+    ] | None = None  # fmt: skip
     """Begin and end of each, in seconds from the emulator's start (in a run: its epoch)."""
+    file: Annotated[str, Field(min_length=1)] | None = None
+    """Instead: a text file with begin and end of an interval on each line, e.g. 2s 3500ms."""
     every_s: Annotated[FiniteFloat, Field(ge=1e-6, le=1e9)] | None = None
     """The intervals repeat after this time."""
 
     words: ClassVar = (
         Word("blackout", "blackout 2s-3s", _read, grammar="blackout T-T[,T-T...] [every T]"),
         Word("every", "blackout 2s-3s every 10s", after="blackout BEGIN-END"),
+        Word("outages", "outages outages.txt", _read_outages, grammar="outages FILE [every T]"),
+        Word("every", "outages outages.txt every 60s", after="outages FILE"),
     )
     behaviour: ClassVar = Behaviour(BlackoutStage, apply)
     tc_missing: ClassVar = "blackouts"
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        ends = [t_s for interval in self.intervals_s for t_s in interval]
-        if any(a >= b for a, b in pairwise(ends)):
-            raise ValueError("intervals_s: each must end after it begins, and before the next")
-        if self.every_s is not None and ends[-1] > self.every_s:
-            raise ValueError(f"every_s: the intervals last longer, until {ends[-1]:g} s")
+        if (self.file is None) == (self.intervals_s is None):
+            raise ValueError("intervals_s: a blackout needs intervals_s, or a file")
+        if self.intervals_s is not None:
+            _require_order(self.intervals_s, self.every_s)
         return self
 
     @classmethod
     def examples(cls) -> Sequence[Self]:
-        return [cls(intervals_s=((0.0, 0.01), (0.02, 0.03)), every_s=0.05),
-                cls(intervals_s=((0.001, 0.02),))]  # fmt: skip
+        return [
+            cls(intervals_s=((0.0, 0.01), (0.02, 0.03)), every_s=0.05),
+            cls(intervals_s=((0.001, 0.02),)),
+            cls(file="my outages.txt", every_s=60.0),
+        ]
 
     def text(self) -> str:
-        parts = (f"{time_text(a)}-{time_text(b)}" for a, b in self.intervals_s)
         every = "" if self.every_s is None else f" every {time_text(self.every_s)}"
+        if self.intervals_s is None:
+            return f"outages {shlex.quote(self.file or '')}{every}"
+        parts = (f"{time_text(a)}-{time_text(b)}" for a, b in self.intervals_s)
         return f"blackout {','.join(parts)}{every}"
 
     def meaning(self) -> str:
+        every = "" if self.every_s is None else f", every {time_text(self.every_s)}"
+        if self.intervals_s is None:
+            return f"loses every packet in the intervals of {self.file}{every}"
         parts = [f"{time_text(begin)} to {time_text(end)}" for begin, end in self.intervals_s[:4]]
         more = ", ..." if len(self.intervals_s) > 4 else ""
-        every = "" if self.every_s is None else f", every {time_text(self.every_s)}"
         return f"loses every packet from {', '.join(parts)}{more} after the start{every}"
 
     def stage(self, tables: StageTables) -> BlackoutStage:
+        if self.intervals_s is None:
+            raise ValueError(f"{self.file}: the intervals have not been read")
         times_ns = [round(t_s * NS_PER_S) for interval in self.intervals_s for t_s in interval]
         begin, end = add_numbers(tables.integers, times_ns)
         return BlackoutStage(begin=begin, end=end, period_ns=round((self.every_s or 0) * NS_PER_S))
 
     def chains(self) -> Sequence[Chain]:
         raise NotPredictableError("losses in a blackout depend on when packets arrive")
+
+    def without_files(self, folder: Path, place: str) -> Self:
+        if self.file is None:
+            return self
+        file = NamedFile(self.file, folder, place)
+        intervals_s = []
+        for number, line in file.lines():
+            try:
+                begin_s, end_s = map(OWN_TIME_S.read, line.split())
+            except ValueError:
+                shown = shortened(line, 40)
+                file.wrong(f"line {number}: {shown!r}: expected begin and end, e.g. 2s 3500ms")
+            intervals_s.append((begin_s, end_s))
+            try:
+                _require_order(intervals_s[-2:], self.every_s)
+            except ValueError as error:
+                file.wrong(f"line {number}: {str(error).partition(': ')[2]}")
+        if not 1 <= len(intervals_s) <= MOST_INTERVALS:
+            file.wrong(f"has {len(intervals_s)} intervals; expected 1 to {MOST_INTERVALS}")
+        return self.model_copy(update={"intervals_s": tuple(intervals_s), "file": None})
+
+
+def _require_order(intervals_s: Sequence[tuple[float, float]], every_s: float | None) -> None:
+    """Raise ValueError if intervals overlap, are empty or out of range, or exceed the period."""
+    ends = [t_s for interval in intervals_s for t_s in interval]
+    if any(a >= b for a, b in pairwise(ends)):
+        raise ValueError("intervals_s: each must end after it begins, and before the next")
+    if not 0 <= ends[0] <= ends[-1] <= MOST_S:
+        raise ValueError(f"intervals_s: must lie between 0 and {MOST_S:g} s")
+    if every_s is not None and ends[-1] > every_s:
+        raise ValueError(f"every_s: the intervals last longer, until {ends[-1]:g} s")

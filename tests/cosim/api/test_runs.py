@@ -101,7 +101,9 @@ def test_an_invalid_run_gives_one_line(tmp_path: Path) -> None:
         noack.open_run(tmp_path)
 
 
-@pytest.mark.parametrize("name", ["states", "errors", "state-norm", "input", "inter-event"])
+@pytest.mark.parametrize(
+    "name", ["states", "errors", "state-norm", "input", "inter-event", "losses"]
+)
 def test_a_figure_is_shown_by_a_notebook(simulated: noack.Run, name: str) -> None:
     figure = simulated.plot(name)
     assert isinstance(figure, Figure)

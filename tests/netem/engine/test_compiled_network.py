@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from hypothesis import given, settings
@@ -186,3 +186,29 @@ def test_changes_during_the_run_apply_from_the_same_datagram_on(
             machines.arrive(bytes(size), 0, now_ns)
         machines.let_out(NEVER_NS)
         machines.received()
+
+
+class _Rows(list[Any]):
+    def extend_table(self, table: str, rows: Any) -> None:
+        self.extend(rows.tolist())
+
+
+@pytest.mark.parametrize("speed", [1.0, 0.25])
+def test_arrival_is_when_the_datagram_reached_the_socket(speed: float) -> None:
+    """It is read later. The kernel's real-time clock may be adjusted by a millisecond meanwhile."""
+    clock = RunClock(time.monotonic_ns() - 10**9, speed)
+    resolved = network(LinkSettings(), LinkSettings(), "none")
+    with endpoints(*["127.0.0.1"] * 5) as (sender, sensor, controller, *receivers):
+        peers = dict(zip((name_of(sensor), name_of(controller)), receivers, strict=True))
+        with closing(CompiledNetwork(cast(Scenario, resolved), BEGINNING, compiled_pump())) as one:
+            one.open(clock, sender, peers, name_of(controller))
+            before_ns = clock.now_ns()
+            sensor.sendto(b"x", name_of(receivers[0]))
+            after_ns = clock.now_ns()
+            time.sleep(0.05)
+            rows = _Rows()
+            read_ns = clock.now_ns()
+            one.drive(read_ns + 10**6, rows)
+    ((_, _, t_ns, now_ns, *_),) = rows
+    assert before_ns - 10**6 <= t_ns <= after_ns + 10**6
+    assert now_ns >= read_ns

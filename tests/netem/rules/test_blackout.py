@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from netem.link_machine import Link
 from netem.words.words_to_settings import settings_of
+from noack.impairments.link_settings import read_files
 
 NS = 10**9
 
@@ -41,3 +42,15 @@ def test_only_packets_that_must_pass_are_delivered(decide: Any) -> None:
     np.testing.assert_array_equal(capped != 0, in_blackout)
     for begin in (100, 600):  # 200 consecutive packets
         assert capped[begin : begin + 200].tolist() == [5, 5, 5, 2] * 50
+
+
+@given(st.lists(st.integers(1, 9), min_size=2, max_size=40), st.integers(0, 400))
+def test_outages_of_a_file_are_a_blackout_of_these_intervals(
+    tmp_path_factory: Any, gaps: list[int], t_ms: int
+) -> None:
+    ends = np.cumsum(gaps)[: len(gaps) // 2 * 2].reshape(-1, 2)
+    file = tmp_path_factory.mktemp("outages") / "outages.txt"
+    file.write_text("# from a log\n" + "".join(f"{a}ms {b / 1000}s\n\n" for a, b in ends))
+    link = Link(read_files(settings_of(f"outages {file}"), file.parent), 0, "a")
+    inside = bool(((ends[:, 0] <= t_ms) & (t_ms < ends[:, 1])).any())
+    assert link.decide(0, 1, t_ms * 10**6).fate == (5 if inside else 0)

@@ -96,7 +96,7 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
     ({"words": 3}, "words = 3: should be a table"),
     ({"reverse": {"mandsd": 3}}, "reverse.mandsd = 3: unknown key; did you mean mansd?"),
     ({"reverse": {"impairments": [{"kind": "dely"}]}}, 'reverse.impairments.0.kind = "dely": '
-     "must be one of blackout, corrupt, delay, duplicate, loss, rate, reorder; did you mean "),
+     "must be one of blackout, corrupt, delay, duplicate, loss, opportunities, rate, reorder, "),
     ({"forward": {"impairments": [{"kind": "loss", "loss": {"model": "bernoulli",
       "probability": 2}}]}}, "forward.impairments.0.loss.probability = 2: should be less than "),
     ({"forward": {"impairments": [{"kind": "delay", "loss_correlation": 0.5}]}},

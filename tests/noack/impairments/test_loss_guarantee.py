@@ -8,13 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from noack.impairments.loss_guarantee import (
+    DeliveriesBetweenBursts,
     LongestBurst,
     LossAutomaton,
     LossesInWindow,
     LossGuarantee,
     LossHistory,
     LossRule,
-    Recovery,
 )
 
 LENGTH = 11
@@ -25,8 +25,8 @@ GUARANTEES = [
     (LossesInWindow(1, 2),),
     (LossesInWindow(2, 5),),
     (LossesInWindow(3, 4), LossesInWindow(4, 9)),
-    (LongestBurst(2), Recovery(3)),
-    (LossesInWindow(3, 7), Recovery(2), LongestBurst(2)),
+    (LongestBurst(2), DeliveriesBetweenBursts(3)),
+    (LossesInWindow(3, 7), DeliveriesBetweenBursts(2), LongestBurst(2)),
 ]
 
 
@@ -38,7 +38,7 @@ def keeps(lost: tuple[bool, ...], rule: LossRule) -> bool:
     if isinstance(rule, LossesInWindow):
         ends = range(1, len(lost) + 1)
         return all(sum(lost[max(i - rule.window, 0) : i]) <= rule.limit for i in ends)
-    assert isinstance(rule, Recovery)
+    assert isinstance(rule, DeliveriesBetweenBursts)
     return all(length >= rule.deliveries for value, length in runs[1:-1] if not value)
 
 

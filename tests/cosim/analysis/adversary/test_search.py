@@ -19,11 +19,13 @@ from cosim.analysis.adversary.search_nodes import Nodes, PatternSearch
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load, validate
+from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.theory.run_conditions import ideal_conditions
 from noack.theory.scenario_certificates import certify
 from tests.cosim.analysis.adversary.scenarios import every_run, flow_of, scenarios, simulate
 
 LANE = Path(__file__).parents[4] / "scenarios" / "lane_following.toml"
+CAP = LossGuarantee((LongestBurst(4),))
 MANY = settings(suppress_health_check=list(HealthCheck), phases=[Phase.generate])
 
 
@@ -50,7 +52,7 @@ def test_the_search_finds_the_worst_of_all_patterns(resolved: Scenario) -> None:
         assert worst.exact
         assert signed(worst) == pytest.approx(expected, rel=1e-9)
         assert objective is Objective.COST or not worst.breaches, worst
-        tree = PatternSearch(flow, resolved.network.mansd)
+        tree = PatternSearch(flow, resolved.network.guarantee)
         assert search_tree(tree, 10**6)
         assert tree.value == pytest.approx(expected, rel=1e-6)
 
@@ -97,7 +99,7 @@ def lane(*settings: str) -> Scenario:
 @pytest.mark.parametrize("objective", Objective)
 def test_a_beam_of_32_runs_comes_within_one_percent_of_all_patterns(objective: Objective) -> None:
     flow = flow_of(lane("horizon_s=16"), objective)
-    every, beam = PatternSearch(flow, 4), PatternSearch(flow, 4)
+    every, beam = PatternSearch(flow, CAP), PatternSearch(flow, CAP)
     assert search_tree(every, 10**4)
     search_beam(beam, 32, window_s=0.8)
     assert every.value - 0.01 * abs(every.value) <= beam.value
@@ -107,7 +109,7 @@ def test_a_beam_of_32_runs_comes_within_one_percent_of_all_patterns(objective: O
 
 def test_the_search_stops_at_its_budget_and_reports_it() -> None:
     resolved = lane("horizon_s=6")
-    search = PatternSearch(flow_of(resolved, Objective.ERROR), 4)
+    search = PatternSearch(flow_of(resolved, Objective.ERROR), CAP)
     assert not search_tree(search, 10)
     assert search.nodes <= 10
     assert not find_worst(resolved, Objective.ERROR, most_nodes=0, beam=4).exact
@@ -152,7 +154,7 @@ def test_no_run_costs_more_than_the_bound(resolved: Scenario) -> None:
 
 def test_the_cost_bound_prunes_the_tree_without_missing_the_worst() -> None:
     flow = flow_of(lane("horizon_s=20"), Objective.COST)
-    every, fewer = PatternSearch(flow, 4), PatternSearch(flow, 4)
+    every, fewer = PatternSearch(flow, CAP), PatternSearch(flow, CAP)
     assert search_tree(every, 10**5)
     fewer.offer(every.value * (1 - 1e-9), ())
     assert search_tree(fewer, 10**5, cost_ceiling(flow.system, 4, 20.0))

@@ -15,6 +15,7 @@ from cosim.analysis.adversary.polynomial_curves import Stack, curve_stack, peak_
 from cosim.simulation.continuous.bernstein import curve_basis
 from cosim.simulation.continuous.continuous_loop import LoopState
 from noack.config.scenario import Scenario
+from noack.impairments.loss_guarantee import LossAutomaton
 from tests.cosim.analysis.adversary.scenarios import flow_of, scenarios, simulate
 
 STATES = 10
@@ -57,7 +58,7 @@ def test_the_value_of_a_pattern_is_that_of_its_run(resolved: Scenario) -> None:
     runs = [simulate(resolved, first + pattern) for pattern in wanted]
     for objective in Objective:
         flow = flow_of(resolved, objective)
-        values, patterns = follow(flow, resolved.network.mansd, wanted)
+        values, patterns = follow(flow, LossAutomaton(resolved.network.guarantee), wanted)
         for value, pattern, run in zip(values, patterns, runs, strict=True):
             assert tuple(run.delivered.tolist()) == first + pattern
             assert value == pytest.approx(evaluate(run, flow.measure).value, rel=1e-6)

@@ -28,7 +28,7 @@ from noack.core.errors import ExitStatus, MachineError
 from tests.cosim.output.report.conftest import HOSTILE, make_record, scenario_of
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
-FIGURES = ["states", "errors", "state-norm", "input", "inter-event"]
+FIGURES = ["states", "errors", "state-norm", "input", "inter-event", "losses"]
 TIMED = ["lateness", "latency"]
 CLAIM = {
     "what": "controller error", "source": "theorem T", "bound": "‖e_c‖ ≤ 5 β e^(−αt)",

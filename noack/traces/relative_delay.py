@@ -54,11 +54,11 @@ class ClockComparison:
         return lines
 
 
-def relative_delays(trace: PacketTrace) -> tuple[PacketTrace, ClockComparison]:
+def relative_delays(trace: PacketTrace) -> PacketTrace:
     """Return the trace with relative delays, without drift; the smallest delay is 0."""
     here = np.flatnonzero(~trace.lost)
     if not len(here):
-        return trace, ClockComparison(None)
+        return trace
     sent_ns = trace.sent_ns[here]
     delay_ns = trace.received_ns[here] - sent_ns
     delay_ns = delay_ns - delay_ns.min()
@@ -71,7 +71,7 @@ def relative_delays(trace: PacketTrace) -> tuple[PacketTrace, ClockComparison]:
     received[here] = sent_ns + delay_ns - delay_ns.min()
     known = slope * 1e6 if is_plausible or (slope == 0 and len(here) >= _FEWEST) else None
     comparison = ClockComparison(None if step_ns else known, step_ns, step_at_ns)
-    return replace(trace, received_ns=received), comparison
+    return replace(trace, received_ns=received).noted(*comparison.lines())
 
 
 def envelope_slope(t: NDArray[np.int64], y: NDArray[np.int64]) -> float:

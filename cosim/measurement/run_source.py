@@ -1,0 +1,39 @@
+"""Packet traces from run directories: the updates, from the emulator to the controller."""
+
+from pathlib import Path
+
+import numpy as np
+
+from cosim.record.packet_outcomes import packet_outcomes
+from cosim.record.run_record import load_record
+from noack.core.errors import CallerError
+from noack.protocol.record_tables import CONTROLLER_DELIVERY
+from noack.traces.packet_trace import LOST_NS, PacketTrace, packet_trace
+
+
+def read_run(run_dir: Path) -> PacketTrace:
+    """Return the trace of a run's updates: sent when they reached the emulator.
+
+    Updates that were in flight at the end are left out.
+
+    Raises:
+        NoackError: it is not a run, or has no updates.
+    """
+    record = load_record(run_dir)
+    outcomes = packet_outcomes(record)
+    arrived = record.columns(CONTROLLER_DELIVERY, "sequence", "now_ns")
+    numbers, first = np.unique(arrived["sequence"], return_index=True)
+    received_ns = np.full(len(outcomes.sequence), LOST_NS)
+    if len(numbers):
+        at = np.minimum(np.searchsorted(numbers, outcomes.sequence), len(numbers) - 1)
+        here = numbers[at] == outcomes.sequence
+        received_ns[here] = arrived["now_ns"][first[at[here]]]
+    sent_ns, lost = outcomes.now_ns, received_ns == LOST_NS
+    ended = ~(outcomes.in_flight & lost)
+    if not ended.any():
+        raise CallerError(f"{run_dir}: no updates reached the network emulator")
+    # Numbers of restarted sensors begin anew far above; the order at the emulator has no gaps.
+    trace = packet_trace(sent_ns[ended], np.maximum(received_ns, sent_ns)[ended], lost[ended])
+    flying = int((~ended).sum())
+    notes = [f"left out: {flying} updates in flight at the end"] if flying else []
+    return trace.noted("the updates of the run, from emulator to controller", *notes)

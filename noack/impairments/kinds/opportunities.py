@@ -1,0 +1,249 @@
+"""Delivery opportunities from a trace of mahimahi; see :mod:`noack.impairments.delivery_queue`."""
+
+import shlex
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from noack.core.clock import NS_PER_S
+from noack.core.errors import shortened
+from noack.impairments.delivery_queue import (
+    OPPORTUNITY_BYTES,
+    OpportunityQueue,
+    OpportunityStage,
+    carry_packet,
+    has_room,
+)
+from noack.impairments.feature import Behaviour, Impairment, StageTables, Table, Word, add_numbers
+from noack.impairments.link_records import (
+    DELIVERED,
+    NEVER_NS,
+    OVERFLOWED,
+    PacketContext,
+    StageMemory,
+    refuse,
+)
+from noack.impairments.quantities import COUNT, SIGNED_COUNT, rate_text, time_text
+from noack.impairments.trace_offset import (
+    LONGEST_NS,
+    Offset,
+    offset_meaning,
+    offset_ns,
+    offset_text,
+    read_offset,
+    require_inside,
+)
+from noack.impairments.word_reader import WordReader
+from noack.settings.named_file import NamedFile
+
+MOST_TIMES = 2_000_000
+_NS_PER_MS = NS_PER_S // 1000
+_LONGEST_MS = LONGEST_NS // _NS_PER_MS
+_QUEUE = 1000
+_HEADERS_BYTES = 32
+_EXPECTED = "times in ms that do not descend, e.g. 0,1,5"
+
+
+def apply(packet: PacketContext, stage: OpportunityStage, memory: StageMemory) -> None:
+    """Put the packet and then its copy into the queue; ignore a packet that is lost already."""
+    decision = packet.decision
+    if decision.fate != DELIVERED:
+        return
+    queue, ring = packet.state.queues[stage.place], packet.state.departures_ns
+    times_ms = packet.program.integers
+    line_bytes = max(decision.size_bytes + stage.overhead_bytes, 1)
+    if not has_room(stage, queue, ring, line_bytes, decision.release_ns):
+        refuse(decision, OVERFLOWED)
+    if decision.fate == DELIVERED:
+        decision.release_ns = carry_packet(stage, times_ms, queue, ring, line_bytes)
+    if decision.copy_ns != NEVER_NS:
+        if decision.fate == DELIVERED and has_room(
+            stage, queue, ring, line_bytes, decision.copy_ns
+        ):
+            decision.copy_ns = carry_packet(stage, times_ms, queue, ring, line_bytes)
+        else:
+            decision.copy_ns = NEVER_NS
+
+
+def _read(reader: WordReader) -> Table:
+    name = reader.file("a file with delivery opportunities, in ms")
+    table: Table = {"times_ms": reader.values(COUNT, _EXPECTED)} if name == "at" else {"file": name}
+    while True:
+        if reader.accept("overhead"):
+            table["overhead_bytes"] = reader.value(SIGNED_COUNT)
+        elif reader.accept("queue"):
+            table["queue"] = reader.value(COUNT)
+        elif reader.accept("bytes"):
+            table["queue_bytes"] = reader.value(COUNT)
+        elif reader.accept("from"):
+            table["offset_s"] = read_offset(reader)
+        else:
+            return table
+
+
+class Opportunities(Impairment):
+    """A link that delivers packets at recorded times, from a finite queue, as mahimahi does."""
+
+    kind: Literal["opportunities"] = "opportunities"
+    file: Annotated[str, Field(min_length=1)] | None = None
+    """The trace: on each line a time in ms at which up to 1504 bytes can be delivered."""
+    times_ms: Annotated[
+        tuple[Annotated[int, Field(ge=0, le=_LONGEST_MS)], ...],
+        Field(min_length=1, max_length=MOST_TIMES),
+    ] | None = None  # fmt: skip
+    """Instead of a file: these times, which do not descend; they repeat after the last."""
+    queue: Annotated[int, Field(ge=1, le=1_000_000)] = _QUEUE
+    """Maximum number of packets that wait; further packets are dropped."""
+    queue_bytes: Annotated[int, Field(ge=1, le=2**40)] | None = None
+    """Maximum number of bytes that wait; by default not limited."""
+    overhead_bytes: Annotated[int, Field(ge=-65_535, le=65_535)] = _HEADERS_BYTES
+    """Bytes added to each payload; 32: UDP, IPv4, and 4 bytes of a TUN device, as in mahimahi."""
+    offset_s: Offset = 0.0
+    """Begin at this time of the trace, in seconds; random: at a time that the seed chooses."""
+
+    words: ClassVar = (
+        Word(
+            "opportunities", "opportunities trace.up", _read,
+            grammar="opportunities FILE [overhead N] [queue N] [bytes N] [from T|random]",
+        ),
+        Word(
+            "at", "opportunities at 0,1,5", after="opportunities",
+            grammar="opportunities at N,N,...",
+        ),
+        Word("overhead", "opportunities trace.up overhead 28", after="opportunities FILE"),
+        Word("queue", "opportunities trace.up queue 20", after="opportunities FILE"),
+        Word("bytes", "opportunities trace.up bytes 30000", after="opportunities FILE"),
+        Word("from", "opportunities trace.up from 20s", after="opportunities FILE"),
+        Word("random", "opportunities trace.up from random", after="opportunities FILE from"),
+    )  # fmt: skip
+    behaviour: ClassVar = Behaviour(OpportunityStage, apply, OpportunityQueue)
+    delays: ClassVar = True
+    tc_missing: ClassVar = "delivery opportunities"
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.file is None) == (self.times_ms is None):
+            raise ValueError("file: delivery opportunities need a file, or times_ms")
+        if self.times_ms is not None:
+            if any(a > b for a, b in pairwise(self.times_ms)):
+                raise ValueError("times_ms: must not descend")
+            if self.times_ms[-1] == 0:
+                raise ValueError("times_ms: the last must not be 0; the times repeat after it")
+            require_inside(self.offset_s, self.length_ns)
+        return self
+
+    @property
+    def length_ns(self) -> int:
+        """Time after which the opportunities repeat."""
+        return (self.times_ms or (0,))[-1] * _NS_PER_MS
+
+    @property
+    def longest_s(self) -> float:
+        """Longest time until a full queue of packets of one opportunity each has been delivered."""
+        if self.times_ms is None:
+            return 0.0
+        cycles, rest = divmod(self.queue + 1, len(self.times_ms))
+        times_ms = np.array(self.times_ms)
+        later_ms = np.concatenate((times_ms, times_ms + times_ms[-1]))[rest:][: len(times_ms)]
+        longest_ms = cycles * int(times_ms[-1]) + int((later_ms - times_ms).max())
+        return longest_ms * _NS_PER_MS / NS_PER_S
+
+    @property
+    def is_bounded(self) -> bool:
+        return False
+
+    @property
+    def prediction_note(self) -> str:
+        return "as long as no queue overflows"
+
+    def reorders(self, delayed: bool, reordered: bool) -> tuple[bool, bool]:
+        return True, False  # it serves in the order of arrival
+
+    @classmethod
+    def examples(cls) -> Sequence[Self]:
+        times_ms = (0, 0, 1, 2, 2, 2, 5)
+        return [
+            cls(times_ms=times_ms, queue=2),
+            cls(times_ms=times_ms, queue=50, queue_bytes=4000, offset_s="random"),
+            cls(times_ms=(1,), queue=1, overhead_bytes=-10, offset_s=0.0005),
+            cls(times_ms=(0, 20), queue=5),
+            cls(file="a trace.up"),
+        ]
+
+    def text(self) -> str:
+        if self.times_ms is None:
+            name = self.file or ""
+            words = ["opportunities", shlex.quote("./at" if name == "at" else name)]
+        else:
+            words = ["opportunities", "at", ",".join(map(str, self.times_ms))]
+        if self.overhead_bytes != _HEADERS_BYTES:
+            words.append(f"overhead {self.overhead_bytes}")
+        if self.queue != _QUEUE:
+            words.append(f"queue {self.queue}")
+        if self.queue_bytes is not None:
+            words.append(f"bytes {self.queue_bytes}")
+        return " ".join(words) + offset_text(self.offset_s)
+
+    def meaning(self) -> str:
+        what = self.file
+        if self.times_ms is not None:
+            bits = len(self.times_ms) * OPPORTUNITY_BYTES * 8
+            rate_bps = round(bits * NS_PER_S / self.length_ns)
+            what = (
+                f"{len(self.times_ms)} delivery opportunities in "
+                f"{time_text(self.length_ns / NS_PER_S)}, {rate_text(rate_bps)} per second"
+            )
+        most = "" if self.queue_bytes is None else f" or {self.queue_bytes} bytes"
+        return (
+            f"delivers up to {OPPORTUNITY_BYTES} bytes at each recorded time, each packet with "
+            f"{self.overhead_bytes} bytes beside its payload: {what}"
+            f"{offset_meaning(self.offset_s)}, repeated; {self.queue} packets{most} may wait, "
+            "more are dropped"
+        )
+
+    def stage(self, tables: StageTables) -> OpportunityStage:
+        if self.times_ms is None:
+            raise ValueError(f"{self.file}: the delivery opportunities have not been read")
+        begin, end = add_numbers(tables.integers, self.times_ms)
+        return OpportunityStage(
+            begin=begin,
+            end=end,
+            offset_ns=offset_ns(self.offset_s, self.length_ns, tables),
+            overhead_bytes=self.overhead_bytes,
+            queue_bytes=self.queue_bytes or 0,
+            queue_places=2 * self.queue,
+        )
+
+    def without_files(self, folder: Path, place: str) -> Self:
+        if self.file is None:
+            return self
+        file = NamedFile(self.file, folder, place)
+        times_ms = _times_ms(file)
+        read = self.model_copy(update={"times_ms": times_ms, "file": None})
+        try:
+            require_inside(self.offset_s, read.length_ns)
+        except ValueError as error:
+            file.wrong(str(error))
+        return read
+
+
+def _times_ms(file: NamedFile) -> tuple[int, ...]:
+    times_ms: list[int] = []
+    for number, line in file.lines():
+        if not (line.isascii() and line.isdigit() and len(line) <= 16):
+            shown = shortened(line, 20)
+            file.wrong(f"line {number}: {shown!r}: expected a time in whole ms, e.g. 12")
+        if int(line) > _LONGEST_MS:
+            file.wrong(f"line {number}: {line}: more than 31 years")
+        if times_ms and int(line) < times_ms[-1]:
+            file.wrong(f"line {number}: {line}: before {times_ms[-1]}; times must not descend")
+        times_ms.append(int(line))
+        if len(times_ms) > MOST_TIMES:
+            file.wrong(f"has more than {MOST_TIMES} delivery opportunities")
+    if not times_ms or times_ms[-1] == 0:
+        file.wrong("has no time after 0; expected a time in ms on each line")
+    return tuple(times_ms)

@@ -1,0 +1,277 @@
+"""Replay of a packet trace; see :mod:`noack.impairments.recorded_delay`."""
+
+import re
+import shlex
+from bisect import bisect_left
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from noack.core.clock import NS_PER_S
+from noack.impairments.feature import Behaviour, Impairment, StageTables, Table, Word, add_numbers
+from noack.impairments.markov_chain import NotPredictableError, Pattern
+from noack.impairments.quantities import (
+    OWN_TIME_NS,
+    PERCENT,
+    TIME,
+    brief_percent,
+    percent_text,
+    time_ns_text,
+    time_text,
+)
+from noack.impairments.recorded_delay import ReplayStage, apply
+from noack.impairments.trace_offset import (
+    LONGEST_NS,
+    Offset,
+    offset_meaning,
+    offset_ns,
+    offset_text,
+    read_offset,
+    require_inside,
+)
+from noack.impairments.word_reader import WordReader
+from noack.settings.named_file import NamedFile
+from noack.settings.section import Probability
+from noack.traces.packet_trace import LOST_NS, PacketTrace
+from noack.traces.trace_formats import read_trace
+
+MOST_RECORDS = 1_000_000
+LONGEST_DELAY_NS = 3600 * NS_PER_S
+_EXPECTED = "records of sending time and delay, e.g. 0ms+12ms,50ms+lost"
+
+
+def _read(reader: WordReader) -> Table:
+    name = reader.file("a file with a packet trace")
+    table: Table = _read_records(reader) if name == "records" else {"file": name}
+    while True:
+        if reader.accept("by"):
+            table["by"] = reader.word("packet or time")
+        elif reader.accept("from"):
+            table["offset_s"] = read_offset(reader)
+        elif reader.accept("share"):
+            table["delay_share"] = reader.value(PERCENT)
+        elif reader.accept("relative"):
+            table["clocks_differ"] = True
+        elif reader.accept("once"):
+            table["repeat"] = False
+        else:
+            return table
+
+
+def _read_records(reader: WordReader) -> Table:
+    sent_ns, delays_ns = [], []
+    for part in reader.word(_EXPECTED).split(","):
+        found = re.fullmatch(rf"({TIME})\+({TIME}|lost)", part)
+        if found is None:
+            reader.wrong(f"expected {_EXPECTED}")
+        sent_ns.append(reader.read(found[1], OWN_TIME_NS))
+        delays_ns.append(LOST_NS if found[2] == "lost" else reader.read(found[2], OWN_TIME_NS))
+    return {"sent_ns": sent_ns, "delays_ns": delays_ns}
+
+
+_Records = Annotated[tuple[int, ...], Field(min_length=1, max_length=MOST_RECORDS)]
+
+
+class Replay(Impairment):
+    """Replays a packet trace: each packet is lost or delayed as a recorded packet was."""
+
+    kind: Literal["replay"] = "replay"
+    file: Annotated[str, Field(min_length=1)] | None = None
+    """The trace, e.g. CSV with the columns sequence, sent_ms and received_ms."""
+    sent_ns: _Records | None = None
+    """Instead of a file: sending times since the first, which is 0."""
+    delays_ns: _Records | None = None
+    """Instead of a file: the delay of each packet; −1 for a lost packet."""
+    by: Literal["packet", "time"] = "packet"
+    """packet: packet k of a flow gets record k. time: a packet gets what was recorded at its time
+    since the emulator's start (in a run: its epoch)."""
+    repeat: bool = True
+    """false: after the trace's end, packets pass without delay."""
+    offset_s: Offset = 0.0
+    """Begin at this time of the trace, in seconds; random: at a time that the seed chooses."""
+    delay_share: Probability = 1.0
+    """This share of each recorded delay is applied, e.g. 0.5 for one way of round-trip times."""
+    clocks_differ: bool = False
+    """true: the file's sending and receiving times are of different clocks. The delays are then
+    counted from the smallest one."""
+
+    words: ClassVar = (
+        Word(
+            "replay", "replay trace.csv", _read,
+            grammar="replay FILE [by packet|time] [from T|random] [share P] [relative] [once]",
+        ),
+        Word(
+            "records", "replay records 0ms+12ms,50ms+lost", after="replay",
+            grammar="replay records T+T,T+lost,...",
+        ),
+        Word("by", "replay trace.csv by time", after="replay FILE"),
+        Word("from", "replay trace.csv from 20s", after="replay FILE"),
+        Word("random", "replay trace.csv from random", after="replay FILE from"),
+        Word("share", "replay trace.csv share 50%", after="replay FILE"),
+        Word("relative", "replay trace.csv relative", after="replay FILE"),
+        Word("once", "replay trace.csv once", after="replay FILE"),
+    )  # fmt: skip
+    behaviour: ClassVar = Behaviour(ReplayStage, apply)
+    delays: ClassVar = True
+    tc_missing: ClassVar = "traces of packets"
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        sent_ns, delays_ns = self.sent_ns, self.delays_ns
+        if (sent_ns is None) != (delays_ns is None) or (self.file is None) == (sent_ns is None):
+            raise ValueError("file: a replay needs a file, or both sent_ns and delays_ns")
+        if sent_ns is None or delays_ns is None:
+            return self
+        if self.clocks_differ:
+            raise ValueError("clocks_differ: goes with a file")
+        if len(sent_ns) != len(delays_ns):
+            raise ValueError(f"delays_ns: has {len(delays_ns)} records, sent_ns {len(sent_ns)}")
+        sent, delays = np.array(sent_ns, object), np.array(delays_ns, object)
+        if sent_ns[0] != 0 or sent_ns[-1] > LONGEST_NS or (sent[1:] < sent[:-1]).any():
+            raise ValueError(
+                "sent_ns: must begin with 0, must not descend, and end within 31 years"
+            )
+        if ((delays < LOST_NS) | (delays > LONGEST_DELAY_NS)).any():
+            raise ValueError(f"delays_ns: must be -1 to {LONGEST_DELAY_NS}, one hour")
+        require_inside(self.offset_s, self.length_ns)
+        return self
+
+    @property
+    def length_ns(self) -> int:
+        """Length of a trace that has been read: a mean interval beyond the last sending."""
+        sent_ns = self.sent_ns or (0,)
+        return max(sent_ns[-1] + sent_ns[-1] // max(len(sent_ns) - 1, 1), 1)
+
+    @property
+    def longest_s(self) -> float:
+        return max(0, *self.delays_ns or (0,), 0) * self.delay_share / NS_PER_S
+
+    @property
+    def _loses(self) -> bool:
+        return self.delays_ns is not None and min(self.delays_ns) < 0
+
+    @property
+    def prediction_note(self) -> str:
+        return "" if self.repeat else "while the trace lasts"
+
+    def reorders(self, delayed: bool, reordered: bool) -> tuple[bool, bool]:
+        varies = self.delays_ns is None or len(set(self.delays_ns) - {LOST_NS}) > 1
+        return True, reordered or varies
+
+    @classmethod
+    def examples(cls) -> Sequence[Self]:
+        ms = 10**6
+        sent_ns = (0, ms, ms, 4 * ms, 5 * ms, 5 * ms + 1)
+        delays_ns = (3 * ms, -1, 9 * ms, 2 * ms, -1, 0)
+        records = cls(sent_ns=sent_ns, delays_ns=delays_ns)
+        updates: Sequence[Table] = (
+            {"by": "time", "offset_s": "random", "delay_share": 0.3},
+            {"repeat": False, "offset_s": 0.002},
+            {"by": "time", "repeat": False},
+        )
+        others = [records.model_copy(update=update) for update in updates]
+        lost = cls(sent_ns=(0,), delays_ns=(-1,))
+        return [records, *others, lost, cls(file="a trace.csv", clocks_differ=True)]
+
+    def text(self) -> str:
+        if self.sent_ns is not None and self.delays_ns is not None:
+            pairs = zip(self.sent_ns, self.delays_ns, strict=True)
+            words = "records " + ",".join(
+                f"{time_ns_text(at)}+{'lost' if delay < 0 else time_ns_text(delay)}"
+                for at, delay in pairs
+            )
+        else:
+            name = self.file or ""
+            words = shlex.quote("./records" if name == "records" else name)
+        by = " by time" if self.by == "time" else ""
+        share = f" share {percent_text(self.delay_share)}" if self.delay_share != 1 else ""
+        relative = " relative" if self.clocks_differ else ""
+        once = "" if self.repeat else " once"
+        return f"replay {words}{by}{offset_text(self.offset_s)}{share}{relative}{once}"
+
+    def meaning(self) -> str:
+        what = self.file
+        if self.delays_ns is not None:
+            lost = sum(delay < 0 for delay in self.delays_ns) / len(self.delays_ns)
+            what = (
+                f"{len(self.delays_ns)} packets of {time_text(self.length_ns / NS_PER_S)}, "
+                f"{brief_percent(lost)} lost, delays up to {time_text(self.longest_s)}"
+            )
+        which = "at its time since the start" if self.by == "time" else "by its number in its flow"
+        again = ", repeated" if self.repeat else ", once"
+        share = (
+            ""
+            if self.delay_share == 1
+            else f", with {brief_percent(self.delay_share)} of the delay"
+        )
+        return (
+            f"loses or delays each packet as recorded {which}{share}: "
+            f"{what}{offset_meaning(self.offset_s)}{again}"
+        )
+
+    def stage(self, tables: StageTables) -> ReplayStage:
+        if self.sent_ns is None or self.delays_ns is None:
+            raise ValueError(f"{self.file}: the trace has not been read")
+        times_begin, _ = add_numbers(tables.integers, self.sent_ns)
+        begin, end = add_numbers(tables.integers, self._applied_ns())
+        first_ns = offset_ns(self.offset_s, self.length_ns, tables)
+        by_time = self.by == "time"
+        return ReplayStage(
+            begin=begin,
+            end=end,
+            times_begin=times_begin,
+            offset=first_ns if by_time else bisect_left(self.sent_ns, first_ns),
+            period_ns=self.length_ns if by_time else 0,
+            once=int(not self.repeat),
+        )
+
+    def _applied_ns(self) -> Sequence[int]:
+        """Return the delays as a stage has them: a lost packet has that of its predecessor."""
+        found: list[int] = []
+        latest_ns = 0
+        for delay_ns in self.delays_ns or ():
+            if delay_ns >= 0:
+                latest_ns = (
+                    delay_ns if self.delay_share == 1 else round(delay_ns * self.delay_share)
+                )
+            found.append(latest_ns if delay_ns >= 0 else -1 - latest_ns)
+        return found
+
+    def chains(self) -> Sequence[Pattern]:
+        if self.delays_ns is None:
+            raise NotPredictableError(f"{self.file} has not been read")
+        if not self._loses:
+            return ()
+        if self.by == "time":
+            raise NotPredictableError("recorded losses by time depend on when packets arrive")
+        if not self.repeat:
+            raise NotPredictableError("a trace that is replayed once has no long-run loss rate")
+        return (Pattern(np.array(self.delays_ns) < 0),)
+
+    def without_files(self, folder: Path, place: str) -> Self:
+        if self.file is None:
+            return self
+        file = NamedFile(self.file, folder, place)
+        trace = read_trace(
+            file.path, place=file.named, clocks_differ=self.clocks_differ,
+            most_packets=MOST_RECORDS,
+        )  # fmt: skip
+        return self.of(trace, file)
+
+    def of(self, trace: PacketTrace, file: NamedFile) -> Self:
+        """Return the settings with a trace, which was in a file."""
+        if (trace.delay_ns > LONGEST_DELAY_NS).any():
+            file.wrong("has a delay of more than an hour; a replay can have none")
+        update = {
+            "sent_ns": tuple(trace.sent_ns.tolist()), "delays_ns": tuple(trace.delay_ns.tolist()),
+            "file": None, "clocks_differ": False,
+        }  # fmt: skip
+        read = self.model_copy(update=update)
+        try:
+            require_inside(self.offset_s, read.length_ns)
+        except ValueError as error:
+            file.wrong(str(error))
+        return read

@@ -1,0 +1,40 @@
+"""A command imports no more than it needs: the imports are most of the time that help takes."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+_PROGRAM = """
+import json, sys
+from contextlib import suppress
+from cosim.cli import main
+with suppress(SystemExit):
+    main()
+print(json.dumps(sorted(sys.modules)), file=sys.stderr)
+"""
+
+
+def imported(*words: str) -> set[str]:
+    command = [sys.executable, "-c", _PROGRAM, *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=150)
+    return set(json.loads(done.stderr.splitlines()[-1]))
+
+
+@pytest.mark.parametrize("words", [["--help"], ["run", "--help"], ["certify", "--help"]])
+def test_help_imports_no_large_library(words: list[str]) -> None:
+    assert not imported(*words) & {"numpy", "pydantic", "rich", "scipy", "zenoh"}
+
+
+def test_a_command_with_a_module_of_its_own_imports_only_this_one() -> None:
+    modules = imported("scenarios", "--json")
+    assert {one for one in modules if one.startswith("cosim.cli.commands.")} == {
+        "cosim.cli.commands.scenarios_command"
+    }
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the fork server is for Linux")
+def test_the_fork_server_starts_before_the_command_line_is_read() -> None:
+    assert "cosim.live.fork_server" in imported("run", "no_such_scenario", "--nonsense")
+    assert "cosim.live.fork_server" not in imported("run", "--help")
