@@ -11,7 +11,7 @@ from benchmarks._relay_load import DATAGRAM_BYTES
 from netem.engine.compiled_rules import compile_rule, compiled_program, compiled_state, set_flow
 from netem.engine.many_decisions import admit_many
 from netem.link_machine import Link
-from netem.rule_program import empty_state, program_of, recent_width
+from netem.rule_program import program_of
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_records import PacketDecision, dtype_of
 from noack.impairments.link_settings import LinkSettings
@@ -80,7 +80,7 @@ def compiled(flows: int) -> Decide:
     """Return the compiled rules, as the fast relay runs them, one batch per call."""
     admit_compiled = compile_rule(admit_many)
     program = program_of(_SETTINGS, SEED, "relay", "forward")
-    state = compiled_state(program, empty_state(program), flows, recent_width(program))
+    state = compiled_state(program, flows)
     for flow in range(flows):
         set_flow(state, flow, flow, _SETTINGS.first_delivered)
     program = compiled_program(program)

@@ -1,11 +1,13 @@
 """The end of a run against its length: peak memory, and time as a multiple of real time.
 
-Simulated runs are spooled as a live run spools its rows. ``noack summary`` then completes each: it
-writes the record, recording, summary and report, replays the run and judges its claims. The
-alternative is the end of a short run: memory should not grow with the length.
+Simulated runs are spooled as a live run spools its rows. Each is then completed as by
+``noack summary``, which writes the record, recording, summary and report, replays the run and
+judges its claims. The alternative is the end of a short run: memory should not grow with the
+length.
 """
 
 import argparse
+import json
 import os
 import shutil
 import subprocess
@@ -30,6 +32,7 @@ class End(NamedTuple):
     wall_s: float
     cpu_s: float
     peak_mib: float
+    phases_s: Mapping[str, float] = {}
 
 
 def end_of(horizon_s: float, folder: Path) -> End:
@@ -41,15 +44,19 @@ def end_of(horizon_s: float, folder: Path) -> End:
     arguments = ["-m", "benchmarks._spooled_run", f"{horizon_s:g}", str(folder)]
     run_dir = Path(execute([sys.executable, *arguments]).stdout.strip())
     begun_s = time.monotonic()
-    command = [sys.executable, "-m", "cosim.cli", "summary", str(run_dir)]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
+    command = [sys.executable, "-m", "benchmarks._finalized_run", str(run_dir)]
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment) as process:
+        assert process.stdout is not None
+        output = process.stdout.read()
         _, status, usage = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
     wall_s = time.monotonic() - begun_s
     if process.returncode != 0:
-        raise MeasurementError(f"noack summary ended with {process.returncode}")
+        raise MeasurementError(f"the end of the run failed with {process.returncode}")
     shutil.rmtree(run_dir)
-    return End(wall_s, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024)
+    cpu_s = usage.ru_utime + usage.ru_stime
+    return End(wall_s, cpu_s, usage.ru_maxrss / 1024, json.loads(output))
 
 
 def rows_of(ends: Mapping[float, End]) -> list[Row]:
@@ -57,14 +64,21 @@ def rows_of(ends: Mapping[float, End]) -> list[Row]:
     shortest_s, longest_s = min(ends), max(ends)
     short, long = ends[shortest_s], ends[longest_s]
     # Start and end of the program cost the same for every length.
-    more_s = max(long.cpu_s - short.cpu_s, 1e-9)
+    more_s, length_s = max(long.wall_s - short.wall_s, 1e-9), longest_s - shortest_s
+    more_cpu_s = max(long.cpu_s - short.cpu_s, 1e-9)
     return [
         Row(f"peak memory, end of {longest_s:g} s", long.peak_mib, "MiB", goal=MOST_MIB),
         Row("the same, against a short run", long.peak_mib, "MiB",
             Peer(f"end of {shortest_s:g} s", short.peak_mib)),
         Row(f"end of {longest_s:g} s", long.wall_s, "s"),
-        Row("CPU time of the end, as a multiple of real time", (longest_s - shortest_s) / more_s,
-            "×", goal=LEAST_SPEED, note="of the additional length"),
+        Row("speed of the end, as a multiple of real time", length_s / more_s,
+            "×", goal=LEAST_SPEED, note="of the additional length, replay beside the rest"),
+        Row("the same, by CPU time of all processes", length_s / more_cpu_s, "×"),
+        *(
+            Row(f"phase: {phase}, per hour of the run",
+                3600 * (took_s - short.phases_s.get(phase, 0.0)) / length_s, "s")
+            for phase, took_s in long.phases_s.items()
+        ),
     ]  # fmt: skip
 
 

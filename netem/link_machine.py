@@ -6,9 +6,9 @@ the loop, in simulation, in replay, and in the relay where the compiled engine i
 
 import heapq
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from netem.rule_program import empty_state, new_flow, new_memory, program_of, recent_width
+from netem.rule_program import FlowRow, empty_state, new_flow, new_row, program_of
 from netem.rules.link_rules import admit, leave
 from netem.rules.settings_change import carry
 from noack.config.parameter_changes import ChangeSchedule, ParameterChange
@@ -19,7 +19,6 @@ from noack.impairments.link_records import (
     FlowState,
     PacketDecision,
     RecordedDecision,
-    StageMemory,
 )
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
@@ -67,6 +66,8 @@ class Link:
         decisions: recorded decisions per flow; each flow repeats them before the settings apply.
         first_number: number of the first input and of the first packet.
         schedule: announced changes of the settings; None: nothing can be announced.
+        restarted: the link has replaced another in a run; see
+            :func:`netem.rule_program.new_losses`.
     """
 
     def __init__(
@@ -77,8 +78,9 @@ class Link:
         decisions: Sequence[Sequence[RecordedDecision]] = (),
         first_number: int = 0,
         schedule: ChangeSchedule | None = None,
+        restarted: bool = False,
     ) -> None:
-        self._settings = settings
+        self._settings, self._restarted = settings, restarted
         self._schedule = schedule
         self._reached_ns = -1
         self._seed = seed
@@ -86,12 +88,8 @@ class Link:
         self._program = program_of(settings, seed, *name, decisions=decisions)
         self._rows: dict[int, int] = {}
         self._free_rows: list[int] = []
-        self._flows: list[FlowState] = []
-        self._memory: list[list[StageMemory]] = []
-        self._recent_ns: list[list[int]] = []
-        self._state = empty_state(self._program)._replace(
-            flows=self._flows, memory=self._memory, recent_ns=self._recent_ns
-        )
+        self._tables: dict[str, Any] = {name: [] for name in FlowRow._fields}
+        self._state = empty_state(self._program)._replace(**self._tables)
         self._decision = PacketDecision()
         self._in_flight: list[_InFlight] = []
         self._put_in_flight = 0
@@ -120,7 +118,7 @@ class Link:
     def flow(self, flow: int) -> FlowState | None:
         """The state of a flow; None if none of its datagrams has arrived."""
         row = self._rows.get(flow)
-        return None if row is None else self._flows[row]
+        return None if row is None else self._state.flows[row]
 
     def forget(self, flow: int) -> None:
         """Remove a flow that has ended and has no datagram in flight."""
@@ -135,16 +133,12 @@ class Link:
         self._program = program_of(settings, self._seed, *self._name, tracks=old.tracks)._replace(
             decisions=old.decisions, decisions_begin=old.decisions_begin
         )
-        self._memory = [new_memory(self._program) for _ in self._flows]
-        self._recent_ns = [[NEVER_NS] * recent_width(self._program) for _ in self._flows]
+        rows = [new_row(self._program, flow) for flow in before.flows]
+        self._tables = {name: [getattr(row, name) for row in rows] for name in FlowRow._fields}
         self._state = empty_state(self._program)._replace(
-            flows=self._flows,
-            memory=self._memory,
-            recent_ns=self._recent_ns,
-            link=before.link,
-            counters=before.counters,
+            **self._tables, link=before.link, counters=before.counters
         )
-        latest_ns = [NEVER_NS] * len(self._flows)
+        latest_ns = [NEVER_NS] * len(rows)
         for leaving in self._in_flight:
             row = self._rows[leaving.datagram.flow]
             latest_ns[row] = max(latest_ns[row], leaving.release_ns)
@@ -232,16 +226,11 @@ class Link:
         return leave(self._state, row, leaving.packet, size_bytes, leaving.delayed, leaving.counts)
 
     def _add_flow(self, flow: int) -> int:
-        state = new_flow(flow, self._settings.first_delivered)
-        memory, recent_ns = new_memory(self._program), [NEVER_NS] * recent_width(self._program)
-        if self._free_rows:
-            row = self._free_rows.pop()
-            self._flows[row], self._memory[row], self._recent_ns[row] = state, memory, recent_ns
-        else:
-            row = len(self._flows)
-            self._flows.append(state)
-            self._memory.append(memory)
-            self._recent_ns.append(recent_ns)
+        new = new_flow(flow, self._settings.first_delivered)
+        state = new_row(self._program, new, restarted=self._restarted)
+        row = self._free_rows.pop() if self._free_rows else len(self._state.flows)
+        for name, table in self._tables.items():
+            table[row : row + 1] = [getattr(state, name)]
         self._rows[flow] = row
         return row
 
@@ -265,14 +254,18 @@ def link_of(
 ) -> Link:  # fmt: skip
     """Return a link of a run."""
     settings, names = at_start(settings, name, start)
-    return Link(settings, seed, *names, first_number=start.first_number, schedule=schedule)
+    return Link(
+        settings, seed, *names, first_number=start.first_number, schedule=schedule,
+        restarted=start.is_restart,
+    )  # fmt: skip
 
 
 def at_start(settings: LinkSettings, name: str, start: Start) -> tuple[LinkSettings, list[str]]:
     """Return the settings of a link of a run, and the names of its random streams.
 
-    A restarted emulator has lost its count of consecutive losses. Therefore its first datagram
-    passes, and later ones are drawn from other random streams than before.
+    A restarted emulator does not know the losses before. Therefore its first datagrams pass
+    (see :func:`netem.rule_program.new_losses`), and later ones are drawn from other random streams
+    than before.
     """
     if not start.is_restart:
         return settings, [name]

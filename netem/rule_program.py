@@ -7,10 +7,13 @@ are several of a kind. Hence adding a delay does not change which packets are lo
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import accumulate
+from typing import NamedTuple
 
+from netem.rules.guarantee import counts_losses
 from noack.core.random_streams import stream_key
 from noack.impairments.feature import StageTables
 from noack.impairments.link_records import (
+    NEVER_NS,
     Counters,
     FlowState,
     LinkMemory,
@@ -19,8 +22,10 @@ from noack.impairments.link_records import (
     RecordedDecision,
     RuleStage,
     StageMemory,
+    WindowRule,
 )
 from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_guarantee import DeliveriesBetweenBursts, LossesInWindow
 from noack.impairments.stage_dispatch import BEHAVIOURS
 
 
@@ -53,13 +58,22 @@ def program_of(
         places += stage.queue_places
         stages.append(stage)
     delays = any(one.delays for one in settings.impairments)
+    rules = [one.rule for one in settings.constraints]
     return LinkProgram(
         stages=stages,
         integers=tables.integers,
         reals=tables.reals,
         decisions=[decision for flow in decisions for decision in flow],
         decisions_begin=list(accumulate(map(len, decisions), initial=0)) if decisions else [],
-        mansd=-1 if settings.mansd is None else settings.mansd,
+        windows=[
+            WindowRule(rule.limit, rule.window)
+            for rule in rules
+            if isinstance(rule, LossesInWindow)
+        ],
+        recovery=sum(
+            rule.deliveries for rule in rules if isinstance(rule, DeliveriesBetweenBursts)
+        ),
+        mansd=-1 if settings.longest_burst is None else settings.longest_burst,
         limit=settings.limit,
         tracks=tracks or delays or bool(decisions),
     )
@@ -95,6 +109,7 @@ def empty_state(program: LinkProgram) -> LinkMemory:
         flows=[],
         memory=[],
         recent_ns=[],
+        losses=[],
         queues=[BEHAVIOURS[stage.kind].queue() for stage in program.stages],
         departures_ns=[0] * sum(stage.queue_places for stage in program.stages),
         link=LinkState(),
@@ -102,16 +117,46 @@ def empty_state(program: LinkProgram) -> LinkMemory:
     )
 
 
+class FlowRow(NamedTuple):
+    """The state of a flow: its row of each table of :class:`LinkMemory` that has a row per flow."""
+
+    flows: FlowState
+    memory: list[StageMemory]
+    recent_ns: list[int]
+    losses: list[int]
+
+
+def new_row(program: LinkProgram, flow: FlowState, *, restarted: bool = False) -> FlowRow:
+    """Return the state of a flow before its first packet; see :func:`new_losses`."""
+    memory = [StageMemory() for _ in program.stages]
+    recent_ns = [NEVER_NS] * recent_width(program)
+    return FlowRow(flow, memory, recent_ns, new_losses(program, restarted=restarted))
+
+
 def new_flow(number: int, first_delivered: bool) -> FlowState:
-    """Return the state of a flow before its first packet."""
+    """Return the numbers of a flow before its first packet."""
     return FlowState(number, forced_first=int(first_delivered))
 
 
-def new_memory(program: LinkProgram) -> list[StageMemory]:
-    """Return the stages' memory of a new flow."""
-    return [StageMemory() for _ in program.stages]
+def new_losses(program: LinkProgram, *, restarted: bool) -> list[int]:
+    """Return a new flow's ring of numbers of losses.
+
+    ``restarted``: packets of the flow may have been lost before. The guarantee then counts as many
+    losses directly before the first packet as a window may have.
+    """
+    width = loss_width(program)
+    assumed = max((window.losses for window in program.windows), default=1) if restarted else 0
+    return [-min(-place % width, assumed) for place in range(width)]
 
 
 def recent_width(program: LinkProgram) -> int:
     """Length of a flow's ring of release times."""
     return program.mansd + 1 if program.tracks and program.mansd >= 0 else 1
+
+
+def loss_width(program: LinkProgram) -> int:
+    """Length of a flow's ring of numbers of losses, a power of 2; 1: it is not needed."""
+    if not counts_losses(program):
+        return 1
+    longest = max((window.packets for window in program.windows), default=0)
+    return 1 << max(longest + 1, program.mansd + program.recovery + 1).bit_length()

@@ -49,19 +49,14 @@ def live_run(record: RunRecord) -> LiveRun:
             model.
         CallerError: exact simulation does not support the scenario.
     """
-    changed = bool(changes_of(record))
-    _require(not changed, "the ideal loop has no changes of settings, as this run has")
-    record.scenario.coverage.require_unchanging()
-    record.scenario.coverage.require_exact()
+    _require_ideal(record)
     steps = record.columns(PLANT_STEP, "sequence", "actuation", "x")
     sensor = record.columns(SENSOR_MEASUREMENT, "input", "t_ns", "event")
     ticks, deliveries = (
         record.columns(table, "input", "sequence", "model_t_ns")
         for table in (CONTROLLER_STEP, CONTROLLER_DELIVERY)
     )
-    restarted, count = record.restarted(), len(sensor)
-    why = f"the ideal loop has no restarts: {restarted} was restarted during the run"
-    _require(restarted is None, why)
+    count = len(sensor)
     _require(
         count >= _LEAST_MEASUREMENTS,
         f"the record holds {count} measurements; {_LEAST_MEASUREMENTS} are needed",
@@ -102,6 +97,16 @@ def live_run(record: RunRecord) -> LiveRun:
         model_ns=latched.model_ns,
     )
     return LiveRun(schedule, steps["x"][measured], event_ns * 1e-9)
+
+
+def _require_ideal(record: RunRecord) -> None:
+    """Require settings and processes that stayed the same, and a loop with an exact simulation."""
+    changed, restarted = bool(changes_of(record)), record.restarted()
+    _require(not changed, "the ideal loop has no changes of settings, as this run has")
+    record.scenario.coverage.require_unchanging()
+    record.scenario.coverage.require_exact()
+    why = f"the ideal loop has no restarts: {restarted} was restarted during the run"
+    _require(restarted is None, why)
 
 
 def _require(met: bool, why: str) -> None:

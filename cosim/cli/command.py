@@ -41,9 +41,10 @@ _TOUR = (
 _MOST_COLUMNS = 78
 
 RUNS, THEORY, CAMPAIGNS = "Runs", "Theory", "Campaigns"
+MEASURING = "Real networks"
 FILES = "Scenario files and this machine"
 PROCESSES = "One terminal per process"
-PANELS = (RUNS, THEORY, CAMPAIGNS, FILES, PROCESSES)
+PANELS = (RUNS, THEORY, CAMPAIGNS, MEASURING, FILES, PROCESSES)
 """The panels of the help, in order."""
 
 _order: dict[Any, tuple[int, int]] = {}

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from netem.engine.compiled_rules import compiled_program, compiled_state, set_flow
 from netem.engine.pump.pump_layout import PER_FLOW, STATES, TABLES, Memory
 from netem.engine.pump_memory import doubled
-from netem.rule_program import empty_state, program_of, recent_width
+from netem.rule_program import new_losses, program_of
 from noack.impairments.link_records import LinkMemory, LinkProgram, RecordedDecision
 from noack.impairments.link_settings import LinkSettings
 
@@ -20,7 +20,7 @@ class BatchedDirection:
     """One direction of a link.
 
     Args:
-        settings, seed, name, decisions: see :class:`netem.link_machine.Link`.
+        settings, seed, name, decisions, restarted: see :class:`netem.link_machine.Link`.
         number: number of the direction in the pump's memory; even: forward, odd: reverse.
         memory: the pump's memory.
         carry_over: :func:`netem.rules.settings_change.carry`, compiled or not.
@@ -35,8 +35,9 @@ class BatchedDirection:
         memory: Memory,
         carry_over: Callable[..., None],
         decisions: Sequence[Sequence[RecordedDecision]] = (),
+        restarted: bool = False,
     ) -> None:
-        self.settings = settings
+        self.settings, self._restarted = settings, restarted
         self._seed, self._name, self._carry = seed, name, carry_over
         self._row = memory.directions[number : number + 1]
         self._link_state, self._counters = memory.link_states[number], memory.counters[number]
@@ -56,7 +57,7 @@ class BatchedDirection:
             grown: dict[str, Any] = {one: doubled(getattr(self.state, one)) for one in PER_FLOW}
             self.state = self.state._replace(**grown)
             self._write_row()
-        set_flow(self.state, row, number, self.settings.first_delivered)
+        set_flow(self.state, row, number, self.settings.first_delivered, self._first_losses)
 
     def change(self, settings: LinkSettings, latest_ns: NDArray[np.int64]) -> None:
         """Apply other settings.
@@ -72,14 +73,13 @@ class BatchedDirection:
             decisions=old.decisions, decisions_begin=old.decisions_begin
         )
         state = self._state(plain, self.rows)._replace(flows=self.state.flows)
-        recent_ns: NDArray[np.int64] = state.recent_ns  # type: ignore[assignment]
-        recent_ns[:] = -1
         self._carry(old, self.state, program, state, latest_ns)
         self.settings, self.program, self.state = settings, program, state
         self._write_row()
 
     def _state(self, plain: LinkProgram, rows: int) -> LinkMemory:
-        state = compiled_state(plain, empty_state(plain), rows, recent_width(plain))
+        self._first_losses = new_losses(plain, restarted=self._restarted)
+        state = compiled_state(plain, rows)
         return state._replace(link=self._link_state, counters=self._counters)
 
     def _write_row(self) -> None:
@@ -89,7 +89,7 @@ class BatchedDirection:
             table: Any = getattr(self.program, name)
             row[name] = table.ctypes.data
             row[f"{name}_rows"] = len(table)
-        for name in ("mansd", "limit", "tracks"):
+        for name in ("recovery", "mansd", "limit", "tracks"):
             row[name] = getattr(self.program, name)
         flips_bits = any(one.flips_bits for one in self.settings.impairments)
         row["keeps"] = self.program.tracks or flips_bits
@@ -97,5 +97,5 @@ class BatchedDirection:
         for name in STATES:
             row[name] = getattr(state, name).ctypes.data
         row["rows"] = len(state.flows)
-        row["width"] = state.recent_ns.shape[1]
+        row["width"], row["loss_width"] = state.recent_ns.shape[1], state.losses.shape[1]
         row["departure_rows"] = len(state.departures_ns)

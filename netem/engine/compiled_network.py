@@ -73,8 +73,9 @@ class CompiledNetwork:
         for number, (settings, name) in enumerate(links):
             first, names = at_start(settings, name, start)
             direction = BatchedDirection(
-                first, resolved.seeds.loss, names, number, self._memory.memory, _carry
-            )
+                first, resolved.seeds.loss, names, number, self._memory.memory, _carry,
+                restarted=start.is_restart,
+            )  # fmt: skip
             direction.start_flow(0, number)
             self._directions.append(direction)
         self._schedule = ChangeSchedule(resolved, lambda one: one.network.link)

@@ -13,14 +13,13 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import netem.engine.pump
 import netem.rules
 import noack.impairments
 from netem import relay_events
 from netem.engine import histogram, object_code
-from netem.rule_program import new_flow
+from netem.rule_program import empty_state, loss_width, new_flow, recent_width
 from noack.core import code_cache
 from noack.core.code_cache import cache_folder, compiler
 from noack.impairments import link_records
@@ -45,6 +44,7 @@ def compiled_program(program: LinkProgram) -> LinkProgram:
     """Return a program as arrays, for compiled rules; ``stages`` rows have all stages' fields."""
     tables: dict[str, Any] = {
         "stages": array_of(union_dtype(STAGE_RECORDS), program.stages),
+        "windows": array_of(dtype_of(link_records.WindowRule), program.windows),
         "decisions": array_of(dtype_of(link_records.RecordedDecision), program.decisions),
         "reals": np.array(program.reals, dtype=np.float64),
     }
@@ -53,15 +53,17 @@ def compiled_program(program: LinkProgram) -> LinkProgram:
     return program._replace(**tables)
 
 
-def compiled_state(program: LinkProgram, state: LinkMemory, rows: int, width: int) -> LinkMemory:
+def compiled_state(program: LinkProgram, rows: int) -> LinkMemory:
     """Return a state without flows as arrays, with room for ``rows`` flows; see :func:`set_flow`.
 
-    ``width`` is the length of the rings of release times.
+    ``program`` is the program before :func:`compiled_program`.
     """
+    state = empty_state(program)
     arrays: dict[str, Any] = {
         "flows": np.zeros(rows, dtype_of(link_records.FlowState)),
         "memory": np.zeros((rows, len(program.stages)), dtype_of(link_records.StageMemory)),
-        "recent_ns": np.zeros((rows, width), np.int64),
+        "recent_ns": np.full((rows, recent_width(program)), NEVER_NS, np.int64),
+        "losses": np.zeros((rows, loss_width(program)), np.int64),
         "queues": array_of(union_dtype(QUEUE_RECORDS), state.queues),
         "departures_ns": np.array(state.departures_ns, dtype=np.int64),
         "link": array_of(dtype_of(link_records.LinkState), [state.link])[0],
@@ -70,16 +72,15 @@ def compiled_state(program: LinkProgram, state: LinkMemory, rows: int, width: in
     return LinkMemory(**arrays)
 
 
-def set_flow(state: LinkMemory, row: int, number: int, first_delivered: bool) -> None:
-    """Initialise a row of a state of arrays for a new flow."""
-    flows, memory, recent_ns = _arrays(state)
-    flows[row] = array_of(flows.dtype, [new_flow(number, first_delivered)])[0]
-    memory[row] = np.zeros(1, memory.dtype)
-    recent_ns[row] = NEVER_NS
-
-
-def _arrays(state: LinkMemory) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    return state.flows, state.memory, state.recent_ns  # type: ignore[return-value]
+def set_flow(
+    state: LinkMemory, row: int, number: int, first_delivered: bool, losses: Sequence[int] = (0,)
+) -> None:
+    """Initialise a row of a state of arrays for a new flow; ``losses``: see :func:`new_losses`."""
+    tables: Any = state
+    tables.flows[row] = array_of(tables.flows.dtype, [new_flow(number, first_delivered)])[0]
+    tables.memory[row] = np.zeros(1, tables.memory.dtype)
+    tables.recent_ns[row] = NEVER_NS
+    tables.losses[row] = losses
 
 
 # No reference counting: nothing is allocated, and counting references to the twenty arrays of

@@ -1,6 +1,6 @@
 """One direction of a link: decisions for arriving packets, and accounting of departures."""
 
-from netem.rules.mansd import make_stale, must_pass, needed_until_ns
+from netem.rules.guarantee import hold_back_until, make_stale, must_pass, note_outcome
 from noack.impairments.link_records import (
     CORRUPTED,
     DELIVERED,
@@ -41,7 +41,7 @@ def admit(
     decision.copy_bit = -1
     decision.arrival_ns = now_ns
     decision.size_bytes = size_bytes
-    decision.must_pass = must_pass(flow, program.mansd)
+    decision.must_pass = must_pass(program, flow, state.losses[row])
     decision.spared = 0
     flow.packets += 1
     counters.received += 1
@@ -106,7 +106,8 @@ def within(bit: int, size_bytes: int) -> int:
 
 def settle(program: LinkProgram, state: LinkMemory, row: int, decision: PacketDecision) -> None:
     """Enforce the guarantee for a packet with known times, count it, complete the decision."""
-    flow, recent_ns, counters = state.flows[row], state.recent_ns[row], state.counters
+    flow, counters = state.flows[row], state.counters
+    recent_ns, losses_before = state.recent_ns[row], state.losses[row]
     packet, now_ns = decision.packet, decision.arrival_ns
     effective_ns = NEVER_NS
     decision.hold_back_ns, decision.makes_stale = 0, 0
@@ -119,7 +120,9 @@ def settle(program: LinkProgram, state: LinkMemory, row: int, decision: PacketDe
             decision.fate = CORRUPTED
     if effective_ns != NEVER_NS:
         if program.tracks:
-            needed_ns = needed_until_ns(flow, recent_ns, program.mansd, packet)
+            needed_ns = hold_back_until(
+                program, flow, recent_ns, losses_before, packet, effective_ns
+            )
             if needed_ns > effective_ns:
                 decision.hold_back_ns = needed_ns - effective_ns
                 if decision.bit < 0:
@@ -128,7 +131,9 @@ def settle(program: LinkProgram, state: LinkMemory, row: int, decision: PacketDe
                     decision.copy_ns = max(decision.copy_ns, needed_ns)
                 effective_ns = needed_ns
                 counters.held_back += 1
-            decision.makes_stale = make_stale(recent_ns, program.mansd, packet, effective_ns)
+            decision.makes_stale = make_stale(
+                program, recent_ns, losses_before, packet, effective_ns
+            )
         if decision.spared != 0:
             decision.fate = FORCED
         if flow.forced_first != 0:
@@ -142,6 +147,7 @@ def settle(program: LinkProgram, state: LinkMemory, row: int, decision: PacketDe
         counters.longest_loss_burst = max(counters.longest_loss_burst, losses)
     if program.tracks and program.mansd >= 0:
         recent_ns[packet % (program.mansd + 1)] = effective_ns
+    note_outcome(program, losses_before, packet, effective_ns == NEVER_NS)
     decision.consecutive_losses = flow.consecutive_losses
     count(counters, decision.fate)
     if decision.copy_ns != NEVER_NS:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from netem.rules.guarantee import counts_losses
 from noack.impairments.bottleneck import BottleneckStage
 from noack.impairments.link_records import LinkMemory, LinkProgram, RuleStage
 
@@ -17,7 +18,7 @@ def carry(
 
     A stage keeps its state if the new program has a stage of the same kind and name; a queue keeps
     its state under another discipline, too. Flows, counters and packets in flight do not change,
-    except that the count of the longest loss burst starts again, since another cap may apply.
+    except that the count of the longest loss burst starts again, since another guarantee may apply.
 
     Args:
         old: the program so far.
@@ -42,6 +43,8 @@ def carry(
     for row in range(len(before.flows)):
         before.flows[row].since = before.flows[row].packets
         before.flows[row].longest_loss_burst = 0
+        if counts_losses(new):
+            _carry_losses(row, old, before, after)
         if new.tracks and new.mansd >= 0:
             _carry_releases(row, old, before, new, after, latest_ns[row])
     after.counters.longest_loss_burst = 0
@@ -73,14 +76,52 @@ def _carry_queue(
     new_queue.carry = queue.carry if new.rate_bps == old.rate_bps else 0
 
 
+def _carry_losses(row: int, old: LinkProgram, before: LinkMemory, after: LinkMemory) -> None:
+    """Transfer the outcomes of the last packets; an unknown outcome counts as a delivery."""
+    packets, losses = before.flows[row].packets, after.losses[row]
+    mask = len(losses) - 1
+    losses[packets & mask] = 0
+    for number in range(packets - 1, packets - mask - 1, -1):
+        lost = 1 if _was_lost(row, old, before, number) else 0
+        losses[number & mask] = losses[(number + 1) & mask] - lost
+
+
+def _was_lost(row: int, old: LinkProgram, before: LinkMemory, number: int) -> bool:
+    """Whether it is known that a packet was lost."""
+    flow, losses, recent_ns = before.flows[row], before.losses[row], before.recent_ns[row]
+    ago = flow.packets - number
+    if counts_losses(old):
+        mask = len(losses) - 1
+        return ago <= mask and losses[(number + 1) & mask] > losses[number & mask]
+    if ago > flow.packets:
+        return False
+    if old.tracks and old.mansd >= 0:
+        width = old.mansd + 1
+        return ago <= width and recent_ns[number % width] < 0
+    return ago <= flow.consecutive_losses
+
+
+def _is_same_guarantee(old: LinkProgram, new: LinkProgram) -> bool:
+    """Whether two programs have the same guarantee."""
+    if old.mansd != new.mansd or old.recovery != new.recovery:
+        return False
+    if len(old.windows) != len(new.windows):
+        return False
+    for number in range(len(new.windows)):
+        one, other = old.windows[number], new.windows[number]
+        if one.losses != other.losses or one.packets != other.packets:
+            return False
+    return True
+
+
 def _carry_releases(
     row: int, old: LinkProgram, before: LinkMemory, new: LinkProgram, after: LinkMemory,
     latest_ns: int,
 ) -> None:  # fmt: skip
     """Transfer the release times that the guarantee needs.
 
-    If the cap differs, or no release times were stored, later packets leave only after the packets
-    that are in flight at the change.
+    If the guarantee differs, or no release times were stored, later packets leave only after the
+    packets that are in flight at the change.
     """
     flow, width = before.flows[row], new.mansd + 1
     if old.tracks:
@@ -88,7 +129,7 @@ def _carry_releases(
             old_width = old.mansd + 1
             for number in range(max(flow.packets - min(width, old_width), 0), flow.packets):
                 after.recent_ns[row][number % width] = before.recent_ns[row][number % old_width]
-        if old.mansd != new.mansd:
+        if not _is_same_guarantee(old, new):
             flow.first_release_ns = max(flow.first_release_ns, latest_ns)
     else:
         delivered = flow.packets - 1 - flow.consecutive_losses

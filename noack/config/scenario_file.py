@@ -88,7 +88,12 @@ def _read(
 
 def dumps(scenario: Scenario) -> str:
     """Return the scenario as TOML that :func:`load` reads back to an equal scenario."""
-    text = tomli_w.dumps(scenario.model_dump(mode="json", exclude_none=True), indent=2)
+    return toml_text(scenario.model_dump(mode="json", exclude_none=True))
+
+
+def toml_text(content: Mapping[str, Any]) -> str:
+    """Return tables as TOML, with each row of numbers or names on one line."""
+    text = tomli_w.dumps(content, indent=2)
     return _ROW.sub(lambda row: f"[{', '.join(re.findall(_ENTRY, row[1]))}]", text)
 
 

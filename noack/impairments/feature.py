@@ -161,13 +161,8 @@ class Constraint(Feature):
 
     @property
     @abstractmethod
-    def scope(self) -> object:
+    def scope(self) -> str:
         """Return what two constraints of a link must not have in common."""
-
-    @property
-    @abstractmethod
-    def twice(self) -> str:
-        """Return the name of that, for messages."""
 
 
 class LossModel(StageFeature):

@@ -83,6 +83,14 @@ class RecordedDecision:
 
 
 @dataclass(slots=True)
+class WindowRule:
+    """A maximum of losses among any ``packets`` consecutive packets of a flow."""
+
+    losses: int
+    packets: int
+
+
+@dataclass(slots=True)
 class StageMemory:
     """A stage's memory of a flow."""
 
@@ -204,8 +212,12 @@ class LinkProgram(NamedTuple):
     """Recorded decisions to be repeated, flow by flow."""
     decisions_begin: Sequence[int]
     """(flows + 1,) Begin of each recorded flow's decisions, and the end of the last; or empty."""
+    windows: Sequence[WindowRule]
+    """Further maxima of losses."""
+    recovery: int
+    """Minimum number of consecutive deliveries between two loss bursts; 0: none."""
     mansd: int
-    """M − 1; −1 for no cap."""
+    """Maximum number of consecutive losses that the guarantee allows; −1: no maximum."""
     limit: int
     """Maximum number of packets delayed at once."""
     tracks: bool
@@ -220,7 +232,9 @@ class LinkMemory(NamedTuple):
     memory: Sequence[Sequence[StageMemory]]
     """(rows, k)"""
     recent_ns: Sequence[MutableSequence[int]]
-    """(rows, mansd + 1) Release times; see :mod:`netem.rules.mansd`."""
+    """(rows, mansd + 1) Release times; see :mod:`netem.rules.guarantee`."""
+    losses: Sequence[MutableSequence[int]]
+    """(rows, power of 2) Numbers of losses so far; see :mod:`netem.rules.guarantee`."""
     queues: Sequence[Any]
     """(k,) One per stage, of :class:`QueueState` or a class derived from it."""
     departures_ns: MutableSequence[int]

@@ -153,6 +153,10 @@ class _Loop(Generic[T]):
         """Whether the loop has waited since the last housekeeping."""
         self._emit(news(clock.now_ns()))
         self.schedule_housekeeping()
+        self._begin(machine, clock)
+
+    def _begin(self, machine: Machine[T], clock: RunClock) -> None:
+        """Prepare what only a subclass needs."""
 
     def schedule_housekeeping(self) -> None:
         """Set the time of the next housekeeping."""
@@ -235,20 +239,11 @@ class _Loop(Generic[T]):
 class _SelfDrivenLoop(_Loop[T]):
     """The loop of a machine that drives itself between two turns of housekeeping."""
 
-    def __init__(
-        self,
-        machine: Machine[T],
-        channel: Channel[T],
-        clock: RunClock,
-        telemetry: RecordSink,
-        spin_s: float,
-        news: Callable[[int], Sequence[Record | Notice]],
-    ) -> None:
-        super().__init__(machine, channel, clock, telemetry, spin_s, news)
+    def _begin(self, machine: Machine[T], clock: RunClock) -> None:
         assert isinstance(machine, SelfDrivenMachine)
         self._drive = machine.drive
         self._period_ns = int(_HOUSEKEEPING_S * NS_PER_S * clock.speed)
-        self._emit(channel.tend(clock.now_ns()))  # messages may have arrived before
+        self._emit(self._channel.tend(clock.now_ns()))  # messages may have arrived before
 
     def step(self) -> None:
         """Let the machine work until the next housekeeping, which it puts off if it is busy."""

@@ -29,7 +29,7 @@ def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> NetworkCond
     common_ns = math.gcd(sample_ns, tick_ns)
     wait_ns = tick_ns - common_ns + phase_ns % common_ns
     late_ns = late_periods * step_ns
-    under_way_ns = late_ns + math.ceil(certified_delay_s(resolved) * NS_PER_S)
+    under_way_ns = network_delay_ns(resolved, late_periods)
     if under_way_ns > 0:  # an update in flight for up to this time may just miss a tick
         wait_ns = under_way_ns + tick_ns - 1
     delay_ns, first_ns = ((t_ns // step_ns + 1) * step_ns for t_ns in (wait_ns, phase_ns))
@@ -48,6 +48,12 @@ def certified_delay_s(resolved: Scenario) -> float:
     """The network delay that the certificates allow for: as given, or the longest one."""
     given_s = resolved.certificate.network_delay_s
     return resolved.network.link.longest_delay_s if given_s is None else given_s
+
+
+def network_delay_ns(resolved: Scenario, late_periods: int) -> int:
+    """Return the longest time for which the network may delay an update under these conditions."""
+    late_ns = late_periods * resolved.timing.plant_period_ns
+    return late_ns + math.ceil(certified_delay_s(resolved) * NS_PER_S)
 
 
 def allowed_conditions(resolved: Scenario) -> NetworkConditions:

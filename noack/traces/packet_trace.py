@@ -96,12 +96,15 @@ def packet_trace(
     if int(sent[-1]) - int(sent[0]) > LONGEST_NS:
         raise TraceRecordError(int(row[-1]), "is sent more than 31 years after the first packet")
     origin_ns = sent[0]
-    apart = np.abs(received // 2 - origin_ns // 2) > LONGEST_NS // 2  # halves do not overflow
+    known = received[~lost]
+    reference_ns = known[0] if clocks_differ and len(known) else origin_ns
+    apart = np.abs(received // 2 - reference_ns // 2) > LONGEST_NS // 2  # halves do not overflow
     _refuse(np.flatnonzero(apart & ~lost), row, "is received 31 years from the first sending")
     sent = sent - origin_ns
-    received = np.where(lost, sent, received - origin_ns)
-    if clocks_differ and not lost.all():
+    received = received - reference_ns
+    if clocks_differ and len(known):
         received = received - (received - sent)[~lost].min()
+    received = np.where(lost, sent, received)
     early = (
         "is received before it is sent; if the two clocks differ, only relative delays are known"
     )

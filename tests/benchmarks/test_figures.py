@@ -95,11 +95,14 @@ def test_startup_has_a_row_for_the_goal_and_one_for_the_peer() -> None:
 
 
 def test_the_end_of_a_long_run_is_judged_by_its_memory_and_its_additional_time() -> None:
-    ends = {60.0: long_run.End(4.0, 5.0, 200.0), 660.0: long_run.End(20.0, 17.0, 500.0)}
-    peak, growth, _, speed = long_run.rows_of(ends)
+    short = long_run.End(4.0, 5.0, 200.0, {"claims": 1.0})
+    ends = {60.0: short, 660.0: long_run.End(20.0, 17.0, 500.0, {"claims": 3.0})}
+    peak, growth, _, speed, by_cpu, claims = long_run.rows_of(ends)
     assert (peak.value, peak.holds) == (500.0, False)
     assert growth.ratio == 2.5
-    assert (speed.value, speed.holds) == (50.0, False)
+    assert (speed.value, speed.holds) == (37.5, False)
+    assert by_cpu.value == 50.0
+    assert claims.value == 12.0
 
 
 def test_a_failed_program_is_reported_with_its_last_output() -> None:

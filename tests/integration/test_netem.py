@@ -3,10 +3,12 @@
 import json
 import os
 import re
+import resource
 import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,6 +21,12 @@ from netem.compile_notice import announced
 from noack.core.errors import ExitStatus
 
 COMMAND = [sys.executable, "-m", "netem"]
+MIB = 2**20
+
+
+def size_of(pid: int) -> int:
+    """Size of a process's address space, in bytes."""
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[0]) * resource.getpagesize()
 
 
 @contextmanager
@@ -221,3 +229,24 @@ def test_unintended_losses_have_their_own_exit_status() -> None:
         _, stderr = process.communicate(timeout=60)
     assert process.returncode == ExitStatus.UNINTENDED_LOSSES == 3
     assert "the guarantee does not hold (exit status 3)" in stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of another process are for Linux")
+def test_the_emulator_keeps_48_mib_of_the_allowed_memory() -> None:
+    """Delayed datagrams take the rest; the emulator goes on, and counts those without room."""
+    words = ("--listen", "127.0.0.1:0", "--to", "127.0.0.1:9", "--json", "delay", "1000s")
+    with emulator(*words) as (process, (port,)), socket.socket(type=socket.SOCK_DGRAM) as sender:
+        allowed = size_of(process.pid) + 160 * MIB
+        resource.prlimit(process.pid, resource.RLIMIT_AS, (allowed, allowed))
+        for number in range(5000):  # 300 MB
+            sender.sendto(bytes(60_000), ("127.0.0.1", port))
+            if number % 50 == 49:
+                time.sleep(0.02)  # for the emulator to read them
+        deadline_s = time.monotonic() + 60
+        while allowed - size_of(process.pid) > 112 * MIB and time.monotonic() < deadline_s:
+            time.sleep(0.1)
+        assert 40 * MIB < allowed - size_of(process.pid) <= 112 * MIB
+        process.send_signal(signal.SIGINT)
+        stdout, stderr = process.communicate(timeout=60)
+    assert process.returncode == ExitStatus.UNINTENDED_LOSSES, stderr
+    assert "Cannot allocate memory" in stdout + stderr

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from netem.engine.compiled_rules import compile_rule, compiled_program, compiled_state, set_flow
 from netem.engine.many_decisions import admit_many
-from netem.rule_program import empty_state, program_of, recent_width
+from netem.rule_program import program_of
 from netem.words.words_to_settings import settings_of
 from noack.impairments.link_records import LinkMemory, PacketDecision, RecordedDecision, dtype_of
 from noack.impairments.link_settings import LinkSettings
@@ -63,7 +63,7 @@ def decide() -> Decide:
         arrivals = np.array(np.broadcast_to(np.asarray(arrivals_ns, np.int64), count))
         sizes = np.array(np.broadcast_to(np.asarray(sizes_bytes, np.int64), count))
         many = int(all_flows.max(initial=0)) + 1
-        state = compiled_state(program, empty_state(program), many, recent_width(program))
+        state = compiled_state(program, many)
         set_flow(state, 0, 0, settings.first_delivered)
         flows_state, recent_ns = np.asarray(state.flows), np.asarray(state.recent_ns)
         flows_state[:], recent_ns[:] = flows_state[0], recent_ns[0]

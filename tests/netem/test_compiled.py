@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from netem.engine.many_decisions import admit_many
-from netem.rule_program import empty_state, new_flow, new_memory, program_of, recent_width
+from netem.rule_program import FlowRow, empty_state, new_flow, new_row, program_of
 from netem.words.words_to_settings import settings_of
 from noack.impairments.link_records import (
     LinkMemory,
@@ -34,11 +34,9 @@ def plain(
 ) -> tuple[list[PacketDecision], LinkMemory]:  # fmt: skip
     program = program_of(link, seed, "test", decisions=recorded)
     many = max(flows) + 1
-    state = empty_state(program)._replace(
-        flows=[new_flow(flow, link.first_delivered) for flow in range(many)],
-        memory=[new_memory(program) for _ in range(many)],
-        recent_ns=[[-1] * recent_width(program) for _ in range(many)],
-    )
+    flow_rows = [new_row(program, new_flow(flow, link.first_delivered)) for flow in range(many)]
+    tables = zip(FlowRow._fields, map(list, zip(*flow_rows, strict=True)), strict=True)
+    state = empty_state(program)._replace(**dict(tables))
     expected = [PacketDecision() for _ in flows]
     admit_many(program, state, flows, sizes, arrivals, expected)
     return expected, state
@@ -53,6 +51,7 @@ def assert_equal(decided: Any, expected: Any, state: LinkMemory) -> None:
     np.testing.assert_array_equal(decided.decisions, rows(expected))
     np.testing.assert_array_equal(decided.state.flows, rows(state.flows))
     np.testing.assert_array_equal(decided.state.recent_ns, state.recent_ns)
+    np.testing.assert_array_equal(decided.state.losses, state.losses)
     np.testing.assert_array_equal(decided.state.departures_ns, state.departures_ns)
     if state.queues:
         queues = array_of(decided.state.queues.dtype, state.queues)

@@ -15,13 +15,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from netem.link_machine import Datagram, Link
-from netem.rule_program import empty_state, new_flow, new_memory, program_of, recent_width
-from netem.rules import mansd as rule
+from netem.rule_program import empty_state, new_flow, new_row, program_of
+from netem.rules import guarantee as rule
 from netem.rules.link_rules import settle
 from netem.words.words_to_settings import settings_of
 from noack.impairments.link_records import DELIVERED, DROPPED, PacketDecision, RecordedDecision
 from noack.impairments.link_settings import LinkSettings
 from tests.netem import any_settings
+from tests.netem.loss_language import is_allowed
 
 MS = 1_000_000
 OUT_OF_ORDER = settings_of("delay 5ms 20ms reorder 50%").impairments
@@ -32,8 +33,9 @@ def often_out_of_order(link: LinkSettings, more: bool) -> LinkSettings:
 
 
 links = st.builds(
-    often_out_of_order, any_settings.harsh.filter(lambda one: one.mansd is not None), st.booleans()
-)
+    often_out_of_order, any_settings.harsh.filter(lambda one: one.longest_burst is not None),
+    st.booleans(),
+)  # fmt: skip
 GAPS_NS = [0, 1, 1000, MS // 3, MS, 5 * MS, 100 * MS]
 
 
@@ -70,6 +72,11 @@ class Observer:
             if not counted or number > counted[-1]:
                 counted.append(number)
 
+    def lost(self, flow: int, sent: int, since: int = 0) -> list[bool]:
+        """Return the outcomes of a flow's datagrams from number ``since`` on."""
+        counted = set(self.counted.get(flow, ()))
+        return [number not in counted for number in range(since, sent)]
+
     def longest_loss_burst(self, flow: int, sent: int, since: int = 0) -> int:
         """Return the longest loss burst of a flow from number ``since`` on, lost ends included."""
         counted = [number for number in self.counted.get(flow, ()) if number >= since]
@@ -102,50 +109,50 @@ def send_all(
 
 def assert_kept(settings: LinkSettings, link: Link, observer: Observer, sent: Any) -> None:
     """The guarantee holds since the last change; the link counts the bursts that are observed."""
-    assert settings.mansd is not None
+    assert settings.longest_burst is not None
     longest = 0
     for flow, count in sent.items():
         of_flow = link.flow(flow)
         assert of_flow is not None
         assert of_flow.longest_loss_burst == observer.longest_loss_burst(flow, count, of_flow.since)
         longest = max(longest, of_flow.longest_loss_burst)
+        assert is_allowed(observer.lost(flow, count, of_flow.since), settings)
         if settings.first_delivered and of_flow.since == 0:
             assert observer.counted[flow][0] == 0
-    assert link.counters.longest_loss_burst == longest <= settings.mansd
+    assert link.counters.longest_loss_burst == longest <= settings.longest_burst
 
 
-@pytest.mark.parametrize("change", ["no", "with the same cap", "with another cap"])
+@pytest.mark.parametrize("change", ["no", "with the same guarantee", "with another guarantee"])
 @settings(max_examples=80)
 @given(
     st.lists(links, min_size=2, max_size=4), arrivals, st.integers(0, 2**32),
     st.sampled_from([0.0, 0.3, 0.9]),
 )  # fmt: skip
-def test_at_most_mansd_consecutive_datagrams_are_not_delivered(
+def test_only_allowed_datagrams_are_not_delivered(
     change: str, stages: list[LinkSettings], steps: list[tuple[int, int]], seed: int, late: float
 ) -> None:
     """Even if datagrams arrive before overdue timers are served, and if the settings change.
 
-    Another cap holds for all later arrivals, whatever is in flight or was lost before.
+    Another guarantee holds for all later arrivals, whatever is in flight or was lost before.
     """
     rng = np.random.default_rng(seed)
     in_force = stages[0]
     link = Link(in_force, seed, "a")
-    own = {"mansd": in_force.mansd, "first_delivered": in_force.first_delivered}
-    same = change != "with another cap"
+    own = {name: getattr(in_force, name) for name in ("mansd", "constraints", "first_delivered")}
+    same = change != "with another guarantee"
 
     def change_sometimes() -> None:
         nonlocal in_force
         if change != "no" and rng.random() < 0.1:
-            assert link.counters.longest_loss_burst <= (in_force.mansd or 0)
+            assert link.counters.longest_loss_burst <= (in_force.longest_burst or 0)
             in_force = stages[int(rng.integers(len(stages)))]
             in_force = in_force.model_copy(update=own) if same else in_force
             link.change(in_force)
 
     observer, sent = send_all(link, steps, lambda: rng.random() < late, change_sometimes)
     assert_kept(in_force, link, observer, sent)
-    if same:  # the same cap holds across the changes, too
-        longest = max(observer.longest_loss_burst(*of_flow) for of_flow in sent.items())
-        assert longest <= (in_force.mansd or 0)
+    if same:  # the same guarantee holds across the changes, too
+        assert all(is_allowed(observer.lost(*of_flow), in_force) for of_flow in sent.items())
 
 
 @settings(max_examples=50)
@@ -165,7 +172,7 @@ def test_the_guarantee_needs_no_clock(settings: LinkSettings, seed: int, count: 
     while link.next_deadline_ns() is not None:
         observer.see(link.on_timer(0))
     for flow, of_flow in enumerate(sent):
-        assert observer.longest_loss_burst(flow, of_flow) <= (settings.mansd or 0)
+        assert is_allowed(observer.lost(flow, of_flow), settings)
 
 
 decisions = st.builds(
@@ -180,13 +187,14 @@ decisions = st.builds(
 
 @given(
     st.lists(decisions, max_size=40), st.lists(st.sampled_from(GAPS_NS), min_size=1, max_size=60),
-    st.integers(0, 4), st.booleans(),
+    st.integers(0, 4), any_settings.constraints, st.booleans(),
 )  # fmt: skip
 def test_the_guarantee_holds_in_any_replay(
-    recorded: list[RecordedDecision], gaps: list[int], mansd: int, first: bool
+    recorded: list[RecordedDecision], gaps: list[int], mansd: int, constraints: Any, first: bool
 ) -> None:
     """Also of decisions that no link makes, at other times."""
-    settings = settings_of(f"loss worst mansd {mansd} {'first' * first}")
+    update = {"mansd": mansd, "constraints": constraints}
+    settings = settings_of(f"loss worst {'first' * first}").model_copy(update=update)
     link = Link(settings, 1, "a", decisions=[recorded])
     observer, sent = send_all(link, [(0, gap) for gap in gaps])
     assert_kept(settings, link, observer, sent)
@@ -196,7 +204,8 @@ def test_the_guarantee_holds_in_any_replay(
 def test_without_a_cap_the_first_is_still_delivered(
     settings: LinkSettings, steps: list[tuple[int, int]]
 ) -> None:
-    freely = settings.model_copy(update={"mansd": None, "first_delivered": True})
+    update = {"mansd": None, "constraints": (), "first_delivered": True}
+    freely = settings.model_copy(update=update)
     observer, sent = send_all(Link(freely, 1, "a"), steps)
     for flow in sent:
         assert observer.counted[flow][0] == 0
@@ -213,44 +222,50 @@ def test_the_cap_forces_only_the_necessary_packets(decide: Any, mansd: int, firs
         assert passed.tolist() == list(range(0 if first else mansd, 1000, mansd + 1))
 
 
-def longest_burst_of(releases: Sequence[int | None]) -> int:
-    """Return the longest loss burst for the given release times, by brute force."""
-    fresh = [
-        time is not None
-        and not any(later is not None and later < time for later in releases[number + 1 :])
+def lost_of(releases: Sequence[int | None]) -> list[bool]:
+    """Return the outcomes for the given release times, by brute force."""
+    return [
+        time is None or any(later is not None and later < time for later in releases[number + 1 :])
         for number, time in enumerate(releases)
     ]
-    borders = [-1, *(number for number, is_fresh in enumerate(fresh) if is_fresh), len(fresh)]
-    return max(b - a - 1 for a, b in itertools.pairwise(borders))
 
 
-@settings(max_examples=80)
-@given(st.lists(st.none() | st.integers(0, 12), max_size=24), st.integers(0, 4))
+@settings(max_examples=200)
+@given(
+    st.lists(st.none() | st.integers(0, 12), max_size=24), st.integers(0, 4),
+    any_settings.constraints,
+)  # fmt: skip
 def test_a_datagram_is_held_back_no_longer_than_necessary(
-    wishes: list[int | None], mansd: int
+    wishes: list[int | None], mansd: int, constraints: Any
 ) -> None:
-    """Compare all times: the earliest at or after the wish that keeps the guarantee is chosen."""
-    program = program_of(settings_of(f"delay 1s mansd {mansd}"), 0, "a")
-    flow, width = new_flow(0, False), recent_width(program)
-    state = empty_state(program)._replace(
-        flows=[flow], memory=[new_memory(program)], recent_ns=[[-1] * width]
-    )
+    """Compare all times: the earliest at or after the wish that keeps the guarantee is chosen.
+
+    And a datagram must pass only if its loss would break the guarantee.
+    """
+    own = settings_of(f"delay 1s mansd {mansd}").model_copy(update={"constraints": constraints})
+    program = program_of(own, 0, "a")
+    row = new_row(program, new_flow(0, False))
+    state = empty_state(program)._replace(**{name: [one] for name, one in row._asdict().items()})
     releases: list[int | None] = []
     for packet, wish in enumerate(wishes):
-        if wish is None and rule.must_pass(flow, mansd):
-            wish = 0
+        if wish is None:
+            must_pass = rule.must_pass(program, row.flows, row.losses)
+            assert must_pass != is_allowed([*lost_of(releases), True], own)
+            wish = 0 if must_pass else None
         if wish is None:
             settle(program, state, 0, PacketDecision(DROPPED, packet))
+            row.flows.packets += 1
             releases.append(None)
         else:
             decision = PacketDecision(DELIVERED, packet, release_ns=wish)
             settle(program, state, 0, decision)
+            row.flows.packets += 1
             alternatives = sorted({wish, *(t for t in releases if t is not None and t > wish)})
-            least = next(t for t in alternatives if longest_burst_of([*releases, t]) <= mansd)
+            least = next(t for t in alternatives if is_allowed(lost_of([*releases, t]), own))
             assert decision.release_ns == least
             assert decision.hold_back_ns == least - wish
             releases.append(least)
-        assert longest_burst_of(releases) <= mansd
+        assert is_allowed(lost_of(releases), own)
 
 
 def test_a_duplicate_is_not_a_second_delivery(decide: Any) -> None:

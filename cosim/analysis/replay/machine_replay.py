@@ -48,7 +48,7 @@ _MOST_BYTES = 65_535
 
 
 _NOT_SENT = (Record, Notice)
-_LAST_RANK = 3  # of the differences at one input, those before count
+_ANSWER_RANK, _LAST_RANK = 2, 3  # of several differences at one input, the first counts
 _DAMAGE = (ArithmeticError, LookupError, ValueError, CallerError)
 """Errors of a machine that gets an input from a damaged record, which no run can have."""
 
@@ -267,25 +267,20 @@ class _Run:
 
     def _compare(self, outputs: Sequence[Sequence[Any]]) -> int:
         """Compare the emitted rows; return how many inputs the machine took."""
-        taken = len(outputs)
-        places: dict[str, list[int]] = {table: [] for table in self._owned}
-        emitted: dict[str, list[tuple[Any, ...]]] = {table: [] for table in self._owned}
-        tables = [*itertools.chain(*([table] * len(rows) for table, rows in self._owned.items()))]
-        for place, (i, each) in enumerate(zip(self._order, outputs, strict=False)):
-            table = tables[i]
-            answers = [one for one in each if isinstance(one, Record)]
-            if len(answers) == 1 and answers[0].table == table:
-                places[table].append(place)
-                emitted[table].append(answers[0].row)
-            else:
-                what = "the machine does not answer with one row of this table"
-                self._differs(place, 2, what)
+        taken, order = len(outputs), np.array(self._order[: len(outputs)], np.int64)
+        answers = [[one for one in each if type(one) is Record] for each in outputs]
         begin = 0
         for table, rows in self._owned.items():
-            at = np.array(places[table], np.int64)
-            recorded = rows[np.array(self._order, np.int64)[at] - begin]
+            at = np.flatnonzero((order >= begin) & (order < begin + len(rows)))
+            mine = [answers[place] for place in at.tolist()]
+            right = [len(one) == 1 and one[0].table == table for one in mine]
+            if not all(right):
+                what = "the machine does not answer with one row of this table"
+                self._differs(int(at[right.index(False)]), _ANSWER_RANK, what)
+                at, mine = at[right], [one for one, fits in zip(mine, right, strict=True) if fits]
+            recorded = rows[order[at] - begin]
             begin += len(rows)
-            fresh, error = rows_of(emitted[table], rows.dtype)
+            fresh, error = rows_of([record.row for (record,) in mine], rows.dtype)
             if error is not None:
                 self._cannot_take(place := int(at[len(fresh)]), error)
                 taken = min(taken, place)
@@ -293,7 +288,7 @@ class _Run:
                 _, row = self._row(place := int(at[first]))
                 row += self._offsets[table]
                 found = rows_differ(table, row, recorded[first], fresh[first])
-                self._found.append((place, 2, found))
+                self._found.append((place, _ANSWER_RANK, found))
         return taken
 
     def _row(self, place: int) -> tuple[str, int]:
@@ -305,7 +300,7 @@ class _Run:
 
     def _differs(self, place: int, rank: int, what: str, *values: Any) -> None:
         """Store a difference at an input; of several there, that of the least rank counts."""
-        if rank < _LAST_RANK and any(known == rank for _, known, _ in self._found):
+        if rank < _ANSWER_RANK and any(known == rank for _, known, _ in self._found):
             return
         table, row = self._row(place)
         now_ns = int(self._owned[table]["now_ns"][row])

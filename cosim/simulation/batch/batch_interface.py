@@ -16,7 +16,7 @@ from cosim.simulation.continuous.continuous_loop import vanished
 from cosim.simulation.continuous.continuous_run import MAX_EVENTS
 from cosim.simulation.continuous.network_fates import timeless
 from netem.link_machine import UPDATE_LINK
-from netem.rule_program import empty_state, program_of, stream_names
+from netem.rule_program import program_of, stream_names
 from noack.config.resolution import loop_of, policy_of
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
@@ -209,7 +209,7 @@ def _network(link: LinkSettings) -> Any:
     from netem.engine.compiled_rules import compiled_program, compiled_state, set_flow
 
     program = program_of(link, 0, UPDATE_LINK)
-    state = compiled_state(program, empty_state(program), 1, 1)
+    state = compiled_state(program, 1)
     set_flow(state, 0, 0, link.first_delivered)
     return LossTable(compiled_program(program), state, np.zeros(1, dtype_of(PacketDecision)))
 

@@ -97,6 +97,9 @@ def renew(network: LossTable, keys: Any, run: int, first_delivered: bool) -> Non
     flow.newest = -1
     flow.since = 0
     flow.longest_loss_burst = 0
+    losses = network.state.losses[0]
+    for place in range(len(losses)):
+        losses[place] = 0
     for stage in range(len(network.program.stages)):
         network.program.stages[stage].key0 = keys[run, stage, 0]
         network.program.stages[stage].key1 = keys[run, stage, 1]

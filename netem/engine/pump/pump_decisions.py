@@ -68,9 +68,9 @@ def decide(
     number = 2 * link + reverse
     direction = memory.directions[number]
     program = _program_at(program_like, direction)
-    flows, stages, recent_ns, queues, departures_ns = _arrays_at(state_like, direction)
+    flows, stages, recent_ns, losses, queues, departures_ns = _arrays_at(state_like, direction)
     state = LinkMemory(
-        flows, stages, recent_ns, queues, departures_ns,
+        flows, stages, recent_ns, losses, queues, departures_ns,
         memory.link_states[number], memory.counters[number],
     )  # fmt: skip
     while pump.batch_next < pump.batch_end:
@@ -126,18 +126,21 @@ def _program_at(like: LinkProgram, direction: Any) -> LinkProgram:
         array_at(
             like.decisions_begin, direction.decisions_begin, direction.decisions_begin_rows, 0
         ),
+        array_at(like.windows, direction.windows, direction.windows_rows, 0),
+        direction.recovery,
         direction.mansd,
         direction.limit,
         direction.tracks != 0,
     )
 
 
-def _arrays_at(like: LinkMemory, direction: Any) -> tuple[Any, Any, Any, Any, Any]:
+def _arrays_at(like: LinkMemory, direction: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
     """Return the arrays of a direction's state; compiled code cannot return its records."""
     return (
         array_at(like.flows, direction.flows, direction.rows, 0),
         array_at(like.memory, direction.memory, direction.rows, direction.stages_rows),
         array_at(like.recent_ns, direction.recent_ns, direction.rows, direction.width),
+        array_at(like.losses, direction.losses, direction.rows, direction.loss_width),
         array_at(like.queues, direction.queues, direction.stages_rows, 0),
         array_at(like.departures_ns, direction.departures_ns, direction.departure_rows, 0),
     )
@@ -170,7 +173,11 @@ def _client_of(memory: Memory, number: int, size_bytes: int) -> int:
 
 
 def _read_arrival(memory: Memory) -> None:
-    """Read the arrival time of the current packet."""
+    """Read the arrival time of the current packet.
+
+    The kernel's timestamps are of the wall clock. One from before the relay's start is ignored: the
+    wall clock was set since.
+    """
     pump = memory.pump[0]
     header, words = memory.in_headers[pump.batch_next], memory.in_controls[pump.batch_next]
     pump.arrival_ns = pump.read_ns
@@ -179,7 +186,9 @@ def _read_arrival(memory: Memory) -> None:
         used_bytes = (words[place] + 7) & ~7
         if words[place + 1] == _STAMP:
             waited_ns = pump.real_ns - (words[place + 2] * _NS + words[place + 3])
-            pump.arrival_ns = pump.read_ns - simulated_ns_of(memory, waited_ns)
+            waited_ns = simulated_ns_of(memory, waited_ns)
+            if waited_ns <= pump.read_ns:
+                pump.arrival_ns = pump.read_ns - waited_ns
         left_bytes -= used_bytes
         place += used_bytes >> 3
 
@@ -240,9 +249,9 @@ def _line_up(memory: Memory, state_like: LinkMemory) -> None:
     leaving = memory.leaving[pump.leaving]
     number = leaving.direction
     direction, link = memory.directions[number], number >> 1
-    flows, stages, recent_ns, queues, departures_ns = _arrays_at(state_like, direction)
+    flows, stages, recent_ns, losses, queues, departures_ns = _arrays_at(state_like, direction)
     state = LinkMemory(
-        flows, stages, recent_ns, queues, departures_ns,
+        flows, stages, recent_ns, losses, queues, departures_ns,
         memory.link_states[number], memory.counters[number],
     )  # fmt: skip
     leaving.stale = leave(

@@ -117,8 +117,8 @@ CLIENT = np.dtype(
         ("local", "u1", (NAME_BYTES,)),  # address of its return path
     ]
 )
-TABLES = ("stages", "integers", "reals", "decisions", "decisions_begin")
-PER_FLOW = ("flows", "memory", "recent_ns")
+TABLES = ("stages", "integers", "reals", "decisions", "decisions_begin", "windows")
+PER_FLOW = ("flows", "memory", "recent_ns", "losses")
 STATES = (*PER_FLOW, "queues", "departures_ns")
 DIRECTION = np.dtype(
     [
@@ -127,7 +127,9 @@ DIRECTION = np.dtype(
         *((name, "<i8") for name in STATES),
         ("rows", "<i8"),
         ("width", "<i8"),  # width of recent_ns
+        ("loss_width", "<i8"),  # width of losses
         ("departure_rows", "<i8"),
+        ("recovery", "<i8"),
         ("mansd", "<i8"),
         ("limit", "<i8"),
         ("tracks", "<i8"),

@@ -39,10 +39,10 @@ def require_consistent(mansd: int | None, constraints: Sequence[AnyConstraint]) 
     Raises:
         ValueError: they cannot; the message begins with the key.
     """
-    seen: set[object] = set()
+    seen: set[str] = set()
     for number, one in enumerate(constraints):
         if one.scope in seen:
-            raise ValueError(f"constraints.{number}: {one.text()}: there is a {one.twice} already")
+            raise ValueError(f"constraints.{number}: {one.text()}: there is a {one.scope} already")
         seen.add(one.scope)
     if constraints and longest_burst_of(mansd, constraints) is None:
         raise ValueError(

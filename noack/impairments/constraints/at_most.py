@@ -50,11 +50,7 @@ class AtMost(Constraint):
         return LossesInWindow(self.losses, self.window)
 
     @property
-    def scope(self) -> object:
-        return self.kind, self.window
-
-    @property
-    def twice(self) -> str:
+    def scope(self) -> str:
         return f"maximum for {self.window} packets"
 
     def text(self) -> str:

@@ -36,11 +36,7 @@ class Recovery(Constraint):
         return DeliveriesBetweenBursts(self.deliveries)
 
     @property
-    def scope(self) -> object:
-        return self.kind
-
-    @property
-    def twice(self) -> str:
+    def scope(self) -> str:
         return "recovery"
 
     def text(self) -> str:

@@ -99,6 +99,7 @@ MORE = {
     "fidelity": (),
     "report": (),
     "scenarios": (),
+    "measure": (),
     "certify": (),
     "simulate": ("--set", "horizon_s=1", "--no-report"),
     "adversary": ("--nodes", "200", "--beam", "2", "--set", "horizon_s=0.5"),
@@ -181,4 +182,5 @@ def test_arguments_have_few_names() -> None:
                 arguments[one.name].add(name)
     assert arguments.keys() == {
         "scenario", "run_dir", "directories", "recording", "file", "name", "settings",
+        "sources",
     }  # fmt: skip

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from netem.engine.compiled_rules import compile_rule, compiled_program, compiled_state, set_flow
 from netem.engine.many_decisions import admit_many
 from netem.link_machine import Link
-from netem.rule_program import empty_state, program_of, recent_width
+from netem.rule_program import program_of
 from netem.rules.settings_change import carry
 from noack.impairments.link_records import (
     Counters,
@@ -39,7 +39,7 @@ class Compiled:
 
     def __init__(self, own: LinkSettings, **others: Any) -> None:
         self.program: LinkProgram = compiled_program(plain := program_of(own, 3, "a", **others))
-        self.state = compiled_state(plain, empty_state(plain), FLOWS, recent_width(plain))
+        self.state = compiled_state(plain, FLOWS)
         self._first_delivered = own.first_delivered
         self._seen: set[int] = set()
 
@@ -56,8 +56,7 @@ class Compiled:
     def change(self, own: LinkSettings) -> None:
         self._first_delivered = own.first_delivered
         plain = program_of(own, 3, "a", tracks=self.program.tracks)
-        state: LinkMemory = compiled_state(plain, empty_state(plain), FLOWS, recent_width(plain))
-        np.asarray(state.recent_ns)[:] = -1
+        state: LinkMemory = compiled_state(plain, FLOWS)
         state = state._replace(
             flows=self.state.flows, link=self.state.link, counters=self.state.counters
         )

@@ -1,0 +1,56 @@
+"""Finalises a run directory, and prints the CPU time of each phase: ``_finalized_run RUN_DIR``.
+
+The phases are those of this process, in s as a JSON object; the replay of a long run takes place in
+another process beside them, and its phase is the time in which this one waits.
+"""
+
+import functools
+import json
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from cosim.analysis.claims.claims_by_part import RunClaims
+from cosim.live import finalize
+from cosim.output.viewer import run_view
+
+_PHASES = (
+    ("spool and Parquet", finalize, "finish_record"),
+    ("recording", run_view, "write_view"),
+    ("summary", finalize, "summarise"),
+    ("fidelity", finalize, "fidelity_for_summary"),
+    ("conditions", RunClaims, "violations"),
+    ("claims", RunClaims, "judge"),
+    ("wait for the replay", finalize.ReplayProcess, "verdict"),
+    ("report", finalize, "_report"),
+)
+
+
+def main(run_dir: str) -> None:
+    """Finalise a run."""
+    took_s: Counter[str] = Counter()
+    for phase, owner, name in _PHASES:
+        setattr(owner, name, _timed(getattr(owner, name), phase, took_s))
+    finalize.reopen(Path(run_dir))
+    print(json.dumps(took_s))
+
+
+def _timed(function: Callable[..., Any], phase: str, took_s: Counter[str]) -> Callable[..., Any]:
+    clock = time.monotonic if phase.startswith("wait") else time.process_time
+
+    @functools.wraps(function)
+    def timed(*arguments: Any, **options: Any) -> Any:
+        begun_s = clock()
+        try:
+            return function(*arguments, **options)
+        finally:
+            took_s[phase] += clock() - begun_s
+
+    return timed
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

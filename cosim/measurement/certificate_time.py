@@ -1,0 +1,172 @@
+"""For which share of a trace's time a scenario's certificate would have been void, by cause.
+
+Each packet of the trace is taken as an update of the scenario, sent when it was sent. The
+conditions are those of the scenario's certificates
+(:func:`noack.theory.run_conditions.allowed_conditions`). Losses are counted as the claims about a
+run count them: by the rules of the guarantee, and
+:class:`cosim.analysis.claims.observed_conditions.PacketLosses`. A condition is violated
+
+* by losses: from the sending of the packet whose loss is one too many, until a later packet is
+  received;
+* by a delay: from the end of the longest time that the certificate allows an update in the network,
+  until it is received.
+
+A packet that a later one overtakes counts as lost if the later one arrives after the allowed delay.
+A claim about a run is void from the first violation on, since its bounds depend on all that
+happened before.
+"""
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.analysis.claims.observed_conditions import PacketLosses, causes_of
+from cosim.analysis.claims.run_evidence import scheduled_certificates
+from cosim.measurement.loss_bursts import outcomes
+from noack.config.resolution import resolve
+from noack.config.scenario import Scenario
+from noack.theory.certificate import NetworkConditions
+from noack.theory.run_conditions import allowed_conditions, network_delay_ns
+from noack.traces.packet_trace import PacketTrace
+
+Times = NDArray[np.int64]
+DELAY, ORDER = "delay", " (out of order)"
+
+
+@dataclass(frozen=True)
+class VoidShare:
+    """How long one condition was violated."""
+
+    cause: str
+    """``delay``, or the name of a rule of the guarantee; with ``(out of order)`` if the rule would
+    hold without the overtaken packets."""
+    share: float
+    """Of the trace's time."""
+    first_s: float
+    """When it was first violated, since the first sending."""
+    worst: float
+    """The worst value: losses, or the longest delay in seconds."""
+    text: str
+    """In words, with the allowed value."""
+
+
+@dataclass(frozen=True)
+class CertificateTime:
+    """The result for a scenario."""
+
+    scenario: str
+    certificates: dict[str, str | None]
+    """By the plants that it covers: None, or why there is no certificate."""
+    allowed_losses: int
+    """The most consecutive losses that the guarantee of the scenario allows."""
+    allowed_delay_s: float
+    """In the network."""
+    observed_s: float
+    share: float
+    """Share of the time in which any of the conditions was violated."""
+    causes: tuple[VoidShare, ...]
+    """Those that were violated."""
+
+    @property
+    def first_s(self) -> float | None:
+        """When a condition was first violated, None if never: a claim is void from then on."""
+        return min((one.first_s for one in self.causes), default=None)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all fields for JSON."""
+        return asdict(self) | {"first_s": self.first_s}
+
+
+def certificate_time(trace: PacketTrace, scenario: Scenario) -> CertificateTime:
+    """Return for which share of the time the certificates of a scenario would have been void."""
+    resolved = resolve(scenario)
+    found: dict[str, str | None] = {}
+    if not causes_of(resolved):
+        found["every plant"] = "a loop with acknowledgements has no certificate"
+    for one in scheduled_certificates(resolved):
+        found[one.scope] = one.void if one.constants is None else None
+    allowed = allowed_conditions(resolved)
+    delay_ns = network_delay_ns(resolved, resolved.certificate.late_periods)
+    end_ns = int(max(trace.sent_ns[-1], trace.received_ns.max()))
+    spans = [one for one in _violations(trace, allowed, delay_ns, end_ns) if len(one.begin_ns)]
+    whole = max(end_ns, 1)
+    union_ns = _covered_ns(
+        np.concatenate([_NONE, *(one.begin_ns for one in spans)]),
+        np.concatenate([_NONE, *(one.end_ns for one in spans)]),
+    )
+    return CertificateTime(
+        scenario=resolved.name,
+        certificates=found or {"every plant": "the scenario cannot have a certificate"},
+        allowed_losses=allowed.dropouts,
+        allowed_delay_s=delay_ns * 1e-9,
+        observed_s=end_ns * 1e-9,
+        share=union_ns / whole,
+        causes=tuple(
+            VoidShare(
+                one.cause,
+                _covered_ns(one.begin_ns, one.end_ns) / whole,
+                float(one.begin_ns.min()) * 1e-9,
+                one.worst,
+                one.text,
+            )
+            for one in spans
+        ),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Spans:
+    """The k intervals in which a condition is violated."""
+
+    cause: str
+    begin_ns: Times
+    """(k,)"""
+    end_ns: Times
+    """(k,) At most the end of the trace."""
+    worst: float
+    text: str
+
+
+def _violations(
+    trace: PacketTrace, allowed: NetworkConditions, delay_ns: int, end_ns: int
+) -> Iterator[_Spans]:
+    """Yield the intervals of each cause."""
+    found, sent_ns, allowed_s = outcomes(trace), trace.sent_ns, delay_ns * 1e-9
+    sent_s, dropped_s = np.asarray(sent_ns * 1e-9), np.where(found.lost, np.inf, 0.0)
+    overtaken, replaced_s = found.out_of_order, dropped_s.copy()
+    replaced_s[overtaken] = (found.newer_ns - sent_ns)[overtaken] * 1e-9
+    # A violation by a lost packet lasts until a newer one is received; else, to the next packet.
+    until_ns = np.where(replaced_s > 0, found.newer_ns, np.append(sent_ns[1:], end_ns))
+    until_ns = np.minimum(until_ns, end_ns)
+    for rule in allowed.guarantee.rules:
+        every, dropped = (
+            PacketLosses(sent_s, times_s).values(rule, allowed_s, rule.start)[0].value
+            for times_s in (replaced_s, dropped_s)
+        )
+        which = dropped > rule.limit
+        for suffix, these in (("", which), (ORDER, (every > rule.limit) & ~which)):
+            worst = float(every[these].max(initial=0))
+            yield _Spans(
+                rule.name + suffix, sent_ns[these], until_ns[these], worst, rule.violation(worst)
+            )
+    delays = trace.received_ns - sent_ns
+    beyond = ~found.lost & ~overtaken & (delays > delay_ns)
+    worst = float(delays[beyond].max(initial=0)) * 1e-9
+    yield _Spans(
+        DELAY, sent_ns[beyond] + delay_ns, trace.received_ns[beyond], worst,
+        f"an update was in the network for {worst:.4g} s, {allowed_s:.4g} s allowed",
+    )  # fmt: skip
+
+
+def _covered_ns(begin_ns: Times, end_ns: Times) -> int:
+    """Return the length of the union of intervals."""
+    order = np.argsort(begin_ns, kind="stable")
+    begin_ns, end_ns = begin_ns[order], end_ns[order]
+    latest_ns = np.append(-1, np.maximum.accumulate(end_ns))[:-1]
+    return int(np.maximum(end_ns - np.maximum(begin_ns, latest_ns), 0).sum())
+
+
+_NONE: Times = np.zeros(0, np.int64)

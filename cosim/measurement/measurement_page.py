@@ -1,0 +1,30 @@
+"""The page of a measurement: its tables and figures, as one HTML file."""
+
+from pathlib import Path
+
+from cosim.measurement.certificate_time import CertificateTime
+from cosim.measurement.measurement_figures import measurement_figures
+from cosim.measurement.measurement_tables import measurement_tables, void_remarks
+from cosim.measurement.network_measurement import Measurement
+from cosim.output.report.report_page import templates
+from noack.core.errors import CallerError
+from noack.core.file_access import write_whole
+
+
+def write_page(found: Measurement, void: CertificateTime | None, path: Path) -> Path:
+    """Write the page; all text is escaped.
+
+    Raises:
+        CallerError: the name does not end in .html.
+        MachineError: the page cannot be written.
+    """
+    if path.suffix != ".html":
+        raise CallerError(f"--out {path}: a measurement is written as .html")
+    template = templates(Path(__file__).parent).get_template("measurement.html.jinja")
+    html = template.render(
+        found=found,
+        remarks=[*found.remarks, *void_remarks(void)],
+        tables=list(measurement_tables(found, void)),
+        figures=list(measurement_figures(found)),
+    )
+    return write_whole(path, html)

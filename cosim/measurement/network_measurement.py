@@ -1,0 +1,280 @@
+"""The measurement of a network from a packet trace: all statistics, fits and tests."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from os import PathLike
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from cosim.measurement.burst_statistics import (
+    WINDOWS,
+    QuantileM,
+    histogram,
+    most_losses,
+    quantile_m,
+)
+from cosim.measurement.certificate_time import CertificateTime, certificate_time
+from cosim.measurement.chain_fits import MOST_FITTED, ChainFit, ChainFits
+from cosim.measurement.confidence_interval import LEVEL, Estimate
+from cosim.measurement.delay_statistics import (
+    DelayStatistics,
+    autocorrelation,
+    delay_statistics,
+)
+from cosim.measurement.goodness_of_fit import FitTest
+from cosim.measurement.loss_bursts import Flags, LossBursts, Outcomes, loss_bursts, outcomes
+from cosim.measurement.outage_fit import OutageFit, fit_outages
+from cosim.measurement.outage_rule import OutageRule, find_outages, outages_longer_than
+from noack.config.scenario import Scenario
+from noack.traces.packet_trace import PacketTrace
+
+QUANTILES = (0.5, 0.9, 0.99, 0.999)
+
+
+@dataclass(frozen=True)
+class MeasurementOptions:
+    """What is measured."""
+
+    deadline_s: float | None = None
+    """A packet that arrives later than this after its sending counts as lost."""
+    quantiles: Sequence[float] = QUANTILES
+    """Shares of bursts and packets for which M is given."""
+    windows: Sequence[int] = WINDOWS
+    """K of the (m, K) table."""
+    outage_s: float | None = None
+    """Bursts of this duration or more are outages; None: the statistical rule."""
+
+
+class FittedModel:
+    """A loss model, fitted to the bursts that are no outages, with its test."""
+
+    def __init__(self, fit: ChainFit, test: FitTest) -> None:
+        self.fit, self.test = fit, test
+
+    @property
+    def is_rejected(self) -> bool:
+        """Whether the test rejects the model."""
+        return self.test.verdict == "rejected"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fit for JSON."""
+        return {
+            "model": self.fit.model,
+            "estimates": {name: _interval(one) for name, one in self.fit.estimates.items()},
+            "loss_rate": self.fit.rates.loss_rate,
+            "log_likelihood": self.fit.log_likelihood,
+            "test": asdict(self.test) | {"verdict": self.test.verdict},
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """A measured network; each property is computed once, when first used."""
+
+    trace: PacketTrace
+    options: MeasurementOptions = field(default_factory=MeasurementOptions)
+    name: str = "trace"
+    notes: Sequence[str] = ()
+    """How the trace was obtained."""
+
+    @cached_property
+    def outcomes(self) -> Outcomes:
+        """What became of each packet."""
+        deadline_s = self.options.deadline_s
+        return outcomes(self.trace, None if deadline_s is None else round(deadline_s * 1e9))
+
+    @cached_property
+    def bursts(self) -> LossBursts:
+        """All loss bursts, outages included."""
+        return loss_bursts(self.outcomes.effective)
+
+    @cached_property
+    def outage_rule(self) -> OutageRule:
+        """Which of the bursts are outages."""
+        if self.options.outage_s is not None:
+            return outages_longer_than(self.bursts.times_s(self.trace)[1], self.options.outage_s)
+        return find_outages(self.bursts)
+
+    @property
+    def is_outage(self) -> Flags:
+        """(b,) Which bursts are outages."""
+        return self.outage_rule.flags
+
+    @property
+    def observed_s(self) -> float:
+        """Time from the first to the last sending."""
+        return float(self.trace.sent_ns[-1]) * 1e-9
+
+    @cached_property
+    def longest_loss_burst(self) -> int:
+        """The longest burst that is no outage; with it, the network has M − 1."""
+        return self.bursts.only(~self.is_outage).longest
+
+    @cached_property
+    def quantiles(self) -> list[QuantileM]:
+        """M for shares of bursts and packets, without the outages."""
+        usual = self.bursts.only(~self.is_outage)
+        packets = usual.packets - int(self.bursts.length[self.is_outage].sum())
+        usual = LossBursts(packets, usual.first, usual.length)
+        return [quantile_m(usual, share) for share in self.options.quantiles]
+
+    @cached_property
+    def windows(self) -> dict[int, tuple[int, int | None]]:
+        """By K: most losses in K consecutive packets, in all and in windows without an outage."""
+        every = most_losses(self.bursts, self.options.windows)
+        usual = most_losses(self.bursts, self.options.windows, self.is_outage)
+        return {window: (most, usual.get(window)) for window, most in every.items()}
+
+    @cached_property
+    def delays(self) -> DelayStatistics:
+        """Delays of the received packets."""
+        return delay_statistics(self.trace)
+
+    @cached_property
+    def loss_correlation(self) -> tuple[tuple[int, ...], tuple[float, ...]]:
+        """Lags, and the correlation of the effective losses of two packets."""
+        every = np.ones(len(self.trace), bool)
+        return autocorrelation(self.outcomes.effective.astype(np.int64), every)
+
+    @cached_property
+    def _fits(self) -> ChainFits:
+        return ChainFits(self.bursts, self.is_outage)
+
+    @cached_property
+    def models(self) -> dict[str, FittedModel]:
+        """The fitted loss models, by name; empty without losses."""
+        return {one.model: self._tested(one) for one in self._fits.all()}
+
+    @cached_property
+    def chosen(self) -> FittedModel:
+        """The model that the Bayesian information criterion prefers."""
+        return self._tested(self._fits.chosen)
+
+    def _tested(self, fit: ChainFit) -> FittedModel:
+        return FittedModel(fit, self._fits.tested(fit))
+
+    @cached_property
+    def outage_fit(self) -> OutageFit:
+        """The model of the outages."""
+        which = self.is_outage
+        durations_s = self.bursts.times_s(self.trace)[1][which]
+        return fit_outages(durations_s, self.bursts.complete[which], self.observed_s)
+
+    def certificate_time(self, scenario: Scenario) -> CertificateTime:
+        """Return for which share of the time a scenario's certificates would have been void."""
+        return certificate_time(self.trace, scenario)
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the page of tables and figures (``.html``).
+
+        Raises:
+            NoackError: the name has another ending, or the file cannot be written.
+        """
+        from cosim.measurement.measurement_page import write_page
+
+        write_page(self, None, Path(path))
+
+    def write_network(
+        self, path: str | PathLike[str], form: Literal["trace", "model"] = "trace"
+    ) -> None:
+        """Write a ``[network]`` section that reproduces the network (``.toml``).
+
+        Raises:
+            NoackError: the name has another ending, or a file cannot be written.
+        """
+        from cosim.measurement.network_file import write_network
+
+        write_network(self, Path(path), form)
+
+    @cached_property
+    def remarks(self) -> list[str]:
+        """What the reader of the numbers must know, in plain words."""
+        found = list(self.notes)
+        count = int((~self.is_outage).sum())
+        if 0 < count < _FEW_BURSTS:
+            found.append(f"loss bursts: only {count}; the fits and quantiles have a weak basis")
+        if len(self.bursts.length) > MOST_FITTED:
+            found.append(f"chains are fitted to the first {MOST_FITTED} loss bursts")
+        cut = ~self.bursts.complete
+        if cut.any():
+            found.append("a loss burst is cut by the beginning or end of the trace")
+        if self.is_outage.any():
+            found.append("outages are reported as such: M and the loss models do not include them")
+            if self.options.outage_s is None and self.models["gilbert_elliott"].is_rejected:
+                found.append(
+                    "the fitted chain is itself rejected by its test: what counts as an outage "
+                    "depends on it; --outage TIME sets the limit by hand"
+                )
+        return found
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all results for JSON."""
+        return {
+            "name": self.name,
+            "packets": len(self.trace),
+            "observed_s": self.observed_s,
+            "deadline_s": self.options.deadline_s,
+            "lost": int(self.outcomes.lost.sum()),
+            "out_of_order": int(self.outcomes.out_of_order.sum()),
+            "late": int(self.outcomes.late.sum()),
+            "effective_losses": self.bursts.losses,
+            "histogram": {str(length): count for length, count in histogram(self.bursts).items()},
+            "longest": self.burst_json(int(np.argmax(self.bursts.length)))
+            if len(self.bursts.length)
+            else None,
+            "outages": [
+                self.burst_json(place) for place in np.flatnonzero(self.is_outage).tolist()
+            ],
+            "outage_rule": self.outage_rule.reason,
+            "M": self.longest_loss_burst + 1,
+            "quantiles": [asdict(one) for one in self.quantiles],
+            "fewest_deliveries_between_bursts": self.fewest_deliveries,
+            "windows": {str(window): asdict_window(*most) for window, most in self.windows.items()},
+            "delay_s": {str(share): value for share, value in self.delays.quantiles_s.items()},
+            "delay_correlation": dict(
+                zip(map(str, self.delays.lags), self.delays.correlation, strict=True)
+            ),
+            "interval_level": LEVEL,
+            "models": {name: one.to_json() for name, one in self.models.items()},
+            "chosen_model": self.chosen.fit.model if self.models else None,
+            "outage_fit": {
+                "count": self.outage_fit.count,
+                "rate_per_s": _interval(self.outage_fit.rate_per_s),
+                "duration_s": _interval(self.outage_fit.duration_s),
+                "p_value": self.outage_fit.p_value,
+                "text": self.outage_fit.text,
+            },
+            "remarks": self.remarks,
+        }
+
+    @property
+    def fewest_deliveries(self) -> int | None:
+        """Smallest number of consecutive deliveries between two bursts; None with fewer bursts."""
+        between = self.bursts.deliveries()[1:-1]
+        return int(between.min()) if len(between) else None
+
+    def burst_json(self, place: int) -> Mapping[str, Any]:
+        """Return a burst for JSON: losses, begin and duration."""
+        begin_s, duration_s = self.bursts.only(np.arange(len(self.bursts.length)) == place).times_s(
+            self.trace
+        )
+        return {
+            "losses": int(self.bursts.length[place]),
+            "begin_s": float(begin_s[0]),
+            "duration_s": float(duration_s[0]),
+        }
+
+
+_FEW_BURSTS = 20
+
+
+def asdict_window(every: int, usual: int | None) -> dict[str, int | None]:
+    """Return an entry of the (m, K) table for JSON."""
+    return {"most_losses": every, "without_outages": usual}
+
+
+def _interval(estimate: Estimate | None) -> dict[str, float] | None:
+    return None if estimate is None else dict(estimate._asdict())
