@@ -70,8 +70,9 @@ def program_of(
             for rule in rules
             if isinstance(rule, LossesInWindow)
         ],
-        recovery=sum(
-            rule.deliveries for rule in rules if isinstance(rule, DeliveriesBetweenBursts)
+        recovery=max(
+            (rule.deliveries for rule in rules if isinstance(rule, DeliveriesBetweenBursts)),
+            default=0,
         ),
         mansd=-1 if settings.longest_burst is None else settings.longest_burst,
         limit=settings.limit,
