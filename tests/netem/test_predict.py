@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from netem.link_machine import Link
-from netem.loss_prediction import predict
 from netem.words.words_to_settings import settings_of
 from noack.impairments.link_records import NEVER_NS
 from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_prediction import predict
 from noack.protocol.record_tables import Fate
 
 DECISIONS = 400_000
