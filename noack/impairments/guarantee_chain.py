@@ -34,7 +34,7 @@ def moves_of(guarantee: LossGuarantee, most: int) -> Moves:
         NotPredictableError: there are more than ``most``.
     """
     automaton = LossAutomaton(guarantee)
-    known, lost, delivered = 1, [], []
+    known, lost, delivered = 1, list[int](), list[int]()
     while len(lost) < known:
         states = np.arange(len(lost), known)
         after_loss, after_delivery = automaton.after_loss(states), automaton.after_delivery(states)
@@ -110,7 +110,7 @@ def _stationary(joint: Any, start: Array) -> Array:
     """Return the stationary distribution of the states that remain possible."""
     from scipy.sparse import csgraph
 
-    reached, before = start > 0, -1
+    reached, before = start > 0, np.int64(-1)
     while before != (before := np.count_nonzero(reached)):
         reached |= joint.T @ reached.astype(float) > 0
     places = np.flatnonzero(reached)
