@@ -13,7 +13,10 @@ from cosim.shipped_files import find_trace
 from noack.core.errors import CallerError, ExitStatus
 
 if TYPE_CHECKING:
+    from cosim.measurement.live.live_measurement import LiveOptions
+    from cosim.measurement.live.probe_result import ProbeResult
     from cosim.measurement.network_measurement import MeasurementOptions
+    from cosim.measurement.trace_sources import SourceOptions
 
 
 class NetworkForm(StrEnum):
@@ -23,6 +26,13 @@ class NetworkForm(StrEnum):
     MODEL = "model"
 
 
+class ClockRelation(StrEnum):
+    """Whether sending and receiving times are comparable."""
+
+    SAME = "same"
+    DIFFERENT = "different"
+
+
 _TRACE = "rural_n8_10kmh"
 
 
@@ -30,17 +40,55 @@ _TRACE = "rural_n8_10kmh"
     (f"noack measure {_TRACE} --deadline 100ms", "a recorded trace"),
     (f"noack measure {_TRACE} --deadline 100ms --out measured.html", "with a page of figures"),
     (f"noack measure {_TRACE} --for-scenario lane_following", "when its certificate would be void"),
+    ("noack measure --listen 0.0.0.0:9100", "receive a probe, on one host"),
+    ("noack measure 192.0.2.7:9100 --rate 50hz --for 60s", "send it, on the other host"),
+    ("noack measure sender.pcap receiver.pcap", "captures of both ends"),
     (f"noack measure {_TRACE} --write network.toml", "the network for a scenario file"),
 ])  # fmt: skip
 def measure(
     sources: Annotated[
-        list[str],
+        list[str] | None,
         typer.Argument(
-            metavar="FILE...",
-            help="A packet trace, the name of a shipped one, or files that belong together.",
+            metavar="FILE...|ADDRESS",
+            help="A packet trace, the name of a shipped one, captures of both ends, a run "
+            "directory; or the address of a listener, to which a probe is sent.",
         ),
-    ],
+    ] = None,
     *,
+    listen: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Receive one probe there, e.g. 0.0.0.0:9100."),
+    ] = None,
+    rate: Annotated[str, typer.Option(metavar="RATE", help="Datagrams of the probe.")] = "50hz",
+    duration: Annotated[
+        str, typer.Option("--for", metavar="TIME", help="Duration of the probe.")
+    ] = "60s",
+    size: Annotated[
+        int, typer.Option(metavar="BYTES", help="Size of the probe's datagrams, at least 100.")
+    ] = 128,
+    round_trip: Annotated[
+        bool, typer.Option("--round-trip", help="The listener sends each datagram back.")
+    ] = False,
+    silence: Annotated[
+        str, typer.Option(metavar="TIME", help="A listener ends after so long without a datagram.")
+    ] = "30s",
+    save: Annotated[
+        Path | None, typer.Option(help="Write the raw trace to this file while probing (.csv).")
+    ] = None,
+    flow: Annotated[
+        int, typer.Option(help="Flow of a capture or a fate file; 1 is the largest.", min=1)
+    ] = 1,
+    sequence_at: Annotated[
+        str | None,
+        typer.Option(
+            metavar="OFFSET:BYTES[:little]",
+            help="Where the payloads of a capture of the receiver's end have sequence numbers.",
+        ),
+    ] = None,
+    clocks: Annotated[
+        ClockRelation | None,
+        typer.Option(help="Whether both times of a file were read on the same clock."),
+    ] = None,
     deadline: Annotated[
         str | None,
         typer.Option(metavar="TIME", help="Packets that take longer count as lost, e.g. 100ms."),
@@ -83,19 +131,54 @@ def measure(
     json: cli.JsonOption = False,
 ) -> int:
     """Measure a network: losses, bursts, M, delays, outages, and models that fit."""
+    from cosim.measurement.live.live_measurement import LiveOptions, period_ns_of
     from cosim.measurement.measurement_outputs import OutputRequest, report
     from cosim.measurement.network_measurement import Measurement
-    from cosim.measurement.trace_sources import read_source
+    from cosim.measurement.trace_sources import SourceOptions
 
     options = _options(deadline, share, window, outage)
     scenario = None if for_scenario is None else cli.load_scenario(for_scenario, settings)
     request = OutputRequest(out, write, form.value, scenario)
-    trace, notes = read_source([*map(find_trace, sources)])
-    found = Measurement(trace, options, " ".join(sources), notes)
+    live = LiveOptions(rate, duration, size, round_trip, silence, save, options.deadline_s)
+    how = SourceOptions(
+        None if clocks is None else clocks is ClockRelation.DIFFERENT,
+        flow, sequence_at, period_ns_of(rate),
+    )  # fmt: skip
+    result, name = _result(sources or [], listen, live, how)
+    if result.trace is None:  # the sender of a one-way probe does not know what arrived
+        if json:
+            cli.print_json({"notes": result.notes})
+        else:
+            print(*result.notes, "the listener reports what has arrived", sep="\n")
+        return ExitStatus.OK
+    found = Measurement(result.trace, options, name, result.notes)
     document = report(found, request, None if json else Console())
     if json:
         cli.print_json(document)
-    return ExitStatus.OK
+    return ExitStatus.UNINTENDED_LOSSES if result.kernel_drops else ExitStatus.OK
+
+
+def _result(
+    sources: list[str], listen: str | None, live: "LiveOptions", how: "SourceOptions"
+) -> tuple["ProbeResult", str]:
+    """Return the result of a probe or of reading files, and a name for it."""
+    from cosim.measurement.live.live_measurement import is_address, receive_live, send_live
+    from cosim.measurement.live.probe_result import ProbeResult
+    from cosim.measurement.trace_sources import read_source
+
+    if listen is not None:
+        if sources:
+            raise CallerError(f"--listen {listen}: receives a probe, and reads no {sources[0]}")
+        return receive_live(listen, live), f"probe received at {listen}"
+    if not sources:
+        raise CallerError("expected a file, the address of a listener, or --listen ADDRESS")
+    if len(sources) == 1 and is_address(sources[0]):
+        return send_live(sources[0], live), f"probe of {sources[0]}"
+    if live.save is not None or live.round_trip:
+        option = "--round-trip" if live.save is None else f"--save {live.save}"
+        raise CallerError(f"{option}: is for live probes, and {sources[0]} is no address")
+    trace, notes = read_source([*map(find_trace, sources)], how)
+    return ProbeResult(trace, notes, None), " ".join(sources)
 
 
 def _options(
