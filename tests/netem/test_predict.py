@@ -114,6 +114,9 @@ def test_many_decisions_have_the_predicted_loss(decide: Any, share_is: Any, word
     ("words", "why"),
     [
         ("loss 5% blackout 1s-2s", "losses in a blackout depend on when packets arrive"),
+        ("replay t.csv", "t.csv has not been read"),
+        ("replay records 0s+1ms,1s+lost by time", "recorded losses by time depend on when packets"),
+        ("replay records 0s+1ms,1s+lost once", "a trace that is replayed once has no long-run"),
         ("loss script 3,4", "a script that is played once"),
         ("loss trace a.txt", "a.txt has not been read"),
         ("loss 5% 99.9%", "a correlation of 0.999 is too high"),
@@ -164,3 +167,10 @@ def makes_stale(settings: LinkSettings) -> bool:
     leaves_ns = [link.decide(0, 100, 10_000 * packet).release_ns for packet in range(2000)]
     left_ns = [t_ns for t_ns in leaves_ns if t_ns != NEVER_NS]
     return left_ns != sorted(left_ns)
+
+
+def test_a_repeated_trace_loses_its_own_share_and_less_under_a_cap() -> None:
+    trace = "replay records 0s+1ms,1s+lost,2s+lost,3s+lost,4s+1ms"
+    assert predicted_loss(trace) == pytest.approx(3 / 5)
+    assert predicted_loss(f"{trace} mansd 2") == pytest.approx(2 / 5)
+    assert predicted_loss("replay records 0s+1ms,1s+2ms by time") == 0.0
