@@ -1,14 +1,11 @@
 """``noack measure``: losses, delays and the M of a real network."""
 
-from enum import StrEnum
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import typer
 from rich.console import Console
 
 from cosim.cli import command as cli
-from cosim.cli import completion
+from cosim.cli import measure_options as given
 from cosim.shipped_files import find_trace
 from noack.core.errors import CallerError, ExitStatus
 
@@ -17,21 +14,6 @@ if TYPE_CHECKING:
     from cosim.measurement.live.probe_result import ProbeResult
     from cosim.measurement.network_measurement import MeasurementOptions
     from cosim.measurement.trace_sources import SourceOptions
-
-
-class NetworkForm(StrEnum):
-    """How a measured network is written."""
-
-    TRACE = "trace"
-    MODEL = "model"
-
-
-class ClockRelation(StrEnum):
-    """Whether sending and receiving times are comparable."""
-
-    SAME = "same"
-    DIFFERENT = "different"
-
 
 _TRACE = "rural_n8_10kmh"
 
@@ -46,88 +28,27 @@ _TRACE = "rural_n8_10kmh"
     (f"noack measure {_TRACE} --write network.toml", "the network for a scenario file"),
 ])  # fmt: skip
 def measure(
-    sources: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="FILE...|ADDRESS",
-            help="A packet trace, the name of a shipped one, captures of both ends, a run "
-            "directory; or the address of a listener, to which a probe is sent.",
-        ),
-    ] = None,
+    sources: given.Sources = None,
     *,
-    listen: Annotated[
-        str | None,
-        typer.Option(metavar="ADDRESS", help="Receive one probe there, e.g. 0.0.0.0:9100."),
-    ] = None,
-    rate: Annotated[str, typer.Option(metavar="RATE", help="Datagrams of the probe.")] = "50hz",
-    duration: Annotated[
-        str, typer.Option("--for", metavar="TIME", help="Duration of the probe.")
-    ] = "60s",
-    size: Annotated[
-        int, typer.Option(metavar="BYTES", help="Size of the probe's datagrams, at least 100.")
-    ] = 128,
-    round_trip: Annotated[
-        bool, typer.Option("--round-trip", help="The listener sends each datagram back.")
-    ] = False,
-    silence: Annotated[
-        str, typer.Option(metavar="TIME", help="A listener ends after so long without a datagram.")
-    ] = "30s",
-    save: Annotated[
-        Path | None, typer.Option(help="Write the raw trace to this file while probing (.csv).")
-    ] = None,
-    flow: Annotated[
-        int, typer.Option(help="Flow of a capture or a fate file; 1 is the largest.", min=1)
-    ] = 1,
-    sequence_at: Annotated[
-        str | None,
-        typer.Option(
-            metavar="OFFSET:BYTES[:little]",
-            help="Where the payloads of a capture of the receiver's end have sequence numbers.",
-        ),
-    ] = None,
-    clocks: Annotated[
-        ClockRelation | None,
-        typer.Option(help="Whether both times of a file were read on the same clock."),
-    ] = None,
-    deadline: Annotated[
-        str | None,
-        typer.Option(metavar="TIME", help="Packets that take longer count as lost, e.g. 100ms."),
-    ] = None,
-    share: Annotated[
-        list[float] | None,
-        typer.Option(help="Share of loss bursts and packets for which M is given; repeatable."),
-    ] = None,
-    window: Annotated[
-        list[int] | None,
-        typer.Option(help="K of the (m, K) table; repeatable.", min=1, max=100_000_000),
-    ] = None,
-    outage: Annotated[
-        str | None,
-        typer.Option(
-            metavar="TIME",
-            help="Loss bursts of this duration or more are outages; by default a test decides.",
-        ),
-    ] = None,
-    for_scenario: Annotated[
-        str | None,
-        typer.Option(
-            metavar="SCENARIO",
-            help="Report for which share of the time its certificate would have been void.",
-            autocompletion=completion.scenarios,
-        ),
-    ] = None,
+    listen: given.Listen = None,
+    rate: given.Rate = "50hz",
+    duration: given.Duration = "60s",
+    size: given.Size = 128,
+    round_trip: given.RoundTrip = False,
+    silence: given.Silence = "30s",
+    save: given.Save = None,
+    flow: given.Flow = 1,
+    sequence_at: given.SequenceAt = None,
+    clocks: given.Clocks = None,
+    deadline: given.Deadline = None,
+    share: given.Shares = None,
+    window: given.Windows = None,
+    outage: given.Outage = None,
+    for_scenario: given.ForScenario = None,
     settings: cli.SetOption = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", help="Write a page with tables and figures (.html).")
-    ] = None,
-    write: Annotated[
-        Path | None,
-        typer.Option(help="Write a [network] section that reproduces the network (.toml)."),
-    ] = None,
-    form: Annotated[
-        NetworkForm,
-        typer.Option("--as", help="Write the network as the trace itself, or as a fitted model."),
-    ] = NetworkForm.TRACE,
+    out: given.Page = None,
+    write: given.NetworkFile = None,
+    form: given.Form = given.NetworkForm.TRACE,
     json: cli.JsonOption = False,
 ) -> int:
     """Measure a network: losses, bursts, M, delays, outages, and models that fit."""
@@ -141,7 +62,7 @@ def measure(
     request = OutputRequest(out, write, form.value, scenario)
     live = LiveOptions(rate, duration, size, round_trip, silence, save, options.deadline_s)
     how = SourceOptions(
-        None if clocks is None else clocks is ClockRelation.DIFFERENT,
+        None if clocks is None else clocks is given.ClockRelation.DIFFERENT,
         flow, sequence_at, period_ns_of(rate),
     )  # fmt: skip
     result, name = _result(sources or [], listen, live, how)
