@@ -117,8 +117,7 @@ class Opportunities(Impairment):
         Word("overhead", "opportunities trace.up overhead 28", after="opportunities FILE"),
         Word("queue", "opportunities trace.up queue 20", after="opportunities FILE"),
         Word("bytes", "opportunities trace.up bytes 30000", after="opportunities FILE"),
-        Word("from", "opportunities trace.up from 20s", after="opportunities FILE"),
-        Word("random", "opportunities trace.up from random", after="opportunities FILE from"),
+        Word("from", "opportunities trace.up from random", after="opportunities FILE"),
     )  # fmt: skip
     behaviour: ClassVar = Behaviour(OpportunityStage, apply, OpportunityQueue)
     delays: ClassVar = True
