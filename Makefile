@@ -59,7 +59,7 @@ fidelity: setup ## Compare the last run with the ideal loop, effect by effect
 compare: setup ## Compare RUNS="runs/A runs/B": key numbers, and curves overlaid
 	@$(BIN)/noack compare $(RUNS) $(ARGS)
 
-report: setup ## Write the last run's report (a page with all figures) and print its path
+report: setup ## Print the path of the last run's report (a page with all figures)
 	@$(BIN)/noack report $(ARGS)
 
 certify: setup ## Compute the guaranteed bounds of SCENARIO and their conditions

@@ -27,6 +27,6 @@ else:
 
 
 __all__ = [
-    "Certificates", "NoackError", "Run", "Scenario", "__version__", "certify", "compare",
-    "from_system", "load", "open_run", "run", "simulate", "with_settings",
+    "Certificates", "Measurement", "NoackError", "Run", "Scenario", "__version__", "certify",
+    "compare", "from_system", "load", "measure", "open_run", "run", "simulate", "with_settings",
 ]  # fmt: skip

@@ -7,6 +7,7 @@ function imports these modules when it is first called.
 from importlib.metadata import version
 
 from cosim.api.certificates import certify as certify
+from cosim.api.measurements import measure as measure
 from cosim.api.runs import Run as Run
 from cosim.api.runs import compare as compare
 from cosim.api.runs import open_run as open_run
@@ -15,6 +16,7 @@ from cosim.api.runs import simulate as simulate
 from cosim.api.scenarios import from_system as from_system
 from cosim.api.scenarios import load as load
 from cosim.api.scenarios import with_settings as with_settings
+from cosim.measurement.network_measurement import Measurement as Measurement
 from cosim.output.certificate_report import Certificates as Certificates
 from noack.config.scenario import Scenario as Scenario
 from noack.core.errors import NoackError as NoackError

@@ -159,9 +159,9 @@ class Run:
         Raises:
             NoackError: the file cannot be written.
         """
-        from cosim.live.finalize import rewrite_report
+        from cosim.live.finalize import run_report
 
-        return rewrite_report(self.directory)
+        return run_report(self.directory, again=True)
 
     def replay(self) -> "Replay":
         """Feed every machine its recorded inputs again and compare the outputs bit for bit.

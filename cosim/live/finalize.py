@@ -164,14 +164,16 @@ def _ending(run_dir: Path, summary: Summary) -> RunEnding:
 
 
 @np.errstate(all="ignore")
-def rewrite_report(run_dir: Path) -> Path:
-    """Write the report of an earlier run again, and return its path.
+def run_report(run_dir: Path, *, again: bool = False) -> Path:
+    """Return the path of an earlier run's report; write it if it is missing, or ``again``.
 
     Raises:
         CallerError: it is not a run directory, or the run is still under way.
         MachineError: the report cannot be written.
     """
-    outcome = reopen(run_dir)
+    outcome, path = reopen(run_dir), run_dir / REPORT_FILE
+    if path.is_file() and not again:
+        return path
     record = load_record(run_dir)
     return _report(record, outcome.summary, run_dir, RunClaims(record))
 

@@ -21,11 +21,14 @@ from cosim.measurement.confidence_interval import (
     minimise,
     profile_interval,
 )
+from cosim.measurement.goodness_of_fit import FitTest, length_test
 from cosim.measurement.loss_bursts import Flags, LossBursts
 from cosim.measurement.loss_likelihood import ChainRates, LossLikelihood
 
 Reals = NDArray[np.float64]
 ModelName = Literal["bernoulli", "gilbert", "gilbert_elliott"]
+MOST_FITTED = 5_000
+"""Number of bursts that a fit uses, at most: their intervals are within some percent."""
 _LIMIT = 18.0
 """Largest log-odds: a probability within 1.5e-8 of 0 or 1 counts as 0 or 1."""
 _STARTS = ((0.02, 0.5), (0.2, 0.8), (0.0, 0.5), (0.0, 0.95), (0.05, 0.999))
@@ -69,11 +72,17 @@ def transitions(bursts: LossBursts, left_out: Flags) -> Transitions:
 
 
 class ChainFits:
-    """The three fits to the bursts of a trace that are not left out."""
+    """The three fits to the bursts of a trace that are not left out.
+
+    Of more than ``MOST_FITTED`` bursts, the first ones are used.
+    """
 
     def __init__(self, bursts: LossBursts, left_out: Flags | None = None) -> None:
-        self._bursts = bursts
-        self._left_out = np.zeros(len(bursts.length), bool) if left_out is None else left_out
+        left_out = np.zeros(len(bursts.length), bool) if left_out is None else left_out
+        if len(bursts.length) > MOST_FITTED:
+            packets, left_out = int(bursts.first[MOST_FITTED]), left_out[:MOST_FITTED]
+            bursts = LossBursts(packets, bursts.first[:MOST_FITTED], bursts.length[:MOST_FITTED])
+        self._bursts, self._left_out = bursts, left_out
         self._likelihood = LossLikelihood(bursts, self._left_out)
         self.lost = int(bursts.length[~self._left_out].sum())
         self.packets = bursts.packets - int(bursts.length[self._left_out].sum())
@@ -136,6 +145,10 @@ class ChainFits:
             estimates[name] = Estimate(*map(_rounded, (best.at[place], *ends)))
         rates = _ordered(best.at)
         return ChainFit("gilbert_elliott", rates, estimates, -best.value, 4)
+
+    def tested(self, fit: ChainFit) -> FitTest:
+        """Return the test of the lengths of bursts and deliveries."""
+        return length_test(self._bursts, self._left_out, fit.rates, fit.parameters)
 
     def all(self) -> list[ChainFit]:
         """Return the three fits; none without losses."""

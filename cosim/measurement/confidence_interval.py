@@ -74,7 +74,7 @@ def minimise(function: Callable[[Reals], float], start: Reals, limit: float) -> 
         return Minimum(start, function(start))
     found = minimize(
         function, start, method="L-BFGS-B", bounds=[(-limit, limit)] * len(start),
-        options={"eps": 1e-5, "ftol": 1e-11, "gtol": 1e-5, "maxiter": 200},
+        options={"eps": 1e-5, "ftol": 1e-10, "gtol": 1e-5, "maxiter": 200},
     )  # fmt: skip
     return Minimum(np.asarray(found.x), float(found.fun))
 

@@ -12,6 +12,8 @@ Reals = NDArray[np.float64]
 SHARES = (0.0, 0.05, 0.5, 0.9, 0.95, 0.99, 0.999, 1.0)
 _MOST_LAGS, _LARGEST_LAG = 40, 1000
 _FEWEST_PAIRS = 30
+_MOST_RANKED = 1_000_000
+"""Number of packets, the first ones, of which correlations are computed."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,9 @@ def autocorrelation(
     values: NDArray[np.int64], known: NDArray[np.bool_]
 ) -> tuple[tuple[int, ...], tuple[float, ...]]:
     """Return lags and the correlation of the normal scores of the known ones of k values."""
+    values, known = values[:_MOST_RANKED], known[:_MOST_RANKED]
+    if not known.any():
+        return (), ()
     scores = np.zeros(len(known))
     scores[known] = normal_scores(values[known])
     if not scores.any():

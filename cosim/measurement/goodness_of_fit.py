@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from cosim.measurement.chain_fits import ChainFit
 from cosim.measurement.loss_bursts import Flags, LossBursts
 from cosim.measurement.loss_likelihood import ChainRates
 
@@ -40,17 +39,17 @@ class FitTest:
         return f"χ² = {self.statistic:.4g}, {self.degrees} d.f., p = {self.p_value:.2g}"
 
 
-def length_test(bursts: LossBursts, left_out: Flags, fit: ChainFit) -> FitTest:
-    """Test whether the lengths of bursts and deliveries follow a fitted model.
+def length_test(bursts: LossBursts, left_out: Flags, rates: ChainRates, parameters: int) -> FitTest:
+    """Test whether the lengths of bursts and deliveries follow a model with fitted parameters.
 
     Lengths that the trace, or a burst that is left out, cuts are not counted. The classes are
     chosen from the expected counts alone.
     """
     deliveries = bursts.deliveries()[1:-1][~left_out[1:] & ~left_out[:-1]]
     lengths = ((bursts.length[bursts.complete & ~left_out], True), (deliveries, False))
-    statistic, degrees = 0.0, -fit.parameters
+    statistic, degrees = 0.0, -parameters
     for observed, lost in lengths:
-        value, classes = _pearson(observed, fit.rates, lost)
+        value, classes = _pearson(observed, rates, lost)
         statistic, degrees = statistic + value, degrees + classes - 1
     if degrees < 1:
         return FitTest(None, max(degrees, 0), None)

@@ -14,6 +14,7 @@ from cosim.measurement.network_measurement import Measurement
 from cosim.output import palette
 from cosim.output.report import axes as draw
 from cosim.output.report.figure_style import printed, styled
+from noack.core.number_format import duration
 
 _BURSTS, _OUTAGES, _DELAYS = map(printed, (palette.SENSOR, palette.CONTROLLER, palette.PLANT))
 _LOST, _LIMIT = map(printed, (palette.LOST, palette.CERTIFIED))
@@ -35,7 +36,7 @@ class MeasurementFigure(NamedTuple):
 def measurement_figures(found: Measurement) -> Iterator[MeasurementFigure]:
     """Yield the figures of a measurement."""
     deadline_s = found.options.deadline_s
-    limit = "" if deadline_s is None else f" Dashed: the deadline of {deadline_s:g} s."
+    limit = "" if deadline_s is None else f" Dashed: the deadline of {duration(deadline_s)}."
     yield MeasurementFigure(
         "bursts", _histogram(found),
         "Number of loss bursts by length. A burst is a number of consecutive effective losses: "

@@ -6,6 +6,7 @@ from typing import Any
 
 from rich.console import Console
 
+from cosim.live.progress import PatientConsole
 from cosim.measurement.measurement_tables import print_measurement
 from cosim.measurement.network_file import Form, write_network
 from cosim.measurement.network_measurement import Measurement
@@ -29,7 +30,9 @@ def report(found: Measurement, request: OutputRequest, console: Console | None) 
     Raises:
         NoackError: one line; a file cannot be written, or the scenario cannot be resolved.
     """
-    void = None if request.scenario is None else found.certificate_time(request.scenario)
+    with PatientConsole(stderr=True).status("measuring"):
+        void = None if request.scenario is None else found.certificate_time(request.scenario)
+        document = found.to_json()
     if console is not None:
         print_measurement(console, found, void)
     written: list[Path] = []
@@ -42,7 +45,7 @@ def report(found: Measurement, request: OutputRequest, console: Console | None) 
     if console is not None:
         for path in written:
             console.print(f"written: {path}", markup=False, highlight=False, soft_wrap=True)
-    document = found.to_json() | {"written": [str(path) for path in written]}
+    document["written"] = [str(path) for path in written]
     if void is not None:
         document["certificate"] = void.to_json()
     return document

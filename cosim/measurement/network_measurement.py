@@ -3,7 +3,9 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from typing import Any
+from os import PathLike
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,14 +17,14 @@ from cosim.measurement.burst_statistics import (
     quantile_m,
 )
 from cosim.measurement.certificate_time import CertificateTime, certificate_time
-from cosim.measurement.chain_fits import ChainFit, ChainFits
+from cosim.measurement.chain_fits import MOST_FITTED, ChainFit, ChainFits
 from cosim.measurement.confidence_interval import LEVEL, Estimate
 from cosim.measurement.delay_statistics import (
     DelayStatistics,
     autocorrelation,
     delay_statistics,
 )
-from cosim.measurement.goodness_of_fit import FitTest, length_test
+from cosim.measurement.goodness_of_fit import FitTest
 from cosim.measurement.loss_bursts import Flags, LossBursts, Outcomes, loss_bursts, outcomes
 from cosim.measurement.outage_fit import OutageFit, fit_outages
 from cosim.measurement.outage_rule import OutageRule, find_outages, outages_longer_than
@@ -30,8 +32,6 @@ from noack.config.scenario import Scenario
 from noack.traces.packet_trace import PacketTrace
 
 QUANTILES = (0.5, 0.9, 0.99, 0.999)
-MOST_FITTED = 50_000
-"""Number of loss bursts beyond which chains are fitted to the first ones only."""
 
 
 @dataclass(frozen=True)
@@ -96,26 +96,12 @@ class Measurement:
         """Which of the bursts are outages."""
         if self.options.outage_s is not None:
             return outages_longer_than(self.bursts.times_s(self.trace)[1], self.options.outage_s)
-        rule = find_outages(self._fitted)
-        flags = np.zeros(len(self.bursts.length), bool)
-        if rule.flags.any():  # the rule saw the first bursts only
-            shortest = self._fitted.length[rule.flags].min()
-            flags = np.asarray(self.bursts.length >= shortest)
-        return OutageRule(flags, rule.reason)
+        return find_outages(self.bursts)
 
     @property
     def is_outage(self) -> Flags:
         """(b,) Which bursts are outages."""
         return self.outage_rule.flags
-
-    @cached_property
-    def _fitted(self) -> LossBursts:
-        """The bursts that chains are fitted to: all, or the first ones."""
-        bursts = self.bursts
-        if len(bursts.length) <= MOST_FITTED:
-            return bursts
-        packets = int(bursts.first[MOST_FITTED])
-        return LossBursts(packets, bursts.first[:MOST_FITTED], bursts.length[:MOST_FITTED])
 
     @property
     def observed_s(self) -> float:
@@ -155,7 +141,7 @@ class Measurement:
 
     @cached_property
     def _fits(self) -> ChainFits:
-        return ChainFits(self._fitted, self.is_outage[: len(self._fitted.length)])
+        return ChainFits(self.bursts, self.is_outage)
 
     @cached_property
     def models(self) -> dict[str, FittedModel]:
@@ -168,8 +154,7 @@ class Measurement:
         return self._tested(self._fits.chosen)
 
     def _tested(self, fit: ChainFit) -> FittedModel:
-        left_out = self.is_outage[: len(self._fitted.length)]
-        return FittedModel(fit, length_test(self._fitted, left_out, fit))
+        return FittedModel(fit, self._fits.tested(fit))
 
     @cached_property
     def outage_fit(self) -> OutageFit:
@@ -179,8 +164,30 @@ class Measurement:
         return fit_outages(durations_s, self.bursts.complete[which], self.observed_s)
 
     def certificate_time(self, scenario: Scenario) -> CertificateTime:
-        """For which share of the time a scenario's certificates would have been void."""
+        """Return for which share of the time a scenario's certificates would have been void."""
         return certificate_time(self.trace, scenario)
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the page of tables and figures (``.html``).
+
+        Raises:
+            NoackError: the name has another ending, or the file cannot be written.
+        """
+        from cosim.measurement.measurement_page import write_page
+
+        write_page(self, None, Path(path))
+
+    def write_network(
+        self, path: str | PathLike[str], form: Literal["trace", "model"] = "trace"
+    ) -> None:
+        """Write a ``[network]`` section that reproduces the network (``.toml``).
+
+        Raises:
+            NoackError: the name has another ending, or a file cannot be written.
+        """
+        from cosim.measurement.network_file import write_network
+
+        write_network(self, Path(path), form)
 
     @cached_property
     def remarks(self) -> list[str]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cosim.measurement.fate_source import is_fate_file, read_fate_file
+from cosim.measurement.opportunity_source import is_opportunity_file, read_opportunities
 from cosim.measurement.run_source import read_run
 from noack.core.errors import CallerError, one_line, why
 from noack.core.file_access import open_regular
@@ -15,6 +16,8 @@ from noack.traces.capture_numbers import SequenceField
 from noack.traces.capture_trace import CaptureOptions, read_captures
 from noack.traces.packet_trace import PacketTrace
 from noack.traces.trace_formats import read_trace
+
+_HEAD_BYTES = 64
 
 
 @dataclass(frozen=True)
@@ -28,6 +31,8 @@ class SourceOptions:
     """Which flow of a capture or a fate file, by its number of packets; 1 is the largest."""
     sequence_at: str | None = None
     """Where the payloads of a capture have sequence numbers: ``OFFSET:BYTES[:little]``."""
+    period_ns: int = 20_000_000
+    """Period of the simulated probe through delivery opportunities."""
 
 
 class SourcedTrace(NamedTuple):
@@ -63,13 +68,15 @@ def _read(paths: Sequence[Path], options: SourceOptions) -> PacketTrace:
         raise CallerError(f"{first}: not a capture, and only captures have --sequence-at")
     if is_fate_file(heads[0]):
         return read_fate_file(first, options.flow)
+    if is_opportunity_file(heads[0]):
+        return read_opportunities(first, options.period_ns)
     return read_trace(first, clocks_differ=bool(options.clocks_differ))
 
 
 def _head(path: Path) -> bytes:
     try:
         with open_regular(path) as file:
-            return file.read(4)
+            return file.read(_HEAD_BYTES)
     except (OSError, ValueError) as error:
         reason = f"cannot be read: {why(error)}" if isinstance(error, OSError) else str(error)
         raise CallerError(f"{path}: {reason}") from None

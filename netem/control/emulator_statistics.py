@@ -46,7 +46,7 @@ class LossStatistics(TypedDict):
     drawn: float | None
     """Share dropped or corrupted by a random draw, not by a full queue or a blackout."""
     predicted: float | None
-    """Expected value of ``drawn``; see :mod:`netem.loss_prediction`."""
+    """Expected value of ``drawn``; see :mod:`noack.impairments.loss_prediction`."""
 
 
 class RecentRates(TypedDict):

@@ -16,6 +16,7 @@ from noack.config.state_estimation import SteadyState, steady_state
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.theory.certificate import Constants, NetworkConditions
+from noack.theory.run_conditions import certified_delay_s
 
 _NOT_COVERED = "not covered by the theorems and the certificates"
 
@@ -220,10 +221,12 @@ def _network_delay(resolved: Scenario) -> str:
     link = resolved.network.link
     if not link.longest_delay_s:
         return ""
-    longest_ms = 1e3 * link.longest_delay_s
-    if link.delay_is_bounded:
-        return f"; the network delays updates by up to {longest_ms:g} ms"
-    return f"; the network's delay has no bound; the certificates allow for {longest_ms:g} ms"
+    longest_ms, certified_ms = 1e3 * link.longest_delay_s, 1e3 * certified_delay_s(resolved)
+    if not link.delay_is_bounded:
+        return f"; the network's delay has no bound; the certificates allow for {certified_ms:g} ms"
+    text = f"; the network delays updates by up to {longest_ms:g} ms"
+    allowed = f"; the certificates allow for {certified_ms:g} ms"
+    return text if certified_ms == longest_ms else text + allowed
 
 
 def certificate_assumptions(

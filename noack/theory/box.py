@@ -15,7 +15,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -31,6 +31,8 @@ class BoxGains(PlantGains):
 
     halfwidth_A: Matrix
     halfwidth_B: Matrix
+
+    is_one_plant: ClassVar = False
 
     @cached_property
     def states(self) -> Mapping[Output, Coefficients]:

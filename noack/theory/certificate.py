@@ -1,26 +1,31 @@
 """Tight certificates: guaranteed bounds of a loop, their conditions and their constants.
 
-Assumptions: the trigger ‖e_s‖_W > βe^{−αt} is tested at least every h seconds, the network drops at
-most M − 1 consecutive updates, and the input is held. With all signals scaled by e^{αt}:
+Assumptions: the trigger ‖e_s‖_W > βe^{−αt} is tested at least every h seconds, the network keeps
+its guarantee about losses, and the input is held. With all signals scaled by e^{αt}:
 
-    sup‖C x‖    ≤ free_C + gain_C π                                     (plant, input error p)
     sup‖C e_c‖  ≤ (‖C W⁻¹‖ + Σ_{j<N} sup_{τ≥jδ} ‖C e^{(H+αI)τ} W⁻¹‖) β̃ = D_C β̃          (I1)
-    π = sup‖p‖  ≤ D_K β̃ + σ (sup‖KH x‖ + D_KH β̃) + r(σ) (sup‖x‖_W + D_W β̃) (input of age ≤ σ)
-    β̃ = sup‖e_s‖_W ≤ ḡβ + I_E sup‖R_E x‖ + I_B π                         (between two tests)
+    sup‖C x‖    ≤ free_C + gain_C q + Γ_C β̃,   Γ_C ≤ gain_C D_K       (plant, input error p)
+    q           ≤ σ (sup‖KH x‖ + D_KH β̃) + r(σ) (sup‖x‖_W + D_W β̃)    (input of age ≤ σ)
+    π = sup‖p‖  ≤ D_K β̃ + q
+    β̃ = sup‖e_s‖_W ≤ ḡβ + I_E sup‖R_E x‖ + I_B π                      (between two tests)
 
-with at most N = M − 1 + ⌈d/δ⌉ missing events. These inequalities are linear in π and β̃ and hold on
-every [0, T]. So their solution bounds the run if the loop gain is below 1. The minimum inter-event
+with at most N missing events: the longest burst of losses, and ⌈d/δ⌉ in flight. Γ_C is smaller if
+few updates may be lost in a window (:mod:`noack.theory.loss_accumulation`). These inequalities are
+linear in q and β̃ and hold on every [0, T]. So their solution bounds the run if the loop gain is
+below 1. The minimum inter-event
 time δ is the time that ‖e_s‖_W needs from 0 to β under these bounds. If an assumed δ gives a time
 of at least δ, it holds by induction over the events; the largest such δ is used.
 """
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, LossRule
 from noack.theory.gains import Coefficients, ErrorGains, Output, PlantGains
+from noack.theory.loss_accumulation import LossAccumulation
 
 _SHORTEST_S, _LONGEST_S = 1e-9, 1e6
 _SETTLED = 1e-3
@@ -33,7 +38,7 @@ class NetworkConditions(NamedTuple):
     """The assumptions of a certificate about network and schedule, in the plant's time."""
 
     dropouts: int
-    """M − 1, the largest number of consecutive losses."""
+    """The largest number of consecutive losses: M − 1, or less by further constraints."""
     sampling_s: float = 0.0
     """h, the longest time between two tests of the trigger; 0 is a continuous trigger."""
     spacing_s: float = 0.0
@@ -119,14 +124,21 @@ def solve(
     conditions: NetworkConditions,
     level: Level,
     background: Background = _CLEAN,
+    *,
+    structured: bool = True,
 ) -> Constants:
     """Return the constants that are certified for all times.
+
+    ``structured``: at every time, p = u − Kx consists of the errors of the events and of the age of
+    the input. Otherwise it is only known that its norm is at most π.
 
     Raises:
         VoidError: the loop gain is not below 1.
         NotDecayingError: a mode of the loop decays more slowly than the threshold.
     """
     step = _Step(error, plant, conditions, level, background)
+    if structured and plant.is_one_plant:
+        step.use_windows()
     if level.reached is None:
         return step.constants(conditions.spacing_s, None)
     spacing_s = background.inter_event_s
@@ -154,6 +166,7 @@ class _Step:
     ) -> None:
         self._error, self._plant = error, plant
         self._conditions, self._level, self._background = conditions, level, background
+        self._lost: LossAccumulation | None = None
         self._remainder = error.hold_remainder(conditions.hold_s)
         self._start_error, start = plant.start_up(conditions.start_s)
         self._states = {
@@ -167,6 +180,10 @@ class _Step:
             self._mismatch_growth = growth.mismatch.integral_on_grid()
             self._input_growth = growth.input_error.integral_on_grid()
 
+    def use_windows(self) -> None:
+        """Use how many updates may be lost in a window, too."""
+        self._lost = LossAccumulation(self._plant, self._conditions.delay_s)
+
     def constants(self, spacing_s: float, inter_event_s: float | None) -> Constants:
         """Return all constants, given inter-event times of at least ``spacing_s``."""
         events = self._missing(spacing_s)
@@ -177,27 +194,32 @@ class _Step:
         hold_s, states = self._conditions.hold_s, self._states
         rate, weighted = states[Output.GAIN_RATE], states[Output.WEIGHTED]
         mismatch = states[Output.MISMATCH]
-        # π = own π + from_e_s β̃ + input_fixed,   β̃ = from_p π + error_fixed
+        from_errors = self._from_errors(events, spacing_s, shares[Output.GAIN])
+        # q = own q + from_e_s β̃ + input_fixed,   β̃ = from_q q + echo β̃ + error_fixed
         own = hold_s * rate.gain + self._remainder * weighted.gain
-        from_e_s = (
-            shares[Output.GAIN]
-            + hold_s * shares[Output.GAIN_RATE]
-            + self._remainder * shares[Output.WEIGHTED]
-        )
+        from_e_s = hold_s * (from_errors[Output.GAIN_RATE] + shares[Output.GAIN_RATE])
+        from_e_s += self._remainder * (from_errors[Output.WEIGHTED] + shares[Output.WEIGHTED])
         input_fixed = hold_s * rate.free + self._remainder * weighted.free
-        from_p = self._mismatch_growth * mismatch.gain + self._input_growth
+        from_q = self._mismatch_growth * mismatch.gain + self._input_growth
+        echo = self._mismatch_growth * from_errors[Output.MISMATCH]
+        echo += self._input_growth * shares[Output.GAIN]
         error_fixed = max(
             self._stretch * self._level.beta
             + self._mismatch_growth * max(mismatch.free, self._background.mismatch)
             + self._input_growth * max(self._start_error, self._background.input_error),
             self._background.sensor_error,
         )
-        loop_gain = own + from_e_s * from_p
+        margin = (1 - own) * (1 - echo) - from_e_s * from_q
+        loop_gain = 1 - margin if own < 1 else math.inf
         if not loop_gain < 1:
             raise VoidError(f"the loop gain of the errors is {loop_gain:.3g}, not below 1")
-        input_error = (input_fixed + from_e_s * error_fixed) / (1 - loop_gain)
-        sensor_error = error_fixed + from_p * input_error
-        state = {output: free + gain * input_error for output, (free, gain) in states.items()}
+        held = (input_fixed * (1 - echo) + from_e_s * error_fixed) / margin
+        sensor_error = ((1 - own) * error_fixed + from_q * input_fixed) / margin
+        input_error = shares[Output.GAIN] * sensor_error + held
+        state = {
+            output: free + gain * held + from_errors[output] * sensor_error
+            for output, (free, gain) in states.items()
+        }
         return Constants(
             self._error.alpha_per_s,
             events,
@@ -212,17 +234,35 @@ class _Step:
             loop_gain,
         )
 
+    def _from_errors(self, events: int, spacing_s: float, share: float) -> Mapping[Output, float]:
+        """Return Γ_C for every output, from D_K, the ``share``, and from the losses in windows.
+
+        The second is computed only where it can be smaller: where all lost updates together have
+        less effect than the longest burst at its largest.
+        """
+        found = {output: gain * share for output, (_, gain) in self._states.items()}
+        error, windows = self._error, self._conditions.guarantee.windows
+        in_flight = events - self._conditions.dropouts
+        present = error.now(Output.GAIN) + error.missing(Output.GAIN, in_flight, spacing_s)
+        density = min(window.losses / window.packets for window in windows)
+        lasting = density * error.kernels[Output.GAIN].integral()
+        if self._lost is None or not lasting < (share - present) * spacing_s:
+            return found
+        for output, (_, gain) in self._states.items():
+            together = gain * present + self._lost.total(output, spacing_s, windows)
+            found[output] = min(found[output], together)
+        return found
+
     def inter_event_s(self, spacing_s: float) -> float:
         """Return the time that ‖e_s‖_W needs to the next event, given the spacing before it."""
         found = self.constants(spacing_s, None)
-        mismatch = self._states[Output.MISMATCH]
         own = self._error.now(Output.GAIN)
         others = found.input_error - own * found.overshoot * self._level.beta
         assert self._level.reached is not None
         found_s = first_passage_s(
             self._plant,
             self._level.reached,
-            max(mismatch.free + mismatch.gain * found.input_error, self._background.mismatch),
+            max(found.mismatch, self._background.mismatch),
             max(others, self._start_error, self._background.input_error),
             own,
         )

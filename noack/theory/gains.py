@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -159,6 +159,9 @@ class PlantGains:
     start: Matrix
     alpha_per_s: float
 
+    is_one_plant: ClassVar = True
+    """Whether A and B are the plant's, and not the centre of a box."""
+
     @cached_property
     def input_matrix(self) -> Matrix:
         """B U."""
@@ -193,9 +196,14 @@ class PlantGains:
         """
         start = response(self.closed_loop, self.start)
         return {
-            output: Coefficients(start.through(C).sup(), self._forced.through(C).integral())
+            output: Coefficients(start.through(C).sup(), self.forced[output].integral())
             for output, C in self.outputs.items()
         }
+
+    @cached_property
+    def forced(self) -> Mapping[Output, KernelBounds]:
+        """‖C e^{(A+BK+αI)τ} B U‖ for every output."""
+        return {output: self._forced.through(C) for output, C in self.outputs.items()}
 
     @cached_property
     def _forced(self) -> ResponseBounds:
@@ -213,8 +221,7 @@ class PlantGains:
         free = response_until(drift, self.start, start_s)
         error = free.through(self.error.split_K[1]).sup_on_grid()
         return error, {
-            output: error * start_s * self._forced.through(C).sup()
-            for output, C in self.outputs.items()
+            output: error * start_s * self.forced[output].sup() for output in self.outputs
         }
 
     def growth(self, until_s: float, cells: int) -> Growth:

@@ -44,10 +44,16 @@ def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> NetworkCond
     )
 
 
+def certified_delay_s(resolved: Scenario) -> float:
+    """The network delay that the certificates allow for: as given, or the longest one."""
+    given_s = resolved.certificate.network_delay_s
+    return resolved.network.link.longest_delay_s if given_s is None else given_s
+
+
 def network_delay_ns(resolved: Scenario, late_periods: int) -> int:
     """Return the longest time for which the network may delay an update under these conditions."""
     late_ns = late_periods * resolved.timing.plant_period_ns
-    return late_ns + math.ceil(resolved.network.link.longest_delay_s * NS_PER_S)
+    return late_ns + math.ceil(certified_delay_s(resolved) * NS_PER_S)
 
 
 def allowed_conditions(resolved: Scenario) -> NetworkConditions:

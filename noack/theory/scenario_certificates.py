@@ -353,7 +353,9 @@ class CertificateScope:
         if key not in self._plants:
             self._plants[key] = self._plant_at(error, start, plant_alpha_per_s)
         background = background or Background(input_error=self._start_error)
-        return solve(error, self._plants[key], conditions, level, background)
+        # Inputs of an earlier run are covered by their norm only.
+        structured = self._start_error == 0.0
+        return solve(error, self._plants[key], conditions, level, background, structured=structured)
 
 
 def _is_finite(constants: Constants) -> bool:

@@ -15,6 +15,8 @@ LOST_NS = -1
 """Receiving time of a lost packet."""
 MAX_PACKETS = 50_000_000
 """Most packets of a trace."""
+_MOST_MISSING = 1000
+"""Most missing packets per record, of a long trace: two records must not fill the memory."""
 LONGEST_NS = 10**18
 """Longest time after the first sending: 31 years."""
 
@@ -96,12 +98,15 @@ def packet_trace(
     if int(sent[-1]) - int(sent[0]) > LONGEST_NS:
         raise TraceRecordError(int(row[-1]), "is sent more than 31 years after the first packet")
     origin_ns = sent[0]
-    apart = np.abs(received // 2 - origin_ns // 2) > LONGEST_NS // 2  # halves do not overflow
+    known = received[~lost]
+    reference_ns = known[0] if clocks_differ and len(known) else origin_ns
+    apart = np.abs(received // 2 - reference_ns // 2) > LONGEST_NS // 2  # halves do not overflow
     _refuse(np.flatnonzero(apart & ~lost), row, "is received 31 years from the first sending")
     sent = sent - origin_ns
-    received = np.where(lost, sent, received - origin_ns)
-    if clocks_differ and not lost.all():
+    received = received - reference_ns
+    if clocks_differ and len(known):
         received = received - (received - sent)[~lost].min()
+    received = np.where(lost, sent, received)
     early = (
         "is received before it is sent; if the two clocks differ, only relative delays are known"
     )
@@ -118,6 +123,7 @@ def _check_numbers(number: Int64s, row: NDArray[Any], most_packets: int) -> None
     again = np.flatnonzero(number[1:] == number[:-1]) + 1
     _refuse(again, row, "has a sequence number that an earlier record has")
     packets = int(number[-1]) - int(number[0]) + 1
+    most_packets = min(most_packets, _MOST_MISSING * (len(number) + 1000))
     if packets > most_packets:
         raise TraceRecordError(
             int(row[-1]), f"makes the trace {packets} packets long; at most {most_packets} can be"

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from scipy.linalg import eigvals, solve_continuous_are
 
+from cosim.analysis.claims.condition_reader import read_conditions
 from cosim.analysis.claims.run_evidence import scheduled_certificates
 from cosim.analysis.model_comparison import linearisation, linearisation_rows
 from cosim.analysis.run_summary import summarise
@@ -27,12 +28,13 @@ from noack.plants.quadrotor import QuadrotorSettings
 from noack.plants.systems.ode_integrator import OdeSystem
 from noack.plants.systems.plant_linearisation import linearise
 from noack.protocol.record_tables import PLANT_STEP
+from noack.theory.run_conditions import allowed_conditions
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 NAMES = sorted(path.stem for path in SCENARIOS.glob("*.toml"))
-ENDS_BELOW = {"f16_lateral": 0.5, "pendulum_observed": 0.5}
+ENDS_BELOW = {"f16_lateral": 0.5, "pendulum_observed": 0.5, "lane_5g_rural": 0.5}
 """‖x(T)‖ / ‖x(0)‖. The F-16 starts with sideslip in rad and ends with a small rudder angle in °;
-the pendulum is balanced from noisy angles.
+the pendulum is balanced from noisy angles; the rural network has an outage of ten seconds.
 """
 
 
@@ -61,6 +63,28 @@ def test_a_shipped_scenario_meets_its_assumptions_and_settles(name: str) -> None
     internal = record.scenario.plant.system.internal_names
     if internal:
         assert record[PLANT_STEP]["z"].shape[1] == len(internal)
+
+
+@pytest.mark.parametrize(
+    ("name", "late"),
+    [("urban", []), ("arterial", [(14.182, 0.024)]), ("rural", [(16.9, 4.512)])],
+)
+def test_the_certificates_on_recorded_networks_are_void_as_the_scenarios_say(
+    name: str, late: list[tuple[float, float]]
+) -> None:
+    """When an update is first too late for the certificates, and the longest delay, in seconds."""
+    record = run_of(f"lane_5g_{name}")
+    conditions = allowed_conditions(record.scenario)
+    assert conditions.delay_s == 0.02
+    found = [
+        (one.t_s, one.worst)
+        for one in read_conditions(record).violations(conditions) if one.cause == "delay"
+    ]  # fmt: skip
+    assert found == [pytest.approx(one) for one in late]
+    longest = shipped(f"lane_5g_{name}", "certificate={}")
+    assert all(one.constants is None for one in scheduled_certificates(longest))
+    box = scheduled_certificates(record.scenario)[-1]
+    assert box.constants is not None
 
 
 def loop(name: str) -> LoopMatrices:

@@ -92,7 +92,7 @@ def test_the_run_directory_holds_everything(finished: Finished) -> None:
     }
     assert not (run_dir / "spool").exists()
     report = (run_dir / "report.html").read_text(encoding="utf-8")
-    assert report.count("<figure") == 7
+    assert report.count("<figure") == 8
     assert "completed 20 s" in report
     assert "warning" not in finished.stderr
 

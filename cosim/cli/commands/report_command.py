@@ -1,5 +1,9 @@
 """``noack report``: a run's page of figures and tables."""
 
+from typing import Annotated
+
+import typer
+
 from cosim.cli import command as cli
 from cosim.record.run_directory import chosen_run
 from noack.core.errors import ExitStatus
@@ -13,12 +17,15 @@ def report(
     run_dir: cli.RunArgument = None,
     *,
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
+    again: Annotated[
+        bool, typer.Option("--again", help="Write the report again, even if there is one.")
+    ] = False,
     json: cli.JsonOption = False,
 ) -> int:
-    """Write a run's report (one HTML page with all figures) and print its path."""
-    from cosim.live.finalize import rewrite_report
+    """Print the path of a run's report (one HTML page with all figures); write it if missing."""
+    from cosim.live.finalize import run_report
 
-    path = rewrite_report(chosen_run(run_dir, runs))
+    path = run_report(chosen_run(run_dir, runs), again=again)
     if json:
         cli.print_json({"report": str(path)})
     else:

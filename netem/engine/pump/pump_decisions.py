@@ -173,7 +173,11 @@ def _client_of(memory: Memory, number: int, size_bytes: int) -> int:
 
 
 def _read_arrival(memory: Memory) -> None:
-    """Read the arrival time of the current packet."""
+    """Read the arrival time of the current packet.
+
+    The kernel's timestamps are of the wall clock. One from before the relay's start is ignored: the
+    wall clock was set since.
+    """
     pump = memory.pump[0]
     header, words = memory.in_headers[pump.batch_next], memory.in_controls[pump.batch_next]
     pump.arrival_ns = pump.read_ns
@@ -182,7 +186,9 @@ def _read_arrival(memory: Memory) -> None:
         used_bytes = (words[place] + 7) & ~7
         if words[place + 1] == _STAMP:
             waited_ns = pump.real_ns - (words[place + 2] * _NS + words[place + 3])
-            pump.arrival_ns = pump.read_ns - simulated_ns_of(memory, waited_ns)
+            waited_ns = simulated_ns_of(memory, waited_ns)
+            if waited_ns <= pump.read_ns:
+                pump.arrival_ns = pump.read_ns - waited_ns
         left_bytes -= used_bytes
         place += used_bytes >> 3
 

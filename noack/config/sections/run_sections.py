@@ -15,6 +15,9 @@ class CertificateSection(ScenarioSection):
 
     late_periods: Annotated[int, Field(ge=0, le=1000)] = 2
     """Updates and inputs may be late by this number of plant steps."""
+    network_delay_s: Annotated[FiniteFloat, Field(ge=0, le=3600)] | None = None
+    """The network may delay updates by this time; a longer delay voids the certificates. By default
+    the longest delay of the network's impairments."""
 
 
 class RecoverySection(ScenarioSection):

@@ -15,7 +15,6 @@ from cosim.measurement.confidence_interval import (
     poisson_estimate,
     profile_interval,
 )
-from cosim.measurement.goodness_of_fit import length_test
 from cosim.measurement.loss_bursts import loss_bursts
 from cosim.measurement.loss_likelihood import ChainRates, LossLikelihood
 from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
@@ -109,23 +108,20 @@ def test_the_preferred_model_is_the_true_one() -> None:
         bursts = loss_bursts(~chain_losses(8000, truth, seed=5))
         fits = ChainFits(bursts)
         assert fits.chosen.model == name
-        left_out = np.zeros(len(bursts.length), bool)
-        assert length_test(bursts, left_out, fits.chosen).verdict == "not rejected"
+        assert fits.tested(fits.chosen).verdict == "not rejected"
 
 
 def test_the_test_of_lengths_rejects_at_its_level_and_wrong_models() -> None:
     found = []
     for seed in range(200):
-        bursts = loss_bursts(~chain_losses(3000, GILBERT, seed))
-        left_out = np.zeros(len(bursts.length), bool)
-        found.append(length_test(bursts, left_out, ChainFits(bursts).gilbert).p_value)
+        fits = ChainFits(loss_bursts(~chain_losses(3000, GILBERT, seed)))
+        found.append(fits.tested(fits.gilbert).p_value)
     p_values = np.array(found, float)
     assert 0.01 < (p_values < 0.05).mean() < 0.12
-    bursts = loss_bursts(~chain_losses(8000, ELLIOTT, seed=2))
-    left_out = np.zeros(len(bursts.length), bool)
-    assert length_test(bursts, left_out, ChainFits(bursts).gilbert).verdict == "rejected"
-    few = loss_bursts(~np.array([0, 1, 0, 0, 1, 1, 0], bool))
-    assert "too few" in length_test(few, np.zeros(2, bool), ChainFits(few).gilbert).verdict
+    fits = ChainFits(loss_bursts(~chain_losses(8000, ELLIOTT, seed=2)))
+    assert fits.tested(fits.gilbert).verdict == "rejected"
+    few = ChainFits(loss_bursts(~np.array([0, 1, 0, 0, 1, 1, 0], bool)))
+    assert "too few" in few.tested(few.gilbert).verdict
 
 
 @pytest.mark.parametrize(

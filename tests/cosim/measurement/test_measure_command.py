@@ -5,14 +5,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from typer.testing import CliRunner, Result
 
 import noack
 from cosim.cli import app
 from cosim.measurement.delay_statistics import autocorrelation, normal_scores
 from cosim.measurement.loss_likelihood import ChainRates
+from cosim.measurement.measurement_figures import measurement_figures
+from cosim.measurement.measurement_tables import measurement_tables
 from cosim.measurement.network_file import trace_csv
-from cosim.measurement.network_measurement import Measurement
+from cosim.measurement.network_measurement import Measurement, MeasurementOptions
 from noack.config import toml_file
 from noack.config.sections.network_section import NetworkSection
 from noack.traces.packet_trace import packet_trace
@@ -20,6 +24,9 @@ from noack.traces.trace_formats import read_trace
 from tests.cosim.measurement.chains import chain_losses, trace_of
 
 RURAL = Path(__file__).parents[3] / "scenarios" / "traces" / "cicv5g" / "rural_n8_10kmh.csv"
+
+
+ANY_RECORD = st.tuples(st.integers(0, 10**9), st.none() | st.integers(0, 10**12))
 
 
 def measure(*words: object) -> Result:
@@ -111,6 +118,31 @@ def test_correlation_is_that_of_an_autoregressive_delay() -> None:
     delays = Measurement(trace).delays
     assert delays.quantiles_s[0.5] == pytest.approx(np.median(delay_ns[known]) * 1e-9)
     assert delays.received == known.sum()
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 10**9), st.none() | st.integers(0, 10**12)),
+        min_size=1,
+        max_size=40,
+    ),
+    st.none() | st.floats(1e-9, 1e3),
+)
+def test_any_trace_is_measured(records: list[tuple[int, int | None]], deadline_s: float) -> None:
+    sent = np.cumsum([gap for gap, _ in records])
+    lost = np.array([delay is None for _, delay in records])
+    received = sent + np.array([delay or 0 for _, delay in records])
+    trace = packet_trace(sent, received, lost)
+    found = Measurement(trace, MeasurementOptions(deadline_s=deadline_s))
+    with np.errstate(all="raise", under="ignore"):
+        document = found.to_json()
+    assert document["effective_losses"] >= int(lost.sum())
+    void = found.certificate_time(noack.load("lane_following"))
+    assert 0 <= void.share <= 1
+    assert all(one.share <= void.share for one in void.causes)
+    assert [*measurement_tables(found, void)]
+    assert len([*measurement_figures(found)]) == 4
 
 
 @pytest.mark.parametrize(

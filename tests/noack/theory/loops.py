@@ -13,6 +13,13 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
+from noack.impairments.loss_guarantee import (
+    DeliveriesBetweenBursts,
+    LongestBurst,
+    LossesInWindow,
+    LossGuarantee,
+    LossRule,
+)
 from noack.theory.certificate import Constants, Level, NetworkConditions, VoidError, solve
 from noack.theory.gains import ErrorGains, PlantGains
 
@@ -52,6 +59,10 @@ class System:
     """Steps between two inputs; 0: the plant applies K x_c continuously."""
     lag_steps: int
     """Delay of an input in steps."""
+    window: tuple[int, int] = (1, 1)
+    """(m, K): at most m losses in K consecutive updates, if m < K."""
+    recovery: int = 0
+    """Least number of deliveries between two bursts of losses."""
 
     @property
     def conditions(self) -> NetworkConditions:
@@ -60,13 +71,22 @@ class System:
         applied_input += self.hold_steps - 1 + self.lag if self.hold_steps else 0
         sampling_s = self.sample_steps * self.step_s
         return NetworkConditions(
-            dropouts=self.mansd,
+            dropouts=self.guarantee.longest_burst,
+            constraints=self.guarantee.rules[1:],
             sampling_s=sampling_s,
             spacing_s=sampling_s,
             delay_s=applied_input * self.step_s,
             hold_s=(self.hold_steps + self.lag) * self.step_s,
             start_s=applied_input * self.step_s,
         )
+
+    @property
+    def guarantee(self) -> LossGuarantee:
+        """The rules of the network's losses."""
+        rules: list[LossRule] = [LongestBurst(self.mansd)]
+        rules += [LossesInWindow(*self.window)] if self.window[0] < self.window[1] else []
+        rules += [DeliveriesBetweenBursts(self.recovery)] if self.recovery else []
+        return LossGuarantee(tuple(rules))
 
     @property
     def lag(self) -> int:
@@ -239,7 +259,7 @@ class _Propagators:
 
 
 def networks(seed: int, system: System) -> tuple[Flags, NDArray[np.int64]]:
-    """Loss patterns with at most M − 1 consecutive losses: worst cases, and random ones."""
+    """Loss patterns that the guarantee allows: worst cases, and random ones."""
     rng = np.random.default_rng(seed)
     events = STEPS // system.sample_steps + 2
     lost = rng.uniform(size=(RUNS, events)) < rng.uniform(size=(RUNS, 1)) ** 0.5
@@ -247,10 +267,14 @@ def networks(seed: int, system: System) -> tuple[Flags, NDArray[np.int64]]:
     lost[1] = False
     if not system.known_start:
         lost[:, 0] = False
-    run = np.zeros(RUNS, dtype=np.int64)
+    run, since = np.zeros(RUNS, dtype=np.int64), np.full(RUNS, system.recovery)
+    most, width = system.window if system.window[0] < system.window[1] else (1, 1)
     for event in range(events):
-        lost[:, event] &= run < system.mansd
+        recent = lost[:, max(event - width + 1, 0) : event].sum(axis=1)
+        lost[:, event] &= (run < system.mansd) & (recent < most)
+        lost[:, event] &= (run > 0) | (since >= system.recovery)
         run = np.where(lost[:, event], run + 1, 0)
+        since = np.where(lost[:, event], 0, since + 1)
     delays = rng.integers(0, system.delay_steps + 1, (RUNS, events))
     delays[:4] = system.delay_steps
     return ~lost, delays
@@ -292,4 +316,6 @@ def systems(draw: st.DrawFn, **fixed: Any) -> System:
         delay_steps=choose("delay_steps", st.integers(0, 4)),
         hold_steps=choose("hold_steps", st.integers(0, 4)),
         lag_steps=choose("lag_steps", st.integers(0, 2)),
+        window=choose("window", st.sampled_from([(1, 1), (1, 4), (2, 5), (3, 12), (4, 40)])),
+        recovery=choose("recovery", st.sampled_from([0, 0, 2, 6])),
     )

@@ -49,3 +49,14 @@ def test_the_networks_delay_adds_to_the_delay_of_updates(
     # The input does not pass through this network.
     assert delayed.hold_s == at_once.hold_s
     assert any("up to 30 ms" in assumption.why for assumption in assumptions(resolved))
+
+
+def test_the_certified_delay_replaces_the_longest_one(content: dict[str, Any]) -> None:
+    content["network"]["impairments"] = [{"kind": "delay", "delay_s": 0.02}]
+    longest = nominal_conditions(resolve(validate(content, "here")), 2)
+    content["network"]["impairments"] = [{"kind": "delay", "delay_s": 3.0}]
+    content["certificate"] = {"network_delay_s": 0.02}
+    resolved = resolve(validate(content, "here"))
+    assert nominal_conditions(resolved, 2) == longest
+    why = "; ".join(assumption.why for assumption in assumptions(resolved))
+    assert "up to 3000 ms; the certificates allow for 20 ms" in why

@@ -85,7 +85,7 @@ def test_clocks_that_differ_give_relative_delays() -> None:
 
 
 WRONG = {
-    "": "not a packet trace; known formats: CSV",
+    "": "not a packet trace; known formats: pcap, CSV, IRTT",
     "\x00\x01": "not a packet trace",
     "sent_ms,received_ms\n": "has no packets",
     "sent_ms,received\n1,2\n": "line 1: has no column received_ms (or _s, _us, _ns); its columns: ",

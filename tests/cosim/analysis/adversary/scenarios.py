@@ -40,11 +40,22 @@ def scenario_of(system: System, horizon_s: float, mode: str, floor: float) -> Sc
             "weight": system.weight.tolist(),
         },
         "network": {
-            "mansd": system.mansd, "loss": {"model": "bernoulli", "probability": 0.5},
+            "mansd": system.mansd, "constraints": constraints_of(system),
+            "loss": {"model": "bernoulli", "probability": 0.5},
             "initial_sync": "known_state" if system.known_start else "first_packet",
         },
     }  # fmt: skip
     return resolve(validate(content, "random"))
+
+
+def constraints_of(system: System) -> list[dict[str, Any]]:
+    """The constraints of a random loop's guarantee, as in a scenario."""
+    (losses, window), found = system.window, []
+    if losses < window:
+        found.append({"kind": "at_most", "losses": losses, "window": window})
+    if system.recovery:
+        found.append({"kind": "recovery", "deliveries": system.recovery})
+    return found
 
 
 @st.composite
@@ -66,15 +77,15 @@ def scenarios(draw: st.DrawFn, most_events: int, **fixed: Any) -> Scenario:
 
 
 def simulate(resolved: Scenario, wanted: Pattern) -> ContinuousRun:
-    """Simulate one pattern with the reference simulator; the cap forces deliveries."""
-    mansd, known_start = resolved.network.mansd, resolved.network.initial_sync == "known_state"
-    dropped = 0
+    """Simulate one pattern with the reference simulator; the guarantee forces deliveries."""
+    known_start = resolved.network.initial_sync == "known_state"
+    so_far = ""  # one letter per event: D delivered, L lost
 
     def delivered(event: int) -> bool:
-        nonlocal dropped
-        arrives = (event == 0 and not known_start) or dropped >= mansd
+        nonlocal so_far
+        arrives = (event == 0 and not known_start) or not may_be_lost(resolved, so_far)
         arrives = arrives or event >= len(wanted) or wanted[event]
-        dropped = 0 if arrives else dropped + 1
+        so_far += "D" if arrives else "L"
         return arrives
 
     return simulate_continuous(
@@ -83,6 +94,24 @@ def simulate(resolved: Scenario, wanted: Pattern) -> ContinuousRun:
         delivered=delivered,
         known_start=known_start,
     )
+
+
+def may_be_lost(resolved: Scenario, so_far: str) -> bool:
+    """Whether the next update may be lost, from the definition of the guarantee."""
+    network = resolved.network
+    bursts = [len(burst) for burst in so_far.split("D")]
+    if bursts[-1] >= network.mansd:
+        return False
+    for one in network.constraints:
+        if one.kind == "at_most":
+            recent = (so_far + "L")[-one.window :]
+            allowed = recent.count("L") <= one.losses
+        else:
+            since = len(so_far) - len(so_far.rstrip("D"))
+            allowed = since == 0 or "L" not in so_far or since >= one.deliveries
+        if not allowed:
+            return False
+    return True
 
 
 def every_run(resolved: Scenario) -> Iterator[ContinuousRun]:

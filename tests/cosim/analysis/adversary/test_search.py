@@ -40,10 +40,27 @@ def rate_of(resolved: Scenario) -> float | None:
     return None if constants is None else constants.rate_per_s
 
 
-@given(resolved=scenarios(5, mansd=2))
-@settings(MANY, max_examples=5)
-def test_the_search_finds_the_worst_of_all_patterns(resolved: Scenario) -> None:
+@pytest.mark.parametrize(
+    "guarantee",
+    [
+        {"mansd": 2, "window": (1, 1), "recovery": 0},
+        {"mansd": 3, "window": (2, 4), "recovery": 0},
+        {"mansd": 2, "window": (2, 5), "recovery": 2},
+    ],
+    ids=["cap", "in a window", "with recovery"],
+)
+def test_the_search_finds_the_worst_of_all_patterns(guarantee: dict[str, Any]) -> None:
     """Also without initial patterns, so that only the tree's own branches can find it."""
+
+    @given(resolved=scenarios(5, **guarantee))
+    @settings(MANY, max_examples=4)
+    def check(resolved: Scenario) -> None:
+        assert_worst_is_found(resolved)
+
+    check()
+
+
+def assert_worst_is_found(resolved: Scenario) -> None:
     runs = list(every_run(resolved))
     for objective in Objective:
         flow = flow_of(resolved, objective, rate_of(resolved))
@@ -81,7 +98,7 @@ def test_a_certificate_that_forgets_a_dropout_is_refuted() -> None:
     """M = 2: for no dropout, Δ would be 1, and almost any loss refutes that."""
     refuted = []
 
-    @given(resolved=scenarios(16, mansd=1, n=2, alpha_share=0.2))
+    @given(resolved=scenarios(16, mansd=1, window=(1, 1), n=2, alpha_share=0.2))
     @settings(MANY, max_examples=4)
     def attempt(resolved: Scenario) -> None:
         broken = certify(resolved, ideal_conditions(resolved)._replace(dropouts=0))
@@ -140,7 +157,7 @@ def test_without_dropouts_there_is_one_pattern() -> None:
 @settings(max_examples=4)
 def test_no_run_costs_more_than_the_bound(resolved: Scenario) -> None:
     flow = flow_of(resolved, Objective.COST)
-    ceiling = cost_ceiling(flow.system, resolved.network.mansd, resolved.horizon_s)
+    ceiling = cost_ceiling(flow.system, resolved.network.longest_burst, resolved.horizon_s)
     assert ceiling is not None
     for run in every_run(resolved):
         states = (run.start, *run.after) if flow.known_start else run.after

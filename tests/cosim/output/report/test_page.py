@@ -337,7 +337,7 @@ def test_a_failed_report_does_not_fail_the_run(
     assert capsys.readouterr().err == "noack: warning: no report.html: no such luck\n"
 
 
-def test_the_command_writes_the_report_again(dead_run: Path) -> None:
+def test_the_command_writes_a_missing_report_and_others_only_if_asked(dead_run: Path) -> None:
     """Also for a run that has not been finalized."""
     ran = CliRunner().invoke(app, ["report", str(dead_run), "--json"])
     assert ran.exit_code == 0, ran.output
@@ -345,6 +345,11 @@ def test_the_command_writes_the_report_again(dead_run: Path) -> None:
     assert json.loads(ran.stdout) == {"report": str(path)}
     parsed = Page(path.read_text(encoding="utf-8"))
     assert "the launcher ended early" in parsed.text
+    path.write_text("as it was")
+    assert CliRunner().invoke(app, ["report", str(dead_run)]).stdout == f"{path}\n"
+    assert path.read_text() == "as it was"
+    assert CliRunner().invoke(app, ["report", str(dead_run), "--again"]).exit_code == 0
+    assert Page(path.read_text(encoding="utf-8")).text == parsed.text
 
 
 def test_the_command_reports_what_is_wrong(tmp_path: Path) -> None:
