@@ -8,6 +8,8 @@ from benchmarks import (
     demo_run,
     emulator,
     flood,
+    guarantee,
+    guarantee_comparison,
     latency,
     lateness,
     long_run,
@@ -27,6 +29,7 @@ from benchmarks._report import run
 MODULES = (
     demo_run, emulator, flood, latency, lateness, startup, recovery, machines, plants, simulation,
     batch, campaign, long_run, relays, relay_delay, relay_flows, relay_soak,
+    guarantee, guarantee_comparison,
 )  # fmt: skip
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from typing import NamedTuple
 from netem.rules.guarantee import counts_losses
 from noack.core.random_streams import stream_key
 from noack.impairments.feature import StageTables
+from noack.impairments.kept_loss import with_kept_loss
 from noack.impairments.link_records import (
     NEVER_NS,
     Counters,
@@ -46,8 +47,9 @@ def program_of(
         tracks: packets may be in flight from earlier settings.
 
     Raises:
-        ValueError: the settings name a file that has not been read.
+        ValueError: the settings name a file that has not been read, or a loss rate cannot be kept.
     """
+    settings = with_kept_loss(settings)
     scored = any(getattr(one, "loss_correlation", 0) != 0 for one in settings.impairments)
     tables = StageTables(scored=scored)
     stages = []
@@ -70,8 +72,9 @@ def program_of(
             for rule in rules
             if isinstance(rule, LossesInWindow)
         ],
-        recovery=sum(
-            rule.deliveries for rule in rules if isinstance(rule, DeliveriesBetweenBursts)
+        recovery=max(
+            (rule.deliveries for rule in rules if isinstance(rule, DeliveriesBetweenBursts)),
+            default=0,
         ),
         mansd=-1 if settings.longest_burst is None else settings.longest_burst,
         limit=settings.limit,

@@ -31,10 +31,10 @@ from cosim.record.divergence import Divergence, divergence
 from cosim.record.packet_outcomes import packet_outcomes
 from cosim.record.recorded_changes import changes_of
 from cosim.record.run_record import RunRecord
-from netem.loss_prediction import predict
 from noack.config.runtime_parameters import text_of
 from noack.core.clock import NS_PER_S
 from noack.core.errors import ExitStatus
+from noack.impairments.kept_loss import expected_loss
 from noack.protocol.machine_interface import FAILED, RESTART
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -125,7 +125,7 @@ def _transmissions(record: RunRecord) -> dict[str, Any]:
         "events": len(events),
         "deliveries": len(deliveries),
         "drops": int(outcomes.lost.sum()),
-        "loss_expected": None if scenario.changes else predict(scenario.network.link).rate,
+        "loss_expected": None if scenario.changes else expected_loss(scenario.network.link).rate,
         "drops_by_cause": drops_by_cause(outcomes),
         "forced_deliveries": int((outcomes.fate == Fate.FORCED).sum()),
         "longest_loss_burst": max(outcomes.longest_loss_burst(), longest),

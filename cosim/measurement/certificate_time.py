@@ -85,7 +85,7 @@ def certificate_time(trace: PacketTrace, scenario: Scenario) -> CertificateTime:
     resolved = resolve(scenario)
     found: dict[str, str | None] = {}
     if not causes_of(resolved):
-        found["every plant"] = "a loop with acknowledgements has no certificate"
+        found["any plant"] = "a loop with acknowledgements cannot have one"
     for one in scheduled_certificates(resolved):
         found[one.scope] = one.void if one.constants is None else None
     allowed = allowed_conditions(resolved)
@@ -99,7 +99,7 @@ def certificate_time(trace: PacketTrace, scenario: Scenario) -> CertificateTime:
     )
     return CertificateTime(
         scenario=resolved.name,
-        certificates=found or {"every plant": "the scenario cannot have a certificate"},
+        certificates=found or {"any plant": "the scenario cannot have one"},
         allowed_losses=allowed.dropouts,
         allowed_delay_s=delay_ns * 1e-9,
         observed_s=end_ns * 1e-9,

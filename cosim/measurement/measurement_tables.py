@@ -75,8 +75,8 @@ def measurement_tables(
     )
     if void is not None:
         yield TextTable(
-            f"certificate of {void.scenario}: share of the time in which it is void",
-            ("condition", "void", "first", "worst"),
+            f"{void.scenario}: when the network violates a condition of its certificates",
+            ("condition", "share of the time", "first", "worst"),
             [*_void_rows(void)],
         )
 

@@ -22,7 +22,7 @@ from cosim.measurement.chain_fits import ChainFits
 from cosim.measurement.loss_bursts import Flags, LossBursts
 
 LEVEL = 1e-3
-"""Probability with which a network without outages has one by this rule."""
+"""Nominal probability with which a network without outages has one by this rule."""
 MOST_TESTED = 30
 """Number of bursts, the longest, that may be outages."""
 FEWEST_BURSTS = 5

@@ -5,21 +5,29 @@ from pathlib import Path
 import numpy as np
 
 from cosim.record.packet_outcomes import packet_outcomes
-from cosim.record.run_record import load_record
+from cosim.record.run_record import RunRecord, load_record
 from noack.core.errors import CallerError
 from noack.protocol.record_tables import CONTROLLER_DELIVERY
 from noack.traces.packet_trace import LOST_NS, PacketTrace, packet_trace
 
 
 def read_run(run_dir: Path) -> PacketTrace:
-    """Return the trace of a run's updates: sent when they reached the emulator.
-
-    Updates that were in flight at the end are left out.
+    """Return the trace of a run's updates.
 
     Raises:
         NoackError: it is not a run, or has no updates.
     """
-    record = load_record(run_dir)
+    try:
+        return updates_trace(load_record(run_dir))
+    except ValueError as error:
+        raise CallerError(f"{run_dir}: {error}") from None
+
+
+def updates_trace(record: RunRecord) -> PacketTrace:
+    """Return the trace of the updates: sent when they reached the emulator.
+
+    Updates that were in flight at the end are left out. Raise ValueError if there are none.
+    """
     outcomes = packet_outcomes(record)
     arrived = record.columns(CONTROLLER_DELIVERY, "sequence", "now_ns")
     numbers, first = np.unique(arrived["sequence"], return_index=True)
@@ -31,7 +39,7 @@ def read_run(run_dir: Path) -> PacketTrace:
     sent_ns, lost = outcomes.now_ns, received_ns == LOST_NS
     ended = ~(outcomes.in_flight & lost)
     if not ended.any():
-        raise CallerError(f"{run_dir}: no updates reached the network emulator")
+        raise ValueError("no updates reached the network emulator")
     # Numbers of restarted sensors begin anew far above; the order at the emulator has no gaps.
     trace = packet_trace(sent_ns[ended], np.maximum(received_ns, sent_ns)[ended], lost[ended])
     flying = int((~ended).sum())

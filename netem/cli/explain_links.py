@@ -12,10 +12,10 @@ from rich.table import Table
 from rich.text import Text
 
 from netem.engine.relay_interface import LinkSpec
-from netem.loss_prediction import predict
 from netem.words.tc_command import tc_command
 from netem.words.words_to_settings import text_of
 from noack.core.errors import shortened
+from noack.impairments.kept_loss import expected_loss, with_kept_loss
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import text_of as address_text
 
@@ -56,7 +56,7 @@ def explain(specs: Sequence[LinkSpec], *, as_json: bool, as_file: bool) -> None:
 
 
 def _document(settings: LinkSettings) -> dict[str, Any]:
-    prediction, tc = predict(settings), tc_command(settings)
+    prediction, tc = expected_loss(settings), tc_command(settings)
     return {
         "words": text_of(settings),
         "settings": settings.model_dump(mode="json", exclude_none=True),
@@ -64,7 +64,7 @@ def _document(settings: LinkSettings) -> dict[str, Any]:
         + [f"{words}: {meaning}" for words, meaning in settings_meaning(settings)],
         "predicted_loss": prediction.rate,
         "predicted_loss_note": prediction.note,
-        "predicted_loss_without_cap": predict(_uncapped(settings)).rate,
+        "predicted_loss_without_cap": expected_loss(_uncapped(settings)).rate,
         "tc": tc.words,
         "tc_lacks": list(tc.lacks),
         "tc_notes": list(tc.notes),
@@ -134,13 +134,13 @@ def _table(settings: LinkSettings, width: int) -> Table:
 
 
 def _rate_text(settings: LinkSettings) -> str:
-    prediction = predict(settings)
+    prediction = expected_loss(settings)
     if prediction.rate is None:
         return f"not known: {prediction.note}"
     text = f"{100 * prediction.rate:.4g}%"
-    without_cap = None if settings.mansd is None else predict(_uncapped(settings)).rate
-    if without_cap is not None:
-        text += f" (without the cap {100 * without_cap:.4g}%)"
+    without = expected_loss(_uncapped(settings)).rate
+    if without is not None and settings.longest_burst is not None:
+        text += f" (without the guarantee {100 * without:.4g}%)"
     return f"{text}, {prediction.note}" if prediction.note else text
 
 
@@ -164,7 +164,8 @@ def _print_tc(console: Console, settings: LinkSettings) -> None:
 
 
 def _uncapped(settings: LinkSettings) -> LinkSettings:
-    return settings.model_copy(update={"mansd": None})
+    """Return settings without the guarantee, which lose with the same probabilities."""
+    return with_kept_loss(settings).model_copy(update={"mansd": None, "constraints": ()})
 
 
 def _link_table(spec: LinkSpec) -> dict[str, Any]:

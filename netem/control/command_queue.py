@@ -15,9 +15,9 @@ from typing import Any, NamedTuple, TypeVar
 
 from netem.engine.relay_base import Relay
 from netem.engine.relay_interface import DIRECTIONS, Direction, LinkReport
-from netem.loss_prediction import predict
 from netem.words.words_to_settings import text_of
 from noack.core.errors import PeerError
+from noack.impairments.kept_loss import expected_loss
 from noack.impairments.link_records import Counters
 from noack.impairments.link_settings import LinkSettings
 
@@ -40,8 +40,8 @@ class AppliedSettings:
 
     @cached_property
     def predicted_loss(self) -> float | None:
-        """See :mod:`netem.loss_prediction`; this may take seconds."""
-        return predict(self.settings).rate
+        """See :mod:`noack.impairments.loss_prediction`; this may take seconds."""
+        return expected_loss(self.settings).rate
 
 
 class Snapshot(NamedTuple):

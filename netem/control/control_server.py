@@ -31,6 +31,7 @@ from netem.engine.relay_interface import DIRECTIONS, Direction
 from netem.words.words_to_settings import settings_of, text_of
 from noack.config.validation_messages import brief
 from noack.core.errors import CallerError, MachineError, NoackError
+from noack.impairments.kept_loss import with_kept_loss
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.udp_sockets import LOOPBACK, free_tcp_port
 from noack.runtime.zenoh_session import SessionSecret, cause_of, open_session
@@ -169,6 +170,10 @@ class ControlServer:
         if settings is None:
             settings = settings_of(change.words or [])
         _require_read(settings)
+        try:
+            with_kept_loss(settings)
+        except ValueError as error:
+            raise CallerError(str(error)) from None
         directions: Sequence[Direction] = (
             DIRECTIONS if change.direction == "both" else (change.direction,)
         )

@@ -15,7 +15,7 @@ from noack.config.runtime_parameters import (
     put_settings,
     require_runtime_parameters,
 )
-from noack.config.scenario_checks import check_setpoint, check_trigger
+from noack.config.scenario_checks import check_kept_loss, check_setpoint, check_trigger
 from noack.config.sections.network_section import NetworkSection
 from noack.config.validation_messages import brief
 from noack.impairments.constraints import require_consistent
@@ -64,6 +64,8 @@ def with_settings(scenario: "Scenario", settings: Mapping[str, Any]) -> "Scenari
         check_trigger(changed)
     if "controller" in sections:
         check_setpoint(changed)
+    if "network" in sections or any(key.startswith("network.") for key in settings):
+        check_kept_loss(changed)
     return changed
 
 

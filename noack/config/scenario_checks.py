@@ -6,6 +6,8 @@ import numpy as np
 
 from noack.config.setpoint import input_at
 from noack.core.clock import NS_PER_S
+from noack.impairments.kept_loss import with_kept_loss
+from noack.impairments.loss_models.trace import TraceLoss
 from noack.protocol.wire_format import MAX_DIMENSION
 from noack.settings.matrices import require_length, require_shape
 
@@ -27,6 +29,23 @@ def check_sections(scenario: "Scenario") -> None:
     _check_observer(scenario)
     _check_watchdog(scenario)
     check_trigger(scenario)
+    check_kept_loss(scenario)
+
+
+def check_kept_loss(scenario: "Scenario") -> None:
+    """Raise ValueError if a loss rate cannot be kept; with a trace, as soon as it has been read."""
+    network = scenario.network
+    for key, link in (
+        ("network", network.link),
+        ("network.acknowledgements", network.reverse.link),
+    ):
+        losses = [getattr(one, "loss", None) for one in link.impairments]
+        if any(isinstance(one, TraceLoss) for one in losses):
+            continue
+        try:
+            with_kept_loss(link)
+        except ValueError as error:
+            raise ValueError(f"{key}.loss: {error}") from None
 
 
 def check_trigger(scenario: "Scenario") -> None:

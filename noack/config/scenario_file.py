@@ -12,6 +12,7 @@ import tomli_w
 from noack.config import toml_file
 from noack.config.matrix_files import with_matrices
 from noack.config.scenario import Scenario
+from noack.config.scenario_checks import check_kept_loss
 from noack.config.sections.network_section import AcknowledgementSection, NetworkSection
 from noack.core.errors import CallerError, printable, shortened
 from noack.settings.named_file import file_tables, located, with_tables
@@ -69,6 +70,10 @@ def _with_files(scenario: Scenario, path: Path, source: str) -> Scenario:
         read = _read(back, path.parent, f"{place}.acknowledgements")
         update["acknowledgements"] = back.model_copy(update=read)
     scenario = scenario.model_copy(update={"network": network.model_copy(update=update)})
+    try:
+        check_kept_loss(scenario)
+    except ValueError as error:
+        raise CallerError(f"{source}: {error}") from None
     tables = {
         place: located(table, path.parent, f"{source}: {place}")
         for place, table in file_tables(scenario)

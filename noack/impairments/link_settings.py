@@ -10,6 +10,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
+from noack.core.errors import CallerError
 from noack.impairments.constraints import AnyConstraint, longest_burst_of, require_consistent
 from noack.impairments.feature import LossModel
 from noack.impairments.kinds import AnyImpairment
@@ -84,10 +85,18 @@ def read_files(settings: LinkSettings, folder: Path, place: str = "") -> LinkSet
         place: as in :meth:`noack.impairments.feature.StageFeature.without_files`.
 
     Raises:
-        CallerError: one line; a file cannot be read, or has wrong content.
+        CallerError: one line; a file cannot be read, or has wrong content; or a loss rate cannot
+            be kept.
     """
+    from noack.impairments.kept_loss import with_kept_loss  # it depends on this module
+
     impairments = tuple(
         one.without_files(folder, f"{place}.impairments.{number}" if place else "")
         for number, one in enumerate(settings.impairments)
     )
-    return settings.model_copy(update={"impairments": impairments})
+    read = settings.model_copy(update={"impairments": impairments})
+    try:
+        with_kept_loss(read)
+    except ValueError as error:
+        raise CallerError(f"{place}: {error}" if place else str(error)) from None
+    return read

@@ -15,6 +15,8 @@ LOST_NS = -1
 """Receiving time of a lost packet."""
 MAX_PACKETS = 50_000_000
 """Most packets of a trace."""
+_MOST_MISSING = 1000
+"""Most missing packets per record, of a long trace: two records must not fill the memory."""
 LONGEST_NS = 10**18
 """Longest time after the first sending: 31 years."""
 
@@ -121,6 +123,7 @@ def _check_numbers(number: Int64s, row: NDArray[Any], most_packets: int) -> None
     again = np.flatnonzero(number[1:] == number[:-1]) + 1
     _refuse(again, row, "has a sequence number that an earlier record has")
     packets = int(number[-1]) - int(number[0]) + 1
+    most_packets = min(most_packets, _MOST_MISSING * (len(number) + 1000))
     if packets > most_packets:
         raise TraceRecordError(
             int(row[-1]), f"makes the trace {packets} packets long; at most {most_packets} can be"

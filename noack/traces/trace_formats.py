@@ -64,7 +64,10 @@ def read_trace(
             found = next((one for one in known if one.recognises(head)), None)
             if found is None:
                 names = ", ".join(one.name for one in known)
-                raise ValueError(f"not a packet trace; known formats: {names}")
+                raise ValueError(
+                    f"not a packet trace; known formats: {names}; a CSV file begins with a "
+                    "header, e.g. sequence,sent_ms,received_ms"
+                )
             return found.read(file, most_packets, clocks_differ)
     except (OSError, ValueError) as error:
         reason = f"cannot be read: {why(error)}" if isinstance(error, OSError) else one_line(error)

@@ -105,8 +105,9 @@ def test_the_wheel_contains_the_packages_and_their_data_only(dist: Path) -> None
     with zipfile.ZipFile(wheel) as file:
         names = set(file.namelist())
     for folder in ("scenarios", "campaigns"):
-        here = {f"cosim/{folder}/{path.name}" for path in (ROOT / folder).glob("*.toml")}
-        assert here <= names
+        paths = (ROOT / folder).rglob("*")
+        kept = {path for path in paths if path.suffix in (".toml", ".csv", ".md")}
+        assert {f"cosim/{path.relative_to(ROOT)}" for path in kept} <= names
     packages = ("noack", "plant_server", "sensor_node", "controller_node", "netem", "cosim")
     for package in packages:
         files = {

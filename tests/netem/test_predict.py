@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from netem.link_machine import Link
-from netem.loss_prediction import predict
 from netem.words.words_to_settings import settings_of
 from noack.impairments.link_records import NEVER_NS
 from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_prediction import predict
 from noack.protocol.record_tables import Fate
 
 DECISIONS = 400_000
@@ -42,6 +42,11 @@ def test_losses_without_chance_are_exact() -> None:
         ("loss script 0,1,2,7,8,9 every 10 mansd 4", 5 / 10),  # six losses, across the end
         ("loss script none every 10", 0.0),
         ("loss periodic 1/2 loss periodic 1/3", 4 / 6),
+        ("loss worst atmost 3 in 10", 3 / 10),
+        ("loss 100% atmost 3 in 10 mansd 2", 3 / 10),
+        ("loss worst mansd 2 recover 3", 2 / 5),
+        ("loss periodic 1/2 atmost 1 in 3", 1 / 4),  # only every other loss
+        ("loss worst atmost 2 in 4 recover 1 mansd 1", 1 / 2),
     ):
         assert predicted_loss(words) == pytest.approx(rate, rel=1e-12), words
 
@@ -87,6 +92,15 @@ def test_the_prediction_of_a_reducible_chain_depends_on_its_start() -> None:
         "corrupt 20% duplicate 50% corrupt 40% duplicate 30% mansd 2",
         "duplicate 40% 60% corrupt 30%",
         "delay 1ms 1ms loss 30% reorder 20% mansd 2",
+        "loss 30% atmost 3 in 10",
+        "loss 90% atmost 5 in 20",
+        "loss 60% mansd 3 recover 4",
+        "loss 40% atmost 3 in 8 atmost 5 in 16 recover 2 mansd 2",
+        "loss 30% 60% atmost 2 in 9",
+        "loss burst 20% 4 mansd 3 recover 2",
+        "loss gemodel 5% 2% 97% 10% atmost 4 in 12",
+        "loss periodic 3/20 loss 20% atmost 2 in 7",
+        "corrupt 20% duplicate 50% loss 20% mansd 2 recover 3",
     ],
 )
 def test_many_decisions_have_the_predicted_loss(decide: Any, share_is: Any, words: str) -> None:
@@ -100,11 +114,16 @@ def test_many_decisions_have_the_predicted_loss(decide: Any, share_is: Any, word
     ("words", "why"),
     [
         ("loss 5% blackout 1s-2s", "losses in a blackout depend on when packets arrive"),
+        ("replay t.csv", "t.csv has not been read"),
+        ("replay records 0s+1ms,1s+lost by time", "recorded losses by time depend on when packets"),
+        ("replay records 0s+1ms,1s+lost once", "a trace that is replayed once has no long-run"),
         ("loss script 3,4", "a script that is played once"),
         ("loss trace a.txt", "a.txt has not been read"),
         ("loss 5% 99.9%", "a correlation of 0.999 is too high"),
         ("loss 5% 90% loss 5% 90%", "together the impairments have .* states"),
         ("loss periodic 1/1000 loss 5%", "together the impairments have 1000 states"),
+        ("loss 5% atmost 20 in 100", "impairments and guarantee together have more than 20000"),
+        ("loss 5% 90% atmost 4 in 15", "impairments and guarantee together have more than 20000"),
         ("loss periodic 1/100000000", "the loss pattern repeats only after 100000000 packets"),
         ("loss periodic 1/9999991 loss periodic 1/2", "the loss patterns repeat together only "),
     ],
@@ -148,3 +167,10 @@ def makes_stale(settings: LinkSettings) -> bool:
     leaves_ns = [link.decide(0, 100, 10_000 * packet).release_ns for packet in range(2000)]
     left_ns = [t_ns for t_ns in leaves_ns if t_ns != NEVER_NS]
     return left_ns != sorted(left_ns)
+
+
+def test_a_repeated_trace_loses_its_own_share_and_less_under_a_cap() -> None:
+    trace = "replay records 0s+1ms,1s+lost,2s+lost,3s+lost,4s+1ms"
+    assert predicted_loss(trace) == pytest.approx(3 / 5)
+    assert predicted_loss(f"{trace} mansd 2") == pytest.approx(2 / 5)
+    assert predicted_loss("replay records 0s+1ms,1s+2ms by time") == 0.0

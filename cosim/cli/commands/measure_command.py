@@ -1,27 +1,19 @@
 """``noack measure``: losses, delays and the M of a real network."""
 
-from enum import StrEnum
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import typer
 from rich.console import Console
 
 from cosim.cli import command as cli
-from cosim.cli import completion
+from cosim.cli import measure_options as given
 from cosim.shipped_files import find_trace
 from noack.core.errors import CallerError, ExitStatus
 
 if TYPE_CHECKING:
+    from cosim.measurement.live.live_measurement import LiveOptions
+    from cosim.measurement.live.probe_result import ProbeResult
     from cosim.measurement.network_measurement import MeasurementOptions
-
-
-class NetworkForm(StrEnum):
-    """How a measured network is written."""
-
-    TRACE = "trace"
-    MODEL = "model"
-
+    from cosim.measurement.trace_sources import SourceOptions
 
 _TRACE = "rural_n8_10kmh"
 
@@ -30,72 +22,84 @@ _TRACE = "rural_n8_10kmh"
     (f"noack measure {_TRACE} --deadline 100ms", "a recorded trace"),
     (f"noack measure {_TRACE} --deadline 100ms --out measured.html", "with a page of figures"),
     (f"noack measure {_TRACE} --for-scenario lane_following", "when its certificate would be void"),
+    ("noack measure --listen 0.0.0.0:9100", "receive a probe, on one host"),
+    ("noack measure 192.0.2.7:9100 --rate 50hz --for 60s", "send it, on the other host"),
+    ("noack measure sender.pcap receiver.pcap", "captures of both ends"),
     (f"noack measure {_TRACE} --write network.toml", "the network for a scenario file"),
 ])  # fmt: skip
 def measure(
-    sources: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="FILE...",
-            help="A packet trace, the name of a shipped one, or files that belong together.",
-        ),
-    ],
+    sources: given.Sources = None,
     *,
-    deadline: Annotated[
-        str | None,
-        typer.Option(metavar="TIME", help="Packets that take longer count as lost, e.g. 100ms."),
-    ] = None,
-    share: Annotated[
-        list[float] | None,
-        typer.Option(help="Share of loss bursts and packets for which M is given; repeatable."),
-    ] = None,
-    window: Annotated[
-        list[int] | None,
-        typer.Option(help="K of the (m, K) table; repeatable.", min=1, max=100_000_000),
-    ] = None,
-    outage: Annotated[
-        str | None,
-        typer.Option(
-            metavar="TIME",
-            help="Loss bursts of this duration or more are outages; by default a test decides.",
-        ),
-    ] = None,
-    for_scenario: Annotated[
-        str | None,
-        typer.Option(
-            metavar="SCENARIO",
-            help="Report for which share of the time its certificate would have been void.",
-            autocompletion=completion.scenarios,
-        ),
-    ] = None,
+    listen: given.Listen = None,
+    rate: given.Rate = "50hz",
+    duration: given.Duration = "60s",
+    size: given.Size = 128,
+    round_trip: given.RoundTrip = False,
+    silence: given.Silence = "30s",
+    save: given.Save = None,
+    flow: given.Flow = 1,
+    sequence_at: given.SequenceAt = None,
+    clocks: given.Clocks = None,
+    deadline: given.Deadline = None,
+    share: given.Shares = None,
+    window: given.Windows = None,
+    outage: given.Outage = None,
+    for_scenario: given.ForScenario = None,
     settings: cli.SetOption = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", help="Write a page with tables and figures (.html).")
-    ] = None,
-    write: Annotated[
-        Path | None,
-        typer.Option(help="Write a [network] section that reproduces the network (.toml)."),
-    ] = None,
-    form: Annotated[
-        NetworkForm,
-        typer.Option("--as", help="Write the network as the trace itself, or as a fitted model."),
-    ] = NetworkForm.TRACE,
+    out: given.Page = None,
+    write: given.NetworkFile = None,
+    form: given.Form = given.NetworkForm.TRACE,
     json: cli.JsonOption = False,
 ) -> int:
     """Measure a network: losses, bursts, M, delays, outages, and models that fit."""
+    from cosim.measurement.live.live_measurement import LiveOptions, period_ns_of
     from cosim.measurement.measurement_outputs import OutputRequest, report
     from cosim.measurement.network_measurement import Measurement
-    from cosim.measurement.trace_sources import read_source
+    from cosim.measurement.trace_sources import SourceOptions
 
     options = _options(deadline, share, window, outage)
     scenario = None if for_scenario is None else cli.load_scenario(for_scenario, settings)
     request = OutputRequest(out, write, form.value, scenario)
-    trace, notes = read_source([*map(find_trace, sources)])
-    found = Measurement(trace, options, " ".join(sources), notes)
+    live = LiveOptions(rate, duration, size, round_trip, silence, save, options.deadline_s)
+    how = SourceOptions(
+        None if clocks is None else clocks is given.ClockRelation.DIFFERENT,
+        flow, sequence_at, period_ns_of(rate),
+    )  # fmt: skip
+    result, name = _result(sources or [], listen, live, how)
+    if result.trace is None:  # the sender of a one-way probe does not know what arrived
+        if json:
+            cli.print_json({"notes": result.notes})
+        else:
+            print(*result.notes, "the listener reports what has arrived", sep="\n")
+        return ExitStatus.OK
+    found = Measurement(result.trace, options, name, result.notes)
     document = report(found, request, None if json else Console())
     if json:
         cli.print_json(document)
-    return ExitStatus.OK
+    return ExitStatus.UNINTENDED_LOSSES if result.kernel_drops else ExitStatus.OK
+
+
+def _result(
+    sources: list[str], listen: str | None, live: "LiveOptions", how: "SourceOptions"
+) -> tuple["ProbeResult", str]:
+    """Return the result of a probe or of reading files, and a name for it."""
+    from cosim.measurement.live.live_measurement import is_address, receive_live, send_live
+    from cosim.measurement.live.probe_result import ProbeResult
+    from cosim.measurement.trace_sources import read_source
+
+    if listen is not None:
+        if sources:
+            raise CallerError(f"--listen {listen}: receives a probe, and reads no {sources[0]}")
+        return receive_live(listen, live), f"probe received at {listen}"
+    if not sources:
+        raise CallerError("expected a file, the address of a listener, or --listen ADDRESS")
+    if len(sources) == 1 and is_address(sources[0]):
+        return send_live(sources[0], live), f"probe of {sources[0]}"
+    if live.save is not None or live.round_trip:
+        option = "--round-trip" if live.save is None else f"--save {live.save}"
+        raise CallerError(f"{option}: is for live probes, and {sources[0]} is no address")
+    trace, notes = read_source([*map(find_trace, sources)], how)
+    return ProbeResult(trace, notes, None), " ".join(sources)
 
 
 def _options(

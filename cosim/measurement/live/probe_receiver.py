@@ -106,8 +106,6 @@ class ProbeReceiver:
         first = self._first
         assert first is not None
         sequence = content.sequence
-        if self.is_same_host:
-            received_ns = max(received_ns, content.sent_ns)  # the kernel's stamp is converted
         ahead_ns = (sequence - first.sequence) * first.period_ns
         if sequence >= MAX_PROBES or ahead_ns > (received_ns - self._first_ns) + _AHEAD_NS:
             self.ignored["ahead of schedule"] += 1
@@ -118,11 +116,13 @@ class ProbeReceiver:
             self.ignored["duplicate"] += 1
             return None
         self._have[sequence] = 1
+        self._last_ns = received_ns
+        if self.is_same_host:
+            received_ns = max(received_ns, content.sent_ns)  # the kernel's stamp is converted
         self._sequence.append(sequence)
         self._sent_ns.append(content.sent_ns)
         self._received_ns.append(received_ns)
         self._rows(sequence, content.sent_ns, received_ns)
-        self._last_ns = received_ns
         if first.kind is not ProbeKind.REQUEST:
             return None
         self._note_seen(sequence)

@@ -14,7 +14,7 @@ from cosim.output import palette
 from cosim.output.report import axes as draw
 from cosim.output.report.figure_style import NotebookFigure, printed, styled
 
-_HEIGHT_IN, _BETWEEN_IN = 1.9, 0.55
+_HEIGHT_IN, _WIDEST_IN = 1.9, 5.0
 _MOST_LABELS = 12
 _LOST, _LIMIT = printed(palette.LOST), printed(palette.CERTIFIED)
 
@@ -37,10 +37,10 @@ def loss_figure(panels: Sequence[LossPanel]) -> Figure:
     """Draw histograms side by side."""
     above_in = draw.head_in([])
     figure = NotebookFigure(figsize=(draw.WIDTH_IN, above_in + _HEIGHT_IN + draw.BELOW_IN))
-    each_in = (draw.WIDTH_IN - draw.RIGHT_IN + _BETWEEN_IN) / len(panels) - draw.LEFT_IN
-    width_in = each_in + (draw.LEFT_IN - _BETWEEN_IN) * (len(panels) == 1)
+    share_in = (draw.WIDTH_IN - draw.RIGHT_IN) / len(panels)
+    width_in = min(share_in - draw.LEFT_IN, _WIDEST_IN)
     for place, panel in enumerate(panels):
-        left_in = draw.LEFT_IN + place * (each_in + draw.LEFT_IN)
+        left_in = draw.LEFT_IN + place * share_in
         _histogram(draw.place(figure, left_in, above_in, width_in, _HEIGHT_IN), panel)
     return figure
 

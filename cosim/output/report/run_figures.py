@@ -18,6 +18,7 @@ from cosim.record.packet_outcomes import packet_outcomes
 from cosim.record.run_record import RunRecord
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
+from noack.impairments.loss_guarantee import LossesInWindow
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
@@ -236,9 +237,9 @@ def _losses(record: RunRecord) -> RunFigure:
                   network.longest_burst)
     ]  # fmt: skip
     panels += [
-        LossPanel(f"Losses in {window.packets} updates", f"losses in {window.packets} consecutive "
-                  "updates", "positions", outcomes.losses_in(window.packets), window.losses)
-        for window in network.guarantee.windows[1:3]
+        LossPanel(f"Losses in {rule.window} updates", f"losses in {rule.window} consecutive "
+                  "updates", "positions", outcomes.losses_in(rule.window), rule.limit)
+        for rule in network.guarantee.rules[:3] if isinstance(rule, LossesInWindow)
     ]  # fmt: skip
     longest = int(bursts.max(initial=0))
     return RunFigure(

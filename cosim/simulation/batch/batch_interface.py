@@ -34,6 +34,7 @@ ROW = np.dtype(
     [
         ("transmissions", np.int64),
         ("deliveries", np.int64),
+        ("longest_loss_burst", np.int64),
         ("inter_event_min_s", np.float64),
         ("inter_event_mean_s", np.float64),
         ("settling_s", np.float64),
@@ -47,6 +48,7 @@ ROW = np.dtype(
 """The row of a run; NaN where a number is not defined.
 
 transmissions, deliveries: numbers of events and of delivered updates, until the end or the failure.
+longest_loss_burst: largest number of consecutive losses, until then.
 inter_event_min_s, inter_event_mean_s: minimum and mean inter-event time; NaN below two events.
 settling_s: the last time at which ‖x‖ > settle ‖x(0)‖; NaN if this holds at the horizon.
 cost: ∫ xᵀQx + uᵀRu dt over the horizon, u = K x_c.

@@ -269,6 +269,7 @@ def begin_row(row: Any) -> None:
     """Initialise a row to the values before the first event."""
     row.transmissions = 0
     row.deliveries = 0
+    row.longest_loss_burst = 0
     row.inter_event_min_s = math.inf
     row.cost = 0.0
     row.sup_e_c_scaled = 0.0
@@ -301,6 +302,8 @@ def count_event(batch: Batch, row: Any, state: Models, t_s: float, last_s: float
     row.transmissions += 1
     if delivered:
         row.deliveries += 1
+    losses = batch.network.state.flows[0].consecutive_losses
+    row.longest_loss_burst = max(row.longest_loss_burst, losses)
     return delivered
 
 

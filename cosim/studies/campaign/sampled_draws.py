@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from cosim.record.align import align_tables, in_common
+from cosim.record.packet_outcomes import packet_outcomes
 from cosim.record.run_record import RunRecord
 from cosim.simulation.batch.batch_interface import ROW
 from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS
@@ -74,6 +75,7 @@ class SampledWork:
         gaps_s = np.diff(events_s)
         row["transmissions"] = len(events_s)
         row["deliveries"] = len(record[CONTROLLER_DELIVERY])
+        row["longest_loss_burst"] = packet_outcomes(record).longest_loss_burst()
         for name in _UNKNOWN:
             row[name] = np.nan
         if len(gaps_s):

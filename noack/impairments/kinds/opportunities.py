@@ -27,7 +27,7 @@ from noack.impairments.link_records import (
     StageMemory,
     refuse,
 )
-from noack.impairments.quantities import COUNT, SIGNED_COUNT, rate_text, time_text
+from noack.impairments.quantities import COUNT, SIGNED_COUNT, brief_number
 from noack.impairments.trace_offset import (
     LONGEST_NS,
     Offset,
@@ -117,8 +117,7 @@ class Opportunities(Impairment):
         Word("overhead", "opportunities trace.up overhead 28", after="opportunities FILE"),
         Word("queue", "opportunities trace.up queue 20", after="opportunities FILE"),
         Word("bytes", "opportunities trace.up bytes 30000", after="opportunities FILE"),
-        Word("from", "opportunities trace.up from 20s", after="opportunities FILE"),
-        Word("random", "opportunities trace.up from random", after="opportunities FILE from"),
+        Word("from", "opportunities trace.up from random", after="opportunities FILE"),
     )  # fmt: skip
     behaviour: ClassVar = Behaviour(OpportunityStage, apply, OpportunityQueue)
     delays: ClassVar = True
@@ -191,11 +190,11 @@ class Opportunities(Impairment):
     def meaning(self) -> str:
         what = self.file
         if self.times_ms is not None:
-            bits = len(self.times_ms) * OPPORTUNITY_BYTES * 8
-            rate_bps = round(bits * NS_PER_S / self.length_ns)
+            length_s = self.length_ns / NS_PER_S
+            rate_bps = len(self.times_ms) * OPPORTUNITY_BYTES * 8 / length_s
             what = (
-                f"{len(self.times_ms)} delivery opportunities in "
-                f"{time_text(self.length_ns / NS_PER_S)}, {rate_text(rate_bps)} per second"
+                f"{len(self.times_ms)} times in {brief_number(length_s)} s, "
+                f"{brief_number(rate_bps / 1e6)} Mbit/s on average"
             )
         most = "" if self.queue_bytes is None else f" or {self.queue_bytes} bytes"
         return (

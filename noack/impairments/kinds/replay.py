@@ -17,10 +17,10 @@ from noack.impairments.quantities import (
     OWN_TIME_NS,
     PERCENT,
     TIME,
+    brief_number,
     brief_percent,
     percent_text,
     time_ns_text,
-    time_text,
 )
 from noack.impairments.recorded_delay import ReplayStage, apply
 from noack.impairments.trace_offset import (
@@ -108,8 +108,7 @@ class Replay(Impairment):
             grammar="replay records T+T,T+lost,...",
         ),
         Word("by", "replay trace.csv by time", after="replay FILE"),
-        Word("from", "replay trace.csv from 20s", after="replay FILE"),
-        Word("random", "replay trace.csv from random", after="replay FILE from"),
+        Word("from", "replay trace.csv from random", after="replay FILE"),
         Word("share", "replay trace.csv share 50%", after="replay FILE"),
         Word("relative", "replay trace.csv relative", after="replay FILE"),
         Word("once", "replay trace.csv once", after="replay FILE"),
@@ -197,8 +196,8 @@ class Replay(Impairment):
         if self.delays_ns is not None:
             lost = sum(delay < 0 for delay in self.delays_ns) / len(self.delays_ns)
             what = (
-                f"{len(self.delays_ns)} packets of {time_text(self.length_ns / NS_PER_S)}, "
-                f"{brief_percent(lost)} lost, delays up to {time_text(self.longest_s)}"
+                f"{len(self.delays_ns)} packets in {brief_number(self.length_ns / NS_PER_S)} s, "
+                f"{brief_percent(lost)} lost, delays up to {brief_number(self.longest_s)} s"
             )
         which = "at its time since the start" if self.by == "time" else "by its number in its flow"
         again = ", repeated" if self.repeat else ", once"

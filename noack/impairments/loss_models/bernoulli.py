@@ -1,13 +1,15 @@
 """Bernoulli losses: each packet is lost with a probability, independently unless correlated."""
 
-from typing import ClassVar, Literal
+from collections.abc import Sequence
+from typing import Any, ClassVar, Literal, Self
 
 from noack.impairments.correlated_chance import ChanceStage, CorrelatedChance, happens, read_chance
-from noack.impairments.feature import Behaviour, LossModel, Word
+from noack.impairments.feature import Behaviour, Impairment, LossModel, Word
 from noack.impairments.link_records import DROPPED, PacketContext, StageMemory, refuse
 from noack.impairments.normal import score
 from noack.impairments.philox import draw
 from noack.impairments.quantities import brief_percent
+from noack.impairments.word_reader import WordReader
 from noack.settings.section import Correlation, Probability
 
 
@@ -20,26 +22,51 @@ def apply(packet: PacketContext, stage: ChanceStage, memory: StageMemory) -> Non
         packet.flow.score = -score(u) if stage.correlation == 0.0 else memory.score
 
 
+def _read(reader: WordReader) -> dict[str, Any]:
+    table: dict[str, Any] = {**read_chance(reader)}
+    if reader.accept("keep"):
+        table["keep"] = True
+    return table
+
+
 class BernoulliLoss(CorrelatedChance, LossModel):
     """Each packet is lost with a probability; independently, unless correlated."""
 
     model: Literal["bernoulli"] = "bernoulli"
     probability: Probability
-    """Probability of loss, before the MANSD cap."""
+    """Probability of loss, before the guarantee is applied."""
     correlation: Correlation = 0.0
     """Between the latent variables of successive packets; 0 is independent loss."""
+    keep: bool = False
+    """true: ``probability`` is the loss rate after the guarantee and the other impairments; the
+    probability of a loss is computed from it."""
 
-    words: ClassVar = (Word("random", "loss 30%", read_chance, grammar="P [CORR]"),)
+    words: ClassVar = (
+        Word("random", "loss 30%", _read, grammar="P [CORR] [keep]"),
+        Word("keep", "loss 30% keep mansd 4", after="loss P"),
+    )
     behaviour: ClassVar = Behaviour(ChanceStage, apply)
     action: ClassVar = "lose"
     gives_score: ClassVar = True
 
+    @classmethod
+    def examples(cls) -> Sequence[Self]:
+        return [*super().examples(), cls(probability=0.1, keep=True)]
+
     def text(self) -> str:
-        return self.chance_text
+        return self.chance_text + (" keep" if self.keep else "")
 
     def meaning(self) -> str:
         how = self.correlation_meaning or ", each independently"
+        if self.keep:
+            return (
+                f"loses packets{self.correlation_meaning}, so many that "
+                f"{brief_percent(self.probability)} of all are lost in the end"
+            )
         return f"loses {brief_percent(self.probability)} of the packets{how}"
+
+    def tc_lacks(self, before: Sequence[Impairment]) -> str:
+        return "a loss rate that is kept" if self.keep else ""
 
     def tc_text(self) -> str:
         return f"random {self.chance_text}"

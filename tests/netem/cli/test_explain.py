@@ -79,7 +79,7 @@ def test_words_are_explained(explain: Explain) -> None:
         "mansd 2 the cap (M − 1): at most 2 consecutive packets of a flow are not delivered" in out
     )
     assert "first the first packet of each flow is always delivered" in out
-    assert "expected loss rate: 3.947% (without the cap 5%)" in out
+    assert "expected loss rate: 3.947% (without the guarantee 5%)" in out
     assert "tc qdisc add dev DEVICE root netem limit 16384 loss gemodel" in out
     assert "tc lacks: mansd 2 (a cap on consecutive losses), first (that the first" in out
 
@@ -87,7 +87,8 @@ def test_words_are_explained(explain: Explain) -> None:
 def test_the_exclusions_of_the_prediction_are_shown(explain: Explain) -> None:
     out = one_line(explain("loss 50% delay 10ms 20ms mansd 1"))
     assert (
-        "33.33% (without the cap 50%), not counting packets delivered out of order (stale)" in out
+        "33.33% (without the guarantee 50%), not counting packets delivered out of order (stale)"
+        in out
     )
     assert "negative delays become 0 (25% of the draws)" in out
 

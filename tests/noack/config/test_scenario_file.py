@@ -108,7 +108,7 @@ LANE_MISTAKES = [
     ("network.loss.model=bernouli", 'network.loss.model = "bernouli": ', "did you mean bernoulli?"),
     ("network.loss={}", "network.loss.model: missing; ", "one of .*bernoulli"),
     # Impairments are a list of tables, each chosen by its kind, with a loss model within a loss.
-    ("network.impairments=[3]", "network.impairments.0 = 3: ", 'e.g. { kind = "blackout", '),
+    ("network.impairments=[3]", "network.impairments.0 = 3: ", 'e.g. { kind = "corrupt", '),
     ("network.impairments=[{}]", "network.impairments.0.kind: missing; ",
      "one of blackout, corrupt"),
     ('network.impairments=[{kind="dely"}]',

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix
-from noack.impairments.loss_guarantee import LossWindow
-from noack.theory.gains import Output, PlantGains
+from noack.impairments.loss_guarantee import LongestBurst, LossesInWindow, LossWindow
+from noack.theory.certificate import Level, NetworkConditions, solve
+from noack.theory.gains import ErrorGains, Output, PlantGains
 from noack.theory.loss_accumulation import LossAccumulation
 from tests.noack.theory.loops import SEARCH, System, systems
 
@@ -127,3 +128,24 @@ def test_more_losses_or_fewer_deliveries_never_have_a_smaller_bound() -> None:
         assert found.total(Output.STATE, spacing_s, [window, LossWindow(0, 1)]) == 0
 
     check()
+
+
+@pytest.mark.parametrize(
+    ("rule", "burst_only", "with_windows"),
+    [
+        (LongestBurst(4), 6.33, 6.33),
+        (LossesInWindow(4, 20), 6.33, 4.50),
+        (LossesInWindow(2, 20), 4.60, 3.35),
+        (LossesInWindow(1, 10), 3.70, 2.87),
+    ],
+    ids=str,
+)
+def test_the_table_of_the_documents(
+    rule: LongestBurst | LossesInWindow, burst_only: float, with_windows: float
+) -> None:
+    one = np.ones((1, 1))
+    plant = PlantGains(ErrorGains(-5 * one, -6 * one, one, 0.5), 1.05 * one, one, one, 0.5)
+    for constraints, expected in (((), burst_only), ((rule,), with_windows)):
+        conditions = NetworkConditions(rule.limit, constraints=constraints)
+        found = solve(plant.error, plant, conditions, Level(1.0, 1.0))
+        assert found.state == pytest.approx(expected, abs=0.006)

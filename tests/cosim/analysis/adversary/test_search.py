@@ -51,10 +51,16 @@ def rate_of(resolved: Scenario) -> float | None:
 )
 def test_the_search_finds_the_worst_of_all_patterns(guarantee: dict[str, Any]) -> None:
     """Also without initial patterns, so that only the tree's own branches can find it."""
-    given(resolved=scenarios(5, **guarantee))(settings(MANY, max_examples=4)(_finds_worst))()
+
+    @given(resolved=scenarios(5, **guarantee))
+    @settings(MANY, max_examples=4)
+    def check(resolved: Scenario) -> None:
+        assert_worst_is_found(resolved)
+
+    check()
 
 
-def _finds_worst(resolved: Scenario) -> None:
+def assert_worst_is_found(resolved: Scenario) -> None:
     runs = list(every_run(resolved))
     for objective in Objective:
         flow = flow_of(resolved, objective, rate_of(resolved))

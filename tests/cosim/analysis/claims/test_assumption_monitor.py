@@ -13,6 +13,7 @@ from cosim.analysis.claims.assumption_monitor import AssumptionMonitor
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.claims.condition_reader import ConditionReader, read_conditions
 from cosim.analysis.claims.observed_conditions import (
+    CAUSES,
     AssumptionViolation,
     ObservedConditions,
     combined,
@@ -37,6 +38,8 @@ from tests.cosim.live.outage import Deaf, Reborn, simulate_with, with_outage
 
 Batches = Iterator[tuple[str, Rows] | None]
 """A table and some of its rows; None where the result so far is queried."""
+IN_WINDOW = {"kind": "at_most", "losses": 2, "window": 6}
+RECOVERY = {"kind": "recovery", "deliveries": 2}
 NO_DELAY = network_of(lambda n: 0)
 SERIES = ("losses", "sampling", "delay", "hold", "watchdog", "safe_input", "restarts")
 
@@ -94,7 +97,10 @@ def scenarios(draw: st.DrawFn, make: Make) -> Scenario:
         horizon_s=1.0, trigger={"beta": draw(st.sampled_from([1e-6, 1e-3]))},
         plant={"rate_hz": rate_hz, "watchdog": watchdog},
         controller={"phase": draw(st.sampled_from([0.0, 0.5])), "safe_input": [0.1]},
-        network={"initial_sync": draw(st.sampled_from(["first_packet", "known_state"]))},
+        network={
+            "initial_sync": draw(st.sampled_from(["first_packet", "known_state"])),
+            "constraints": draw(st.sampled_from([[], [IN_WINDOW], [IN_WINDOW, RECOVERY]])),
+        },
     )  # fmt: skip
 
 
@@ -139,10 +145,17 @@ def test_batches_in_any_order_show_what_the_whole_record_shows(make: Make) -> No
         causes.update(cause for _, cause in violations)
 
     check()
-    assert causes == {"dropouts", "sampling", "delay", "hold", "start", "watchdog", "safe input"}
+    assert causes == {*CAUSES, "dropouts", "atmost 2 in 6", "recover 2"} - {"restart"}
 
 
 # --- violation of each condition: the live report, and the evaluation after the run ---------------
+
+
+def losing(*numbers: int, constraint: dict[str, Any]) -> Callable[[Make], RunRecord]:
+    return lambda make: simulate(
+        make(network={"constraints": [constraint]}),
+        network_of(lambda n: None if n in numbers else 0),
+    )
 
 
 def deaf(role: str, first: int, last: int) -> Callable[[Make], RunRecord]:
@@ -194,6 +207,8 @@ def restarted_sensor(make: Make) -> RunRecord:
     [
         (deaf("controller", 10, 14), 12, "4 consecutive updates lost, 2 allowed"),
         (deaf("network", 10, 14), 12, "4 consecutive updates lost, 2 allowed"),
+        (losing(10, 12, 14, constraint=IN_WINDOW), 14, "3 of 6 consecutive updates lost"),
+        (losing(10, 12, 19, constraint=RECOVERY), 12, "only 1 delivered between two bursts"),
         (delayed(lambda n: 33 if n == 7 else 0), 7, "an update took effect after 0.04 s, 0.01 s"),
         (deaf("sensor", 100, 103), 0.99, "no measurement for 0.04 s, 0.01 s allowed"),
         (lambda make: with_outage(make(), 2.0, 2.3), 2.01, "an input was 0.315 s old, 0.015 s"),

@@ -19,6 +19,7 @@ from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_c
 from netem.link_machine import UPDATE_LINK, Link
 from noack.config.resolution import LoopMatrices
 from noack.core.linear_systems import Vector
+from noack.impairments.constraints.at_most import AtMost
 from noack.impairments.kinds.corrupt import Corrupt
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
@@ -62,6 +63,9 @@ def random_setting(rng: np.random.Generator, n: int, m: int) -> Setting:
         link=LinkSettings(
             impairments=tuple(impairments),
             mansd=int(rng.integers(0, 5)) if rng.random() < 0.9 else None,
+            constraints=(AtMost(losses=2, window=int(rng.integers(3, 8))),)
+            if rng.random() < 0.3
+            else (),
             first_delivered=bool(not known and rng.random() < 0.8),
         ),
         horizon_s=3.0,
@@ -157,6 +161,8 @@ def compare(setting: Setting, row: Any, found: Events, run: ContinuousRun) -> No
     np.testing.assert_allclose(found.event_s, run.event_s, rtol=0, atol=1e-9)
     assert row["transmissions"] == len(run.event_s)
     assert row["deliveries"] == run.delivered.sum()
+    bursts = "".join("D" if one else "L" for one in run.delivered).split("D")
+    assert row["longest_loss_burst"] == max(map(len, bursts))
     gaps_s = np.diff(run.event_s)
     least_s, mean_s = (gaps_s.min(), gaps_s.mean()) if len(gaps_s) else (math.nan, math.nan)
     assert row["inter_event_min_s"] == pytest.approx(least_s, abs=2e-9, nan_ok=True)

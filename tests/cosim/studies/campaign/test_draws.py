@@ -1,13 +1,19 @@
 """Draws depend only on their number and have the distributions of the scenario."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from cosim.simulation.batch.batch_interface import run_batch
 from cosim.simulation.continuous.continuous_report import run_continuous
 from cosim.studies.campaign.random_draws import box_of, drawn_scenario
+from netem.link_machine import update_link_of
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
+from noack.config.scenario_file import load
+from noack.impairments.kinds.replay import Replay
+from noack.impairments.loss_models.lossless import NoLoss
 from tests.cosim.studies.campaign.conftest import Few
 
 
@@ -84,3 +90,17 @@ def test_chunks_do_not_change_the_measures(campaign: Few) -> None:
     parts = np.concatenate([work.run(range(4, 6)), work.run(range(4))])
     assert whole.tobytes() == np.roll(parts, -2).tobytes()
     assert len(run_batch(work.setting, work.box.population(0, range(0)))) == 0
+
+
+def test_each_draw_has_its_own_window_of_a_trace() -> None:
+    scenario = load(Path(__file__).parents[4] / "scenarios/lane_following.toml")
+    steps_ns = tuple(k * 10**6 for k in range(1000))
+    one = Replay(sent_ns=steps_ns, delays_ns=steps_ns, offset_s="random")
+    network = scenario.network.model_copy(update={"loss": NoLoss(), "impairments": (one,)})
+    scenario = scenario.model_copy(update={"network": network})
+    begins_ms = [
+        update_link_of(drawn_scenario(scenario, 5, draw)).decide(0, 1, 0).release_ns // 10**6
+        for draw in range(40)
+    ]
+    assert len(set(begins_ms)) > 30
+    assert min(begins_ms) < 200 < 800 < max(begins_ms)

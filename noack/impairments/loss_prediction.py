@@ -1,4 +1,4 @@
-"""The expected loss rate of a link under its cap.
+"""The expected loss rate of a link under its guarantee.
 
 Each random feature is a Markov chain that advances with every packet. Together they are one chain
 with transition matrix P; in each state, a packet is not effectively delivered with probability ℓ.
@@ -8,7 +8,9 @@ delivered packet. Then
 * E D = v Σ_{k=1..m} A^k 1 is the expected number of losses before the next delivery, and
 * v is stationary under Σ_{k<m} A^k B + A^m P, since the packet after m losses must pass.
 
-The loss rate is E D/(E D + 1). For independent losses it is p(1 − p^m)/(1 − p^{m+1}).
+The loss rate is E D/(E D + 1). For independent losses it is p(1 − p^m)/(1 − p^{m+1}). With windows
+or recovery, the states of the guarantee are part of the chain; see
+:mod:`noack.impairments.guarantee_chain`.
 """
 
 import math
@@ -19,7 +21,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from noack.impairments.constraints import guarantee_of
+from noack.impairments.guarantee_chain import constrained_rate, pattern_rate
 from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_guarantee import LossGuarantee
 from noack.impairments.markov_chain import (
     LONGEST_PATTERN,
     MOST_STATES,
@@ -50,16 +55,26 @@ def predict(settings: LinkSettings) -> LossPrediction:
     impairments = settings.impairments
     try:
         parts = [part for one in impairments for part in one.chains()]
-        rate = _capped_rate(parts, settings.mansd)
+        if settings.constraints:
+            rate = _constrained_rate(parts, guarantee_of(settings.mansd, settings.constraints))
+        else:
+            rate = _capped_rate(parts, settings.mansd)
     except NotPredictableError as error:
         return LossPrediction(None, str(error))
     notes = list(dict.fromkeys(one.prediction_note for one in impairments if one.prediction_note))
     delayed, reordered = False, False
     for one in impairments:
         delayed, reordered = one.reorders(delayed, reordered)
-    if settings.mansd != 0 and reordered:
+    if settings.longest_burst != 0 and reordered:
         notes.append("not counting packets delivered out of order (stale)")
     return LossPrediction(rate, "; ".join(notes))
+
+
+def _constrained_rate(parts: Sequence[Chain | Pattern], guarantee: LossGuarantee) -> float:
+    patterns = [part.lost for part in parts if isinstance(part, Pattern)]
+    if len(patterns) == len(parts):
+        return pattern_rate(_together_lost(patterns), guarantee)
+    return constrained_rate(*_together(parts), guarantee)
 
 
 def _capped_rate(parts: Sequence[Chain | Pattern], mansd: int | None) -> float:
@@ -78,12 +93,8 @@ def _capped_rate(parts: Sequence[Chain | Pattern], mansd: int | None) -> float:
 
 def _pattern_rate(patterns: Sequence[NDArray[np.bool_]], mansd: int | None) -> float:
     """Return the loss rate of several patterns combined, counted over their common period."""
-    period = math.lcm(*map(len, patterns))
-    if period > LONGEST_PATTERN:
-        raise NotPredictableError(f"the loss patterns repeat together only after {period} packets")
-    lost = np.zeros(period, bool)
-    for pattern in patterns:
-        lost |= np.resize(pattern, period)
+    lost = _together_lost(patterns)
+    period = len(lost)
     if mansd is None:
         return float(lost.mean())
     if lost.all():
@@ -91,6 +102,17 @@ def _pattern_rate(patterns: Sequence[NDArray[np.bool_]], mansd: int | None) -> f
     passed = np.flatnonzero(~lost)
     bursts = np.diff(passed, append=passed[0] + period) - 1
     return float((bursts - bursts // (mansd + 1)).sum() / period)
+
+
+def _together_lost(patterns: Sequence[NDArray[np.bool_]]) -> NDArray[np.bool_]:
+    """Return the losses of several patterns combined, over their common period."""
+    period = math.lcm(*map(len, patterns))
+    if period > LONGEST_PATTERN:
+        raise NotPredictableError(f"the loss patterns repeat together only after {period} packets")
+    lost = np.zeros(period, bool)
+    for pattern in patterns:
+        lost |= np.resize(pattern, period)
+    return lost
 
 
 def _together(parts: Sequence[Chain | Pattern]) -> tuple[Array, Array, Array]:

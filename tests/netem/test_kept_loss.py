@@ -1,0 +1,67 @@
+"""``loss P keep``: the realised loss rate is P, or the words are refused."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from netem.words.words_to_settings import settings_of
+from noack.core.errors import CallerError
+from noack.impairments.kept_loss import expected_loss, with_kept_loss
+from noack.impairments.link_settings import read_files
+from noack.protocol.record_tables import Fate
+
+DECISIONS = 4_000_000
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "loss 30% keep mansd 2",
+        "loss 20% keep atmost 3 in 10 recover 2",
+        "loss 30% keep atmost 3 in 10",
+        "loss 25% 50% keep mansd 3 corrupt 5% duplicate 10%",
+        "loss 40% keep loss burst 10% 3 mansd 4 atmost 6 in 9",
+    ],
+)
+def test_the_realised_loss_is_the_asked_one(decide: Any, words: str) -> None:
+    fates = decide(words, DECISIONS, seed=3).fates
+    lost = float(np.mean(~np.isin(fates, (Fate.DELIVERED, Fate.FORCED))))
+    assert lost == pytest.approx(float(words.split("%")[0].split()[1]) / 100, abs=1e-3)
+
+
+def test_the_rate_is_continuous_with_a_correlation() -> None:
+    """The chain of a correlation has states that hardly ever occur."""
+    words = "loss {p}% 50% mansd 3 atmost 3 in 10 corrupt 5%"
+    rates = [expected_loss(settings_of(words.format(p=p))).rate or 0.0 for p in range(0, 101, 5)]
+    steps = np.diff(rates)
+    assert (steps > 0).all()
+    assert steps.max() < 0.05
+
+
+def test_the_closed_form_is_inverted() -> None:
+    (loss,) = with_kept_loss(settings_of("loss 30% keep mansd 2")).impairments
+    p = loss.loss.probability  # type: ignore[attr-defined]
+    assert p * (1 - p**2) / (1 - p**3) == pytest.approx(0.3, abs=1e-11)
+    assert expected_loss(settings_of("loss 80% keep mansd 4")).rate == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("loss 81% keep mansd 4", "impossible with this guarantee, which allows at most 80%"),
+        ("loss 41% keep mansd 2 recover 3", "with this guarantee, which allows at most 40%"),
+        ("loss 10% keep loss 20%", "impossible, the other impairments lose 20% already"),
+        ("loss 10% keep loss 10% keep", "only one loss of a direction can be kept"),
+        ("loss 10% keep blackout 1s-2s", "cannot be predicted: losses in a blackout"),
+        ("loss 10% keep atmost 20 in 100", "cannot be predicted: impairments and guarantee"),
+    ],
+)
+def test_what_is_impossible_is_refused_in_one_line(words: str, message: str) -> None:
+    with pytest.raises(CallerError) as refused:
+        read_files(settings_of(words), Path(), "links.toml: link.0.forward")
+    text = str(refused.value)
+    assert text.startswith("links.toml: link.0.forward: loss ")
+    assert message in text
+    assert "\n" not in text
