@@ -3,6 +3,7 @@
 import difflib
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -101,7 +102,9 @@ def _hint(name: str, names: Sequence[str]) -> str:
 def _path_of(name: str, folder: str) -> Path:
     """Return the path of a shipped file, relative to the working directory if inside it."""
     path = _place(folder) / f"{name}.toml"
-    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
+    with suppress(OSError, ValueError):  # the working directory was removed; or is elsewhere
+        return path.relative_to(Path.cwd())
+    return path
 
 
 def _place(folder: str) -> Path:

@@ -1,0 +1,81 @@
+"""The joint spectral radius of a switched system along the paths of a graph, enclosed.
+
+It is the largest growth per unit of time that a path can have in the long run; all paths are stable
+exactly if it is below 1. A cycle bounds it from below
+(:mod:`noack.theory.destabilising_cycle`), polytopes from above
+(:mod:`noack.theory.invariant_polytopes`). Both bounds include all rounding.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from noack.theory.destabilising_cycle import NO_CYCLE, Cycle, find_cycle, rigorous_growth
+from noack.theory.invariant_polytopes import InvariantPolytopes, initial_vertices
+from noack.theory.switched_system import Edge, SwitchedSystem, strongly_connected
+
+ACCURACY = 1e-4
+_COARSER, _COARSEST = 8.0, 1e15
+_BEAM = 400
+_CYCLE_EDGES, _MOST_CYCLE_EDGES = 12, 60
+"""Length of the cycles that are tried: the number of nodes, within these limits."""
+MOST_VERTICES = 1500
+_SMALLEST = 1e-3
+"""Growth of the polytopes if no cycle grows, relative to the largest norm of a matrix."""
+
+
+class JointSpectralRadius(NamedTuple):
+    """Bounds of the joint spectral radius."""
+
+    lower: float
+    upper: float
+    cycle: tuple[int, ...]
+    """Numbers of the edges of the cycle that attains the lower bound, in their order of time."""
+    vertices: int
+    """Number of vertices of the polytopes that prove the upper bound."""
+
+
+def joint_spectral_radius(
+    edges: Sequence[Edge], *, accuracy: float = ACCURACY, most_vertices: int = MOST_VERTICES
+) -> JointSpectralRadius:
+    """Enclose the joint spectral radius.
+
+    Args:
+        edges: the system; paths that cannot be continued forever do not count.
+        accuracy: wanted upper/lower − 1.
+        most_vertices: limit of the work; at the limit the bounds are farther apart.
+    """
+    numbers = {id(edge): number for number, edge in enumerate(edges)}
+    lower, upper, vertices = 0.0, 0.0, 0
+    path: tuple[int, ...] = ()
+    for part in strongly_connected(edges):
+        found = _connected(part, accuracy, most_vertices)
+        if found.lower > lower:
+            lower = found.lower
+            path = tuple(numbers[id(part.edges[i])] for i in found.cycle)
+        upper, vertices = max(upper, found.upper), vertices + found.vertices
+    return JointSpectralRadius(lower, upper, path, vertices)
+
+
+def _connected(system: SwitchedSystem, accuracy: float, most_vertices: int) -> JointSpectralRadius:
+    balanced = system.balanced()
+    longest = min(max(_CYCLE_EDGES, len(system.dimensions)), _MOST_CYCLE_EDGES)
+    cycle = find_cycle(balanced, longest, _BEAM)
+    if cycle.path:
+        # The original matrices have smaller radii.
+        cycle = Cycle(cycle.path, max(cycle.growth, rigorous_growth(system, cycle.path)))
+    growth = cycle.growth
+    if growth == 0.0:
+        largest = max(float(np.abs(edge.matrix.middle).max()) for edge in balanced.edges)
+        cycle, growth = NO_CYCLE, max(_SMALLEST * largest, np.finfo(float).tiny)
+    upper, vertices, complete = math.inf, 0, False
+    while not complete and accuracy < _COARSEST:
+        wanted = growth * (1 + accuracy)
+        start = initial_vertices(balanced, cycle, wanted)
+        polytopes = InvariantPolytopes(balanced, wanted, start)
+        complete = polytopes.grow(most_vertices)
+        upper, vertices = min((upper, vertices), (polytopes.bound(), polytopes.count))
+        accuracy *= _COARSER
+    return JointSpectralRadius(cycle.growth, upper, cycle.path, vertices)

@@ -1,0 +1,150 @@
+"""The bounds of joint spectral radii, against published values, closed forms and brute force."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+from noack.core.linear_systems import Matrix
+from noack.theory.destabilising_cycle import spectral_radius_below
+from noack.theory.interval_matrix import IntervalMatrix, exactly
+from noack.theory.invariant_polytopes import InvariantPolytopes
+from noack.theory.joint_spectral_radius import joint_spectral_radius
+from noack.theory.switched_system import Edge, strongly_connected
+
+GOLDEN_RATIO = (1 + 5**0.5) / 2
+
+
+def edge(source: int, target: int, matrix: Matrix, duration: int = 1) -> Edge:
+    return Edge(source, target, exactly(np.array(matrix, dtype=float)), duration)
+
+
+def failing_gains() -> tuple[list[Edge], list[int]]:
+    """The example of Philippe, Essick, Dullerud and Jungers (Automatica 72, 2016), and its modes.
+
+    Either gain may fail, but not twice in succession, and both (mode 4) only after success.
+    """
+    A, B, K = np.array([[0.94, 0.56], [0.14, 0.46]]), np.array([[0], [1]]), np.array([-0.49, 0.27])
+    works = {1: [1, 1], 2: [0, 1], 3: [1, 0], 4: [0, 0]}
+    listed = (123, 212, 131, 312, 231, 323, 331, 344, 431)  # from node, to node, mode
+    moves = [(one // 100, one // 10 % 10, one % 10) for one in listed]
+    edges = [edge(a, b, A + B * (K * works[mode])) for a, b, mode in moves]
+    return edges, [mode for _, _, mode in moves]
+
+
+def test_published_value_from_both_sides() -> None:
+    edges, modes = failing_gains()
+    found = joint_spectral_radius(edges, accuracy=1e-11)
+    assert found.lower == pytest.approx(0.9748171979372, abs=1e-12)
+    assert found.lower <= found.upper <= 0.9748171979372 + 1e-10
+    cycle = [modes[number] for number in found.cycle]
+    rotations = [cycle[i:] + cycle[:i] for i in range(len(cycle))]
+    assert [2, 1, 2, 3, 1, 1, 1, 1] in rotations
+
+
+def test_one_more_failure_than_allowed_is_worse() -> None:
+    edges, _ = failing_gains()
+    allowed = joint_spectral_radius(edges)
+    again = joint_spectral_radius([*edges, edges[7]._replace(source=4)])
+    assert again.lower > allowed.upper
+
+
+@pytest.mark.parametrize(
+    ("matrices", "value"),
+    [
+        ([[[1, 1], [0, 1]], [[1, 0], [1, 1]]], GOLDEN_RATIO),
+        ([[[0, -1], [1, 0]], [[0.6, -0.8], [0.8, 0.6]]], 1.0),  # rotations
+        ([[[0, 2], [0, 0]], [[0, 0], [0.125, 0]]], 0.5),  # each alone is nilpotent
+        ([[[0.5, 1], [0, 0.5]]], 0.5),  # defective
+        ([[[3]], [[-5]]], 5.0),
+    ],
+)
+def test_closed_forms(matrices: list[Matrix], value: float) -> None:
+    found = joint_spectral_radius([edge(0, 0, matrix) for matrix in matrices], accuracy=1e-6)
+    assert found.lower <= value * (1 + 1e-15)
+    assert found.upper >= value
+    assert found.lower == pytest.approx(value, rel=1e-7)
+    assert found.upper == pytest.approx(value, rel=2e-3)  # the defective one needs many vertices
+
+
+def test_nilpotent_systems_do_not_grow() -> None:
+    shift = np.diag([1.0, 1.0], k=1)
+    found = joint_spectral_radius([edge(0, 0, shift), edge(0, 0, 2 * shift)])
+    assert found.lower == 0
+    assert found.upper < 0.01
+
+
+def test_durations_count_and_dimensions_may_differ() -> None:
+    # Around the two nodes, x grows by 16 in 1 + 3 units of time.
+    found = joint_spectral_radius(
+        [edge(0, 1, [[2.0], [0.0], [1.0]]), edge(1, 0, [[8.0, 7.0, 0.0]], 3)]
+    )
+    assert found.lower == pytest.approx(2, rel=1e-12)
+    assert 2 <= found.upper <= 2.001
+
+
+def test_paths_that_end_do_not_count() -> None:
+    edges = [edge(0, 0, [[0.5]]), edge(0, 1, [[100.0]]), edge(1, 2, [[100.0]])]
+    assert joint_spectral_radius(edges).upper < 0.51
+
+
+def random_graph(rng: np.random.Generator) -> list[Edge]:
+    """A graph of up to 3 nodes with random edges; a ring connects all nodes."""
+    nodes, n = int(rng.integers(1, 4)), int(rng.integers(1, 4))
+    pairs = [(i, (i + 1) % nodes) for i in range(nodes)]
+    pairs += [(i, j) for i in range(nodes) for j in range(nodes) if rng.random() < 0.4]
+    return [edge(i, j, rng.normal(size=(n, n)), int(rng.integers(1, 3))) for i, j in pairs]
+
+
+def fastest_cycle(edges: list[Edge], longest: int) -> float:
+    """The largest growth of all cycles of up to that many edges."""
+    best = 0.0
+    for length in range(1, longest + 1):
+        for path in product(edges, repeat=length):
+            closed = all(path[i - 1].target == path[i].source for i in range(length))
+            if closed:
+                Π = np.linalg.multi_dot([np.eye(len(path[0].matrix.middle[0]))] * 2 + [
+                    one.matrix.middle for one in reversed(path)
+                ])  # fmt: skip
+                growth = np.abs(np.linalg.eigvals(Π)).max()
+                best = max(best, growth ** (1 / sum(one.duration for one in path)))
+    return float(best)
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_random_systems_against_all_cycles(seed: int) -> None:
+    edges = random_graph(np.random.default_rng(seed))
+    longest = 5 if len(edges) <= 6 else 4
+    found = joint_spectral_radius(edges, accuracy=1e-3)
+    brute = fastest_cycle(edges, longest)
+    assert brute * (1 - 1e-9) <= found.lower <= found.upper
+    assert found.upper / found.lower < 1.01
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_no_polytopes_prove_too_much(seed: int) -> None:
+    """The bound is valid for any vertices, also if they were not grown to the end."""
+    rng = np.random.default_rng(seed)
+    (system,) = strongly_connected(random_graph(rng))
+    value = joint_spectral_radius(system.edges, accuracy=1e-3).lower
+    vertices = {
+        node: np.concatenate([np.diag(rng.uniform(0.01, 2, n)), rng.normal(size=(5, n))])
+        for node, n in system.dimensions.items()
+    }
+    polytopes = InvariantPolytopes(system, value * rng.uniform(0.5, 2), vertices)
+    assert polytopes.bound() >= value
+    polytopes.grow(30)
+    assert polytopes.bound() >= value
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_spectral_radius_below_holds_for_every_matrix_of_an_enclosure(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 7))
+    middle = rng.normal(size=(n, n))
+    sharp = spectral_radius_below(exactly(middle))
+    assert sharp == pytest.approx(np.abs(np.linalg.eigvals(middle)).max(), rel=1e-8)
+    radius = rng.uniform(0, 1e-4, (n, n))
+    below = spectral_radius_below(IntervalMatrix(middle, radius))
+    ends = [middle + radius * rng.choice([-1, 1], (n, n)) for _ in range(200)]
+    assert 0.9 * sharp < below <= min(np.abs(np.linalg.eigvals(end)).max() for end in ends)

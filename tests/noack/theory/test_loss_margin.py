@@ -1,0 +1,193 @@
+"""The maps of the time-triggered loop against simulated runs, and the margin against patterns."""
+
+from collections.abc import Sequence
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from cosim.simulation.virtual_time import simulate
+from noack.config.resolution import loop_of, resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import load
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix, Vector, discretise
+from noack.impairments.loss_guarantee import (
+    DeliveriesBetweenBursts,
+    LongestBurst,
+    LossesInWindow,
+    LossGuarantee,
+    LossHistory,
+)
+from noack.theory.loss_margin import LossMargin, bursts_of, capped
+
+ROOT = Path(__file__).parents[3]
+PERIODIC = 'trigger={policy="periodic", period_s=0.0997}'
+DELAYED = 'network.impairments=[{kind="delay", delay_s=0.0333}]'
+
+
+def scenario(name: str, *settings: str) -> Scenario:
+    settings = (PERIODIC, "network.mansd=20", *settings)
+    return resolve(load(ROOT / "scenarios" / f"{name}.toml", settings))
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("double_integrator", ()),
+        ("double_integrator", ("mode=zoh",)),
+        ("double_integrator", (DELAYED,)),
+        ("double_integrator", ("controller.rate_hz=10", DELAYED.replace("333", "99"))),
+        ("double_integrator", ("controller.rate_hz=40", "controller.phase=0.3")),
+        ("double_integrator", ("plant.measure_every=7", "controller.phase=0")),
+        ("lane_following", ("controller.phase=0", "controller.rate_hz=125", DELAYED)),
+    ],
+)
+def test_maps_are_those_of_a_simulated_run(name: str, settings: Sequence[str]) -> None:
+    resolved = scenario(name, "horizon_s=6", *settings)
+    margin, loop = LossMargin(resolved), loop_of(resolved)
+    delay_ns = margin.loop.times.delay_ns
+    fates = np.random.default_rng(1).random(1000) < 0.5
+    fates[0] = True
+    numbers = iter(range(1000))
+    run = simulate(resolved, lambda data, now_ns: delay_ns if fates[next(numbers)] else None)
+
+    steps, tested = run["plant_step"], run["sensor_measurement"]
+    sent_ns = tested["t_ns"][tested["event"] >= 0]
+    assert set(np.diff(sent_ns)) == {margin.period_ns}
+    delivered = np.flatnonzero(fates[: len(sent_ns)])
+    assert len(delivered) > 15
+
+    def state(number: int, before: int) -> Vector:
+        step = steps[np.searchsorted(steps["t_ns"], sent_ns[number])]
+        if not delay_ns:
+            return np.concatenate([step["x"], step["u"]])
+        older = steps[np.searchsorted(steps["t_ns"], sent_ns[before])]
+        x_c = expm(loop.H * (sent_ns[number] - sent_ns[before]) * 1e-9) @ older["x"]
+        return np.concatenate([step["x"], x_c, step["u"]])[: margin.loop.dimension]
+
+    slots = margin.loop.times.slots
+    for before, one, following in zip(delivered[1:], delivered[2:], delivered[3:], strict=False):
+        map_ = margin.loop.map(int(one % slots), int(following - one - 1)).middle
+        expected = state(following, one)
+        np.testing.assert_allclose(
+            map_ @ state(one, before), expected, rtol=0, atol=1e-11 * np.abs(expected).max()
+        )
+
+
+def test_the_destabilising_pattern_grows_as_computed_in_a_simulated_run() -> None:
+    resolved = scenario("lane_following", 'trigger={policy="periodic", period_s=0.5}')
+    found = LossMargin(resolved).stability(LossGuarantee((LongestBurst(7),)))
+    assert found.verdict == "destabilised"
+    pattern, cycles = found.pattern, 12
+    assert pattern[0]
+    longer = resolved.model_copy(update={"horizon_s": 0.5 * len(pattern) * cycles + 0.01})
+    numbers = iter(range(100_000))
+    run = simulate(
+        longer, lambda data, now_ns: 0 if pattern[next(numbers) % len(pattern)] else None
+    )
+    steps = run["plant_step"]
+    stride = round(0.5 * len(pattern) * 500)
+    norms = np.linalg.norm(steps["x"][::stride], axis=1)
+    growth = (norms[-1] / norms[-3]) ** (1 / (2 * len(pattern)))
+    assert growth == pytest.approx(found.lower, rel=1e-6)
+    assert found.lower <= found.upper <= found.lower * (1 + 1e-3)
+
+
+def held_loop(resolved: Scenario, pattern: Sequence[bool]) -> Matrix:
+    """The map of (x, x_c, u) over a pattern, with the controller's ticks half a step later.
+
+    It is computed step by step, without :mod:`noack.theory`.
+    """
+    loop, h_ns = loop_of(resolved), resolved.timing.plant_period_ns
+    n, m = loop.n, loop.m
+    Ad, Bd = discretise(loop.A, loop.B, h_ns)
+    half = expm(loop.H * h_ns / 2 * 1e-9)
+    eye = np.eye(2 * n + m)
+    x, x_c, u = eye[:n], eye[n : 2 * n], eye[2 * n :]
+    for delivered in pattern:
+        x_c = x if delivered else x_c
+        for _ in range(round(0.1e9) // h_ns):
+            x_c = half @ x_c
+            x, u = Ad @ x + Bd @ u, loop.K @ x_c
+            x_c = half @ x_c
+    return np.vstack([x, x_c, u])
+
+
+GUARANTEES = [
+    LossGuarantee((LongestBurst(3),)),
+    LossGuarantee((LossesInWindow(2, 5),)),
+    LossGuarantee((LongestBurst(3), DeliveriesBetweenBursts(2))),
+]
+
+
+def admissible(guarantee: LossGuarantee, pattern: Sequence[bool]) -> bool:
+    history = LossHistory(guarantee.rules)
+    return not any(history.add(not delivered) for delivered in (*pattern,) * 12)
+
+
+@pytest.mark.parametrize("guarantee", GUARANTEES, ids=lambda one: one.meaning)
+def test_no_pattern_grows_faster_than_the_upper_bound(guarantee: LossGuarantee) -> None:
+    resolved = scenario(
+        "unstable_pendulum", "mode=zoh", "plant.rate_hz=100", "controller.rate_hz=100"
+    )
+    found = LossMargin(resolved).stability(guarantee)
+    fastest = 0.0
+    for length in range(1, 8):
+        for pattern in product((True, False), repeat=length):
+            if pattern[0] and admissible(guarantee, pattern):
+                radius = np.abs(np.linalg.eigvals(held_loop(resolved, pattern))).max()
+                fastest = max(fastest, float(radius) ** (1 / length))
+    assert admissible(guarantee, found.pattern)
+    if len(found.pattern) <= 7:
+        assert fastest == pytest.approx(found.lower, rel=1e-9)
+    assert fastest <= found.upper <= found.lower * (1 + 1e-3)
+    worse = LossGuarantee(tuple(
+        rule._replace(limit=rule.limit + 1) if isinstance(rule, LongestBurst | LossesInWindow)
+        else rule for rule in guarantee.rules
+    ))  # fmt: skip
+    assert LossMargin(resolved).stability(worse).lower > found.upper
+
+
+@pytest.mark.parametrize("guarantee", GUARANTEES, ids=lambda one: one.meaning)
+@pytest.mark.parametrize("slots", [1, 3])
+def test_paths_are_the_admissible_patterns(guarantee: LossGuarantee, slots: int) -> None:
+    bursts = bursts_of(guarantee, slots)
+
+    def patterns(node: int, left: int) -> set[tuple[bool, ...]]:
+        found: set[tuple[bool, ...]] = {()} if left == 0 else set()
+        for one in bursts:
+            if one.source == node and one.losses < left:
+                rest = patterns(one.target, left - one.losses - 1)
+                found |= {((False,) * one.losses + (True, *more)) for more in rest}
+        return found
+
+    def allowed(pattern: Sequence[bool]) -> bool:
+        history = LossHistory(guarantee.rules)
+        return not any(history.add(not delivered) for delivered in (True, *pattern))
+
+    for length in range(1, 9):
+        every = product((True, False), repeat=length)
+        assert patterns(0, length) == {one for one in every if one[-1] and allowed(one)}
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (('trigger={policy="decaying", beta=0.1, alpha_per_s=0.1}',), "time-triggered"),
+        ((DELAYED.replace("0.0333", "0.2"),), "less than the period"),
+        ((DELAYED.replace("}", ", jitter_s=0.001}"),), "network.impairments.0: delay: .* constant"),
+        (("network.mansd=9000",), "more than 5,000 transitions"),
+        (("plant.watchdog.timeout_s=0.001",), "plant.watchdog.timeout_s"),
+    ],
+)
+def test_what_is_not_covered_is_refused_in_one_line(settings: Sequence[str], message: str) -> None:
+    with pytest.raises(CallerError, match=message):
+        LossMargin(scenario("double_integrator", *settings)).stability()
+
+
+def test_capped_replaces_the_cap_alone() -> None:
+    changed = capped(LossGuarantee((LongestBurst(3), LossesInWindow(2, 5))), 7)
+    assert set(changed.rules) == {LongestBurst(7), LossesInWindow(2, 5)}
