@@ -53,10 +53,13 @@ def finalize(ending: RunEnding, *, report: bool = True, again: bool = False) -> 
         record = finish_record(run_dir) if unfinished else load_record(run_dir)
         replaying = stack.enter_context(ReplayProcess(record, run_dir))
         # A stopped recorder has no time to write the recording of a long run.
-        if unfinished or (record.kind == "live" and (again or is_long(record.scenario))):
+        needed = unfinished or (record.kind == "live" and is_long(record.scenario))
+        if needed or (again and record.kind == "live"):
             from cosim.output.viewer.run_view import write_view
 
-            write_view(record, run_dir, ending.run_id)
+            # The recording of an earlier attempt may be complete.
+            with suppress(*(() if needed else (MachineError,))):
+                write_view(record, run_dir, ending.run_id)
         summary = summarise(record, int(ending.status), ending.reason, ending.startup_s)
         _write_summary(run_dir, summary)
         # Written again with the results below, so that none of them can cost the summary.
