@@ -36,8 +36,8 @@ class ModelDifference:
 
     def event(self, sequence: int, e_s: Vector) -> None:
         """Add event ``sequence`` at the present time with sensor error e_s(t_k⁻), shape (n,)."""
-        self._jumps[sequence] = (self._t_ns, e_s)
         self._total = self.total() + e_s
+        self._jumps[sequence] = (self._t_ns, e_s)
 
     def received(self, sequence: int) -> None:
         """Remove the missed events up to ``sequence``: the controller received this update."""
