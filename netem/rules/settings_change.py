@@ -45,7 +45,7 @@ def carry(
         before.flows[row].longest_loss_burst = 0
         if counts_losses(new):
             _carry_losses(row, old, before, after)
-        if new.tracks and new.mansd >= 0:
+        if new.tracks:
             _carry_releases(row, old, before, new, after, latest_ns[row])
     after.counters.longest_loss_burst = 0
 
@@ -120,18 +120,18 @@ def _carry_releases(
 ) -> None:  # fmt: skip
     """Transfer the release times that the guarantee needs.
 
-    If the guarantee differs, or no release times were stored, later packets leave only after the
+    If the guarantee differs (or there is none any more), later packets leave only after the
     packets that are in flight at the change.
     """
     flow, width = before.flows[row], new.mansd + 1
     if old.tracks:
-        if old.mansd >= 0:
+        if old.mansd >= 0 and new.mansd >= 0:
             old_width = old.mansd + 1
             for number in range(max(flow.packets - min(width, old_width), 0), flow.packets):
                 after.recent_ns[row][number % width] = before.recent_ns[row][number % old_width]
         if not _is_same_guarantee(old, new):
             flow.first_release_ns = max(flow.first_release_ns, latest_ns)
-    else:
+    elif new.mansd >= 0:
         delivered = flow.packets - 1 - flow.consecutive_losses
         if delivered >= 0 and flow.consecutive_losses < width:
             after.recent_ns[row][delivered % width] = 0

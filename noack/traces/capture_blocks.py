@@ -68,8 +68,10 @@ def captured_packets(file: IO[bytes]) -> Iterator[CapturedPacket]:
             yield packet
     except CutCaptureError:
         raise CutCaptureError(f"is cut off after packet {count}") from None
-    except (ValueError, struct.error) as error:
+    except ValueError as error:
         raise ValueError(f"after packet {count}: {error}") from None
+    except struct.error:
+        raise ValueError(f"after packet {count}: a block is too short; it is damaged") from None
 
 
 def _exactly(file: IO[bytes], size_bytes: int) -> bytes:
