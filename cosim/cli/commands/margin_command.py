@@ -10,7 +10,7 @@ from noack.core.errors import CallerError, ExitStatus
 
 @cli.command(cli.THEORY, 30, [
     ("noack margin lane_periodic", "the largest M and the longest period"),
-    ("noack margin lane_periodic --run", "play the destabilising pattern live"),
+    ("noack margin lane_periodic --play", "play the destabilising pattern live"),
     ("noack margin lane_periodic --set mode=zoh --no-period --json", "hold the input; as JSON"),
 ])  # fmt: skip
 def margin(
@@ -26,8 +26,8 @@ def margin(
     period: Annotated[
         bool, typer.Option(help="Search for the longest period with the scenario's own M, too.")
     ] = True,
-    run: Annotated[
-        bool, typer.Option("--run", help="Play the destabilising pattern in a live run.")
+    play: Annotated[
+        bool, typer.Option("--play", help="Play the destabilising pattern in a live run.")
     ] = False,
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
     json: cli.JsonOption = False,
@@ -41,8 +41,8 @@ def margin(
     from cosim.output.margin_report import print_margin
     from noack.config.resolution import resolve
 
-    if run and json:
-        raise CallerError("--run: has an output of its own; leave out --json")
+    if play and json:
+        raise CallerError("--play: has an output of its own; leave out --json")
     if not 1e-8 <= accuracy < 1:
         raise CallerError(f"--accuracy {accuracy:g}: expected a number from 1e-8 to 1, e.g. 1e-4")
     resolved = resolve(cli.load_scenario(scenario, settings))
@@ -55,10 +55,10 @@ def margin(
         cli.print_json(found.to_json())
     else:
         print_margin(cli.console(), found)
-    if not run:
+    if not play:
         return ExitStatus.OK if found.stable_m else ExitStatus.FAILED
     if found.destabilised is None:
-        raise CallerError(f"--run: no destabilising pattern was found for M up to {most}")
+        raise CallerError(f"--play: no destabilising pattern was found for M up to {most}")
 
     from cosim.cli.execute_run import RunOutput, run_processes
 

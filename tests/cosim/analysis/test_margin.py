@@ -85,8 +85,8 @@ def test_command_as_json_and_as_a_table() -> None:
     ("words", "status", "message"),
     [
         (["lane_following"], 2, "time-triggered"),
-        (["lane_periodic", "--run", "--json"], 2, "--run"),
-        (["lane_periodic", "--run", "--most", "1", "--no-period"], 2, "no destabilising pattern"),
+        (["lane_periodic", "--play", "--json"], 2, "--play"),
+        (["lane_periodic", "--play", "--most", "1", "--no-period"], 2, "no destabilising pattern"),
         (["lane_periodic", "--accuracy", "2"], 2, "--accuracy 2: expected"),
         (["lane_periodic", "--set", "trigger.period_s=9", "--no-period"], 1, "destabilises M = 1"),
     ],
