@@ -3,7 +3,6 @@
 import difflib
 import re
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -102,9 +101,7 @@ def _hint(name: str, names: Sequence[str]) -> str:
 def _path_of(name: str, folder: str) -> Path:
     """Return the path of a shipped file, relative to the working directory if inside it."""
     path = _place(folder) / f"{name}.toml"
-    with suppress(OSError, ValueError):  # the working directory was removed; or is elsewhere
-        return path.relative_to(Path.cwd())
-    return path
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
 def _place(folder: str) -> Path:

@@ -120,10 +120,13 @@ class ForkServer:
         its_stdin, own_stdin = os.pipe()
         try:
             request = json.dumps([module, arguments]).encode()
-            socket.send_fds(self._socket, [request], [its_stdin, log.fileno()])
+            with suppress(BrokenPipeError, ConnectionResetError):  # likewise no answer
+                socket.send_fds(self._socket, [request], [its_stdin, log.fileno()])
             pid = int(self._socket.recv(_MOST_BYTES) or 0)
-            if pid <= 0:
-                raise OSError(-pid, os.strerror(-pid) if pid else "the fork server ended")
+            if pid < 0:
+                raise OSError(-pid, os.strerror(-pid))
+            if pid == 0:
+                raise OSError("the fork server ended")
         except BaseException:
             os.close(own_stdin)
             raise
