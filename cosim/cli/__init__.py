@@ -23,6 +23,8 @@ _LIVE = ("run", "demo", "record")
 
 def main() -> None:
     """Entry point."""
+    from contextlib import suppress
+
     from noack.runtime.signals import quiet_interrupt
 
     words = sys.argv[1:]
@@ -31,7 +33,8 @@ def main() -> None:
         if sys.platform == "linux" and words[:1] and words[0] in _LIVE and "--help" not in words:
             from cosim.live.fork_server import ForkServer
 
-            server = ForkServer()  # it imports while this process does
+            with suppress(OSError):  # the command reports it
+                server = ForkServer()  # it imports while this process does
         from cosim.cli.command import register_commands, run_program
 
         register_commands(*words[:1])

@@ -163,7 +163,11 @@ def command(
             except NoackError as error:
                 status = failed(str(error), error.exit_status, who=NAME, as_json=as_json)
             except OSError as error:  # standard output is on a full disk
-                what = f"cannot write: {why(error)}"
+                what = (
+                    f"cannot write: {why(error)}"
+                    if _is_here()
+                    else "the current folder was deleted"
+                )
                 status = failed(what, ExitStatus.FAILED, who=NAME, as_json=as_json)
             raise typer.Exit(int(status))
 
@@ -175,6 +179,14 @@ def command(
         return registered
 
     return register
+
+
+def _is_here() -> bool:
+    """Whether the current folder still exists."""
+    try:
+        return Path.cwd().is_dir()
+    except OSError:
+        return False
 
 
 def register_commands(wanted: str = "") -> None:

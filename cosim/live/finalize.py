@@ -35,8 +35,13 @@ from noack.runtime.spool import SPOOL
 
 
 @np.errstate(all="ignore")
-def finalize(ending: RunEnding, *, report: bool = True) -> Outcome:
+def finalize(ending: RunEnding, *, report: bool = True, again: bool = False) -> Outcome:
     """Complete the record of a run; write its summary and report.
+
+    Args:
+        ending: how the run ended.
+        report: whether to write the report.
+        again: an earlier attempt may have been interrupted.
 
     Raises:
         CallerError: the run is still under way.
@@ -48,10 +53,13 @@ def finalize(ending: RunEnding, *, report: bool = True) -> Outcome:
         record = finish_record(run_dir) if unfinished else load_record(run_dir)
         replaying = stack.enter_context(ReplayProcess(record, run_dir))
         # A stopped recorder has no time to write the recording of a long run.
-        if unfinished or (record.kind == "live" and is_long(record.scenario)):
+        needed = unfinished or (record.kind == "live" and is_long(record.scenario))
+        if needed or (again and record.kind == "live"):
             from cosim.output.viewer.run_view import write_view
 
-            write_view(record, run_dir, ending.run_id)
+            # The recording of an earlier attempt may be complete.
+            with suppress(*(() if needed else (MachineError,))):
+                write_view(record, run_dir, ending.run_id)
         summary = summarise(record, int(ending.status), ending.reason, ending.startup_s)
         _write_summary(run_dir, summary)
         # Written again with the results below, so that none of them can cost the summary.
@@ -149,7 +157,7 @@ def reopen(run_dir: Path) -> Outcome:
     ending = _ending(run_dir, summary)
     # The summary is missing or damaged; or a process that was frozen spooled rows after the end.
     if not can_be_shown(summary) or (run_dir / SPOOL).is_dir():
-        return finalize(ending)
+        return finalize(ending, again=True)
     return Outcome(run_dir, ending.status, ending.reason, summary)
 
 

@@ -9,14 +9,16 @@ import ctypes
 import gc
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from importlib import import_module
 from typing import IO
 
+from noack.core.errors import MachineError
 from noack.core.python_process import python_command
 from noack.runtime.command_line import TICKET_ON_STDIN
 
@@ -61,11 +63,15 @@ class ForkedProcess:
     def kill(self) -> None:
         """Kill the process."""
         if self.poll() is None:
-            os.kill(self.pid, 9)
+            with suppress(ProcessLookupError):
+                os.kill(self.pid, 9)
 
     def _wait(self, options: int) -> int | None:
         if self._status is None:
-            pid, status = os.waitpid(self.pid, options)
+            try:
+                pid, status = os.waitpid(self.pid, options)
+            except ChildProcessError:  # SIGCHLD is ignored; subprocess returns 0, too
+                pid, status = self.pid, 0
             if pid:
                 self._status = os.waitstatus_to_exitcode(status)
         return self._status
@@ -81,8 +87,8 @@ class ForkServer:
     def __init__(self) -> None:
         self._socket, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._socket.settimeout(_START_TIMEOUT_S)
-        _adopt_orphans(True)
-        with its:
+        with its, ExitStack() as on_error:
+            on_error.callback(self._socket.close)
             self._process = subprocess.Popen(
                 python_command("-m", "cosim.live.fork_server", its.fileno()),
                 pass_fds=[its.fileno()],
@@ -90,6 +96,8 @@ class ForkServer:
                 start_new_session=True,  # the launcher handles Ctrl-C
                 env=os.environ | ENVIRONMENT,
             )
+            on_error.pop_all()
+        _adopt_orphans(True)
 
     def close(self) -> None:
         """End the server; its processes go on."""
@@ -112,10 +120,13 @@ class ForkServer:
         its_stdin, own_stdin = os.pipe()
         try:
             request = json.dumps([module, arguments]).encode()
-            socket.send_fds(self._socket, [request], [its_stdin, log.fileno()])
+            with suppress(BrokenPipeError, ConnectionResetError):  # likewise no answer
+                socket.send_fds(self._socket, [request], [its_stdin, log.fileno()])
             pid = int(self._socket.recv(_MOST_BYTES) or 0)
-            if pid <= 0:
-                raise OSError(-pid, os.strerror(-pid) if pid else "the fork server ended")
+            if pid < 0:
+                raise OSError(-pid, os.strerror(-pid))
+            if pid == 0:
+                raise OSError("the fork server ended")
         except BaseException:
             os.close(own_stdin)
             raise
@@ -126,11 +137,19 @@ class ForkServer:
 
 @contextmanager
 def fork_server(server: ForkServer | None = None) -> Iterator[ForkServer | None]:
-    """Have a fork server while the context lasts, this or a new one; None without Linux."""
+    """Have a fork server while the context lasts, this or a new one; None without Linux.
+
+    Raises:
+        MachineError: it cannot be started.
+    """
     if sys.platform != "linux":
         yield None
         return
-    with closing(server or ForkServer()) as server:
+    try:
+        server = server or ForkServer()
+    except OSError as error:
+        raise MachineError(f"the fork server cannot be started: {error}") from None
+    with closing(server):
         yield server
 
 
@@ -186,6 +205,7 @@ def _fork_twice() -> int:
 
 def main() -> None:
     """Run the server."""
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # a parent's "ignore" is inherited
     connection = socket.socket(fileno=int(sys.argv[1]))
     for module in _IMPORTS:
         import_module(module)

@@ -212,8 +212,10 @@ def _write(
     folder.mkdir(exist_ok=True)
     for table, batches in tables.items():
         write_table(folder / f"{table}.parquet", batches, types[table], loop)
-    with (folder / _NOTICES_FILE).open("w", encoding="utf-8") as file:
+    scratch = folder / f"{_NOTICES_FILE}.partial"
+    with scratch.open("w", encoding="utf-8") as file:
         file.writelines(json.dumps(notice) + "\n" for notice in notices)
+    scratch.replace(folder / _NOTICES_FILE)
 
 
 def finish_record(run_dir: Path) -> RunRecord:
@@ -231,7 +233,9 @@ def finish_record(run_dir: Path) -> RunRecord:
     try:
         _write(folder, tables, types, loop_of(scenario), notices)
         if spool.is_dir():  # moved in one step, so that an incomplete spool is never read
-            shutil.rmtree(spool.rename(spool.with_name(f"{SPOOL}.done")), ignore_errors=True)
+            done = spool.with_name(f"{SPOOL}.done")
+            shutil.rmtree(done, ignore_errors=True)  # of an earlier attempt that was interrupted
+            shutil.rmtree(spool.rename(done), ignore_errors=True)
     except OSError as error:
         raise MachineError(
             f"{folder}: the record cannot be written: {why(error)}; what was recorded is kept "

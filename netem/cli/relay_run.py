@@ -152,13 +152,14 @@ def relay(specs: Sequence[LinkSpec], options: argparse.Namespace) -> Statistics:
 
 
 def _replaying(specs: Sequence[LinkSpec], path: Path) -> Sequence[LinkSpec]:
-    """Return links that replay a trace; a link without a cap gets the cap of the trace."""
+    """Return links that replay a trace; a link without a guarantee gets that of the trace."""
     fates = read_fates(path, [spec.name for spec in specs])
 
     def settings(spec: LinkSpec, direction: Direction) -> LinkSettings:
         given: LinkSettings = getattr(spec, direction)
-        cap = fates.caps[spec.name, direction] if given.mansd is None else given.mansd
-        return given.model_copy(update={"mansd": cap})
+        if given.longest_burst is not None:
+            return given
+        return given.model_copy(update=fates.guarantees[spec.name, direction])
 
     return [
         replace(

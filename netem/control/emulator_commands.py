@@ -16,7 +16,7 @@ from netem.control.emulator_session import Session, find, running
 from netem.control.live_screen import Screen
 from netem.control.statistics_view import History, render
 from netem.engine.relay_interface import DIRECTIONS
-from netem.words.words_to_settings import require_no_dashes, settings_of
+from netem.words.words_to_settings import guarantee_words, require_no_dashes, settings_of
 from noack.core.errors import CallerError, ExitStatus, NoackError
 from noack.impairments.link_settings import LinkSettings, read_files
 from noack.runtime.command_line import Parser, failed
@@ -124,11 +124,15 @@ def _warn_of_removed_caps(
 ) -> None:
     for old, new in zip(before, after, strict=True):
         for direction in DIRECTIONS:
-            cap = old[direction]["settings"]["mansd"]
-            if cap is not None and new[direction]["settings"]["mansd"] is None:
+            was, now = (
+                guarantee_words(LinkSettings.model_validate_json(json.dumps(one["settings"])))
+                for one in (old[direction], new[direction])
+            )
+            kept = {words.partition(" ")[0] for words in now}
+            if removed := [words for words in was if words.partition(" ")[0] not in kept]:
                 print(
-                    f"noack netem set: {new['name']} {direction} has no cap now; the words "
-                    f"replaced all settings, mansd {cap} too",
+                    f"noack netem set: {new['name']} {direction} no longer has "
+                    f"{', '.join(removed)}; the words replaced all settings",
                     file=sys.stderr, flush=True,
                 )  # fmt: skip
 

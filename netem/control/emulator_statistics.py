@@ -96,7 +96,9 @@ class DirectionStatistics(TypedDict):
     held_back: int
     longest_loss_burst: int
     mansd: int | None
-    """The cap on that number (M − 1); null if there is none."""
+    """Maximum of that number (M − 1) that the guarantee allows; null if there is none."""
+    constraints: list[str]
+    """The further constraints of the guarantee, in words."""
     loss: LossStatistics
     unintended: dict[str, int]
     in_flight: int
@@ -190,7 +192,8 @@ def _direction(
         "delivered_out_of_order": counters.delivered_out_of_order,
         "held_back": counters.held_back,
         "longest_loss_burst": counters.longest_loss_burst,
-        "mansd": report.settings.mansd,
+        "mansd": report.settings.longest_burst,
+        "constraints": [one.text() for one in report.settings.constraints],
         "loss": {
             "realised": loss_share(counters, since),
             "lost": _share(counters, since, "dropped", "corrupted", "overflowed", "blacked_out"),

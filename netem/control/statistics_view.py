@@ -221,9 +221,10 @@ def _lost_text(of: DirectionStatistics) -> str:
 
 
 def burst_text(of: DirectionStatistics) -> str:
-    """Return the longest loss burst beside its cap."""
+    """Return the longest loss burst beside its cap, and the constraints."""
     cap = of["mansd"]
-    return f"{of['longest_loss_burst']:,}, {'no cap' if cap is None else f'cap {cap:,}'}"
+    limits = ["no cap" if cap is None else f"cap {cap:,}", *of["constraints"]]
+    return f"{of['longest_loss_burst']:,}, {', '.join(limits)}"
 
 
 def _burst(of: DirectionStatistics, width: int) -> Text:

@@ -206,7 +206,7 @@ class PlainRelay(Relay):
             self._taps.departure(self._route(link, reverse, client), departure, now_ns)
 
     def _route(self, link: _PlainLink, reverse: bool, client: _Client) -> TapRoute:
-        mansd = self._directions[2 * link.number + reverse].settings.mansd
+        mansd = self._directions[2 * link.number + reverse].settings.longest_burst
         return TapRoute(
             link.number, reverse, -1 if mansd is None else mansd, address_of(client.name),
             link.link.address, client.local, link.link.spec.to,

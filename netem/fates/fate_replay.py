@@ -3,19 +3,21 @@
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from netem.engine.relay_interface import DIRECTIONS, Direction
 from netem.fates.fate_trace import FORMAT, METADATA, SCHEMA
 from noack.core.errors import CallerError, one_line
+from noack.impairments.constraints import require_consistent
 from noack.impairments.link_records import RecordedDecision
-from noack.impairments.link_settings import Mansd
+from noack.impairments.link_settings import Constraints, Mansd
+from noack.impairments.loss_guarantee import LossHistory
 from noack.protocol.record_tables import Fate
 
 _LONGEST_NS = 2**62
@@ -28,16 +30,17 @@ class Fates(NamedTuple):
 
     decisions: Mapping[tuple[str, Direction], Sequence[Sequence[RecordedDecision]]]
     """Decisions of each flow, in packet order."""
-    caps: Mapping[tuple[str, Direction], int | None]
-    """The cap (M − 1); None if there was none or the recorded fates exceed it."""
+    guarantees: Mapping[tuple[str, Direction], Mapping[str, Any]]
+    """The keys ``mansd`` and ``constraints`` of its settings; none if the recorded fates break the
+    guarantee, because it changed during the recording."""
 
 
 def read_fates(path: Path, links: Sequence[str] | None = None) -> Fates:
     """Read a trace, for :func:`netem.rule_program.program_of` and :class:`netem.link_machine.Link`.
 
     A replaying link repeats the decisions of each flow, packet by packet: the same fate, the same
-    flipped bits, and the same delay from arrival. Its cap holds even if the datagrams arrive at
-    other times. For flows and packets beyond the trace, the link's own settings apply.
+    flipped bits, and the same delay from arrival. Its guarantee holds even if the datagrams arrive
+    at other times. For flows and packets beyond the trace, the link's own settings apply.
 
     Args:
         path: the file.
@@ -54,17 +57,32 @@ def read_fates(path: Path, links: Sequence[str] | None = None) -> Fates:
             raise CallerError(f"{path}: has no link {link!r}; its links: {known}")
     columns = {name: table[name].to_numpy() for name in SCHEMA.names}
     found: dict[tuple[str, Direction], Sequence[Sequence[RecordedDecision]]] = {}
-    caps: dict[tuple[str, Direction], int | None] = {}
+    guarantees: dict[tuple[str, Direction], Mapping[str, Any]] = {}
     for link in links_recorded if links is None else links:
         for direction in DIRECTIONS:
             here = (columns["link"] == link) & (columns["direction"] == direction)
             rows = {name: column[here] for name, column in columns.items()}
             found[link, direction] = _flows(rows, len(table), f"{path}: {link} {direction}")
-            cap = getattr(settings[link], direction).mansd
-            # The cap may have changed during the recording.
-            holds = cap is not None and rows["consecutive_losses"].max(initial=0) <= cap
-            caps[link, direction] = cap if holds else None
-    return Fates(found, caps)
+            given: _Direction = getattr(settings[link], direction)
+            guarantees[link, direction] = dict(given) if _is_kept(given, rows) else {}
+    return Fates(found, guarantees)
+
+
+def _is_kept(settings: "_Direction", rows: Mapping[str, NDArray[Any]]) -> bool:
+    """Whether the losses of each flow are allowed, not counting those out of order."""
+    losses = rows["consecutive_losses"]
+    if settings.mansd is not None and losses.max(initial=0) > settings.mansd:
+        return False
+    if not settings.constraints:
+        return True
+    rules = [one.rule for one in settings.constraints]
+    histories: dict[int, LossHistory] = {}
+    order = np.lexsort((rows["packet"], rows["flow"]))
+    flows, lost = rows["flow"][order].tolist(), (losses > 0)[order].tolist()
+    return not any(
+        histories.setdefault(flow, LossHistory(rules)).add(one)
+        for flow, one in zip(flows, lost, strict=True)
+    )
 
 
 @contextmanager
@@ -107,6 +125,12 @@ def _missing(path: Path, count: int | str) -> CallerError:
 
 class _Direction(BaseModel):
     mansd: Mansd | None
+    constraints: Constraints = ()
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        require_consistent(self.mansd, self.constraints)
+        return self
 
 
 class _Link(BaseModel):

@@ -63,8 +63,12 @@ def hold_back_until(
     """
     release_ns = max(desired_ns, flow.first_release_ns)
     width = program.mansd + 1
+    oldest = max(packet - width, 0)
+    newest = _newest(recent_ns, width, oldest, packet)
+    if newest < oldest or recent_ns[newest % width] <= release_ns:
+        return release_ns  # no packet becomes stale
     delivered = -1
-    for number in range(max(packet - width, 0), packet):
+    for number in range(oldest, packet):
         time_ns = recent_ns[number % width]
         if time_ns > release_ns:
             if may_lose_after(program, losses, delivered, packet):
@@ -73,6 +77,14 @@ def hold_back_until(
         if time_ns >= 0:
             delivered = number
     return release_ns
+
+
+def _newest(recent_ns: Sequence[int], width: int, oldest: int, end: int) -> int:
+    """Return the newest effectively delivered packet below ``end``; below ``oldest``: none."""
+    number = end - 1
+    while number >= oldest and recent_ns[number % width] < 0:
+        number -= 1
+    return number
 
 
 def may_lose_after(
@@ -102,12 +114,14 @@ def make_stale(
 ) -> int:
     """Mark the earlier packets that leave after ``release_ns`` as stale; return how many."""
     width, mask = program.mansd + 1, len(losses) - 1
-    stale = 0
-    for number in range(max(packet - width, 0), packet):
-        if recent_ns[number % width] > release_ns:
-            recent_ns[number % width] = NEVER_NS
-            stale += 1
-        if stale > 0 and counts_losses(program):
+    oldest, stale, first = max(packet - width, 0), 0, packet
+    number = _newest(recent_ns, width, oldest, packet)
+    while number >= oldest and recent_ns[number % width] > release_ns:
+        recent_ns[number % width] = NEVER_NS
+        stale, first = stale + 1, number
+        number = _newest(recent_ns, width, oldest, number)
+    if counts_losses(program):
+        for number in range(first, packet):
             losses[(number + 1) & mask] = losses[number & mask] + 1
     return stale
 

@@ -123,9 +123,7 @@ def settings_of(words: str | Sequence[str]) -> LinkSettings:
 def text_of(settings: LinkSettings, seed: int | None = None) -> str:
     """Return words that :func:`parse` reads back to the same settings."""
     words = [impairment.text() for impairment in settings.impairments]
-    if settings.mansd is not None:
-        words.append(f"mansd {settings.mansd}")
-    words += [constraint.text() for constraint in settings.constraints]
+    words += guarantee_words(settings)
     if settings.first_delivered:
         words.append("first")
     if settings.limit != _LIMIT:
@@ -133,6 +131,12 @@ def text_of(settings: LinkSettings, seed: int | None = None) -> str:
     if seed is not None:
         words.append(f"seed {seed}")
     return " ".join(words)
+
+
+def guarantee_words(settings: LinkSettings) -> list[str]:
+    """Return the words of the guarantee's parts."""
+    cap = [] if settings.mansd is None else [f"mansd {settings.mansd}"]
+    return [*cap, *(constraint.text() for constraint in settings.constraints)]
 
 
 def require_no_dashes(arguments: Sequence[str]) -> None:

@@ -16,6 +16,8 @@ from noack.impairments.markov_chain import Array, NotPredictableError
 
 MOST_JOINT_STATES = 20_000
 _MOST_STEPS = 1_000_000
+_WARM_UP = 100
+"""Steps of the chain after which a likely state is chosen."""
 
 
 class Moves(NamedTuple):
@@ -130,15 +132,21 @@ def _stationary(joint: Any, start: Array) -> Array:
 def _balance(moves: Any) -> Array:
     """Return the stationary distribution π = πP of an irreducible chain.
 
-    With π₀ = 1 the other equations are a regular system. It is sparse: few states of the guarantee
-    follow a state.
+    With π = 1 for a likely state, the other equations are a regular, well-conditioned system. It is
+    sparse: few states of the guarantee follow a state.
     """
     from scipy.sparse import eye_array, linalg
 
-    system = (eye_array(moves.shape[0]) - moves.T).tocsc()
-    if moves.shape[0] == 1:
-        return np.ones(1)
-    others = linalg.splu(system[1:, 1:].tocsc()).solve(-system[1:, [0]].toarray()[:, 0])
-    found: Array = np.maximum(np.concatenate([[1.0], others]), 0.0)
+    count = moves.shape[0]
+    found: Array = np.ones(count)
+    if count == 1:
+        return found
+    for _ in range(_WARM_UP):
+        found = (found + moves.T @ found) / 2
+    others = np.delete(np.arange(count), likely := int(np.argmax(found)))
+    system = (eye_array(count) - moves.T).tocsc()
+    flow = moves[[likely]].toarray()[0, others]
+    found[likely] = 1.0
+    found[others] = np.maximum(linalg.splu(system[others][:, others].tocsc()).solve(flow), 0.0)
     found /= found.sum()
     return found

@@ -67,17 +67,15 @@ def _fifo(priority: int, place: int | None, undo: ExitStack) -> None:
     if sys.platform != "linux":
         raise OSError(0, "not available on this system")
     loop = threading.get_native_id()
+    rank = priority if place is None else priority - _LAST_PLACE + place
+    os.sched_setscheduler(loop, os.SCHED_FIFO, os.sched_param(max(rank, 1)))
+    undo.callback(os.sched_setscheduler, 0, os.SCHED_OTHER, os.sched_param(0))
     # The other threads (zenoh's) share locks with the loop; left at normal priority, one that is
     # preempted while it holds a lock would keep the loop waiting for milliseconds.
-    for task in Path("/proc/self/task").iterdir():
-        thread = int(task.name)
-        rank = priority - _LAST_PLACE - 1
-        if thread == loop:
-            rank = priority if place is None else priority - _LAST_PLACE + place
-        ended = () if thread == loop else (ProcessLookupError,)
-        with suppress(*ended):
+    rank = priority - _LAST_PLACE - 1
+    for thread in {int(task.name) for task in Path("/proc/self/task").iterdir()} - {loop}:
+        with suppress(ProcessLookupError):
             os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(max(rank, 1)))
-    undo.callback(os.sched_setscheduler, 0, os.SCHED_OTHER, os.sched_param(0))
 
 
 def _affinity(place: int, undo: ExitStack) -> None:

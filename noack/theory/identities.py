@@ -20,11 +20,13 @@ class ModelDifference:
         self._jumps: dict[int, tuple[int, Vector]] = {}
         self._t_ns = 0
         self._total = np.zeros(H.shape[0])
+        self._is_old = False
+        """Whether an update was received since the sum was computed."""
 
     def advance_to(self, t_ns: int) -> None:
         """Propagate the sum of the missed jumps to time ``t_ns``."""
-        if self._jumps:
-            self._total = self.propagate(self._total, t_ns - self._t_ns)
+        if self._jumps and t_ns != self._t_ns:
+            self._total = self.propagate(self.total(), t_ns - self._t_ns)
         self._t_ns = t_ns
 
     @property
@@ -34,17 +36,20 @@ class ModelDifference:
 
     def event(self, sequence: int, e_s: Vector) -> None:
         """Add event ``sequence`` at the present time with sensor error e_s(t_k⁻), shape (n,)."""
+        self._total = self.total() + e_s
         self._jumps[sequence] = (self._t_ns, e_s)
-        self._total = self._total + e_s
 
     def received(self, sequence: int) -> None:
         """Remove the missed events up to ``sequence``: the controller received this update."""
         if self._jumps and next(iter(self._jumps)) <= sequence:  # events are in order
             self._jumps = {k: jump for k, jump in self._jumps.items() if k > sequence}
-            # Sum again instead of subtracting, so that rounding errors end at a delivery.
-            terms = [self.propagate(e_s, self._t_ns - t_ns) for t_ns, e_s in self._jumps.values()]
-            self._total = np.sum([np.zeros_like(self._total), *terms], axis=0)
+            self._is_old = True
 
     def total(self) -> Vector:
         """Return the sum of the missed jumps at the present time, shape (n,)."""
+        if self._is_old:
+            # Sum again instead of subtracting, so that rounding errors end at a delivery.
+            terms = [self.propagate(e_s, self._t_ns - t_ns) for t_ns, e_s in self._jumps.values()]
+            self._total = np.sum([np.zeros_like(self._total), *terms], axis=0)
+            self._is_old = False
         return self._total

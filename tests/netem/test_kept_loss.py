@@ -31,6 +31,15 @@ def test_the_realised_loss_is_the_asked_one(decide: Any, words: str) -> None:
     assert lost == pytest.approx(float(words.split("%")[0].split()[1]) / 100, abs=1e-3)
 
 
+def test_the_rate_is_continuous_with_a_correlation() -> None:
+    """The chain of a correlation has states that hardly ever occur."""
+    words = "loss {p}% 50% mansd 3 atmost 3 in 10 corrupt 5%"
+    rates = [expected_loss(settings_of(words.format(p=p))).rate or 0.0 for p in range(0, 101, 5)]
+    steps = np.diff(rates)
+    assert (steps > 0).all()
+    assert steps.max() < 0.05
+
+
 def test_the_closed_form_is_inverted() -> None:
     (loss,) = with_kept_loss(settings_of("loss 30% keep mansd 2")).impairments
     p = loss.loss.probability  # type: ignore[attr-defined]

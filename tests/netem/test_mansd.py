@@ -211,6 +211,26 @@ def test_without_a_cap_the_first_is_still_delivered(
         assert observer.counted[flow][0] == 0
 
 
+HISTORIES = list(itertools.product([False, True], repeat=9))
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["mansd 2", "atmost 3 in 10", "mansd 2 recover 4", "atmost 3 in 8 atmost 4 in 9 recover 3"],
+)
+def test_a_restarted_link_keeps_the_guarantee_behind_any_history(words: str) -> None:
+    """And no longer than necessary: some history makes each forced datagram necessary."""
+    settings = settings_of(f"loss worst first {words}")
+    link = Link(settings, 1, "a", restarted=True)
+    lost = [link.decide(0, 100, t_ns).fate == DROPPED for t_ns in range(30)]
+    before = [list(one) for one in HISTORIES if is_allowed(one, settings)]
+    assert all(is_allowed([*one, *lost], settings) for one in before)
+    earlier = lost.index(True) - 1
+    assert earlier == 0 or any(
+        not is_allowed([*one, *[False] * earlier, True], settings) for one in before
+    )
+
+
 # The cap forces and holds back no more datagrams than necessary.
 
 

@@ -1,11 +1,15 @@
 """Creates a run's recording for the viewer, during the run or from its record."""
 
+import errno
+import os
 from pathlib import Path
+from shutil import disk_usage
 
 from cosim.output.viewer.live_viewer import LiveView
 from cosim.output.viewer.pictures.network_picture import LEG_S, NetworkDiagram
 from cosim.output.viewer.pictures.picture_choice import picture_of
 from cosim.output.viewer.recording import RunView
+from cosim.output.viewer.recording_file import ViewError
 from cosim.output.viewer.table_feed import ViewFeed
 from cosim.record.decimate import is_long
 from cosim.record.environment import Kind
@@ -17,6 +21,9 @@ from noack.protocol.topology import LOOP_ROLES
 
 _INDEXED_S = 120.0
 """Recordings of runs up to this wall time get an index, which needs memory."""
+
+_SPARE_BYTES = 4 * 2**20
+"""Free space without which no recording is written from a record."""
 
 
 def open_view(
@@ -52,9 +59,11 @@ def write_view(record: RunRecord, run_dir: Path, run_id: int) -> None:
     """Write a run's recording from its record; that of a long run shows extremes only."""
     scenario = record.scenario
     columns = record.slice_columns if is_long(scenario) else None
+    _require_space(run_dir)
     with open_view(scenario, run_dir, run_id, None, record.kind, at_once=True) as view:
         feed = ViewFeed(scenario, view, columns)
         for i, part in enumerate(record.slices()):
+            _require_space(run_dir)
             if i:
                 feed.advance()
             for table, rows in part.items():
@@ -62,6 +71,13 @@ def write_view(record: RunRecord, run_dir: Path, run_id: int) -> None:
         for notice in record.notices:
             feed.log(notice)
         feed.advance(final=True)
+
+
+def _require_space(run_dir: Path) -> None:
+    """Raise ViewError if the disk is nearly full: rerun may wait forever after a failed write."""
+    if disk_usage(run_dir).free < _SPARE_BYTES:
+        path = run_dir / RECORDING_FILE
+        raise ViewError(f"{path}: cannot write the recording: {os.strerror(errno.ENOSPC)}")
 
 
 def about(scenario: Scenario, kind: Kind = "live") -> str:

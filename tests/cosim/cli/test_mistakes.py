@@ -114,3 +114,12 @@ def test_a_folder_that_cannot_be_written_is_named_once() -> None:
     assert (
         done.stderr == "noack: /dev/null/runs: no run directory can be created: Not a directory\n"
     )
+
+
+def test_a_deleted_current_folder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    folder.rmdir()
+    done = CliRunner().invoke(app, ["simulate", "lane_following"])
+    assert (done.exit_code, done.stderr) == (1, "noack: the current folder was deleted\n")

@@ -4,6 +4,7 @@ import json
 import shutil
 from pathlib import Path
 from typing import Any, NoReturn
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -13,12 +14,19 @@ from cosim.live.finalize import finalize, reopen
 from cosim.record.environment import write_environment
 from cosim.record.run_directory import (
     ENDING_FILE,
+    RECORDING_FILE,
     REPORTS_FILE,
     SCENARIO_FILE,
     SUMMARY_FILE,
 )
 from cosim.record.run_ending import EndingFile, RunEnding
-from cosim.record.run_record import RunRecord, load_record, write_record, write_reports
+from cosim.record.run_record import (
+    RunRecord,
+    finish_record,
+    load_record,
+    write_record,
+    write_reports,
+)
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
@@ -218,3 +226,29 @@ def test_a_damaged_log_is_one_clear_line(run_dir: Path) -> None:
     (run_dir / "record/notices.jsonl").write_bytes(b"\xae\xff")
     with pytest.raises(CallerError, match=r"notices\.jsonl: cannot be read"):
         reopen(run_dir)
+
+
+def test_an_interrupted_finalisation_is_completed(whole: Path) -> None:
+    """It may have ended while the log, the spool or the viewer's recording was written."""
+    notices, write = whole / "record/notices.jsonl", json.dumps
+    notices.write_text('{"t_ns": 5, "level": "info", "text": "kept", "process": "plant"}\n')
+    before = notices.read_text()
+    for name in (SPOOL, f"{SPOOL}.done"):
+        writer = SpoolWriter(whole / name, "plant")
+        writer.append(PLANT_STEP, 0, b"")
+        writer.close()
+
+    def full(value: Any, **options: Any) -> str:
+        if isinstance(value, dict) and not options:
+            raise OSError(28, "No space left on device")
+        return write(value, **options)
+
+    with patch("json.dumps", full), pytest.raises(MachineError, match="No space"):
+        finish_record(whole)
+    assert notices.read_text() == before
+    assert finish_record(whole).notices
+    assert not [*whole.glob(f"{SPOOL}*")]
+    (whole / SUMMARY_FILE).unlink()
+    (whole / RECORDING_FILE).write_bytes(b"cut")
+    reopen(whole)
+    assert (whole / RECORDING_FILE).stat().st_size > 10_000

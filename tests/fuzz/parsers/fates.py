@@ -67,7 +67,7 @@ def _replay(path: Path, links: list[str] | None) -> None:
     """Replay the decisions of a trace; every accepted trace must be replayable."""
     fates = read_fates(path, links)
     for place, flows in fates.decisions.items():
-        link = Link(LinkSettings(mansd=fates.caps[place]), 0, *place, decisions=flows)
+        link = Link(LinkSettings(**fates.guarantees[place]), 0, *place, decisions=flows)
         for flow, decisions in enumerate(flows):
             for decision in decisions:
                 # The compiled relay adds in signed 64 bits.

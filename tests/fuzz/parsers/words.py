@@ -4,13 +4,14 @@ from netem.words.tc_command import tc_command
 from netem.words.words_to_settings import EXAMPLES as ANY_WORD
 from netem.words.words_to_settings import parse, text_of
 from noack.core.errors import CallerError
+from noack.impairments.constraints import CONSTRAINTS
 from noack.impairments.kinds import IMPAIRMENTS
 from noack.impairments.kinds.delay import SHAPES
 from tests.fuzz.choices import EDITS, Choices
 from tests.fuzz.harness import refusal
 
 EXAMPLES = (
-    *(one.text() for kind in IMPAIRMENTS for one in kind.examples()),
+    *(one.text() for kind in (*IMPAIRMENTS, *CONSTRAINTS) for one in kind.examples()),
     "mansd 4", "first", "limit 100", "seed 7", "slot 1ms", "ecn",
 )  # fmt: skip
 TOKENS = (

@@ -14,6 +14,7 @@ NO_FATES = dict.fromkeys(
 UNUSED: Any = {
     "words": "", "received": 0, "forwarded": 0, "fates": NO_FATES, "duplicated": 0,
     "delivered_out_of_order": 0, "held_back": 0, "longest_loss_burst": 0, "mansd": None,
+    "constraints": [],
     "loss": {"realised": None, "lost": None, "predicted": 0.0}, "received_before": 0,
     "unintended": {"lost_in_kernel": 0}, "in_flight": 0,
     "delay_ns": {"p50": None, "p99": None}, "lateness_ns": {"p50": None, "p99": None},

@@ -49,8 +49,8 @@ def test_a_cap_set_at_runtime_is_kept(capsys: pytest.CaptureFixture[str]) -> Non
 
         assert emulator_commands.main(["set", "lab", "loss 5%"]) == ExitStatus.OK
         assert capsys.readouterr().err == (
-            "noack netem set: relay forward has no cap now; the words replaced "
-            "all settings, mansd 2 too\n"
+            "noack netem set: relay forward no longer has mansd 2; the words replaced "
+            "all settings\n"
         )
 
     assert running() == []

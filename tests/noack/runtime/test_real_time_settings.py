@@ -1,8 +1,12 @@
 import os
 import subprocess
 import sys
+import threading
+from contextlib import ExitStack
 
 import pytest
+
+from noack.runtime.real_time_settings import _fifo
 
 _PROGRAM = """
 import os, sys
@@ -34,3 +38,28 @@ def test_receiver_interrupts_its_sender_on_the_same_core() -> None:
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="Linux")
 def test_lowest_priority_is_1() -> None:
     assert [_applied(1, place)[0] for place in range(4)] == [1, 1, 1, 1]
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setscheduler"), reason="Linux")
+def test_other_threads_stay_normal_if_the_loop_may_not_be_real_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """RLIMIT_RTPRIO may permit their lower priority only."""
+    priorities = []
+
+    def limited(_thread: int, _policy: int, parameters: os.sched_param) -> None:
+        if parameters.sched_priority > 46:
+            raise PermissionError(1, "Operation not permitted")
+        priorities.append(parameters.sched_priority)
+
+    monkeypatch.setattr(os, "sched_setscheduler", limited)
+    ended = threading.Event()
+    other = threading.Thread(target=ended.wait)
+    other.start()
+    try:
+        with ExitStack() as undo, pytest.raises(PermissionError):
+            _fifo(50, 1, undo)
+    finally:
+        ended.set()
+        other.join()
+    assert priorities == []

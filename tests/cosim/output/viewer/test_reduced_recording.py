@@ -1,6 +1,7 @@
 """The recording of a long run is written from its record, reduced; no extreme is lost."""
 
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -8,6 +9,8 @@ from numpy.typing import NDArray
 
 from cosim.live.finalize import finalize
 from cosim.output.viewer import blueprint as bp
+from cosim.output.viewer.recording_file import ViewError
+from cosim.output.viewer.run_view import write_view
 from cosim.record import decimate, run_record
 from cosim.record.environment import write_environment
 from cosim.record.run_directory import RECORDING_FILE, write_scenario
@@ -80,3 +83,14 @@ def test_each_envelope_holds_all_samples_of_its_bin(
         kept_ns, kept = series(shown, bp.state_path(name))
         require_envelope(measured["t_ns"], measured["x"][:, i : i + 1], kept_ns, kept[:, :1])
         require_envelope(measured["t_ns"], after_reset[:, i : i + 1], kept_ns, kept[:, 1:2])
+
+
+def test_no_recording_is_written_on_a_full_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a failed write rerun may wait forever."""
+    scenario = resolve(load(find_shipped("lane_following", "scenarios"), ["horizon_s=0.1"]))
+    monkeypatch.setattr("cosim.output.viewer.run_view.disk_usage", lambda _: Mock(free=1 << 20))
+    with pytest.raises(ViewError, match="No space left"):
+        write_view(simulate(scenario), tmp_path, 1)
+    assert not [*tmp_path.iterdir()]
