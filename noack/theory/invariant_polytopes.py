@@ -20,7 +20,7 @@ from noack.theory.switched_system import SwitchedSystem
 UNIT = 0.1
 _INSIDE = 1 - 1e-9
 _MUCH_LARGER = 1.3
-_ROUNDS = 50
+_ROUNDS = 60
 _FARTHEST = 1e3
 """Entries of a vertex, whose first ones have at most 1; products are rarely that much larger."""
 
@@ -60,7 +60,7 @@ class InvariantPolytopes:
         """Add images until all are inside.
 
         Return False at ``most_vertices`` vertices, or when the vertices show that a path grows
-        faster than γ, or after 50 rounds.
+        faster than γ, or after 60 rounds.
         """
         pending = dict(self.vertices)
         for _ in range(_ROUNDS):

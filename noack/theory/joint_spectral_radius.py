@@ -20,7 +20,7 @@ ACCURACY = 2e-4
 _COARSER, _COARSEST = 4.0, 1e15
 _MOST_CYCLE_EDGES = 60
 """Largest length of the cycles that are tried, also in a graph of more nodes."""
-MOST_VERTICES = 600
+MOST_VERTICES = 800
 _SMALLEST = 1e-3
 """Growth of the polytopes if no cycle grows, relative to the largest norm of a matrix."""
 
