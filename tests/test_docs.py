@@ -84,6 +84,7 @@ SHORTER = {
     "run": ("--no-report",),
     "adversary": ("--set", "horizon_s=2", "--nodes", "2000"),
     "design": ("--draws", "100"),
+    "margin": ("--no-period",),
     "doctor": ("--seconds", "0.1"),
 }
 """Arguments added to a command to shorten it; other tests cover reports and long runs."""

@@ -7,6 +7,7 @@ function imports these modules when it is first called.
 from importlib.metadata import version
 
 from cosim.api.certificates import certify as certify
+from cosim.api.certificates import margin as margin
 from cosim.api.measurements import measure as measure
 from cosim.api.runs import Run as Run
 from cosim.api.runs import compare as compare

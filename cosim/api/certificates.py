@@ -1,7 +1,10 @@
-"""The certificates of a scenario."""
+"""The certificates of a scenario, and its margin of losses."""
 
+from cosim.analysis.margin_search import MOST_M, MarginResult, find_margin
 from cosim.api.scenarios import Source, load
 from cosim.output.certificate_report import Certificates, certificates_of
+from noack.config.resolution import resolve
+from noack.theory.joint_spectral_radius import ACCURACY
 
 
 def certify(scenario: Source, *, weight: str = "given", late: int | None = None) -> Certificates:
@@ -20,3 +23,23 @@ def certify(scenario: Source, *, weight: str = "given", late: int | None = None)
             measured.
     """
     return certificates_of(load(scenario), weight, late)
+
+
+def margin(
+    scenario: Source, *, most_m: int = MOST_M, accuracy: float = ACCURACY, period: bool = True
+) -> MarginResult:
+    """Return the largest M for which a time-triggered loop is stable under every loss pattern.
+
+    Args:
+        scenario: a scenario with a periodic trigger, or a source that :func:`noack.load` accepts.
+        most_m: largest M to examine.
+        accuracy: wanted ratio of upper and lower bound of the growth, minus 1.
+        period: whether to search for the longest period with the scenario's own M, too.
+
+    Raises:
+        NoackError: the scenario is wrong; or its trigger is not periodic, its loop is not linear,
+            or its delay varies or is not below the period.
+    """
+    return find_margin(
+        resolve(load(scenario)), most_m=most_m, accuracy=accuracy, with_period=period
+    )

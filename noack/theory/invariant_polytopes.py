@@ -7,7 +7,7 @@ the joint spectral radius this ends. Whatever vertices result, the bound is then
 anew with all rounding included, so it does not depend on how they were found.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -19,6 +19,10 @@ from noack.theory.switched_system import SwitchedSystem
 
 UNIT = 0.1
 _INSIDE = 1 - 1e-9
+_MUCH_LARGER = 1.3
+_ROUNDS = 60
+_FARTHEST = 1e3
+"""Entries of a vertex, whose first ones have at most 1; products are rarely that much larger."""
 
 
 def initial_vertices(system: SwitchedSystem, cycle: Cycle, growth: float) -> dict[int, Matrix]:
@@ -44,6 +48,8 @@ class InvariantPolytopes:
     growth: float
     vertices: dict[int, Matrix]
     """By node, (m, n)."""
+    _examined: dict[int, int] = field(default_factory=dict)
+    """Number of vertices after the last search for redundant ones, by node."""
 
     @property
     def count(self) -> int:
@@ -51,9 +57,13 @@ class InvariantPolytopes:
         return sum(map(len, self.vertices.values()))
 
     def grow(self, most_vertices: int) -> bool:
-        """Add images until all are inside; return False at ``most_vertices`` vertices."""
+        """Add images until all are inside.
+
+        Return False at ``most_vertices`` vertices, or when the vertices show that a path grows
+        faster than γ, or after 60 rounds.
+        """
         pending = dict(self.vertices)
-        while pending:
+        for _ in range(_ROUNDS):
             images: dict[int, list[Matrix]] = {}
             for edge in self.system.edges:
                 if edge.source in pending:
@@ -61,26 +71,36 @@ class InvariantPolytopes:
                     images.setdefault(edge.target, []).append(image / self.growth**edge.duration)
             pending = {}
             for node, parts in images.items():
-                outside = self._add(node, np.concatenate(parts))
-                if len(outside):
-                    pending[node] = outside
-            if self.count > most_vertices:
-                return False
-        return True
+                added = self._add(node, np.concatenate(parts))
+                if len(added):
+                    pending[node] = added
+            if not pending:
+                return True
+            farthest = max(float(np.abs(points).max()) for points in pending.values())
+            if self.count > most_vertices or not farthest < _FARTHEST:
+                break
+        return False
 
     def _add(self, node: int, points: Matrix) -> Matrix:
-        """Add the points that are outside, the farthest first; return them."""
-        added = []
+        """Add the points that are outside, the farthest first; return those that are vertices."""
+        before = len(self.vertices[node])
         while len(points):
             norm = PolytopeNorm(self.vertices[node])
             norms = norm.combinations(points, enough=_INSIDE).norms
             order = np.argsort(-norms)
             order = order[norms[order] > _INSIDE]
-            first = points[order[: max(4, len(order) // 4)]]
+            first, points = np.split(points[order], [max(4, len(order) // 4)])
             self.vertices[node] = np.concatenate([self.vertices[node], first])
-            added.append(first)
-            points = points[order[len(first) :]]
-        return np.concatenate(added) if added else points
+        if len(self.vertices[node]) == before:
+            return points
+        # Without points in its interior it is the same polytope.
+        everywhere = len(self.vertices[node]) > _MUCH_LARGER * self._examined.get(node, 0)
+        kept = ~PolytopeNorm(self.vertices[node]).redundant(0 if everywhere else before, _INSIDE)
+        added = self.vertices[node][before:][kept[before:]]
+        self.vertices[node] = self.vertices[node][kept]
+        if everywhere:
+            self._examined[node] = len(self.vertices[node])
+        return added
 
     def bound(self) -> float:
         """Return a rigorous upper bound of the joint spectral radius, from the polytopes."""
@@ -88,6 +108,7 @@ class InvariantPolytopes:
         for edge in self.system.edges:
             M = edge.matrix
             images = exactly(self.vertices[edge.source]) @ IntervalMatrix(M.middle.T, M.radius.T)
-            largest = float(PolytopeNorm(self.vertices[edge.target]).bounds(images).max())
+            norm, inside = PolytopeNorm(self.vertices[edge.target]), self.growth**edge.duration
+            largest = float(norm.bounds(images, inside).max())
             growths.append(largest ** (1 / edge.duration) * (1 + 1e-15))
         return max(growths)

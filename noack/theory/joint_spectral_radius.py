@@ -12,18 +12,26 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.theory.destabilising_cycle import NO_CYCLE, Cycle, find_cycle, rigorous_growth
+from noack.theory.destabilising_cycle import Cycle, find_cycle, rigorous_growth
 from noack.theory.invariant_polytopes import InvariantPolytopes, initial_vertices
 from noack.theory.switched_system import Edge, SwitchedSystem, strongly_connected
 
-ACCURACY = 1e-4
-_COARSER, _COARSEST = 8.0, 1e15
-_BEAM = 400
-_CYCLE_EDGES, _MOST_CYCLE_EDGES = 12, 60
-"""Length of the cycles that are tried: the number of nodes, within these limits."""
-MOST_VERTICES = 1500
+ACCURACY = 2e-4
+_COARSER, _COARSEST = 4.0, 1e15
+_MOST_CYCLE_EDGES = 60
+"""Largest length of the cycles that are tried, also in a graph of more nodes."""
+MOST_VERTICES = 800
 _SMALLEST = 1e-3
 """Growth of the polytopes if no cycle grows, relative to the largest norm of a matrix."""
+
+
+class _Search(NamedTuple):
+    edges: int
+    """Length of the cycles that are tried; at least the number of nodes."""
+    beam: int
+
+
+_SEARCH, _LONG_SEARCH = _Search(20, 100), _Search(40, 300)
 
 
 class JointSpectralRadius(NamedTuple):
@@ -61,21 +69,37 @@ def joint_spectral_radius(
 
 def _connected(system: SwitchedSystem, accuracy: float, most_vertices: int) -> JointSpectralRadius:
     balanced = system.balanced()
-    longest = min(max(_CYCLE_EDGES, len(system.dimensions)), _MOST_CYCLE_EDGES)
-    cycle = find_cycle(balanced, longest, _BEAM)
-    if cycle.path:
-        # The original matrices have smaller radii.
-        cycle = Cycle(cycle.path, max(cycle.growth, rigorous_growth(system, cycle.path)))
-    growth = cycle.growth
-    if growth == 0.0:
-        largest = max(float(np.abs(edge.matrix.middle).max()) for edge in balanced.edges)
-        cycle, growth = NO_CYCLE, max(_SMALLEST * largest, np.finfo(float).tiny)
-    upper, vertices, complete = math.inf, 0, False
-    while not complete and accuracy < _COARSEST:
-        wanted = growth * (1 + accuracy)
-        start = initial_vertices(balanced, cycle, wanted)
-        polytopes = InvariantPolytopes(balanced, wanted, start)
+    cycle = _best_cycle(system, balanced, _SEARCH)
+    upper, vertices, searched = math.inf, 0, False
+    while accuracy < _COARSEST:
+        growth = max(cycle.growth, _SMALLEST * _largest(balanced)) * (1 + accuracy)
+        start = initial_vertices(balanced, cycle, growth)
+        polytopes = InvariantPolytopes(balanced, growth, start)
         complete = polytopes.grow(most_vertices)
         upper, vertices = min((upper, vertices), (polytopes.bound(), polytopes.count))
+        if complete:
+            break
+        if not searched:  # if a longer cycle grows faster, the polytopes cannot be completed
+            searched, before = True, cycle.growth
+            cycle = max(cycle, _best_cycle(system, balanced, _LONG_SEARCH), key=_growth)
+            if cycle.growth > before * (1 + accuracy / 2):
+                continue
         accuracy *= _COARSER
     return JointSpectralRadius(cycle.growth, upper, cycle.path, vertices)
+
+
+def _best_cycle(system: SwitchedSystem, balanced: SwitchedSystem, search: _Search) -> Cycle:
+    longest = min(max(search.edges, len(system.dimensions)), _MOST_CYCLE_EDGES)
+    cycle = find_cycle(balanced, longest, search.beam)
+    if not cycle.path:
+        return cycle
+    # The original matrices have smaller radii.
+    return cycle._replace(growth=max(cycle.growth, rigorous_growth(system, cycle.path)))
+
+
+def _growth(cycle: Cycle) -> float:
+    return cycle.growth
+
+
+def _largest(system: SwitchedSystem) -> float:
+    return max(float(np.abs(edge.matrix.middle).max()) for edge in system.edges)

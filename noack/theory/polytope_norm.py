@@ -16,7 +16,9 @@ from noack.theory.interval_matrix import IntervalMatrix, exactly
 _EXCHANGES = 400
 _IMPROVEMENT = 1e-11
 _PIVOT = 1e-9
-_CHUNK = 256
+_PRODUCTS = 250_000
+"""Of a product of matrices: the BLAS uses several threads for larger ones, which is slower here."""
+_NONE = -1
 _ENLARGED = 1 + 2.0**-40
 
 
@@ -51,13 +53,31 @@ class PolytopeNorm:
 
     def combinations(self, points: Matrix, enough: float = 0.0) -> Combinations:
         """Return combinations for points, (k, n), of the smallest norm, or at most ``enough``."""
+        none = np.full(len(points), _NONE)
+        return self._in_chunks(points, enough, none)
+
+    def redundant(self, first: int, enough: float) -> NDArray[np.bool_]:
+        """Return which vertices from number ``first`` on have a norm up to ``enough`` without them.
+
+        Each is compared with all others; the unit vectors are never redundant.
+        """
+        numbers = np.arange(first, len(self.vertices))
+        norms = self._in_chunks(self.vertices[first:], enough, numbers).norms
+        found = np.zeros(len(self.vertices), dtype=bool)
+        found[first:] = (norms <= enough) & (numbers >= self.vertices.shape[1])
+        return found
+
+    def _in_chunks(self, points: Matrix, enough: float, without: NDArray[np.int64]) -> Combinations:
+        chunk = max(_PRODUCTS // self.vertices.size, 16)
         parts = [
-            self._combinations(points[i : i + _CHUNK], enough)
-            for i in range(0, len(points), _CHUNK)
+            self._combinations(points[i : i + chunk], enough, without[i : i + chunk])
+            for i in range(0, len(points), chunk)
         ]
         return Combinations(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
-    def _combinations(self, points: Matrix, enough: float) -> Combinations:
+    def _combinations(
+        self, points: Matrix, enough: float, without: NDArray[np.int64]
+    ) -> Combinations:
         (k, n), V = points.shape, self.vertices
         chosen = np.tile(np.arange(n), (k, 1))
         signs = np.where(points >= 0, 1.0, -1.0) * np.sign(np.diag(V[:n]))
@@ -67,9 +87,13 @@ class PolytopeNorm:
             active = active[coefficients[active].sum(axis=1) > enough]
             if not len(active):
                 break
-            undone = np.linalg.inv(V[chosen[active]] * signs[active][:, :, None])
+            try:
+                undone = np.linalg.inv(V[chosen[active]] * signs[active][:, :, None])
+            except np.linalg.LinAlgError:  # by rounding
+                break
             # The vertex that violates the dual's inequalities most enters the basis.
             scores = undone.sum(axis=2) @ V.T
+            scores[without[active] != _NONE, without[active][without[active] != _NONE]] = 0.0
             entering = np.abs(scores).argmax(axis=1)
             value = scores[np.arange(len(active)), entering]
             sign = np.sign(value)
@@ -85,16 +109,15 @@ class PolytopeNorm:
             coefficients[active, leaving] = step
             chosen[active, leaving] = entering[go]
             signs[active, leaving] = sign[go]
-        basis = V[chosen].transpose(0, 2, 1)
-        exact: Matrix = np.asarray(np.linalg.solve(basis, points[:, :, None]), dtype=np.float64)
-        return Combinations(chosen, exact[:, :, 0])
+        return Combinations(chosen, coefficients * signs)
 
-    def bounds(self, points: IntervalMatrix) -> Vector:
+    def bounds(self, points: IntervalMatrix, enough: float = 0.0) -> Vector:
         """Return rigorous upper bounds of the norms of points, (k, n).
 
+        A bound that is at most ``enough`` is not improved further.
         Nothing is assumed about the combinations; what they miss is a combination of unit vectors.
         """
-        found = self.combinations(points.middle)
+        found = self.combinations(points.middle, enough)
         basis = exactly(self.vertices[found.vertices])
         sums = exactly(found.coefficients[:, None, :]) @ basis
         missed = (points - IntervalMatrix(sums.middle[:, 0], sums.radius[:, 0])).magnitude

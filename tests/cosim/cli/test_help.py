@@ -101,6 +101,7 @@ MORE = {
     "scenarios": (),
     "measure": (),
     "certify": (),
+    "margin": ("--most", "2", "--no-period"),
     "simulate": ("--set", "horizon_s=1", "--no-report"),
     "adversary": ("--nodes", "200", "--beam", "2", "--set", "horizon_s=0.5"),
 }
@@ -111,7 +112,7 @@ def run_examples() -> list[str]:
     found = []
     for command in MORE:
         first, *_, last = examples_of(COMMANDS[command])
-        found += [first] if command in ("certify", "report") else [first, last]
+        found += [first] if command in ("certify", "margin", "report") else [first, last]
     return found
 
 

@@ -64,7 +64,7 @@ def test_closed_forms(matrices: list[Matrix], value: float) -> None:
     assert found.lower <= value * (1 + 1e-15)
     assert found.upper >= value
     assert found.lower == pytest.approx(value, rel=1e-7)
-    assert found.upper == pytest.approx(value, rel=2e-3)  # the defective one needs many vertices
+    assert found.upper == pytest.approx(value, rel=6e-3)  # the defective one needs many vertices
 
 
 def test_nilpotent_systems_do_not_grow() -> None:

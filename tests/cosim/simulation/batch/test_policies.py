@@ -137,7 +137,7 @@ def test_events_fates_and_measures_are_those_of_the_exact_simulator(name: str) -
             compare(setting, row, run_events(setting, draw), run)
             events += len(run.event_s)
             finished += 1
-    assert events > (2 if name == "lyapunov" else 20)
+    assert events > (2 if name == "lyapunov" else 15)
     assert finished >= (2 if name == "lyapunov" else 6)
 
 

@@ -1,0 +1,211 @@
+"""The margin of a time-triggered loop: the largest M, and the largest period for its own M."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from noack.config.scenario import Scenario
+from noack.core.clock import NS_PER_S
+from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
+from noack.theory.joint_spectral_radius import ACCURACY
+from noack.theory.loss_margin import LossMargin, Stability, capped
+
+MOST_M = 16
+
+MarginProgress = Callable[[str], None]
+"""Receives what is examined next."""
+
+
+class LossCap(NamedTuple):
+    """An M, and what is known about the loop with it."""
+
+    m: int
+    """M; at most M − 1 consecutive losses."""
+    found: Stability
+
+    @property
+    def settings(self) -> tuple[str, ...]:
+        """The settings of a scenario in which the network plays the pattern again and again."""
+        pattern = self.found.pattern
+        lost = [number for number, delivered in enumerate(pattern) if not delivered]
+        script = f'{{model="scripted", lost={lost}, repeat_every={len(pattern)}}}'
+        return f"network.mansd={self.m - 1}", f"network.loss={script}"
+
+
+class PeriodLimit(NamedTuple):
+    """Two periods between which all patterns of the scenario's guarantee cease to be stable."""
+
+    stable_s: float | None
+    """A period that is proven stable; None: none was found."""
+    unstable_s: float | None
+    """The next longer period that was examined; it is not proven stable. None: none was found."""
+    found: Stability | None
+    """What is known about ``unstable_s``."""
+
+    @property
+    def text(self) -> str:
+        """The limit in words."""
+        if self.found is None:
+            return f"stable for every pattern up to T = {self.stable_s:g} s, the longest examined"
+        longer = f"T = {self.unstable_s:g} s is undecided"
+        if self.found.verdict == "destabilised":
+            longer = f"this pattern destabilises T = {self.unstable_s:g} s: {self.found.text}"
+        if self.stable_s is None:
+            return f"no stable period was found; {longer}"
+        return f"stable for every pattern with T = {self.stable_s:g} s; {longer}"
+
+
+@dataclass(frozen=True)
+class MarginResult:
+    """The margin of a time-triggered loop.
+
+    ``print`` shows it in words; ``caps`` has the bounds for each M, ``period`` the longest period.
+    """
+
+    scenario: str
+    mode: str
+    mansd: int
+    """M − 1 of the scenario."""
+    guarantee: str
+    period_s: float
+    """Time between two transmissions."""
+    delay_s: float
+    """Delay of an update in the network."""
+    caps: tuple[LossCap, ...]
+    """M = 1, 2, … up to the first one that is not proven stable."""
+    every_m: bool
+    """The constraints of the network allow no more losses with a larger M."""
+    period: PeriodLimit | None
+    """None if it was not searched for."""
+
+    @property
+    def stable_m(self) -> int | None:
+        """The largest M with which every pattern is proven stable; None if there is none."""
+        stable = [cap.m for cap in self.caps if cap.found.verdict == "stable"]
+        return max(stable, default=None)
+
+    @property
+    def destabilised(self) -> LossCap | None:
+        """The smallest M with a destabilising pattern, if one was found."""
+        last = self.caps[-1]
+        return last if last.found.verdict == "destabilised" else None
+
+    @property
+    def verdict(self) -> str:
+        """The margin in words."""
+        last, most = self.caps[-1], self.stable_m
+        parts = []
+        if most is not None and self.every_m:
+            parts = [f"stable for every pattern that the constraints allow, with every M ≥ {most}"]
+        elif most is not None:
+            parts = [f"stable for every pattern with M ≤ {most}"]
+        if self.destabilised is not None:
+            parts.append(f"this pattern destabilises M = {last.m}: {last.found.text}")
+        elif last.found.verdict == "undecided":
+            parts.append(f"M = {last.m} is undecided")
+        return "; ".join(parts)
+
+    def __repr__(self) -> str:
+        """Return the verdicts."""
+        return "\n".join([self.verdict, *([self.period.text] if self.period else [])])
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all fields and the verdicts for JSON."""
+        period = None
+        if self.period is not None:
+            period = self.period._asdict() | {"text": self.period.text}
+            period["found"] = None if self.period.found is None else _document(self.period.found)
+        own = ("scenario", "mode", "mansd", "guarantee", "period_s", "delay_s", "every_m")
+        return {key: getattr(self, key) for key in own} | {
+            "verdict": self.verdict,
+            "stable_m": self.stable_m,
+            "caps": [{"m": cap.m, **_document(cap.found)} for cap in self.caps],
+            "period": period,
+        }
+
+
+def _document(found: Stability) -> dict[str, Any]:
+    return found._asdict() | {"pattern": found.text, "verdict": found.verdict}
+
+
+def find_margin(
+    resolved: Scenario,
+    *,
+    most_m: int = MOST_M,
+    accuracy: float = ACCURACY,
+    with_period: bool = True,
+    progress: MarginProgress = lambda text: None,
+) -> MarginResult:
+    """Find the margin of a scenario's loop.
+
+    Args:
+        resolved: the resolved scenario; its trigger is periodic.
+        most_m: largest M to examine.
+        accuracy: wanted ratio of upper and lower bound, minus 1.
+        with_period: whether to search for the longest period, too.
+        progress: receives what is examined next.
+
+    Raises:
+        CallerError: the loop is not covered.
+    """
+    margin, network = LossMargin(resolved), resolved.network
+    others = LossGuarantee(
+        tuple(rule for rule in network.guarantee.rules if not isinstance(rule, LongestBurst))
+    )
+    caps: list[LossCap] = []
+    every_m = False
+    for m in range(1, most_m + 1):
+        progress(f"M = {m}")
+        caps.append(LossCap(m, margin.stability(capped(others, m - 1), accuracy)))
+        every_m = others.longest_burst is not None and others.longest_burst < m
+        if every_m or caps[-1].found.verdict != "stable":
+            break
+    return MarginResult(
+        resolved.name, resolved.mode, network.mansd, network.guarantee.meaning,
+        margin.period_ns / NS_PER_S, margin.loop.times.delay_ns / NS_PER_S, tuple(caps), every_m,
+        find_longest_period(resolved, progress) if with_period else None,
+    )  # fmt: skip
+
+
+def find_longest_period(
+    resolved: Scenario, progress: MarginProgress = lambda text: None
+) -> PeriodLimit:
+    """Find a stable period and an unstable one that is one measurement longer.
+
+    From the scenario's period on, periods are doubled or halved until one is stable and one is not;
+    then the interval between them is bisected. Stability need not be monotonic in the period, so
+    nothing is said about periods that were not examined.
+    """
+    step_ns = resolved.timing.measurement_period_ns
+    examined: dict[int, Stability] = {}
+
+    def is_stable(steps: int) -> bool:
+        progress(f"period {steps * step_ns / NS_PER_S:g} s")
+        examined[steps] = LossMargin(resolved, steps * step_ns).is_stable()
+        return examined[steps].verdict == "stable"
+
+    first = LossMargin(resolved)
+    longest = max(resolved.timing.horizon_ns, first.period_ns) // step_ns
+    shortest = first.loop.times.delay_ns // step_ns + 1
+    stable, unstable = 0, 0
+    steps = first.period_ns // step_ns
+    while not stable or not unstable:
+        if is_stable(steps):
+            stable = steps
+            if steps == longest:
+                return PeriodLimit(steps * step_ns / NS_PER_S, None, None)
+            following = min(2 * steps, longest)
+        else:
+            unstable = steps
+            if steps == shortest:
+                break
+            following = max(steps // 2, shortest)
+        steps = following
+    while stable and unstable - stable > 1:
+        steps = (stable + unstable) // 2
+        stable, unstable = (steps, unstable) if is_stable(steps) else (stable, steps)
+    return PeriodLimit(
+        stable * step_ns / NS_PER_S if stable else None,
+        unstable * step_ns / NS_PER_S,
+        examined[unstable],
+    )

@@ -1,0 +1,33 @@
+"""The margin of a time-triggered loop as a table."""
+
+from rich.console import Console
+from rich.table import Table
+
+from cosim.analysis.margin_search import MarginResult
+
+_STYLES = {"stable": "green", "destabilised": "red", "undecided": "yellow"}
+
+
+def print_margin(console: Console, margin: MarginResult) -> None:
+    """Print the bounds for each M, and the verdicts."""
+    delay = f", updates delayed by {margin.delay_s:g} s" if margin.delay_s else ""
+    mode = "model-based" if margin.mode == "model" else "zero-order hold"
+    table = Table(
+        title=f"{margin.scenario}: growth of the worst loss pattern per period of "
+        f"{margin.period_s:g} s, {mode}{delay}"
+    )
+    headings = ("M", "maximum consecutive losses (M − 1)", "at least", "at most", "verdict")
+    for heading in headings:
+        table.add_column(heading, justify="left" if heading == "verdict" else "right")
+    for m, found in margin.caps:
+        style = _STYLES[found.verdict]
+        table.add_row(
+            str(m), str(m - 1), f"{found.lower:.9f}", f"{found.upper:.9f}",
+            f"[{style}]{found.verdict}[/]",
+        )  # fmt: skip
+    console.print(table)
+    console.print(margin.verdict, soft_wrap=True, highlight=False)
+    if margin.period is not None:
+        text = f"for {margin.guarantee}: {margin.period.text}"
+        console.print(text, soft_wrap=True, highlight=False)
+    console.print("[dim]D delivered, L lost, repeated. Below 1: every pattern is stable.[/]")

@@ -1,0 +1,109 @@
+"""The margin of a scenario: the search, the command, the library."""
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import noack
+from cosim.analysis.margin_search import find_longest_period, find_margin
+from cosim.cli import app
+from cosim.cli.command import load_scenario
+from noack.config.resolution import loop_of, resolve
+from noack.config.scenario import Scenario
+from noack.core.linear_systems import discretise
+
+HELD = {
+    "mode": "zoh",
+    "trigger": {"policy": "periodic", "period_s": 0.1},
+    "plant.rate_hz": 50.0,
+    "controller.rate_hz": 50.0,
+    "network.mansd": 0,
+}
+
+
+def held_integrator(**settings: object) -> Scenario:
+    """The double integrator, x held between updates every 0.1 s."""
+    return noack.with_settings(noack.load("double_integrator"), {**HELD, **settings})
+
+
+def test_longest_period_is_that_of_the_sampled_loop() -> None:
+    """Without losses, the map over a period is known in closed form."""
+    resolved = resolve(held_integrator())
+    loop, h = loop_of(resolved), 20_000_000
+
+    def radius(steps: int) -> float:
+        # The first step of each period still has the older input.
+        (A1, B1), (A, B) = (discretise(loop.A, loop.B, h * k) for k in (1, steps - 1))
+        held = np.block([[A @ A1 + B @ loop.K, A @ B1], [loop.K, np.zeros((1, 1))]])
+        return float(np.abs(np.linalg.eigvals(held)).max())
+
+    found = find_longest_period(resolved)
+    assert found.stable_s is not None
+    assert found.unstable_s == pytest.approx(found.stable_s + 0.02)
+    assert radius(round(found.stable_s * 50)) < 1 < radius(round(found.unstable_s * 50))
+    assert found.found is not None
+    assert found.found.lower == pytest.approx(radius(round(found.unstable_s * 50)), rel=1e-9)
+
+
+def test_verdicts_agree_with_the_bounds() -> None:
+    trigger = {"policy": "periodic", "period_s": 0.5}
+    found = find_margin(resolve(held_integrator(trigger=trigger)), with_period=False)
+    assert [cap.m for cap in found.caps] == list(range(1, len(found.caps) + 1))
+    assert [cap.found.verdict for cap in found.caps[:-1]] == ["stable"] * (len(found.caps) - 1)
+    assert all(cap.found.upper < 1 for cap in found.caps[:-1])
+    growth = [cap.found.lower for cap in found.caps]
+    assert growth == sorted(growth)
+    assert found.destabilised is not None
+    assert found.destabilised.found.lower > 1
+    assert f"M ≤ {found.stable_m}; this pattern destabilises M = {len(growth)}: D" in str(found)
+
+
+def test_constraints_that_cap_the_losses_themselves() -> None:
+    constraints = [{"kind": "at_most", "losses": 1, "window": 4}]
+    settings = {"network.constraints": constraints, "network.mansd": 5}
+    found = noack.margin(held_integrator(**settings), period=False)
+    assert found.every_m
+    assert found.stable_m == 2
+    assert "every M ≥ 2" in found.verdict
+
+
+def test_command_as_json_and_as_a_table() -> None:
+    words = ["margin", "lane_periodic", "--no-period", "--most", "2"]
+    done = CliRunner().invoke(app, [*words, "--json"])
+    assert done.exit_code == 0, done.output
+    document = json.loads(done.stdout)
+    assert document["stable_m"] == 2
+    assert [cap["m"] for cap in document["caps"]] == [1, 2]
+    assert document["caps"][0]["lower"] <= document["caps"][0]["upper"] < 1
+    shown = CliRunner().invoke(app, words).output
+    assert "stable for every pattern with M ≤ 2" in shown
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "message"),
+    [
+        (["lane_following"], 2, "time-triggered"),
+        (["lane_periodic", "--play", "--json"], 2, "--play"),
+        (["lane_periodic", "--play", "--most", "1", "--no-period"], 2, "no destabilising pattern"),
+        (["lane_periodic", "--accuracy", "2"], 2, "--accuracy 2: expected"),
+        (["lane_periodic", "--set", "trigger.period_s=9", "--no-period"], 1, "destabilises M = 1"),
+    ],
+)
+def test_mistakes_and_negative_answers(words: list[str], status: int, message: str) -> None:
+    done = CliRunner().invoke(app, ["margin", *words])
+    assert done.exit_code == status, done.output
+    assert message in done.output
+
+
+def test_the_played_settings_are_the_pattern() -> None:
+    found = noack.margin("lane_periodic", period=False).destabilised
+    assert found is not None
+    played = load_scenario("lane_periodic", found.settings)
+    assert played.network.mansd == found.m - 1
+    run = noack.simulate(played)
+    received = run.events()["received"].to_pylist()
+    pattern = found.found.pattern
+    expected = [pattern[i % len(pattern)] for i in range(len(received))]
+    assert received[:-1] == expected[:-1]
