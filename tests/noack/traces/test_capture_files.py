@@ -90,5 +90,5 @@ def test_tshark_finds_the_same_datagrams(link_type: int, tmp_path: Path) -> None
 
 def test_a_block_that_is_too_short_is_named_in_plain_words() -> None:
     section = bytes.fromhex("0a0d0d0a 1c000000 4d3c2b1a 0100 0000 ffffffffffffffff 1c000000")
-    with pytest.raises(ValueError, match="^after packet 0: a block is too short"):
+    with pytest.raises(ValueError, match=r"^after packet 0: a block is too short"):
         list(captured_packets(io.BytesIO(section + bytes.fromhex("06000000 0c000000 0c000000"))))
