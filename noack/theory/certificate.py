@@ -210,7 +210,7 @@ class _Step:
             self._background.sensor_error,
         )
         margin = (1 - own) * (1 - echo) - from_e_s * from_q
-        loop_gain = 1 - margin if own < 1 else math.inf
+        loop_gain = max(own, echo, 1 - margin)
         if not loop_gain < 1:
             raise VoidError(f"the loop gain of the errors is {loop_gain:.3g}, not below 1")
         held = (input_fixed * (1 - echo) + from_e_s * error_fixed) / margin

@@ -2,8 +2,6 @@
 
 from typing import TYPE_CHECKING
 
-from rich.console import Console
-
 from cosim.cli import command as cli
 from cosim.cli import measure_options as given
 from cosim.shipped_files import find_trace
@@ -52,6 +50,8 @@ def measure(
     json: cli.JsonOption = False,
 ) -> int:
     """Measure a network: losses, bursts, M, delays, outages, and models that fit."""
+    from rich.console import Console
+
     from cosim.measurement.live.live_measurement import LiveOptions, period_ns_of
     from cosim.measurement.measurement_outputs import OutputRequest, report
     from cosim.measurement.network_measurement import Measurement
