@@ -44,7 +44,11 @@ RoundTrip = Annotated[
     bool, typer.Option("--round-trip", help="The listener sends each datagram back.")
 ]
 Silence = Annotated[
-    str, typer.Option(metavar="TIME", help="A listener ends after so long without a datagram.")
+    str,
+    typer.Option(
+        metavar="TIME",
+        help="Once a probe has begun, a listener ends after so long without a datagram.",
+    ),
 ]
 Save = Annotated[
     Path | None, typer.Option(help="Write the raw trace to this file while probing (.csv).")
