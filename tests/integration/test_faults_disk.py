@@ -39,11 +39,10 @@ class Disk:
         """Fill the disk; leave at most ``but_bytes`` free."""
         self.empty()
         room = shutil.disk_usage(self.path).free - but_bytes
-        with self._filler.open("wb") as file:
+        with self._filler.open("wb", buffering=0) as file:
             while room > 0:  # other processes may write at the same time
                 try:
                     room -= file.write(bytes(min(room, 1 << 16)))
-                    file.flush()
                 except OSError:
                     break
 

@@ -162,7 +162,8 @@ def _spool(choices: Choices, name: str, data: bytes) -> bytes:
 def _show(run_dir: Path) -> None:
     """Process an existing summary as `noack summary` does."""
 
-    def finalize(ending: RunEnding) -> Outcome:
+    def finalize(ending: RunEnding, *, again: bool) -> Outcome:
+        assert again
         assert isinstance(ending.reason, str)
         return Outcome(run_dir, ending.status, ending.reason, {})
 

@@ -99,15 +99,22 @@ class System:
         return plant(models, self.A, self.B, self.x0[:, None], self.alpha)
 
     def certify(
-        self, conditions: NetworkConditions | None = None, plant: PlantGains | None = None
+        self,
+        conditions: NetworkConditions | None = None,
+        plant: PlantGains | None = None,
+        *,
+        structured: bool = True,
     ) -> Constants:
-        plant = plant or self.gains()
-        return solve(plant.error, plant, conditions or self.conditions, Level(self.beta, self.beta))
+        plant, level = plant or self.gains(), Level(self.beta, self.beta)
+        conditions = conditions or self.conditions
+        return solve(plant.error, plant, conditions, level, structured=structured)
 
 
-def certified_or_skipped(system: System, conditions: NetworkConditions | None = None) -> Constants:
+def certified_or_skipped(
+    system: System, conditions: NetworkConditions | None = None, *, structured: bool = True
+) -> Constants:
     try:
-        return system.certify(conditions)
+        return system.certify(conditions, structured=structured)
     except VoidError:
         assume(False)
         raise
