@@ -13,7 +13,6 @@ from benchmarks import (
     latency,
     lateness,
     long_run,
-    loss_margins,
     machines,
     plants,
     recovery,
@@ -30,7 +29,7 @@ from benchmarks._report import run
 MODULES = (
     demo_run, emulator, flood, latency, lateness, startup, recovery, machines, plants, simulation,
     batch, campaign, long_run, relays, relay_delay, relay_flows, relay_soak,
-    guarantee, guarantee_comparison, loss_margins,
+    guarantee, guarantee_comparison,
 )  # fmt: skip
 
 if __name__ == "__main__":
