@@ -3,7 +3,7 @@
 import contextlib
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from noack.theory.certificate import (
 )
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.gains import ErrorGains, PlantGains, error_gains
+from noack.theory.run_conditions import kept_probability
 
 OWN_PLANT = "the scenario's plant"
 BOX = "every plant of the uncertainty box"
@@ -238,11 +239,17 @@ class CertificateScope:
             void = str(error)
         except (OverflowError, np.linalg.LinAlgError):
             void = _TOO_LARGE
-        assumptions = certificate_assumptions(self._resolved, conditions, self._decay, first, void)
-        return ScenarioCertificate(
+        found = ScenarioCertificate(
             self.name, trigger.beta, trigger.alpha_per_s, trigger.floor,
-            self._loop.weight is not None, conditions, tuple(assumptions), first, late, void,
+            self._loop.weight is not None, conditions, (), first, late, void,
         )  # fmt: skip
+        kept = None
+        if not self._resolved.network.enforce_mansd:
+            kept = kept_probability(self._resolved, conditions.guarantee, found.inter_event_s)
+        assumptions = certificate_assumptions(
+            self._resolved, conditions, self._decay, first, void, kept
+        )
+        return replace(found, assumptions=tuple(assumptions))
 
     def largest(self, conditions: NetworkConditions, change: Change, most_s: float = 10.0) -> float:
         """Return the largest time for which the changed conditions still have a certificate.

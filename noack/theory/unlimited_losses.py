@@ -8,7 +8,6 @@
   does so for every loss probability below 1.
 """
 
-import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -24,7 +23,8 @@ from noack.theory.certificate import NetworkConditions, VoidError
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.gains import PlantGains, error_gains
 from noack.theory.random_losses import Moments, moment_at_events, moments
-from noack.theory.scenario_certificates import CertificateScope, ScenarioCertificate
+from noack.theory.run_conditions import most_events
+from noack.theory.scenario_certificates import CertificateScope
 
 ORDERS = (1, 2)
 _MOST_BURST = 64
@@ -75,25 +75,6 @@ class UnlimitedLosses:
         }
 
 
-def kept_probability(resolved: Scenario, certificate: ScenarioCertificate) -> float | None:
-    """Bound the probability that a run keeps the guarantee of its certificate by chance.
-
-    None if it cannot be computed, or if the number of events has no bound.
-    """
-    if not (spacing_s := certificate.inter_event_s):
-        return None
-    try:
-        losses = loss_process(resolved.network.link)
-        return losses.keeps(certificate.conditions.guarantee, events_in(resolved, spacing_s))
-    except NotPredictableError:
-        return None
-
-
-def events_in(resolved: Scenario, spacing_s: float) -> int:
-    """Return the largest number of events in a run."""
-    return math.floor(resolved.timing.horizon_ns / NS_PER_S / spacing_s * (1 + 1e-12)) + 1
-
-
 def unlimited_losses(
     resolved: Scenario, scope: CertificateScope, conditions: NetworkConditions
 ) -> UnlimitedLosses:
@@ -127,7 +108,7 @@ def _bursts(
         constants, spacing_s = certificate.constants, certificate.inter_event_s
         if constants is None or not spacing_s:
             break
-        events = events_in(resolved, spacing_s)
+        events = most_events(resolved, spacing_s)
         try:
             kept = losses.keeps(LossGuarantee((LongestBurst(most),)), events)
         except NotPredictableError:
