@@ -37,8 +37,8 @@ class BurstFrequency(NamedTuple):
         return (
             f"{self.longer:,} of {self.runs:,} runs ({100 * self.longer / self.runs:.3g} %, "
             f"interval {100 * self.low:.3g} to {100 * self.high:.3g} %) had a burst longer than "
-            f"M − 1 = {self.most}; the losses' chain predicts {100 * self.predicted:.3g} % for "
-            f"{self.packets:,} packets, the most that a run sent"
+            f"M − 1 = {self.most}; at most {100 * self.predicted:.3g} % are expected, since no run "
+            f"sent more than {self.packets:,} packets"
         )
 
 
