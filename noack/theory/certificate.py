@@ -132,7 +132,7 @@ class Background(NamedTuple):
     """Bound of the inter-event time."""
 
 
-_CLEAN = Background()
+NO_BACKGROUND = Background()
 
 
 class EstimationBound(NamedTuple):
@@ -156,7 +156,7 @@ def solve(
     plant: PlantGains,
     conditions: NetworkConditions,
     bound: TriggerBound,
-    background: Background = _CLEAN,
+    background: Background = NO_BACKGROUND,
     *,
     estimation: EstimationBound = _MEASURED,
     structured: bool = True,
@@ -187,7 +187,7 @@ class Part(NamedTuple):
 def solve_sum(
     parts: Sequence[Part],
     conditions: NetworkConditions,
-    background: Background = _CLEAN,
+    background: Background = NO_BACKGROUND,
     *,
     structured: bool = True,
 ) -> list[Constants]:
@@ -200,7 +200,7 @@ def solve_sum(
 
     Raises: as :func:`solve`.
     """
-    backgrounds = [background, *[_CLEAN] * (len(parts) - 1)]
+    backgrounds = [background, *[NO_BACKGROUND] * (len(parts) - 1)]
     steps = [
         _Step(part, conditions, before) for part, before in zip(parts, backgrounds, strict=True)
     ]
@@ -306,7 +306,8 @@ class _Step:
         Raises:
             VoidError: the loop gain is not below 1.
         """
-        free, errors, held = signals.free, signals.errors, {
+        free, errors = signals.free, signals.errors
+        held: dict[str, float] = {
             Output.GAIN_RATE: self._conditions.hold_s, Output.WEIGHTED: self._remainder,
         }  # fmt: skip
         beyond = max(self._start_error, self._background.input_error)
@@ -314,7 +315,7 @@ class _Step:
         input_error = errors[Output.GAIN] + np.array([1.0, 0.0, 0.0])
 
         through = signals.row(held)
-        of_age = sum(gain * errors[output] for output, gain in held.items())
+        of_age = sum(gain * errors[Output(output)] for output, gain in held.items())
         rows = [(through @ signals.states + of_age, float(through @ free))]
         grown = []
         for growing in self._growths:
@@ -437,7 +438,8 @@ def first_passage_s(
 
         ρ(r) ≤ ∫₀^r ‖W e^{Hs} L_E‖ sup‖R_E x‖ + ‖W e^{Hs} B U‖ (π' + own · ρ(r−s)) ds
 
-    and further terms from the disturbances and ``start``. This is iterated from ρ = ``level``; every iterate is a bound until the level is reached.
+    and further terms from the disturbances and ``start``. This is iterated from ρ = ``level``;
+    every iterate is a bound until the level is reached.
 
     ``level`` is ‖e_s‖_W at an event, ``mismatch`` sup‖R_E x‖, ``own`` ‖K W^{−1}‖, and
     ``input_error`` π', the input error without the effect of the present e_s.
