@@ -1,7 +1,7 @@
 """Random loops with bounded disturbances and noise: their certificates, and their worst signals."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from noack.theory.certificate import (
     Part,
     TriggerBound,
 )
-from noack.theory.gains import ErrorGains, Forcing, PlantGains
+from noack.theory.gains import ErrorGains, Forcing, Growth, PlantGains
 from noack.theory.superposition import solve_divided
 from tests.noack.theory.loops import (
     RUNS,
@@ -49,7 +49,9 @@ class DisturbedLoop:
         return Forcing(self.columns, lasting_s, np.zeros(self.system.B.shape[1]))
 
     def certify(
-        self, change: "Callable[[DisturbedLoop], DisturbedLoop]" = lambda loop: loop
+        self,
+        change: "Callable[[DisturbedLoop], DisturbedLoop]" = lambda loop: loop,
+        plant: type[PlantGains] = PlantGains,
     ) -> "Sum":
         """The certificate; ``change`` makes it one of another loop."""
         loop = change(self)
@@ -57,11 +59,11 @@ class DisturbedLoop:
         decaying = system.gains()
         models = ErrorGains(system.H, system.K, system.weight, 0.0)
         at_rest = np.zeros((len(system.A), 1))
-        plant = PlantGains(models, system.A, system.B, at_rest, 0.0, forcing=loop.forcing)
+        pushed = plant(models, system.A, system.B, at_rest, 0.0, forcing=loop.forcing)
         estimation = EstimationBound(float(np.linalg.norm(np.abs(system.weight) @ loop.noise)))
         first, rest = solve_divided(
             Part(decaying.error, decaying, TriggerBound(system.beta, None)),
-            Part(models, plant, TriggerBound(floor, None, unit=1.0), estimation),
+            Part(models, pushed, TriggerBound(floor, None, unit=1.0), estimation),
             system.conditions,
         )
         return Sum(self.system, first, rest)
@@ -141,3 +143,45 @@ def simulate_disturbed(loop: DisturbedLoop, rng: np.random.Generator) -> Trace:
         pushes=pushes,
         estimate=lambda step, x, u: x + noise[:, step],
     )
+
+
+def without(**changes: Any) -> Callable[[DisturbedLoop], Sum]:
+    """A certificate of another loop: with some fields replaced."""
+    return lambda loop: loop.certify(lambda one: replace(one, **changes))
+
+
+def with_plant(broken: type[PlantGains]) -> Callable[[DisturbedLoop], Sum]:
+    """A certificate with other gains of the plant."""
+    return lambda loop: loop.certify(plant=broken)
+
+
+class NoPushedState(PlantGains):
+    def disturbed(self, C: Matrix) -> float:
+        return 0.0
+
+
+class NoPushedError(PlantGains):
+    """e_s does not grow by the disturbances."""
+
+    def growth(self, until_s: float, cells: int) -> Growth:
+        found = super().growth(until_s, cells)
+        return found._replace(forced=np.zeros(cells))
+
+
+BROKEN: dict[str, tuple[Callable[[DisturbedLoop], Sum], dict[str, Any]]] = {
+    "no disturbance": (
+        lambda loop: loop.certify(lambda one: replace(one, columns=0 * one.columns)),
+        {"push": 1.0, "beta": 0.01},
+    ),
+    "no noise": (
+        lambda loop: loop.certify(lambda one: replace(one, noise=0 * one.noise)),
+        {"noise": 0.1, "push": 0.02, "beta": 0.01},
+    ),
+    "no floor": (without(floor=0.0), {"floor": 0.5, "push": 0.02, "beta": 0.01}),
+    "the disturbance ends early": (without(duration_steps=(5,)), {"channels": 1, "push": 1.0}),
+    "the state is not disturbed": (with_plant(NoPushedState), {"push": 1.0, "beta": 0.01}),
+    "e_s is not disturbed": (
+        with_plant(NoPushedError),
+        {"push": 1.0, "beta": 0.01, "step_share": 0.03, "sample_steps": 4},
+    ),
+}
