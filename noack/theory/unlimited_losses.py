@@ -11,6 +11,8 @@
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
@@ -42,7 +44,9 @@ class BurstCertificate(NamedTuple):
     events: int
     """Upper bound of the number of events in a run."""
     delta: float
+    """Δ."""
     state: float
+    """Bound of ‖x‖ at t = 0, and so at all times."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +117,8 @@ def _bursts(
             kept = losses.keeps(LossGuarantee((LongestBurst(most),)), events)
         except NotPredictableError:
             break
-        found.append(BurstCertificate(most, kept, events, constants.delta, constants.state))
+        state = float(certificate.state(np.zeros(1))[0])
+        found.append(BurstCertificate(most, kept, events, constants.delta, state))
         if kept > _CERTAIN:
             break
     return found
@@ -122,6 +127,8 @@ def _bursts(
 def _moments(
     resolved: Scenario, losses: LossProcess, conditions: NetworkConditions
 ) -> tuple[list[Moments], str | None]:
+    if not _is_covered(resolved):
+        return [], "moments need the paper's trigger, and no disturbance, noise or observer"
     loop, trigger = loop_of(resolved), resolved.decaying
     decay = -max(spectral_abscissa(loop.H), spectral_abscissa(loop.A + loop.B @ loop.K))
     alpha = trigger.alpha_per_s if below(trigger.alpha_per_s, decay) else _SLOWER * decay
@@ -144,6 +151,8 @@ def _moments(
 
 def _paper(resolved: Scenario, losses: LossProcess) -> tuple[float | None, tuple[float, ...]]:
     """Return the rate and the moments at events under the paper's conditions."""
+    if not _is_covered(resolved):
+        return None, ()
     loop, alpha = loop_of(resolved), resolved.decaying.alpha_per_s
     decay = -max(spectral_abscissa(loop.H), spectral_abscissa(loop.A + loop.B @ loop.K))
     if resolved.decaying.floor > 0 or not below(alpha, decay):
@@ -153,3 +162,8 @@ def _paper(resolved: Scenario, losses: LossProcess) -> tuple[float | None, tuple
         return alpha, tuple(moment_at_events(error, losses, 0.0, order) for order in ORDERS)
     except (VoidError, NotDecayingError):
         return None, ()
+
+
+def _is_covered(resolved: Scenario) -> bool:
+    coverage = resolved.coverage
+    return not resolved.plant.disturbances and coverage.knows_state and coverage.is_decaying
