@@ -335,9 +335,7 @@ def _at_floor(first: Constants, share: float) -> Constants:
     times: for s ≤ t, θ(s) ≤ θ(t) e^{α(t−s)}, which is all that their proof uses of βe^{−αt}.
     """
     scaled = ("input_error", "start_error", "state", "state_weighted", "mismatch")
-    return first._replace(
-        rate_per_s=0.0, **{name: share * getattr(first, name) for name in scaled}
-    )
+    return first._replace(rate_per_s=0.0, **{name: share * getattr(first, name) for name in scaled})
 
 
 def _is_finite(constants: Constants) -> bool:
