@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.measurement.confidence_interval import binomial_estimate
+from cosim.studies.campaign.draw_statistics import CONFIDENCE
 from cosim.studies.campaign.metrics import Metric
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
@@ -24,7 +24,7 @@ class BurstFrequency(NamedTuple):
     longer: int
     """Number of runs with a longer burst."""
     low: float
-    """The confidence interval of their share."""
+    """Low end of the confidence interval of their share (Clopper and Pearson)."""
     high: float
     packets: int
     """Largest number of packets of a run."""
@@ -44,18 +44,22 @@ class BurstFrequency(NamedTuple):
 
 def burst_frequency(scenario: Scenario, metrics: Mapping[Metric, Vector]) -> BurstFrequency | None:
     """Compare; None if the network enforces the guarantee or the losses cannot be predicted."""
+    from scipy.stats import binomtest
+
     network = resolve(scenario).network
     if network.enforce_mansd:
         return None
     bursts, packets = metrics["longest_loss_burst"], metrics["transmissions"]
     finished = np.isfinite(bursts)
     longer, runs = int((bursts[finished] > network.mansd).sum()), int(finished.sum())
-    interval = binomial_estimate(longer, runs)
-    if interval is None:
+    if not runs:
         return None
+    interval = binomtest(longer, runs).proportion_ci(CONFIDENCE)
     most = int(packets[finished].max())
     try:
         kept = loss_process(network.link).keeps(LossGuarantee((LongestBurst(network.mansd),)), most)
     except NotPredictableError:
         return None
-    return BurstFrequency(network.mansd, runs, longer, *interval[1:], most, 1 - kept)
+    return BurstFrequency(
+        network.mansd, runs, longer, float(interval.low), float(interval.high), most, 1 - kept
+    )
