@@ -30,4 +30,5 @@ def print_margin(console: Console, margin: MarginResult) -> None:
     if margin.period is not None:
         text = f"for {margin.guarantee}: {margin.period.text}"
         console.print(text, soft_wrap=True, highlight=False)
+    console.print(margin.random_text, soft_wrap=True, highlight=False, markup=False)
     console.print("[dim]D delivered, L lost, repeated. Below 1: every pattern is stable.[/]")
