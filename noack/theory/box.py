@@ -35,7 +35,7 @@ class BoxGains(PlantGains):
     is_one_plant: ClassVar = False
 
     @cached_property
-    def states(self) -> Mapping[Output, Coefficients]:
+    def states(self) -> Mapping[str, Coefficients]:
         """sup‖C x‖ from x(0) and from the input error; w is added to ``MISMATCH``.
 
         Raises:
@@ -55,7 +55,7 @@ class BoxGains(PlantGains):
         )
         return found
 
-    def start_up(self, start_s: float) -> tuple[float, Mapping[Output, float]]:
+    def start_up(self, start_s: float) -> tuple[float, Mapping[str, float]]:
         """Return the effect of zero input before ``start_s``: p = −K x, x' = A x for every A.
 
         With zero input w = Ã x, which the bound of w covers.
@@ -114,7 +114,7 @@ class BoxGains(PlantGains):
         )
 
     @cached_property
-    def _peaks(self) -> Mapping[Output, "_PeakGains"]:
+    def _peaks(self) -> Mapping[str, "_PeakGains"]:
         return {output: self._peaks_at(C) for output, C in self.outputs.items()}
 
     @cached_property

@@ -10,22 +10,26 @@ its guarantee about losses, and the input is held. With all signals scaled by e^
     β̃ = sup‖e_s‖_W ≤ ḡβ + I_E sup‖R_E x‖ + I_B π                      (between two tests)
 
 with at most N missing events: the longest burst of losses, and ⌈d/δ⌉ in flight. Γ_C is smaller if
-few updates may be lost in a window (:mod:`noack.theory.loss_accumulation`). These inequalities are
-linear in q and β̃ and hold on every [0, T]. So their solution bounds the run if the loop gain is
-below 1. The minimum inter-event
+few updates may be lost in a window (:mod:`noack.theory.loss_accumulation`). A policy's
+threshold may contain more than β, see :class:`TriggerBound`. These inequalities are linear in q
+and β̃ and hold on every [0, T]. So their solution (:mod:`noack.theory.nonnegative_system`) bounds
+the run if the loop gain is below 1. The minimum inter-event
 time δ is the time that ‖e_s‖_W needs from 0 to β under these bounds. If an assumed δ gives a time
 of at least δ, it holds by induction over the events; the largest such δ is used.
 """
 
 import math
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 
+from noack.core.linear_systems import Vector
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, LossRule
 from noack.theory.gains import Coefficients, ErrorGains, Output, PlantGains
 from noack.theory.loss_accumulation import LossAccumulation
+from noack.theory.nonnegative_system import solve_inequalities
 
 _SHORTEST_S, _LONGEST_S = 1e-9, 1e6
 _SETTLED = 1e-3
@@ -89,13 +93,24 @@ class VoidError(ArithmeticError):
     """There is no certificate; the message has the reason."""
 
 
-class Level(NamedTuple):
-    """The trigger's threshold, scaled."""
+class TriggerBound(NamedTuple):
+    """What a trigger guarantees about e_s, scaled.
+
+    After each of its tests ‖e_s‖_W ≤ β + Σ_C share_C sup‖C x‖.
+    """
 
     beta: float
-    """β: after a test, ‖e_s‖_W ≤ β."""
+    """β, in the units of ‖W x‖."""
     reached: float | None
     """The smallest ‖e_s‖_W at an event; None if it may be arbitrarily small."""
+    shares: Mapping[str, float] = MappingProxyType({})
+    """share_C by the name of C in :attr:`PlantGains.outputs`."""
+    untested_s: float = 0.0
+    """After an event the trigger is not tested for this time: e_s grows from 0 for up to h more."""
+    apart_s: float = 0.0
+    """Events are at least this far apart, whatever happens to e_s."""
+    unit: float | None = None
+    """Unit of the constants Δ and β̃/β; by default β."""
 
 
 class Background(NamedTuple):
@@ -122,7 +137,7 @@ def solve(
     error: ErrorGains,
     plant: PlantGains,
     conditions: NetworkConditions,
-    level: Level,
+    bound: TriggerBound,
     background: Background = _CLEAN,
     *,
     structured: bool = True,
@@ -136,21 +151,22 @@ def solve(
         VoidError: the loop gain is not below 1.
         NotDecayingError: a mode of the loop decays more slowly than the threshold.
     """
-    step = _Step(error, plant, conditions, level, background)
+    step = _Step(error, plant, conditions, bound, background)
     if structured and plant.is_one_plant:
         step.use_windows()
-    if level.reached is None:
-        return step.constants(conditions.spacing_s, None)
+    least_s = max(conditions.spacing_s, bound.apart_s)
+    if bound.reached is None:
+        return step.constants(least_s, bound.apart_s or None)
     spacing_s = background.inter_event_s
     for _ in range(_ATTEMPTS):
-        if spacing_s <= conditions.spacing_s:
+        if spacing_s <= least_s:
             break
         found_s = step.inter_event_s(spacing_s)
         if found_s >= spacing_s:
             return step.constants(spacing_s, spacing_s)
         # Iterate from above to the largest spacing that is consistent with itself.
         spacing_s = found_s if found_s < (1 - _SETTLED) * spacing_s else (1 - _SETTLED) * found_s
-    return step.constants(conditions.spacing_s, conditions.spacing_s or None)
+    return step.constants(least_s, least_s or None)
 
 
 class _Step:
@@ -161,11 +177,11 @@ class _Step:
         error: ErrorGains,
         plant: PlantGains,
         conditions: NetworkConditions,
-        level: Level,
+        bound: TriggerBound,
         background: Background,
     ) -> None:
         self._error, self._plant = error, plant
-        self._conditions, self._level, self._background = conditions, level, background
+        self._conditions, self._bound, self._background = conditions, bound, background
         self._lost: LossAccumulation | None = None
         self._remainder = error.hold_remainder(conditions.hold_s)
         self._start_error, start = plant.start_up(conditions.start_s)
@@ -173,12 +189,10 @@ class _Step:
             output: Coefficients(free + start[output], gain)
             for output, (free, gain) in plant.states.items()
         }
-        self._stretch = error.stretch(conditions.sampling_s)
-        self._mismatch_growth, self._input_growth = 0.0, 0.0
-        if conditions.sampling_s > 0:
-            growth = plant.growth(conditions.sampling_s, _COARSE)
-            self._mismatch_growth = growth.mismatch.integral_on_grid()
-            self._input_growth = growth.input_error.integral_on_grid()
+        self._growths = [_Growing(plant, conditions.sampling_s, bound)]
+        if bound.untested_s > 0:
+            longest_s = conditions.sampling_s + bound.untested_s
+            self._growths.append(_Growing(plant, longest_s, None))
 
     def use_windows(self) -> None:
         """Use how many updates may be lost in a window, too."""
@@ -191,41 +205,19 @@ class _Step:
             output: self._error.now(output) + self._error.missing(output, events, spacing_s)
             for output in self._error.outputs
         }
-        hold_s, states = self._conditions.hold_s, self._states
-        rate, weighted = states[Output.GAIN_RATE], states[Output.WEIGHTED]
-        mismatch = states[Output.MISMATCH]
         from_errors = self._from_errors(events, spacing_s, shares[Output.GAIN])
-        # q = own q + from_e_s β̃ + input_fixed,   β̃ = from_q q + echo β̃ + error_fixed
-        own = hold_s * rate.gain + self._remainder * weighted.gain
-        from_e_s = hold_s * (from_errors[Output.GAIN_RATE] + shares[Output.GAIN_RATE])
-        from_e_s += self._remainder * (from_errors[Output.WEIGHTED] + shares[Output.WEIGHTED])
-        input_fixed = hold_s * rate.free + self._remainder * weighted.free
-        from_q = self._mismatch_growth * mismatch.gain + self._input_growth
-        echo = self._mismatch_growth * from_errors[Output.MISMATCH]
-        echo += self._input_growth * shares[Output.GAIN]
-        error_fixed = max(
-            self._stretch * self._level.beta
-            + self._mismatch_growth * max(mismatch.free, self._background.mismatch)
-            + self._input_growth * max(self._start_error, self._background.input_error),
-            self._background.sensor_error,
-        )
-        margin = (1 - own) * (1 - echo) - from_e_s * from_q
-        loop_gain = max(own, echo, 1 - margin)
-        if not loop_gain < 1:
-            raise VoidError(f"the loop gain of the errors is {loop_gain:.3g}, not below 1")
-        held = (input_fixed * (1 - echo) + from_e_s * error_fixed) / margin
-        sensor_error = ((1 - own) * error_fixed + from_q * input_fixed) / margin
-        input_error = shares[Output.GAIN] * sensor_error + held
+        loop_gain, (held, sensor_error) = self._solved(shares, from_errors)
         state = {
             output: free + gain * held + from_errors[output] * sensor_error
-            for output, (free, gain) in states.items()
+            for output, (free, gain) in self._states.items()
         }
+        unit = self._bound.beta if self._bound.unit is None else self._bound.unit
         return Constants(
             self._error.alpha_per_s,
             events,
-            shares[Output.WEIGHTED] * sensor_error / self._level.beta,
-            sensor_error / self._level.beta,
-            input_error,
+            shares[Output.WEIGHTED] * sensor_error / unit,
+            sensor_error / unit,
+            shares[Output.GAIN] * sensor_error + held,
             self._start_error,
             state[Output.STATE],
             state[Output.WEIGHTED],
@@ -234,7 +226,41 @@ class _Step:
             loop_gain,
         )
 
-    def _from_errors(self, events: int, spacing_s: float, share: float) -> Mapping[Output, float]:
+    def _solved(
+        self, shares: Mapping[Output, float], from_errors: Mapping[str, float]
+    ) -> tuple[float, Vector]:
+        """Return the loop gain and the bounds of (q, β̃).
+
+        sup‖C x‖ is free_C + (gain_C, Γ_C)·(q, β̃); the rest of the right sides is (D, g).
+        """
+        names = list(self._states)
+        free = np.array([self._states[name].free for name in names])
+        from_signals = np.array([(self._states[name].gain, from_errors[name]) for name in names])
+        hold_s, remainder = self._conditions.hold_s, self._remainder
+
+        def row(gains: Mapping[str, float]) -> Vector:
+            return np.array([gains.get(name, 0.0) for name in names])
+
+        of_hold = {Output.GAIN_RATE: hold_s, Output.WEIGHTED: remainder}
+        through = row(of_hold)
+        direct = np.array([0.0, sum(gain * shares[output] for output, gain in of_hold.items())])
+        F, g = [direct + through @ from_signals], [through @ free]
+        at_growth = np.maximum(free, row({Output.MISMATCH: self._background.mismatch}))
+        beyond = max(self._start_error, self._background.input_error)
+        grown = []
+        for growing in self._growths:
+            through = row(growing.shares)
+            ofp = growing.input_error * np.array([1.0, shares[Output.GAIN]])
+            fixed = growing.beta + through @ at_growth + growing.input_error * beyond
+            grown.append((ofp + through @ from_signals, fixed))
+        F.append(np.max([gains for gains, _ in grown], axis=0))
+        g.append(max(self._background.sensor_error, *(fixed for _, fixed in grown)))
+        solution = solve_inequalities(np.array(F), np.array(g))
+        if solution.bound is None:
+            raise VoidError(f"the loop gain of the errors is {solution.loop_gain:.3g}, not below 1")
+        return solution.loop_gain, solution.bound
+
+    def _from_errors(self, events: int, spacing_s: float, share: float) -> Mapping[str, float]:
         """Return Γ_C for every output, from D_K, the ``share``, and from the losses in windows.
 
         The second is computed only where it can be smaller: where all lost updates together have
@@ -257,15 +283,17 @@ class _Step:
         """Return the time that ‖e_s‖_W needs to the next event, given the spacing before it."""
         found = self.constants(spacing_s, None)
         own = self._error.now(Output.GAIN)
-        others = found.input_error - own * found.overshoot * self._level.beta
-        assert self._level.reached is not None
+        unit = self._bound.beta if self._bound.unit is None else self._bound.unit
+        others = found.input_error - own * found.overshoot * unit
+        assert self._bound.reached is not None
         found_s = first_passage_s(
             self._plant,
-            self._level.reached,
+            self._bound.reached,
             max(found.mismatch, self._background.mismatch),
             max(others, self._start_error, self._background.input_error),
             own,
         )
+        found_s = max(found_s, self._bound.apart_s)
         grid_s = self._conditions.spacing_s
         return found_s if grid_s == 0 else grid_s * max(1, math.ceil(found_s / grid_s - 1e-9))
 
@@ -276,6 +304,25 @@ class _Step:
         if spacing_s == 0:
             raise VoidError("events may be arbitrarily close, so that any number may be under way")
         return dropouts + math.ceil(delay_s / spacing_s)
+
+
+class _Growing:
+    """The growth of e_s without a test: from the bound after a test, or from 0 after an event.
+
+    sup‖e_s‖_W ≤ ``beta`` + Σ_C ``shares``_C sup‖C x‖ + ``input_error`` sup‖p‖
+    """
+
+    def __init__(self, plant: PlantGains, longest_s: float, after: TriggerBound | None) -> None:
+        stretch = plant.error.stretch(longest_s) if after else 0.0
+        self.beta = stretch * after.beta if after else 0.0
+        shares = {C: stretch * share for C, share in (after.shares if after else {}).items()}
+        self.input_error = 0.0
+        if longest_s > 0:
+            growth = plant.growth(longest_s, _COARSE)
+            mismatch = growth.mismatch.integral_on_grid()
+            shares[Output.MISMATCH] = shares.get(Output.MISMATCH, 0.0) + mismatch
+            self.input_error = growth.input_error.integral_on_grid()
+        self.shares: Mapping[str, float] = shares
 
 
 def first_passage_s(

@@ -10,9 +10,10 @@ interest are the weighted norm W, the state itself, E x, and K H x (the error ra
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
+from types import MappingProxyType
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -158,6 +159,8 @@ class PlantGains:
     B: Matrix
     start: Matrix
     alpha_per_s: float
+    further_outputs: Mapping[str, Matrix] = field(default=MappingProxyType({}), kw_only=True)
+    """Further matrices C, (k, n), by name: sup‖C x‖ is bounded for them, too."""
 
     is_one_plant: ClassVar = True
     """Whether A and B are the plant's, and not the centre of a box."""
@@ -178,17 +181,18 @@ class PlantGains:
         return factors(self.A + self.B @ self.error.K - self.error.H)
 
     @cached_property
-    def outputs(self) -> Mapping[Output, Matrix]:
+    def outputs(self) -> Mapping[str, Matrix]:
         """C of each output C x."""
         return {
             Output.STATE: np.eye(len(self.A)),
             Output.WEIGHTED: self.error.weight,
             Output.MISMATCH: self.split_mismatch[1],
             Output.GAIN_RATE: self.error.outputs[Output.GAIN_RATE],
+            **self.further_outputs,
         }
 
     @cached_property
-    def states(self) -> Mapping[Output, Coefficients]:
+    def states(self) -> Mapping[str, Coefficients]:
         """sup‖C x‖ from x(0) and from the input error.
 
         Raises:
@@ -201,7 +205,7 @@ class PlantGains:
         }
 
     @cached_property
-    def forced(self) -> Mapping[Output, KernelBounds]:
+    def forced(self) -> Mapping[str, KernelBounds]:
         """‖C e^{(A+BK+αI)τ} B U‖ for every output."""
         return {output: self._forced.through(C) for output, C in self.outputs.items()}
 
@@ -209,7 +213,7 @@ class PlantGains:
     def _forced(self) -> ResponseBounds:
         return response(self.closed_loop, self.input_matrix)
 
-    def start_up(self, start_s: float) -> tuple[float, Mapping[Output, float]]:
+    def start_up(self, start_s: float) -> tuple[float, Mapping[str, float]]:
         """Return the effect of zero input before ``start_s``, where p = −K x.
 
         Returns:

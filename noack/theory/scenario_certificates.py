@@ -17,8 +17,8 @@ from noack.theory.box import BoxGains
 from noack.theory.certificate import (
     Background,
     Constants,
-    Level,
     NetworkConditions,
+    TriggerBound,
     VoidError,
     solve,
 )
@@ -283,14 +283,14 @@ class CertificateScope:
         start = self._loop.x0[:, None]
         if not self._held and below(alpha, decay) and floor < beta:
             try:
-                return self._solve(conditions, alpha, alpha, start, Level(beta, beta))
+                return self._solve(conditions, alpha, alpha, start, TriggerBound(beta, beta))
             except NotDecayingError:
                 if floor > 0:
                     raise
                 return self._slower(conditions, alpha, start)
         # Certify a slower decay or none; the smallest event level is then the floor, if any.
         slower = 0.0 if self._held or floor > 0 else max(_SLOWER * decay, 0.0)
-        level = Level(max(beta, floor), floor or None)
+        level = TriggerBound(max(beta, floor), floor or None)
         return self._solve(conditions, slower, slower, start, level)
 
     def _slower(
@@ -304,7 +304,7 @@ class CertificateScope:
         for share in _SHARES_OF_ALPHA:
             rate = share * alpha_per_s
             with contextlib.suppress(NotDecayingError):
-                level = Level(self._resolved.decaying.beta, None)
+                level = TriggerBound(self._resolved.decaying.beta, None)
                 return self._solve(conditions, rate, rate, start, level)
         raise NotDecayingError("the uncertainty box is too large for the loop's gains")
 
@@ -332,7 +332,7 @@ class CertificateScope:
             alpha,
             0.0,
             share * first.state * np.eye(self._loop.n),
-            Level(floor, floor),
+            TriggerBound(floor, floor),
             background,
         )
         return found._replace(rate_per_s=0.0)
@@ -343,7 +343,7 @@ class CertificateScope:
         error_alpha_per_s: float,
         plant_alpha_per_s: float,
         start: Matrix,
-        level: Level,
+        level: TriggerBound,
         background: Background | None = None,
     ) -> Constants:
         if error_alpha_per_s not in self._errors:

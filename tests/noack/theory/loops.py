@@ -20,7 +20,7 @@ from noack.impairments.loss_guarantee import (
     LossGuarantee,
     LossRule,
 )
-from noack.theory.certificate import Constants, Level, NetworkConditions, VoidError, solve
+from noack.theory.certificate import Constants, NetworkConditions, TriggerBound, VoidError, solve
 from noack.theory.gains import ErrorGains, PlantGains
 
 Reals = NDArray[np.float64]
@@ -105,7 +105,7 @@ class System:
         *,
         structured: bool = True,
     ) -> Constants:
-        plant, level = plant or self.gains(), Level(self.beta, self.beta)
+        plant, level = plant or self.gains(), TriggerBound(self.beta, self.beta)
         conditions = conditions or self.conditions
         return solve(plant.error, plant, conditions, level, structured=structured)
 
