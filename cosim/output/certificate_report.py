@@ -29,6 +29,7 @@ from noack.theory.scenario_certificates import (
     own_plant,
 )
 from noack.theory.weight import choose_weight
+from noack.trigger.decaying import DecayingSettings
 
 IDEAL = "paper"
 """The paper's conditions: no sampling, no delay, no hold."""
@@ -155,8 +156,10 @@ class Certificates:
 
 
 def _theorem_2(scenario: Scenario, certificate: ScenarioCertificate) -> Theorem2 | None:
-    trigger, constants = scenario.decaying, certificate.constants
-    if constants is None or constants.rate_per_s != trigger.alpha_per_s:
+    trigger, constants = scenario.trigger, certificate.constants
+    if not isinstance(trigger, DecayingSettings) or constants is None:
+        return None
+    if constants.rate_per_s != trigger.alpha_per_s:
         return None
     if trigger.floor or trigger.weight is not None:
         return None
@@ -186,7 +189,7 @@ def with_weight(
     elif which != "identity":
         raise CallerError(f'weight: given, identity or chosen, not "{which}"')
     rows = None if weight is None else tuple(tuple(row) for row in weight.tolist())
-    trigger = resolved.decaying.model_copy(update={"weight": rows})
+    trigger = resolved.trigger.model_copy(update={"weight": rows})
     return resolved.model_copy(update={"trigger": trigger}), weight
 
 
@@ -268,12 +271,11 @@ def _in_words(found: Certificates) -> Iterator[str]:
 
 
 def _print_constants(console: Console, found: Certificates) -> None:
-    trigger = found.scenario.decaying
+    trigger = found.scenario.trigger
     norm = "‖W·‖" if trigger.weight is not None else "‖·‖"
     table = Table(
         title=f"{found.scenario.name}: certified bounds, "
-        f"{found.scenario.network.guarantee.meaning}, β = {trigger.beta:g}, "
-        f"α = {trigger.alpha_per_s:g} /s, norm {norm}"
+        f"{found.scenario.network.guarantee.meaning}; event: {trigger.description}; norm {norm}"
     )
     table.add_column("")
     for under, certificate in found:
@@ -320,7 +322,7 @@ def _constants(found: Certificates) -> Iterator[tuple[str, list[str], str]]:
         delta_2 = "(same)"
         state_2 = number(theorem.state_start + theorem.state_forced, 4)
         spacing_2 = number(theorem.inter_event_s, 4)
-    rate_2 = number(found.scenario.decaying.alpha_per_s, 4)
+    rate_2 = number(found.scenario.trigger.threshold_decay_per_s, 4)
     yield "decay rate, 1/s", constant("rate_per_s"), rate_2
     yield "updates outstanding", constant("missing_events"), NONE
     yield "Δ, bound of ‖e_c‖/β", constant("delta"), delta_2

@@ -235,16 +235,18 @@ def certificate_assumptions(
     decay: dict[str, float],
     constants: Constants | None,
     void: str | None,
+    promise: str,
 ) -> list[Assumption]:
     """Return the assumptions of a certificate, with verdicts.
 
     ``decay`` has the decay rates per second of "the models" (infinite if they hold) and "A + BK".
-    Without a certificate, ``constants`` is None and ``void`` is the reason.
+    Without a certificate, ``constants`` is None and ``void`` is the reason. ``promise`` is what the
+    trigger's rule promises.
     """
-    alpha = resolved.decaying.alpha_per_s
+    alpha = resolved.trigger.threshold_decay_per_s
     slower = 0.0 if constants is None else constants.rate_per_s
-    found = []
-    for of, source in (("the models", "(I1)"), ("A + BK", "Theorem 2")):
+    found = [Assumption("the trigger", "certificate", AssumptionStatus.HOLDS, promise)]
+    for of, source in (("the models", "(I1)"), ("A + BK", "Theorem 2")) if alpha else ():
         holds = below(alpha, decay[of])
         why = f"α = {alpha:g} /s, {_decays(decay[of])}"
         if slower and not holds:

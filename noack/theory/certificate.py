@@ -19,7 +19,7 @@ of at least δ, it holds by induction over the events; the largest such δ is us
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -29,7 +29,7 @@ from noack.core.linear_systems import Vector
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, LossRule
 from noack.theory.gains import Coefficients, ErrorGains, Output, PlantGains
 from noack.theory.loss_accumulation import LossAccumulation
-from noack.theory.nonnegative_system import solve_inequalities
+from noack.theory.nonnegative_system import Solution, solve_inequalities
 
 _SHORTEST_S, _LONGEST_S = 1e-9, 1e6
 _SETTLED = 1e-3
@@ -107,8 +107,17 @@ class TriggerBound(NamedTuple):
     """share_C by the name of C in :attr:`PlantGains.outputs`."""
     untested_s: float = 0.0
     """After an event the trigger is not tested for this time: e_s grows from 0 for up to h more."""
+    is_tested: bool = True
+    """Whether there is a test at all; without one, only the time since the event bounds e_s."""
+    ago_s: float = 0.0
+    """The bound is that of ‖e_s‖_W at some time up to this long before the test. An event comes no
+    earlier than this after the last one, unless ‖e_s‖_W has exceeded ``reached``."""
     apart_s: float = 0.0
     """Events are at least this far apart, whatever happens to e_s."""
+    due_s: float = math.inf
+    """Events are at most this far apart."""
+    also: tuple["TriggerBound", ...] = ()
+    """Further bounds that hold at the same time; only their e_s is used, not their times."""
     unit: float | None = None
     """Unit of the constants Δ and β̃/β; by default β."""
 
@@ -155,7 +164,7 @@ def solve(
     if structured and plant.is_one_plant:
         step.use_windows()
     least_s = max(conditions.spacing_s, bound.apart_s)
-    if bound.reached is None:
+    if bound.reached is None and all(one.reached is None for one in bound.also):
         return step.constants(least_s, bound.apart_s or None)
     spacing_s = background.inter_event_s
     for _ in range(_ATTEMPTS):
@@ -189,20 +198,21 @@ class _Step:
             output: Coefficients(free + start[output], gain)
             for output, (free, gain) in plant.states.items()
         }
-        self._growths = [_Growing(plant, conditions.sampling_s, bound)]
-        if bound.untested_s > 0:
-            longest_s = conditions.sampling_s + bound.untested_s
-            self._growths.append(_Growing(plant, longest_s, None))
+        self._growths = [
+            _growing(plant, conditions.sampling_s, one) for one in (bound, *bound.also)
+        ]
+        """The rows of each bound, of which the larger one counts."""
 
     def use_windows(self) -> None:
         """Use how many updates may be lost in a window, too."""
-        self._lost = LossAccumulation(self._plant, self._conditions.delay_s)
+        if self._error.decays:
+            self._lost = LossAccumulation(self._plant, self._conditions.delay_s)
 
     def constants(self, spacing_s: float, inter_event_s: float | None) -> Constants:
         """Return all constants, given inter-event times of at least ``spacing_s``."""
         events = self._missing(spacing_s)
         shares = {
-            output: self._error.now(output) + self._error.missing(output, events, spacing_s)
+            output: self._error.now(output) + self._missing_gain(output, events, spacing_s)
             for output in self._error.outputs
         }
         from_errors = self._from_errors(events, spacing_s, shares[Output.GAIN])
@@ -247,18 +257,28 @@ class _Step:
         F, g = [direct + through @ from_signals], [through @ free]
         at_growth = np.maximum(free, row({Output.MISMATCH: self._background.mismatch}))
         beyond = max(self._start_error, self._background.input_error)
-        grown = []
-        for growing in self._growths:
+
+        def solved(growing: _Growing) -> Solution:
             through = row(growing.shares)
             ofp = growing.input_error * np.array([1.0, shares[Output.GAIN]])
             fixed = growing.beta + through @ at_growth + growing.input_error * beyond
-            grown.append((ofp + through @ from_signals, fixed))
-        F.append(np.max([gains for gains, _ in grown], axis=0))
-        g.append(max(self._background.sensor_error, *(fixed for _, fixed in grown)))
-        solution = solve_inequalities(np.array(F), np.array(g))
-        if solution.bound is None:
-            raise VoidError(f"the loop gain of the errors is {solution.loop_gain:.3g}, not below 1")
-        return solution.loop_gain, solution.bound
+            fixed = max(fixed, self._background.sensor_error)
+            return solve_inequalities(
+                np.array([*F, ofp + through @ from_signals]), np.array([*g, fixed])
+            )
+
+        # Of each bound, one of its rows applies; of all bounds, the smallest.
+        found = [_largest([solved(one) for one in rows]) for rows in self._growths]
+        gain = min(one.loop_gain for one in found)
+        bounds = [one.bound for one in found if one.bound is not None]
+        if not bounds:
+            raise VoidError(f"the loop gain of the errors is {gain:.3g}, not below 1")
+        return gain, np.min(bounds, axis=0)
+
+    def _missing_gain(self, output: Output, events: int, spacing_s: float) -> float:
+        if self._error.decays or math.isinf(self._bound.due_s):
+            return self._error.missing(output, events, spacing_s)
+        return self._error.missing_until(output, events, self._bound.due_s)
 
     def _from_errors(self, events: int, spacing_s: float, share: float) -> Mapping[str, float]:
         """Return Γ_C for every output, from D_K, the ``share``, and from the losses in windows.
@@ -267,12 +287,14 @@ class _Step:
         less effect than the longest burst at its largest.
         """
         found = {output: gain * share for output, (_, gain) in self._states.items()}
+        if self._lost is None:
+            return found
         error, windows = self._error, self._conditions.guarantee.windows
         in_flight = events - self._conditions.dropouts
-        present = error.now(Output.GAIN) + error.missing(Output.GAIN, in_flight, spacing_s)
+        present = error.now(Output.GAIN) + self._missing_gain(Output.GAIN, in_flight, spacing_s)
         density = min(window.losses / window.packets for window in windows)
         lasting = density * error.kernels[Output.GAIN].integral()
-        if self._lost is None or not lasting < (share - present) * spacing_s:
+        if not lasting < (share - present) * spacing_s:
             return found
         for output, (_, gain) in self._states.items():
             together = gain * present + self._lost.total(output, spacing_s, windows)
@@ -285,15 +307,17 @@ class _Step:
         own = self._error.now(Output.GAIN)
         unit = self._bound.beta if self._bound.unit is None else self._bound.unit
         others = found.input_error - own * found.overshoot * unit
-        assert self._bound.reached is not None
-        found_s = first_passage_s(
-            self._plant,
-            self._bound.reached,
-            max(found.mismatch, self._background.mismatch),
-            max(others, self._start_error, self._background.input_error),
-            own,
+        mismatch = max(found.mismatch, self._background.mismatch)
+        others = max(others, self._start_error, self._background.input_error)
+        found_s = max(
+            min(
+                first_passage_s(self._plant, one.reached, mismatch, others, own),
+                one.ago_s or math.inf,
+            )
+            for one in (self._bound, *self._bound.also)
+            if one.reached is not None
         )
-        found_s = max(found_s, self._bound.apart_s)
+        found_s = max(min(found_s, self._bound.due_s), self._bound.apart_s)
         grid_s = self._conditions.spacing_s
         return found_s if grid_s == 0 else grid_s * max(1, math.ceil(found_s / grid_s - 1e-9))
 
@@ -306,23 +330,43 @@ class _Step:
         return dropouts + math.ceil(delay_s / spacing_s)
 
 
-class _Growing:
-    """The growth of e_s without a test: from the bound after a test, or from 0 after an event.
+class _Growing(NamedTuple):
+    """The growth of e_s without a test: ‖e_s‖_W ≤ β + Σ_C share_C sup‖C x‖ + gain · sup‖p‖."""
 
-    sup‖e_s‖_W ≤ ``beta`` + Σ_C ``shares``_C sup‖C x‖ + ``input_error`` sup‖p‖
-    """
+    beta: float
+    shares: Mapping[str, float]
+    input_error: float
 
-    def __init__(self, plant: PlantGains, longest_s: float, after: TriggerBound | None) -> None:
-        stretch = plant.error.stretch(longest_s) if after else 0.0
-        self.beta = stretch * after.beta if after else 0.0
-        shares = {C: stretch * share for C, share in (after.shares if after else {}).items()}
-        self.input_error = 0.0
-        if longest_s > 0:
-            growth = plant.growth(longest_s, _COARSE)
-            mismatch = growth.mismatch.integral_on_grid()
-            shares[Output.MISMATCH] = shares.get(Output.MISMATCH, 0.0) + mismatch
-            self.input_error = growth.input_error.integral_on_grid()
-        self.shares: Mapping[str, float] = shares
+
+def _growing(plant: PlantGains, sampling_s: float, bound: TriggerBound) -> list[_Growing]:
+    """Return the growth from the bound after a test, and from 0 after an event."""
+    found = []
+    if bound.is_tested:
+        stretch = plant.error.stretch(sampling_s + bound.ago_s)
+        shares = {C: stretch * share for C, share in bound.shares.items()}
+        found.append(_grown(plant, sampling_s + bound.ago_s, stretch * bound.beta, shares))
+    if bound.untested_s > 0 or not bound.is_tested:
+        found.append(_grown(plant, sampling_s + bound.untested_s, 0.0, {}))
+    return found
+
+
+def _grown(
+    plant: PlantGains, longest_s: float, beta: float, shares: Mapping[str, float]
+) -> _Growing:
+    """Return the growth over a time from β and shares, which have grown already."""
+    if not longest_s > 0:
+        return _Growing(beta, shares, 0.0)
+    growth = plant.growth(longest_s, _COARSE)
+    mismatch = shares.get(Output.MISMATCH, 0.0) + growth.mismatch.integral_on_grid()
+    through = {**shares, Output.MISMATCH: mismatch}
+    return _Growing(beta, through, growth.input_error.integral_on_grid())
+
+
+def _largest(found: Sequence[Solution]) -> Solution:
+    """Return the larger of several solutions; no bound if one has none."""
+    bounds = [one.bound for one in found if one.bound is not None]
+    gain = max(one.loop_gain for one in found)
+    return Solution(gain, np.max(bounds, axis=0) if len(bounds) == len(found) else None)
 
 
 def first_passage_s(

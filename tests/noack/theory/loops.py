@@ -3,6 +3,7 @@
 Every signal is propagated by matrix exponentials on a grid finer than every period of the loop.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -160,6 +161,10 @@ def times_s(system: System) -> Reals:
     return np.arange(STEPS) * system.step_s
 
 
+EventRule = Callable[[int, NDArray[np.int64], Reals, Reals], Flags]
+"""Which runs have an event at a test, from the step, the steps since each last event, x and e_s."""
+
+
 class Plants(NamedTuple):
     """Plants between which each run switches arbitrarily."""
 
@@ -176,6 +181,7 @@ def simulate(
     *,
     floor: float = 0.0,
     plants: Plants | None = None,
+    rule: "EventRule | None" = None,
 ) -> Trace:
     """Simulate all runs at once.
 
@@ -185,6 +191,7 @@ def simulate(
         delays: (runs, events) delay of each update in steps.
         floor: floor of the trigger's threshold.
         plants: replace the system's own plant.
+        rule: replaces the decaying threshold.
     """
     runs, n, K, W = len(delivered), len(system.A), system.K.T, system.weight.T
     pool = [(system.A, system.B)] if plants is None else plants.pool
@@ -204,7 +211,10 @@ def simulate(
         threshold = max(system.beta * np.exp(-system.alpha * step * system.step_s), floor)
         trace[0, step] = np.linalg.norm((x_s - x) @ W, axis=1).max()
         if step % system.sample_steps == 0:
-            event = np.linalg.norm((x_s - x) @ W, axis=1) > threshold
+            if rule is None:
+                event = np.linalg.norm((x_s - x) @ W, axis=1) > threshold
+            else:
+                event = rule(step, step - last_event, x, x_s - x)
             event |= step == 0 and not system.known_start
             shortest = min(
                 shortest, int((step - last_event)[event & (events > 0)].min(initial=10**9))
