@@ -5,6 +5,7 @@ import sys
 from benchmarks import (
     batch,
     campaign,
+    certificates,
     demo_run,
     emulator,
     flood,
@@ -30,7 +31,7 @@ from benchmarks._report import run
 MODULES = (
     demo_run, emulator, flood, latency, lateness, startup, recovery, machines, plants, simulation,
     batch, campaign, long_run, relays, relay_delay, relay_flows, relay_soak,
-    guarantee, guarantee_comparison, loss_margins,
+    guarantee, guarantee_comparison, loss_margins, certificates,
 )  # fmt: skip
 
 if __name__ == "__main__":

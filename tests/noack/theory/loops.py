@@ -3,7 +3,7 @@
 Every signal is propagated by matrix exponentials on a grid finer than every period of the loop.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -82,6 +82,11 @@ class System:
         )
 
     @property
+    def events(self) -> int:
+        """More than the number of tests in a run."""
+        return STEPS // self.sample_steps + 2
+
+    @property
     def guarantee(self) -> LossGuarantee:
         """The rules of the network's losses."""
         rules: list[LossRule] = [LongestBurst(self.mansd)]
@@ -131,7 +136,7 @@ def assert_not_smaller(larger: Constants, smaller: Constants, system: System) ->
 
 
 class Trace(NamedTuple):
-    """The maximum over all runs, (STEPS,) each, and the shortest inter-event time."""
+    """Norms of signals in every run and step, (runs, STEPS), and the shortest inter-event time."""
 
     sensor_error: Reals
     """‖e_s‖_W before a reset."""
@@ -141,11 +146,11 @@ class Trace(NamedTuple):
     input_error: Reals
     inter_event_s: float
 
-    def exceeded(self, system: System, certified: Constants) -> list[str]:
-        """The bounds that some run exceeds."""
+    def shares(self, system: System, certified: Constants) -> dict[str, Reals]:
+        """Each signal divided by its bound, (runs, STEPS) or a number; at most 1 if it holds."""
         growth, beta = np.exp(system.alpha * times_s(system)), system.beta
         assert certified.inter_event_s is not None
-        shares = {
+        return {
             "sensor error": growth * self.sensor_error / (certified.overshoot * beta),
             "controller error": growth * self.controller_error / (certified.delta * beta),
             "state": growth * self.state / certified.state,
@@ -153,6 +158,10 @@ class Trace(NamedTuple):
             "input error": growth * self.input_error / certified.input_error,
             "inter-event time": np.array(certified.inter_event_s / self.inter_event_s),
         }
+
+    def exceeded(self, system: System, certified: Constants) -> list[str]:
+        """The bounds that some run exceeds."""
+        shares = self.shares(system, certified)
         return [name for name, share in shares.items() if share.max() > ROUNDING]
 
 
@@ -206,14 +215,13 @@ def simulate(
     newest, events, last_event = np.zeros(runs, int), np.zeros(runs, int), np.zeros(runs, int)
     synchronised = np.full(runs, system.known_start)
     commands: list[tuple[Reals, Flags]] = []
-    trace, shortest, every = np.zeros((5, STEPS)), 10**9, np.arange(runs)
+    trace, shortest, every = np.zeros((5, runs, STEPS)), 10**9, np.arange(runs)
     for step in range(STEPS):
         threshold = max(system.beta * np.exp(-system.alpha * step * system.step_s), floor)
-        trace[0, step] = np.linalg.norm((x_s - x) @ W, axis=1).max()
+        trace[0, :, step] = _norms((x_s - x) @ W)
         if step % system.sample_steps == 0:
-            if rule is None:
-                event = np.linalg.norm((x_s - x) @ W, axis=1) > threshold
-            else:
+            event = trace[0, :, step] > threshold
+            if rule is not None:
                 event = rule(step, step - last_event, x, x_s - x)
             event |= step == 0 and not system.known_start
             shortest = min(
@@ -241,17 +249,21 @@ def simulate(
         u = np.where(has_input[:, None], u, 0.0)
         for i, value in enumerate(
             (
-                np.linalg.norm((x_c - x) @ W, axis=1)[synchronised],
-                np.linalg.norm(x, axis=1),
-                np.linalg.norm(x @ W, axis=1),
-                np.linalg.norm(u - x @ K, axis=1)[has_input],
+                _norms((x_c - x) @ W) * synchronised,
+                _norms(x),
+                _norms(x @ W),
+                _norms(u - x @ K) * has_input,
             )
         ):
-            trace[i + 1, step] = value.max(initial=0.0)
+            trace[i + 1, :, step] = value
         following = [own.advance(x, x_c, u, has_input, held=system.hold_steps > 0) for own in model]
         x = following[0] if plants is None else np.array(following)[plants.which[:, step], every]
         x_s, x_c = x_s @ model[0].model, x_c @ model[0].model
     return Trace(*trace, shortest * system.step_s)
+
+
+def _norms(rows: Reals) -> Reals:
+    return np.sqrt(np.einsum("ij,ij->i", rows, rows))
 
 
 class _Propagators:
@@ -278,13 +290,20 @@ class _Propagators:
 def networks(seed: int, system: System) -> tuple[Flags, NDArray[np.int64]]:
     """Loss patterns that the guarantee allows: worst cases, and random ones."""
     rng = np.random.default_rng(seed)
-    events = STEPS // system.sample_steps + 2
-    lost = rng.uniform(size=(RUNS, events)) < rng.uniform(size=(RUNS, 1)) ** 0.5
+    lost = rng.uniform(size=(RUNS, system.events)) < rng.uniform(size=(RUNS, 1)) ** 0.5
     lost[0] = True
     lost[1] = False
+    delays = rng.integers(0, system.delay_steps + 1, lost.shape)
+    delays[:4] = system.delay_steps
+    return ~allowed(lost, system), delays
+
+
+def allowed(lost: Flags, system: System) -> Flags:
+    """The losses (runs, events) without those that the guarantee does not allow."""
+    lost, (runs, events) = lost.copy(), lost.shape
     if not system.known_start:
         lost[:, 0] = False
-    run, since = np.zeros(RUNS, dtype=np.int64), np.full(RUNS, system.recovery)
+    run, since = np.zeros(runs, dtype=np.int64), np.full(runs, system.recovery)
     most, width = system.window if system.window[0] < system.window[1] else (1, 1)
     for event in range(events):
         recent = lost[:, max(event - width + 1, 0) : event].sum(axis=1)
@@ -292,29 +311,30 @@ def networks(seed: int, system: System) -> tuple[Flags, NDArray[np.int64]]:
         lost[:, event] &= (run > 0) | (since >= system.recovery)
         run = np.where(lost[:, event], run + 1, 0)
         since = np.where(lost[:, event], 0, since + 1)
-    delays = rng.integers(0, system.delay_steps + 1, (RUNS, events))
-    delays[:4] = system.delay_steps
-    return ~lost, delays
+    return lost
 
 
-@st.composite
-def systems(draw: st.DrawFn, **fixed: Any) -> System:
+def systems(**fixed: Any) -> st.SearchStrategy[System]:
     """Loops of every kind; ``fixed`` replaces some of the drawn values."""
+    return seeds.map(lambda seed: random_system(np.random.default_rng(seed), **fixed))
 
-    def choose(name: str, strategy: st.SearchStrategy[Any]) -> Any:
-        return fixed[name] if name in fixed else draw(strategy)
 
-    n, m = choose("n", st.integers(1, 5)), choose("m", st.integers(1, 2))
-    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
-    H = rng.uniform(-1, 1, (n, n)) * choose("spread", st.sampled_from([1.0, 3.0]))
+def random_system(rng: np.random.Generator, **fixed: Any) -> System:
+    """A loop of any kind; ``fixed`` replaces some of the drawn values."""
+
+    def choose(name: str, values: Sequence[Any]) -> Any:
+        return fixed.get(name, values[rng.integers(len(values))])
+
+    n, m = choose("n", range(1, 6)), choose("m", (1, 2))
+    H = rng.uniform(-1, 1, (n, n)) * choose("spread", (1.0, 3.0))
     H -= (spectral_abscissa(H) + rng.uniform(0.5, 2.0)) * np.eye(n)
     B_model, K = rng.uniform(-1, 1, (n, m)), rng.uniform(-1, 1, (m, n))
-    alpha = choose("alpha_share", st.sampled_from([0.2, 0.5, 0.8])) * -spectral_abscissa(H)
+    alpha = choose("alpha_share", (0.2, 0.5, 0.8)) * -spectral_abscissa(H)
     change_A, change_B = rng.uniform(-1, 1, (n, n)), rng.uniform(-1, 1, (n, m))
-    mismatch = choose("mismatch", st.sampled_from([0.0, 0.1, 0.5]))
+    mismatch = choose("mismatch", (0.0, 0.1, 0.5))
     while spectral_abscissa(H + mismatch * (change_A + change_B @ K)) >= -alpha:
         mismatch /= 2
-    weighted = choose("weighted", st.booleans())
+    weighted = choose("weighted", (False, True))
     weight = rng.uniform(-1, 1, (n, n)) + 1.5 * np.eye(n) if weighted else np.eye(n)
     speed = float(np.abs(np.linalg.eigvals(H)).max())
     return System(
@@ -325,14 +345,14 @@ def systems(draw: st.DrawFn, **fixed: Any) -> System:
         weight=weight,
         x0=rng.uniform(-1, 1, n),
         alpha=alpha,
-        beta=choose("beta", st.sampled_from([0.01, 0.05, 0.3, 1.0])),
-        known_start=choose("known_start", st.booleans()),
-        mansd=choose("mansd", st.integers(0, 6)),
-        step_s=choose("step_share", st.sampled_from([0.002, 0.01, 0.03])) / speed,
-        sample_steps=choose("sample_steps", st.integers(1, 4)),
-        delay_steps=choose("delay_steps", st.integers(0, 4)),
-        hold_steps=choose("hold_steps", st.integers(0, 4)),
-        lag_steps=choose("lag_steps", st.integers(0, 2)),
-        window=choose("window", st.sampled_from([(1, 1), (1, 4), (2, 5), (3, 12), (4, 40)])),
-        recovery=choose("recovery", st.sampled_from([0, 0, 2, 6])),
+        beta=choose("beta", (0.01, 0.05, 0.3, 1.0)),
+        known_start=choose("known_start", (False, True)),
+        mansd=choose("mansd", range(7)),
+        step_s=choose("step_share", (0.002, 0.01, 0.03)) / speed,
+        sample_steps=choose("sample_steps", range(1, 5)),
+        delay_steps=choose("delay_steps", range(5)),
+        hold_steps=choose("hold_steps", range(5)),
+        lag_steps=choose("lag_steps", range(3)),
+        window=choose("window", ((1, 1), (1, 4), (2, 5), (3, 12), (4, 40))),
+        recovery=choose("recovery", (0, 0, 2, 6)),
     )

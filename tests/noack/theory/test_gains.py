@@ -59,8 +59,8 @@ def test_missing_events_count_what_they_may_have_grown_to(
         sampled = [values[t_s >= j * spacing_s].max(initial=0.0) for j in range(events)]
         found = error.missing(output, events, spacing_s)
         assert found >= sum(sampled) * ROUNDING
-        # Sampling misses the start of a supremum and all times beyond twelve time constants.
-        assert found <= 1.03 * sum(sampled) + 1e-3 * values.max()
+        # The cells are coarse; sampling misses the start of a supremum, and late times.
+        assert found <= 1.05 * sum(sampled) + 1e-3 * values.max()
         exact = float(np.linalg.norm(C @ inverse, 2))
         assert exact * ROUNDING <= error.now(output) <= exact * (1 + 1e-9)
 
