@@ -16,7 +16,6 @@ from noack.trigger.policy_settings import ModelMatrices, WeightedSettings
 from noack.trigger.trigger_condition import error_form
 from noack.trigger.trigger_rule import TriggerRule
 
-
 _LEAST_BETA = 1e-300
 
 

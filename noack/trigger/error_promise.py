@@ -23,10 +23,7 @@ _RELATIVE, _RESIDUAL = 1e-7, 1e-13
 
 
 class ErrorPromise(NamedTuple):
-    """After a comparison with the threshold f that did not transmit, and after every event:
-
-    ‖W e_s‖ ≤ ``size`` · f + Σ ‖S x‖ over the ``shares`` S.
-    """
+    """‖W e_s‖ ≤ ``size`` · f + Σ ‖S x‖ over the ``shares`` S, after an event or a comparison with f."""
 
     size: float
     shares: tuple[Matrix, ...]

@@ -1,4 +1,4 @@
-"""Random loops under every trigger policy: the settings, and the same rule written independently."""
+"""Random loops under every trigger policy: its settings, and the same rule written again."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,6 +10,7 @@ from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
 from noack.core.linear_systems import Matrix
+from noack.theory.scenario_certificates import ScenarioCertificate
 from tests.noack.theory.event_rules import (
     Area,
     AtLatest,
@@ -19,7 +20,9 @@ from tests.noack.theory.event_rules import (
     NotBefore,
     Quadratic,
 )
-from tests.noack.theory.loops import EventRule, System
+from tests.noack.theory.loops import EventRule, System, Trace, times_s
+
+_ROUNDING = 1e-9
 
 Case = tuple[dict[str, Any], EventRule]
 Rng = np.random.Generator
@@ -83,11 +86,13 @@ def _deadline(system: System, rng: Rng) -> Case:
 
 
 def _lyapunov(system: System, rng: Rng) -> Case:
-    """With a deadline; V grows on a random scale, which stands for any rule without a promise."""
+    """With a deadline; its own rule is another one, which bounds e_s as little."""
     steps = int(rng.integers(1, 4)) * system.sample_steps
     rule = {"policy": "lyapunov", "rate_per_s": 0.3}
     settings = {"policy": "deadline", "rule": rule, "interval_s": steps * system.step_s}
-    return settings, AtLatest(steps, Growing(rng.uniform(0, 2), system.sample_steps))
+    return settings, AtLatest(
+        steps, Growing(float(rng.choice([0.9, 2.0, 100.0])), system.sample_steps)
+    )
 
 
 def _dwell(system: System, rng: Rng) -> Case:
@@ -135,3 +140,22 @@ def scenario_with(system: System, trigger: dict[str, Any]) -> Scenario:
         "network": {"mansd": system.mansd, "loss": {"model": "worst_case"}},
     }  # fmt: skip
     return resolve(validate(content, "test"))
+
+
+def shares_of(trace: Trace, certificate: ScenarioCertificate, system: System) -> dict[str, float]:
+    """The largest share of each bound that any run reached."""
+    t_s = times_s(system)
+    slack = _ROUNDING * trace.state_weighted
+    signals = {
+        "e_s": (trace.sensor_error, certificate.sensor_error(t_s) + slack),
+        "e_c": (trace.controller_error, certificate.controller_error(t_s) + slack),
+        "x": (trace.state, certificate.state(t_s) * (1 + _ROUNDING)),
+    }
+    shares = {name: float((seen / bound).max()) for name, (seen, bound) in signals.items()}
+    least_s = certificate.inter_event_s or 0.0
+    return shares | {"1/δ": (1 - _ROUNDING) * least_s / trace.inter_event_s}
+
+
+def exceeded_by(trace: Trace, certificate: ScenarioCertificate, system: System) -> list[str]:
+    """The bounds that some run exceeds, beyond rounding."""
+    return [name for name, share in shares_of(trace, certificate, system).items() if share > 1]
