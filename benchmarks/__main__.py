@@ -1,38 +1,21 @@
-"""Benchmarks, one table each: ``python -m benchmarks [NAME ...] [--json FILE] [--install]``."""
+"""Benchmarks, one table each: ``python -m benchmarks [NAME ...] [--json FILE] [--install]``.
 
+Each file of this folder whose name does not begin with an underscore declares one.
+"""
+
+import pkgutil
 import sys
+from importlib import import_module
+from pathlib import Path
 
-from benchmarks import (
-    batch,
-    campaign,
-    certificates,
-    demo_run,
-    emulator,
-    flood,
-    guarantee,
-    guarantee_comparison,
-    latency,
-    lateness,
-    long_run,
-    loss_margins,
-    machines,
-    plants,
-    recovery,
-    relay_delay,
-    relay_flows,
-    relay_soak,
-    relays,
-    simulation,
-    startup,
-)
 from benchmarks._programs import provide
 from benchmarks._report import run
 
-MODULES = (
-    demo_run, emulator, flood, latency, lateness, startup, recovery, machines, plants, simulation,
-    batch, campaign, long_run, relays, relay_delay, relay_flows, relay_soak,
-    guarantee, guarantee_comparison, loss_margins, certificates,
-)  # fmt: skip
+MODULES = [
+    import_module(f"benchmarks.{found.name}")
+    for found in pkgutil.iter_modules([str(Path(__file__).parent)])
+    if not (found.ispkg or found.name.startswith("_"))
+]
 
 if __name__ == "__main__":
     provide()

@@ -1,4 +1,4 @@
-"""Loops that tick at a fixed rate and record each tick's lateness: ours and two alternatives."""
+"""Loops that tick at a fixed rate and record each tick's lateness: ours and asyncio's."""
 
 import argparse
 import asyncio
@@ -12,11 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks._report import MeasurementError
-from noack.core.clock import RunClock
-from noack.protocol.machine_interface import Notice, Record
-from noack.runtime.real_time_loop import run_loop
+from cosim.doctor.probe import idle_lateness_ns
+from noack.core.clock import NS_PER_S
 from noack.runtime.real_time_settings import realtime
-from noack.runtime.udp_sockets import bind
 
 FIFO_PRIORITY = 50
 
@@ -53,67 +51,8 @@ def ticks(kind: str, seconds: float, period_us: int, *, asked: bool) -> Ticks:
     return Ticks(*json.loads(done.stdout))
 
 
-class _Ticker:
-    """A machine that only records its lateness."""
-
-    def __init__(self, count: int, period_ns: int) -> None:
-        self.late_ns: list[int] = []
-        self._count = count
-        self._period_ns = period_ns
-        self._due_ns = period_ns
-
-    def next_deadline_ns(self) -> int | None:
-        return self._due_ns if len(self.late_ns) < self._count else None
-
-    def on_timer(self, now_ns: int) -> Sequence[Record | Notice]:
-        self.late_ns.append(now_ns - self._due_ns)
-        self._due_ns += self._period_ns
-        return ()
-
-    def handle(self, message: Record, now_ns: int) -> Sequence[Record | Notice]:
-        return ()
-
-
-class _Nowhere:
-    """An output that is never used."""
-
-    def append(self, record: Record) -> None: ...
-    def notice(self, notice: Notice) -> None: ...
-    def flush(self) -> None: ...
-
-
-class _Silence:
-    """A socket that never receives anything."""
-
-    def __init__(self) -> None:
-        self._endpoint = bind(0, "port")
-        self.watched = (self._endpoint.fileno(),)
-
-    def receive(self, readable: int) -> Record | None:
-        return None
-
-    def tend(self, now_ns: int) -> tuple[Notice, ...]:
-        return ()
-
-    def send(self, message: Record) -> None: ...
-
-
-def _run_loop(count: int, period_ns: int) -> list[int]:
-    ticker = _Ticker(count, period_ns)
-    clock = RunClock(time.monotonic_ns())
-    end_ns = (count + 1) * period_ns
-    run_loop(ticker, _Silence(), clock, _Nowhere(), end_ns=end_ns, stop=lambda: False)
-    return ticker.late_ns
-
-
-def _time_sleep(count: int, period_ns: int) -> list[int]:
-    late_ns = []
-    begin_ns = time.monotonic_ns()
-    for number in range(1, count + 1):
-        due_ns = begin_ns + number * period_ns
-        time.sleep(max(due_ns - time.monotonic_ns(), 0) * 1e-9)
-        late_ns.append(time.monotonic_ns() - due_ns)
-    return late_ns
+def _run_loop(count: int, period_ns: int) -> Sequence[int]:
+    return idle_lateness_ns(period_ns, count * period_ns / NS_PER_S)
 
 
 def _asyncio(count: int, period_ns: int) -> list[int]:
@@ -134,9 +73,8 @@ def _asyncio(count: int, period_ns: int) -> list[int]:
     return late_ns
 
 
-LOOPS: dict[str, Callable[[int, int], list[int]]] = {
+LOOPS: dict[str, Callable[[int, int], Sequence[int]]] = {
     "run_loop": _run_loop,
-    "time.sleep": _time_sleep,
     "asyncio": _asyncio,
 }
 

@@ -2,7 +2,7 @@
 
 Each combination is decided by the compiled rules, a million datagrams per flow; a check that does
 not know the rules counts violations at the receiver. Costs alternate with those of the
-plain cap that allows as many consecutive losses.
+plain cap that allows as many consecutive losses; the plain cap's, with those of plain Python.
 """
 
 import argparse
@@ -17,6 +17,7 @@ from benchmarks._loss_check import Limits, outcomes_of, violations
 from benchmarks._report import Benchmark, Goal, Rounds, Row, say
 from netem.engine.compiled_rules import compile_rule, compiled_program, compiled_state, set_flow
 from netem.engine.many_decisions import admit_many
+from netem.link_machine import Link
 from netem.rule_program import program_of
 from netem.words.words_to_settings import settings_of
 from noack.impairments.kept_loss import expected_loss
@@ -32,8 +33,8 @@ COMBINATIONS: Mapping[str, Limits] = {
     "mansd 4 recover 3": Limits(((4, 5),), 3),
     "mansd 2 atmost 3 in 10 recover 2": Limits(((2, 3), (3, 10)), 2),
 }
-KEPT = ("loss 30% keep mansd 2", "loss 20% keep atmost 3 in 10 recover 2",
-        "loss 20% 50% keep mansd 3 atmost 3 in 10 corrupt 5%")  # fmt: skip
+EXPECTED = ("loss 50% mansd 4", "loss 30% keep mansd 2", "loss 20% keep atmost 3 in 10 recover 2",
+            "loss 20% 50% keep mansd 3 atmost 3 in 10 corrupt 5%")  # fmt: skip
 _ROUNDS = 30
 
 
@@ -69,16 +70,39 @@ def check_rows(words: str, limits: Limits, count: int) -> list[Row]:
     return [Row(f"{words}: violations", found, "", goal=Goal("==", 0), note=note)]
 
 
-def kept_row(words: str, count: int) -> Row:
-    """Return the realised loss rate beside the asked one."""
+def expected_row(words: str, count: int) -> Row:
+    """Return the realised loss rate beside the expected one, which may be asked for (keep)."""
     say(f"{count:,} decisions, {words}")
     decider, lost = Decider(words), 0
     for _ in range(count // _BATCH):
         lost += int(outcomes_of(decider.decide()).sum())
-    asked = expected_loss(settings_of(words)).rate or 0.0
-    error = 100 * abs(lost / count - asked)
-    note = f"{count:,} decisions: {lost / count:.4%} lost, {asked:.4%} asked"
+    expected = expected_loss(settings_of(words)).rate or 0.0
+    error = 100 * abs(lost / count - expected)
+    note = f"{count:,} decisions: {lost / count:.4%} lost, {expected:.4%} expected"
     return Row(f"{words}: error", error, "% of all", goal=Goal("<=", 0.1), note=note)
+
+
+def speed_row(words: str = "loss 50% mansd 4") -> Row:
+    """Return the decisions per second of the compiled rules beside those in plain Python."""
+    say(f"speed of decisions, {words}")
+    decider, link, rounds = (
+        Decider(words),
+        Link(settings_of(words), 7, "relay", "forward"),
+        Rounds(),
+    )
+
+    def decide_plainly() -> None:
+        for _ in range(_BATCH // 20):
+            link.decide(0, 72, 0)
+
+    sides = (("compiled", decider.decide, _BATCH), ("plain Python", decide_plainly, _BATCH // 20))
+    for number in range(-1, 5):
+        for side, decide, count in sides:
+            begun_s = time.perf_counter()
+            decide()
+            if number >= 0:
+                rounds.add(side, {"per_s": count / (time.perf_counter() - begun_s)})
+    return rounds.row(f"{words}: decisions", "/s", "per_s", "compiled", "plain Python", paired=True)
 
 
 def plain_cap(words: str) -> str:
@@ -110,12 +134,12 @@ def cost_rows() -> list[Row]:
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
-    """Measure costs, then violations, then kept loss rates."""
-    rows = cost_rows()
+    """Measure speed and costs, then violations, then loss rates."""
+    rows = [speed_row(), *cost_rows()]
     for words, limits in COMBINATIONS.items():
         rows += check_rows(f"loss 50% {words}", limits, DECISIONS)
         rows += check_rows(f"loss 30% {_REORDERING} {words}", limits, DECISIONS)
-    return rows + [kept_row(words, DECISIONS // 5) for words in KEPT]
+    return rows + [expected_row(words, DECISIONS // 5) for words in EXPECTED]
 
 
 BENCHMARK = Benchmark("guarantee", "Emulator: the guarantee over many decisions", measure)

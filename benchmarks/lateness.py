@@ -1,4 +1,4 @@
-"""Lateness of our 1 kHz loop, compared with cyclictest, asyncio and ``time.sleep``.
+"""Lateness of our 1 kHz loop, compared with cyclictest and asyncio.
 
 cyclictest (Debian: rt-tests) is the kernel's own measure: a C loop on ``clock_nanosleep`` with
 SCHED_FIFO, locked memory and no deep idle states, the settings that our processes request. Without

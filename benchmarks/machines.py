@@ -1,7 +1,7 @@
-"""Cost per call of the state machines, the wire format and the telemetry buffer.
+"""Cost per call of the plant, the wire format and the telemetry buffer.
 
-Each is compared with a simple alternative: pickle with HMAC, JSON, a matrix exponential in each
-step, a general integrator. Both sides make the same calls on the same inputs, in turn.
+Each is compared with a simple alternative: pickle with HMAC, JSON, a general integrator. Both sides
+make the same calls on the same inputs, in turn.
 """
 
 import argparse
@@ -17,22 +17,18 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import solve_ivp
-from scipy.linalg import expm
 
 from benchmarks._report import Benchmark, Peer, Row, median, say
-from controller_node.controller import controller_of
 from cosim.cli import find_scenario
-from netem.link_machine import Datagram, update_link_of
 from noack.config.resolution import LoopMatrices, loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
-from noack.core.linear_systems import Propagator, Vector
+from noack.core.linear_systems import Vector
 from noack.protocol.machine_interface import Record
 from noack.protocol.record_tables import PLANT_STEP, tables
 from noack.protocol.wire_format import Decoder, Encoder, Flow, Message
 from noack.runtime.telemetry import TelemetryBuffer
 from plant_server.plant import plant_of
-from sensor_node.sensor import sensor_of
 
 ROUNDS = 9
 CALLS = 400
@@ -145,46 +141,22 @@ def telemetry_case(inputs: Inputs) -> Case:
     return Case("telemetry append", ours, "list append, then json.dumps", peer)
 
 
-def machine_cases(inputs: Inputs) -> list[Case]:
-    """The machines and their propagation, compared with the plain mathematics."""
-    loop, scenario, h_s, h_ns = inputs.loop, inputs.scenario, inputs.period_s, inputs.period_ns
-    messages, steps = inputs.measurements, [k * h_ns for k in range(CALLS)]
-    states = [message.vector for message in messages]
-    datagrams = [Datagram(0, Encoder(1, inputs.key).encode(message)) for message in messages]
-    u = np.zeros(loop.m)
-    propagate = Propagator(loop.H)
-    draws = np.random.default_rng(0)
+def plant_case(inputs: Inputs) -> Case:
+    """A step of the plant, compared with a general integrator."""
+    loop, h_s, u = inputs.loop, inputs.period_s, np.zeros(inputs.loop.m)
+    states = [message.vector for message in inputs.measurements]
+    steps = [k * inputs.period_ns for k in range(CALLS)]
 
     def integrated(x: Vector) -> object:
         return solve_ivp(lambda t, z: loop.A @ z + loop.B @ u, (0.0, h_s), x, rtol=1e-9).y[:, -1]
 
-    def advanced(x: Vector) -> object:
-        return expm(loop.H * h_s) @ x
+    return Case("plant step", lambda: each(plant_of(inputs.scenario).on_timer, steps),
+                "scipy's solve_ivp, RK45", lambda: each(integrated, states))  # fmt: skip
 
-    def tested(x: Vector) -> object:
-        return np.linalg.norm(expm(loop.H * h_s) @ x - x) > 0.5
 
-    def controlled(x: Vector) -> object:
-        return loop.K @ (expm(loop.H * h_s) @ x)
-
-    per_step = "scipy's expm in each step"
-    return [
-        Case("propagation, cached", lambda: each(lambda x: propagate(x, h_ns), states),
-             per_step, lambda: each(advanced, states)),
-        Case("plant step", lambda: each(plant_of(scenario).on_timer, steps),
-             "scipy's solve_ivp, RK45", lambda: each(integrated, states)),
-        Case("sensor measurement", lambda: each(sensor_of(scenario).handle, messages,
-                                                steps),
-             per_step, lambda: each(tested, states)),
-        Case("controller tick", lambda: each(controller_of(scenario).on_timer, steps),
-             per_step, lambda: each(controlled, states)),
-        Case("controller delivery", lambda: each(controller_of(scenario).handle, messages,
-                                                 steps),
-             per_step, lambda: each(advanced, states)),
-        Case("netem datagram", lambda: each(update_link_of(scenario).handle, datagrams,
-                                            steps),
-             "the random draw alone", lambda: each(lambda t_ns: draws.random() < 0.8, steps)),
-    ]  # fmt: skip
+def cases(inputs: Inputs) -> list[Case]:
+    """All cases."""
+    return [plant_case(inputs), *wire_cases(inputs), telemetry_case(inputs)]
 
 
 def per_call_us(batch: Batch) -> float:
@@ -210,9 +182,8 @@ def compare(case: Case, rounds: int = ROUNDS) -> Row:
 
 def measure(options: argparse.Namespace) -> list[Row]:
     """Compare all cases."""
-    inputs = Inputs()
     rows = []
-    for case in [*machine_cases(inputs), *wire_cases(inputs), telemetry_case(inputs)]:
+    for case in cases(Inputs()):
         say(case.name)
         rows.append(compare(case))
     return rows

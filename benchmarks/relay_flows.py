@@ -1,33 +1,20 @@
-"""The cost of ten thousand flows for a relay, and the speed of the link's decisions.
+"""The cost of ten thousand flows for a relay.
 
 Flows differ in the sender's address (127.1.0.0 and on); datagrams come from them in turn. The cost
 is the relay's CPU time per datagram while it empties a full receive buffer, as in
 :mod:`benchmarks.relays`. The C relay, which ignores addresses, shows the kernel's share of it; with
-a socket per client, it shows that of our relay with the reverse direction. The loss bursts of the
-decisions are counted from the fates only.
+a socket per client, it shows that of our relay with the reverse direction.
 """
 
 import argparse
-import time
-from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
-from typing import NamedTuple
 
 from benchmarks._relay_cores import BEFORE_OTHERS, LOAD_CORE, on_core, scheduled
-from benchmarks._relay_decisions import (
-    LOSS,
-    MANSD,
-    Decide,
-    LossRuns,
-    compiled,
-    plain,
-    predicted_loss,
-)
 from benchmarks._relay_load import built, sources
 from benchmarks._relay_ours import Ours
 from benchmarks._relay_process import Relay, c_relay, in_turn, our_relay, start_all
-from benchmarks._report import Benchmark, Goal, MeasurementError, Peer, Rounds, Row, say
+from benchmarks._report import Benchmark, Goal, Rounds, Row, say
 
 ROUNDS = 30
 FLOWS = 10_000
@@ -38,8 +25,6 @@ KINDS = {
     "ours, with the reverse direction": Ours(WORDS, reverse=True),
 }
 PEER, PATHS = "C relay", "C relay, a socket per client"
-_PACKETS = 10
-"""Packets of each flow in a call."""
 
 
 def flow_rows(rounds: Rounds) -> list[Row]:
@@ -58,49 +43,8 @@ def flow_rows(rounds: Rounds) -> list[Row]:
     return rows
 
 
-class Decided(NamedTuple):
-    """Results of the link's decisions."""
-
-    per_s: float
-    runs: LossRuns
-
-
-def decide_all(decide: Decide, decisions: int, flows: int) -> Decided:
-    """Make at least this number of decisions, batch by batch; only the link's time counts."""
-    runs, seconds = LossRuns(flows), 0.0
-    runs.add(decide(1))  # creates the flows' states, compiles the code
-    unmeasured = runs.decisions
-    while runs.decisions < decisions:
-        begun_s = time.perf_counter()
-        fates = decide(_PACKETS)
-        seconds += time.perf_counter() - begun_s
-        runs.add(fates)
-    return Decided((runs.decisions - unmeasured) / seconds, runs)
-
-
-def decision_rows(name: str, found: Decided | str) -> list[Row]:
-    """Return the rows of one way to run the link: the results, or why there are none."""
-    if isinstance(found, str):
-        return [Row(f"{name}: decisions", None, "/s", unjudged=found)]
-    runs = found.runs
-    note = f"{runs.decisions:,} decisions, loss {LOSS:.0%}, mansd {MANSD}, {FLOWS:,} flows"
-    return [
-        Row(f"{name}: decisions", found.per_s, "/s", note=note),
-        Row(f"{name}: longest loss burst", runs.longest, "", goal=Goal("<=", MANSD)),
-        Row(f"{name}: loss", 100 * runs.lost / runs.decisions, "%",
-            Peer("predicted", 100 * predicted_loss(LOSS, MANSD))),
-    ]  # fmt: skip
-
-
-def _decisions(name: str, make: Callable[[int], Decide], count: int) -> list[Row]:
-    say(f"{count:,} decisions, {name}")
-    try:
-        return decision_rows(name, decide_all(make(FLOWS), count, FLOWS))
-    except MeasurementError as error:
-        return decision_rows(name, str(error))
-
-
-def _measure_flows() -> list[Row]:
+def measure(options: argparse.Namespace) -> list[Row]:
+    """Send bursts from many addresses and from one to each relay in turn."""
     rounds = Rounds()
     with built() as tools, on_core(LOAD_CORE), scheduled(BEFORE_OTHERS), ExitStack() as stack:
         kinds = {PEER: c_relay(tools), PATHS: c_relay(tools, "paths")} | {
@@ -122,13 +66,4 @@ def _measure_flows() -> list[Row]:
     return flow_rows(rounds)
 
 
-def measure(options: argparse.Namespace) -> list[Row]:
-    """Measure the flows, then the decisions."""
-    return [
-        *_measure_flows(),
-        *_decisions("compiled", compiled, 100_000_000),
-        *_decisions("plain Python", plain, 500_000),
-    ]
-
-
-BENCHMARK = Benchmark("relay_flows", "Relays: flows and decisions", measure)
+BENCHMARK = Benchmark("relay_flows", "Relays: flows", measure)

@@ -27,11 +27,12 @@ def wake(period_ns: int, duration_s: float, priority: int, spin_us: float) -> di
     # Timer slack and locked memory cannot be undone in a process: measure without them first.
     for name, enabled in (("plain", False), ("realtime", True)):
         with realtime(enabled, priority, place=0) as granted:
-            found |= {name: _lateness(period_ns, duration_s, spin_us), "granted": granted}
+            found |= {name: idle_lateness_ns(period_ns, duration_s, spin_us), "granted": granted}
     return found
 
 
-def _lateness(period_ns: int, duration_s: float, spin_us: float) -> Sequence[int]:
+def idle_lateness_ns(period_ns: int, duration_s: float, spin_us: float = 0.0) -> Sequence[int]:
+    """Return the lateness of each wake-up of a run's loop that has nothing else to do, in ns."""
     metronome, wall = _Metronome(period_ns), RunClock(time.monotonic_ns())
     end_ns = round(duration_s * NS_PER_S) + _WARM_UP * period_ns
     run_loop(

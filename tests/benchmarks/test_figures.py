@@ -128,13 +128,7 @@ def test_the_pickled_alternative_gives_messages_back_and_refuses_a_wrong_tag() -
 
 
 def test_each_case_gives_a_row_with_its_alternative() -> None:
-    inputs = machines.Inputs()
-    cases = [
-        *machines.machine_cases(inputs),
-        *machines.wire_cases(inputs),
-        machines.telemetry_case(inputs),
-    ]
-    for case in cases:
+    for case in machines.cases(machines.Inputs()):
         row = machines.compare(case, rounds=1)
         assert row.peer is not None
         assert row.ratio is not None

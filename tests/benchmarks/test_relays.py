@@ -1,4 +1,3 @@
-import itertools
 import json
 from pathlib import Path
 
@@ -6,12 +5,10 @@ import numpy as np
 import pytest
 
 from benchmarks import relay_delay, relay_flows, relay_soak, relays
-from benchmarks._relay_decisions import LossRuns, plain, predicted_loss
 from benchmarks._relay_load import Burst, Soak
 from benchmarks._relay_ours import Ours, Totals, command_of, totals_of
 from benchmarks._relay_process import figures_of
 from benchmarks._report import MeasurementError, Rounds, Row
-from noack.protocol.record_tables import Fate
 
 
 def test_the_rate_counts_decided_and_not_forwarded_packets() -> None:
@@ -94,65 +91,6 @@ def test_the_cost_of_many_flows_is_compared_with_one_flow() -> None:
     assert ours.holds is True
     assert reverse.holds is None
     assert "no such option" in reverse.as_json()["note"]
-
-
-@pytest.mark.parametrize("batch", [1, 3, 7, 50])
-def test_consecutive_losses_do_not_depend_on_the_batches(batch: int) -> None:
-    delivered = (Fate.DELIVERED, Fate.FORCED)
-    fates = np.random.default_rng(batch).integers(0, 4, (50, 3)).astype(np.uint8)
-    runs = LossRuns(3)
-    for first in range(0, 50, batch):
-        runs.add(fates[first : first + batch])
-    expected = [
-        len(list(group))
-        for flow in range(3)
-        for lost, group in itertools.groupby(f not in delivered for f in fates[:, flow])
-        if lost
-    ]
-    assert runs.longest == max(expected)
-    assert runs.lost == sum(expected)
-    assert runs.decisions == 150
-
-
-@pytest.mark.parametrize(("probability", "mansd"), [(0.5, 4), (0.05, 4), (0.9, 1), (0.3, 0)])
-def test_the_predicted_loss_is_that_of_the_stationary_markov_chain(
-    probability: float, mansd: int
-) -> None:
-    chain = np.zeros((mansd + 1, mansd + 1))  # transitions of the number of consecutive losses
-    for run in range(mansd):
-        chain[run, run + 1] = probability
-        chain[run, 0] = 1 - probability
-    chain[mansd, 0] = 1
-    stationary = np.linalg.matrix_power((chain + np.eye(mansd + 1)) / 2, 4096)[0]
-    expected = float(stationary[1:].sum())
-    assert predicted_loss(probability, mansd) == pytest.approx(expected, rel=1e-12)
-
-
-def test_the_pure_link_keeps_its_guarantee_and_the_predicted_loss() -> None:
-    found = relay_flows.decide_all(plain(200), 100_000, 200)
-    assert found.runs.longest == 4
-    assert found.runs.decisions >= 100_000
-    # 5 standard errors of independent draws; the cap reduces the variance.
-    share = found.runs.lost / found.runs.decisions
-    assert share == pytest.approx(predicted_loss(0.5, 4), abs=0.008)
-
-
-def test_a_loss_burst_beyond_the_cap_misses_the_goal() -> None:
-    def decide(count: int) -> np.ndarray[tuple[int, int], np.dtype[np.uint8]]:
-        fates = np.zeros((count, relay_flows.FLOWS), np.uint8)
-        fates[-3:, 7] = Fate.DROPPED  # with the two of the next batch: five consecutive losses
-        fates[:2, 7] = 99  # any fate except delivered and forced
-        return fates
-
-    found = relay_flows.decide_all(decide, 3_000_000, relay_flows.FLOWS)
-    assert found.runs.longest == 5
-    verdicts = [row.holds for row in relay_flows.decision_rows("link", found) if row.goal]
-    assert verdicts == [False]
-
-
-def test_unavailable_decisions_state_the_reason() -> None:
-    (row,) = relay_flows.decision_rows("compiled", "not built")
-    assert row.as_json()["note"] == "not built"
 
 
 def soaked(**changes: int) -> list[Row]:
