@@ -1,5 +1,6 @@
 """The certificates of a scenario, as tables and as JSON."""
 
+import contextlib
 from collections.abc import Callable, Iterator
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -18,6 +19,7 @@ from noack.core.number_format import NONE, duration, number
 from noack.theory.assumptions import assumptions
 from noack.theory.certificate import NetworkConditions
 from noack.theory.enclosure import NotDecayingError
+from noack.theory.loss_margin import LossMargin, Stability
 from noack.theory.paper_bounds import Theorem2, theorem_2
 from noack.theory.run_conditions import ideal_conditions, nominal_conditions
 from noack.theory.scenario_certificates import (
@@ -30,6 +32,7 @@ from noack.theory.scenario_certificates import (
 )
 from noack.theory.weight import choose_weight
 from noack.trigger.decaying import DecayingSettings
+from noack.trigger.periodic_trigger import PeriodicSettings
 
 IDEAL = "paper"
 """The paper's conditions: no sampling, no delay, no hold."""
@@ -122,6 +125,18 @@ class Certificates:
         """
         return next(iter(self._limits.values()))
 
+    @cached_property
+    def stability(self) -> Stability | None:
+        """What is known about the stability of all loss patterns, if the loop is time-triggered.
+
+        None for other loops, and where the exact margin does not cover the schedule.
+        """
+        if not isinstance(self.scenario.trigger, PeriodicSettings):
+            return None
+        with contextlib.suppress(CallerError):
+            return LossMargin(self.scenario).is_stable()
+        return None
+
     def to_json(self) -> dict[str, Any]:
         """Return all certificates as one document, as ``noack certify --json`` prints it."""
         return {
@@ -132,6 +147,7 @@ class Certificates:
                 "theorem_2": None if self.theorem_2 is None else self.theorem_2._asdict(),
             },
             "certificates": [{"under": under, **one.to_json()} for under, one in self],
+            "stability": None if self.stability is None else self.stability._asdict(),
             "limits": {scope: limits._asdict() for scope, limits in self._limits.items()},
         }
 
@@ -189,7 +205,7 @@ def with_weight(
     elif which != "identity":
         raise CallerError(f'weight: given, identity or chosen, not "{which}"')
     rows = None if weight is None else tuple(tuple(row) for row in weight.tolist())
-    trigger = resolved.trigger.model_copy(update={"weight": rows})
+    trigger = resolved.decaying.model_copy(update={"weight": rows})
     return resolved.model_copy(update={"trigger": trigger}), weight
 
 
@@ -239,7 +255,7 @@ def print_certificates(console: Console, found: Certificates) -> None:
     print_assumptions(console, [a._asdict() for a in found.schedule.assumptions])
     console.print("assumptions of the paper's theorems:")
     print_assumptions(console, [a._asdict() for a in assumptions(found.scenario)])
-    for sentence in _in_words(found):
+    for sentence in (*_in_words(found), *_stability_in_words(found)):
         console.print(sentence, markup=False, highlight=False)
     if found.weight is not None:
         rows = ",\n".join(f"  {[float(f'{v:.6g}') for v in row]}" for row in found.weight)
@@ -268,6 +284,20 @@ def _in_words(found: Certificates) -> Iterator[str]:
             f"with {certificate.conditions.guarantee.meaning}: "
             f"‖x‖ ≤ {constants.state:.4g}{decay}{late}.{apart}"
         )
+
+
+def _stability_in_words(found: Certificates) -> Iterator[str]:
+    """Yield what is known exactly about the stability of a time-triggered loop."""
+    if (known := found.stability) is None:
+        return
+    patterns = f"patterns with {found.scenario.network.guarantee.meaning}"
+    growth = f"growth per period {known.lower:.4g} to {known.upper:.4g}"
+    text = {
+        "stable": f"all {patterns} are stable: {growth}",
+        "destabilised": f"the pattern {known.text}, repeated, destabilises the loop: {growth}",
+        "undecided": f"whether all {patterns} are stable is undecided: {growth}",
+    }[known.verdict]
+    yield f"Without lateness, exactly: {text} (noack margin)."
 
 
 def _print_constants(console: Console, found: Certificates) -> None:

@@ -241,11 +241,12 @@ def certificate_assumptions(
 
     ``decay`` has the decay rates per second of "the models" (infinite if they hold) and "A + BK".
     Without a certificate, ``constants`` is None and ``void`` is the reason. ``promise`` is what the
-    trigger's rule promises.
+    trigger's rule says about e_s, or empty.
     """
     alpha = resolved.trigger.threshold_decay_per_s
     slower = 0.0 if constants is None else constants.rate_per_s
-    found = [Assumption("the trigger", "certificate", AssumptionStatus.HOLDS, promise)]
+    why = promise or "not where it does not transmit"
+    found = [_checked("the trigger bounds ‖e_s‖", "certificate", bool(promise), why)]
     for of, source in (("the models", "(I1)"), ("A + BK", "Theorem 2")) if alpha else ():
         holds = below(alpha, decay[of])
         why = f"α = {alpha:g} /s, {_decays(decay[of])}"

@@ -72,11 +72,6 @@ class TriggerBounds:
         return self.promise.size * self.rule.floor
 
     @property
-    def unit(self) -> float:
-        """Unit of the bounds of e_s and e_c: β or ε; 1 without either."""
-        return max(self.beta, self.floor) or 1.0
-
-    @property
     def is_homogeneous(self) -> bool:
         """Whether all bounds of e_s are multiples of bounds of x: a certificate may decay."""
         return not (self.beta or self.floor or self.area)
@@ -114,7 +109,7 @@ class TriggerBounds:
     def bound(
         self, conditions: NetworkConditions, level: float, reached: float | None
     ) -> TriggerBound:
-        """Return all bounds.
+        """Return all bounds; their unit is the level, or 1 without one.
 
         Args:
             conditions: as :meth:`tested` returns them.
@@ -125,7 +120,7 @@ class TriggerBounds:
             VoidError: nothing bounds e_s, or nothing separates events.
         """
         due_s, apart_s = self._between_events(conditions)
-        h_s, unit = conditions.sampling_s, self.unit
+        h_s = conditions.sampling_s
         idle_s = self._after(self.rule.idle_ns, conditions)
         untested_s = max(idle_s - h_s, 0.0) if math.isfinite(idle_s) else 0.0
         found: list[TriggerBound] = []
@@ -142,7 +137,9 @@ class TriggerBounds:
         separated = apart_s or conditions.spacing_s
         if not separated and level == 0 and all(one.reached is None for one in found):
             raise VoidError(_ACCUMULATE)
-        return found[0]._replace(unit=unit, apart_s=apart_s, due_s=due_s, also=tuple(found[1:]))
+        return found[0]._replace(
+            unit=level or 1.0, apart_s=apart_s, due_s=due_s, also=tuple(found[1:])
+        )
 
     def text(self) -> str:
         """Return in words what the rule promises about e_s."""
@@ -167,13 +164,13 @@ class TriggerBounds:
         if not self.area:
             return [(0.0, level, reached)]
         assert self.promise is not None
-        least, test_s = self.promise.least * self.rule.floor, conditions.spacing_s
+        least = self.promise.least * self.rule.floor
+        test_s, longest_s = conditions.spacing_s, conditions.sampling_s
         times_s = _AVERAGED / self.fastest_per_s
         if test_s:  # the trapezoidal sum of the last k tests
             tests = sorted({math.ceil(t_s / test_s) for t_s in times_s})
             return [
-                (k * conditions.sampling_s, self.area / (k * test_s), least / (k * test_s))
-                for k in tests
+                (k * longest_s, self.area / (k * test_s), least / (k * longest_s)) for k in tests
             ]
         return [(t_s, self.area / t_s, least / t_s) for t_s in times_s.tolist()]
 

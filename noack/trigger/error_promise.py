@@ -23,7 +23,7 @@ _RELATIVE, _RESIDUAL = 1e-7, 1e-13
 
 
 class ErrorPromise(NamedTuple):
-    """‖W e_s‖ ≤ ``size`` · f + Σ ‖S x‖ over the ``shares`` S, after an event or a comparison with f."""
+    """‖W e_s‖ ≤ ``size`` · f + Σ ‖S x‖, after an event, or a comparison with f that was none."""
 
     size: float
     shares: tuple[Matrix, ...]

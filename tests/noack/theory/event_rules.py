@@ -7,12 +7,9 @@ x and e_s, and returns which runs have an event.
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix
-from tests.noack.theory.loops import EventRule, Flags, Reals
-
-Steps = NDArray[np.int64]
+from tests.noack.theory.loops import EventRule, Flags, Reals, Steps
 
 
 @dataclass

@@ -26,6 +26,7 @@ from noack.theory.gains import ErrorGains, PlantGains
 
 Reals = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+Steps = NDArray[np.int64]
 
 RUNS, STEPS = 128, 240
 
@@ -170,7 +171,7 @@ def times_s(system: System) -> Reals:
     return np.arange(STEPS) * system.step_s
 
 
-EventRule = Callable[[int, NDArray[np.int64], Reals, Reals], Flags]
+EventRule = Callable[[int, Steps, Reals, Reals], Flags]
 """Which runs have an event at a test, from the step, the steps since each last event, x and e_s."""
 
 

@@ -263,14 +263,12 @@ def test_no_violation_is_reported_in_a_run_that_meets_its_conditions(run: RunRec
 
 
 def test_only_assumptions_of_existing_claims_are_reported(make: Make) -> None:
-    """With another trigger, only (I1) and its consequences are claimed; with acks, nothing."""
+    """With acknowledgements nothing is claimed; with another trigger as with the paper's."""
     network = network_of(lambda n: None if 10 <= n < 20 else 33)
     trigger = AbsoluteSettings(policy="absolute", delta=0.02)
     absolute = make().model_copy(update={"trigger": trigger})
-    for resolved in (make(network={"protocol": "ack"}), absolute):
-        assert reported(simulate(resolved, network)) == []
-    gap = deaf("sensor", 100, 103)(lambda: absolute)
-    assert [one.cause for one in reported(gap)] == ["sampling"]
+    assert reported(simulate(make(network={"protocol": "ack"}), network)) == []
+    assert "dropouts" in [one.cause for one in reported(simulate(absolute, network))]
 
 
 # --- reports are timely and cost little memory ----------------------------------------------------
