@@ -238,7 +238,7 @@ class _Step:
 
     def _solved(
         self, shares: Mapping[Output, float], from_errors: Mapping[str, float]
-    ) -> tuple[float, Vector]:
+    ) -> tuple[float, tuple[float, float]]:
         """Return the loop gain and the bounds of (q, β̃).
 
         sup‖C x‖ is free_C + (gain_C, Γ_C)·(q, β̃); the rest of the right sides is (D, g).
@@ -251,9 +251,9 @@ class _Step:
         def row(gains: Mapping[str, float]) -> Vector:
             return np.array([gains.get(name, 0.0) for name in names])
 
-        of_hold = {Output.GAIN_RATE: hold_s, Output.WEIGHTED: remainder}
+        of_hold: dict[str, float] = {Output.GAIN_RATE: hold_s, Output.WEIGHTED: remainder}
         through = row(of_hold)
-        direct = np.array([0.0, sum(gain * shares[output] for output, gain in of_hold.items())])
+        direct = np.array([0.0, sum(gain * shares[Output(C)] for C, gain in of_hold.items())])
         F, g = [direct + through @ from_signals], [through @ free]
         at_growth = np.maximum(free, row({Output.MISMATCH: self._background.mismatch}))
         beyond = max(self._start_error, self._background.input_error)
@@ -273,7 +273,7 @@ class _Step:
         bounds = [one.bound for one in found if one.bound is not None]
         if not bounds:
             raise VoidError(f"the loop gain of the errors is {gain:.3g}, not below 1")
-        return gain, np.min(bounds, axis=0)
+        return gain, np.min(bounds, axis=0).tolist()
 
     def _missing_gain(self, output: Output, events: int, spacing_s: float) -> float:
         if self._error.decays or math.isinf(self._bound.due_s):

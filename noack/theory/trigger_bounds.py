@@ -134,8 +134,9 @@ class TriggerBounds:
             found.append(TriggerBound(0.0, None, {}, due_s - h_s, is_tested=False))
         if not found:
             raise VoidError(_NONE)
-        separated = apart_s or conditions.spacing_s
-        if not separated and level == 0 and all(one.reached is None for one in found):
+        is_separated = apart_s or conditions.spacing_s or any(one.reached for one in found)
+        grows_first = level > 0 and self.promise is not None and self.promise.least > 0
+        if not is_separated and not grows_first:
             raise VoidError(_ACCUMULATE)
         return found[0]._replace(
             unit=level or 1.0, apart_s=apart_s, due_s=due_s, also=tuple(found[1:])
