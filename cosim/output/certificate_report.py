@@ -134,7 +134,7 @@ class Certificates:
         if not isinstance(self.scenario.trigger, PeriodicSettings):
             return None
         with contextlib.suppress(CallerError):
-            return LossMargin(self.scenario).is_stable()
+            return LossMargin(self.scenario).first_bounds()
         return None
 
     def to_json(self) -> dict[str, Any]:
@@ -295,9 +295,9 @@ def _stability_in_words(found: Certificates) -> Iterator[str]:
     text = {
         "stable": f"all {patterns} are stable: {growth}",
         "destabilised": f"the pattern {known.text}, repeated, destabilises the loop: {growth}",
-        "undecided": f"whether all {patterns} are stable is undecided: {growth}",
+        "undecided": f"{growth} under the worst of all {patterns}",
     }[known.verdict]
-    yield f"Without lateness, exactly: {text} (noack margin)."
+    yield f"Exactly, but without lateness: {text}; noack margin finds the limits."
 
 
 def _print_constants(console: Console, found: Certificates) -> None:

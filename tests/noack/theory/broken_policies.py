@@ -51,9 +51,9 @@ class AThirdOfTheTime(TriggerBounds):
     """Takes a third of the time up to the next event."""
 
     def bound(self, conditions: Conditions, level: float, reached: float | None) -> TriggerBound:
-        rule = self.rule._replace(longest_ns=self.rule.longest_ns / 3)
-        exact = conditions._replace(sampling_s=0.0, spacing_s=0.0)
-        return TriggerBounds(rule, self.weight, self.fastest_per_s).bound(exact, level, reached)
+        found, h_s = super().bound(conditions, level, reached), conditions.sampling_s
+        assert not found.is_tested
+        return found._replace(untested_s=(found.untested_s + h_s) / 3 - h_s)
 
 
 def with_trigger(kind: type[TriggerBounds]) -> Callable[[Scenario, Conditions], Any]:
