@@ -355,8 +355,9 @@ def _constants(found: Certificates) -> Iterator[tuple[str, list[str], str]]:
     rate_2 = number(found.scenario.trigger.threshold_decay_per_s, 4)
     yield "decay rate, 1/s", constant("rate_per_s"), rate_2
     yield "updates outstanding", constant("missing_events"), NONE
-    yield "Δ, bound of ‖e_c‖/β", constant("delta"), delta_2
-    yield "bound of ‖e_s‖/β", constant("overshoot"), "1"
+    unit = next((f"/{one.unit}" for one in certificates if one.unit), "")
+    yield f"Δ, bound of ‖e_c‖{unit}", constant("delta"), delta_2
+    yield f"bound of ‖e_s‖{unit}", constant("overshoot"), "1"
     yield "bound of ‖u − Kx‖", constant("input_error"), NONE
     yield "X, bound of ‖x‖", constant("state"), state_2
     yield "inter-event time, s", row(lambda c: c.inter_event_s), spacing_2

@@ -29,7 +29,7 @@ OWN_PLANT = "the scenario's plant"
 BOX = "every plant of the uncertainty box"
 _SLOWER = 0.9
 _SHARES_OF_ALPHA = (0.8, 0.6, 0.4, 0.2)
-_SHARES_OF_DECAY = (0.7, 0.4, 0.2, 0.1, 0.05)
+_SHARES_OF_DECAY = (0.05, 0.2, 0.4, 0.7)
 
 _RESOLUTION = 1e-3
 _TOO_LARGE = "intermediate results are too large or too small for floating point"
@@ -81,11 +81,15 @@ class ScenarioCertificate:
         return min(known) if known and len(known) == len(found) else None
 
     @property
+    def unit(self) -> str:
+        """The unit of Δ and β̃: β or ε; empty for 1."""
+        return "ε" if self.floor > self.beta else "β" if self.beta else ""
+
+    @property
     def level(self) -> str:
-        """The unit of the error bounds: βe^{−αt}, or without decay β or ε; empty for 1."""
+        """The unit of the error bounds at all times: βe^{−αt}; without decay β or ε."""
         rate = 0.0 if self.constants is None else self.constants.rate_per_s
-        unit = "ε" if self.floor > self.beta else "β" if self.beta else ""
-        return f"{unit}e^(−{rate:.3g}t)" if rate else unit
+        return f"{self.unit}e^(−{rate:.3g}t)" if rate else self.unit
 
     def sensor_error(self, t_s: Matrix) -> Matrix:
         """Bound of ‖e_s‖_W at times (k,); NaN without a certificate."""
@@ -326,9 +330,11 @@ class CertificateScope:
         decays = math.isfinite(decay) and decay > 0 and self._start_error == 0.0
         for share in _SHARES_OF_DECAY if decays and not self._held else ():
             rate = share * decay
-            with contextlib.suppress(NotDecayingError, VoidError):
+            try:
                 one = self._solve(conditions, rate, rate, start, 0.0, None)
-                found.append((math.log(max(10 * one.state / size, 1.0)) / rate, one))
+            except (NotDecayingError, VoidError):
+                break  # larger rates have larger gains
+            found.append((math.log(max(10 * one.state / size, 1.0)) / rate, one))
         if not found:
             return self._solve(conditions, 0.0, 0.0, start, 0.0, None)
         return min(found, key=lambda one: one[0])[1]

@@ -138,6 +138,8 @@ class TriggerBounds:
         grows_first = level > 0 and self.promise is not None and self.promise.least > 0
         if not is_separated and not grows_first:
             raise VoidError(_ACCUMULATE)
+        if self.is_homogeneous:
+            apart_s = max(apart_s, conditions.spacing_s)
         return found[0]._replace(
             unit=level or 1.0, apart_s=apart_s, due_s=due_s, also=tuple(found[1:])
         )
