@@ -98,12 +98,10 @@ class TriggerBounds:
         grid_s, step_s = self.rule.grid_ns / NS_PER_S, conditions.spacing_s
         if conditions.sampling_s != step_s:
             raise VoidError("the rule compares on a grid, and measurements there may be missing")
-        grid_s = _rounded_up(grid_s, step_s)
-        spacing_s = grid_s
-        if self.has_due_time:  # such an event may lie between two points of the grid
-            due_s = _rounded_up(self.rule.longest_ns / NS_PER_S, step_s)
-            common_ns = math.gcd(round(grid_s * NS_PER_S), round(due_s * NS_PER_S))
-            spacing_s = common_ns / NS_PER_S
+        grid_s = spacing_s = _rounded_up(grid_s, step_s)
+        due_ns = self.rule.longest_ns
+        if self.has_due_time and due_ns % self.rule.grid_ns:  # due between two points of the grid
+            spacing_s = step_s or math.gcd(round(self.rule.grid_ns), round(due_ns)) / NS_PER_S
         return conditions._replace(sampling_s=grid_s, spacing_s=spacing_s)
 
     def bound(
