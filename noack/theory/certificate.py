@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.core.linear_systems import Vector
+from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, LossRule
 from noack.theory.gains import Coefficients, ErrorGains, Output, PlantGains
 from noack.theory.loss_accumulation import LossAccumulation
@@ -87,6 +87,8 @@ class Constants(NamedTuple):
     """δ, lower bound of the inter-event time; None if there is no such bound."""
     loop_gain: float
     """Loop gain of the errors (small-gain condition); below 1."""
+    estimation_error: float = 0.0
+    """‖x̂ − x‖_W at the measurements. Where it is not 0, e_s and e_c are x_s − x̂ and x_c − x̂."""
 
 
 class VoidError(ArithmeticError):
@@ -121,6 +123,11 @@ class TriggerBound(NamedTuple):
     unit: float | None = None
     """Unit of the constants Δ and β̃/β; by default β."""
 
+    @property
+    def every(self) -> tuple["TriggerBound", ...]:
+        """This bound and the further ones."""
+        return (self, *self.also)
+
 
 class Background(NamedTuple):
     """Bounds from an earlier phase of the run, which still have effects in this phase.
@@ -139,7 +146,23 @@ class Background(NamedTuple):
     """Bound of the inter-event time."""
 
 
-_CLEAN = Background()
+NO_BACKGROUND = Background()
+
+
+class EstimationBound(NamedTuple):
+    """Bound of the estimation error at every measurement, where the trigger tests x̂ instead of x.
+
+    ‖x̂ − x‖_W ≤ fixed + Σ_C share_C sup‖C x‖ + from_input sup‖p‖
+    """
+
+    fixed: float = 0.0
+    """From noise, disturbances and the first estimate."""
+    shares: Mapping[str, float] = MappingProxyType({})
+    """share_C by the name of C in :attr:`PlantGains.outputs`: the plant is not the model."""
+    from_input: float = 0.0
+
+
+_MEASURED = EstimationBound()
 
 
 def solve(
@@ -147,8 +170,9 @@ def solve(
     plant: PlantGains,
     conditions: NetworkConditions,
     bound: TriggerBound,
-    background: Background = _CLEAN,
+    background: Background = NO_BACKGROUND,
     *,
+    estimation: EstimationBound = _MEASURED,
     structured: bool = True,
 ) -> Constants:
     """Return the constants that are certified for all times.
@@ -160,37 +184,69 @@ def solve(
         VoidError: the loop gain is not below 1.
         NotDecayingError: a mode of the loop decays more slowly than the threshold.
     """
-    step = _Step(error, plant, conditions, bound, background)
-    if structured and plant.is_one_plant:
-        step.use_windows()
-    least_s = max(conditions.spacing_s, bound.apart_s)
-    if bound.reached is None and all(one.reached is None for one in bound.also):
-        return step.constants(least_s, bound.apart_s or None)
+    part = Part(error, plant, bound, estimation)
+    (found,) = solve_sum([part], conditions, background, structured=structured)
+    return found
+
+
+class Part(NamedTuple):
+    """One of several bounds that are added: with its own decay rate and its own causes."""
+
+    error: ErrorGains
+    plant: PlantGains
+    bound: TriggerBound
+    estimation: EstimationBound = _MEASURED
+
+
+def solve_sum(
+    parts: Sequence[Part],
+    conditions: NetworkConditions,
+    background: Background = NO_BACKGROUND,
+    *,
+    structured: bool = True,
+) -> list[Constants]:
+    """Return the constants of several parts, whose bounds hold when they are added.
+
+    All inequalities are linear in functions of time, for given events. So the causes may be
+    divided: what decays is one part, what persists another one. The threshold is at least the sum
+    of the parts' ``reached``, so the next event needs one part that reaches its own. The
+    ``background`` is that of the first part.
+
+    Raises: as :func:`solve`.
+    """
+    backgrounds = [background, *[NO_BACKGROUND] * (len(parts) - 1)]
+    steps = [
+        _Step(part, conditions, before) for part, before in zip(parts, backgrounds, strict=True)
+    ]
+    if structured and parts[0].plant.is_one_plant:
+        for step in steps:
+            step.use_windows()
+
+    def constants(spacing_s: float, inter_event_s: float | None) -> list[Constants]:
+        return [step.constants(spacing_s, inter_event_s) for step in steps]
+
+    apart_s = max(part.bound.apart_s for part in parts)
+    least_s = max(conditions.spacing_s, apart_s)
+    if any(all(one.reached is None for one in part.bound.every) for part in parts):
+        return constants(least_s, apart_s or None)
     spacing_s = background.inter_event_s
     for _ in range(_ATTEMPTS):
         if spacing_s <= least_s:
             break
-        found_s = step.inter_event_s(spacing_s)
+        found_s = min(step.inter_event_s(spacing_s) for step in steps)
         if found_s >= spacing_s:
-            return step.constants(spacing_s, spacing_s)
+            return constants(spacing_s, spacing_s)
         # Iterate from above to the largest spacing that is consistent with itself.
         spacing_s = found_s if found_s < (1 - _SETTLED) * spacing_s else (1 - _SETTLED) * found_s
-    return step.constants(least_s, least_s or None)
+    return constants(least_s, least_s or None)
 
 
 class _Step:
     """One iteration: all constants for an assumed spacing of events."""
 
-    def __init__(
-        self,
-        error: ErrorGains,
-        plant: PlantGains,
-        conditions: NetworkConditions,
-        bound: TriggerBound,
-        background: Background,
-    ) -> None:
-        self._error, self._plant = error, plant
-        self._conditions, self._bound, self._background = conditions, bound, background
+    def __init__(self, part: Part, conditions: NetworkConditions, background: Background) -> None:
+        self._error, self._plant, self._bound, self._estimation = error, plant, bound, _ = part
+        self._conditions, self._background = conditions, background
         self._lost: LossAccumulation | None = None
         self._remainder = error.hold_remainder(conditions.hold_s)
         self._start_error, start = plant.start_up(conditions.start_s)
@@ -198,10 +254,7 @@ class _Step:
             output: Coefficients(free + start[output], gain)
             for output, (free, gain) in plant.states.items()
         }
-        self._growths = [
-            _growing(plant, conditions.sampling_s, one) for one in (bound, *bound.also)
-        ]
-        """The rows of each bound, of which the larger one counts."""
+        self._growths = [_growths(plant, conditions.sampling_s, one) for one in bound.every]
 
     def use_windows(self) -> None:
         """Use how many updates may be lost in a window, too."""
@@ -216,64 +269,88 @@ class _Step:
             for output in self._error.outputs
         }
         from_errors = self._from_errors(events, spacing_s, shares[Output.GAIN])
-        loop_gain, (held, sensor_error) = self._solved(shares, from_errors)
-        state = {
-            output: free + gain * held + from_errors[output] * sensor_error
-            for output, (free, gain) in self._states.items()
-        }
-        unit = self._bound.beta if self._bound.unit is None else self._bound.unit
+        signals = self._signals(shares, from_errors)
+        loop_gain, solved = self._solved(signals)
+        sensor_error = float(solved[1] + solved[2])
+        state = dict(zip(self._states, signals.free + signals.states @ solved, strict=True))
         return Constants(
             self._error.alpha_per_s,
             events,
-            shares[Output.WEIGHTED] * sensor_error / unit,
-            sensor_error / unit,
-            shares[Output.GAIN] * sensor_error + held,
+            shares[Output.WEIGHTED] * sensor_error / self.unit,
+            sensor_error / self.unit,
+            float(signals.errors[Output.GAIN] @ solved + solved[0]),
             self._start_error,
-            state[Output.STATE],
-            state[Output.WEIGHTED],
-            state[Output.MISMATCH],
+            float(state[Output.STATE]),
+            float(state[Output.WEIGHTED]),
+            float(state[Output.MISMATCH]),
             inter_event_s,
             loop_gain,
+            float(solved[2]),
         )
 
-    def _solved(
+    @property
+    def unit(self) -> float:
+        """The unit of Δ and β̃/β."""
+        return self._bound.beta if self._bound.unit is None else self._bound.unit
+
+    def _signals(
         self, shares: Mapping[Output, float], from_errors: Mapping[str, float]
-    ) -> tuple[float, tuple[float, float]]:
-        """Return the loop gain and the bounds of (q, β̃).
+    ) -> "_Signals":
+        """Return how all outputs depend on (q, β̃, η).
 
-        sup‖C x‖ is free_C + (gain_C, Γ_C)·(q, β̃); the rest of the right sides is (D, g).
+        An event's x_s − x̂ is at most β̃ + η, the present x_s − x at most β̃.
         """
-        names = list(self._states)
-        free = np.array([self._states[name].free for name in names])
-        from_signals = np.array([(self._states[name].gain, from_errors[name]) for name in names])
-        hold_s, remainder = self._conditions.hold_s, self._remainder
+        free = np.array([state.free for state in self._states.values()])
+        now = self._error.now(Output.GAIN)
+        states = [
+            (gain, from_errors[name], from_errors[name] - gain * now)
+            for name, (_, gain) in self._states.items()
+        ]
+        errors = {
+            output: np.array([0.0, share, share - self._error.now(output)])
+            for output, share in shares.items()
+        }
+        return _Signals(list(self._states), free, np.array(states), errors)
 
-        def row(gains: Mapping[str, float]) -> Vector:
-            return np.array([gains.get(name, 0.0) for name in names])
+    def _solved(self, signals: "_Signals") -> tuple[float, Vector]:
+        """Return the loop gain and the bounds of (q, β̃, η).
 
-        of_hold: dict[str, float] = {Output.GAIN_RATE: hold_s, Output.WEIGHTED: remainder}
-        through = row(of_hold)
-        direct = np.array([0.0, sum(gain * shares[Output(C)] for C, gain in of_hold.items())])
-        F, g = [direct + through @ from_signals], [through @ free]
-        at_growth = np.maximum(free, row({Output.MISMATCH: self._background.mismatch}))
+        Raises:
+            VoidError: the loop gain is not below 1.
+        """
+        free, errors = signals.free, signals.errors
+        held: dict[str, float] = {
+            Output.GAIN_RATE: self._conditions.hold_s, Output.WEIGHTED: self._remainder,
+        }  # fmt: skip
         beyond = max(self._start_error, self._background.input_error)
+        at_growth = np.maximum(free, signals.row({Output.MISMATCH: self._background.mismatch}))
+        input_error = errors[Output.GAIN] + np.array([1.0, 0.0, 0.0])
+
+        through = signals.row(held)
+        from_errors = sum(gain * errors[Output(output)] for output, gain in held.items())
+        of_age = (through @ signals.states + from_errors, float(through @ free))
+        estimation = self._estimation
+        through = signals.row(estimation.shares)
+        of_estimate = (
+            through @ signals.states + estimation.from_input * input_error,
+            estimation.fixed + float(through @ free) + estimation.from_input * beyond,
+        )
 
         def solved(growing: _Growing) -> Solution:
-            through = row(growing.shares)
-            ofp = growing.input_error * np.array([1.0, shares[Output.GAIN]])
-            fixed = growing.beta + through @ at_growth + growing.input_error * beyond
-            fixed = max(fixed, self._background.sensor_error)
-            return solve_inequalities(
-                np.array([*F, ofp + through @ from_signals]), np.array([*g, fixed])
-            )
+            through = signals.row(growing.shares)
+            after = np.array([0.0, 0.0, growing.estimation])
+            F = through @ signals.states + growing.input_error * input_error + after
+            fixed = growing.fixed + through @ at_growth + growing.input_error * beyond
+            grown = (F, max(self._background.sensor_error, fixed))
+            return solve_inequalities(*map(np.array, zip(of_age, grown, of_estimate, strict=True)))
 
-        # Of each bound, one of its rows applies; of all bounds, the smallest.
-        found = [_largest([solved(one) for one in rows]) for rows in self._growths]
+        # Of each bound one growth applies, and all bounds hold.
+        found = [_largest([solved(one) for one in growths]) for growths in self._growths]
         gain = min(one.loop_gain for one in found)
         bounds = [one.bound for one in found if one.bound is not None]
         if not bounds:
             raise VoidError(f"the loop gain of the errors is {gain:.3g}, not below 1")
-        return gain, np.min(bounds, axis=0).tolist()
+        return gain, np.min(bounds, axis=0)
 
     def _missing_gain(self, output: Output, events: int, spacing_s: float) -> float:
         if self._error.decays or math.isinf(self._bound.due_s):
@@ -305,18 +382,24 @@ class _Step:
         """Return the time that ‖e_s‖_W needs to the next event, given the spacing before it."""
         found = self.constants(spacing_s, None)
         own = self._error.now(Output.GAIN)
-        unit = self._bound.beta if self._bound.unit is None else self._bound.unit
-        others = found.input_error - own * found.overshoot * unit
-        mismatch = max(found.mismatch, self._background.mismatch)
-        others = max(others, self._start_error, self._background.input_error)
-        found_s = max(
-            min(
-                first_passage_s(self._plant, one.reached, mismatch, others, own),
-                one.ago_s or math.inf,
+        sensor_error = found.overshoot * self.unit - found.estimation_error
+        others = found.input_error - own * sensor_error
+        estimation = found.estimation_error
+        # After an event e_s is the estimation error, and x_s − x̂ differs from e_s by one, too.
+        passages_s = [
+            first_passage_s(
+                self._plant,
+                one.reached - estimation,
+                max(found.mismatch, self._background.mismatch),
+                max(others, self._start_error, self._background.input_error),
+                own,
+                estimation,
             )
-            for one in (self._bound, *self._bound.also)
+            for one in self._bound.every
             if one.reached is not None
-        )
+        ]
+        limits_s = [one.ago_s or math.inf for one in self._bound.every if one.reached is not None]
+        found_s = max(map(min, passages_s, limits_s))
         found_s = max(min(found_s, self._bound.due_s), self._bound.apart_s)
         grid_s = self._conditions.spacing_s
         return found_s if grid_s == 0 else grid_s * max(1, math.ceil(found_s / grid_s - 1e-9))
@@ -330,36 +413,54 @@ class _Step:
         return dropouts + math.ceil(delay_s / spacing_s)
 
 
-class _Growing(NamedTuple):
-    """The growth of e_s without a test: ‖e_s‖_W ≤ β + Σ_C share_C sup‖C x‖ + gain · sup‖p‖."""
+class _Signals(NamedTuple):
+    """The outputs of x and e_c as linear functions of (q, β̃, η), η = sup‖x̂ − x‖_W."""
 
-    beta: float
-    shares: Mapping[str, float]
-    input_error: float
+    names: list[str]
+    free: Vector
+    """(k,) the constant part of sup‖C x‖."""
+    states: Matrix
+    """(k, 3)"""
+    errors: Mapping[Output, Vector]
+    """(3,) of sup‖C e_c‖."""
+
+    def row(self, gains: Mapping[str, float]) -> Vector:
+        """Return gains of the outputs, by name, as an array (k,)."""
+        return np.array([gains.get(name, 0.0) for name in self.names])
 
 
-def _growing(plant: PlantGains, sampling_s: float, bound: TriggerBound) -> list[_Growing]:
+class _Growing:
+    """The growth of e_s without a test: from the bound after a test, or from 0 after an event.
+
+    sup‖e_s‖_W ≤ ``fixed`` + ``estimation`` η + Σ_C ``shares``_C sup‖C x‖ + ``input_error`` sup‖p‖
+    """
+
+    def __init__(self, plant: PlantGains, longest_s: float, after: TriggerBound) -> None:
+        stretch, outputs = plant.error.stretch(longest_s), plant.outputs
+        self.fixed, self.input_error = stretch * after.beta, 0.0
+        # The trigger tests x_s − x̂, and may compare it with x̂.
+        self.estimation = stretch * (1 + sum(
+            share * float(np.linalg.norm(outputs[C] @ plant.error.inverse_weight, 2))
+            for C, share in after.shares.items()
+        ))  # fmt: skip
+        shares = {C: stretch * share for C, share in after.shares.items()}
+        if longest_s > 0:
+            growth = plant.growth(longest_s, _COARSE)
+            mismatch = growth.mismatch.integral_on_grid()
+            shares[Output.MISMATCH] = shares.get(Output.MISMATCH, 0.0) + mismatch
+            self.input_error = growth.input_error.integral_on_grid()
+            self.fixed += float(growth.forced.sum())
+        self.shares: Mapping[str, float] = shares
+
+
+def _growths(plant: PlantGains, sampling_s: float, bound: TriggerBound) -> list[_Growing]:
     """Return the growth from the bound after a test, and from 0 after an event."""
     found = []
     if bound.is_tested:
-        stretch = plant.error.stretch(sampling_s + bound.ago_s)
-        shares = {C: stretch * share for C, share in bound.shares.items()}
-        found.append(_grown(plant, sampling_s + bound.ago_s, stretch * bound.beta, shares))
+        found.append(_Growing(plant, sampling_s + bound.ago_s, bound))
     if bound.untested_s > 0 or not bound.is_tested:
-        found.append(_grown(plant, sampling_s + bound.untested_s, 0.0, {}))
+        found.append(_Growing(plant, sampling_s + bound.untested_s, TriggerBound(0.0, None)))
     return found
-
-
-def _grown(
-    plant: PlantGains, longest_s: float, beta: float, shares: Mapping[str, float]
-) -> _Growing:
-    """Return the growth over a time from β and shares, which have grown already."""
-    if not longest_s > 0:
-        return _Growing(beta, shares, 0.0)
-    growth = plant.growth(longest_s, _COARSE)
-    mismatch = shares.get(Output.MISMATCH, 0.0) + growth.mismatch.integral_on_grid()
-    through = {**shares, Output.MISMATCH: mismatch}
-    return _Growing(beta, through, growth.input_error.integral_on_grid())
 
 
 def _largest(found: Sequence[Solution]) -> Solution:
@@ -370,24 +471,35 @@ def _largest(found: Sequence[Solution]) -> Solution:
 
 
 def first_passage_s(
-    plant: PlantGains, level: float, mismatch: float, input_error: float, own: float
+    plant: PlantGains,
+    level: float,
+    mismatch: float,
+    input_error: float,
+    own: float,
+    start: float = 0.0,
 ) -> float:
-    """Return a time before which ‖e_s‖_W, starting at 0, cannot reach ``level``.
+    """Return a time before which ‖e_s‖_W, starting at ``start``, cannot reach ``level``.
 
     Let ρ(r) = sup_{s≤r} ‖e_s‖_W. The part of e_c that equals the present e_s is bounded by ρ:
 
         ρ(r) ≤ ∫₀^r ‖W e^{Hs} L_E‖ sup‖R_E x‖ + ‖W e^{Hs} B U‖ (π' + own · ρ(r−s)) ds
 
-    This is iterated from ρ = ``level``; every iterate is a bound until the level is reached.
+    and further terms from the disturbances and ``start``. This is iterated from ρ = ``level``;
+    every iterate is a bound until the level is reached.
 
     ``level`` is ‖e_s‖_W at an event, ``mismatch`` sup‖R_E x‖, ``own`` ‖K W^{−1}‖, and
     ``input_error`` π', the input error without the effect of the present e_s.
     """
+    if level <= start:
+        return 0.0
     window_s, cells = _first_window_s(plant, level, mismatch, input_error + own * level), _COARSE
     known_s = 0.0
     while True:
         growth = plant.growth(window_s, cells)
-        fixed = np.cumsum(growth.mismatch.area * mismatch + growth.input_error.area * input_error)
+        areas = growth.mismatch.area * mismatch + growth.input_error.area * input_error
+        fixed = np.cumsum(areas + growth.forced)
+        if start:
+            fixed += start * plant.error.stretch(window_s)
         rho = np.full(cells, level)
         for _ in range(_PICARD_ROUNDS):
             echo = np.convolve(growth.input_error.area, rho)[:cells]
@@ -408,6 +520,7 @@ def _first_window_s(plant: PlantGains, level: float, mismatch: float, input_erro
     """Return the first search window: twice the time to ``level`` at the initial speed, limited."""
     start = plant.growth(_SHORTEST_S, 1)
     speed = start.mismatch.sup_on_grid() * mismatch + start.input_error.sup_on_grid() * input_error
+    speed += float(start.forced.sum()) / _SHORTEST_S
     if not speed > 0:
         return _LONGEST_S
     return min(max(2 * level / speed, _SHORTEST_S), _LONGEST_S)

@@ -286,7 +286,7 @@ class CertificateScope:
         conditions = trigger.tested(conditions)
         first = self._first_phase(conditions)
         if 0 < trigger.floor < trigger.beta and first.rate_per_s == trigger.alpha_per_s:
-            late = self._after_floor(conditions, first)
+            late = _at_floor(first, trigger.floor / trigger.beta)
         if first.input_error < self._start_error:
             raise VoidError(
                 f"at its start the input was {self._start_error:.3g} from Kx; a certificate "
@@ -353,36 +353,6 @@ class CertificateScope:
                 return self._solve(conditions, rate, rate, start, self._trigger.beta, None)
         raise NotDecayingError("the uncertainty box is too large for the loop's gains")
 
-    def _after_floor(self, conditions: NetworkConditions, first: Constants) -> Constants:
-        """Return the constants without decay from t_ε on, when the threshold is the floor.
-
-        They hold for every state at the end of the first phase. The bounds of the first phase decay
-        like e^{−αt}: at t_ε − τ they are larger than at t_ε by the factor e^{ατ}. The gains of the
-        models keep α, so their kernels e^{(H+αI)τ} contain this factor for all effects of the first
-        phase on this one.
-        """
-        trigger = self._trigger
-        beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
-        share, from_s = floor / beta, _floor_from_s(beta, alpha, floor)
-        before_s = max(conditions.sampling_s, first.inter_event_s or 0.0)
-        started = conditions.start_s + before_s <= from_s
-        background = Background(
-            sensor_error=floor * first.overshoot,
-            mismatch=share * first.mismatch,
-            input_error=share * max(first.input_error, 0.0 if started else first.start_error),
-            inter_event_s=first.inter_event_s or 0.0,
-        )
-        found = self._solve(
-            conditions._replace(start_s=max(conditions.start_s - from_s, 0.0)),
-            alpha,
-            0.0,
-            share * first.state * np.eye(self._loop.n),
-            floor,
-            floor,
-            background,
-        )
-        return found._replace(rate_per_s=0.0)
-
     def _solve(
         self,
         conditions: NetworkConditions,
@@ -391,7 +361,6 @@ class CertificateScope:
         start: Matrix,
         level: float,
         reached: float | None,
-        background: Background | None = None,
     ) -> Constants:
         if error_alpha_per_s not in self._errors:
             self._errors[error_alpha_per_s] = error_gains(self._loop, error_alpha_per_s)
@@ -402,11 +371,21 @@ class CertificateScope:
                 self._plant_at(error, start, plant_alpha_per_s),
                 further_outputs=self._trigger.outputs,
             )
-        background = background or Background(input_error=self._start_error)
+        background = Background(input_error=self._start_error)
         # Inputs of an earlier run are covered by their norm only.
         structured = self._start_error == 0.0
         bound = self._trigger.bound(conditions, level, reached)
         return solve(error, self._plants[key], conditions, bound, background, structured=structured)
+
+
+def _at_floor(first: Constants, share: float) -> Constants:
+    """Return the constants from the floor on, ``share`` = ε/β.
+
+    With θ(t) = max(βe^{−αt}, ε) in place of βe^{−αt}, all bounds of the first phase hold at all
+    times: for s ≤ t, θ(s) ≤ θ(t) e^{α(t−s)}, which is all that their proof uses of βe^{−αt}.
+    """
+    scaled = ("input_error", "start_error", "state", "state_weighted", "mismatch")
+    return first._replace(rate_per_s=0.0, **{name: share * getattr(first, name) for name in scaled})
 
 
 def _is_finite(constants: Constants) -> bool:
