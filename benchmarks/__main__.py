@@ -1,4 +1,4 @@
-"""Benchmarks, one table each: ``python -m benchmarks [NAME ...] [--json FILE] [--install]``.
+"""Benchmarks, one table each: ``python -m benchmarks [NAME ...] [--json FILE]``.
 
 Each file of this folder whose name does not begin with an underscore declares one.
 """

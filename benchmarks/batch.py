@@ -88,8 +88,9 @@ def drawn(
 
 
 def integrated(
-    setting: Setting, draw: Population, delivered: NDArray[np.bool_], method: Method
-) -> list[float]:
+    setting: Setting, draw: Population, delivered: NDArray[np.bool_], method: Method,
+    rtol: float = 1e-8,
+) -> list[float]:  # fmt: skip
     """Return event times by ``solve_ivp`` of plant and both models, from crossing to crossing."""
     A, B, x = draw.A[0], draw.B[0], draw.x0[0]
     n, trigger = len(x), setting.trigger
@@ -106,7 +107,7 @@ def integrated(
     while True:
         solution = solve_ivp(
             lambda _, z: field @ z, (t_s, setting.horizon_s), z,
-            method=method, events=excess, rtol=1e-8, atol=1e-10,
+            method=method, events=excess, rtol=rtol, atol=1e-2 * rtol,
         )  # fmt: skip
         if not len(solution.t_events[0]):
             return found

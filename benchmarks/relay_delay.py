@@ -16,18 +16,10 @@ from contextlib import ExitStack
 
 import numpy as np
 
+from benchmarks import _relay_process as relay_process
 from benchmarks._relay_cores import BEFORE_OTHERS, LOAD_CORE, RELAY_CORE, on_core, scheduled
 from benchmarks._relay_load import Built, Ends, Nanoseconds, built
 from benchmarks._relay_ours import Ours
-from benchmarks._relay_process import (
-    Relay,
-    asyncio_relay,
-    c_relay,
-    in_turn,
-    our_relay,
-    socat,
-    start_all,
-)
 from benchmarks._report import Benchmark, Figures, Goal, MeasurementError, Rounds, Row, say
 from benchmarks.lateness import KERNEL, cyclictest
 
@@ -95,11 +87,11 @@ def refusal(fifo: bool) -> str | None:
     return None if os.access(_LATENCY, os.W_OK) else f"{_LATENCY} cannot be written"
 
 
-def _added(relay: Relay, base_us: float) -> Figures:
+def _added(relay: relay_process.Relay, base_us: float) -> Figures:
     return quantiles_of(relay.name, relay.ends.ping(PINGS), base_us)
 
 
-def _late(relay: Relay) -> Figures:
+def _late(relay: relay_process.Relay) -> Figures:
     delays_ns = relay.ends.pace(LINE_ROUND_S * 1_000_000_000 // PERIOD_NS, PERIOD_NS)
     return quantiles_of(relay.name, delays_ns, DELAY_MS * 1e3)
 
@@ -108,12 +100,12 @@ def _measure_added(tools: Built) -> list[Row]:
     rounds = Rounds()
     with scheduled(BEFORE_OTHERS), on_core(RELAY_CORE), ExitStack() as stack:
         kinds = {
-            "socat": socat(),
-            "C relay": c_relay(tools),
-            "asyncio relay": asyncio_relay(),
-            OURS: our_relay(OURS, Ours("loss 5% mansd 0 seed 7"), lossy=False),
+            "socat": relay_process.socat(),
+            "C relay": relay_process.c_relay(tools),
+            "asyncio relay": relay_process.asyncio_relay(),
+            OURS: relay_process.our_relay(OURS, Ours("loss 5% mansd 0 seed 7"), lossy=False),
         }
-        relays = start_all(kinds, tools, stack, rounds)
+        relays = relay_process.start_all(kinds, tools, stack, rounds)
         direct = Ends(tools.load)
         stack.callback(direct.close)
         direct.connect(direct.sink_port)
@@ -121,7 +113,7 @@ def _measure_added(tools: Built) -> list[Row]:
         for _ in range(PING_ROUNDS):
             base = quantiles_of(DIRECT, direct.ping(PINGS))
             rounds.add(DIRECT, base)
-            in_turn(relays, rounds, functools.partial(_added, base_us=base["p50"]))
+            relay_process.in_turn(relays, rounds, functools.partial(_added, base_us=base["p50"]))
     return added_rows(rounds)
 
 
@@ -129,17 +121,19 @@ def _measure_lateness(tools: Built) -> list[Row]:
     rounds = Rounds()
     with on_core(LOAD_CORE), ExitStack() as stack:
         kinds = {
-            OURS: our_relay(OURS, Ours(f"delay {DELAY_MS}ms", realtime=True), lossy=False),
-            "asyncio relay": asyncio_relay(DELAY_MS),
+            OURS: relay_process.our_relay(
+                OURS, Ours(f"delay {DELAY_MS}ms", realtime=True), lossy=False
+            ),
+            "asyncio relay": relay_process.asyncio_relay(DELAY_MS),
         }
-        relays = start_all(kinds, tools, stack, rounds)
+        relays = relay_process.start_all(kinds, tools, stack, rounds)
         for number in range(LINE_ROUNDS):
             say(f"lateness, round {number + 1} of {LINE_ROUNDS}")
             rounds.add(KERNEL, cyclictest(LINE_ROUND_S, FIFO_PRIORITY, RELAY_CORE))
             with scheduled(FIFO_PRIORITY) as granted:
                 if refused := refusal(granted):
                     rounds.add(KERNEL, refused)
-                in_turn(relays, rounds, _late)
+                relay_process.in_turn(relays, rounds, _late)
     return lateness_rows(rounds)
 
 

@@ -12,20 +12,10 @@ median over rounds of the ratio within a round.
 import argparse
 from contextlib import ExitStack
 
+from benchmarks import _relay_process as relay_process
 from benchmarks._relay_cores import BEFORE_OTHERS, LOAD_CORE, RELAY_CORE, on_core, scheduled
 from benchmarks._relay_load import Ends, built
 from benchmarks._relay_ours import Ours
-from benchmarks._relay_process import (
-    BURST,
-    Relay,
-    asyncio_relay,
-    c_relay,
-    figures_of,
-    in_turn,
-    our_relay,
-    socat,
-    start_all,
-)
 from benchmarks._report import Benchmark, Goal, Rounds, Row, say
 
 ROUNDS = 40
@@ -75,25 +65,25 @@ def measure(options: argparse.Namespace) -> list[Row]:
     rounds = Rounds()
     with built() as tools, on_core(LOAD_CORE), scheduled(BEFORE_OTHERS), ExitStack() as stack:
         kinds = {
-            "socat": socat(),
-            "socat, connected": socat(connected=True),
-            "C relay": c_relay(tools),
-            "C relay, segments": c_relay(tools, "segment"),
-            "asyncio relay": asyncio_relay(),
-            **{name: our_relay(name, ours) for name, ours in OURS.items()},
+            "socat": relay_process.socat(),
+            "socat, connected": relay_process.socat(connected=True),
+            "C relay": relay_process.c_relay(tools),
+            "C relay, segments": relay_process.c_relay(tools, "segment"),
+            "asyncio relay": relay_process.asyncio_relay(),
+            **{name: relay_process.our_relay(name, ours) for name, ours in OURS.items()},
         }
-        relays = start_all(kinds, tools, stack, rounds)
+        relays = relay_process.start_all(kinds, tools, stack, rounds)
         direct = Ends(tools.load)
         stack.callback(direct.close)
         direct.connect(direct.sink_port)
-        count = min(BURST, direct.sink_holds)
+        count = min(relay_process.BURST, direct.sink_holds)
         for number in range(ROUNDS):
             if number % 10 == 0:
                 say(f"rounds {number + 1} to {number + 10} of {ROUNDS}")
-            in_turn(relays, rounds, Relay.burst)
+            relay_process.in_turn(relays, rounds, relay_process.Relay.burst)
             with on_core(RELAY_CORE):
                 found, cpu_s = direct.direct(count)
-            rounds.add(DIRECT, figures_of(DIRECT, found, count, 0, cpu_s))
+            rounds.add(DIRECT, relay_process.figures_of(DIRECT, found, count, 0, cpu_s))
     return rows_of(rounds)
 
 

@@ -7,59 +7,30 @@ accuracy is set so that its event times agree to 1e-8 s.
 import argparse
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 # Set before numpy is imported, as the command line does: small matrices do not gain from threads.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 import numpy as np
-from scipy.integrate import solve_ivp
 
 from benchmarks._report import Benchmark, Goal, Peer, Row, median, say
+from benchmarks.batch import integrated
 from cosim.cli import find_scenario
-from cosim.simulation.continuous.continuous_loop import ContinuousLoop, continuous_loop_of
+from cosim.simulation.batch.batch_interface import Population, setting_of
+from cosim.simulation.continuous.continuous_loop import continuous_loop_of
 from cosim.simulation.continuous.continuous_run import simulate_continuous
 from cosim.simulation.continuous.network_fates import network_fates
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
-from noack.core.linear_systems import Vector
 from noack.theory.run_conditions import ideal_conditions
 from noack.theory.scenario_certificates import certify
 
 ROUNDS = 5
 _RTOL = 1e-10
 _AGREEMENT_S = 1e-8
-
-
-def integrated_events(
-    system: ContinuousLoop, horizon_s: float, delivered: Sequence[bool]
-) -> list[float]:
-    """Return event times by ``solve_ivp``, from one threshold crossing to the next."""
-    n, generator = system.loop.n, system.generator
-    trigger = system.trigger
-
-    def field(t_s: float, z: Vector) -> Vector:
-        return np.asarray(generator @ z)
-
-    def crossing(t_s: float, z: Vector) -> float:
-        return float(np.log(np.linalg.norm(z[n : 2 * n]) + 1e-300) - np.log(trigger.beta)
-                     + trigger.alpha_per_s * t_s)  # fmt: skip
-
-    crossing.terminal, crossing.direction = True, 1.0  # type: ignore[attr-defined]
-    z, t_s, found = np.concatenate([system.loop.x0, np.zeros(2 * n)]), 0.0, [0.0]
-    while True:
-        solution = solve_ivp(
-            field, (t_s, horizon_s), z, events=crossing, method="DOP853", rtol=_RTOL, atol=1e-14
-        )
-        if not len(solution.t_events[0]):
-            return found
-        t_s, z = float(solution.t_events[0][0]), solution.y_events[0][0].copy()
-        z[n : 2 * n] = 0.0
-        if delivered[len(found)]:
-            z[2 * n :] = 0.0
-        found.append(t_s)
 
 
 def timed_ms(call: Callable[[], object]) -> float:
@@ -72,14 +43,16 @@ def timed_ms(call: Callable[[], object]) -> float:
 def continuous_row(scenario: Scenario) -> Row:
     """A run in continuous time."""
     system, fate = continuous_loop_of(scenario), network_fates(scenario)
-    fates, horizon_s = [fate(i) for i in range(1000)], scenario.horizon_s
+    horizon_s, loop, setting = scenario.horizon_s, system.loop, setting_of(scenario)
+    fates = [fate(i) for i in range(1000)]
+    draw = Population(loop.A[None], loop.B[None], loop.x0[None], np.zeros(1, np.uint64))
 
     def ours() -> list[float]:
         ran = simulate_continuous(system, horizon_s=horizon_s, delivered=fates, known_start=False)
         return [float(t_s) for t_s in ran.event_s]
 
     def theirs() -> list[float]:
-        return integrated_events(system, horizon_s, fates)
+        return integrated(setting, draw, np.array(fates), "DOP853", _RTOL)
 
     found, expected = ours(), theirs()
     same = len(found) == len(expected)

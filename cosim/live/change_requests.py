@@ -1,17 +1,20 @@
 """Requests to change the runtime parameters of a run: checked, given a time, announced."""
 
+from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import Any
 
 from noack.config.parameter_changes import (
     ChangeSchedule,
     ParameterChange,
+    changed,
     current_parameters,
     scheduled,
 )
 from noack.config.scenario import MOST_CHANGES
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
+from noack.impairments.kept_loss import found_probabilities
 from noack.runtime.control_messages import ChangeRequest, parse_message
 from noack.runtime.control_plane import ControlPlane
 from noack.runtime.join_ticket import Ticket
@@ -33,7 +36,9 @@ class ChangeRequests:
         for change in scheduled(ticket.scenario):
             self._add(change, 0, "in the scenario")
 
-    def answer(self, request: bytes, now_ns: int, obstacle: str | None) -> dict[str, Any]:
+    def answer(
+        self, request: bytes, clock: Callable[[], int], obstacle: str | None
+    ) -> dict[str, Any]:
         """Announce the requested change, unless there is an obstacle; return the parameters.
 
         Raises:
@@ -41,12 +46,14 @@ class ChangeRequests:
             PeerError: the message is not a change request.
         """
         settings = parse_message(ChangeRequest, request).get("settings", {})
-        from_s = None
+        from_s, now_ns = None, clock()
         if settings:
             if obstacle is not None:
                 raise CallerError(obstacle)
             if len(self.announced) >= MOST_CHANGES:
                 raise CallerError(f"this run has had {MOST_CHANGES} changes, the maximum")
+            changed(self._schedule.last, settings)  # before the time is chosen, as it may take long
+            now_ns = clock()
             delay_ns = int(_CHANGE_DELAY_S * NS_PER_S * self._scenario.speed)
             t_ns = -(-max(now_ns + delay_ns, 0) // _MILLISECOND_NS) * _MILLISECOND_NS
             if t_ns >= self._scenario.timing.horizon_ns:
@@ -78,6 +85,12 @@ class ChangeRequests:
             "settings": dict(change.settings),
             "requested_ns": requested_ns,
             "requested_at": requested_at,
+            "kept_losses": found_probabilities(
+                *(
+                    one.network.link
+                    for one in self._schedule.between(change.t_ns, self._scenario.timing.horizon_ns)
+                )
+            ),
         }
         self.announced.append(announcement)
         return announcement

@@ -219,7 +219,7 @@ class Coordinator:
         if self._stopped is not None:
             obstacle = f"the run is stopping: {self._stopped}"
         try:
-            answer = self._changes.answer(_payload(query), self.now_ns(), obstacle)
+            answer = self._changes.answer(_payload(query), self.now_ns, obstacle)
         except (CallerError, PeerError) as error:
             self.plane.refuse(query, str(error))
         else:

@@ -14,7 +14,7 @@ from netem.control.emulator_statistics import Statistics
 from noack.core.errors import PeerError
 from noack.runtime.zenoh_session import answer_to, cause_of, open_session
 
-_ANSWER_S = 10.0
+_ANSWER_S = 30.0
 _SILENCE_S = 3.0
 _POLL_S = 0.02
 

@@ -64,11 +64,13 @@ def hold_back_until(
     release_ns = max(desired_ns, flow.first_release_ns)
     width = program.mansd + 1
     oldest = max(packet - width, 0)
-    newest = _newest(recent_ns, width, oldest, packet)
-    if newest < oldest or recent_ns[newest % width] <= release_ns:
-        return release_ns  # no packet becomes stale
-    delivered = -1
-    for number in range(oldest, packet):
+    delivered = _newest(recent_ns, width, oldest, packet)
+    while delivered >= oldest and recent_ns[delivered % width] > release_ns:
+        delivered = _newest(recent_ns, width, oldest, delivered)
+    first = delivered + 1
+    if delivered < oldest:
+        delivered = -1
+    for number in range(first, packet):
         time_ns = recent_ns[number % width]
         if time_ns > release_ns:
             if may_lose_after(program, losses, delivered, packet):

@@ -5,6 +5,7 @@ input is added to u after the actuator, where it is not measured. A disturbance 
 ẋ = Ax + Bu + w.
 """
 
+import math
 from abc import abstractmethod
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -50,6 +51,23 @@ class DisturbanceSettings(ScenarioSection):
     def variance(self) -> Vector:
         """Variance of the random part of each entry; zeros if the disturbance is not random."""
         return np.zeros(len(self.entries))
+
+    @property
+    def normal_entries(self) -> int:
+        """Number of entries with a normally distributed value at every step, which has no bound."""
+        return 0
+
+    @property
+    def longest_s(self) -> float:
+        """The time from the first value other than 0 to the last one; by default infinite."""
+        return math.inf
+
+    @abstractmethod
+    def extent(self, normal: float) -> Matrix:
+        """Return columns, (entries, k): the signal is their sum with k factors from −1 to 1.
+
+        ``normal`` is the assumed bound of every value that has a standard normal distribution.
+        """
 
     @abstractmethod
     def signal(self, steps: range, source: SignalSource) -> Matrix:

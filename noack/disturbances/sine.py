@@ -25,6 +25,9 @@ class SineDisturbance(DisturbanceSettings):
     phase_rad: FiniteFloat = 0.0
     """Phase at t = 0."""
 
+    def extent(self, normal: float) -> Matrix:
+        return np.array(self.amplitude)[:, None]
+
     def signal(self, steps: range, source: SignalSource) -> Matrix:
         """The value at the beginning of each step."""
         t_s = np.array(steps) * source.period_ns * 1e-9

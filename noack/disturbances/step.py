@@ -1,5 +1,6 @@
 """A disturbance that is constant while it lasts: a load, a gust of wind."""
 
+import math
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
@@ -31,6 +32,13 @@ class StepDisturbance(DisturbanceSettings):
         if self.until_s is not None and self.until_s <= self.from_s:
             raise ValueError("until_s: must be later than from_s")
         return self
+
+    @property
+    def longest_s(self) -> float:
+        return math.inf if self.until_s is None else self.until_s - self.from_s
+
+    def extent(self, normal: float) -> Matrix:
+        return np.array(self.amplitude)[:, None]
 
     def signal(self, steps: range, source: SignalSource) -> Matrix:
         """The constant in steps that begin in [from_s, until_s), else 0."""

@@ -30,6 +30,9 @@ class UniformDisturbance(DisturbanceSettings):
     def variance(self) -> Vector:
         return np.square(self.bound) / 3
 
+    def extent(self, normal: float) -> Matrix:
+        return np.diag(self.bound)
+
     def signal(self, steps: range, source: SignalSource) -> Matrix:
         unit = uniforms(source.seed, *source.stream, rows=steps, width=len(self.bound))
         return np.asarray(np.array(self.bound) * (2.0 * unit - 1.0))

@@ -6,6 +6,7 @@ delivered. The loss rate is Σ π(s, a) ℓ(s⁺) over the states that allow a l
 distribution π, and s⁺ the state of the impairments after their step.
 """
 
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,6 +30,7 @@ class Moves(NamedTuple):
     """(a,)"""
 
 
+@lru_cache(maxsize=4)
 def moves_of(guarantee: LossGuarantee, most: int) -> Moves:
     """Return all states of a guarantee.
 
@@ -112,10 +114,8 @@ def _stationary(joint: Any, start: Array) -> Array:
     """Return the stationary distribution of the states that remain possible."""
     from scipy.sparse import csgraph
 
-    reached, before = start > 0, np.int64(-1)
-    while before != (before := np.count_nonzero(reached)):
-        reached |= joint.T @ reached.astype(float) > 0
-    places = np.flatnonzero(reached)
+    steps = csgraph.dijkstra(joint, indices=np.flatnonzero(start), unweighted=True, min_only=True)
+    places = np.flatnonzero(np.isfinite(steps))
     part = joint[places][:, places]
     _, labels = csgraph.connected_components(part, connection="strong")
     sources, targets = part.nonzero()

@@ -44,7 +44,8 @@ class LossRule(Protocol):
         """Return how a value violates the rule, as part of a sentence."""
 
 
-class LongestBurst(NamedTuple):
+@dataclass(frozen=True)
+class LongestBurst:
     """At most ``limit`` consecutive losses; the state is the number of consecutive losses."""
 
     limit: int
@@ -69,7 +70,8 @@ class LongestBurst(NamedTuple):
         return f"{value:.0f} consecutive updates lost, {self.limit} allowed"
 
 
-class LossesInWindow(NamedTuple):
+@dataclass(frozen=True)
+class LossesInWindow:
     """At most ``limit`` losses in ``window`` consecutive packets.
 
     The state has one bit for each of the last ``window`` − 1 packets: 1 if it was lost.
@@ -99,7 +101,8 @@ class LossesInWindow(NamedTuple):
         return f"{value:.0f} of {self.window} consecutive updates lost, {self.limit} allowed"
 
 
-class DeliveriesBetweenBursts(NamedTuple):
+@dataclass(frozen=True)
+class DeliveriesBetweenBursts:
     """At least ``deliveries`` consecutive deliveries between two bursts of losses.
 
     The state is the number of deliveries since the last loss, up to ``deliveries``; the value is

@@ -76,6 +76,8 @@ class ChangeAnnouncement(ControlMessage):
     settings: dict[str, JsonValue]  # values by scenario key
     requested_ns: Nanoseconds  # simulated time of the request
     requested_at: str  # date and time of the request; or that the scenario contains the change
+    kept_losses: dict[str, FiniteFloat] = {}
+    """Probabilities for :func:`noack.impairments.kept_loss.remember`."""
 
 
 class ChangeRequest(ControlMessage):

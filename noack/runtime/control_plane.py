@@ -19,6 +19,7 @@ from zenoh.handlers import FifoChannel, RingChannel
 from noack.config.parameter_changes import ParameterChange
 from noack.config.scenario import MOST_CHANGES
 from noack.core.errors import NoAnswerError, PeerError
+from noack.impairments.kept_loss import remember
 from noack.protocol.topology import COORDINATOR
 from noack.runtime.control_messages import ChangeAnnouncement, parse_message
 from noack.runtime.join_ticket import Ticket
@@ -232,6 +233,7 @@ class ParameterUpdates:
         taken: list[tuple[ParameterChange, Mapping[str, Any]]] = []
         while self._waiting and (at_most is None or len(taken) < at_most):
             one = self._waiting.pop(0)
+            remember(one.get("kept_losses", {}))
             if one["number"] >= self._next_number:  # a late process receives some twice
                 self._next_number = one["number"] + 1
                 taken.append((ParameterChange(one["number"], one["t_ns"], one["settings"]), one))

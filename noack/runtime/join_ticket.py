@@ -12,11 +12,12 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, ValidationError
 
 from noack.config.scenario import Scenario
 from noack.config.validation_messages import brief
 from noack.core.errors import CallerError, PeerError
+from noack.impairments.kept_loss import found_probabilities, remember
 from noack.protocol.wire_format import KEY_BYTES
 from noack.runtime.lock_file import lock_file
 from noack.runtime.private_folder import open_private, private_folder, require_name
@@ -35,6 +36,8 @@ class Ticket(ScenarioSection):
     endpoint: str  # zenoh endpoint of the control plane, e.g. ``tcp/127.0.0.1:7447``
     run_dir: str
     launched: bool  # whether a launcher holds the process's standard input open as its lifeline
+    kept_losses: Annotated[dict[str, FiniteFloat], AfterValidator(remember)] = Field({})
+    """Probabilities that the check of the scenario needs."""
     scenario: Scenario  # resolved
 
 
@@ -46,6 +49,7 @@ def new_ticket(scenario: Scenario, endpoint: str, run_dir: Path, *, launched: bo
         endpoint=endpoint,
         run_dir=str(run_dir),
         launched=launched,
+        kept_losses=found_probabilities(scenario.network.link, scenario.network.reverse.link),
         scenario=scenario,
     )
 

@@ -22,7 +22,7 @@ from noack.runtime.join_ticket import Ticket
 from noack.runtime.zenoh_session import SessionSecret, answer_to, cause_of, open_session
 
 _KIND = "runs"
-_ANSWER_S = 10.0
+_ANSWER_S = 30.0
 
 
 class OpenRun(NamedTuple):

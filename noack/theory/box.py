@@ -35,8 +35,8 @@ class BoxGains(PlantGains):
     is_one_plant: ClassVar = False
 
     @cached_property
-    def states(self) -> Mapping[Output, Coefficients]:
-        """sup‖C x‖ from x(0) and from the input error; w is added to ``MISMATCH``.
+    def states(self) -> Mapping[str, Coefficients]:
+        """sup‖C x‖ from x(0), disturbances and input error; w is added to ``MISMATCH``.
 
         Raises:
             NotDecayingError: the model decays too slowly, or the box is too large.
@@ -55,7 +55,7 @@ class BoxGains(PlantGains):
         )
         return found
 
-    def start_up(self, start_s: float) -> tuple[float, Mapping[Output, float]]:
+    def start_up(self, start_s: float) -> tuple[float, Mapping[str, float]]:
         """Return the effect of zero input before ``start_s``: p = −K x, x' = A x for every A.
 
         With zero input w = Ã x, which the bound of w covers.
@@ -65,10 +65,12 @@ class BoxGains(PlantGains):
         R, box = self.error.split_K[1], float(np.linalg.norm(self.halfwidth_A, 2))
         # ‖e^{As}‖ ≤ e^{μs}; the logarithmic norm μ of a sum is at most the sum of both norms.
         mu = max(logarithmic_norm(self.A) + box, 0.0) + self.alpha_per_s
-        size = float(np.linalg.norm(self.start, 2)) * math.exp(mu * start_s)
+        pushes = self._forcing.columns
+        size = float(np.linalg.norm(self.start, 2) + start_s * np.linalg.norm(pushes, axis=0).sum())
+        size *= math.exp(mu * start_s)
         rate = float(np.linalg.norm(R @ self.A, 2)) + float(np.linalg.norm(R, 2)) * box
         first = float(np.linalg.norm(R @ self.start, 2)) * math.exp(self.alpha_per_s * start_s)
-        error = first + start_s * rate * size
+        error = first + start_s * (rate * size + np.linalg.norm(R @ pushes, axis=0).sum())
         impulse = error * start_s
         w = self._bound_of_w(impulse * np.array([peaks.impulse for peaks in self._coordinates]))
         found = {
@@ -85,7 +87,8 @@ class BoxGains(PlantGains):
         differs = R.any() or not self._rows
         columns = np.concatenate([nominal, self._directions], axis=1)
         forced = columns if differs else self._directions
-        return self.error.growth(forced, self.input_matrix, until_s, cells)
+        disturbed = self._forcing.columns
+        return self.error.growth(forced, self.input_matrix, disturbed, until_s, cells)
 
     @cached_property
     def _rows(self) -> list[int]:
@@ -107,14 +110,14 @@ class BoxGains(PlantGains):
     def _peaks_at(self, C: Matrix) -> "_PeakGains":
         (start, to_w), forced = self._responses, self._forced.through(C)
         return _PeakGains(
-            start.through(C).sup(),
+            start.through(C).sup() + self.disturbed(C),
             forced.integral(),
             forced.sup(),
             np.array([w.through(C).integral() for w in to_w]),
         )
 
     @cached_property
-    def _peaks(self) -> Mapping[Output, "_PeakGains"]:
+    def _peaks(self) -> Mapping[str, "_PeakGains"]:
         return {output: self._peaks_at(C) for output, C in self.outputs.items()}
 
     @cached_property
@@ -143,11 +146,12 @@ class BoxGains(PlantGains):
         forced = np.array([peaks.forced for peaks in self._coordinates])
         forced[len(self.A) :] += np.linalg.norm(self.error.split_K[0], axis=1)  # u = K x + p
         start = np.array([peaks.start for peaks in self._coordinates])
+        start[len(self.A) :] += self._forcing.at_input  # B̃ acts on u with its disturbance
         return self._bound_of_w(start), self._bound_of_w(forced)
 
 
 class _PeakGains(NamedTuple):
-    """sup‖C x‖ ≤ start + forced · sup‖p‖ + impulse · ∫‖p‖ + from_w · |w|."""
+    """sup‖C x‖ ≤ start (with disturbances) + forced · sup‖p‖ + impulse · ∫‖p‖ + from_w · |w|."""
 
     start: float
     forced: float

@@ -10,22 +10,26 @@ its guarantee about losses, and the input is held. With all signals scaled by e^
     β̃ = sup‖e_s‖_W ≤ ḡβ + I_E sup‖R_E x‖ + I_B π                      (between two tests)
 
 with at most N missing events: the longest burst of losses, and ⌈d/δ⌉ in flight. Γ_C is smaller if
-few updates may be lost in a window (:mod:`noack.theory.loss_accumulation`). These inequalities are
-linear in q and β̃ and hold on every [0, T]. So their solution bounds the run if the loop gain is
-below 1. The minimum inter-event
+few updates may be lost in a window (:mod:`noack.theory.loss_accumulation`). A policy's
+threshold may contain more than β, see :class:`TriggerBound`. These inequalities are linear in q
+and β̃ and hold on every [0, T]. So their solution (:mod:`noack.theory.nonnegative_system`) bounds
+the run if the loop gain is below 1. The minimum inter-event
 time δ is the time that ‖e_s‖_W needs from 0 to β under these bounds. If an assumed δ gives a time
 of at least δ, it holds by induction over the events; the largest such δ is used.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 
+from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, LossRule
 from noack.theory.gains import Coefficients, ErrorGains, Output, PlantGains
 from noack.theory.loss_accumulation import LossAccumulation
+from noack.theory.nonnegative_system import solve_inequalities
 
 _SHORTEST_S, _LONGEST_S = 1e-9, 1e6
 _SETTLED = 1e-3
@@ -83,19 +87,32 @@ class Constants(NamedTuple):
     """δ, lower bound of the inter-event time; None if there is no such bound."""
     loop_gain: float
     """Loop gain of the errors (small-gain condition); below 1."""
+    estimation_error: float = 0.0
+    """‖x̂ − x‖_W at the measurements. Where it is not 0, e_s and e_c are x_s − x̂ and x_c − x̂."""
 
 
 class VoidError(ArithmeticError):
     """There is no certificate; the message has the reason."""
 
 
-class Level(NamedTuple):
-    """The trigger's threshold, scaled."""
+class TriggerBound(NamedTuple):
+    """What a trigger guarantees about e_s, scaled.
+
+    After each of its tests ‖e_s‖_W ≤ β + Σ_C share_C sup‖C x‖.
+    """
 
     beta: float
-    """β: after a test, ‖e_s‖_W ≤ β."""
+    """β, in the units of ‖W x‖."""
     reached: float | None
     """The smallest ‖e_s‖_W at an event; None if it may be arbitrarily small."""
+    shares: Mapping[str, float] = MappingProxyType({})
+    """share_C by the name of C in :attr:`PlantGains.outputs`."""
+    untested_s: float = 0.0
+    """After an event the trigger is not tested for this time: e_s grows from 0 for up to h more."""
+    apart_s: float = 0.0
+    """Events are at least this far apart, whatever happens to e_s."""
+    unit: float | None = None
+    """Unit of the constants Δ and β̃/β; by default β."""
 
 
 class Background(NamedTuple):
@@ -115,16 +132,33 @@ class Background(NamedTuple):
     """Bound of the inter-event time."""
 
 
-_CLEAN = Background()
+NO_BACKGROUND = Background()
+
+
+class EstimationBound(NamedTuple):
+    """Bound of the estimation error at every measurement, where the trigger tests x̂ instead of x.
+
+    ‖x̂ − x‖_W ≤ fixed + Σ_C share_C sup‖C x‖ + from_input sup‖p‖
+    """
+
+    fixed: float = 0.0
+    """From noise, disturbances and the first estimate."""
+    shares: Mapping[str, float] = MappingProxyType({})
+    """share_C by the name of C in :attr:`PlantGains.outputs`: the plant is not the model."""
+    from_input: float = 0.0
+
+
+_MEASURED = EstimationBound()
 
 
 def solve(
     error: ErrorGains,
     plant: PlantGains,
     conditions: NetworkConditions,
-    level: Level,
-    background: Background = _CLEAN,
+    bound: TriggerBound,
+    background: Background = NO_BACKGROUND,
     *,
+    estimation: EstimationBound = _MEASURED,
     structured: bool = True,
 ) -> Constants:
     """Return the constants that are certified for all times.
@@ -136,36 +170,69 @@ def solve(
         VoidError: the loop gain is not below 1.
         NotDecayingError: a mode of the loop decays more slowly than the threshold.
     """
-    step = _Step(error, plant, conditions, level, background)
-    if structured and plant.is_one_plant:
-        step.use_windows()
-    if level.reached is None:
-        return step.constants(conditions.spacing_s, None)
+    part = Part(error, plant, bound, estimation)
+    (found,) = solve_sum([part], conditions, background, structured=structured)
+    return found
+
+
+class Part(NamedTuple):
+    """One of several bounds that are added: with its own decay rate and its own causes."""
+
+    error: ErrorGains
+    plant: PlantGains
+    bound: TriggerBound
+    estimation: EstimationBound = _MEASURED
+
+
+def solve_sum(
+    parts: Sequence[Part],
+    conditions: NetworkConditions,
+    background: Background = NO_BACKGROUND,
+    *,
+    structured: bool = True,
+) -> list[Constants]:
+    """Return the constants of several parts, whose bounds hold when they are added.
+
+    All inequalities are linear in functions of time, for given events. So the causes may be
+    divided: what decays is one part, what persists another one. The threshold is at least the sum
+    of the parts' ``reached``, so the next event needs one part that reaches its own. The
+    ``background`` is that of the first part.
+
+    Raises: as :func:`solve`.
+    """
+    backgrounds = [background, *[NO_BACKGROUND] * (len(parts) - 1)]
+    steps = [
+        _Step(part, conditions, before) for part, before in zip(parts, backgrounds, strict=True)
+    ]
+    if structured and parts[0].plant.is_one_plant:
+        for step in steps:
+            step.use_windows()
+
+    def constants(spacing_s: float, inter_event_s: float | None) -> list[Constants]:
+        return [step.constants(spacing_s, inter_event_s) for step in steps]
+
+    apart_s = max(part.bound.apart_s for part in parts)
+    least_s = max(conditions.spacing_s, apart_s)
+    if any(part.bound.reached is None for part in parts):
+        return constants(least_s, apart_s or None)
     spacing_s = background.inter_event_s
     for _ in range(_ATTEMPTS):
-        if spacing_s <= conditions.spacing_s:
+        if spacing_s <= least_s:
             break
-        found_s = step.inter_event_s(spacing_s)
+        found_s = min(step.inter_event_s(spacing_s) for step in steps)
         if found_s >= spacing_s:
-            return step.constants(spacing_s, spacing_s)
+            return constants(spacing_s, spacing_s)
         # Iterate from above to the largest spacing that is consistent with itself.
         spacing_s = found_s if found_s < (1 - _SETTLED) * spacing_s else (1 - _SETTLED) * found_s
-    return step.constants(conditions.spacing_s, conditions.spacing_s or None)
+    return constants(least_s, least_s or None)
 
 
 class _Step:
     """One iteration: all constants for an assumed spacing of events."""
 
-    def __init__(
-        self,
-        error: ErrorGains,
-        plant: PlantGains,
-        conditions: NetworkConditions,
-        level: Level,
-        background: Background,
-    ) -> None:
-        self._error, self._plant = error, plant
-        self._conditions, self._level, self._background = conditions, level, background
+    def __init__(self, part: Part, conditions: NetworkConditions, background: Background) -> None:
+        self._error, self._plant, self._bound, self._estimation = error, plant, bound, _ = part
+        self._conditions, self._background = conditions, background
         self._lost: LossAccumulation | None = None
         self._remainder = error.hold_remainder(conditions.hold_s)
         self._start_error, start = plant.start_up(conditions.start_s)
@@ -173,12 +240,10 @@ class _Step:
             output: Coefficients(free + start[output], gain)
             for output, (free, gain) in plant.states.items()
         }
-        self._stretch = error.stretch(conditions.sampling_s)
-        self._mismatch_growth, self._input_growth = 0.0, 0.0
-        if conditions.sampling_s > 0:
-            growth = plant.growth(conditions.sampling_s, _COARSE)
-            self._mismatch_growth = growth.mismatch.integral_on_grid()
-            self._input_growth = growth.input_error.integral_on_grid()
+        self._growths = [_Growing(plant, conditions.sampling_s, bound)]
+        if bound.untested_s > 0:
+            longest_s = conditions.sampling_s + bound.untested_s
+            self._growths.append(_Growing(plant, longest_s, TriggerBound(0.0, None)))
 
     def use_windows(self) -> None:
         """Use how many updates may be lost in a window, too."""
@@ -191,50 +256,87 @@ class _Step:
             output: self._error.now(output) + self._error.missing(output, events, spacing_s)
             for output in self._error.outputs
         }
-        hold_s, states = self._conditions.hold_s, self._states
-        rate, weighted = states[Output.GAIN_RATE], states[Output.WEIGHTED]
-        mismatch = states[Output.MISMATCH]
         from_errors = self._from_errors(events, spacing_s, shares[Output.GAIN])
-        # q = own q + from_e_s β̃ + input_fixed,   β̃ = from_q q + echo β̃ + error_fixed
-        own = hold_s * rate.gain + self._remainder * weighted.gain
-        from_e_s = hold_s * (from_errors[Output.GAIN_RATE] + shares[Output.GAIN_RATE])
-        from_e_s += self._remainder * (from_errors[Output.WEIGHTED] + shares[Output.WEIGHTED])
-        input_fixed = hold_s * rate.free + self._remainder * weighted.free
-        from_q = self._mismatch_growth * mismatch.gain + self._input_growth
-        echo = self._mismatch_growth * from_errors[Output.MISMATCH]
-        echo += self._input_growth * shares[Output.GAIN]
-        error_fixed = max(
-            self._stretch * self._level.beta
-            + self._mismatch_growth * max(mismatch.free, self._background.mismatch)
-            + self._input_growth * max(self._start_error, self._background.input_error),
-            self._background.sensor_error,
-        )
-        margin = (1 - own) * (1 - echo) - from_e_s * from_q
-        loop_gain = max(own, echo, 1 - margin)
-        if not loop_gain < 1:
-            raise VoidError(f"the loop gain of the errors is {loop_gain:.3g}, not below 1")
-        held = (input_fixed * (1 - echo) + from_e_s * error_fixed) / margin
-        sensor_error = ((1 - own) * error_fixed + from_q * input_fixed) / margin
-        input_error = shares[Output.GAIN] * sensor_error + held
-        state = {
-            output: free + gain * held + from_errors[output] * sensor_error
-            for output, (free, gain) in states.items()
-        }
+        signals = self._signals(shares, from_errors)
+        loop_gain, solved = self._solved(signals)
+        sensor_error = float(solved[1] + solved[2])
+        state = dict(zip(self._states, signals.free + signals.states @ solved, strict=True))
         return Constants(
             self._error.alpha_per_s,
             events,
-            shares[Output.WEIGHTED] * sensor_error / self._level.beta,
-            sensor_error / self._level.beta,
-            input_error,
+            shares[Output.WEIGHTED] * sensor_error / self.unit,
+            sensor_error / self.unit,
+            float(signals.errors[Output.GAIN] @ solved + solved[0]),
             self._start_error,
-            state[Output.STATE],
-            state[Output.WEIGHTED],
-            state[Output.MISMATCH],
+            float(state[Output.STATE]),
+            float(state[Output.WEIGHTED]),
+            float(state[Output.MISMATCH]),
             inter_event_s,
             loop_gain,
+            float(solved[2]),
         )
 
-    def _from_errors(self, events: int, spacing_s: float, share: float) -> Mapping[Output, float]:
+    @property
+    def unit(self) -> float:
+        """The unit of Δ and β̃/β."""
+        return self._bound.beta if self._bound.unit is None else self._bound.unit
+
+    def _signals(
+        self, shares: Mapping[Output, float], from_errors: Mapping[str, float]
+    ) -> "_Signals":
+        """Return how all outputs depend on (q, β̃, η).
+
+        An event's x_s − x̂ is at most β̃ + η, the present x_s − x at most β̃.
+        """
+        free = np.array([state.free for state in self._states.values()])
+        now = self._error.now(Output.GAIN)
+        states = [
+            (gain, from_errors[name], from_errors[name] - gain * now)
+            for name, (_, gain) in self._states.items()
+        ]
+        errors = {
+            output: np.array([0.0, share, share - self._error.now(output)])
+            for output, share in shares.items()
+        }
+        return _Signals(list(self._states), free, np.array(states), errors)
+
+    def _solved(self, signals: "_Signals") -> tuple[float, Vector]:
+        """Return the loop gain and the bounds of (q, β̃, η).
+
+        Raises:
+            VoidError: the loop gain is not below 1.
+        """
+        free, errors = signals.free, signals.errors
+        held: dict[str, float] = {
+            Output.GAIN_RATE: self._conditions.hold_s, Output.WEIGHTED: self._remainder,
+        }  # fmt: skip
+        beyond = max(self._start_error, self._background.input_error)
+        at_growth = np.maximum(free, signals.row({Output.MISMATCH: self._background.mismatch}))
+        input_error = errors[Output.GAIN] + np.array([1.0, 0.0, 0.0])
+
+        through = signals.row(held)
+        of_age = sum(gain * errors[Output(output)] for output, gain in held.items())
+        rows = [(through @ signals.states + of_age, float(through @ free))]
+        grown = []
+        for growing in self._growths:
+            through = signals.row(growing.shares)
+            after = np.array([0.0, 0.0, growing.estimation])
+            F = through @ signals.states + growing.input_error * input_error + after
+            grown.append((F, growing.fixed + through @ at_growth + growing.input_error * beyond))
+        gains, fixed = zip(*grown, strict=True)
+        rows.append((np.max(gains, axis=0), max(self._background.sensor_error, *fixed)))
+        estimation = self._estimation
+        through = signals.row(estimation.shares)
+        rows.append((
+            through @ signals.states + estimation.from_input * input_error,
+            estimation.fixed + float(through @ free) + estimation.from_input * beyond,
+        ))  # fmt: skip
+        solution = solve_inequalities(*map(np.array, zip(*rows, strict=True)))
+        if solution.bound is None:
+            raise VoidError(f"the loop gain of the errors is {solution.loop_gain:.3g}, not below 1")
+        return solution.loop_gain, solution.bound
+
+    def _from_errors(self, events: int, spacing_s: float, share: float) -> Mapping[str, float]:
         """Return Γ_C for every output, from D_K, the ``share``, and from the losses in windows.
 
         The second is computed only where it can be smaller: where all lost updates together have
@@ -257,15 +359,19 @@ class _Step:
         """Return the time that ‖e_s‖_W needs to the next event, given the spacing before it."""
         found = self.constants(spacing_s, None)
         own = self._error.now(Output.GAIN)
-        others = found.input_error - own * found.overshoot * self._level.beta
-        assert self._level.reached is not None
+        sensor_error = found.overshoot * self.unit - found.estimation_error
+        others = found.input_error - own * sensor_error
+        assert self._bound.reached is not None
+        # After an event e_s is the estimation error, and x_s − x̂ differs from e_s by one, too.
         found_s = first_passage_s(
             self._plant,
-            self._level.reached,
+            self._bound.reached - found.estimation_error,
             max(found.mismatch, self._background.mismatch),
             max(others, self._start_error, self._background.input_error),
             own,
+            found.estimation_error,
         )
+        found_s = max(found_s, self._bound.apart_s)
         grid_s = self._conditions.spacing_s
         return found_s if grid_s == 0 else grid_s * max(1, math.ceil(found_s / grid_s - 1e-9))
 
@@ -278,25 +384,76 @@ class _Step:
         return dropouts + math.ceil(delay_s / spacing_s)
 
 
+class _Signals(NamedTuple):
+    """The outputs of x and e_c as linear functions of (q, β̃, η), η = sup‖x̂ − x‖_W."""
+
+    names: list[str]
+    free: Vector
+    """(k,) the constant part of sup‖C x‖."""
+    states: Matrix
+    """(k, 3)"""
+    errors: Mapping[Output, Vector]
+    """(3,) of sup‖C e_c‖."""
+
+    def row(self, gains: Mapping[str, float]) -> Vector:
+        """Return gains of the outputs, by name, as an array (k,)."""
+        return np.array([gains.get(name, 0.0) for name in self.names])
+
+
+class _Growing:
+    """The growth of e_s without a test: from the bound after a test, or from 0 after an event.
+
+    sup‖e_s‖_W ≤ ``fixed`` + ``estimation`` η + Σ_C ``shares``_C sup‖C x‖ + ``input_error`` sup‖p‖
+    """
+
+    def __init__(self, plant: PlantGains, longest_s: float, after: TriggerBound) -> None:
+        stretch, outputs = plant.error.stretch(longest_s), plant.outputs
+        self.fixed, self.input_error = stretch * after.beta, 0.0
+        # The trigger tests x_s − x̂, and may compare it with x̂.
+        self.estimation = stretch * (1 + sum(
+            share * float(np.linalg.norm(outputs[C] @ plant.error.inverse_weight, 2))
+            for C, share in after.shares.items()
+        ))  # fmt: skip
+        shares = {C: stretch * share for C, share in after.shares.items()}
+        if longest_s > 0:
+            growth = plant.growth(longest_s, _COARSE)
+            mismatch = growth.mismatch.integral_on_grid()
+            shares[Output.MISMATCH] = shares.get(Output.MISMATCH, 0.0) + mismatch
+            self.input_error = growth.input_error.integral_on_grid()
+            self.fixed += float(growth.forced.sum())
+        self.shares: Mapping[str, float] = shares
+
+
 def first_passage_s(
-    plant: PlantGains, level: float, mismatch: float, input_error: float, own: float
+    plant: PlantGains,
+    level: float,
+    mismatch: float,
+    input_error: float,
+    own: float,
+    start: float = 0.0,
 ) -> float:
-    """Return a time before which ‖e_s‖_W, starting at 0, cannot reach ``level``.
+    """Return a time before which ‖e_s‖_W, starting at ``start``, cannot reach ``level``.
 
     Let ρ(r) = sup_{s≤r} ‖e_s‖_W. The part of e_c that equals the present e_s is bounded by ρ:
 
         ρ(r) ≤ ∫₀^r ‖W e^{Hs} L_E‖ sup‖R_E x‖ + ‖W e^{Hs} B U‖ (π' + own · ρ(r−s)) ds
 
-    This is iterated from ρ = ``level``; every iterate is a bound until the level is reached.
+    and further terms from the disturbances and ``start``. This is iterated from ρ = ``level``;
+    every iterate is a bound until the level is reached.
 
     ``level`` is ‖e_s‖_W at an event, ``mismatch`` sup‖R_E x‖, ``own`` ‖K W^{−1}‖, and
     ``input_error`` π', the input error without the effect of the present e_s.
     """
+    if level <= start:
+        return 0.0
     window_s, cells = _first_window_s(plant, level, mismatch, input_error + own * level), _COARSE
     known_s = 0.0
     while True:
         growth = plant.growth(window_s, cells)
-        fixed = np.cumsum(growth.mismatch.area * mismatch + growth.input_error.area * input_error)
+        areas = growth.mismatch.area * mismatch + growth.input_error.area * input_error
+        fixed = np.cumsum(areas + growth.forced)
+        if start:
+            fixed += start * plant.error.stretch(window_s)
         rho = np.full(cells, level)
         for _ in range(_PICARD_ROUNDS):
             echo = np.convolve(growth.input_error.area, rho)[:cells]
@@ -317,6 +474,7 @@ def _first_window_s(plant: PlantGains, level: float, mismatch: float, input_erro
     """Return the first search window: twice the time to ``level`` at the initial speed, limited."""
     start = plant.growth(_SHORTEST_S, 1)
     speed = start.mismatch.sup_on_grid() * mismatch + start.input_error.sup_on_grid() * input_error
+    speed += float(start.forced.sum()) / _SHORTEST_S
     if not speed > 0:
         return _LONGEST_S
     return min(max(2 * level / speed, _SHORTEST_S), _LONGEST_S)

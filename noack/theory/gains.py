@@ -10,7 +10,7 @@ interest are the weighted norm W, the state itself, E x, and K H x (the error ra
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
 from typing import ClassVar, NamedTuple
@@ -18,7 +18,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from noack.config.resolution import LoopMatrices
-from noack.core.linear_systems import Matrix
+from noack.core.linear_systems import Matrix, Vector
 from noack.theory.enclosure import (
     KernelBounds,
     ResponseBounds,
@@ -47,6 +47,17 @@ class Coefficients(NamedTuple):
     gain: float
 
 
+class Forcing(NamedTuple):
+    """Disturbances: ẋ = Ax + Bu + Σ_i D_i s_i, |s_i| ≤ 1 at every time."""
+
+    columns: Matrix
+    """D_i, (n, k)."""
+    durations_s: Vector
+    """The time for which s_i is not 0, (k,); infinite if it never ends."""
+    at_input: Vector
+    """Bound of what is added to u, included in the columns, (m,)."""
+
+
 class Growth(NamedTuple):
     """The growth of ‖e_s‖_W after a reset."""
 
@@ -54,6 +65,8 @@ class Growth(NamedTuple):
     """‖W e^{Hτ} L_E‖, E = L_E R_E"""
     input_error: KernelBounds
     """‖W e^{Hτ} B U‖"""
+    forced: Vector
+    """Σ_i ∫‖W e^{Hτ} D_i‖ over each cell of the grid, from the disturbances."""
 
 
 @dataclass(frozen=True)
@@ -121,13 +134,16 @@ class ErrorGains:
             self.kernels[output].sups(spacing_s * np.arange(events, dtype=np.float64)).sum()
         )
 
-    def growth(self, mismatch: Matrix, forced: Matrix, until_s: float, cells: int) -> Growth:
-        """Return the growth of ‖e_s‖_W if E x and B p act through these columns."""
+    def growth(
+        self, mismatch: Matrix, forced: Matrix, disturbed: Matrix, until_s: float, cells: int
+    ) -> Growth:
+        """Return the growth of ‖e_s‖_W if E x, B p and disturbances act through these columns."""
 
         def kernel(D: Matrix) -> KernelBounds:
             return response_until(self.scaled_H, D, until_s, cells).through(self.weight)
 
-        return Growth(kernel(mismatch), kernel(forced))
+        areas = [kernel(column[:, None]).area for column in disturbed.T]
+        return Growth(kernel(mismatch), kernel(forced), np.sum([np.zeros(cells), *areas], axis=0))
 
     def stretch(self, until_s: float) -> float:
         """Return sup‖e^{(H+αI)τ}‖_W over τ ≤ ``until_s``, the growth of a sampled error."""
@@ -158,6 +174,10 @@ class PlantGains:
     B: Matrix
     start: Matrix
     alpha_per_s: float
+    further_outputs: Mapping[str, Matrix] = field(default_factory=dict, kw_only=True)
+    """Further matrices C, (k, n), by name: sup‖C x‖ is bounded for them, too."""
+    forcing: Forcing | None = field(default=None, kw_only=True)
+    """The disturbances; they need α = 0."""
 
     is_one_plant: ClassVar = True
     """Whether A and B are the plant's, and not the centre of a box."""
@@ -178,30 +198,50 @@ class PlantGains:
         return factors(self.A + self.B @ self.error.K - self.error.H)
 
     @cached_property
-    def outputs(self) -> Mapping[Output, Matrix]:
+    def outputs(self) -> Mapping[str, Matrix]:
         """C of each output C x."""
         return {
             Output.STATE: np.eye(len(self.A)),
             Output.WEIGHTED: self.error.weight,
             Output.MISMATCH: self.split_mismatch[1],
             Output.GAIN_RATE: self.error.outputs[Output.GAIN_RATE],
+            **self.further_outputs,
         }
 
     @cached_property
-    def states(self) -> Mapping[Output, Coefficients]:
-        """sup‖C x‖ from x(0) and from the input error.
+    def states(self) -> Mapping[str, Coefficients]:
+        """sup‖C x‖ from x(0), the disturbances and the input error.
 
         Raises:
             NotDecayingError: α is not below the decay rate of e^{(A+BK)τ}.
         """
         start = response(self.closed_loop, self.start)
         return {
-            output: Coefficients(start.through(C).sup(), self.forced[output].integral())
+            output: Coefficients(
+                start.through(C).sup() + self.disturbed(C), self.forced[output].integral()
+            )
             for output, C in self.outputs.items()
         }
 
+    def disturbed(self, C: Matrix) -> float:
+        """Return the part of sup‖C x‖ from the disturbances: min(∫k, duration · sup k) of each."""
+        total = 0.0
+        for followed, duration_s in zip(self._disturbed, self._forcing.durations_s, strict=True):
+            kernel = followed.through(C)
+            total += min(kernel.integral(), duration_s * kernel.sup())
+        return total
+
     @cached_property
-    def forced(self) -> Mapping[Output, KernelBounds]:
+    def _disturbed(self) -> list[ResponseBounds]:
+        return [response(self.closed_loop, column[:, None]) for column in self._forcing.columns.T]
+
+    @property
+    def _forcing(self) -> Forcing:
+        n, m = self.B.shape
+        return self.forcing or Forcing(np.zeros((n, 0)), np.zeros(0), np.zeros(m))
+
+    @cached_property
+    def forced(self) -> Mapping[str, KernelBounds]:
         """‖C e^{(A+BK+αI)τ} B U‖ for every output."""
         return {output: self._forced.through(C) for output, C in self.outputs.items()}
 
@@ -209,7 +249,7 @@ class PlantGains:
     def _forced(self) -> ResponseBounds:
         return response(self.closed_loop, self.input_matrix)
 
-    def start_up(self, start_s: float) -> tuple[float, Mapping[Output, float]]:
+    def start_up(self, start_s: float) -> tuple[float, Mapping[str, float]]:
         """Return the effect of zero input before ``start_s``, where p = −K x.
 
         Returns:
@@ -219,14 +259,19 @@ class PlantGains:
             return 0.0, dict.fromkeys(self.outputs, 0.0)
         drift = self.A + self.alpha_per_s * np.eye(len(self.A))
         free = response_until(drift, self.start, start_s)
-        error = free.through(self.error.split_K[1]).sup_on_grid()
+        R = self.error.split_K[1]
+        error = free.through(R).sup_on_grid()
+        for column in self._forcing.columns.T:
+            pushed = response_until(drift, column[:, None], start_s)
+            error += pushed.through(R).integral_on_grid()
         return error, {
             output: error * start_s * self.forced[output].sup() for output in self.outputs
         }
 
     def growth(self, until_s: float, cells: int) -> Growth:
         """Return the growth of ‖e_s‖_W over ``until_s``, on a grid."""
-        return self.error.growth(self.split_mismatch[0], self.input_matrix, until_s, cells)
+        mismatch, disturbed = self.split_mismatch[0], self._forcing.columns
+        return self.error.growth(mismatch, self.input_matrix, disturbed, until_s, cells)
 
 
 def error_gains(loop: LoopMatrices, alpha_per_s: float) -> ErrorGains:

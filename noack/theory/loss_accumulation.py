@@ -38,7 +38,7 @@ class LossAccumulation:
     plant: PlantGains
     delay_s: float
 
-    def total(self, output: Output, spacing_s: float, windows: Sequence[LossWindow]) -> float:
+    def total(self, output: str, spacing_s: float, windows: Sequence[LossWindow]) -> float:
         """Return the bound of sup‖C x‖ / β̃ from all lost updates; infinite if it is not found."""
         bins = math.ceil(self._until_s / spacing_s) if spacing_s > 0 else _MOST_BINS
         if bins >= _MOST_BINS:
@@ -46,9 +46,7 @@ class LossAccumulation:
         highest = _over_bins(self._effects[output], spacing_s / self._cell_s, bins)
         return min(self._total(output, highest, spacing_s, window) for window in windows)
 
-    def _total(
-        self, output: Output, highest: Vector, spacing_s: float, window: LossWindow
-    ) -> float:
+    def _total(self, output: str, highest: Vector, spacing_s: float, window: LossWindow) -> float:
         most, packets = window
         if most == 0:
             return 0.0
@@ -60,7 +58,7 @@ class LossAccumulation:
         return float(ranked[:, :most].sum()) * _ROUNDING + beyond
 
     @cached_property
-    def _kernels(self) -> tuple[KernelBounds, Mapping[Output, KernelBounds]]:
+    def _kernels(self) -> tuple[KernelBounds, Mapping[str, KernelBounds]]:
         """The kernel g and the k of every output, over all times."""
         return self.plant.error.kernels[Output.GAIN], self.plant.forced
 
@@ -76,7 +74,7 @@ class LossAccumulation:
         return self._until_s / _CELLS
 
     @cached_property
-    def _effects(self) -> Mapping[Output, Vector]:
+    def _effects(self) -> Mapping[str, Vector]:
         """The bound of c over each cell, for every output."""
         plant, error = self.plant, self.plant.error
         until_s = self._until_s
@@ -90,7 +88,7 @@ class LossAccumulation:
             for output, C in plant.outputs.items()
         }
 
-    def _beyond(self, output: Output, most: int, block_s: float) -> float:
+    def _beyond(self, output: str, most: int, block_s: float) -> float:
         """Bound the sum over the losses that are older than the grid: a falling function f of age.
 
         The blocks that begin beyond it contribute at most m f(T) + m/block ∫_T^∞ f.

@@ -3,7 +3,7 @@
 import contextlib
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,13 +17,14 @@ from noack.theory.box import BoxGains
 from noack.theory.certificate import (
     Background,
     Constants,
-    Level,
     NetworkConditions,
+    TriggerBound,
     VoidError,
     solve,
 )
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.gains import ErrorGains, PlantGains, error_gains
+from noack.theory.run_conditions import kept_probability
 
 OWN_PLANT = "the scenario's plant"
 BOX = "every plant of the uncertainty box"
@@ -238,11 +239,17 @@ class CertificateScope:
             void = str(error)
         except (OverflowError, np.linalg.LinAlgError):
             void = _TOO_LARGE
-        assumptions = certificate_assumptions(self._resolved, conditions, self._decay, first, void)
-        return ScenarioCertificate(
+        found = ScenarioCertificate(
             self.name, trigger.beta, trigger.alpha_per_s, trigger.floor,
-            self._loop.weight is not None, conditions, tuple(assumptions), first, late, void,
+            self._loop.weight is not None, conditions, (), first, late, void,
         )  # fmt: skip
+        kept = None
+        if not self._resolved.network.enforce_mansd:
+            kept = kept_probability(self._resolved, conditions.guarantee, found.inter_event_s)
+        assumptions = certificate_assumptions(
+            self._resolved, conditions, self._decay, first, void, kept
+        )
+        return replace(found, assumptions=tuple(assumptions))
 
     def largest(self, conditions: NetworkConditions, change: Change, most_s: float = 10.0) -> float:
         """Return the largest time for which the changed conditions still have a certificate.
@@ -266,7 +273,7 @@ class CertificateScope:
         trigger, late = self._resolved.decaying, None
         first = self._first_phase(conditions)
         if 0 < trigger.floor < trigger.beta and first.rate_per_s == trigger.alpha_per_s:
-            late = self._after_floor(conditions, first)
+            late = _at_floor(first, trigger.floor / trigger.beta)
         if first.input_error < self._start_error:
             raise VoidError(
                 f"at its start the input was {self._start_error:.3g} from Kx; a certificate "
@@ -283,14 +290,14 @@ class CertificateScope:
         start = self._loop.x0[:, None]
         if not self._held and below(alpha, decay) and floor < beta:
             try:
-                return self._solve(conditions, alpha, alpha, start, Level(beta, beta))
+                return self._solve(conditions, alpha, alpha, start, TriggerBound(beta, beta))
             except NotDecayingError:
                 if floor > 0:
                     raise
                 return self._slower(conditions, alpha, start)
         # Certify a slower decay or none; the smallest event level is then the floor, if any.
         slower = 0.0 if self._held or floor > 0 else max(_SLOWER * decay, 0.0)
-        level = Level(max(beta, floor), floor or None)
+        level = TriggerBound(max(beta, floor), floor or None)
         return self._solve(conditions, slower, slower, start, level)
 
     def _slower(
@@ -304,38 +311,9 @@ class CertificateScope:
         for share in _SHARES_OF_ALPHA:
             rate = share * alpha_per_s
             with contextlib.suppress(NotDecayingError):
-                level = Level(self._resolved.decaying.beta, None)
+                level = TriggerBound(self._resolved.decaying.beta, None)
                 return self._solve(conditions, rate, rate, start, level)
         raise NotDecayingError("the uncertainty box is too large for the loop's gains")
-
-    def _after_floor(self, conditions: NetworkConditions, first: Constants) -> Constants:
-        """Return the constants without decay from t_ε on, when the threshold is the floor.
-
-        They hold for every state at the end of the first phase. The bounds of the first phase decay
-        like e^{−αt}: at t_ε − τ they are larger than at t_ε by the factor e^{ατ}. The gains of the
-        models keep α, so their kernels e^{(H+αI)τ} contain this factor for all effects of the first
-        phase on this one.
-        """
-        trigger = self._resolved.decaying
-        beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
-        share, from_s = floor / beta, _floor_from_s(beta, alpha, floor)
-        before_s = max(conditions.sampling_s, first.inter_event_s or 0.0)
-        started = conditions.start_s + before_s <= from_s
-        background = Background(
-            sensor_error=floor * first.overshoot,
-            mismatch=share * first.mismatch,
-            input_error=share * max(first.input_error, 0.0 if started else first.start_error),
-            inter_event_s=first.inter_event_s or 0.0,
-        )
-        found = self._solve(
-            conditions._replace(start_s=max(conditions.start_s - from_s, 0.0)),
-            alpha,
-            0.0,
-            share * first.state * np.eye(self._loop.n),
-            Level(floor, floor),
-            background,
-        )
-        return found._replace(rate_per_s=0.0)
 
     def _solve(
         self,
@@ -343,8 +321,7 @@ class CertificateScope:
         error_alpha_per_s: float,
         plant_alpha_per_s: float,
         start: Matrix,
-        level: Level,
-        background: Background | None = None,
+        level: TriggerBound,
     ) -> Constants:
         if error_alpha_per_s not in self._errors:
             self._errors[error_alpha_per_s] = error_gains(self._loop, error_alpha_per_s)
@@ -352,10 +329,20 @@ class CertificateScope:
         key = (error_alpha_per_s, plant_alpha_per_s, start.tobytes())
         if key not in self._plants:
             self._plants[key] = self._plant_at(error, start, plant_alpha_per_s)
-        background = background or Background(input_error=self._start_error)
+        background = Background(input_error=self._start_error)
         # Inputs of an earlier run are covered by their norm only.
         structured = self._start_error == 0.0
         return solve(error, self._plants[key], conditions, level, background, structured=structured)
+
+
+def _at_floor(first: Constants, share: float) -> Constants:
+    """Return the constants from the floor on, ``share`` = ε/β.
+
+    With θ(t) = max(βe^{−αt}, ε) in place of βe^{−αt}, all bounds of the first phase hold at all
+    times: for s ≤ t, θ(s) ≤ θ(t) e^{α(t−s)}, which is all that their proof uses of βe^{−αt}.
+    """
+    scaled = ("input_error", "start_error", "state", "state_weighted", "mismatch")
+    return first._replace(rate_per_s=0.0, **{name: share * getattr(first, name) for name in scaled})
 
 
 def _is_finite(constants: Constants) -> bool:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from noack.config.resolution import LoopMatrices
 from noack.core.linear_systems import Matrix, spectral_abscissa
-from noack.theory.certificate import Level, NetworkConditions, VoidError, solve
+from noack.theory.certificate import NetworkConditions, TriggerBound, VoidError, solve
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.gains import ErrorGains, PlantGains
 
@@ -59,7 +59,7 @@ def choose_weight(
         error = ErrorGains(loop.H, loop.K, weight, alpha_per_s)
         plant = PlantGains(error, loop.A, loop.B, loop.x0[:, None], alpha_per_s)
         try:
-            found = solve(error, plant, NetworkConditions(longest_burst), Level(beta, beta))
+            found = solve(error, plant, NetworkConditions(longest_burst), TriggerBound(beta, beta))
         except (VoidError, NotDecayingError):
             return 0.0
         return -(found.inter_event_s or 0.0)

@@ -147,15 +147,6 @@ def test_a_plant_step_is_compared_with_its_period_and_a_linear_plant() -> None:
         assert share.value == pytest.approx(p99.value / 20)  # per cent of a period of 2 ms
 
 
-@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="not a git repository")
-def test_the_repository_is_copied_without_generated_files(tmp_path: Path) -> None:
-    startup.copy_repository(tmp_path)
-    assert (tmp_path / "Makefile").is_file()
-    assert (tmp_path / "noack" / "protocol" / "wire_format.py").is_file()
-    assert not (tmp_path / ".git").exists()
-    assert not list(tmp_path.rglob("*.pyc"))
-
-
 @pytest.mark.parametrize("kind", ["compiled", "plain"])
 def test_an_emulator_relays_and_records_every_datagram_of_the_bursts(
     kind: str, monkeypatch: pytest.MonkeyPatch

@@ -1,5 +1,6 @@
 """``loss P keep``: the realised loss rate is P, or the words are refused."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -8,8 +9,15 @@ import pytest
 
 from netem.words.words_to_settings import settings_of
 from noack.core.errors import CallerError
-from noack.impairments.kept_loss import expected_loss, with_kept_loss
+from noack.impairments import kept_loss
+from noack.impairments.kept_loss import (
+    expected_loss,
+    found_probabilities,
+    remember,
+    with_kept_loss,
+)
 from noack.impairments.link_settings import read_files
+from noack.impairments.loss_prediction import predict
 from noack.protocol.record_tables import Fate
 
 DECISIONS = 4_000_000
@@ -45,6 +53,29 @@ def test_the_closed_form_is_inverted() -> None:
     p = loss.loss.probability  # type: ignore[attr-defined]
     assert p * (1 - p**2) / (1 - p**3) == pytest.approx(0.3, abs=1e-11)
     assert expected_loss(settings_of("loss 80% keep mansd 4")).rate == pytest.approx(0.8)
+
+
+def test_what_another_process_found_is_not_computed_again(monkeypatch: Any) -> None:
+    """Not even by the loops of a run; but other settings have another probability."""
+    settings = settings_of("loss 10% keep loss 5% mansd 1 delay 1ms")
+    found = found_probabilities(settings, settings_of("delay 1ms"))
+    assert list(found.values()) == [with_kept_loss(settings).impairments[0].loss.probability]  # type: ignore[attr-defined]
+    monkeypatch.setattr(kept_loss, "_found", {})
+    monkeypatch.setattr(kept_loss, "predict", None)
+    remember(json.loads(json.dumps(found)))
+    assert found_probabilities(settings_of("loss 10% keep loss 5% delay 9ms mansd 1")) == found
+    for other in ("loss 10% keep loss 5% mansd 2", "loss 10% keep mansd 1"):
+        with pytest.raises(TypeError):
+            with_kept_loss(settings_of(other))
+
+
+@pytest.mark.parametrize("others", ["", "loss script 0,2,10,11 every 12", "corrupt 10%"])
+def test_no_smaller_probability_gives_the_asked_rate(others: str) -> None:
+    guarantee = "atmost 3 in 11 recover 3"
+    (found,) = found_probabilities(settings_of(f"loss 26% keep {others} {guarantee}")).values()
+    smaller = np.linspace(0, found, 40)[:-1]
+    rates = [predict(settings_of(f"loss {100 * p}% {others} {guarantee}")).rate for p in smaller]
+    assert max(rate or 0.0 for rate in rates) < 0.26
 
 
 @pytest.mark.parametrize(

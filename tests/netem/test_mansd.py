@@ -19,8 +19,10 @@ from netem.rule_program import empty_state, new_flow, new_row, program_of
 from netem.rules import guarantee as rule
 from netem.rules.link_rules import settle
 from netem.words.words_to_settings import settings_of
+from noack.impairments.constraints import guarantee_of
 from noack.impairments.link_records import DELIVERED, DROPPED, PacketDecision, RecordedDecision
 from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_guarantee import LossAutomaton
 from tests.netem import any_settings
 from tests.netem.loss_language import is_allowed
 
@@ -297,6 +299,46 @@ def test_a_datagram_is_held_back_no_longer_than_necessary(
             assert decision.hold_back_ns == least - wish
             releases.append(least)
         assert is_allowed(lost_of(releases), own)
+
+
+@given(st.lists(st.booleans(), max_size=60), st.integers(0, 4), any_settings.constraints)
+def test_the_link_and_the_rules_of_the_analysis_are_one_guarantee(
+    wishes: list[bool], mansd: int, constraints: Any
+) -> None:
+    """A packet must pass exactly where the automaton of the analysis has no path for a loss."""
+    own = settings_of(f"mansd {mansd}").model_copy(update={"constraints": constraints})
+    program = program_of(own, 0, "a")
+    row = new_row(program, new_flow(0, False))
+    state = empty_state(program)._replace(**{name: [one] for name, one in row._asdict().items()})
+    automaton, place = LossAutomaton(guarantee_of(mansd, constraints)), np.zeros(1, np.int64)
+    for packet, wish in enumerate(wishes):
+        must_pass = rule.must_pass(program, row.flows, row.losses)
+        assert must_pass == (automaton.after_loss(place)[0] < 0)
+        lost = wish and not must_pass
+        place = automaton.after_loss(place) if lost else automaton.after_delivery(place)
+        fate = DROPPED if lost else DELIVERED
+        settle(program, state, 0, PacketDecision(fate, packet, release_ns=0))
+        row.flows.packets += 1
+
+
+class CountedList(list[int]):
+    """Counts how often an entry is read."""
+
+    reads = 0
+
+    def __getitem__(self, place: Any) -> Any:
+        self.reads += 1
+        return super().__getitem__(place)
+
+
+@pytest.mark.parametrize("words", ["mansd 100000", "mansd 100000 recover 2"])
+def test_a_large_cap_costs_no_more_than_the_packets_that_may_become_stale(words: str) -> None:
+    program = program_of(settings_of(f"delay 1s {words}"), 0, "a")
+    times_ns = CountedList(range(program.mansd + 1))
+    row = new_row(program, new_flow(0, False))
+    packet = len(times_ns)
+    assert rule.hold_back_until(program, row.flows, times_ns, row.losses, packet, packet - 4) >= 0
+    assert times_ns.reads < 20
 
 
 def test_a_duplicate_is_not_a_second_delivery(decide: Any) -> None:

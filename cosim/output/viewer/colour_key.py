@@ -4,19 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import rerun.blueprint as rrb
 
-from cosim.output.palette import (
-    CERTIFIED,
-    CONTROLLER,
-    FORCED,
-    IDENTITY,
-    LOST,
-    NETWORK,
-    PLANT,
-    SENSOR,
-    SERIES,
-    THRESHOLD,
-    Colour,
-)
+from cosim.output import palette
 from cosim.output.viewer.pictures.picture import Shape, label, lines
 
 COLOUR_KEY = "key"
@@ -28,30 +16,30 @@ _HALF, _THICK = 0.7, 0.16
 _DIAMOND = ((0.0, 0.3), (0.2, 0.1), (0.0, -0.1), (-0.2, 0.1), (0.0, 0.3))
 _CROSS = ((-0.16, 0.26), (0.16, -0.06), (0.0, 0.1), (0.16, 0.26), (-0.16, -0.06))
 _STROKE = ((-_HALF, 0.0), (_HALF, 0.0))
-_Entry = tuple[str, Colour, Sequence[tuple[float, float]]]
+_Entry = tuple[str, palette.Colour, Sequence[tuple[float, float]]]
 """Name, colour, and line of the sample."""
 _ROWS: tuple[tuple[_Entry, ...], ...] = (
     (
-        ("plant: x", PLANT, _STROKE),
-        ("sensor: x_s, ‖e_s‖, sent", SENSOR, _STROKE),
-        ("controller: x_c, ‖e_c‖, received", CONTROLLER, _STROKE),
+        ("plant: x", palette.PLANT, _STROKE),
+        ("sensor: x_s, ‖e_s‖, sent", palette.SENSOR, _STROKE),
+        ("controller: x_c, ‖e_c‖, received", palette.CONTROLLER, _STROKE),
     ),
     (
-        ("threshold", THRESHOLD, _STROKE),
-        ("bound from (I1)", IDENTITY, _STROKE),
-        ("certified bound", CERTIFIED, _STROKE),
+        ("threshold", palette.THRESHOLD, _STROKE),
+        ("bound from (I1)", palette.IDENTITY, _STROKE),
+        ("certified bound", palette.CERTIFIED, _STROKE),
     ),
     (
-        ("lost", LOST, _CROSS),
-        ("delivery forced", FORCED, _DIAMOND),
-        ("network", NETWORK, _STROKE),
+        ("lost", palette.LOST, _CROSS),
+        ("delivery forced", palette.FORCED, _DIAMOND),
+        ("network", palette.NETWORK, _STROKE),
     ),
 )
 
 
-def input_colour(i: int) -> Colour:
+def input_colour(i: int) -> palette.Colour:
     """Return the colour of the i-th control input."""
-    return SERIES[i % len(SERIES)]
+    return palette.SERIES[i % len(palette.SERIES)]
 
 
 class ColourKey:

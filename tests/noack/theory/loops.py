@@ -3,7 +3,7 @@
 Every signal is propagated by matrix exponentials on a grid finer than every period of the loop.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -21,7 +21,7 @@ from noack.impairments.loss_guarantee import (
     LossGuarantee,
     LossRule,
 )
-from noack.theory.certificate import Constants, Level, NetworkConditions, VoidError, solve
+from noack.theory.certificate import Constants, NetworkConditions, TriggerBound, VoidError, solve
 from noack.theory.gains import ErrorGains, PlantGains
 
 Reals = NDArray[np.float64]
@@ -111,7 +111,7 @@ class System:
         *,
         structured: bool = True,
     ) -> Constants:
-        plant, level = plant or self.gains(), Level(self.beta, self.beta)
+        plant, level = plant or self.gains(), TriggerBound(self.beta, self.beta)
         conditions = conditions or self.conditions
         return solve(plant.error, plant, conditions, level, structured=structured)
 
@@ -179,6 +179,15 @@ class Plants(NamedTuple):
     """(runs, STEPS) the index of each run's plant in each step."""
 
 
+Estimate = Callable[[int, Reals, Reals], Reals]
+"""Returns x̂ at a step, from x and the input of the step before, (runs, n) and (runs, m)."""
+
+
+def exact_state(step: int, x: Reals, u: Reals) -> Reals:
+    """A sensor that measures x."""
+    return x
+
+
 def simulate(
     system: System,
     delivered: Flags,
@@ -186,6 +195,8 @@ def simulate(
     *,
     floor: float = 0.0,
     plants: Plants | None = None,
+    pushes: Reals | None = None,
+    estimate: Estimate = exact_state,
 ) -> Trace:
     """Simulate all runs at once.
 
@@ -195,6 +206,8 @@ def simulate(
         delays: (runs, events) delay of each update in steps.
         floor: floor of the trigger's threshold.
         plants: replace the system's own plant.
+        pushes: (runs, STEPS, n) disturbances that are added to ẋ, constant in each step.
+        estimate: what the sensor knows of x; errors are the larger of those to it and to x.
     """
     runs, n, K, W = len(delivered), len(system.A), system.K.T, system.weight.T
     pool = [(system.A, system.B)] if plants is None else plants.pool
@@ -210,20 +223,25 @@ def simulate(
     synchronised = np.full(runs, system.known_start)
     commands: list[tuple[Reals, Flags]] = []
     trace, shortest, every = np.zeros((5, runs, STEPS)), 10**9, np.arange(runs)
+    u = np.zeros((runs, K.shape[1]))
     for step in range(STEPS):
         threshold = max(system.beta * np.exp(-system.alpha * step * system.step_s), floor)
-        trace[0, :, step] = _norms((x_s - x) @ W)
+        trace[0, :, step], known = norms((x_s - x) @ W), x
         if step % system.sample_steps == 0:
-            event = trace[0, :, step] > threshold
+            known = estimate(step, x, u)
+            tested = norms((x_s - known) @ W)
+            trace[0, :, step] = np.maximum(trace[0, :, step], tested)
+            event = tested > threshold
             event |= step == 0 and not system.known_start
             shortest = min(
                 shortest, int((step - last_event)[event & (events > 0)].min(initial=10**9))
             )
-            x_s, last_event = np.where(event[:, None], x, x_s), np.where(event, step, last_event)
+            x_s = np.where(event[:, None], known, x_s)
+            last_event = np.where(event, step, last_event)
             sent = np.flatnonzero(event & delivered[every, events])
             in_flight = delays[sent, events[sent]]
             slot = (step + in_flight) % (system.delay_steps + 1)
-            arriving[sent, slot] = np.einsum("ri,rij->rj", x[sent], model[0].late[in_flight])
+            arriving[sent, slot] = np.einsum("ri,rij->rj", known[sent], model[0].late[in_flight])
             arrives[sent, slot] = events[sent] + 1
             events = events + event
         slot_now = step % (system.delay_steps + 1)
@@ -241,20 +259,24 @@ def simulate(
         u = np.where(has_input[:, None], u, 0.0)
         for i, value in enumerate(
             (
-                _norms((x_c - x) @ W) * synchronised,
-                _norms(x),
-                _norms(x @ W),
-                _norms(u - x @ K) * has_input,
+                np.maximum(norms((x_c - x) @ W), norms((x_c - known) @ W)) * synchronised,
+                norms(x),
+                norms(x @ W),
+                norms(u - x @ K) * has_input,
             )
         ):
             trace[i + 1, :, step] = value
-        following = [own.advance(x, x_c, u, has_input, held=system.hold_steps > 0) for own in model]
+        push = np.zeros_like(x) if pushes is None else pushes[:, step]
+        following = [
+            own.advance(x, x_c, u, has_input, held=system.hold_steps > 0) + push @ own.pushed
+            for own in model
+        ]
         x = following[0] if plants is None else np.array(following)[plants.which[:, step], every]
         x_s, x_c = x_s @ model[0].model, x_c @ model[0].model
     return Trace(*trace, shortest * system.step_s)
 
 
-def _norms(rows: Reals) -> Reals:
+def norms(rows: Reals) -> Reals:
     return np.sqrt(np.einsum("ij,ij->i", rows, rows))
 
 
@@ -269,6 +291,8 @@ class _Propagators:
         self.both = expm(flow * step_s).T[:, :n]
         self.held = expm(held * step_s).T[:, :n]
         self.free, self.model = expm(A * step_s).T, expm(system.H * step_s).T
+        both = np.block([[A, np.eye(n)], [np.zeros((n, 2 * n))]])
+        self.pushed = expm(both * step_s)[:n, n:].T
         self.late = np.array([expm(system.H * step_s * k).T for k in range(system.delay_steps + 1)])
 
     def advance(self, x: Reals, x_c: Reals, u: Reals, has_input: Flags, *, held: bool) -> Reals:

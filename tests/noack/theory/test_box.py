@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.box import BoxGains
-from noack.theory.certificate import Constants, Level, NetworkConditions, VoidError, solve
+from noack.theory.certificate import Constants, NetworkConditions, TriggerBound, VoidError, solve
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.gains import Coefficients, Output, PlantGains
 from tests.noack.theory.loops import (
@@ -107,7 +107,7 @@ def test_a_larger_box_never_has_smaller_bounds(case: Case, share: float) -> None
 def test_an_empty_box_has_the_bounds_of_the_model(system: System) -> None:
     """Without the windows of the guarantee, which a box does not use."""
     certified_or_skipped(system)
-    plant, level = system.gains(), Level(system.beta, system.beta)
+    plant, level = system.gains(), TriggerBound(system.beta, system.beta)
     try:
         own = solve(plant.error, plant, system.conditions, level, structured=False)
     except VoidError:

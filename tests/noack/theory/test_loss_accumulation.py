@@ -13,7 +13,7 @@ from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix
 from noack.impairments.loss_guarantee import LongestBurst, LossesInWindow, LossWindow
-from noack.theory.certificate import Level, NetworkConditions, solve
+from noack.theory.certificate import NetworkConditions, TriggerBound, solve
 from noack.theory.gains import ErrorGains, Output, PlantGains
 from noack.theory.loss_accumulation import LossAccumulation
 from tests.noack.theory.loops import SEARCH, System, systems
@@ -147,5 +147,5 @@ def test_the_table_of_the_documents(
     plant = PlantGains(ErrorGains(-5 * one, -6 * one, one, 0.5), 1.05 * one, one, one, 0.5)
     for constraints, expected in (((), burst_only), ((rule,), with_windows)):
         conditions = NetworkConditions(rule.limit, constraints=constraints)
-        found = solve(plant.error, plant, conditions, Level(1.0, 1.0))
+        found = solve(plant.error, plant, conditions, TriggerBound(1.0, 1.0))
         assert found.state == pytest.approx(expected, abs=0.006)

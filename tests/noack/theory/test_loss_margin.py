@@ -1,6 +1,7 @@
 """The maps of the time-triggered loop against simulated runs, and the margin against patterns."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -151,7 +152,7 @@ def test_no_pattern_grows_faster_than_the_upper_bound(guarantee: LossGuarantee) 
         assert fastest == pytest.approx(found.lower, rel=1e-9)
     assert fastest <= found.upper <= found.lower * (1 + 1e-3)
     worse = LossGuarantee(tuple(
-        rule._replace(limit=rule.limit + 1) if isinstance(rule, LongestBurst | LossesInWindow)
+        replace(rule, limit=rule.limit + 1) if isinstance(rule, LongestBurst | LossesInWindow)
         else rule for rule in guarantee.rules
     ))  # fmt: skip
     assert LossMargin(resolved).stability(worse).lower > found.upper

@@ -8,20 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from cosim.output.palette import Colour
-from cosim.output.viewer.pictures.picture import (
-    STILL,
-    WHO,
-    Columns,
-    DrawnPlant,
-    Frames,
-    Picture,
-    Shape,
-    body,
-    legend,
-    lines,
-    outline,
-    poses,
-)
+from cosim.output.viewer.pictures import picture as draw
 
 _LANE_M = 3.5
 _MARK_M, _MARKS_EVERY_M, _POSTS_EVERY_M = 3.0, 9.0, 18.0
@@ -31,7 +18,7 @@ _BEHIND_M, _AHEAD_M, _HIGH_M = 9.0, 15.0, 5.7
 _GLASS: Colour = (58, 62, 70)
 
 
-class LanePicture(Picture):
+class LanePicture(draw.Picture):
     """A car on a straight lane, drawn from its lateral offset and yaw.
 
     Args:
@@ -53,7 +40,7 @@ class LanePicture(Picture):
         self._hand = -1.0 if forward_mps < 0 else 1.0
 
     @classmethod
-    def of(cls, plant: DrawnPlant) -> "LanePicture | None":
+    def of(cls, plant: draw.DrawnPlant) -> "LanePicture | None":
         if plant.scenario.plant.system.kind in cls.kinds:
             # x is the state of the lane models: V, r, psi, Y_g.
             return cls(3, 2, forward_mps=float(plant.loop.A_model[3, 2]), vehicle=True)
@@ -64,15 +51,17 @@ class LanePicture(Picture):
     def bounds(self) -> tuple[float, float, float, float]:
         return -_BEHIND_M, _AHEAD_M, -_HIGH_M, _HIGH_M
 
-    def scenery(self) -> Mapping[str, Shape]:
+    def scenery(self) -> Mapping[str, draw.Shape]:
         edge, between = 1.5 * _LANE_M, 0.5 * _LANE_M
         left, right = -_BEHIND_M - _POSTS_EVERY_M, _AHEAD_M + 2 * _POSTS_EVERY_M
         marks = np.arange(round(left / _MARKS_EVERY_M), round(right / _MARKS_EVERY_M))
         posts = np.arange(round(left / _POSTS_EVERY_M), round(right / _POSTS_EVERY_M))
         return {
-            "road/edges": lines([[(left, y), (right, y)] for y in (-edge, edge)], STILL, 0.15),
-            "road/middle": lines([[(left, 0.0), (right, 0.0)]], STILL, 0.03),
-            "road/passing": lines(
+            "road/edges": draw.lines(
+                [[(left, y), (right, y)] for y in (-edge, edge)], draw.STILL, 0.15
+            ),
+            "road/middle": draw.lines([[(left, 0.0), (right, 0.0)]], draw.STILL, 0.03),
+            "road/passing": draw.lines(
                 [
                     *(
                         [(start, y), (start + _MARK_M, y)]
@@ -85,42 +74,44 @@ class LanePicture(Picture):
                         for side in (-1.0, 1.0)
                     ),
                 ],
-                STILL,
+                draw.STILL,
                 0.15,
             ),
             **self._car(),
-            "sensor/outline": body("sensor", outline(_corners(0.1)), 0.13),
-            "controller/outline": body("controller", outline(_corners(0.28), 0.3), 0.2),
-        } | legend(_AHEAD_M - 3.9, _HIGH_M - 0.6, 1.1)
+            "sensor/outline": draw.body("sensor", draw.outline(_corners(0.1)), 0.13),
+            "controller/outline": draw.body("controller", draw.outline(_corners(0.28), 0.3), 0.2),
+        } | draw.legend(_AHEAD_M - 3.9, _HIGH_M - 0.6, 1.1)
 
-    def frames(self, frames: Frames) -> Mapping[str, Columns]:
+    def frames(self, frames: draw.Frames) -> Mapping[str, draw.Columns]:
         k = len(frames.t_s)
         zero = np.zeros(k)
-        found: dict[str, Columns] = {}
-        for who in WHO:
+        found: dict[str, draw.Columns] = {}
+        for who in draw.WHO:
             x = frames.of(who)
-            found[who] = poses(zero, x[:, self._lateral], self._hand * x[:, self._yaw])
+            found[who] = draw.poses(zero, x[:, self._lateral], self._hand * x[:, self._yaw])
         along = abs(self._forward_mps) * frames.t_s
         if self._vehicle and frames.z is not None:
             # The first states of every vehicle model; the fourth is the speed.
             along, across, steering, _, yaw = frames.z[:, :5].T
-            found["plant"] = poses(zero, self._hand * across, self._hand * yaw)
+            found["plant"] = draw.poses(zero, self._hand * across, self._hand * yaw)
             for side, y in (("left", _TRACK_M), ("right", -_TRACK_M)):
-                found[f"plant/steered/{side}"] = poses(
+                found[f"plant/steered/{side}"] = draw.poses(
                     np.full(k, _AXLE_M), np.full(k, y), self._hand * steering
                 )
-        found["road/passing"] = poses(-np.remainder(along, _POSTS_EVERY_M), zero)
+        found["road/passing"] = draw.poses(-np.remainder(along, _POSTS_EVERY_M), zero)
         return found
 
-    def _car(self) -> dict[str, Shape]:
+    def _car(self) -> dict[str, draw.Shape]:
         half = _LENGTH_M / 2
         wheels = [(-_AXLE_M, _TRACK_M), (-_AXLE_M, -_TRACK_M)]
-        steered: dict[str, Shape] = {}
+        steered: dict[str, draw.Shape] = {}
         if not self._vehicle:
             wheels += [(_AXLE_M, _TRACK_M), (_AXLE_M, -_TRACK_M)]
         else:
             for side in ("left", "right"):
-                steered[f"plant/steered/{side}"] = lines([_wheel(0.0, 0.0)], _GLASS, 0.3, order=1.0)
+                steered[f"plant/steered/{side}"] = draw.lines(
+                    [_wheel(0.0, 0.0)], _GLASS, 0.3, order=1.0
+                )
         round_m = 0.35
         inner, across = half - round_m, _WIDTH_M / 2 - round_m
         panels = [[(-inner, y), (inner, y)] for y in np.linspace(-across, across, 4).tolist()]
@@ -129,9 +120,9 @@ class LanePicture(Picture):
             [(-1.35, -0.5), (-1.35, 0.5)],
         ]
         return steered | {
-            "plant/wheels": lines([_wheel(x, y) for x, y in wheels], _GLASS, 0.3, order=1.0),
-            "plant/body": body("plant", panels, 2 * round_m),
-            "plant/glass": lines(glass, _GLASS, 0.3, order=2.5),
+            "plant/wheels": draw.lines([_wheel(x, y) for x, y in wheels], _GLASS, 0.3, order=1.0),
+            "plant/body": draw.body("plant", panels, 2 * round_m),
+            "plant/glass": draw.lines(glass, _GLASS, 0.3, order=2.5),
         }
 
 

@@ -7,28 +7,14 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from cosim.output.viewer.pictures.picture import (
-    STILL,
-    WHO,
-    Columns,
-    DrawnPlant,
-    Frames,
-    Picture,
-    Reals,
-    Shape,
-    body,
-    legend,
-    lines,
-    outline,
-    poses,
-)
+from cosim.output.viewer.pictures import picture as draw
 from noack.plants.cart_pole import CartPoleSettings
 
 _CART, _CART_HIGH = 0.5, 0.22
 _WIDTHS: Mapping[str, float] = {"plant": 0.075, "sensor": 0.022, "controller": 0.03}
 
 
-class PendulumPicture(Picture):
+class PendulumPicture(draw.Picture):
     """Poles and carts: plant solid, sensor's model outlined, controller's model dashed.
 
     Args:
@@ -59,7 +45,7 @@ class PendulumPicture(Picture):
         self._wide = (2.3 if position is not None else 1.6) * self._scale
 
     @classmethod
-    def of(cls, plant: DrawnPlant) -> "PendulumPicture | None":
+    def of(cls, plant: draw.DrawnPlant) -> "PendulumPicture | None":
         system = plant.scenario.plant.system
         if isinstance(system, CartPoleSettings):
             return cls(0, 2, reach_m=float(plant.reach[0]), pole_m=2 * system.length_m)
@@ -76,60 +62,66 @@ class PendulumPicture(Picture):
         low = (-0.55 if self._position is not None else -0.4) * self._scale
         return -self._wide, self._wide, low, high
 
-    def scenery(self) -> Mapping[str, Shape]:
+    def scenery(self) -> Mapping[str, draw.Shape]:
         scale = self._scale
-        found: dict[str, Shape] = {}
+        found: dict[str, draw.Shape] = {}
         if self._position is None:
             foot = [(-0.16 * scale, -0.1 * scale), (0.0, 0.0), (0.16 * scale, -0.1 * scale)]
-            found["pivot"] = lines([foot], STILL, 0.04 * scale)
-            found["upright"] = lines([[(0.0, 0.0), (0.0, 1.15 * scale)]], STILL, 0.008 * scale)
+            found["pivot"] = draw.lines([foot], draw.STILL, 0.04 * scale)
+            found["upright"] = draw.lines(
+                [[(0.0, 0.0), (0.0, 1.15 * scale)]], draw.STILL, 0.008 * scale
+            )
         else:
             ground = -(_CART_HIGH / 2 + 0.03) * scale
             ends = (-2 * self._wide, 2 * self._wide)
             step = 10.0 ** np.floor(np.log10(self._wide))
             ticks = (step * np.arange(-10, 11)).tolist()
-            found["rail"] = lines([[(ends[0], ground), (ends[1], ground)]], STILL, 0.03 * scale)
-            found["rail/ticks"] = lines(
-                [[(at, ground), (at, ground - 0.08 * scale)] for at in ticks], STILL, 0.02 * scale
+            found["rail"] = draw.lines(
+                [[(ends[0], ground), (ends[1], ground)]], draw.STILL, 0.03 * scale
             )
-            found["rail/zero"] = lines(
-                [[(0.0, ground), (0.0, ground - 0.2 * scale)]], STILL, 0.03 * scale
+            found["rail/ticks"] = draw.lines(
+                [[(at, ground), (at, ground - 0.08 * scale)] for at in ticks],
+                draw.STILL,
+                0.02 * scale,
             )
-        for who in WHO:
+            found["rail/zero"] = draw.lines(
+                [[(0.0, ground), (0.0, ground - 0.2 * scale)]], draw.STILL, 0.03 * scale
+            )
+        for who in draw.WHO:
             if self._position is not None:
                 found[f"{who}/cart"] = self._cart(who)
             if self._angle is not None:
                 found[f"{who}/pole"] = self._pole(who)
         left, _, _, top = self.bounds()
-        return found | legend(left + 0.7 * scale, top - 0.05 * scale, 0.22 * scale)
+        return found | draw.legend(left + 0.7 * scale, top - 0.05 * scale, 0.22 * scale)
 
-    def frames(self, frames: Frames) -> Mapping[str, Columns]:
-        found: dict[str, Columns] = {}
-        for who in WHO:
+    def frames(self, frames: draw.Frames) -> Mapping[str, draw.Columns]:
+        found: dict[str, draw.Columns] = {}
+        for who in draw.WHO:
             x = frames.of(who)
-            zero: Reals = np.zeros(len(x))
+            zero: draw.Reals = np.zeros(len(x))
             if self._position is not None:
-                found[who] = poses(x[:, self._position], zero)
+                found[who] = draw.poses(x[:, self._position], zero)
             if self._angle is not None:
-                found[f"{who}/pole"] = poses(zero, zero, -x[:, self._angle])
+                found[f"{who}/pole"] = draw.poses(zero, zero, -x[:, self._angle])
         return found
 
-    def _cart(self, who: str) -> Shape:
+    def _cart(self, who: str) -> draw.Shape:
         x, y = _CART / 2 * self._scale, _CART_HIGH / 2 * self._scale
         if who == "plant":
             inner = y * 0.5
             rows = [[(-x + inner, at), (x - inner, at)] for at in (-inner, 0.0, inner)]
-            return body(who, rows, 2 * inner)
+            return draw.body(who, rows, 2 * inner)
         corners = [(-x, -y), (x, -y), (x, y), (-x, y)]
         dash = None if who == "sensor" else 0.05 * self._scale
-        return body(who, outline(corners, dash), _WIDTHS[who] * self._scale)
+        return draw.body(who, draw.outline(corners, dash), _WIDTHS[who] * self._scale)
 
-    def _pole(self, who: str) -> Shape:
+    def _pole(self, who: str) -> draw.Shape:
         high, width = self._scale, _WIDTHS[who] * self._scale
         pole = [(0.0, 0.0), (0.0, high)]
         bob = [(0.07 * self._scale * np.cos(a), high + 0.07 * self._scale * np.sin(a))
                for a in np.linspace(0, 2 * np.pi, 13).tolist()]  # fmt: skip
         if who == "controller":
             pieces = [[(0.0, high * a), (0.0, high * (a + 0.06))] for a in np.arange(0, 0.95, 0.1)]
-            return body(who, [*pieces, bob], 1.4 * width)
-        return body(who, [pole, bob], width)
+            return draw.body(who, [*pieces, bob], 1.4 * width)
+        return draw.body(who, [pole, bob], width)

@@ -8,31 +8,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from cosim.output.viewer.pictures.picture import (
-    STILL,
-    WHO,
-    Columns,
-    DrawnPlant,
-    Frames,
-    Picture,
-    Reals,
-    Shape,
-    body,
-    circle,
-    label,
-    legend,
-    lines,
-    outline,
-    poses,
-    strips,
-    trail_style,
-)
+from cosim.output.viewer.pictures import picture as draw
 
 _RING = 0.035
 _WIDTHS: Mapping[str, float] = {"plant": 0.022, "sensor": 0.009, "controller": 0.014}
 
 
-class PhasePicture(Picture):
+class PhasePicture(draw.Picture):
     """The first state on the horizontal axis, the second on the vertical, with a trail.
 
     Args:
@@ -40,26 +22,26 @@ class PhasePicture(Picture):
         reach: (n,) expected maximum of each |x_i|, above 0.
     """
 
-    def __init__(self, names: Sequence[str], reach: Reals) -> None:
+    def __init__(self, names: Sequence[str], reach: draw.Reals) -> None:
         self._names = list(names[:2])
         self._reach = np.asarray(reach, dtype=float)[:2]
         self.title = " against ".join(reversed(self._names)) + ": phase plot"
         if len(self._names) == 1:
             self.title = f"{self._names[0]} of plant and models"
-        self.trails = tuple(f"{who}/trail" for who in WHO) if len(self._names) == 2 else ()
-        self._last: dict[str, Reals] = {}
+        self.trails = tuple(f"{who}/trail" for who in draw.WHO) if len(self._names) == 2 else ()
+        self._last: dict[str, draw.Reals] = {}
 
     @classmethod
-    def of(cls, plant: DrawnPlant) -> "PhasePicture":
+    def of(cls, plant: draw.DrawnPlant) -> "PhasePicture":
         return cls(plant.loop.state_names, plant.reach)
 
     def bounds(self) -> tuple[float, float, float, float]:
         return -1.25, 2.8, -1.5, 1.25
 
-    def scenery(self) -> Mapping[str, Shape]:
-        square = outline([(-1, -1), (1, -1), (1, 1), (-1, 1)])
-        found: dict[str, Shape] = {
-            "axes": lines([*square, [(-1, 0), (1, 0)], [(0, -1), (0, 1)]], STILL, 0.006)
+    def scenery(self) -> Mapping[str, draw.Shape]:
+        square = draw.outline([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+        found: dict[str, draw.Shape] = {
+            "axes": draw.lines([*square, [(-1, 0), (1, 0)], [(0, -1), (0, 1)]], draw.STILL, 0.006)
         }
         ends: list[tuple[str, float, tuple[float, float]]] = [
             (self._names[0], self._reach[0], (1.0, -1.0))
@@ -67,34 +49,34 @@ class PhasePicture(Picture):
         if len(self._names) == 2:
             ends.append((self._names[1], self._reach[1], (0.0, 1.17)))
         for i, (name, reach, at) in enumerate(ends):
-            found[f"axes/{i}"] = label(f"{name} = {reach:.3g}", at, STILL)
-        for who in WHO:
+            found[f"axes/{i}"] = draw.label(f"{name} = {reach:.3g}", at, draw.STILL)
+        for who in draw.WHO:
             width = _WIDTHS[who]
             if who == "plant":  # filled by its line width
-                found[f"{who}/point"] = body(who, [[(-1e-3, 0), (1e-3, 0)]], 0.06)
+                found[f"{who}/point"] = draw.body(who, [[(-1e-3, 0), (1e-3, 0)]], 0.06)
             else:
                 radius, dash = (_RING, None) if who == "sensor" else (1.6 * _RING, 0.01)
-                ring = outline(circle(radius, 16), dash)
-                found[f"{who}/point"] = body(who, ring, 1.4 * width)
+                ring = draw.outline(draw.circle(radius, 16), dash)
+                found[f"{who}/point"] = draw.body(who, ring, 1.4 * width)
             if self.trails:
-                found[f"{who}/trail"] = trail_style(who, width)
-        return found | legend(1.95, 1.0, 0.3)
+                found[f"{who}/trail"] = draw.trail_style(who, width)
+        return found | draw.legend(1.95, 1.0, 0.3)
 
-    def frames(self, frames: Frames) -> Mapping[str, Columns]:
-        found: dict[str, Columns] = {}
-        for i, who in enumerate(WHO):
+    def frames(self, frames: draw.Frames) -> Mapping[str, draw.Columns]:
+        found: dict[str, draw.Columns] = {}
+        for i, who in enumerate(draw.WHO):
             points = self._scaled(frames.of(who), 0.3 - 0.3 * i)
-            found[f"{who}/point"] = poses(points[:, 0], points[:, 1])
+            found[f"{who}/point"] = draw.poses(points[:, 0], points[:, 1])
             if self.trails:
                 before = np.vstack([self._last.get(who, points[:1]), points[:-1]])
                 # No line to or from an unknown state.
                 whole = np.isfinite(before + points).all(axis=1, keepdims=True)
                 before = np.where(whole, before, points)
-                found[f"{who}/trail"] = strips(np.stack([before, points], axis=1))
+                found[f"{who}/trail"] = draw.strips(np.stack([before, points], axis=1))
                 self._last[who] = points[-1:]
         return found
 
-    def _scaled(self, states: Reals, row: float) -> Reals:
+    def _scaled(self, states: draw.Reals, row: float) -> draw.Reals:
         if len(self._names) == 1:
             x = states[:, 0] / self._reach[0]
             return np.column_stack([x, np.full_like(x, row)])

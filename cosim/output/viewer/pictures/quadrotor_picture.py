@@ -4,28 +4,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from cosim.output.viewer.pictures.picture import (
-    STILL,
-    WHO,
-    Columns,
-    DrawnPlant,
-    Frames,
-    Picture,
-    Shape,
-    body,
-    circle,
-    label,
-    legend,
-    lines,
-    outline,
-    poses,
-)
+from cosim.output.viewer.pictures import picture as draw
 
 _ARM_M = 0.3
 _WIDTHS: Mapping[str, float] = {"plant": 0.2, "sensor": 0.06, "controller": 0.09}
 
 
-class QuadrotorPicture(Picture):
+class QuadrotorPicture(draw.Picture):
     """Two drawings side by side: from above (x to the right, y up) and from the side (x and z).
 
     Args:
@@ -41,7 +26,7 @@ class QuadrotorPicture(Picture):
         self._apart = 1.1 * self._reach
 
     @classmethod
-    def of(cls, plant: DrawnPlant) -> "QuadrotorPicture | None":
+    def of(cls, plant: draw.DrawnPlant) -> "QuadrotorPicture | None":
         if plant.scenario.plant.system.kind not in cls.kinds:
             return None
         return cls(float(plant.reach[:3].max()))
@@ -50,8 +35,8 @@ class QuadrotorPicture(Picture):
         apart, reach = self._apart, self._reach
         return -2 * apart, 3.3 * apart, -1.1 * reach, 1.4 * reach
 
-    def scenery(self) -> Mapping[str, Shape]:
-        found: dict[str, Shape] = {}
+    def scenery(self) -> Mapping[str, draw.Shape]:
+        found: dict[str, draw.Shape] = {}
         thin, edge = 0.008 * self._reach, self._reach
         for view, side in (("above", -1), ("side", 1)):
             middle = side * self._apart
@@ -63,23 +48,23 @@ class QuadrotorPicture(Picture):
                 [(middle - edge, 0.0), (middle + edge, 0.0)],
                 [(middle, -edge), (middle, edge)],
             ]
-            found[f"{view}/frame"] = lines([*outline(corners), *cross], STILL, thin)
+            found[f"{view}/frame"] = draw.lines([*draw.outline(corners), *cross], draw.STILL, thin)
             text = {"above": "from above: x, y", "side": "from the side: x, z"}
-            found[f"{view}/title"] = label(text[view], (middle, 1.3 * edge), STILL)
-            for who in WHO:
+            found[f"{view}/title"] = draw.label(text[view], (middle, 1.3 * edge), draw.STILL)
+            for who in draw.WHO:
                 strips = (_above if view == "above" else _side)(dashed=who == "controller")
                 scaled = [np.multiply(strip, self._arm).tolist() for strip in strips]
-                found[f"{view}/{who}"] = body(who, scaled, _WIDTHS[who] * self._arm)
-        return found | legend(2.65 * self._apart, self._reach, 0.3 * self._reach)
+                found[f"{view}/{who}"] = draw.body(who, scaled, _WIDTHS[who] * self._arm)
+        return found | draw.legend(2.65 * self._apart, self._reach, 0.3 * self._reach)
 
-    def frames(self, frames: Frames) -> Mapping[str, Columns]:
-        found: dict[str, Columns] = {}
-        for who in WHO:
+    def frames(self, frames: draw.Frames) -> Mapping[str, draw.Columns]:
+        found: dict[str, draw.Columns] = {}
+        for who in draw.WHO:
             state = frames.of(who)
             x, y, z, _, pitch, yaw = state[:, :6].T
-            found[f"above/{who}"] = poses(x - self._apart, y, yaw)
+            found[f"above/{who}"] = draw.poses(x - self._apart, y, yaw)
             # With z up, a positive pitch about +y turns the x axis down.
-            found[f"side/{who}"] = poses(x + self._apart, z, -pitch)
+            found[f"side/{who}"] = draw.poses(x + self._apart, z, -pitch)
         return found
 
 
@@ -88,7 +73,7 @@ def _above(*, dashed: bool) -> list[list[list[float]]]:
     found: list[list[list[float]]] = [[[0.0, 0.0], [0.6, 0.0]]]
     for x in (-0.7, 0.7):
         for y in (-0.7, 0.7):
-            found += outline(circle(0.4, 12, (x, y)), 0.07 if dashed else None)
+            found += draw.outline(draw.circle(0.4, 12, (x, y)), 0.07 if dashed else None)
             if not dashed:
                 found.append([[0.0, 0.0], [x, y]])
     return found

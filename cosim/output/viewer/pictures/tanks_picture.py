@@ -4,21 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from cosim.output.viewer.pictures.picture import (
-    STILL,
-    WHO,
-    Columns,
-    DrawnPlant,
-    Frames,
-    Picture,
-    Reals,
-    Shape,
-    label,
-    legend,
-    lines,
-    strips,
-    style,
-)
+from cosim.output.viewer.pictures import picture as draw
 
 _WIDE, _HIGH = 1.0, 1.6
 _PLACES = ((-0.9, 0.0), (0.9, 0.0), (-0.9, 2.3), (0.9, 2.3))
@@ -29,7 +15,7 @@ _STYLES: Mapping[str, tuple[float, float]] = {
 }  # fmt: skip
 
 
-class TanksPicture(Picture):
+class TanksPicture(draw.Picture):
     """Levels as bars; each model's level is a line, which protrudes from the tank on one side."""
 
     kinds = ("four_tank",)
@@ -37,45 +23,45 @@ class TanksPicture(Picture):
     rate_hz = 10.0
 
     @classmethod
-    def of(cls, plant: DrawnPlant) -> "TanksPicture | None":
+    def of(cls, plant: draw.DrawnPlant) -> "TanksPicture | None":
         return cls() if plant.scenario.plant.system.kind in cls.kinds else None
 
     def bounds(self) -> tuple[float, float, float, float]:
         return -3.6, 2.6, -0.35, 4.25
 
-    def scenery(self) -> Mapping[str, Shape]:
+    def scenery(self) -> Mapping[str, draw.Shape]:
         walls = [
             [(left, low + _HIGH), (left, low), (left + _WIDE, low), (left + _WIDE, low + _HIGH)]
             for left, low in _PLACES
         ]
         spouts = [[(left + _WIDE / 2, low), (left + _WIDE / 2, low - 0.3)] for left, low in _PLACES]
-        found: dict[str, Shape] = {
-            "walls": lines(walls, STILL, 0.06),
-            "spouts": lines(spouts, STILL, 0.06),
+        found: dict[str, draw.Shape] = {
+            "walls": draw.lines(walls, draw.STILL, 0.06),
+            "spouts": draw.lines(spouts, draw.STILL, 0.06),
         }
         for i, (left, low) in enumerate(_PLACES):
             for who, (width, order) in _STYLES.items():
-                found[f"{who}/{i + 1}"] = style(WHO[who], width, order=order)
-            found[f"number/{i + 1}"] = label(
-                f"tank {i + 1}", (left + _WIDE / 2, low + _HIGH), STILL
+                found[f"{who}/{i + 1}"] = draw.style(draw.WHO[who], width, order=order)
+            found[f"number/{i + 1}"] = draw.label(
+                f"tank {i + 1}", (left + _WIDE / 2, low + _HIGH), draw.STILL
             )
-        return found | legend(-2.6, 4.1, 0.45)
+        return found | draw.legend(-2.6, 4.1, 0.45)
 
-    def frames(self, frames: Frames) -> Mapping[str, Columns]:
-        found: dict[str, Columns] = {}
+    def frames(self, frames: draw.Frames) -> Mapping[str, draw.Columns]:
+        found: dict[str, draw.Columns] = {}
         if frames.z is None:
             return found
         # x is the deviation of the levels z from the operating point, in cm.
         at_rest = frames.z - frames.x
-        for who in WHO:
+        for who in draw.WHO:
             levels_cm = frames.of(who) + at_rest
             for i, (left, low) in enumerate(_PLACES):
                 height = low + np.maximum(levels_cm[:, i], 0.0) / _TALLEST_CM * _HIGH
-                found[f"{who}/{i + 1}"] = strips(_level(who, left, low, height))
+                found[f"{who}/{i + 1}"] = draw.strips(_level(who, left, low, height))
         return found
 
 
-def _level(who: str, left: float, low: float, height: Reals) -> Reals:
+def _level(who: str, left: float, low: float, height: draw.Reals) -> draw.Reals:
     """Return the line of a level (k, p, 2): a hatched bar, or a stroke."""
     k = len(height)
     if who == "plant":

@@ -1,0 +1,49 @@
+"""Certificates under persistent causes: what decays and what persists, bounded apart and added.
+
+For given events all inequalities of a certificate are linear in functions of time, v ≤ T v + g,
+with a positive T. So for g = g₁ + g₂, v is at most the sum of both solutions: one for the start and
+βe^{−αt}, scaled by e^{αt}; the other, not scaled, for disturbances, noise and the floor ε of the
+threshold, which is at most βe^{−αt} + ε. Both use the same δ. An event needs a threshold of at
+least λβe^{−αt} + (1 − λ)ε, for any λ in [0, 1].
+"""
+
+from noack.theory.certificate import (
+    NO_BACKGROUND,
+    Background,
+    Constants,
+    NetworkConditions,
+    Part,
+    solve_sum,
+)
+
+_SHARES = (0.5, 0.2, 0.8)
+"""Tried values of λ."""
+
+
+def solve_divided(
+    decaying: Part,
+    persistent: Part,
+    conditions: NetworkConditions,
+    background: Background = NO_BACKGROUND,
+    *,
+    structured: bool = True,
+) -> tuple[Constants, Constants]:
+    """Return the constants of both parts, with the λ for which δ is longest.
+
+    Raises:
+        VoidError: the loop gain of one part is not below 1.
+        NotDecayingError: a mode of the loop decays more slowly than a part's bounds.
+    """
+    beta, floor = decaying.bound.beta, persistent.bound.beta
+
+    def solved(share: float) -> tuple[Constants, Constants]:
+        reached = (share * beta, (1 - share) * floor) if floor > 0 else (None, None)
+        parts = [
+            part._replace(bound=part.bound._replace(reached=level))
+            for part, level in zip((decaying, persistent), reached, strict=True)
+        ]
+        first, second = solve_sum(parts, conditions, background, structured=structured)
+        return first, second
+
+    tried = [solved(share) for share in (_SHARES if floor > 0 else (0.5,))]
+    return max(tried, key=lambda found: found[0].inter_event_s or 0.0)

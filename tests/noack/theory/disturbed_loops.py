@@ -1,0 +1,187 @@
+"""Random loops with bounded disturbances and noise: their certificates, and their worst signals."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.linalg import expm
+
+from noack.theory.certificate import (
+    Constants,
+    EstimationBound,
+    Part,
+    TriggerBound,
+)
+from noack.theory.gains import ErrorGains, Forcing, Growth, PlantGains
+from noack.theory.superposition import solve_divided
+from tests.noack.theory.loops import (
+    RUNS,
+    STEPS,
+    Matrix,
+    Reals,
+    System,
+    Trace,
+    Vector,
+    networks,
+    random_system,
+    simulate,
+    times_s,
+)
+
+
+@dataclass(frozen=True)
+class DisturbedLoop:
+    """A loop under disturbances D s, |s_i| ≤ 1, for limited times, and noise of the measurement."""
+
+    system: System
+    columns: Matrix
+    """D, (n, k)."""
+    duration_steps: tuple[int, ...]
+    noise: Vector
+    """Bound of each entry of the noise, (n,)."""
+    floor: float
+    """0: the threshold falls to 0, and events are separated by the tests only."""
+
+    @property
+    def forcing(self) -> Forcing:
+        lasting_s = np.array(self.duration_steps) * self.system.step_s
+        return Forcing(self.columns, lasting_s, np.zeros(self.system.B.shape[1]))
+
+    def certify(
+        self,
+        change: "Callable[[DisturbedLoop], DisturbedLoop]" = lambda loop: loop,
+        plant: type[PlantGains] = PlantGains,
+    ) -> "Sum":
+        """The certificate; ``change`` makes it one of another loop."""
+        loop = change(self)
+        system, floor = loop.system, loop.floor
+        decaying = system.gains()
+        models = ErrorGains(system.H, system.K, system.weight, 0.0)
+        at_rest = np.zeros((len(system.A), 1))
+        pushed = plant(models, system.A, system.B, at_rest, 0.0, forcing=loop.forcing)
+        estimation = EstimationBound(float(np.linalg.norm(np.abs(system.weight) @ loop.noise)))
+        first, rest = solve_divided(
+            Part(decaying.error, decaying, TriggerBound(system.beta, None)),
+            Part(models, pushed, TriggerBound(floor, None, unit=1.0), estimation),
+            system.conditions,
+        )
+        return Sum(self.system, first, rest)
+
+
+@dataclass(frozen=True)
+class Sum:
+    """The bounds of both parts, added."""
+
+    system: System
+    first: Constants
+    rest: Constants
+
+    def shares(self, trace: Trace) -> dict[str, float]:
+        """The largest shares of the bounds that runs reach."""
+        system, first, rest = self.system, self.first, self.rest
+        decay, beta = np.exp(-system.alpha * times_s(system)), system.beta
+        bounds = {
+            "e_s": (trace.sensor_error, first.overshoot * beta * decay + rest.overshoot),
+            "e_c": (trace.controller_error, first.delta * beta * decay + rest.delta),
+            "x": (trace.state, first.state * decay + rest.state),
+            "u − Kx": (trace.input_error, first.input_error * decay + rest.input_error),
+        }
+        shares = {name: float((values / bound).max()) for name, (values, bound) in bounds.items()}
+        return shares | {"δ": (first.inter_event_s or 0.0) / trace.inter_event_s}
+
+
+def random_disturbed_loop(rng: np.random.Generator, **fixed: Any) -> DisturbedLoop:
+    """A loop of any kind; ``fixed`` replaces some of the drawn values."""
+
+    def choose(name: str, values: tuple[Any, ...]) -> Any:
+        return fixed.pop(name, values[rng.integers(len(values))])
+
+    size, noise, floor = (
+        choose("push", (0.02, 0.2, 1.0)), choose("noise", (0.0, 0.0, 0.01, 0.1)),
+        choose("floor", (0.0, 0.05, 0.5)),
+    )  # fmt: skip
+    lasting, channels = choose("lasting", (STEPS, STEPS, 20)), choose("channels", (1, 2))
+    system = random_system(rng, **fixed)
+    n = len(system.A)
+    columns = size * rng.uniform(-1, 1, (n, channels))
+    return DisturbedLoop(
+        system, columns, (lasting,) * channels, noise * rng.uniform(0.2, 1.0, n), floor
+    )
+
+
+def signals(loop: DisturbedLoop, rng: np.random.Generator) -> tuple[Reals, Reals]:
+    """Disturbances (RUNS, STEPS, n) and noise: at random, and with the worst sign for a kernel."""
+    system, n, k = loop.system, len(loop.system.A), loop.columns.shape[1]
+    s = rng.uniform(-1, 1, (RUNS, STEPS, k))
+    flips = rng.uniform(size=s.shape) < rng.choice([0.0, 0.02, 0.1], size=(RUNS, 1, 1))
+    switching = np.cumprod(np.where(flips, -1, 1), axis=1)
+    s[::4] = switching[::4]
+    generators = [system.A + system.B @ system.K, system.A, system.H]
+    for run in range(1, RUNS, 2):  # the largest response of a random output at a random time
+        step = expm(generators[rng.integers(3)].T * system.step_s)
+        costate, until = rng.normal(size=n), int(rng.integers(STEPS // 2, STEPS))
+        for at in range(until - 1, -1, -1):
+            s[run, at] = np.where(costate @ loop.columns >= 0, 1.0, -1.0)
+            costate = step @ costate
+    for i, lasting in enumerate(loop.duration_steps):
+        begins = rng.integers(0, STEPS, RUNS)[:, None]
+        late = np.arange(STEPS) >= (begins if lasting < STEPS else 0)
+        s[:, :, i] *= late & (np.arange(STEPS) < begins + lasting)
+    noise = loop.noise * np.where(rng.uniform(size=(RUNS, STEPS, n)) < 0.5, -1.0, 1.0)
+    noise[::4] *= rng.uniform(size=(len(noise[::4]), STEPS, n))
+    return s @ loop.columns.T, noise
+
+
+def simulate_disturbed(loop: DisturbedLoop, rng: np.random.Generator) -> Trace:
+    """Simulate runs with random and adversarial losses, disturbances and noise."""
+    pushes, noise = signals(loop, rng)
+    return simulate(
+        loop.system,
+        *networks(int(rng.integers(2**32)), loop.system),
+        floor=loop.floor,
+        pushes=pushes,
+        estimate=lambda step, x, u: x + noise[:, step],
+    )
+
+
+def without(**changes: Any) -> Callable[[DisturbedLoop], Sum]:
+    """A certificate of another loop: with some fields replaced."""
+    return lambda loop: loop.certify(lambda one: replace(one, **changes))
+
+
+def with_plant(broken: type[PlantGains]) -> Callable[[DisturbedLoop], Sum]:
+    """A certificate with other gains of the plant."""
+    return lambda loop: loop.certify(plant=broken)
+
+
+class NoPushedState(PlantGains):
+    def disturbed(self, C: Matrix) -> float:
+        return 0.0
+
+
+class NoPushedError(PlantGains):
+    """e_s does not grow by the disturbances."""
+
+    def growth(self, until_s: float, cells: int) -> Growth:
+        found = super().growth(until_s, cells)
+        return found._replace(forced=np.zeros(cells))
+
+
+BROKEN: dict[str, tuple[Callable[[DisturbedLoop], Sum], dict[str, Any]]] = {
+    "no disturbance": (
+        lambda loop: loop.certify(lambda one: replace(one, columns=0 * one.columns)),
+        {"push": 1.0, "beta": 0.01},
+    ),
+    "no noise": (
+        lambda loop: loop.certify(lambda one: replace(one, noise=0 * one.noise)),
+        {"noise": 0.1, "push": 0.02, "beta": 0.01},
+    ),
+    "no floor": (without(floor=0.0), {"floor": 0.5, "push": 0.02, "beta": 0.01}),
+    "the disturbance ends early": (without(duration_steps=(5,)), {"channels": 1, "push": 1.0}),
+    "the state is not disturbed": (with_plant(NoPushedState), {"push": 1.0, "beta": 0.01}),
+    "e_s is not disturbed": (
+        with_plant(NoPushedError),
+        {"push": 1.0, "beta": 0.01, "step_share": 0.03, "sample_steps": 4},
+    ),
+}
