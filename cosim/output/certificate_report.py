@@ -11,11 +11,13 @@ from rich.table import Table
 
 from cosim.output.assumptions_table import print_assumptions
 from cosim.output.row_display import Rows, as_html, as_text
+from cosim.output.unlimited_losses_report import print_unlimited
 from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.core.number_format import NONE, duration, number
+from noack.impairments.markov_chain import NotPredictableError
 from noack.theory.assumptions import assumptions
 from noack.theory.certificate import NetworkConditions
 from noack.theory.enclosure import NotDecayingError
@@ -30,6 +32,7 @@ from noack.theory.scenario_certificates import (
     outside_box,
     own_plant,
 )
+from noack.theory.unlimited_losses import UnlimitedLosses, unlimited_losses
 from noack.theory.weight import choose_weight
 from noack.trigger.decaying import DecayingSettings
 from noack.trigger.periodic_trigger import PeriodicSettings
@@ -80,6 +83,11 @@ class Certificates:
     weight: Matrix | None
     """W of the trigger's norm, (n, n), if this call chose it; else None."""
 
+    unlimited: UnlimitedLosses | None
+    """What holds without a limit on the losses; None if the network enforces its guarantee, or if
+    the losses are no Markov chain over the packets (``unpredictable`` is the reason)."""
+    unpredictable: str | None
+
     def __init__(self, scenario: Scenario, late_periods: int, weight: Matrix | None = None) -> None:
         scenario.coverage.require_unchanging()
         scenario.coverage.require_exact()
@@ -93,6 +101,7 @@ class Certificates:
             for scope in self._scopes
         ]  # fmt: skip
         self.theorem_2 = _theorem_2(scenario, self.paper)
+        self.unlimited, self.unpredictable = self._unlimited()
 
     def __iter__(self) -> Iterator[tuple[str, ScenarioCertificate]]:
         return iter(self._certificates)
@@ -148,6 +157,7 @@ class Certificates:
             },
             "certificates": [{"under": under, **one.to_json()} for under, one in self],
             "stability": None if self.stability is None else self.stability._asdict(),
+            "unlimited_losses": None if self.unlimited is None else self.unlimited.to_json(),
             "limits": {scope: limits._asdict() for scope, limits in self._limits.items()},
         }
 
@@ -155,6 +165,14 @@ class Certificates:
     def _limits(self) -> dict[str, NetworkLimits]:
         """Limits by scope, from about a hundred certificates."""
         return {scope.name: _limits(scope, self._scheduled) for scope in self._scopes}
+
+    def _unlimited(self) -> tuple[UnlimitedLosses | None, str | None]:
+        if self.scenario.network.enforce_mansd:
+            return None, None
+        try:
+            return unlimited_losses(self.scenario, self._scopes[0], self._scheduled), None
+        except NotPredictableError as error:
+            return None, str(error)
 
     def _of(self, conditions: str) -> list[ScenarioCertificate]:
         return [one for under, one in self if under == conditions]
@@ -255,6 +273,7 @@ def print_certificates(console: Console, found: Certificates) -> None:
     print_assumptions(console, [a._asdict() for a in found.schedule.assumptions])
     console.print("assumptions of the paper's theorems:")
     print_assumptions(console, [a._asdict() for a in assumptions(found.scenario)])
+    print_unlimited(console, found.unlimited, found.unpredictable)
     for sentence in (*_in_words(found), *_stability_in_words(found)):
         console.print(sentence, markup=False, highlight=False)
     if found.weight is not None:

@@ -23,6 +23,7 @@ from noack.theory.certificate import (
 )
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.gains import ErrorGains, PlantGains, error_gains
+from noack.theory.run_conditions import kept_probability
 from noack.theory.trigger_bounds import TriggerBounds
 
 OWN_PLANT = "the scenario's plant"
@@ -255,13 +256,17 @@ class CertificateScope:
             void = str(error)
         except (OverflowError, np.linalg.LinAlgError):
             void = _TOO_LARGE
-        assumptions = certificate_assumptions(
-            self._resolved, conditions, self._decay, first, void, trigger.text()
-        )
-        return ScenarioCertificate(
+        found = ScenarioCertificate(
             self.name, trigger.beta, trigger.alpha_per_s, trigger.floor,
-            self._loop.weight is not None, conditions, tuple(assumptions), first, late, void,
+            self._loop.weight is not None, conditions, (), first, late, void,
         )  # fmt: skip
+        kept = None
+        if not self._resolved.network.enforce_mansd:
+            kept = kept_probability(self._resolved, conditions.guarantee, found.inter_event_s)
+        assumptions = certificate_assumptions(
+            self._resolved, conditions, self._decay, first, void, trigger.text(), kept
+        )
+        return replace(found, assumptions=tuple(assumptions))
 
     def largest(self, conditions: NetworkConditions, change: Change, most_s: float = 10.0) -> float:
         """Return the largest time for which the changed conditions still have a certificate.
