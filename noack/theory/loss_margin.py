@@ -15,8 +15,13 @@ from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.impairments.kinds.delay import Delay
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
-from noack.theory.delivery_graph import Burst, EventTimes, bursts_of
-from noack.theory.joint_spectral_radius import ACCURACY, JointSpectralRadius, joint_spectral_radius
+from noack.theory.delivery_graph import EVERY_STEP, Burst, EventTimes, bursts_of
+from noack.theory.joint_spectral_radius import (
+    ACCURACY,
+    MOST_VERTICES,
+    JointSpectralRadius,
+    joint_spectral_radius,
+)
 from noack.theory.switched_system import Edge
 from noack.theory.time_triggered_loop import LoopTimes, TimeTriggeredLoop
 from noack.trigger.trigger_condition import NEVER_NS
@@ -132,8 +137,12 @@ class LossMargin:
             raise CallerError(
                 "the loop between two deliveries exceeds 1e308; reduce mansd or the period"
             ) from None
+        # Short steps would need many vertices.
+        vertices = MOST_VERTICES if self._times == EVERY_STEP else 0
         while True:
-            found = joint_spectral_radius(edges, accuracy=accuracy / self._times.longest)
+            found = joint_spectral_radius(
+                edges, accuracy=accuracy / self._times.longest, most_vertices=vertices
+            )
             finest = _LAST_ACCURACY if found.vertices else ACCURACY  # of quadratic norms
             if not found.lower <= 1 <= found.upper or accuracy < finest:
                 return self._stability(found, bursts)
