@@ -28,6 +28,7 @@ from noack.trigger.trigger_condition import NEVER_NS
 
 _TIMELESS = ("loss", "corrupt", "blackout", "duplicate")
 _FIRST_ACCURACY = 1e-2
+_QUICK_ACCURACY = 3e-2
 _LAST_ACCURACY = 1e-8
 
 
@@ -119,13 +120,18 @@ class LossMargin:
         self._maps = cache(self.loop.map)
 
     def stability(
-        self, guarantee: LossGuarantee | None = None, accuracy: float = ACCURACY
+        self,
+        guarantee: LossGuarantee | None = None,
+        accuracy: float = ACCURACY,
+        *,
+        refine: bool = True,
     ) -> Stability:
         """Bound the growth of all patterns of a guarantee, by default the scenario's.
 
         Args:
             guarantee: the guarantee.
-            accuracy: wanted upper/lower − 1; it is refined if the bounds are on both sides of 1.
+            accuracy: wanted upper/lower − 1.
+            refine: whether the accuracy is refined if the bounds are on both sides of 1.
         """
         bursts = bursts_of(guarantee or self.guarantee, self.loop.times.slots, self._times)
         try:
@@ -144,13 +150,18 @@ class LossMargin:
                 edges, accuracy=accuracy / self._times.longest, most_vertices=vertices
             )
             finest = _LAST_ACCURACY if found.vertices else ACCURACY  # of quadratic norms
-            if not found.lower <= 1 <= found.upper or accuracy < finest:
+            decided = not found.lower <= 1 <= found.upper
+            if decided or not refine or accuracy < finest:
                 return self._stability(found, bursts)
             accuracy = min(accuracy / 10, (1 - found.lower) / 2)
 
     def is_stable(self, guarantee: LossGuarantee | None = None) -> Stability:
         """Return coarser bounds, which decide whether all patterns are stable."""
         return self.stability(guarantee, _FIRST_ACCURACY)
+
+    def first_bounds(self) -> Stability:
+        """Return bounds that take less than a second; they may leave stability undecided."""
+        return self.stability(accuracy=_QUICK_ACCURACY, refine=False)
 
     def _stability(self, found: JointSpectralRadius, bursts: list[Burst]) -> Stability:
         path = [bursts[number] for number in found.cycle]
