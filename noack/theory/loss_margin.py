@@ -18,8 +18,13 @@ from noack.impairments.kinds.delay import Delay
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.loss_process import LossProcess
 from noack.impairments.markov_chain import NotPredictableError
-from noack.theory.delivery_graph import Burst, EventTimes, bursts_of
-from noack.theory.joint_spectral_radius import ACCURACY, JointSpectralRadius, joint_spectral_radius
+from noack.theory.delivery_graph import EVERY_STEP, Burst, EventTimes, bursts_of
+from noack.theory.joint_spectral_radius import (
+    ACCURACY,
+    MOST_VERTICES,
+    JointSpectralRadius,
+    joint_spectral_radius,
+)
 from noack.theory.mean_square_growth import RandomGrowth, mean_square_growth, sure_growth
 from noack.theory.switched_system import Edge
 from noack.theory.time_triggered_loop import LoopTimes, TimeTriggeredLoop
@@ -145,8 +150,12 @@ class LossMargin:
             raise CallerError(
                 "the loop between two deliveries exceeds 1e308; reduce mansd or the period"
             ) from None
+        # Short steps would need many vertices.
+        vertices = MOST_VERTICES if self._times == EVERY_STEP else 0
         while True:
-            found = joint_spectral_radius(edges, accuracy=accuracy / self._times.longest)
+            found = joint_spectral_radius(
+                edges, accuracy=accuracy / self._times.longest, most_vertices=vertices
+            )
             finest = _LAST_ACCURACY if found.vertices else ACCURACY  # of quadratic norms
             decided = not found.lower <= 1 <= found.upper
             if decided or not refine or accuracy < finest:
