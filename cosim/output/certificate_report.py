@@ -65,8 +65,8 @@ class Certificates:
         weight: W, if noack chose it.
 
     Raises:
-        CallerError: its updates are acknowledged, its plant is nonlinear or disturbed, or its
-            state is not measured exactly.
+        CallerError: its updates are acknowledged, its plant or controller is nonlinear, or its
+            settings change.
     """
 
     scenario: Scenario
@@ -78,7 +78,7 @@ class Certificates:
 
     def __init__(self, scenario: Scenario, late_periods: int, weight: Matrix | None = None) -> None:
         scenario.coverage.require_unchanging()
-        scenario.coverage.require_exact()
+        scenario.coverage.require_certifiable()
         self.scenario, self.weight = scenario, weight
         self._scheduled = nominal_conditions(scenario, late_periods)
         conditions = {IDEAL: ideal_conditions(scenario), SCHEDULE: self._scheduled}
@@ -158,7 +158,7 @@ def _theorem_2(scenario: Scenario, certificate: ScenarioCertificate) -> Theorem2
     trigger, constants = scenario.decaying, certificate.constants
     if constants is None or constants.rate_per_s != trigger.alpha_per_s:
         return None
-    if trigger.floor or trigger.weight is not None:
+    if trigger.floor or trigger.weight is not None or not scenario.coverage.is_undisturbed:
         return None
     return theorem_2(loop_of(scenario), trigger.beta, trigger.alpha_per_s, constants.delta)
 

@@ -50,8 +50,3 @@ def noise_bound(resolved: Scenario) -> Vector:
     if measurement.noise_std is None:
         return uniform
     return uniform + (normal_bound(resolved) or 0.0) * np.array(measurement.noise_std)
-
-
-def is_exact(resolved: Scenario) -> bool:
-    """Whether nothing disturbs the plant, and the sensor measures x."""
-    return resolved.coverage.knows_state and not resolved.plant.disturbances

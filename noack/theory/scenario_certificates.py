@@ -4,6 +4,7 @@ import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from noack.theory.certificate import (
     VoidError,
     solve,
 )
+from noack.theory.disturbed_certificate import DisturbedCertificate, PlantAt
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.gains import ErrorGains, PlantGains, error_gains
 
@@ -35,9 +37,6 @@ _TOO_LARGE = "intermediate results are too large or too small for floating point
 
 Change = Callable[[NetworkConditions, float], NetworkConditions]
 """Sets a time of the conditions."""
-
-PlantAt = Callable[[ErrorGains, Matrix, float], PlantGains]
-"""Returns the plant's gains from the gains of the models, the start of x, and α."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +58,9 @@ class ScenarioCertificate:
     """The constants from ``floor_from_s`` on, with ε in place of βe^{−αt} and without decay."""
     void: str | None
     """Reason for having no certificate; None if there is one."""
+    persistent_constants: Constants | None = None
+    """The constants, in units of 1 and without decay, whose bounds are added to those of
+    ``constants`` under disturbances, noise or an observer."""
 
     @property
     def source(self) -> str:
@@ -97,15 +99,20 @@ class ScenarioCertificate:
         """Bound of ‖x‖ at times (k,); NaN without a certificate."""
         return self._envelope(t_s, lambda c, level: c.state)
 
+    def estimation_error(self, t_s: Matrix) -> Matrix:
+        """Bound of ‖x̂ − x‖_W at measurements (k,); NaN without a certificate."""
+        return self._envelope(t_s, lambda c, level: c.estimation_error)
+
     def to_json(self) -> dict[str, Any]:
         """Return all fields for JSON."""
-        constants, late = self.constants, self.floor_constants
+        constants, late, rest = self.constants, self.floor_constants, self.persistent_constants
         return asdict(self) | {
             "conditions": self.conditions._asdict()
             | {"constraints": [rule.name for rule in self.conditions.constraints]},
             "assumptions": [assumption._asdict() for assumption in self.assumptions],
             "constants": None if constants is None else constants._asdict(),
             "floor_constants": None if late is None else late._asdict(),
+            "persistent_constants": None if rest is None else rest._asdict(),
             "inter_event_s": self.inter_event_s,
             "floor_from_s": None if self.floor == 0 else self.floor_from_s,
         }
@@ -118,6 +125,8 @@ class ScenarioCertificate:
         if self.floor_constants is not None:
             late = scale(self.floor_constants, self.floor)
             bound = np.where(t_s < self.floor_from_s, bound, late)
+        if self.persistent_constants is not None:
+            bound = bound + scale(self.persistent_constants, 1.0)
         return np.asarray(bound)
 
 
@@ -230,10 +239,14 @@ class CertificateScope:
         trigger = self._resolved.decaying
         first: Constants | None = None
         late: Constants | None = None
+        rest: Constants | None = None
         void = None
         try:
             with np.errstate(all="ignore"):
-                first, late = self._phases(conditions)
+                if self._resolved.coverage.is_undisturbed:
+                    first, late = self._phases(conditions)
+                else:
+                    first, rest = self._disturbed_phases(conditions)
         except (NotDecayingError, VoidError) as error:
             void = str(error)
         except (OverflowError, np.linalg.LinAlgError):
@@ -241,7 +254,7 @@ class CertificateScope:
         assumptions = certificate_assumptions(self._resolved, conditions, self._decay, first, void)
         return ScenarioCertificate(
             self.name, trigger.beta, trigger.alpha_per_s, trigger.floor,
-            self._loop.weight is not None, conditions, tuple(assumptions), first, late, void,
+            self._loop.weight is not None, conditions, tuple(assumptions), first, late, void, rest,
         )  # fmt: skip
 
     def largest(self, conditions: NetworkConditions, change: Change, most_s: float = 10.0) -> float:
@@ -267,15 +280,37 @@ class CertificateScope:
         first = self._first_phase(conditions)
         if 0 < trigger.floor < trigger.beta and first.rate_per_s == trigger.alpha_per_s:
             late = self._after_floor(conditions, first)
+        return self._checked(first, late)
+
+    def _disturbed_phases(
+        self, conditions: NetworkConditions
+    ) -> tuple[Constants, Constants | None]:
+        """Return the constants, and those that are added to them under persistent causes."""
+        alpha = self._resolved.decaying.alpha_per_s
+        decays = not self._held and below(alpha, min(self._decay.values()))
+        return self._checked(*self._disturbed.constants(conditions, decays=decays))
+
+    @cached_property
+    def _disturbed(self) -> DisturbedCertificate:
+        return DisturbedCertificate(self._resolved, self._plant_at, self._start_error)
+
+    def _checked(
+        self, first: Constants, other: Constants | None
+    ) -> tuple[Constants, Constants | None]:
+        """Return the constants.
+
+        Raises:
+            VoidError: they do not cover the inputs at the start, or are not finite.
+        """
         if first.input_error < self._start_error:
             raise VoidError(
                 f"at its start the input was {self._start_error:.3g} from Kx; a certificate "
                 f"covers at most {first.input_error:.3g}"
             )
-        for constants in (first, late):
+        for constants in (first, other):
             if constants is not None and not _is_finite(constants):
                 raise VoidError(_TOO_LARGE)
-        return first, late
+        return first, other
 
     def _first_phase(self, conditions: NetworkConditions) -> Constants:
         trigger, decay = self._resolved.decaying, min(self._decay.values())
