@@ -5,7 +5,9 @@ With an observer of gains L_k, and s steps of the plant between two measurements
     e_k = (I − L_k C)(Âˢ e_{k−1} + Σ_i Âⁱ d_{k,i}) + L_k v_k,    e_0 from the first estimate
     d   = (Â − A) x + (B̂ − B) u − B w_u − G w_x                   (discrete-time matrices, a step)
 
-The gains do not depend on data: those of a Kalman filter are computed until they have settled. The
+Normal sources make a normal error, whose
+covariance is computed. The gains do not depend on data: those of a Kalman filter are computed until
+they have settled. The
 sum over all past sources of ‖W Φ(k, j) S‖ is largest at some k; beyond the computed ones it is
 bounded in a norm in which (I − L C) Âˢ contracts. Without an observer x̂ = y and e = v.
 """
@@ -25,7 +27,7 @@ from noack.core.linear_systems import Matrix, discretise
 from noack.theory.certificate import EstimationBound
 from noack.theory.enclosure import NotDecayingError, factors
 from noack.theory.gains import Forcing
-from noack.theory.persistent_causes import noise_bound
+from noack.theory.persistent_causes import noise_bound, noise_deviations, normal_bounds
 
 Stack = NDArray[np.float64]
 
@@ -48,12 +50,15 @@ class EstimationError:
         self._weight = np.eye(loop.n) if loop.weight is None else loop.weight
         self._period_s = period_ns / NS_PER_S
         self._noise = noise_bound(resolved)
+        self._noise_deviations = noise_deviations(resolved)
         self._model = model = assumed_model(resolved)
         Ad, Bd = discretise(A, B, period_ns)
         n = loop.n
-        self._pushes = np.zeros((n, 0))
+        self._pushes = self._normal_pushes = np.zeros((n, 0))
         if forcing is not None:
             self._pushes = discretise(A, forcing.columns, period_ns)[1]
+            if forcing.normal is not None:
+                self._normal_pushes = discretise(A, forcing.normal.columns, period_ns)[1]
         input_basis, _ = factors(loop.K)
         self._from_input = (model.Bd - Bd) @ input_basis
         self._from_state, self.output = factors(model.Ad - Ad + (model.Bd - Bd) @ loop.K)
@@ -64,7 +69,9 @@ class EstimationError:
         return {} if self._resolved.observer is None else {MISMATCH: self.output}
 
     def decaying(self, alpha_per_s: float) -> EstimationBound:
-        """Return the bound of the part from the first estimate, scaled by e^{αt}.
+        """Return the bound of the part from the start, scaled by e^{αt}.
+
+        At the start there is the first estimate, and the gains have not settled.
 
         Raises:
             NotDecayingError: the estimation error decays more slowly.
@@ -79,21 +86,77 @@ class EstimationError:
         start = (self._rest(0) @ (first - loop.x0))[None, :, None]
         nothing = np.zeros((0, loop.n, 1))
         fixed = self._peak([nothing] * len(self._gains), alpha_per_s, start)
+        for sources in self._persistent_sources:
+            fixed += self._excess(sources, alpha_per_s)
+        if self._radius:
+            fixed += self._radius * self._excess_deviation(alpha_per_s)
         return self._with_model_error(fixed, alpha_per_s)
 
     def persistent(self) -> EstimationBound:
-        """Return the bound of the part from noise and disturbances.
+        """Return the bound of the part from noise and disturbances, when the gains have settled.
 
         Raises:
             NotDecayingError: the estimation error does not decay.
         """
+        W = self._weight
         if self._resolved.observer is None:
-            return EstimationBound(float(np.linalg.norm(np.abs(self._weight) @ self._noise)))
-        noise = [(L * self._noise).T[:, :, None] for L in self._gains]
-        fixed = self._peak(noise, 0.0)
-        for column in self._pushes.T:
-            fixed += self._peak(self._sources(column[:, None], 0.0), 0.0)
+            spread = float(np.linalg.norm(W * self._noise_deviations, 2))
+            fixed = float(np.linalg.norm(np.abs(W) @ self._noise)) + self._radius * spread
+            return EstimationBound(fixed)
+        fixed = sum(self._peak(sources[-2:], 0.0) for sources in self._persistent_sources)
+        spread = float(np.linalg.norm(W @ self._settled_covariance @ W.T, 2))
+        fixed += self._radius * np.sqrt(spread) * _ROUNDING
         return self._with_model_error(fixed, 0.0)
+
+    @cached_property
+    def _radius(self) -> float:
+        """Bound of n standard normal values, of which e is a linear function; 0 if not needed."""
+        bounds = normal_bounds(self._resolved)
+        return 0.0 if bounds is None else bounds.radius(self._loop.n)
+
+    @cached_property
+    def _persistent_sources(self) -> list[list[Stack]]:
+        """The effects of bounded noise and of each bounded disturbance on the measurements."""
+        found = [self._sources(column[:, None], 0.0) for column in self._pushes.T]
+        if self._noise.any():
+            found.append([(L * self._noise).T[:, :, None] for L in self._gains])
+        return found
+
+    @cached_property
+    def _covariances(self) -> list[tuple[Matrix, Matrix]]:
+        """F_k, and the covariance of what each measurement adds to e."""
+        sources, found = self._sources(self._normal_pushes, 0.0), []
+        for k, L in enumerate(self._gains):
+            pushed, noise = np.hstack([*sources[k]]), L * self._noise_deviations
+            found.append((self._rest(k) @ self._between, pushed @ pushed.T + noise @ noise.T))
+        return found
+
+    @cached_property
+    def _settled_covariance(self) -> Matrix:
+        from scipy.linalg import solve_discrete_lyapunov
+
+        F, added = self._covariances[-1]
+        _contraction(F)
+        return np.asarray(solve_discrete_lyapunov(F, added))
+
+    def _excess_deviation(self, alpha_per_s: float) -> float:
+        """Return sup_k of the root of ‖W (P_k − P_∞) Wᵀ‖, scaled."""
+        W, settled = self._weight, self._settled_covariance
+        growth = self._growth(alpha_per_s)
+        P, scale, largest = np.zeros_like(settled), 1 / growth, 0.0
+        for F, added in self._covariances:
+            P, scale = F @ P @ F.T + added, scale * growth
+            above = float(np.linalg.eigvalsh(W @ (P - settled) @ W.T).max())
+            largest = max(largest, scale * np.sqrt(max(above, 0.0)))
+        # From then on P − P_∞ follows F.
+        factor, _ = _contraction(growth * F)
+        seen = float(np.linalg.norm(W @ np.linalg.inv(factor), 2))
+        beyond = float(np.linalg.norm(factor @ (P - settled) @ factor.T, 2))
+        return float(max(largest, scale * seen * np.sqrt(beyond)) * _ROUNDING)
+
+    def _growth(self, alpha_per_s: float) -> float:
+        """e^{αT}, T the time between two measurements."""
+        return float(np.exp(alpha_per_s * self._period_s * self._model.steps))
 
     def _with_model_error(self, fixed: float, alpha_per_s: float) -> EstimationBound:
         gains = [
@@ -113,13 +176,13 @@ class EstimationError:
         found: list[Matrix] = []
         for L in islice(self._resolved.observer.gains(self._model), _MOST_GAINS):
             if found and np.abs(L - found[-1]).max() <= _SETTLED * np.abs(L).max() * (
-                1 - self._radius(L)
+                1 - self._spectral_radius(L)
             ):
                 return [*found, L]
             found.append(L)
         raise NotDecayingError(f"the observer's gain changes for {_MOST_GAINS} measurements")
 
-    def _radius(self, L: Matrix) -> float:
+    def _spectral_radius(self, L: Matrix) -> float:
         F = (np.eye(len(L)) - L @ self._model.C) @ self._between
         return float(min(np.abs(np.linalg.eigvals(F)).max(), 1.0))
 
@@ -140,12 +203,15 @@ class EstimationError:
         stack = np.array(effects)
         return [self._rest(k) @ stack for k in range(len(self._gains))]
 
+    def _steps(self, alpha_per_s: float) -> list[Matrix]:
+        growth = self._growth(alpha_per_s)
+        return [growth * self._rest(k) @ self._between for k in range(len(self._gains))]
+
     def _peak(
         self, sources: Sequence[Stack], alpha_per_s: float, start: Stack | None = None
     ) -> float:
         """Return sup_k Σ_j ‖W Φ(k, j) S_j‖, scaled; the last gain and source apply from then on."""
-        growth = np.exp(alpha_per_s * self._period_s * self._model.steps)
-        steps = [growth * self._rest(k) @ self._between for k in range(len(self._gains))]
+        steps = self._steps(alpha_per_s)[-len(sources) :]
         old = sources[0] if start is None else np.concatenate([start, sources[0]])
         largest = _sizes(self._weight, old)
         for step, new in zip(steps[1:-1], sources[1:-1], strict=True):
@@ -163,6 +229,23 @@ class EstimationError:
             if rest <= _TAIL_SHARE * largest:
                 break
         return float((largest + rest) * _ROUNDING)
+
+    def _excess(self, sources: Sequence[Stack], alpha_per_s: float) -> float:
+        """Return sup_k of Σ_j ‖W Φ(k, j) S_j‖ minus its value for settled gains, scaled."""
+        if len(sources) == 2:  # settled from the start on
+            return 0.0
+        total, W = self._peak(sources[-2:], 0.0), self._weight
+        growth, scale, steps = self._growth(alpha_per_s), 1.0, self._steps(0.0)
+        old, settled = sources[0], sources[-1]
+        largest = _sizes(W, old) - total
+        for step, new in zip(steps[1:-1], sources[1:-1], strict=True):
+            old, scale = np.concatenate([step @ old, new]), scale * growth
+            settled = np.concatenate([steps[-1] @ settled, sources[-1]])
+            largest = max(largest, scale * (_sizes(W, old) - total))
+        # From then on the effects of these sources, and those with settled gains, follow F.
+        factor, _ = _contraction(growth * steps[-1])
+        seen = float(np.linalg.norm(W @ np.linalg.inv(factor), 2))
+        return max(largest, scale * seen * _sizes(factor, old - settled), 0.0) * _ROUNDING
 
 
 def _sizes(C: Matrix, stack: Stack) -> float:
