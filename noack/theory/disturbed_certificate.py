@@ -5,7 +5,7 @@ persists (disturbances, noise, the floor). If α is too large, all are bounded t
 decay.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -27,7 +27,7 @@ from noack.theory.enclosure import NotDecayingError
 from noack.theory.estimation_error import EstimationError
 from noack.theory.gains import ErrorGains, Forcing, PlantGains, error_gains
 from noack.theory.persistent_causes import forcing_of
-from noack.theory.superposition import solve_divided
+from noack.theory.superposition import SHARES, solve_divided
 
 PlantAt = Callable[[ErrorGains, Matrix, float], PlantGains]
 """Returns the plant's gains from the gains of the models, the start of x, and α."""
@@ -42,11 +42,12 @@ class DisturbedCertificate:
     start_error: float
 
     def constants(
-        self, conditions: NetworkConditions, *, decays: bool
+        self, conditions: NetworkConditions, *, decays: bool, shares: Sequence[float] = SHARES
     ) -> tuple[Constants, Constants | None]:
         """Return the constants that decay and those to be added; without decay only one.
 
-        ``decays``: α is below the decay rates of the models and of the plant.
+        ``decays``: α is below the decay rates of the models and of the plant. ``shares`` are those
+        of :func:`solve_divided`.
 
         Raises:
             VoidError: the loop gain is not below 1, or the estimation error is not known.
@@ -61,8 +62,9 @@ class DisturbedCertificate:
         if decays:
             try:
                 return solve_divided(
-                    self._decaying, self._persistent, conditions, background, structured=structured
-                )
+                    self._decaying, self._persistent, conditions, background,
+                    structured=structured, shares=shares,
+                )  # fmt: skip
             except NotDecayingError:
                 pass
         (found,) = solve_sum([self._together], conditions, background, structured=structured)

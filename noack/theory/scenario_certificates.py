@@ -2,7 +2,7 @@
 
 import contextlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
@@ -26,6 +26,7 @@ from noack.theory.certificate import (
 from noack.theory.disturbed_certificate import DisturbedCertificate, PlantAt
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.gains import ErrorGains, PlantGains, error_gains
+from noack.theory.superposition import SHARES
 
 OWN_PLANT = "the scenario's plant"
 BOX = "every plant of the uncertainty box"
@@ -234,8 +235,13 @@ class CertificateScope:
         self._errors: dict[float, ErrorGains] = {}
         self._plants: dict[tuple[float, float, bytes], PlantGains] = {}
 
-    def certificate(self, conditions: NetworkConditions) -> ScenarioCertificate:
-        """Return the certificate under some conditions; a void certificate has the reason."""
+    def certificate(
+        self, conditions: NetworkConditions, shares: Sequence[float] = SHARES
+    ) -> ScenarioCertificate:
+        """Return the certificate under some conditions; a void certificate has the reason.
+
+        ``shares`` are those of :func:`solve_divided`; with fewer of them δ may be shorter.
+        """
         trigger = self._resolved.decaying
         first: Constants | None = None
         late: Constants | None = None
@@ -246,12 +252,15 @@ class CertificateScope:
                 if self._resolved.coverage.is_undisturbed:
                     first, late = self._phases(conditions)
                 else:
-                    first, rest = self._disturbed_phases(conditions)
+                    first, rest = self._disturbed_phases(conditions, shares)
         except (NotDecayingError, VoidError) as error:
             void = str(error)
         except (OverflowError, np.linalg.LinAlgError):
             void = _TOO_LARGE
-        assumptions = certificate_assumptions(self._resolved, conditions, self._decay, first, void)
+        gains = [one.loop_gain for one in (first, rest) if one is not None]
+        assumptions = certificate_assumptions(
+            self._resolved, conditions, self._decay, first, void, max(gains, default=0.0)
+        )
         return ScenarioCertificate(
             self.name, trigger.beta, trigger.alpha_per_s, trigger.floor,
             self._loop.weight is not None, conditions, tuple(assumptions), first, late, void, rest,
@@ -264,7 +273,8 @@ class CertificateScope:
         """
 
         def stands(value_s: float) -> bool:
-            return self.certificate(change(conditions, value_s)).constants is not None
+            certificate = self.certificate(change(conditions, value_s), SHARES[:1])
+            return certificate.constants is not None
 
         if stands(most_s):
             return most_s
@@ -283,12 +293,12 @@ class CertificateScope:
         return self._checked(first, late)
 
     def _disturbed_phases(
-        self, conditions: NetworkConditions
+        self, conditions: NetworkConditions, shares: Sequence[float]
     ) -> tuple[Constants, Constants | None]:
         """Return the constants, and those that are added to them under persistent causes."""
         alpha = self._resolved.decaying.alpha_per_s
         decays = not self._held and below(alpha, min(self._decay.values()))
-        return self._checked(*self._disturbed.constants(conditions, decays=decays))
+        return self._checked(*self._disturbed.constants(conditions, decays=decays, shares=shares))
 
     @cached_property
     def _disturbed(self) -> DisturbedCertificate:

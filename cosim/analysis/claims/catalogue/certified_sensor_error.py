@@ -11,6 +11,8 @@ def _bound(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate)
     formula = f"‖e_s‖ ≤ {{:.4g}} {certificate.level}"
     if (late := certificate.floor_constants) is not None:
         formula += f", from {certificate.floor_from_s:.4g} s on {late.overshoot:.4g} ε"
+    if (rest := certificate.persistent_constants) is not None:
+        formula += f" + {rest.overshoot:.4g}"
     shares = samples.joined.e_s_norm / certificate.sensor_error(samples.t_s)
     void, overshoot = run.violation_of(certificate), certificate.constants.overshoot
     return Bound(formula, samples.t_s, shares, void, overshoot)
