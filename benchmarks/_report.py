@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import os
 import resource
 import statistics
 import sys
@@ -12,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+import psutil
 from rich.console import Console
 from rich.table import Table
 
@@ -113,23 +114,6 @@ class Row:
         return row | ({"note": "; ".join(notes)} if notes else {})
 
 
-class CpuTimes(NamedTuple):
-    """CPU seconds of all cores since boot."""
-
-    total_s: float
-    busy_s: float
-    steal_s: float
-
-
-def cpu_times(stat: str) -> CpuTimes:
-    """Return CPU times from the content of ``/proc/stat``; user time already includes guests."""
-    ticks = [int(field) for field in stat.splitlines()[0].split()[1:9]]
-    user, nice, system, idle, iowait, irq, softirq, steal = ticks
-    busy = user + nice + system + irq + softirq
-    per_s = os.sysconf("SC_CLK_TCK")
-    return CpuTimes((busy + idle + iowait + steal) / per_s, busy / per_s, steal / per_s)
-
-
 class Load:
     """The machine's load by other programs since the object's construction."""
 
@@ -138,23 +122,23 @@ class Load:
 
     def rows(self) -> list[Row]:
         """Return the shares of all cores used by other programs and by the hypervisor."""
-        if self._before is None or (now := self._read()) is None:
-            return []
-        (before, own_before_s), (after, own_after_s) = self._before, now
-        total_s = max(after.total_s - before.total_s, 1e-9)
-        others_s = after.busy_s - before.busy_s - (own_after_s - own_before_s)
+        total_s, busy_s, steal_s, own_s = np.subtract(self._read(), self._before).tolist()
+        total_s = max(total_s, 1e-9)
         return [
-            _share("machine: other programs", max(others_s, 0.0) / total_s, BUSY_SHARE),
-            _share("machine: steal", (after.steal_s - before.steal_s) / total_s, STEAL_SHARE),
+            _share("machine: other programs", max(busy_s - own_s, 0.0) / total_s, BUSY_SHARE),
+            _share("machine: steal", steal_s / total_s, STEAL_SHARE),
         ]
 
     @staticmethod
-    def _read() -> tuple[CpuTimes, float] | None:
-        path = Path("/proc/stat")
-        if not path.is_file():
-            return None
+    def _read() -> tuple[float, ...]:
+        """CPU seconds: of all cores, used, taken by the hypervisor; used by this benchmark."""
+        times = psutil.cpu_times()._asdict()
+        for part in ("guest", "guest_nice"):  # included in the users' time
+            times.pop(part, None)
+        total_s, steal_s = sum(times.values()), times.get("steal", 0.0)
+        busy_s = total_s - steal_s - times["idle"] - times.get("iowait", 0.0)
         used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-        return cpu_times(path.read_text()), sum(usage.ru_utime + usage.ru_stime for usage in used)
+        return total_s, busy_s, steal_s, sum(one.ru_utime + one.ru_stime for one in used)
 
 
 def _share(name: str, share: float, doubtful: float) -> Row:

@@ -34,7 +34,7 @@ class TheoryCoverage:
 
     @property
     def is_certifiable(self) -> bool:
-        """Whether certificates apply."""
+        """Whether certificates apply; the paper's theorems need its trigger as well."""
         return self.beyond_theory is None
 
     @property
@@ -45,9 +45,7 @@ class TheoryCoverage:
     @property
     def beyond_theory(self) -> str | None:
         """The first setting that certificates do not cover; None if all are."""
-        if (why := self._beyond_certificates) is not None or self.is_decaying:
-            return why
-        return f'trigger.policy = "{self.scenario.trigger.policy}": not the paper\'s trigger'
+        return self._beyond_certificates or self.scenario.trigger.beyond_exact
 
     @property
     def _beyond_certificates(self) -> str | None:

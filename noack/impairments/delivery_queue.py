@@ -15,6 +15,7 @@ from collections.abc import MutableSequence, Sequence
 from dataclasses import dataclass
 
 from noack.impairments.link_records import QueueState, RuleStage
+from noack.impairments.sorted_numbers import first_above
 
 OPPORTUNITY_BYTES = 1504
 _NS_PER_MS = 1_000_000
@@ -55,14 +56,8 @@ def opportunity_after(stage: OpportunityStage, times_ms: Sequence[int], now_ns: 
     elapsed_ns = now_ns + stage.offset_ns
     cycle = elapsed_ns // period_ns
     elapsed_ns -= cycle * period_ns
-    low, high = stage.begin, stage.end - 1  # the last is later
-    while low < high:
-        middle = (low + high) // 2
-        if times_ms[middle] * _NS_PER_MS <= elapsed_ns:
-            low = middle + 1
-        else:
-            high = middle
-    return cycle * (stage.end - stage.begin) + low - stage.begin
+    place = first_above(times_ms, stage.begin, stage.end - 1, elapsed_ns // _NS_PER_MS)
+    return cycle * (stage.end - stage.begin) + place - stage.begin
 
 
 def opportunity_ns(stage: OpportunityStage, times_ms: Sequence[int], number: int) -> int:

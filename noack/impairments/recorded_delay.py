@@ -16,6 +16,7 @@ from noack.impairments.link_records import (
     StageMemory,
     refuse,
 )
+from noack.impairments.sorted_numbers import first_above
 
 
 @dataclass(slots=True, kw_only=True)
@@ -56,15 +57,12 @@ def apply(packet: PacketContext, stage: ReplayStage, memory: StageMemory) -> Non
 
 def delay_at(stage: ReplayStage, table: Sequence[int], elapsed_ns: int) -> int:
     """Return the delay of a packet by its time in the trace, or −1 − d for a lost packet."""
-    low, high = 0, stage.end - stage.begin  # low: the last record that is not later
-    while high - low > 1:
-        middle = (low + high) // 2
-        if table[stage.times_begin + middle] <= elapsed_ns:
-            low = middle
-        else:
-            high = middle
+    count = stage.end - stage.begin
+    later = first_above(table, stage.times_begin, stage.times_begin + count, elapsed_ns)
+    high = later - stage.times_begin
+    low = max(high - 1, 0)  # the last record that is not later
     delay_ns = table[stage.begin + low]
-    if delay_ns < 0 or high == stage.end - stage.begin or table[stage.begin + high] < 0:
+    if delay_ns < 0 or high == count or table[stage.begin + high] < 0:
         return delay_ns
     sent_ns = table[stage.times_begin + low]
     gap_ns = table[stage.times_begin + high] - sent_ns

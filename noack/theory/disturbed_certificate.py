@@ -28,6 +28,7 @@ from noack.theory.estimation_error import EstimationError
 from noack.theory.gains import ErrorGains, Forcing, PlantGains, error_gains
 from noack.theory.persistent_causes import forcing_of
 from noack.theory.superposition import SHARES, solve_divided
+from noack.theory.trigger_bounds import TriggerBounds
 
 PlantAt = Callable[[ErrorGains, Matrix, float], PlantGains]
 """Returns the plant's gains from the gains of the models, the start of x, and α."""
@@ -39,6 +40,7 @@ class DisturbedCertificate:
 
     resolved: Scenario
     plant_at: PlantAt
+    trigger: TriggerBounds
     start_error: float
 
     def constants(
@@ -57,9 +59,10 @@ class DisturbedCertificate:
             self.start_error or loop_of(self.resolved).setpoint is not None
         ):
             raise VoidError("after a change or at a set-point the estimation error is not known")
+        conditions = self.trigger.tested(conditions)
         background = Background(input_error=self.start_error)
         structured = self.start_error == 0.0
-        if decays:
+        if decays and self.resolved.coverage.is_decaying:
             try:
                 return solve_divided(
                     self._decaying, self._persistent, conditions, background,
@@ -67,36 +70,41 @@ class DisturbedCertificate:
                 )  # fmt: skip
             except NotDecayingError:
                 pass
-        (found,) = solve_sum([self._together], conditions, background, structured=structured)
+        level, floor = max(self.trigger.beta, self.trigger.floor), self.trigger.floor
+        bound = self.trigger.bound(conditions, level, floor or None)
+        part = self._together._replace(bound=bound)
+        (found,) = solve_sum([part], conditions, background, structured=structured)
         return found, None
 
     @cached_property
     def _decaying(self) -> Part:
-        trigger = self.resolved.decaying
-        plant = self._plant(trigger.alpha_per_s)
-        bound = TriggerBound(trigger.beta, None)
-        estimation = self._estimation.decaying(trigger.alpha_per_s)
+        alpha_per_s = self.trigger.alpha_per_s
+        plant = self._plant(alpha_per_s)
+        bound = TriggerBound(self.trigger.beta, None)
+        estimation = self._estimation.decaying(alpha_per_s)
         return Part(plant.error, plant, bound, estimation)
 
     @cached_property
     def _persistent(self) -> Part:
         plant = self._plant(0.0)
         at_rest = replace(plant, start=np.zeros_like(plant.start), forcing=self._forcing(plant))
-        bound = TriggerBound(self.resolved.decaying.floor, None, unit=1.0)
+        bound = TriggerBound(self.trigger.floor, None, unit=1.0)
         return Part(plant.error, at_rest, bound, self._estimation.persistent())
 
     @cached_property
     def _together(self) -> Part:
-        trigger, plant = self.resolved.decaying, self._plant(0.0)
+        """All causes without decay; the trigger's bound depends on the conditions."""
+        plant = self._plant(0.0)
         pushed = replace(plant, forcing=self._forcing(plant))
-        bound = TriggerBound(max(trigger.beta, trigger.floor), trigger.floor or None)
         first, rest = self._estimation.decaying(0.0), self._estimation.persistent()
-        return Part(plant.error, pushed, bound, rest._replace(fixed=rest.fixed + first.fixed))
+        estimation = rest._replace(fixed=rest.fixed + first.fixed)
+        return Part(plant.error, pushed, TriggerBound(0.0, None), estimation)
 
     def _plant(self, alpha_per_s: float) -> PlantGains:
         loop = loop_of(self.resolved)
         plant = self.plant_at(error_gains(loop, alpha_per_s), loop.x0[:, None], alpha_per_s)
-        return replace(plant, further_outputs=self._estimation.further_outputs)
+        outputs = {**self._estimation.further_outputs, **self.trigger.outputs}
+        return replace(plant, further_outputs=outputs)
 
     def _forcing(self, plant: PlantGains) -> Forcing | None:
         return forcing_of(self.resolved, plant.B)

@@ -1,18 +1,18 @@
 import argparse
 import json
-import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from benchmarks._report import (
     Benchmark,
     Goal,
+    Load,
     MeasurementError,
     Peer,
     Rounds,
     Row,
-    cpu_times,
     run,
 )
 
@@ -73,15 +73,12 @@ def test_a_row_as_json_has_all_keys_and_the_reason_if_not_judged() -> None:
     assert unjudged["holds"] is None
 
 
-def test_cpu_times_are_read_from_the_line_of_all_cores() -> None:
-    per_s = os.sysconf("SC_CLK_TCK")
-    ticks = [per_s * seconds for seconds in (10, 1, 5, 80, 2, 0, 1, 4, 3, 0)]
-    times = cpu_times("cpu  " + " ".join(map(str, ticks)) + "\ncpu0 1 1 1 1 1 1 1 1 1 1\n")
-    assert times.busy_s == 10 + 1 + 5 + 0 + 1
-    assert times.steal_s == 4
-    assert (
-        times.total_s == 17 + 80 + 2 + 4
-    )  # user time already includes guest time, the last two values
+def test_a_busy_machine_is_reported() -> None:
+    load = Load()
+    load._before = tuple(np.subtract(load._before, (100.0, 60.0, 2.0, 20.0)))
+    others, steal = load.rows()
+    assert (others.value, steal.value) == pytest.approx((40.0, 2.0), abs=1.0)
+    assert others.note == steal.note == "the machine was busy: figures are doubtful"
 
 
 def benchmark(rows: list[Row]) -> Benchmark:

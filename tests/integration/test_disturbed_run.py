@@ -17,17 +17,7 @@ import pytest
 from cosim.record.run_record import RunRecord, load_record
 from noack.protocol.topology import ROLES
 from tests.cosim.output.viewer.test_viewer import is_left, read
-from tests.integration.conftest import (
-    AT_RATE,
-    RATE_HZ,
-    Finished,
-    Running,
-    begun,
-    command_of,
-    is_over,
-    settings,
-    wait_for,
-)
+from tests.integration import conftest as live
 from tests.integration.test_faults import wait_recording
 
 HORIZON_S = 36.0
@@ -74,7 +64,7 @@ class WallClock:
 class Disturbed(NamedTuple):
     """A finished run, its record, and its live viewer's processes."""
 
-    finished: Finished
+    finished: live.Finished
     record: RunRecord
     left_behind: list[psutil.Process]
     viewers: list[psutil.Process]
@@ -87,12 +77,12 @@ def pause(process: psutil.Process, pause_s: float) -> None:
     process.send_signal(signal.SIGCONT)
 
 
-def viewers_of(running: Running) -> list[psutil.Process]:
+def viewers_of(running: live.Running) -> list[psutil.Process]:
     """Return the server of the recording and the server of rerun's page."""
     return [
         child
         for child in running.child("recorder").children(recursive=True)
-        if "cosim.output.viewer.live_viewer" in command_of(child) or is_rerun(child)
+        if "cosim.output.viewer.live_viewer" in live.command_of(child) or is_rerun(child)
     ]
 
 
@@ -105,12 +95,12 @@ def is_rerun(process: psutil.Process) -> bool:
 
 def disturbed_run(folder: Path) -> Disturbed:
     clock = WallClock(folder)
-    with pytest.MonkeyPatch.context() as environment, begun(folder) as start:
+    with pytest.MonkeyPatch.context() as environment, live.begun(folder) as start:
         for name in [name for name in os.environ if "DISPLAY" in name]:
             environment.delenv(name)  # the viewer opens in a browser
         for name, value in clock.environment.items():
             environment.setenv(name, value)
-        running = start(*AT_RATE, *settings(speed=4.0, horizon_s=HORIZON_S), "--live")
+        running = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=HORIZON_S), "--live")
         for name in clock.environment:
             environment.delenv(name)
         wait_recording(running)
@@ -150,7 +140,7 @@ def test_every_step_is_executed_recorded_and_replayed(disturbed: Disturbed) -> N
     for table in ("plant_step", "sensor_measurement", "controller_step"):
         rows = record[table]
         assert np.array_equal(rows["sequence"], np.arange(len(rows)))
-    assert len(record["plant_step"]) == HORIZON_S * RATE_HZ + 1
+    assert len(record["plant_step"]) == HORIZON_S * live.RATE_HZ + 1
     assert summary["missing_samples"] == 0
     assert summary["unintended_losses"] == 0
     assert summary["replay"]["bit_exact"]
@@ -190,6 +180,6 @@ def test_the_recording_is_complete_and_the_stalled_viewer_is_ended(disturbed: Di
     assert len(disturbed.viewers) == 2
     assert "live view: http://127.0.0.1:" in disturbed.finished.stderr
     chunks = read(disturbed.finished.run_dir / "recording.rrd")
-    assert sum(chunk.num_rows for chunk in chunks["error/log10"]) > HORIZON_S * RATE_HZ
-    wait_for(lambda: not is_left(disturbed.viewer_group))
-    assert all(is_over(viewer) for viewer in disturbed.viewers)
+    assert sum(chunk.num_rows for chunk in chunks["error/log10"]) > HORIZON_S * live.RATE_HZ
+    live.wait_for(lambda: not is_left(disturbed.viewer_group))
+    assert all(live.is_over(viewer) for viewer in disturbed.viewers)

@@ -13,28 +13,18 @@ from typer.testing import CliRunner
 from cosim.cli import app
 from cosim.live.finalize import reopen
 from cosim.record.run_record import load_record
-from tests.integration.conftest import (
-    AT_RATE,
-    EPHEMERAL,
-    RATE_HZ,
-    Running,
-    child_of,
-    private_files,
-    run_scenario,
-    settings,
-    wait_for,
-)
+from tests.integration import conftest as live
 
-Start = Callable[..., Running]
-LONG = [*AT_RATE, *settings(speed=4.0, horizon_s=400.0)]
+Start = Callable[..., live.Running]
+LONG = [*live.AT_RATE, *live.settings(speed=4.0, horizon_s=400.0)]
 
 
-def wait_recording(running: Running) -> None:
+def wait_recording(running: live.Running) -> None:
     """Wait until the recorder has stored rows of plant, sensor and controller."""
     running.wait_started()
     for table in ("plant_step", "sensor_measurement", "controller_step"):
         spooled = running.runs / "latest" / "spool" / f"{table}.recorder"
-        wait_for(lambda spooled=spooled: spooled.exists() and spooled.stat().st_size > 10_000)
+        live.wait_for(lambda spooled=spooled: spooled.exists() and spooled.stat().st_size > 10_000)
 
 
 def test_a_killed_recorder_is_named_and_no_recorded_row_is_lost(start: Start) -> None:
@@ -72,10 +62,10 @@ def test_a_frozen_recorder_is_named_and_no_row_is_lost(start: Start) -> None:
     assert finished.summary["replay"]["bit_exact"]
     steps = load_record(finished.run_dir)["plant_step"]
     # Rows exist up to the end of the lease: two seconds since the last keep-alive.
-    assert len(steps) > 1.5 * 4 * RATE_HZ
+    assert len(steps) > 1.5 * 4 * live.RATE_HZ
     assert np.array_equal(steps["sequence"], np.arange(len(steps)))
     assert not (finished.run_dir / "spool").exists()
-    assert private_files(running.runs.parent) == []
+    assert live.private_files(running.runs.parent) == []
     assert running.left_behind() == []
 
 
@@ -97,7 +87,7 @@ def test_a_taken_port_gives_one_clear_line(tmp_path: Path, role: str) -> None:
         if role == "control":
             squatter.listen()
         port = squatter.getsockname()[1]
-        given = (*EPHEMERAL, *settings(**{f"ports__{role}": port}))
+        given = (*live.EPHEMERAL, *live.settings(**{f"ports__{role}": port}))
         done = CliRunner().invoke(app, ["run", "lane_following", "--runs", str(tmp_path), *given])
     assert done.exit_code == 2
     assert done.stdout == ""
@@ -107,9 +97,11 @@ def test_a_taken_port_gives_one_clear_line(tmp_path: Path, role: str) -> None:
 
 
 def test_an_overloaded_run_does_not_claim_its_horizon(tmp_path: Path) -> None:
-    finished = run_scenario(
+    finished = live.run_scenario(
         tmp_path,
-        *settings(speed=1000.0, horizon_s=400.0, plant__rate_hz=500.0, plant__measure_every=100),
+        *live.settings(
+            speed=1000.0, horizon_s=400.0, plant__rate_hz=500.0, plant__measure_every=100
+        ),
     )
     assert finished.status == 1
     # Its other threads may starve, too; the process then seems to be lost.
@@ -120,9 +112,9 @@ def test_an_overloaded_run_does_not_claim_its_horizon(tmp_path: Path) -> None:
 
 def test_a_process_that_is_not_ready_in_time_is_named(start: Start) -> None:
     """It is frozen before the start barrier, so that it has no liveliness token."""
-    running = start(*LONG, *settings(start_within_s=2.0))
-    wait_for(lambda: child_of(running.process, "sensor") is not None)
-    sensor = child_of(running.process, "sensor")
+    running = start(*LONG, *live.settings(start_within_s=2.0))
+    live.wait_for(lambda: live.child_of(running.process, "sensor") is not None)
+    sensor = live.child_of(running.process, "sensor")
     assert sensor is not None
     sensor.send_signal(signal.SIGSTOP)
     error = running.finish_unstarted()

@@ -12,24 +12,16 @@ import psutil
 from cosim.live.finalize import reopen
 from cosim.record.run_record import load_record
 from noack.protocol.topology import LOOP_ROLES
-from tests.integration.conftest import (
-    AT_RATE,
-    PATIENCE_S,
-    RATE_HZ,
-    Running,
-    private_files,
-    settings,
-    wait_for,
-)
+from tests.integration import conftest as live
 from tests.integration.test_faults import wait_recording
 
-Start = Callable[..., Running]
+Start = Callable[..., live.Running]
 ByHand = Callable[[str], subprocess.Popen[str]]
 RECORD = ("record", "lane_following")
 
 
 def ended(process: subprocess.Popen[str]) -> tuple[str, str]:
-    return process.communicate(timeout=PATIENCE_S)
+    return process.communicate(timeout=live.PATIENCE_S)
 
 
 def test_a_wait_for_a_missing_process_can_be_interrupted(
@@ -39,7 +31,7 @@ def test_a_wait_for_a_missing_process_can_be_interrupted(
     own = psutil.Process(recording.process.pid)
     processes = {role: by_hand(role) for role in LOOP_ROLES if role != "netem"}
     assert recording.process.stderr is not None
-    wait_for(lambda: recording.process.stderr.readline() == "waiting for netem\n")  # type: ignore[union-attr]
+    live.wait_for(lambda: recording.process.stderr.readline() == "waiting for netem\n")  # type: ignore[union-attr]
     children = own.children(recursive=True)
     recording.process.send_signal(signal.SIGINT)
     stdout, stderr = ended(recording.process)
@@ -55,13 +47,13 @@ def test_a_wait_for_a_missing_process_can_be_interrupted(
             "stopped by the user (SIGINT)",
             "lost the connection to the run's coordinator",
         ), stderr
-    assert psutil.wait_procs(children, timeout=PATIENCE_S)[1] == []
-    assert private_files(tmp_path) == []
+    assert psutil.wait_procs(children, timeout=live.PATIENCE_S)[1] == []
+    assert live.private_files(tmp_path) == []
 
 
 def test_the_loop_outlives_the_coordinator(start: Start, by_hand: ByHand) -> None:
     """The loop reaches its horizon, and each process stores all of its rows itself."""
-    recording = start(*AT_RATE, *settings(speed=4.0, horizon_s=12.0), command=RECORD)
+    recording = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=12.0), command=RECORD)
     processes = {role: by_hand(role) for role in LOOP_ROLES}
     wait_recording(recording)
     run_dir = (recording.runs / "latest").resolve()
@@ -82,4 +74,4 @@ def test_the_loop_outlives_the_coordinator(start: Start, by_hand: ByHand) -> Non
     assert replay is not None
     assert replay["bit_exact"]
     steps = load_record(run_dir)["plant_step"]
-    assert np.array_equal(steps["sequence"], np.arange(12 * RATE_HZ + 1))
+    assert np.array_equal(steps["sequence"], np.arange(12 * live.RATE_HZ + 1))

@@ -15,17 +15,10 @@ from cosim.cli import app
 from cosim.live.finalize import reopen
 from cosim.record.run_record import load_record
 from noack.core.errors import MachineError
-from tests.integration.conftest import (
-    AT_RATE,
-    EPHEMERAL,
-    PATIENCE_S,
-    RATE_HZ,
-    Running,
-    settings,
-)
+from tests.integration import conftest as live
 from tests.integration.test_faults import wait_recording
 
-Start = Callable[..., Running]
+Start = Callable[..., live.Running]
 
 
 class Disk:
@@ -81,11 +74,11 @@ def noack(*arguments: str) -> Result:
 def test_a_run_on_a_disk_that_fills_up_can_be_finalised_later(
     start: Start, small: Disk, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    running = start(*AT_RATE, *settings(speed=4.0, horizon_s=60.0))
+    running = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=60.0))
     wait_recording(running)
     run_dir = (running.runs / "latest").resolve()
     small.fill()
-    stdout, stderr = running.process.communicate(timeout=PATIENCE_S)
+    stdout, stderr = running.process.communicate(timeout=live.PATIENCE_S)
     lines = [line for line in stderr.splitlines() if line.startswith("noack")]
     assert running.process.returncode == 1
     reason = f"recorder: {run_dir / 'spool'}: the record cannot be written: No space left on device"
@@ -137,7 +130,7 @@ def test_a_run_on_a_disk_that_fills_up_can_be_finalised_later(
 
 @pytest.mark.parametrize("small", [8], indirect=True)
 def test_a_run_does_not_begin_on_a_full_disk(small: Disk) -> None:
-    done = noack("run", "lane_following", "--runs", str(small.path), *EPHEMERAL)
+    done = noack("run", "lane_following", "--runs", str(small.path), *live.EPHEMERAL)
     assert done.exit_code == 1
     (line,) = done.stderr.strip().splitlines()
     assert line.startswith(f"noack: {small.path}: only ")
@@ -147,13 +140,13 @@ def test_a_run_does_not_begin_on_a_full_disk(small: Disk) -> None:
 @pytest.mark.parametrize("small", [64], indirect=True)
 def test_a_folder_that_becomes_read_only_gives_clear_errors(start: Start, small: Disk) -> None:
     """Open files can still be written; new files cannot be created."""
-    running = start(*AT_RATE, *settings(speed=4.0, horizon_s=16.0))
+    running = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=16.0))
     wait_recording(running)
     run_dir = (running.runs / "latest").resolve()
     mounted(small.path, "--bind", str(small.path))
     try:
         mounted(small.path, "-o", "remount,bind,ro")
-        _, stderr = running.process.communicate(timeout=PATIENCE_S)
+        _, stderr = running.process.communicate(timeout=live.PATIENCE_S)
         assert running.process.returncode == 1
         lines = [line for line in stderr.splitlines() if line.startswith("noack")]
         why = f"{run_dir / 'reports.json'}: cannot be written: Read-only file system"
@@ -168,15 +161,15 @@ def test_a_folder_that_becomes_read_only_gives_clear_errors(start: Start, small:
     summary = json.loads((run_dir / "summary.json").read_text())
     assert summary["exit"] == {"status": 1, "reason": f"recorder: {why}"}
     steps = load_record(run_dir)["plant_step"]
-    assert np.array_equal(steps["sequence"], np.arange(16 * RATE_HZ + 1))
+    assert np.array_equal(steps["sequence"], np.arange(16 * live.RATE_HZ + 1))
 
 
 def test_a_removed_run_directory_ends_the_run_with_clear_lines(start: Start) -> None:
-    running = start(*AT_RATE, *settings(speed=4.0, horizon_s=400.0))
+    running = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=400.0))
     wait_recording(running)
     run_dir = (running.runs / "latest").resolve()
     run_dir.rename(running.runs.parent / "removed")  # at once; rmtree would race with new files
-    _, stderr = running.process.communicate(timeout=PATIENCE_S)
+    _, stderr = running.process.communicate(timeout=live.PATIENCE_S)
     assert running.process.returncode == 1
     lines = [line for line in stderr.splitlines() if line.startswith("noack")]
     assert len(lines) == 2, stderr

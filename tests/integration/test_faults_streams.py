@@ -16,38 +16,28 @@ from cosim.shipped_files import find_shipped
 from noack.config.scenario_file import load
 from noack.core.errors import MachineError
 from noack.protocol.topology import ROLES
-from tests.integration.conftest import (
-    AT_RATE,
-    BARE,
-    PATIENCE_S,
-    RATE_HZ,
-    child_of,
-    is_over,
-    noack_command,
-    settings,
-    wait_for,
-)
+from tests.integration import conftest as live
 
 HORIZON_S = 8.0
-SHORT = [*AT_RATE, *settings(speed=4.0, horizon_s=HORIZON_S)]
+SHORT = [*live.AT_RATE, *live.settings(speed=4.0, horizon_s=HORIZON_S)]
 F_SETPIPE_SZ = 1031
 AS_A_TERMINAL = os.environ | {"FORCE_COLOR": "1", "TERM": "dumb"}
 """A terminal that cannot redraw a line: progress is printed line by line, also to a pipe."""
 
 
 def run(runs: Path) -> list[str]:
-    return noack_command("run", "lane_following", "--runs", str(runs), *BARE, *SHORT)
+    return live.noack_command("run", "lane_following", "--runs", str(runs), *live.BARE, *SHORT)
 
 
 def is_whole(run_dir: Path) -> bool:
     steps = load_record(run_dir)["plant_step"]
-    return np.array_equal(steps["sequence"], np.arange(HORIZON_S * RATE_HZ + 1))
+    return np.array_equal(steps["sequence"], np.arange(HORIZON_S * live.RATE_HZ + 1))
 
 
 def test_a_run_with_closed_streams_is_complete(tmp_path: Path) -> None:
     """Closed by a shell's ``<&- >&- 2>&-``: files opened next get the descriptors 0 to 2."""
     shell = ["/bin/sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", *run(tmp_path)]
-    assert subprocess.run(shell, timeout=PATIENCE_S, check=False).returncode == 0
+    assert subprocess.run(shell, timeout=live.PATIENCE_S, check=False).returncode == 0
     run_dir = (tmp_path / "latest").resolve()
     assert is_whole(run_dir)
     assert {log.read_text() for log in (run_dir / "logs").iterdir()} == {""}
@@ -65,16 +55,16 @@ def test_a_full_and_then_closed_pipe_does_not_disturb_the_run(tmp_path: Path) ->
     os.close(writing)
     try:
         latest = tmp_path / "latest"
-        wait_for(lambda: latest.exists() or process.poll() is not None)
-        loop = [child for role in ROLES if (child := child_of(process, role)) is not None]
+        live.wait_for(lambda: latest.exists() or process.poll() is not None)
+        loop = [child for role in ROLES if (child := live.child_of(process, role)) is not None]
         assert len(loop) == len(ROLES)
         # The loop and the recorder end although the pipe is not read.
-        wait_for(lambda: all(is_over(child) for child in loop))
+        live.wait_for(lambda: all(live.is_over(child) for child in loop))
         assert process.poll() is None
         assert any(child.is_running() for child in loop)  # not reaped yet
     finally:
         os.close(reading)
-    assert process.wait(PATIENCE_S) == 0
+    assert process.wait(live.PATIENCE_S) == 0
     assert is_whole(latest.resolve())
 
 

@@ -13,15 +13,7 @@ from noack.config.scenario_file import load
 from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import OWNER
 from noack.runtime.spool import read_chunks
-from tests.integration.conftest import (
-    AT_RATE,
-    Finished,
-    Running,
-    begun,
-    child_of,
-    settings,
-    wait_for,
-)
+from tests.integration import conftest as live
 
 LOOP = ("plant_step", "sensor_measurement", "controller_step")
 KEEPS = {
@@ -33,7 +25,7 @@ KEEPS = {
 RESTARTED = ("recorder", "controller", "sensor", "netem")
 
 
-def spooled(running: Running, table: str) -> Rows:
+def spooled(running: live.Running, table: str) -> Rows:
     """Return the rows of a table that are on disk."""
     spool = running.runs / "latest" / "spool"
     dtype = tables_of(load(running.runs / "latest" / "scenario.toml"))[table]
@@ -41,13 +33,13 @@ def spooled(running: Running, table: str) -> Rows:
     return np.concatenate([np.zeros(0, dtype), *found])
 
 
-def is_whole(running: Running, table: str) -> bool:
+def is_whole(running: live.Running, table: str) -> bool:
     """Whether a table has no gaps."""
     inputs = spooled(running, table)["sequence"] % GENERATION
     return bool((np.diff(np.unique(inputs)) == 1).all())
 
 
-def goes_on(running: Running, role: str) -> bool:
+def goes_on(running: live.Running, role: str) -> bool:
     """Whether the restarted process of a role has recorded rows; fail if the run has ended."""
     assert running.process.poll() is None, running.process.communicate()
     if role == "recorder":
@@ -56,37 +48,37 @@ def goes_on(running: Running, role: str) -> bool:
     return bool((spooled(running, KEEPS[role])["input"] >= GENERATION).any())
 
 
-def let_run(running: Running, simulated_s: float) -> None:
+def let_run(running: live.Running, simulated_s: float) -> None:
     def now_ns() -> int:
         return int(spooled(running, "plant_step")["t_ns"].max())
 
     until_ns = now_ns() + simulated_s * 1e9
-    wait_for(lambda: now_ns() > until_ns)
+    live.wait_for(lambda: now_ns() > until_ns)
 
 
 @pytest.fixture(scope="module")
-def restarted(tmp_path_factory: pytest.TempPathFactory) -> Finished:
+def restarted(tmp_path_factory: pytest.TempPathFactory) -> live.Finished:
     """A run in which the processes were killed one after the other."""
     folder = tmp_path_factory.mktemp("restarted")
-    with begun(folder) as start:
+    with live.begun(folder) as start:
         running = start(
-            *settings(speed=3.0, horizon_s=4000.0, recovery__rejoin_within_s=60),
-            *AT_RATE,
-            *settings(realtime__enabled=False, network__mansd=1, trigger__floor=0.02),
+            *live.settings(speed=3.0, horizon_s=4000.0, recovery__rejoin_within_s=60),
+            *live.AT_RATE,
+            *live.settings(realtime__enabled=False, network__mansd=1, trigger__floor=0.02),
         )
         running.wait_started()
         # Each process has rows on disk before it is killed: its own, or of the recorder's tables.
-        wait_for(lambda: all(len(spooled(running, table)) > 0 for table in KEEPS.values()))
+        live.wait_for(lambda: all(len(spooled(running, table)) > 0 for table in KEEPS.values()))
         for role in RESTARTED:
-            before = child_of(running.process, role)
+            before = live.child_of(running.process, role)
             assert before is not None
             before.kill()
-            wait_for(lambda role=role: goes_on(running, role))
+            live.wait_for(lambda role=role: goes_on(running, role))
             if role == "recorder":
                 # Unacknowledged rows are sent again. Wait until all of them are on disk before
                 # the next process is killed.
                 let_run(running, 9)
-                wait_for(lambda: all(is_whole(running, table) for table in LOOP))
+                live.wait_for(lambda: all(is_whole(running, table) for table in LOOP))
         let_run(running, 12)
         running.process.send_signal(signal.SIGINT)
         finished = running.finish()
@@ -94,7 +86,7 @@ def restarted(tmp_path_factory: pytest.TempPathFactory) -> Finished:
         return finished
 
 
-def test_the_run_continues_and_lists_its_restarts(restarted: Finished) -> None:
+def test_the_run_continues_and_lists_its_restarts(restarted: live.Finished) -> None:
     assert restarted.status == 130, restarted.stderr
     assert restarted.summary["exit"]["reason"] == "stopped by the user (SIGINT)"
     restarts = {one["process"]: one for one in restarted.summary["restarts"]}
@@ -114,7 +106,7 @@ def rows_of_life(record: RunRecord, table: str, place: int) -> Rows:
     return numbers
 
 
-def test_no_recorded_row_is_lost_and_all_rows_are_replayed(restarted: Finished) -> None:
+def test_no_recorded_row_is_lost_and_all_rows_are_replayed(restarted: live.Finished) -> None:
     assert restarted.summary["missing_samples"] == 0
     verdict = restarted.summary["replay"]
     assert verdict["bit_exact"], verdict
@@ -125,7 +117,7 @@ def test_no_recorded_row_is_lost_and_all_rows_are_replayed(restarted: Finished) 
 
 
 def test_a_restarted_sensor_and_network_begin_with_a_delivered_measurement(
-    restarted: Finished,
+    restarted: live.Finished,
 ) -> None:
     record = load_record(restarted.run_dir)
     first = rows_of_life(record, "sensor_measurement", 1)[0]
@@ -137,7 +129,7 @@ def test_a_restarted_sensor_and_network_begin_with_a_delivered_measurement(
 
 
 def test_a_restarted_controller_outputs_zero_until_its_first_update(
-    restarted: Finished,
+    restarted: live.Finished,
 ) -> None:
     record = load_record(restarted.run_dir)
     ticks = rows_of_life(record, "controller_step", 1)
@@ -151,7 +143,7 @@ def test_a_restarted_controller_outputs_zero_until_its_first_update(
     )
 
 
-def test_the_loop_converges_again_and_its_identity_holds(restarted: Finished) -> None:
+def test_the_loop_converges_again_and_its_identity_holds(restarted: live.Finished) -> None:
     record = load_record(restarted.run_dir)
     assert restarted.summary["identity_residual_relative"] < 1e-11
     joined = align_tables(record)
@@ -165,14 +157,14 @@ def test_the_loop_converges_again_and_its_identity_holds(restarted: Finished) ->
     assert norms[-100:].max() < 0.1 * norms.max()
 
 
-def test_claims_are_void_from_the_first_outage_on(restarted: Finished) -> None:
+def test_claims_are_void_from_the_first_outage_on(restarted: live.Finished) -> None:
     claims = ClaimEvaluation(load_record(restarted.run_dir)).judge()
     assert {claim.verdict for claim in claims} == {"void"}
     gone_s = min(one["last_s"] or np.inf for one in restarted.summary["restarts"])
     assert all(claim.since_s <= gone_s + 0.1 for claim in claims if claim.since_s is not None)
 
 
-def test_a_restarted_process_accepts_no_old_message(restarted: Finished) -> None:
+def test_a_restarted_process_accepts_no_old_message(restarted: live.Finished) -> None:
     """A restarted process has lost the accepted numbers; the generation identifies old messages."""
     record = load_record(restarted.run_dir)
     for table in ("sensor_measurement", "controller_delivery"):

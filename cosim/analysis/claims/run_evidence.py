@@ -255,6 +255,7 @@ class RunEvidence:
         if (
             not scenario.coverage.is_certifiable
             or not scenario.coverage.is_undisturbed
+            or not scenario.coverage.is_decaying
             or loop.weight is not None
             or scenario.decaying.floor > 0
         ):

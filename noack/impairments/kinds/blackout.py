@@ -22,6 +22,7 @@ from noack.impairments.link_records import (
 )
 from noack.impairments.markov_chain import Chain, NotPredictableError
 from noack.impairments.quantities import OWN_TIME_S, TIME, time_text
+from noack.impairments.sorted_numbers import first_above
 from noack.impairments.word_reader import WordReader
 from noack.settings.named_file import NamedFile
 
@@ -33,7 +34,7 @@ _TimeS = Annotated[FiniteFloat, Field(ge=0, le=MOST_S)]
 
 @dataclass(slots=True, kw_only=True)
 class BlackoutStage(RuleStage):
-    """Intervals in the program's table of integers: begin, end, begin, end, …, ascending."""
+    """Intervals in the program's table of integers: all begins, then all ends, ascending."""
 
     begin: int
     end: int
@@ -47,15 +48,9 @@ def apply(packet: PacketContext, stage: BlackoutStage, memory: StageMemory) -> N
     times_ns, now_ns = packet.program.integers, decision.arrival_ns
     if stage.period_ns > 0 and now_ns >= 0:
         now_ns %= stage.period_ns
-    low, high = 0, (stage.end - stage.begin) // 2  # low: the first interval that ends later
-    while low < high:
-        middle = (low + high) // 2
-        if times_ns[stage.begin + 2 * middle + 1] <= now_ns:
-            low = middle + 1
-        else:
-            high = middle
-    place = stage.begin + 2 * low
-    if place < stage.end and times_ns[place] <= now_ns:
+    count = (stage.end - stage.begin) // 2
+    place = first_above(times_ns, stage.begin + count, stage.end, now_ns)
+    if place < stage.end and times_ns[place - count] <= now_ns:
         refuse(decision, BLACKED_OUT)
 
 
@@ -133,7 +128,8 @@ class Blackout(Impairment):
     def stage(self, tables: StageTables) -> BlackoutStage:
         if self.intervals_s is None:
             raise ValueError(f"{self.file}: the intervals have not been read")
-        times_ns = [round(t_s * NS_PER_S) for interval in self.intervals_s for t_s in interval]
+        begins_and_ends = zip(*self.intervals_s, strict=True)
+        times_ns = [round(t_s * NS_PER_S) for times_s in begins_and_ends for t_s in times_s]
         begin, end = add_numbers(tables.integers, times_ns)
         return BlackoutStage(begin=begin, end=end, period_ns=round((self.every_s or 0) * NS_PER_S))
 

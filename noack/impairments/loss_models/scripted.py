@@ -11,6 +11,7 @@ from noack.impairments.feature import Behaviour, LossModel, StageTables, Table, 
 from noack.impairments.link_records import DROPPED, PacketContext, RuleStage, StageMemory, refuse
 from noack.impairments.markov_chain import NotPredictableError, Pattern, pattern
 from noack.impairments.quantities import COUNT
+from noack.impairments.sorted_numbers import first_above
 from noack.impairments.word_reader import WordReader
 
 MAX_SCRIPT = 10_000_000
@@ -32,14 +33,8 @@ def apply(packet: PacketContext, stage: ScriptStage, memory: StageMemory) -> Non
     decision = packet.decision
     numbers = packet.program.integers
     wanted = decision.packet % stage.period if stage.period > 0 else decision.packet
-    low, high = stage.begin, stage.end
-    while low < high:
-        middle = (low + high) // 2
-        if numbers[middle] < wanted:
-            low = middle + 1
-        else:
-            high = middle
-    if low < stage.end and numbers[low] == wanted:
+    place = first_above(numbers, stage.begin, stage.end, wanted - 1)
+    if place < stage.end and numbers[place] == wanted:
         refuse(decision, DROPPED)
 
 

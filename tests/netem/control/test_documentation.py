@@ -7,16 +7,8 @@ from typing import Any, get_type_hints
 
 import pytest
 
+from netem.control import emulator_statistics
 from netem.control.control_server import ControlServer
-from netem.control.emulator_statistics import (
-    DelayQuantiles,
-    DirectionStatistics,
-    FlowStatistics,
-    LinkStatistics,
-    LossStatistics,
-    RecentRates,
-    Statistics,
-)
 from netem.engine.relay_interface import LinkSpec
 from netem.fates.fate_recorder import FateRecorder
 from netem.fates.fate_trace import SCHEMA
@@ -41,10 +33,10 @@ def names(text: str) -> set[str]:
 @pytest.mark.parametrize(
     ("title", "keys"),
     [
-        ("document", get_type_hints(Statistics)),
-        ("link", get_type_hints(LinkStatistics)),
-        ("direction", get_type_hints(DirectionStatistics)),
-        ("recent", get_type_hints(RecentRates)),
+        ("document", get_type_hints(emulator_statistics.Statistics)),
+        ("link", get_type_hints(emulator_statistics.LinkStatistics)),
+        ("direction", get_type_hints(emulator_statistics.DirectionStatistics)),
+        ("recent", get_type_hints(emulator_statistics.RecentRates)),
         ("column", dict.fromkeys(SCHEMA.names)),
         ("key", dict.fromkeys(("report", "settings", "change", "statistics"))),
     ],
@@ -55,9 +47,9 @@ def test_every_key_is_documented_and_no_other(title: str, keys: dict[str, Any]) 
 
 def test_nested_keys_are_documented() -> None:
     text = rows("direction")
-    assert names(text["`loss`"]) == set(get_type_hints(LossStatistics))
-    assert names(text["`flows`"]) == set(get_type_hints(FlowStatistics))
-    assert names(text["`delay_ns`"]) == set(get_type_hints(DelayQuantiles))
+    assert names(text["`loss`"]) == set(get_type_hints(emulator_statistics.LossStatistics))
+    assert names(text["`flows`"]) == set(get_type_hints(emulator_statistics.FlowStatistics))
+    assert names(text["`delay_ns`"]) == set(get_type_hints(emulator_statistics.DelayQuantiles))
 
 
 def programs() -> list[str]:
