@@ -58,3 +58,9 @@ def test_a_mistake_gets_one_line(text: str, says: str) -> None:
         parse_address(text, "here")
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_destination_has_a_port() -> None:
+    assert parse_destination(":9001", "--to") == ("127.0.0.1", 9001)
+    with pytest.raises(CallerError, match="--to: expected a port from 1 to 65535; found ':0'"):
+        parse_destination(":0", "--to")
