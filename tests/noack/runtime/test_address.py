@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from noack.core.errors import CallerError
-from noack.runtime.address import Address, family_of, parse_address, text_of
+from noack.runtime.address import Address, family_of, parse_address, parse_destination, text_of
 
 
 @given(st.one_of(st.ip_addresses(v=4), st.ip_addresses(v=6)), st.integers(0, 65_535))

@@ -138,7 +138,7 @@ def test_compressed_files_are_read_like_others(tmp_path: Path) -> None:
     assert read_trace(path).delay_ns.tolist() == [31_500_000, -1, 29_500_000]
     for wrong in (gzip.compress(content)[:-9], gzip.compress(content)[:5], b"\x1f\x8bxxxxxxxxxx"):
         path.write_bytes(wrong)
-        with pytest.raises(CallerError, match="trace.csv.gz: cannot be decompressed"):
+        with pytest.raises(CallerError, match=r"trace\.csv\.gz: cannot be decompressed"):
             read_trace(path)
 
 
