@@ -14,6 +14,7 @@ import numpy as np
 from benchmarks._certificate_kinds import Broken, Kind, Tally
 from benchmarks._certificate_kinds.decaying import DECAYING
 from benchmarks._certificate_kinds.disturbed import DISTURBED
+from benchmarks._certificate_kinds.policies import POLICIES
 from benchmarks._certificate_kinds.random_losses import RANDOM_LOSSES
 from benchmarks._report import Benchmark, Goal, Row, say
 from cosim.studies.process_pool import interrupts_held, processes
@@ -24,6 +25,7 @@ KINDS: Mapping[str, Kind] = {
         DECAYING,
         DISTURBED,
         RANDOM_LOSSES,
+        *POLICIES,
     )
 }
 

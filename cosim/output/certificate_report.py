@@ -1,5 +1,6 @@
 """The certificates of a scenario, as tables and as JSON."""
 
+import contextlib
 from collections.abc import Callable, Iterator
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -20,6 +21,7 @@ from noack.impairments.markov_chain import NotPredictableError
 from noack.theory.assumptions import assumptions
 from noack.theory.certificate import NetworkConditions
 from noack.theory.enclosure import NotDecayingError
+from noack.theory.loss_margin import LossMargin, Stability
 from noack.theory.paper_bounds import Theorem2, theorem_2
 from noack.theory.run_conditions import ideal_conditions, nominal_conditions
 from noack.theory.scenario_certificates import (
@@ -32,6 +34,8 @@ from noack.theory.scenario_certificates import (
 )
 from noack.theory.unlimited_losses import UnlimitedLosses, unlimited_losses
 from noack.theory.weight import choose_weight
+from noack.trigger.decaying import DecayingSettings
+from noack.trigger.periodic_trigger import PeriodicSettings
 
 IDEAL = "paper"
 """The paper's conditions: no sampling, no delay, no hold."""
@@ -130,6 +134,18 @@ class Certificates:
         """
         return next(iter(self._limits.values()))
 
+    @cached_property
+    def stability(self) -> Stability | None:
+        """What is known about the stability of all loss patterns, if the loop is time-triggered.
+
+        None for other loops, and where the exact margin does not cover the schedule.
+        """
+        if not isinstance(self.scenario.trigger, PeriodicSettings):
+            return None
+        with contextlib.suppress(CallerError):
+            return LossMargin(self.scenario).first_bounds()
+        return None
+
     def to_json(self) -> dict[str, Any]:
         """Return all certificates as one document, as ``noack certify --json`` prints it."""
         return {
@@ -140,6 +156,7 @@ class Certificates:
                 "theorem_2": None if self.theorem_2 is None else self.theorem_2._asdict(),
             },
             "certificates": [{"under": under, **one.to_json()} for under, one in self],
+            "stability": None if self.stability is None else self.stability._asdict(),
             "unlimited_losses": None if self.unlimited is None else self.unlimited.to_json(),
             "limits": {scope: limits._asdict() for scope, limits in self._limits.items()},
         }
@@ -173,8 +190,10 @@ class Certificates:
 
 
 def _theorem_2(scenario: Scenario, certificate: ScenarioCertificate) -> Theorem2 | None:
-    trigger, constants = scenario.decaying, certificate.constants
-    if constants is None or constants.rate_per_s != trigger.alpha_per_s:
+    trigger, constants = scenario.trigger, certificate.constants
+    if not isinstance(trigger, DecayingSettings) or constants is None:
+        return None
+    if constants.rate_per_s != trigger.alpha_per_s:
         return None
     if trigger.floor or trigger.weight is not None:
         return None
@@ -255,7 +274,7 @@ def print_certificates(console: Console, found: Certificates) -> None:
     console.print("assumptions of the paper's theorems:")
     print_assumptions(console, [a._asdict() for a in assumptions(found.scenario)])
     print_unlimited(console, found.unlimited, found.unpredictable)
-    for sentence in _in_words(found):
+    for sentence in (*_in_words(found), *_stability_in_words(found)):
         console.print(sentence, markup=False, highlight=False)
     if found.weight is not None:
         rows = ",\n".join(f"  {[float(f'{v:.6g}') for v in row]}" for row in found.weight)
@@ -286,13 +305,26 @@ def _in_words(found: Certificates) -> Iterator[str]:
         )
 
 
+def _stability_in_words(found: Certificates) -> Iterator[str]:
+    """Yield what is known exactly about the stability of a time-triggered loop."""
+    if (known := found.stability) is None:
+        return
+    patterns = f"patterns with {found.scenario.network.guarantee.meaning}"
+    growth = f"growth per period {known.lower:.4g} to {known.upper:.4g}"
+    text = {
+        "stable": f"all {patterns} are stable: {growth}",
+        "destabilised": f"the pattern {known.text}, repeated, destabilises the loop: {growth}",
+        "undecided": f"{growth} under the worst of all {patterns}",
+    }[known.verdict]
+    yield f"Exactly, but without lateness: {text}; noack margin finds the limits."
+
+
 def _print_constants(console: Console, found: Certificates) -> None:
-    trigger = found.scenario.decaying
+    trigger = found.scenario.trigger
     norm = "‖W·‖" if trigger.weight is not None else "‖·‖"
     table = Table(
         title=f"{found.scenario.name}: certified bounds, "
-        f"{found.scenario.network.guarantee.meaning}, β = {trigger.beta:g}, "
-        f"α = {trigger.alpha_per_s:g} /s, norm {norm}"
+        f"{found.scenario.network.guarantee.meaning}; event: {trigger.description}; norm {norm}"
     )
     table.add_column("")
     for under, certificate in found:
@@ -339,11 +371,12 @@ def _constants(found: Certificates) -> Iterator[tuple[str, list[str], str]]:
         delta_2 = "(same)"
         state_2 = number(theorem.state_start + theorem.state_forced, 4)
         spacing_2 = number(theorem.inter_event_s, 4)
-    rate_2 = number(found.scenario.decaying.alpha_per_s, 4)
+    rate_2 = number(found.scenario.trigger.threshold_decay_per_s, 4)
     yield "decay rate, 1/s", constant("rate_per_s"), rate_2
     yield "updates outstanding", constant("missing_events"), NONE
-    yield "Δ, bound of ‖e_c‖/β", constant("delta"), delta_2
-    yield "bound of ‖e_s‖/β", constant("overshoot"), "1"
+    unit = next((f"/{one.unit}" for one in certificates if one.unit), "")
+    yield f"Δ, bound of ‖e_c‖{unit}", constant("delta"), delta_2
+    yield f"bound of ‖e_s‖{unit}", constant("overshoot"), "1"
     yield "bound of ‖u − Kx‖", constant("input_error"), NONE
     yield "X, bound of ‖x‖", constant("state"), state_2
     yield "inter-event time, s", row(lambda c: c.inter_event_s), spacing_2

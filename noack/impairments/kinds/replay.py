@@ -47,19 +47,13 @@ _EXPECTED = "records of sending time and delay, e.g. 0ms+12ms,50ms+lost"
 def _read(reader: WordReader) -> Table:
     name = reader.file("a file with a packet trace")
     table: Table = _read_records(reader) if name == "records" else {"file": name}
-    while True:
-        if reader.accept("by"):
-            table["by"] = reader.word("packet or time")
-        elif reader.accept("from"):
-            table["offset_s"] = read_offset(reader)
-        elif reader.accept("share"):
-            table["delay_share"] = reader.value(PERCENT)
-        elif reader.accept("relative"):
-            table["clocks_differ"] = True
-        elif reader.accept("once"):
-            table["repeat"] = False
-        else:
-            return table
+    return reader.options(table, {
+        "by": ("by", lambda reader: reader.word("packet or time")),
+        "from": ("offset_s", read_offset),
+        "share": ("delay_share", lambda reader: reader.value(PERCENT)),
+        "relative": ("clocks_differ", lambda _: True),
+        "once": ("repeat", lambda _: False),
+    })  # fmt: skip
 
 
 def _read_records(reader: WordReader) -> Table:
@@ -271,8 +265,5 @@ class Replay(Impairment):
             "file": None, "clocks_differ": False,
         }  # fmt: skip
         read = self.model_copy(update=update)
-        try:
-            require_inside(self.offset_s, read.length_ns)
-        except ValueError as error:
-            file.wrong(str(error))
+        require_inside(self.offset_s, read.length_ns, file)
         return read
