@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import noack
 from noack.core.errors import CallerError, shortened
 
 _LONGEST = 100
@@ -33,6 +32,6 @@ def find_trace(name: str, folder: Path = Path(), named: str = "") -> Path:
 
 def _folder() -> Path:
     """Return their folder: in the installed package, or in the repository."""
-    root = Path(noack.__file__).parent.parent
+    root = Path(__file__).parents[2]
     installed = root / "cosim" / "scenarios" / "traces"
     return installed if installed.is_dir() else root / "scenarios" / "traces"
