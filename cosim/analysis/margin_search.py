@@ -8,8 +8,11 @@ from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
+from noack.impairments.loss_process import loss_process
+from noack.impairments.markov_chain import NotPredictableError
 from noack.theory.joint_spectral_radius import ACCURACY
 from noack.theory.loss_margin import LossMargin, Stability, capped
+from noack.theory.mean_square_growth import RandomGrowth
 
 MOST_M = 16
 
@@ -93,6 +96,8 @@ class MarginResult:
     """The constraints of the network allow no more losses with a larger M."""
     period: PeriodLimit | None
     """None if it was not searched for."""
+    without_guarantee: RandomGrowth | str
+    """The growth under the scenario's losses if nothing limits them, or why it is not known."""
 
     @property
     def is_periodic(self) -> bool:
@@ -128,7 +133,14 @@ class MarginResult:
 
     def __repr__(self) -> str:
         """Return the verdicts."""
-        return "\n".join([self.verdict, *([self.period.text] if self.period else [])])
+        period = [self.period.text] if self.period else []
+        return "\n".join([self.verdict, *period, self.random_text])
+
+    @property
+    def random_text(self) -> str:
+        """What holds for random losses without the guarantee, as a sentence."""
+        found = self.without_guarantee
+        return f"without the guarantee: {found if isinstance(found, str) else found.text}"
 
     def to_json(self) -> dict[str, Any]:
         """Return all fields and the verdicts for JSON."""
@@ -136,6 +148,7 @@ class MarginResult:
         if self.period is not None:
             period = self.period._asdict() | {"text": self.period.text}
             period["found"] = None if self.period.found is None else _document(self.period.found)
+        found = self.without_guarantee
         own = (
             "scenario",
             "mode",
@@ -152,6 +165,7 @@ class MarginResult:
             "stable_m": self.stable_m,
             "caps": [{"m": cap.m, **_document(cap.found)} for cap in self.caps],
             "period": period,
+            "without_guarantee": found if isinstance(found, str) else found._asdict(),
         }
 
 
@@ -196,7 +210,18 @@ def find_margin(
         margin.shortest_ns / NS_PER_S, margin.longest_ns / NS_PER_S,
         margin.loop.times.delay_ns / NS_PER_S, tuple(caps), every_m,
         find_longest_period(resolved, progress) if with_period else None,
+        _without_guarantee(resolved, margin, progress),
     )  # fmt: skip
+
+
+def _without_guarantee(
+    resolved: Scenario, margin: LossMargin, progress: MarginProgress
+) -> RandomGrowth | str:
+    progress("random losses")
+    try:
+        return margin.random_growth(loss_process(resolved.network.link))
+    except NotPredictableError as error:
+        return f"not known: {error}"
 
 
 def find_longest_period(

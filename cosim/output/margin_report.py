@@ -33,6 +33,7 @@ def print_margin(console: Console, margin: MarginResult) -> None:
     if margin.period is not None:
         text = f"for {margin.guarantee}: {margin.period.text}"
         console.print(text, soft_wrap=True, highlight=False)
+    console.print(margin.random_text, soft_wrap=True, highlight=False, markup=False)
     note = "D delivered, L lost, repeated. Below 1: every pattern is stable."
     if not margin.is_periodic:
         note += " In brackets: the time to the next update."

@@ -61,7 +61,8 @@ def joint_spectral_radius(
     Args:
         edges: the system; paths that cannot be continued forever do not count.
         accuracy: wanted upper/lower − 1.
-        most_vertices: limit of the work; at the limit the bounds are farther apart.
+        most_vertices: limit of the work; at the limit the bounds are farther apart. 0: quadratic
+            norms take the place of polytopes.
     """
     numbers = {id(edge): number for number, edge in enumerate(edges)}
     lower, upper, vertices = 0.0, 0.0, 0
@@ -77,7 +78,7 @@ def joint_spectral_radius(
 
 def _connected(system: SwitchedSystem, accuracy: float, most_vertices: int) -> JointSpectralRadius:
     leaving = Counter(edge.source for edge in system.edges)
-    if max(leaving.values()) > MOST_LEAVING:
+    if not most_vertices or max(leaving.values()) > MOST_LEAVING:
         return _by_quadratic_norms(system, accuracy)
     balanced = system.balanced()
     cycle = _best_cycle(system, balanced, _SEARCH)

@@ -6,6 +6,7 @@ edges, with the loop's maps over their times (:mod:`noack.theory.time_triggered_
 switched system (:mod:`noack.theory.switched_system`).
 """
 
+import math
 from functools import cache
 from typing import NamedTuple
 
@@ -15,12 +16,23 @@ from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.impairments.kinds.delay import Delay
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
-from noack.theory.delivery_graph import Burst, EventTimes, bursts_of
-from noack.theory.joint_spectral_radius import ACCURACY, JointSpectralRadius, joint_spectral_radius
+from noack.impairments.loss_process import LossProcess
+from noack.impairments.markov_chain import NotPredictableError
+from noack.theory.delivery_graph import EVERY_STEP, Burst, EventTimes, bursts_of
+from noack.theory.joint_spectral_radius import (
+    ACCURACY,
+    MOST_VERTICES,
+    JointSpectralRadius,
+    joint_spectral_radius,
+)
+from noack.theory.mean_square_growth import RandomGrowth, mean_square_growth, sure_growth
 from noack.theory.switched_system import Edge
 from noack.theory.time_triggered_loop import LoopTimes, TimeTriggeredLoop
 from noack.trigger.trigger_condition import NEVER_NS
 
+_MOST_SLOTS = 100
+_MOST_LIKELY, _LEAST_LIKELY = 0.93, 1e-12
+"""Loss probability up to which almost all runs are examined, and the bursts left out."""
 _TIMELESS = ("loss", "corrupt", "blackout", "duplicate")
 _FIRST_ACCURACY = 1e-2
 _QUICK_ACCURACY = 3e-2
@@ -138,13 +150,38 @@ class LossMargin:
             raise CallerError(
                 "the loop between two deliveries exceeds 1e308; reduce mansd or the period"
             ) from None
+        # Short steps would need many vertices.
+        vertices = MOST_VERTICES if self._times == EVERY_STEP else 0
         while True:
-            found = joint_spectral_radius(edges, accuracy=accuracy / self._times.longest)
+            found = joint_spectral_radius(
+                edges, accuracy=accuracy / self._times.longest, most_vertices=vertices
+            )
             finest = _LAST_ACCURACY if found.vertices else ACCURACY  # of quadratic norms
             decided = not found.lower <= 1 <= found.upper
             if decided or not refine or accuracy < finest:
                 return self._stability(found, bursts)
             accuracy = min(accuracy / 10, (1 - found.lower) / 2)
+
+    def random_growth(self, losses: LossProcess) -> RandomGrowth:
+        """Return the growth under random losses that nothing limits.
+
+        Raises:
+            NotPredictableError: loop and losses have too many states, or the sensor is not
+                time-triggered.
+        """
+        if self.shortest_ns != self.longest_ns:
+            raise NotPredictableError("the times between updates are not known")
+        slots = range(self.loop.times.slots)
+        if len(slots) > _MOST_SLOTS:
+            raise NotPredictableError("the times of the loop repeat only after many periods")
+        maps = [(self.loop.period(slot, True), self.loop.period(slot, False)) for slot in slots]
+        mean_square = almost_sure = mean_square_growth(maps, losses)
+        p = losses.largest_probability
+        if len(slots) == 1 and losses.is_independent and 0 < p < _MOST_LIKELY:
+            bursts = range(math.ceil(math.log(_LEAST_LIKELY) / math.log(p)))
+            between = [self._maps(0, burst).middle for burst in bursts]
+            almost_sure = min(mean_square, sure_growth(between, p))
+        return RandomGrowth(mean_square, almost_sure)
 
     def is_stable(self, guarantee: LossGuarantee | None = None) -> Stability:
         """Return coarser bounds, which decide whether all patterns are stable."""
