@@ -51,7 +51,7 @@ def assumptions(resolved: Scenario) -> list[Assumption]:
     loop, linear = loop_of(resolved), resolved.coverage.is_linear
     found = [_closed_loop(loop)] if linear else _not_linear(loop, resolved)
     if not resolved.coverage.is_decaying:
-        why = f'the policy is "{resolved.trigger.policy}": {_NOT_COVERED}'
+        why = f'the policy is "{resolved.trigger.policy}": not covered by the paper\'s theorems'
         found.append(_violated("the trigger is ‖e_s‖ > βe^(−αt)", "eq:thre", why))
     elif linear:
         found.append(_decay_rate(loop, resolved.decaying.alpha_per_s))

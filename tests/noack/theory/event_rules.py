@@ -109,3 +109,16 @@ class Growing:
         size = np.einsum("ri,ri->r", x, x)
         self._size = np.where((since <= self.every) | (step == 0), size, self._size)
         return np.asarray(size > self.factor * self._size)
+
+
+@dataclass
+class Between:
+    """After any number of steps between two; it stands for every forecast."""
+
+    shortest: int
+    longest: int
+    seed: int
+
+    def __call__(self, step: int, since: Steps, x: Reals, e_s: Reals) -> Flags:
+        wanted = np.random.default_rng((self.seed, step)).uniform(size=len(x)) < 0.3
+        return np.asarray((since >= self.longest) | (wanted & (since >= self.shortest)))

@@ -14,6 +14,7 @@ from noack.theory.scenario_certificates import ScenarioCertificate
 from tests.noack.theory.event_rules import (
     Area,
     AtLatest,
+    Between,
     Compare,
     Decaying,
     Growing,
@@ -95,6 +96,16 @@ def _lyapunov(system: System, rng: Rng) -> Case:
     )
 
 
+def _self_triggered(system: System, rng: Rng) -> Case:
+    shortest, more = (int(rng.integers(1, 3)) * system.sample_steps for _ in range(2))
+    settings = {
+        "policy": "self_triggered", "beta": system.beta, "alpha_per_s": system.alpha,
+        "growth_per_s": 1.0, "mismatch_per_s": 1.0, "shortest_s": shortest * system.step_s,
+        "longest_s": (shortest + more) * system.step_s,
+    }  # fmt: skip
+    return settings, Between(shortest, shortest + more, int(rng.integers(1000)))
+
+
 def _dwell(system: System, rng: Rng) -> Case:
     rule, event = _decaying(system) if rng.uniform() < 0.5 else _mixed(system, rng)
     steps = int(rng.integers(1, 6)) * system.sample_steps
@@ -105,7 +116,7 @@ def _dwell(system: System, rng: Rng) -> Case:
 KINDS: dict[str, Callable[[System, Rng], Case]] = {
     "absolute": _absolute, "relative": _relative, "mixed": _mixed, "quadratic": _quadratic,
     "send_on_area": _send_on_area, "periodic": _periodic, "deadline": _deadline,
-    "lyapunov": _lyapunov, "dwell": _dwell,
+    "lyapunov": _lyapunov, "self_triggered": _self_triggered, "dwell": _dwell,
 }  # fmt: skip
 
 

@@ -7,9 +7,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
+from noack.config.resolution import policy_of
+from noack.theory.certificate import NetworkConditions
 from noack.theory.scenario_certificates import certify
-from tests.noack.theory.broken_policies import BROKEN_POLICIES
+from tests.noack.theory.broken_policies import BROKEN_POLICIES, INSTANT
+from tests.noack.theory.exact_loops import observe
 from tests.noack.theory.loops import (
+    ROUNDING,
     SEARCH,
     System,
     networks,
@@ -30,6 +34,28 @@ def test_no_bound_of_a_policy_is_exceeded(kind: str, system: System, seed: int) 
     if certificate.constants is not None:
         trace = simulate(system, *networks(seed, system), rule=rule)
         assert exceeded_by(trace, certificate, system) == []
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS.keys() - {"lyapunov"}))
+@settings(SEARCH, max_examples=3)
+@given(systems(**INSTANT), seeds)
+def test_no_bound_of_a_policy_is_exceeded_in_continuous_time(
+    kind: str, system: System, seed: int
+) -> None:
+    resolved, _, system = policy_case(kind, system, seed)
+    certificate = certify(resolved, NetworkConditions(system.mansd))
+    if certificate.constants is None:
+        return
+    least_s = certificate.inter_event_s or 0.0
+    for run, samples in observe(system, 6.0, seed, policy=policy_of(resolved)):
+        slack = ROUNDING - 1
+        for seen, bound in (
+            (run.system.norms(samples.e_s), certificate.sensor_error(samples.t_s)),
+            (run.system.norms(samples.e_c), certificate.controller_error(samples.t_s)),
+            (np.linalg.norm(samples.x, axis=1), certificate.state(samples.t_s)),
+        ):
+            assert (seen <= ROUNDING * bound + slack * certificate.state(samples.t_s)).all()
+        assert np.diff(run.event_s).min(initial=np.inf) >= least_s / ROUNDING - 1e-9
 
 
 @pytest.mark.parametrize("mistake", BROKEN_POLICIES)
