@@ -41,6 +41,7 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.life_cycle import HORIZON
+from noack.theory.persistent_causes import forcing_of
 from noack.theory.setpoint_shift import about_setpoint, void_at_setpoint
 
 _TIMES = ("t_ns", "now_ns", "model_t_ns", "release_ns", "copy_ns")
@@ -244,7 +245,7 @@ def _start_error(own: RunRecord, started_s: float) -> float:
     """sup‖u − Kx‖ e^{αt} over the steps until the plant applied the first input of the part.
 
     u is constant within a step. So ‖u − Kx‖ is at most the larger of its values at both ends, plus
-    a term for the curvature of x: Δt²/8 sup‖K A ẋ‖, with ẋ = e^{As}(Ax + Bu).
+    a term for the curvature of x: Δt²/8 sup‖K A ẋ‖, with ẋ = e^{As}(Ax + Bu + Dw), w constant.
     """
     alpha = own.scenario.trigger.threshold_decay_per_s
     largest, last = 0.0, np.zeros(0, own.tables[PLANT_STEP])
@@ -266,7 +267,10 @@ def _input_error(own: RunRecord, steps: Rows, alpha_per_s: float) -> float:
     ends = np.maximum(row_norms(u - x[:-1] @ loop.K.T), row_norms(u - x[1:] @ loop.K.T))
     speed = x[:-1] @ loop.A.T + u @ loop.B.T
     grown = math.exp(min(float(np.linalg.norm(loop.A, 2)) * dt_s, 700.0))
-    bend = dt_s**2 / 8 * grown * row_norms(speed @ (loop.K @ loop.A).T)
+    pushes, forcing = 0.0, forcing_of(own.scenario, loop.B)
+    if forcing is not None:
+        pushes = float(np.linalg.norm(loop.K @ loop.A @ forcing.limited, axis=0).sum())
+    bend = dt_s**2 / 8 * grown * (row_norms(speed @ (loop.K @ loop.A).T) + pushes)
     return float(((ends + bend) * np.exp(alpha_per_s * steps["t_ns"][1:] * 1e-9)).max())
 
 
