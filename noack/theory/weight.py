@@ -2,8 +2,8 @@
 
 If P = WᵀW and (H+αI)ᵀP + P(H+αI) ⪯ 0, ‖·‖_W contracts along the models. Then Δ ≤ M on a network
 without delay. Among these factors W, the search first lowers the loop gain until there is a
-certificate, and then the product of X and 1/δ: P solves the Lyapunov equation for some Q ⪰ 0, and
-Q is varied. W is scaled to |det W| = 1, so that ‖W e‖ ≤ β encloses the same volume as ‖e‖ ≤ β.
+certificate, and then X/δ³: P solves the Lyapunov equation for some Q ⪰ 0, and Q is varied. W is
+scaled to |det W| = 1, so that ‖W e‖ ≤ β encloses the same volume as ‖e‖ ≤ β.
 
 The search uses kernels that are sampled, not enclosed. Whatever W it finds is certified afterwards.
 """
@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from noack.config.resolution import LoopMatrices
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
@@ -23,9 +22,7 @@ from noack.theory.contraction import Stack, product
 from noack.theory.enclosure import KernelBounds, NotDecayingError, response
 from noack.theory.gains import Coefficients, ErrorGains, Output, PlantGains
 
-Indices = NDArray[np.int_]
-
-_ROUNDS = 600
+_ROUNDS_PER_SCALE, _ROUNDS, _ROUNDS_PER_ENTRY = 15, 40, 12
 _MOST_FREE = 7
 _NODES = 256
 _VOID = 1e3
@@ -34,7 +31,7 @@ _VOID = 1e3
 
 def choose_weight(
     loop: LoopMatrices,
-    bound: TriggerBound,
+    beta: float,
     alpha_per_s: float,
     conditions: NetworkConditions,
     progress: Callable[[float], None] = lambda share: None,
@@ -52,25 +49,37 @@ def choose_weight(
     for name, matrix in (("the models", loop.H), ("A + BK", loop.A + loop.B @ loop.K)):
         if spectral_abscissa(matrix) + alpha_per_s >= 0:
             raise NotDecayingError(f"α = {alpha_per_s:g} /s is not below the decay rate of {name}")
+    samples, bound = _Samples(loop, alpha_per_s), TriggerBound(beta, beta)
     # Off-diagonal entries of Q are varied only for few states; for more they cost too much time.
-    free = np.tril_indices(n) if n <= _MOST_FREE else np.diag_indices(n)
-    samples = _Samples(loop, alpha_per_s)
+    full = np.tril_indices(n) if n <= _MOST_FREE else np.diag_indices(n)
+    scale_rounds = _ROUNDS_PER_SCALE * n
+    entry_rounds = _ROUNDS + _ROUNDS_PER_ENTRY * len(full[0])
     rounds = 0
 
-    def merit(entries: Vector) -> float:
-        nonlocal rounds
-        rounds += 1
-        progress(min(rounds / _ROUNDS, 1.0))
-        weight = _weight(loop.H, alpha_per_s, free, entries)
-        return 2 * _VOID if weight is None else samples.merit(weight, conditions, bound)
+    def search(most: int, start: Vector, factor: Callable[[Vector], Matrix]) -> Vector:
+        def merit(entries: Vector) -> float:
+            nonlocal rounds
+            rounds += 1
+            progress(min(rounds / (scale_rounds + entry_rounds), 1.0))
+            weight = _weight(loop.H, alpha_per_s, factor(entries))
+            return 2 * _VOID if weight is None else samples.merit(weight, conditions, bound)
 
-    start = np.eye(n)[free]
-    best = minimize(
-        merit, start, method="Nelder-Mead", options={"maxfev": _ROUNDS, "adaptive": True}
-    )
+        best = minimize(
+            merit, start, method="Nelder-Mead", options={"maxfev": most, "adaptive": True}
+        )
+        return np.asarray(best.x)
+
+    def triangular(entries: Vector) -> Matrix:
+        L = np.zeros((n, n))
+        L[full] = entries
+        return L
+
+    # First the scales of the states, which may have very different units.
+    scales = search(scale_rounds, np.zeros(n), lambda logs: np.diag(np.exp(logs)))
+    best = search(entry_rounds, np.diag(np.exp(scales))[full], triangular)
     progress(1.0)
-    for entries in (best.x, start):
-        weight = _weight(loop.H, alpha_per_s, free, entries)
+    for L in (triangular(best), np.eye(n)):
+        weight = _weight(loop.H, alpha_per_s, L)
         if weight is not None:
             return weight
     raise NotDecayingError("no Lyapunov function of the models was found")
@@ -102,7 +111,7 @@ class _Samples:
         return _thinned(self.plain.closed_loop, columns)
 
     def merit(self, weight: Matrix, conditions: NetworkConditions, bound: TriggerBound) -> float:
-        """Return log X − log δ, or without a certificate a large number that has the loop gain."""
+        """Return log X − 3 log δ, or without a certificate a large number and the loop gain."""
         loop = self.loop
         error = _SampledError(loop.H, loop.K, weight, self.alpha_per_s, samples=self)
         plant = _SampledPlant(
@@ -112,7 +121,7 @@ class _Samples:
             found = solve(error, plant, conditions, bound, structured=False)
         except VoidError as void:
             return _VOID + min(void.loop_gain, _VOID)
-        return math.log(found.state) - math.log(found.inter_event_s or math.inf)
+        return math.log(found.state) - 3 * math.log(found.inter_event_s or math.inf)
 
 
 @dataclass(frozen=True)
@@ -175,15 +184,11 @@ def _gram(values: Stack) -> Stack:
     return values @ turned if values.shape[1] <= values.shape[2] else turned @ values
 
 
-def _weight(
-    H: Matrix, alpha_per_s: float, free: tuple[Indices, ...], entries: Matrix
-) -> Matrix | None:
-    """Return W for Q = L Lᵀ from L's free entries; None if it fails the inequality by rounding."""
+def _weight(H: Matrix, alpha_per_s: float, L: Matrix) -> Matrix | None:
+    """Return W for Q = L Lᵀ; None if it fails the inequality by rounding."""
     from scipy.linalg import solve_continuous_lyapunov
 
     n = len(H)
-    L = np.zeros((n, n))
-    L[free] = entries
     Q = L @ L.T
     Q += 1e-6 * np.trace(Q) / n * np.eye(n)
     P = solve_continuous_lyapunov((H + alpha_per_s * np.eye(n)).T, -Q)
