@@ -14,10 +14,20 @@ import numpy as np
 from benchmarks._certificate_kinds import Broken, Kind, Tally
 from benchmarks._certificate_kinds.decaying import DECAYING
 from benchmarks._certificate_kinds.disturbed import DISTURBED
+from benchmarks._certificate_kinds.policies import POLICIES
+from benchmarks._certificate_kinds.random_losses import RANDOM_LOSSES
 from benchmarks._report import Benchmark, Goal, Row, say
 from cosim.studies.process_pool import interrupts_held, processes
 
-KINDS: Mapping[str, Kind] = {kind.name: kind for kind in (DECAYING, DISTURBED)}
+KINDS: Mapping[str, Kind] = {
+    kind.name: kind
+    for kind in (
+        DECAYING,
+        DISTURBED,
+        RANDOM_LOSSES,
+        *POLICIES,
+    )
+}
 
 ROUNDING = 1 + 1e-9
 _CHUNK = 20

@@ -16,6 +16,8 @@ from noack.theory.certificate import Constants, VoidError
 from noack.theory.enclosure import NotDecayingError
 from tests.noack.theory.broken_certificates import MUTANTS
 from tests.noack.theory.loops import (
+    Flags,
+    Steps,
     System,
     Trace,
     allowed,
@@ -56,8 +58,17 @@ def certified_by(certify: Callable[[System], Constants]) -> Callable[[System], B
     return bounds
 
 
-def search(system: System, rng: np.random.Generator) -> Observed:
-    """Simulate repeated, random and improved patterns of losses."""
+def search(
+    system: System,
+    rng: np.random.Generator,
+    run: Callable[[System, Flags, Steps], Trace] = simulate,
+    worst_of: Callable[[System, Trace], dict[str, float]] | None = None,
+) -> Observed:
+    """Simulate repeated, random and improved patterns of losses.
+
+    ``run`` simulates outcomes and delays, ``worst_of`` returns what is compared with the bounds.
+    """
+    worst_of = worst_of or _worst
     repeated = np.array(list(product([False, True], repeat=_REPEATED)))
     times = -(-system.events // _REPEATED)
     lost = allowed(np.tile(repeated, times)[:, : system.events], system)
@@ -65,8 +76,8 @@ def search(system: System, rng: np.random.Generator) -> Observed:
     outcomes = np.concatenate([~np.unique(lost, axis=0), at_random])
     slowest = np.full((len(outcomes) - len(delays), system.events), system.delay_steps)
     delays = np.concatenate([slowest, delays])
-    trace = simulate(system, outcomes, delays)
-    runs, worst = len(outcomes), _worst(system, trace)
+    trace = run(system, outcomes, delays)
+    runs, worst = len(outcomes), worst_of(system, trace)
     pairs = np.arange(_CHANGED)
     for _ in range(_ROUNDS):
         best = np.repeat([_best(system, trace, name) for name in _OBJECTIVES], _CHANGED)
@@ -74,9 +85,9 @@ def search(system: System, rng: np.random.Generator) -> Observed:
         for first in range(0, len(best), _CHANGED):
             outcomes[first + pairs, pairs] ^= True
         outcomes = ~allowed(~outcomes, system)
-        trace = simulate(system, outcomes, delays)
+        trace = run(system, outcomes, delays)
         runs += len(outcomes)
-        worst = {name: max(value, worst[name]) for name, value in _worst(system, trace).items()}
+        worst = {name: max(value, worst[name]) for name, value in worst_of(system, trace).items()}
     return Observed(runs, worst)
 
 

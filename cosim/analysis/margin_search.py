@@ -1,4 +1,4 @@
-"""The margin of a time-triggered loop: the largest M, and the largest period for its own M."""
+"""The margin of a loop: the largest M, and the longest time between events for its own M."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -6,9 +6,13 @@ from typing import Any, NamedTuple
 
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
+from noack.core.errors import CallerError
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
+from noack.impairments.loss_process import loss_process
+from noack.impairments.markov_chain import NotPredictableError
 from noack.theory.joint_spectral_radius import ACCURACY
 from noack.theory.loss_margin import LossMargin, Stability, capped
+from noack.theory.mean_square_growth import RandomGrowth
 
 MOST_M = 16
 
@@ -25,11 +29,21 @@ class LossCap(NamedTuple):
 
     @property
     def settings(self) -> tuple[str, ...]:
-        """The settings of a scenario in which the network plays the pattern again and again."""
+        """The settings of a scenario that plays the pattern again and again, time-triggered.
+
+        Raises:
+            CallerError: the times between the updates of the pattern differ.
+        """
         pattern = self.found.pattern
+        if not self.found.is_periodic:
+            raise CallerError(
+                "--play: the times between the updates of the pattern differ, so no trigger "
+                "policy transmits at them"
+            )
         lost = [number for number, delivered in enumerate(pattern) if not delivered]
         script = f'{{model="scripted", lost={lost}, repeat_every={len(pattern)}}}'
-        return f"network.mansd={self.m - 1}", f"network.loss={script}"
+        trigger = f'{{policy="periodic", period_s={self.found.intervals_s[0]!r}}}'
+        return f"network.mansd={self.m - 1}", f"network.loss={script}", f"trigger={trigger}"
 
 
 class PeriodLimit(NamedTuple):
@@ -39,25 +53,28 @@ class PeriodLimit(NamedTuple):
     """A period that is proven stable; None: none was found."""
     unstable_s: float | None
     """The next longer period that was examined; it is not proven stable. None: none was found."""
+    is_longest: bool
+    """The period is the longest time between two updates; shorter times are possible."""
     found: Stability | None
     """What is known about ``unstable_s``."""
 
     @property
     def text(self) -> str:
         """The limit in words."""
+        T = "T ≤" if self.is_longest else "T ="
         if self.found is None:
             return f"stable for every pattern up to T = {self.stable_s:g} s, the longest examined"
-        longer = f"T = {self.unstable_s:g} s is undecided"
+        longer = f"{T} {self.unstable_s:g} s is undecided"
         if self.found.verdict == "destabilised":
-            longer = f"this pattern destabilises T = {self.unstable_s:g} s: {self.found.text}"
+            longer = f"this pattern destabilises {T} {self.unstable_s:g} s: {self.found.text}"
         if self.stable_s is None:
             return f"no stable period was found; {longer}"
-        return f"stable for every pattern with T = {self.stable_s:g} s; {longer}"
+        return f"stable for every pattern with {T} {self.stable_s:g} s; {longer}"
 
 
 @dataclass(frozen=True)
 class MarginResult:
-    """The margin of a time-triggered loop.
+    """The margin of a loop.
 
     ``print`` shows it in words; ``caps`` has the bounds for each M, ``period`` the longest period.
     """
@@ -67,8 +84,10 @@ class MarginResult:
     mansd: int
     """M − 1 of the scenario."""
     guarantee: str
+    shortest_s: float
+    """The shortest time between two transmissions."""
     period_s: float
-    """Time between two transmissions."""
+    """The longest time between two transmissions."""
     delay_s: float
     """Delay of an update in the network."""
     caps: tuple[LossCap, ...]
@@ -77,6 +96,13 @@ class MarginResult:
     """The constraints of the network allow no more losses with a larger M."""
     period: PeriodLimit | None
     """None if it was not searched for."""
+    without_guarantee: RandomGrowth | str
+    """The growth under the scenario's losses if nothing limits them, or why it is not known."""
+
+    @property
+    def is_periodic(self) -> bool:
+        """Whether the sensor is time-triggered: its period is the time between all updates."""
+        return self.shortest_s == self.period_s
 
     @property
     def stable_m(self) -> int | None:
@@ -107,7 +133,14 @@ class MarginResult:
 
     def __repr__(self) -> str:
         """Return the verdicts."""
-        return "\n".join([self.verdict, *([self.period.text] if self.period else [])])
+        period = [self.period.text] if self.period else []
+        return "\n".join([self.verdict, *period, self.random_text])
+
+    @property
+    def random_text(self) -> str:
+        """What holds for random losses without the guarantee, as a sentence."""
+        found = self.without_guarantee
+        return f"without the guarantee: {found if isinstance(found, str) else found.text}"
 
     def to_json(self) -> dict[str, Any]:
         """Return all fields and the verdicts for JSON."""
@@ -115,12 +148,24 @@ class MarginResult:
         if self.period is not None:
             period = self.period._asdict() | {"text": self.period.text}
             period["found"] = None if self.period.found is None else _document(self.period.found)
-        own = ("scenario", "mode", "mansd", "guarantee", "period_s", "delay_s", "every_m")
+        found = self.without_guarantee
+        own = (
+            "scenario",
+            "mode",
+            "mansd",
+            "guarantee",
+            "shortest_s",
+            "period_s",
+            "delay_s",
+            "every_m",
+        )
         return {key: getattr(self, key) for key in own} | {
+            "shortest_s": self.shortest_s,
             "verdict": self.verdict,
             "stable_m": self.stable_m,
             "caps": [{"m": cap.m, **_document(cap.found)} for cap in self.caps],
             "period": period,
+            "without_guarantee": found if isinstance(found, str) else found._asdict(),
         }
 
 
@@ -139,7 +184,7 @@ def find_margin(
     """Find the margin of a scenario's loop.
 
     Args:
-        resolved: the resolved scenario; its trigger is periodic.
+        resolved: the resolved scenario; its trigger has a longest time between two events.
         most_m: largest M to examine.
         accuracy: wanted ratio of upper and lower bound, minus 1.
         with_period: whether to search for the longest period, too.
@@ -162,9 +207,21 @@ def find_margin(
             break
     return MarginResult(
         resolved.name, resolved.mode, network.mansd, network.guarantee.meaning,
-        margin.period_ns / NS_PER_S, margin.loop.times.delay_ns / NS_PER_S, tuple(caps), every_m,
+        margin.shortest_ns / NS_PER_S, margin.longest_ns / NS_PER_S,
+        margin.loop.times.delay_ns / NS_PER_S, tuple(caps), every_m,
         find_longest_period(resolved, progress) if with_period else None,
+        _without_guarantee(resolved, margin, progress),
     )  # fmt: skip
+
+
+def _without_guarantee(
+    resolved: Scenario, margin: LossMargin, progress: MarginProgress
+) -> RandomGrowth | str:
+    progress("random losses")
+    try:
+        return margin.random_growth(loss_process(resolved.network.link))
+    except NotPredictableError as error:
+        return f"not known: {error}"
 
 
 def find_longest_period(
@@ -185,15 +242,16 @@ def find_longest_period(
         return examined[steps].verdict == "stable"
 
     first = LossMargin(resolved)
-    longest = max(resolved.timing.horizon_ns, first.period_ns) // step_ns
+    is_longest = first.shortest_ns < first.longest_ns
+    longest = max(resolved.timing.horizon_ns, first.longest_ns) // step_ns
     shortest = first.loop.times.delay_ns // step_ns + 1
     stable, unstable = 0, 0
-    steps = first.period_ns // step_ns
+    steps = first.longest_ns // step_ns
     while not stable or not unstable:
         if is_stable(steps):
             stable = steps
             if steps == longest:
-                return PeriodLimit(steps * step_ns / NS_PER_S, None, None)
+                return PeriodLimit(steps * step_ns / NS_PER_S, None, is_longest, None)
             following = min(2 * steps, longest)
         else:
             unstable = steps
@@ -207,5 +265,6 @@ def find_longest_period(
     return PeriodLimit(
         stable * step_ns / NS_PER_S if stable else None,
         unstable * step_ns / NS_PER_S,
+        is_longest,
         examined[unstable],
     )

@@ -28,17 +28,18 @@ def certify(scenario: Source, *, weight: str = "given", late: int | None = None)
 def margin(
     scenario: Source, *, most_m: int = MOST_M, accuracy: float = ACCURACY, period: bool = True
 ) -> MarginResult:
-    """Return the largest M for which a time-triggered loop is stable under every loss pattern.
+    """Return the largest M for which a loop is stable under every loss pattern.
 
     Args:
-        scenario: a scenario with a periodic trigger, or a source that :func:`noack.load` accepts.
+        scenario: a scenario whose trigger has a longest time between two events, as ``periodic``
+            and ``deadline`` have, or a source that :func:`noack.load` accepts.
         most_m: largest M to examine.
         accuracy: wanted ratio of upper and lower bound of the growth, minus 1.
         period: whether to search for the longest period with the scenario's own M, too.
 
     Raises:
-        NoackError: the scenario is wrong; or its trigger is not periodic, its loop is not linear,
-            or its delay varies or is not below the period.
+        NoackError: the scenario is wrong; or its trigger has no longest time, its loop is not
+            linear, or its delay varies or is not below the shortest period.
     """
     return find_margin(
         resolve(load(scenario)), most_m=most_m, accuracy=accuracy, with_period=period

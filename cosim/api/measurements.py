@@ -6,7 +6,7 @@ from pathlib import Path
 
 from cosim.measurement.network_measurement import Measurement, MeasurementOptions
 from cosim.measurement.trace_sources import read_source
-from cosim.shipped_files import find_trace
+from noack.traces.shipped_traces import find_trace
 
 
 def measure(
@@ -26,8 +26,8 @@ def measure(
     Raises:
         NoackError: a file cannot be read, or is not a trace.
     """
-    trace, notes = read_source([find_trace(str(source)) for source in sources])
+    trace = read_source([find_trace(str(source)) for source in sources])
     options = MeasurementOptions(deadline_s=deadline_s, outage_s=outage_s)
     if shares is not None:
         options = MeasurementOptions(deadline_s, tuple(shares), outage_s=outage_s)
-    return Measurement(trace, options, " ".join(str(Path(one)) for one in sources), notes)
+    return Measurement(trace, options, " ".join(str(Path(one)) for one in sources), trace.notes)

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 from cosim.measurement.fate_source import is_fate_file, read_fate_file
 from cosim.measurement.opportunity_source import is_opportunity_file, read_opportunities
@@ -35,25 +34,13 @@ class SourceOptions:
     """Period of the simulated probe through delivery opportunities."""
 
 
-class SourcedTrace(NamedTuple):
-    """A packet trace, and lines about how it was obtained."""
-
-    trace: PacketTrace
-    notes: Sequence[str]
-
-
-def read_source(paths: Sequence[Path], options: SourceOptions | None = None) -> SourcedTrace:
+def read_source(paths: Sequence[Path], options: SourceOptions | None = None) -> PacketTrace:
     """Return the packet trace in a file, or in the captures of the sender's and receiver's ends.
 
     Raises:
         NoackError: one line; it cannot be read, or is not a trace.
     """
-    trace = _read(paths, options or SourceOptions())
-    return SourcedTrace(trace, trace.notes)
-
-
-def _read(paths: Sequence[Path], options: SourceOptions) -> PacketTrace:
-    first = paths[0]
+    options, first = options or SourceOptions(), paths[0]
     if len(paths) == 1 and first.is_dir():
         return read_run(first)
     heads = [_head(path) for path in paths]

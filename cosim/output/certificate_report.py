@@ -1,5 +1,6 @@
 """The certificates of a scenario, as tables and as JSON."""
 
+import contextlib
 from collections.abc import Callable, Iterator
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -10,14 +11,17 @@ from rich.table import Table
 
 from cosim.output.assumptions_table import print_assumptions
 from cosim.output.row_display import Rows, as_html, as_text
+from cosim.output.unlimited_losses_report import print_unlimited
 from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.core.number_format import NONE, duration, number
+from noack.impairments.markov_chain import NotPredictableError
 from noack.theory.assumptions import assumptions
 from noack.theory.certificate import NetworkConditions
 from noack.theory.enclosure import NotDecayingError
+from noack.theory.loss_margin import LossMargin, Stability
 from noack.theory.paper_bounds import Theorem2, theorem_2
 from noack.theory.run_conditions import ideal_conditions, nominal_conditions
 from noack.theory.scenario_certificates import (
@@ -28,7 +32,10 @@ from noack.theory.scenario_certificates import (
     outside_box,
     own_plant,
 )
+from noack.theory.unlimited_losses import UnlimitedLosses, unlimited_losses
 from noack.theory.weight import choose_weight
+from noack.trigger.decaying import DecayingSettings
+from noack.trigger.periodic_trigger import PeriodicSettings
 
 IDEAL = "paper"
 """The paper's conditions: no sampling, no delay, no hold."""
@@ -76,6 +83,11 @@ class Certificates:
     weight: Matrix | None
     """W of the trigger's norm, (n, n), if this call chose it; else None."""
 
+    unlimited: UnlimitedLosses | None
+    """What holds without a limit on the losses; None if the network enforces its guarantee, or if
+    the losses are no Markov chain over the packets (``unpredictable`` is the reason)."""
+    unpredictable: str | None
+
     def __init__(self, scenario: Scenario, late_periods: int, weight: Matrix | None = None) -> None:
         scenario.coverage.require_unchanging()
         scenario.coverage.require_exact()
@@ -89,6 +101,7 @@ class Certificates:
             for scope in self._scopes
         ]  # fmt: skip
         self.theorem_2 = _theorem_2(scenario, self.paper)
+        self.unlimited, self.unpredictable = self._unlimited()
 
     def __iter__(self) -> Iterator[tuple[str, ScenarioCertificate]]:
         return iter(self._certificates)
@@ -121,6 +134,18 @@ class Certificates:
         """
         return next(iter(self._limits.values()))
 
+    @cached_property
+    def stability(self) -> Stability | None:
+        """What is known about the stability of all loss patterns, if the loop is time-triggered.
+
+        None for other loops, and where the exact margin does not cover the schedule.
+        """
+        if not isinstance(self.scenario.trigger, PeriodicSettings):
+            return None
+        with contextlib.suppress(CallerError):
+            return LossMargin(self.scenario).first_bounds()
+        return None
+
     def to_json(self) -> dict[str, Any]:
         """Return all certificates as one document, as ``noack certify --json`` prints it."""
         return {
@@ -131,6 +156,8 @@ class Certificates:
                 "theorem_2": None if self.theorem_2 is None else self.theorem_2._asdict(),
             },
             "certificates": [{"under": under, **one.to_json()} for under, one in self],
+            "stability": None if self.stability is None else self.stability._asdict(),
+            "unlimited_losses": None if self.unlimited is None else self.unlimited.to_json(),
             "limits": {scope: limits._asdict() for scope, limits in self._limits.items()},
         }
 
@@ -138,6 +165,14 @@ class Certificates:
     def _limits(self) -> dict[str, NetworkLimits]:
         """Limits by scope, from about a hundred certificates."""
         return {scope.name: _limits(scope, self._scheduled) for scope in self._scopes}
+
+    def _unlimited(self) -> tuple[UnlimitedLosses | None, str | None]:
+        if self.scenario.network.enforce_mansd:
+            return None, None
+        try:
+            return unlimited_losses(self.scenario, self._scopes[0], self._scheduled), None
+        except NotPredictableError as error:
+            return None, str(error)
 
     def _of(self, conditions: str) -> list[ScenarioCertificate]:
         return [one for under, one in self if under == conditions]
@@ -155,8 +190,10 @@ class Certificates:
 
 
 def _theorem_2(scenario: Scenario, certificate: ScenarioCertificate) -> Theorem2 | None:
-    trigger, constants = scenario.decaying, certificate.constants
-    if constants is None or constants.rate_per_s != trigger.alpha_per_s:
+    trigger, constants = scenario.trigger, certificate.constants
+    if not isinstance(trigger, DecayingSettings) or constants is None:
+        return None
+    if constants.rate_per_s != trigger.alpha_per_s:
         return None
     if trigger.floor or trigger.weight is not None:
         return None
@@ -239,7 +276,8 @@ def print_certificates(console: Console, found: Certificates) -> None:
     print_assumptions(console, [a._asdict() for a in found.schedule.assumptions])
     console.print("assumptions of the paper's theorems:")
     print_assumptions(console, [a._asdict() for a in assumptions(found.scenario)])
-    for sentence in _in_words(found):
+    print_unlimited(console, found.unlimited, found.unpredictable)
+    for sentence in (*_in_words(found), *_stability_in_words(found)):
         console.print(sentence, markup=False, highlight=False)
     if found.weight is not None:
         rows = ",\n".join(f"  {[float(f'{v:.6g}') for v in row]}" for row in found.weight)
@@ -270,13 +308,26 @@ def _in_words(found: Certificates) -> Iterator[str]:
         )
 
 
+def _stability_in_words(found: Certificates) -> Iterator[str]:
+    """Yield what is known exactly about the stability of a time-triggered loop."""
+    if (known := found.stability) is None:
+        return
+    patterns = f"patterns with {found.scenario.network.guarantee.meaning}"
+    growth = f"growth per period {known.lower:.4g} to {known.upper:.4g}"
+    text = {
+        "stable": f"all {patterns} are stable: {growth}",
+        "destabilised": f"the pattern {known.text}, repeated, destabilises the loop: {growth}",
+        "undecided": f"{growth} under the worst of all {patterns}",
+    }[known.verdict]
+    yield f"Exactly, but without lateness: {text}; noack margin finds the limits."
+
+
 def _print_constants(console: Console, found: Certificates) -> None:
-    trigger = found.scenario.decaying
+    trigger = found.scenario.trigger
     norm = "‖W·‖" if trigger.weight is not None else "‖·‖"
     table = Table(
         title=f"{found.scenario.name}: certified bounds, "
-        f"{found.scenario.network.guarantee.meaning}, β = {trigger.beta:g}, "
-        f"α = {trigger.alpha_per_s:g} /s, norm {norm}"
+        f"{found.scenario.network.guarantee.meaning}; event: {trigger.description}; norm {norm}"
     )
     table.add_column("")
     for under, certificate in found:
@@ -323,11 +374,12 @@ def _constants(found: Certificates) -> Iterator[tuple[str, list[str], str]]:
         delta_2 = "(same)"
         state_2 = number(theorem.state_start + theorem.state_forced, 4)
         spacing_2 = number(theorem.inter_event_s, 4)
-    rate_2 = number(found.scenario.decaying.alpha_per_s, 4)
+    rate_2 = number(found.scenario.trigger.threshold_decay_per_s, 4)
     yield "decay rate, 1/s", constant("rate_per_s"), rate_2
     yield "updates outstanding", constant("missing_events"), NONE
-    yield "Δ, bound of ‖e_c‖/β", constant("delta"), delta_2
-    yield "bound of ‖e_s‖/β", constant("overshoot"), "1"
+    unit = next((f"/{one.unit}" for one in certificates if one.unit), "")
+    yield f"Δ, bound of ‖e_c‖{unit}", constant("delta"), delta_2
+    yield f"bound of ‖e_s‖{unit}", constant("overshoot"), "1"
     yield "bound of ‖u − Kx‖", constant("input_error"), NONE
     yield "X, bound of ‖x‖", constant("state"), state_2
     yield "inter-event time, s", row(lambda c: c.inter_event_s), spacing_2

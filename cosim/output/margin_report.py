@@ -1,4 +1,4 @@
-"""The margin of a time-triggered loop as a table."""
+"""The margin of a loop as a table."""
 
 from rich.console import Console
 from rich.table import Table
@@ -12,9 +12,12 @@ def print_margin(console: Console, margin: MarginResult) -> None:
     """Print the bounds for each M, and the verdicts."""
     delay = f", updates delayed by {margin.delay_s:g} s" if margin.delay_s else ""
     mode = "model-based" if margin.mode == "model" else "zero-order hold"
+    times = f"with an update every {margin.period_s:g} s"
+    if not margin.is_periodic:
+        times = f"with updates {margin.shortest_s:g} to {margin.period_s:g} s apart"
     table = Table(
-        title=f"{margin.scenario}: growth of the worst loss pattern per period of "
-        f"{margin.period_s:g} s, {mode}{delay}"
+        title=f"{margin.scenario}: growth of the worst loss pattern per {margin.period_s:g} s, "
+        f"{times}, {mode}{delay}"
     )
     headings = ("M", "maximum consecutive losses (M − 1)", "at least", "at most", "verdict")
     for heading in headings:
@@ -30,4 +33,8 @@ def print_margin(console: Console, margin: MarginResult) -> None:
     if margin.period is not None:
         text = f"for {margin.guarantee}: {margin.period.text}"
         console.print(text, soft_wrap=True, highlight=False)
-    console.print("[dim]D delivered, L lost, repeated. Below 1: every pattern is stable.[/]")
+    console.print(margin.random_text, soft_wrap=True, highlight=False, markup=False)
+    note = "D delivered, L lost, repeated. Below 1: every pattern is stable."
+    if not margin.is_periodic:
+        note += " In brackets: the time to the next update."
+    console.print(f"[dim]{note}[/]")

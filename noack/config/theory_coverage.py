@@ -34,15 +34,13 @@ class TheoryCoverage:
 
     @property
     def is_certifiable(self) -> bool:
-        """Whether the paper's theorems and the certificates apply."""
+        """Whether certificates apply; the paper's theorems need its trigger as well."""
         return self.beyond_theory is None
 
     @property
     def beyond_theory(self) -> str | None:
-        """The first setting that the theorems and certificates do not cover; None if all are."""
-        if (why := self._beyond_linear) is not None or self.is_decaying:
-            return why
-        return f'trigger.policy = "{self.scenario.trigger.policy}": not the paper\'s trigger'
+        """The first setting that certificates do not cover; None if all are."""
+        return self._beyond_linear or self.scenario.trigger.beyond_exact
 
     @property
     def _beyond_linear(self) -> str | None:

@@ -82,7 +82,7 @@ def _key(settings: LinkSettings) -> str:
 
 def _matters(impairment: Impairment) -> bool:
     try:
-        return bool(impairment.chains())
+        return not impairment.delays or bool(impairment.chains())
     except NotPredictableError:
         return True
 

@@ -70,6 +70,17 @@ def predict(settings: LinkSettings) -> LossPrediction:
     return LossPrediction(rate, "; ".join(notes))
 
 
+def joint_chain(settings: LinkSettings) -> tuple[Array, Array, Array]:
+    """Return the chain of all impairments: start (n,), matrix (n, n), probability of loss (n,).
+
+    The settings must not name files.
+
+    Raises:
+        NotPredictableError: there is no such chain; the message is the reason.
+    """
+    return _together([part for one in settings.impairments for part in one.chains()])
+
+
 def _constrained_rate(parts: Sequence[Chain | Pattern], guarantee: LossGuarantee) -> float:
     patterns = [part.lost for part in parts if isinstance(part, Pattern)]
     if len(patterns) == len(parts):

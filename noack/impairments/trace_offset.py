@@ -9,6 +9,7 @@ from noack.impairments.feature import StageTables
 from noack.impairments.philox import uniforms
 from noack.impairments.quantities import OWN_TIME_S, time_text
 from noack.impairments.word_reader import WordReader
+from noack.settings.named_file import NamedFile
 
 Offset = Annotated[FiniteFloat, Field(ge=0, le=1e9)] | Literal["random"]
 """In seconds after the trace's first packet."""
@@ -35,10 +36,13 @@ def offset_meaning(offset: float | str) -> str:
     return f", from {time_text(offset)} after its beginning" if offset else ""
 
 
-def require_inside(offset: float | str, length_ns: int) -> None:
-    """Raise ValueError if an offset is not inside a trace of this length."""
+def require_inside(offset: float | str, length_ns: int, file: NamedFile | None = None) -> None:
+    """Raise ValueError if an offset is not inside a trace of this length; CallerError of a file."""
     if not isinstance(offset, str) and round(offset * NS_PER_S) >= max(length_ns, 1):
-        raise ValueError(f"offset_s: the trace lasts {time_text(length_ns / NS_PER_S)}")
+        message = f"offset_s: the trace lasts {time_text(length_ns / NS_PER_S)}"
+        if file is not None:
+            file.wrong(message)
+        raise ValueError(message)
 
 
 def offset_ns(offset: float | str, length_ns: int, tables: StageTables) -> int:

@@ -3,14 +3,16 @@
 import difflib
 import shlex
 from collections import deque
-from collections.abc import Collection, Sequence
-from typing import NoReturn, TypeVar
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any, NoReturn, TypeVar
 
 from noack.core.errors import CallerError, printable, shortened
 from noack.impairments.quantities import Quantity
 
 T = TypeVar("T")
 
+Option = tuple[str, Callable[["WordReader"], object]]
+"""The key of an option, and what reads its value."""
 _SPACES = " \t\r\n"
 
 
@@ -86,6 +88,16 @@ class WordReader:
             return False
         self._take()
         return True
+
+    def options(self, table: dict[str, Any], known: Mapping[str, Option]) -> dict[str, Any]:
+        """Read options in any order, each at most once, into a table; return the table."""
+        while self._peek() in known:
+            word = str(self._take())
+            key, read = known[word]
+            if key in table:
+                self.wrong(f"{word} is given twice")
+            table[key] = read(self)
+        return table
 
     def unknown(self, word: str, known: Collection[str]) -> NoReturn:
         """Raise a CallerError for an unknown word; name the nearest known word."""

@@ -49,7 +49,7 @@ def assumptions(resolved: Scenario) -> list[Assumption]:
     loop, linear = loop_of(resolved), resolved.coverage.is_linear
     found = [_closed_loop(loop)] if linear else _not_linear(loop, resolved)
     if not resolved.coverage.is_decaying:
-        why = f'the policy is "{resolved.trigger.policy}": {_NOT_COVERED}'
+        why = f'the policy is "{resolved.trigger.policy}": not covered by the paper\'s theorems'
         found.append(_violated("the trigger is ‖e_s‖ > βe^(−αt)", "eq:thre", why))
     elif linear:
         found.append(_decay_rate(loop, resolved.decaying.alpha_per_s))
@@ -235,16 +235,21 @@ def certificate_assumptions(
     decay: dict[str, float],
     constants: Constants | None,
     void: str | None,
+    promise: str,
+    kept: float | None,
 ) -> list[Assumption]:
     """Return the assumptions of a certificate, with verdicts.
 
     ``decay`` has the decay rates per second of "the models" (infinite if they hold) and "A + BK".
-    Without a certificate, ``constants`` is None and ``void`` is the reason.
+    Without a certificate, ``constants`` is None and ``void`` is the reason. ``promise`` is what the
+    trigger's rule says about e_s, or empty. ``kept`` is the probability that a run keeps a
+    guarantee that nothing enforces, if it is known.
     """
-    alpha = resolved.decaying.alpha_per_s
+    alpha = resolved.trigger.threshold_decay_per_s
     slower = 0.0 if constants is None else constants.rate_per_s
-    found = []
-    for of, source in (("the models", "(I1)"), ("A + BK", "Theorem 2")):
+    why = promise or "not where it does not transmit"
+    found = [_checked("the trigger bounds ‖e_s‖", "certificate", bool(promise), why)]
+    for of, source in (("the models", "(I1)"), ("A + BK", "Theorem 2")) if alpha else ():
         holds = below(alpha, decay[of])
         why = f"α = {alpha:g} /s, {_decays(decay[of])}"
         if slower and not holds:
@@ -252,7 +257,7 @@ def certificate_assumptions(
         if math.isinf(decay[of]):
             holds, why = False, "a hold does not decay: the certified bounds are constant"
         found.append(_checked(f"α is below the decay rate of {of}", source, holds, why))
-    found += _conditions(conditions, resolved.network.enforce_mansd)
+    found += _conditions(conditions, resolved, kept)
     if constants is None:
         found.append(_violated("there is a certificate", "certificate", void or ""))
     else:
@@ -263,12 +268,19 @@ def certificate_assumptions(
     return [*found, Assumption(what, source, AssumptionStatus.NOT_NEEDED, why)]
 
 
-def _conditions(conditions: NetworkConditions, enforced: bool) -> list[Assumption]:
+def _conditions(
+    conditions: NetworkConditions, resolved: Scenario, kept: float | None
+) -> list[Assumption]:
+    enforced = resolved.network.enforce_mansd
+    why = "enforced by the network" if enforced else "not enforced"
+    if kept is not None:
+        horizon_s = resolved.timing.horizon_ns / NS_PER_S
+        why += f"; a run of {horizon_s:g} s keeps it with probability {kept:.4g} or more"
     losses = Assumption(
         f"{conditions.guarantee.meaning} after a first delivery at t_0",
         "certificate",
         AssumptionStatus.HOLDS if enforced else AssumptionStatus.ASSUMED,
-        "enforced by the network" if enforced else "not enforced",
+        why,
     )
     sampling = (
         f"every {1e3 * conditions.sampling_s:g} ms" if conditions.sampling_s else "continuously"

@@ -30,7 +30,7 @@ from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, LossRule
 from noack.theory.gains import Coefficients, ErrorGains, Growth, Output, PlantGains
 from noack.theory.loss_accumulation import LossAccumulation
-from noack.theory.nonnegative_system import solve_inequalities
+from noack.theory.nonnegative_system import Solution, solve_inequalities
 
 _SHORTEST_S, _LONGEST_S = 1e-9, 1e6
 _SETTLED = 1e-3
@@ -115,10 +115,24 @@ class TriggerBound(NamedTuple):
     """share_C by the name of C in :attr:`PlantGains.outputs`."""
     untested_s: float = 0.0
     """After an event the trigger is not tested for this time: e_s grows from 0 for up to h more."""
+    is_tested: bool = True
+    """Whether there is a test at all; without one, only the time since the event bounds e_s."""
+    ago_s: float = 0.0
+    """The bound is that of ‖e_s‖_W at some time up to this long before the test. An event comes no
+    earlier than this after the last one, unless ‖e_s‖_W has exceeded ``reached``."""
     apart_s: float = 0.0
     """Events are at least this far apart, whatever happens to e_s."""
+    due_s: float = math.inf
+    """Events are at most this far apart."""
+    also: tuple["TriggerBound", ...] = ()
+    """Further bounds that hold at the same time; only their e_s is used, not their times."""
     unit: float | None = None
     """Unit of the constants Δ and β̃/β; by default β."""
+
+    @property
+    def every(self) -> tuple["TriggerBound", ...]:
+        """This bound and the further ones."""
+        return (self, *self.also)
 
 
 class Background(NamedTuple):
@@ -219,7 +233,7 @@ def solve_sum(
 
     apart_s = max(part.bound.apart_s for part in parts)
     least_s = max(conditions.spacing_s, apart_s)
-    if any(part.bound.reached is None for part in parts):
+    if any(all(one.reached is None for one in part.bound.every) for part in parts):
         return constants(least_s, apart_s or None)
     spacing_s = background.inter_event_s
     for _ in range(_ATTEMPTS):
@@ -249,14 +263,12 @@ class _Step:
             output: Coefficients(free + start[output], gain)
             for output, (free, gain) in plant.states.items()
         }
-        self._growths = [_Growing(plant, conditions.sampling_s, bound)]
-        if bound.untested_s > 0:
-            longest_s = conditions.sampling_s + bound.untested_s
-            self._growths.append(_Growing(plant, longest_s, TriggerBound(0.0, None)))
+        self._growths = [_growths(plant, conditions.sampling_s, one) for one in bound.every]
 
     def use_windows(self) -> None:
         """Use how many updates may be lost in a window, too."""
-        self._lost = LossAccumulation(self._plant, self._conditions.delay_s)
+        if self._error.decays:
+            self._lost = LossAccumulation(self._plant, self._conditions.delay_s)
 
     def constants(self, spacing_s: float, inter_event_s: float | None) -> Constants:
         """Return all constants, given inter-event times of at least ``spacing_s``."""
@@ -267,11 +279,11 @@ class _Step:
         error, events = self._error, self._missing(spacing_s)
         bounds = [_ErrorBound(
             {output: error.now(output) for output in error.outputs},
-            {output: error.missing(output, events, spacing_s) for output in error.outputs},
-            error.missing(Output.GAIN, events - self._conditions.dropouts, spacing_s),
+            {output: self._missing_gain(output, events, spacing_s) for output in error.outputs},
+            self._missing_gain(Output.GAIN, events - self._conditions.dropouts, spacing_s),
             error.now(Output.GAIN),
         )]  # fmt: skip
-        if self._conditions.delay_s > 0:
+        if self._conditions.delay_s > 0 and error.decays:
             bounds.append(self._drifting(spacing_s))
         found, void = [], VoidError("")
         for bound in bounds:
@@ -367,31 +379,38 @@ class _Step:
         input_error = errors[Output.GAIN] + held_input
 
         through = signals.row(held)
-        of_age = sum(gain * errors[Output(output)] for output, gain in held.items())
-        rows = [(through @ signals.states + of_age, float(through @ free))]
-        grown = []
-        for growing in self._growths:
+        from_errors = sum(gain * errors[Output(output)] for output, gain in held.items())
+        of_age = (through @ signals.states + from_errors, float(through @ free))
+        estimation = self._estimation
+        through = signals.row(estimation.shares)
+        of_estimate = (
+            through @ signals.states + estimation.from_input * input_error,
+            estimation.fixed + float(through @ free) + estimation.from_input * beyond,
+        )
+        through = signals.row({Output.MISMATCH: 1.0})
+        of_mismatch = (through @ signals.states, float(through @ at_growth))
+        others = ((input_error, beyond), of_mismatch, (0.0 * input_error, 1.0))
+
+        def solved(growing: _Growing) -> Solution:
             through = signals.row(growing.shares)
             F = through @ signals.states + growing.input_error * input_error
             F += growing.estimation * estimated
-            grown.append((F, growing.fixed + through @ at_growth + growing.input_error * beyond))
-        gains, fixed = zip(*grown, strict=True)
-        rows.append((np.max(gains, axis=0), max(self._background.sensor_error, *fixed)))
-        estimation = self._estimation
-        through = signals.row(estimation.shares)
-        rows.append((
-            through @ signals.states + estimation.from_input * input_error,
-            estimation.fixed + float(through @ free) + estimation.from_input * beyond,
-        ))  # fmt: skip
-        through = signals.row({Output.MISMATCH: 1.0})
-        rows.append((input_error, beyond))
-        rows.append((through @ signals.states, float(through @ at_growth)))
-        rows.append((0.0 * input_error, 1.0))
-        solution = solve_inequalities(*map(np.array, zip(*rows, strict=True)))
-        if solution.bound is None:
-            gain = solution.loop_gain
+            fixed = growing.fixed + through @ at_growth + growing.input_error * beyond
+            rows = (of_age, (F, max(self._background.sensor_error, fixed)), of_estimate, *others)
+            return solve_inequalities(*map(np.array, zip(*rows, strict=True)))
+
+        # Of each bound one growth applies, and all bounds hold.
+        found = [_largest([solved(one) for one in growths]) for growths in self._growths]
+        gain = min(one.loop_gain for one in found)
+        bounds = [one.bound for one in found if one.bound is not None]
+        if not bounds:
             raise VoidError(f"the loop gain of the errors is {gain:.3g}, not below 1", gain)
-        return solution.loop_gain, solution.bound
+        return gain, np.min(bounds, axis=0)
+
+    def _missing_gain(self, output: Output, events: int, spacing_s: float) -> float:
+        if self._error.decays or math.isinf(self._bound.due_s):
+            return self._error.missing(output, events, spacing_s)
+        return self._error.missing_until(output, events, self._bound.due_s)
 
     def _from_errors(self, bound: "_ErrorBound", spacing_s: float) -> Mapping[str, float]:
         """Return Γ_C for every output, from D_K and from the losses in windows.
@@ -402,10 +421,12 @@ class _Step:
         present = bound.present[Output.GAIN] + bound.in_flight
         share = bound.present[Output.GAIN] + bound.missing[Output.GAIN]
         found = {output: gain * share for output, (_, gain) in self._states.items()}
+        if self._lost is None:
+            return found
         windows = self._conditions.guarantee.windows
         density = min(window.losses / window.packets for window in windows)
         lasting = density * self._error.kernels[Output.GAIN].integral()
-        if self._lost is None or not lasting < (share - present) * spacing_s:
+        if not lasting < (share - present) * spacing_s:
             return found
         for output, (_, gain) in self._states.items():
             together = gain * present + self._lost.total(output, spacing_s, windows)
@@ -417,17 +438,23 @@ class _Step:
         found, own = self._best(spacing_s)
         sensor_error = found.overshoot * self.unit - found.estimation_error
         others = found.input_error - own * sensor_error
-        assert self._bound.reached is not None
+        estimation = found.estimation_error
         # After an event e_s is the estimation error, and x_s − x̂ differs from e_s by one, too.
-        found_s = first_passage_s(
-            self._plant,
-            self._bound.reached - found.estimation_error,
-            max(found.mismatch, self._background.mismatch),
-            max(others, self._start_error, self._background.input_error),
-            own,
-            found.estimation_error,
-        )
-        found_s = max(found_s, self._bound.apart_s)
+        passages_s = [
+            first_passage_s(
+                self._plant,
+                one.reached - estimation,
+                max(found.mismatch, self._background.mismatch),
+                max(others, self._start_error, self._background.input_error),
+                own,
+                estimation,
+            )
+            for one in self._bound.every
+            if one.reached is not None
+        ]
+        limits_s = [one.ago_s or math.inf for one in self._bound.every if one.reached is not None]
+        found_s = max(map(min, passages_s, limits_s))
+        found_s = max(min(found_s, self._bound.due_s), self._bound.apart_s)
         grid_s = self._conditions.spacing_s
         return found_s if grid_s == 0 else grid_s * max(1, math.ceil(found_s / grid_s - 1e-9))
 
@@ -496,6 +523,23 @@ class _Growing:
             self.input_error = growth.input_error.integral_on_grid()
             self.fixed += float(growth.forced.sum())
         self.shares: Mapping[str, float] = shares
+
+
+def _growths(plant: PlantGains, sampling_s: float, bound: TriggerBound) -> list[_Growing]:
+    """Return the growth from the bound after a test, and from 0 after an event."""
+    found = []
+    if bound.is_tested:
+        found.append(_Growing(plant, sampling_s + bound.ago_s, bound))
+    if bound.untested_s > 0 or not bound.is_tested:
+        found.append(_Growing(plant, sampling_s + bound.untested_s, TriggerBound(0.0, None)))
+    return found
+
+
+def _largest(found: Sequence[Solution]) -> Solution:
+    """Return the larger of several solutions; no bound if one has none."""
+    bounds = [one.bound for one in found if one.bound is not None]
+    gain = max(one.loop_gain for one in found)
+    return Solution(gain, np.max(bounds, axis=0) if len(bounds) == len(found) else None)
 
 
 def first_passage_s(

@@ -18,7 +18,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from noack.config.resolution import LoopMatrices
-from noack.core.linear_systems import Matrix, Vector
+from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.theory.enclosure import (
     KernelBounds,
     ResponseBounds,
@@ -156,6 +156,20 @@ class ErrorGains:
         return float(
             self.kernels[output].sups(spacing_s * np.arange(events, dtype=np.float64)).sum()
         )
+
+    def missing_until(self, output: Output, events: int, due_s: float) -> float:
+        """Return Σ_{j<N} sup_{τ ≤ (j+1)L} ‖C e^{(H+αI)τ} W^{−1}‖, for events at most L apart."""
+        total = 0.0
+        for number in range(events):
+            until_s = (number + 1) * due_s
+            followed = response_until(self.scaled_H, self.inverse_weight, until_s)
+            total += followed.through(self.outputs[output]).sup_on_grid()
+        return total
+
+    @property
+    def decays(self) -> bool:
+        """Whether e^{(H+αI)τ} decays, or is constant in a hold."""
+        return not self.scaled_H.any() or spectral_abscissa(self.scaled_H) < 0
 
     def growth(self, columns: Columns, until_s: float, cells: int) -> Callable[[Output], Growth]:
         """Return the growth of every output C e_s, with what drives e_s through these columns."""

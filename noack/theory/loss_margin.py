@@ -1,30 +1,41 @@
-"""The losses that a time-triggered loop tolerates: all patterns of a guarantee are stable or not.
+"""The losses that a loop tolerates whatever its sensor measures: stable for all patterns, or not.
 
-A pattern of losses is a path of the guarantee's automaton. Its states just after deliveries are the
-nodes of a switched system (:mod:`noack.theory.switched_system`); k losses and the delivery after
-them are an edge that lasts k + 1 periods, with the loop's map over that time as its matrix
-(:mod:`noack.theory.time_triggered_loop`).
+The sensor is time-triggered, or transmits at unknown times with a longest time between two. A
+pattern of losses, and of such times, is a path of a graph (:mod:`noack.theory.delivery_graph`). Its
+edges, with the loop's maps over their times (:mod:`noack.theory.time_triggered_loop`), are a
+switched system (:mod:`noack.theory.switched_system`).
 """
 
+import math
 from functools import cache
 from typing import NamedTuple
 
-import numpy as np
-
-from noack.config.resolution import loop_of
+from noack.config.resolution import loop_of, policy_of
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.impairments.kinds.delay import Delay
-from noack.impairments.loss_guarantee import LongestBurst, LossAutomaton, LossGuarantee
-from noack.theory.joint_spectral_radius import ACCURACY, JointSpectralRadius, joint_spectral_radius
+from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
+from noack.impairments.loss_process import LossProcess
+from noack.impairments.markov_chain import NotPredictableError
+from noack.theory.delivery_graph import EVERY_STEP, Burst, EventTimes, bursts_of
+from noack.theory.joint_spectral_radius import (
+    ACCURACY,
+    MOST_VERTICES,
+    JointSpectralRadius,
+    joint_spectral_radius,
+)
+from noack.theory.mean_square_growth import RandomGrowth, mean_square_growth, sure_growth
 from noack.theory.switched_system import Edge
 from noack.theory.time_triggered_loop import LoopTimes, TimeTriggeredLoop
-from noack.trigger.periodic_trigger import PeriodicSettings
+from noack.trigger.trigger_condition import NEVER_NS
 
-MOST_EDGES = 5000
+_MOST_SLOTS = 100
+_MOST_LIKELY, _LEAST_LIKELY = 0.93, 1e-12
+"""Loss probability up to which almost all runs are examined, and the bursts left out."""
 _TIMELESS = ("loss", "corrupt", "blackout", "duplicate")
 _FIRST_ACCURACY = 1e-2
+_QUICK_ACCURACY = 3e-2
 _LAST_ACCURACY = 1e-8
 
 
@@ -32,13 +43,15 @@ class Stability(NamedTuple):
     """What is known about all loss patterns of a guarantee."""
 
     lower: float
-    """The pattern grows at least by this factor per period in the long run."""
+    """The pattern grows at least by this factor per longest interval, in the long run."""
     upper: float
-    """No pattern grows by more than this factor per period in the long run."""
+    """No pattern grows by more than this factor per longest interval, in the long run."""
     pattern: tuple[bool, ...]
     """Whether each update is delivered, in a pattern that repeats; it begins with a delivery."""
+    intervals_s: tuple[float, ...]
+    """The time from each update of the pattern to the next one."""
     vertices: int
-    """Number of vertices of the polytopes that prove the upper bound."""
+    """Number of vertices of the polytopes that prove the upper bound; 0: quadratic norms do."""
 
     @property
     def verdict(self) -> str:
@@ -48,9 +61,23 @@ class Stability(NamedTuple):
         return "destabilised" if self.lower > 1 else "undecided"
 
     @property
+    def is_periodic(self) -> bool:
+        """Whether the updates of the pattern are equally far apart."""
+        return len(set(self.intervals_s)) <= 1
+
+    @property
     def text(self) -> str:
-        """The pattern, one letter per update: ``D`` delivered, ``L`` lost."""
-        return " ".join("D" if delivered else "L" for delivered in self.pattern)
+        """The pattern, one letter per update: ``D`` delivered, ``L`` lost.
+
+        If they differ, the times to the next update stand between.
+        """
+        letters = ["D" if delivered else "L" for delivered in self.pattern]
+        if not self.is_periodic:
+            letters = [
+                f"{letter} ({interval_s:g} s)"
+                for letter, interval_s in zip(letters, self.intervals_s, strict=True)
+            ]
+        return " ".join(letters)
 
 
 def capped(guarantee: LossGuarantee, losses: int) -> LossGuarantee:
@@ -59,122 +86,127 @@ def capped(guarantee: LossGuarantee, losses: int) -> LossGuarantee:
     return LossGuarantee((LongestBurst(losses), *others))
 
 
-class Burst(NamedTuple):
-    """Losses between two deliveries, as an edge of the guarantee's graph."""
-
-    source: int
-    target: int
-    slot: int
-    """Number of the first delivered update, modulo the number of slots."""
-    losses: int
-
-
-def bursts_of(guarantee: LossGuarantee, slots: int = 1) -> list[Burst]:
-    """Return the graph of a guarantee between deliveries; node 0 is that of the first delivery.
-
-    Raises:
-        CallerError: there are more than 5,000 edges.
-    """
-    automaton = LossAutomaton(guarantee)
-    found: list[Burst] = []
-    first = int(automaton.after_delivery(np.zeros(1, int))[0])
-    numbers, pending = {(first, 0): 0}, [(first, 0)]
-    while pending:
-        state, slot = pending.pop()
-        source, losses = numbers[state, slot], 0
-        while state >= 0:
-            if len(found) == MOST_EDGES:
-                raise CallerError(
-                    f"network: {guarantee.meaning}: more than {MOST_EDGES:,} transitions; "
-                    "reduce mansd or the windows of the constraints"
-                )
-            after = int(automaton.after_delivery(np.array([state]))[0])
-            target = (after, (slot + losses + 1) % slots)
-            if target not in numbers:
-                numbers[target] = len(numbers)
-                pending.append(target)
-            found.append(Burst(source, numbers[target], slot, losses))
-            state, losses = int(automaton.after_loss(np.array([state]))[0]), losses + 1
-    return found
-
-
 class LossMargin:
-    """The time-triggered loop of a scenario, with its own or another period.
+    """The loop of a scenario, with its own or another longest time between two transmissions.
 
     Args:
         resolved: the resolved scenario.
-        period_ns: time between two transmissions, a multiple of the time between measurements; by
-            default the scenario's.
+        longest_ns: longest time between two transmissions, a multiple of the time between
+            measurements; by default the scenario's.
 
     Raises:
         CallerError: the loop is not covered; the message names the setting.
     """
 
-    def __init__(self, resolved: Scenario, period_ns: int | None = None) -> None:
+    def __init__(self, resolved: Scenario, longest_ns: int | None = None) -> None:
         require_covered(resolved)
         loop, timing = loop_of(resolved), resolved.timing
         self.guarantee = resolved.network.guarantee
-        self.period_ns = period_ns or transmission_period_ns(resolved)
+        self.shortest_ns, self.longest_ns = intervals_ns(resolved)
+        if longest_ns is not None:
+            same = self.shortest_ns == self.longest_ns
+            self.shortest_ns = longest_ns if same else min(self.shortest_ns, longest_ns)
+            self.longest_ns = longest_ns
+        is_periodic = self.shortest_ns == self.longest_ns
+        self._unit_ns = unit_ns = self.longest_ns if is_periodic else _step_ns(resolved)
+        self._times = EventTimes(self.shortest_ns // unit_ns, self.longest_ns // unit_ns)
         times = LoopTimes(
             timing.plant_period_ns,
             timing.controller_period_ns,
             timing.controller_phase_ns,
-            self.period_ns,
+            unit_ns,
             update_delay_ns(resolved),
         )
-        if times.delay_ns >= self.period_ns:
+        if times.delay_ns >= unit_ns:
+            what = "two updates" if is_periodic else "two measurements"
             raise CallerError(
                 f"network.impairments: a delay of {times.delay_ns / NS_PER_S:g} s; expected less "
-                f"than the period between two updates, {self.period_ns / NS_PER_S:g} s"
+                f"than the period between {what}, {unit_ns / NS_PER_S:g} s"
             )
         self.loop = TimeTriggeredLoop(loop.A, loop.B, loop.K, loop.H, times)
         self._maps = cache(self.loop.map)
 
     def stability(
-        self, guarantee: LossGuarantee | None = None, accuracy: float = ACCURACY
+        self,
+        guarantee: LossGuarantee | None = None,
+        accuracy: float = ACCURACY,
+        *,
+        refine: bool = True,
     ) -> Stability:
         """Bound the growth of all patterns of a guarantee, by default the scenario's.
 
         Args:
             guarantee: the guarantee.
-            accuracy: wanted upper/lower − 1; it is refined if the bounds are on both sides of 1.
+            accuracy: wanted upper/lower − 1.
+            refine: whether the accuracy is refined if the bounds are on both sides of 1.
         """
-        bursts = bursts_of(guarantee or self.guarantee, self.loop.times.slots)
+        bursts = bursts_of(guarantee or self.guarantee, self.loop.times.slots, self._times)
         try:
             edges = [
-                Edge(one.source, one.target, self._maps(one.slot, one.losses), one.losses + 1)
+                Edge(one.source, one.target, self._maps(one.slot, one.steps - 1), one.steps)
                 for one in bursts
             ]
         except OverflowError:
             raise CallerError(
                 "the loop between two deliveries exceeds 1e308; reduce mansd or the period"
             ) from None
+        # Short steps would need many vertices.
+        vertices = MOST_VERTICES if self._times == EVERY_STEP else 0
         while True:
-            found = joint_spectral_radius(edges, accuracy=accuracy)
-            if not found.lower <= 1 <= found.upper or accuracy < _LAST_ACCURACY:
-                return _stability(found, bursts)
+            found = joint_spectral_radius(
+                edges, accuracy=accuracy / self._times.longest, most_vertices=vertices
+            )
+            finest = _LAST_ACCURACY if found.vertices else ACCURACY  # of quadratic norms
+            decided = not found.lower <= 1 <= found.upper
+            if decided or not refine or accuracy < finest:
+                return self._stability(found, bursts)
             accuracy = min(accuracy / 10, (1 - found.lower) / 2)
+
+    def random_growth(self, losses: LossProcess) -> RandomGrowth:
+        """Return the growth under random losses that nothing limits.
+
+        Raises:
+            NotPredictableError: loop and losses have too many states, or the sensor is not
+                time-triggered.
+        """
+        if self.shortest_ns != self.longest_ns:
+            raise NotPredictableError("the times between updates are not known")
+        slots = range(self.loop.times.slots)
+        if len(slots) > _MOST_SLOTS:
+            raise NotPredictableError("the times of the loop repeat only after many periods")
+        maps = [(self.loop.period(slot, True), self.loop.period(slot, False)) for slot in slots]
+        mean_square = almost_sure = mean_square_growth(maps, losses)
+        p = losses.largest_probability
+        if len(slots) == 1 and losses.is_independent and 0 < p < _MOST_LIKELY:
+            bursts = range(math.ceil(math.log(_LEAST_LIKELY) / math.log(p)))
+            between = [self._maps(0, burst).middle for burst in bursts]
+            almost_sure = min(mean_square, sure_growth(between, p))
+        return RandomGrowth(mean_square, almost_sure)
 
     def is_stable(self, guarantee: LossGuarantee | None = None) -> Stability:
         """Return coarser bounds, which decide whether all patterns are stable."""
         return self.stability(guarantee, _FIRST_ACCURACY)
 
+    def first_bounds(self) -> Stability:
+        """Return bounds that take less than a second; they may leave stability undecided."""
+        return self.stability(accuracy=_QUICK_ACCURACY, refine=False)
 
-def _stability(found: JointSpectralRadius, bursts: list[Burst]) -> Stability:
-    pattern = [one for edge in found.cycle for one in (*[False] * bursts[edge].losses, True)]
-    # The last update of an edge is delivered, and so is the one before the first edge.
-    return Stability(found.lower, found.upper, (*pattern[-1:], *pattern[:-1]), found.vertices)
+    def _stability(self, found: JointSpectralRadius, bursts: list[Burst]) -> Stability:
+        path = [bursts[number] for number in found.cycle]
+        pattern = [delivered for one in path for delivered in (True, *[False] * one.losses)]
+        intervals_s = (
+            steps * self._unit_ns / NS_PER_S for one in path for steps in one.intervals(self._times)
+        )
+        return Stability(
+            found.lower**self._times.longest, found.upper**self._times.longest,
+            tuple(pattern), tuple(intervals_s), found.vertices,
+        )  # fmt: skip
 
 
 def require_covered(resolved: Scenario) -> None:
-    """Raise CallerError unless the loop is linear, time-triggered, and the watchdog idle."""
+    """Raise CallerError unless the loop is linear, transmits in time, and the watchdog is idle."""
     resolved.coverage.require_exact()
     resolved.coverage.require_unchanging()
-    if not isinstance(resolved.trigger, PeriodicSettings):
-        raise CallerError(
-            f'trigger.policy = "{resolved.trigger.policy}": the margin is that of a '
-            "time-triggered loop; use e.g. --set 'trigger={policy=\"periodic\", period_s=0.5}'"
-        )
     timing = resolved.timing
     if timing.plant_period_ns + timing.controller_period_ns > timing.actuation_timeout_ns:
         raise CallerError(
@@ -182,11 +214,28 @@ def require_covered(resolved: Scenario) -> None:
         )
 
 
-def transmission_period_ns(resolved: Scenario) -> int:
-    """Return the time between two updates: whole measurement periods, at least ``period_s``."""
-    trigger, step_ns = resolved.trigger, resolved.timing.measurement_period_ns
-    assert isinstance(trigger, PeriodicSettings)
-    return -(-round(trigger.period_s * NS_PER_S) // step_ns) * step_ns
+def intervals_ns(resolved: Scenario) -> tuple[int, int]:
+    """Return the shortest and the longest time between two transmissions, as measurements allow.
+
+    Raises:
+        CallerError: there is no longest time.
+    """
+    rule, step_ns = policy_of(resolved).trigger_rule(loop_of(resolved).n), _step_ns(resolved)
+    if rule.longest_ns == NEVER_NS:
+        raise CallerError(
+            f'trigger.policy = "{resolved.trigger.policy}": the margin needs a longest time '
+            "between two events, as periodic and deadline have; use e.g. "
+            "--set 'trigger={policy=\"periodic\", period_s=0.5}'"
+        )
+    longest_ns = max(-int(-rule.longest_ns // step_ns), 1) * step_ns
+    if rule.forecast is None and not len(rule.form.up):  # nothing is compared
+        return longest_ns, longest_ns
+    least_ns = max(rule.idle_ns, 0.0 if rule.forecast is None else rule.shortest_ns, step_ns)
+    return min(-int(-least_ns // step_ns) * step_ns, longest_ns), longest_ns
+
+
+def _step_ns(resolved: Scenario) -> int:
+    return resolved.timing.measurement_period_ns
 
 
 def update_delay_ns(resolved: Scenario) -> int:

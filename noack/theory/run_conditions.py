@@ -5,7 +5,9 @@ from typing import Any
 
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
-from noack.impairments.loss_guarantee import LongestBurst
+from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
+from noack.impairments.loss_process import loss_process
+from noack.impairments.markov_chain import NotPredictableError
 from noack.theory.certificate import NetworkConditions
 
 
@@ -64,6 +66,28 @@ def allowed_conditions(resolved: Scenario) -> NetworkConditions:
 def ideal_conditions(resolved: Scenario) -> NetworkConditions:
     """The paper's conditions: a continuous trigger, a network and input without delay."""
     return NetworkConditions(**_losses(resolved))
+
+
+def most_events(resolved: Scenario, inter_event_s: float) -> int:
+    """Return the largest number of events in a run, given a bound of its inter-event times."""
+    return math.floor(resolved.timing.horizon_ns / NS_PER_S / inter_event_s * (1 + 1e-12)) + 1
+
+
+def kept_probability(
+    resolved: Scenario, guarantee: LossGuarantee, inter_event_s: float | None
+) -> float | None:
+    """Bound the probability that a run's losses keep a guarantee that nothing enforces.
+
+    Until the first loss too many, events are at least ``inter_event_s`` apart. None: there is no
+    such bound, or the losses are no Markov chain over the packets.
+    """
+    if not inter_event_s:
+        return None
+    try:
+        losses = loss_process(resolved.network.link)
+        return losses.keeps(guarantee, most_events(resolved, inter_event_s))
+    except NotPredictableError:
+        return None
 
 
 def _losses(resolved: Scenario) -> dict[str, Any]:

@@ -3,12 +3,12 @@
 import contextlib
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from noack.config.resolution import loop_of
+from noack.config.resolution import loop_of, policy_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.settings.matrices import Rows
@@ -18,17 +18,19 @@ from noack.theory.certificate import (
     Background,
     Constants,
     NetworkConditions,
-    TriggerBound,
     VoidError,
     solve,
 )
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.gains import ErrorGains, PlantGains, error_gains
+from noack.theory.run_conditions import kept_probability
+from noack.theory.trigger_bounds import TriggerBounds
 
 OWN_PLANT = "the scenario's plant"
 BOX = "every plant of the uncertainty box"
 _SLOWER = 0.9
 _SHARES_OF_ALPHA = (0.8, 0.6, 0.4, 0.2)
+_SHARES_OF_DECAY = (0.05, 0.2, 0.4, 0.7)
 
 _RESOLUTION = 1e-3
 _TOO_LARGE = "intermediate results are too large or too small for floating point"
@@ -47,8 +49,10 @@ class ScenarioCertificate:
     scope: str
     """The plants that it covers."""
     beta: float
+    """β, or 0 if the threshold has no such part."""
     alpha_per_s: float
     floor: float
+    """ε: the constant part of the threshold, or 0."""
     weighted: bool
     """Whether the trigger's norm is weighted."""
     conditions: NetworkConditions
@@ -78,12 +82,15 @@ class ScenarioCertificate:
         return min(known) if known and len(known) == len(found) else None
 
     @property
+    def unit(self) -> str:
+        """The unit of Δ and β̃: β or ε; empty for 1."""
+        return "ε" if self.floor > self.beta else "β" if self.beta else ""
+
+    @property
     def level(self) -> str:
-        """The unit of the error bounds: βe^{−αt}, or without decay β or the floor ε."""
+        """The unit of the error bounds at all times: βe^{−αt}; without decay β or ε."""
         rate = 0.0 if self.constants is None else self.constants.rate_per_s
-        if rate:
-            return f"βe^(−{rate:.3g}t)"
-        return "ε" if self.floor > self.beta else "β"
+        return f"{self.unit}e^(−{rate:.3g}t)" if rate else self.unit
 
     def sensor_error(self, t_s: Matrix) -> Matrix:
         """Bound of ‖e_s‖_W at times (k,); NaN without a certificate."""
@@ -114,15 +121,25 @@ class ScenarioCertificate:
         if self.constants is None:
             return np.full(len(t_s), np.nan)
         level = max(self.beta, self.floor if self.constants.rate_per_s == 0 else 0.0)
-        bound = scale(self.constants, level) * np.exp(-self.constants.rate_per_s * t_s)
+        bound = scale(self.constants, level or 1.0) * np.exp(-self.constants.rate_per_s * t_s)
         if self.floor_constants is not None:
             late = scale(self.floor_constants, self.floor)
             bound = np.where(t_s < self.floor_from_s, bound, late)
         return np.asarray(bound)
 
 
+def trigger_bounds(resolved: Scenario) -> TriggerBounds:
+    """Return what a certificate uses of a resolved scenario's trigger."""
+    loop = loop_of(resolved)
+    weight = np.eye(loop.n) if loop.weight is None else loop.weight
+    fastest = float(np.abs(np.linalg.eigvals(loop.A_model + loop.B_model @ loop.K)).max()) or 1.0
+    return TriggerBounds(policy_of(resolved).trigger_rule(loop.n), weight, fastest)
+
+
 def _floor_from_s(beta: float, alpha_per_s: float, floor: float) -> float:
-    return math.inf if floor == 0 else max(math.log(beta / floor) / alpha_per_s, 0.0)
+    if floor == 0:
+        return math.inf
+    return math.log(beta / floor) / alpha_per_s if beta > floor else 0.0
 
 
 def certify(
@@ -216,18 +233,19 @@ class CertificateScope:
         self.name = name
         self._resolved = resolved
         self._loop = loop_of(resolved)
-        self._held = not self._loop.H.any()
-        self._decay = {
-            "the models": math.inf if self._held else -spectral_abscissa(self._loop.H),
-            "A + BK": -spectral_abscissa(closed_loop),
-        }
+        self._trigger = trigger_bounds(resolved)
+        # Where events have a due time, a missed update is missed for a limited time.
+        due = self._trigger.has_due_time
+        self._held = not self._loop.H.any() and not due
+        decays = math.inf if self._held or due else -spectral_abscissa(self._loop.H)
+        self._decay = {"the models": decays, "A + BK": -spectral_abscissa(closed_loop)}
         self._plant_at = plant_at
         self._errors: dict[float, ErrorGains] = {}
         self._plants: dict[tuple[float, float, bytes], PlantGains] = {}
 
     def certificate(self, conditions: NetworkConditions) -> ScenarioCertificate:
         """Return the certificate under some conditions; a void certificate has the reason."""
-        trigger = self._resolved.decaying
+        trigger = self._trigger
         first: Constants | None = None
         late: Constants | None = None
         void = None
@@ -238,11 +256,17 @@ class CertificateScope:
             void = str(error)
         except (OverflowError, np.linalg.LinAlgError):
             void = _TOO_LARGE
-        assumptions = certificate_assumptions(self._resolved, conditions, self._decay, first, void)
-        return ScenarioCertificate(
+        found = ScenarioCertificate(
             self.name, trigger.beta, trigger.alpha_per_s, trigger.floor,
-            self._loop.weight is not None, conditions, tuple(assumptions), first, late, void,
+            self._loop.weight is not None, conditions, (), first, late, void,
         )  # fmt: skip
+        kept = None
+        if not self._resolved.network.enforce_mansd:
+            kept = kept_probability(self._resolved, conditions.guarantee, found.inter_event_s)
+        assumptions = certificate_assumptions(
+            self._resolved, conditions, self._decay, first, void, trigger.text(), kept
+        )
+        return replace(found, assumptions=tuple(assumptions))
 
     def largest(self, conditions: NetworkConditions, change: Change, most_s: float = 10.0) -> float:
         """Return the largest time for which the changed conditions still have a certificate.
@@ -263,7 +287,8 @@ class CertificateScope:
 
     def _phases(self, conditions: NetworkConditions) -> tuple[Constants, Constants | None]:
         """Return the constants, and those after the threshold has reached its floor, if any."""
-        trigger, late = self._resolved.decaying, None
+        trigger, late = self._trigger, None
+        conditions = trigger.tested(conditions)
         first = self._first_phase(conditions)
         if 0 < trigger.floor < trigger.beta and first.rate_per_s == trigger.alpha_per_s:
             late = _at_floor(first, trigger.floor / trigger.beta)
@@ -278,20 +303,46 @@ class CertificateScope:
         return first, late
 
     def _first_phase(self, conditions: NetworkConditions) -> Constants:
-        trigger, decay = self._resolved.decaying, min(self._decay.values())
+        trigger, decay = self._trigger, min(self._decay.values())
         beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
         start = self._loop.x0[:, None]
+        if trigger.is_homogeneous:
+            return self._fastest(conditions, decay, start)
         if not self._held and below(alpha, decay) and floor < beta:
             try:
-                return self._solve(conditions, alpha, alpha, start, TriggerBound(beta, beta))
+                return self._solve(conditions, alpha, alpha, start, beta, beta)
             except NotDecayingError:
                 if floor > 0:
                     raise
                 return self._slower(conditions, alpha, start)
         # Certify a slower decay or none; the smallest event level is then the floor, if any.
-        slower = 0.0 if self._held or floor > 0 else max(_SLOWER * decay, 0.0)
-        level = TriggerBound(max(beta, floor), floor or None)
-        return self._solve(conditions, slower, slower, start, level)
+        is_constant = self._held or floor > 0 or trigger.area > 0
+        slower = 0.0 if is_constant else max(_SLOWER * decay, 0.0)
+        level = max(beta, floor)
+        return self._solve(conditions, slower, slower, start, level, floor or None)
+
+    def _fastest(self, conditions: NetworkConditions, decay: float, start: Matrix) -> Constants:
+        """Return bounds for a threshold that is a share of the state: any rate may be certified.
+
+        The rate is the one at which the bound of ‖x‖ falls to a tenth of ‖x(0)‖ first.
+
+        Raises:
+            VoidError: there are no bounds, not even without decay.
+        """
+        size = float(np.linalg.norm(start)) or 1.0
+        found: list[tuple[float, Constants]] = []
+        # Inputs of an earlier run are bounded without a rate.
+        decays = math.isfinite(decay) and decay > 0 and self._start_error == 0.0
+        for share in _SHARES_OF_DECAY if decays and not self._held else ():
+            rate = share * decay
+            try:
+                one = self._solve(conditions, rate, rate, start, 0.0, None)
+            except (NotDecayingError, VoidError):
+                break  # larger rates have larger gains
+            found.append((math.log(max(10 * one.state / size, 1.0)) / rate, one))
+        if not found:
+            return self._solve(conditions, 0.0, 0.0, start, 0.0, None)
+        return min(found, key=lambda one: one[0])[1]
 
     def _slower(
         self, conditions: NetworkConditions, alpha_per_s: float, start: Matrix
@@ -304,8 +355,7 @@ class CertificateScope:
         for share in _SHARES_OF_ALPHA:
             rate = share * alpha_per_s
             with contextlib.suppress(NotDecayingError):
-                level = TriggerBound(self._resolved.decaying.beta, None)
-                return self._solve(conditions, rate, rate, start, level)
+                return self._solve(conditions, rate, rate, start, self._trigger.beta, None)
         raise NotDecayingError("the uncertainty box is too large for the loop's gains")
 
     def _solve(
@@ -314,18 +364,23 @@ class CertificateScope:
         error_alpha_per_s: float,
         plant_alpha_per_s: float,
         start: Matrix,
-        level: TriggerBound,
+        level: float,
+        reached: float | None,
     ) -> Constants:
         if error_alpha_per_s not in self._errors:
             self._errors[error_alpha_per_s] = error_gains(self._loop, error_alpha_per_s)
         error = self._errors[error_alpha_per_s]
         key = (error_alpha_per_s, plant_alpha_per_s, start.tobytes())
         if key not in self._plants:
-            self._plants[key] = self._plant_at(error, start, plant_alpha_per_s)
+            self._plants[key] = replace(
+                self._plant_at(error, start, plant_alpha_per_s),
+                further_outputs=self._trigger.outputs,
+            )
         background = Background(input_error=self._start_error)
         # Inputs of an earlier run are covered by their norm only.
         structured = self._start_error == 0.0
-        return solve(error, self._plants[key], conditions, level, background, structured=structured)
+        bound = self._trigger.bound(conditions, level, reached)
+        return solve(error, self._plants[key], conditions, bound, background, structured=structured)
 
 
 def _at_floor(first: Constants, share: float) -> Constants:

@@ -1,7 +1,7 @@
 """The base of policies that combine a rule with an interval."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 from pydantic import field_validator
 
@@ -36,6 +36,9 @@ class CombinedSettings(PolicySettings):
     @property
     def threshold_decay_per_s(self) -> float:
         return self.rule.threshold_decay_per_s
+
+    def at_origin(self, t_s: float) -> Self:
+        return self.model_copy(update={"rule": self.rule.at_origin(t_s)})
 
     @property
     def largest_threshold(self) -> float:

@@ -16,6 +16,8 @@ from noack.trigger.policy_settings import ModelMatrices, WeightedSettings
 from noack.trigger.trigger_condition import error_form
 from noack.trigger.trigger_rule import TriggerRule
 
+_LEAST_BETA = 1e-300
+
 
 class DecayingSettings(WeightedSettings):
     """The paper's trigger: transmit when ‖e_s‖_W > max(β e^{−αt}, floor)."""
@@ -42,6 +44,10 @@ class DecayingSettings(WeightedSettings):
     @property
     def threshold_decay_per_s(self) -> float:
         return self.alpha_per_s
+
+    def at_origin(self, t_s: float) -> Self:
+        beta = max(self.beta * math.exp(-self.alpha_per_s * t_s), _LEAST_BETA)
+        return self.model_copy(update={"beta": beta})
 
     @property
     def largest_threshold(self) -> float:

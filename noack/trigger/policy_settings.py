@@ -79,6 +79,10 @@ class PolicySettings(ScenarioSection):
         """α of a threshold that decays from the run's start on; 0 if there is none."""
         return 0.0
 
+    def at_origin(self, t_s: float) -> Self:
+        """Return the settings of the same trigger with times counted from ``t_s`` on."""
+        return self
+
     @property
     def largest_threshold(self) -> float:
         """The largest constant that ‖e_s‖_W is compared with; 0 if there is none."""

@@ -19,6 +19,7 @@ from noack.config.resolution import resolve
 from noack.config.scenario_file import load
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.wire_format import Decoder, Flow, Rejection
+from tests.cosim.record.changed_records import changed, copied
 
 PERIOD_NS = 2_000_000
 
@@ -77,7 +78,7 @@ def record() -> RunRecord:
 
 
 def test_the_effects_of_a_flood_are_read_from_the_record(record: RunRecord) -> None:
-    rows = {table: record[table].copy() for table in record.tables}
+    rows = copied(record)
     for table in (PLANT_STEP, CONTROLLER_STEP, SENSOR_MEASUREMENT):
         rows[table]["now_ns"] = rows[table]["t_ns"] + 50_000
     steps, received = rows[PLANT_STEP], rows[SENSOR_MEASUREMENT]
@@ -86,7 +87,7 @@ def test_the_effects_of_a_flood_are_read_from_the_record(record: RunRecord) -> N
     after = (steps["t_ns"] >= 2_000_000_000) & (steps["t_ns"] < 2_040_000_000)
     steps["now_ns"][after] += 3_000_000
     rows[SENSOR_MEASUREMENT] = np.delete(received, [600, 601, 602])
-    flooded = RunRecord(record.scenario, rows, [], {})
+    flooded = changed(record, rows, reports={})
     run = FaultedRun(flooded, {"unintended_losses": 5}, 100.0, Flood(101.0, 102.0, 12_345), None)
     last_late_ns = 2_040_000_000 - PERIOD_NS + 3_050_000
     assert figures_of(run) == pytest.approx({

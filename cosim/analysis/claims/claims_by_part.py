@@ -43,11 +43,9 @@ from noack.protocol.record_tables import (
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.life_cycle import HORIZON
 from noack.theory.scenario_certificates import BOX, OWN_PLANT
-from noack.trigger.decaying import DecayingSettings
 
 _TIMES = ("t_ns", "now_ns", "model_t_ns", "release_ns", "copy_ns")
 _STATES = ("x", "x_s", "x_c", "x_c_before", "x_s_before")
-_LEAST_BETA = 1e-300
 _AT_REST = 1e-9
 """The set-point is an equilibrium if |A x_r + B u_r| is at most this share of its larger term."""
 
@@ -220,10 +218,7 @@ def _part_of(
     }
     if sequence is not None:
         update["network"] = scenario.network.model_copy(update={"initial_sync": "first_packet"})
-    if isinstance(trigger := scenario.trigger, DecayingSettings):
-        faded = math.exp(-trigger.alpha_per_s * origin_ns / NS_PER_S)
-        beta = max(trigger.beta * faded, _LEAST_BETA)
-        update["trigger"] = trigger.model_copy(update={"beta": beta})
+    update["trigger"] = scenario.trigger.at_origin(origin_ns / NS_PER_S)
     return record.derived(scenario.model_copy(update=update), derive)
 
 
@@ -255,8 +250,7 @@ def _start_error(own: RunRecord, started_s: float) -> float:
     u is constant within a step. So ‖u − Kx‖ is at most the larger of its values at both ends, plus
     a term for the curvature of x: Δt²/8 sup‖K A ẋ‖, with ẋ = e^{As}(Ax + Bu).
     """
-    trigger = own.scenario.trigger
-    alpha = trigger.alpha_per_s if isinstance(trigger, DecayingSettings) else 0.0
+    alpha = own.scenario.trigger.threshold_decay_per_s
     largest, last = 0.0, np.zeros(0, own.tables[PLANT_STEP])
     for batch in own.source.batches(PLANT_STEP):
         steps = np.concatenate([last, batch])

@@ -244,6 +244,7 @@ class RunEvidence:
         scenario, loop = self.record.scenario, self.record.loop
         if (
             not scenario.coverage.is_certifiable
+            or not scenario.coverage.is_decaying
             or loop.weight is not None
             or scenario.decaying.floor > 0
         ):

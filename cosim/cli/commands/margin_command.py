@@ -1,4 +1,4 @@
-"""``noack margin``: the losses that a time-triggered loop tolerates."""
+"""``noack margin``: the losses that a loop tolerates, whatever its sensor measures."""
 
 from typing import Annotated
 
@@ -32,9 +32,11 @@ def margin(
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
     json: cli.JsonOption = False,
 ) -> int:
-    """Find the largest M for which a time-triggered loop is stable under every loss pattern.
+    """Find the largest M for which a loop is stable under every loss pattern.
 
-    The trigger policy must be periodic. Exit status 1: the loop is not proven stable for any M.
+    The trigger policy must have a longest time between two events, as periodic and deadline have.
+    The verdict holds whenever the events happen. Exit status 1: the loop is not proven stable for
+    any M.
     """
     from cosim.analysis.margin_search import find_margin
     from cosim.live.progress import PatientConsole

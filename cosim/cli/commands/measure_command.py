@@ -4,8 +4,8 @@ from typing import TYPE_CHECKING
 
 from cosim.cli import command as cli
 from cosim.cli import measure_options as given
-from cosim.shipped_files import find_trace
 from noack.core.errors import CallerError, ExitStatus
+from noack.traces.shipped_traces import find_trace
 
 if TYPE_CHECKING:
     from cosim.measurement.live.live_measurement import LiveOptions
@@ -58,6 +58,8 @@ def measure(
     from cosim.measurement.trace_sources import SourceOptions
 
     options = _options(deadline, share, window, outage)
+    if settings and for_scenario is None:
+        raise CallerError("--set: replaces a value of the scenario of --for-scenario; give one")
     scenario = None if for_scenario is None else cli.load_scenario(for_scenario, settings)
     request = OutputRequest(out, write, form.value, scenario)
     live = LiveOptions(rate, duration, size, round_trip, silence, save, options.deadline_s)
@@ -88,6 +90,8 @@ def _result(
     from cosim.measurement.trace_sources import read_source
 
     if listen is not None:
+        if live.round_trip:
+            raise CallerError("--round-trip: is for the sender; the listener learns it")
         if sources:
             raise CallerError(f"--listen {listen}: receives a probe, and reads no {sources[0]}")
         return receive_live(listen, live), f"probe received at {listen}"
@@ -98,36 +102,23 @@ def _result(
     if live.save is not None or live.round_trip:
         option = "--round-trip" if live.save is None else f"--save {live.save}"
         raise CallerError(f"{option}: is for live probes, and {sources[0]} is no address")
-    trace, notes = read_source([*map(find_trace, sources)], how)
-    return ProbeResult(trace, notes, None), " ".join(sources)
+    trace = read_source([*map(find_trace, sources)], how)
+    return ProbeResult(trace, trace.notes, None), " ".join(sources)
 
 
 def _options(
     deadline: str | None, shares: list[float] | None, window: list[int] | None, outage: str | None
 ) -> "MeasurementOptions":
     from cosim.measurement.burst_statistics import WINDOWS
+    from cosim.measurement.live.live_measurement import time_s_of
     from cosim.measurement.network_measurement import QUANTILES, MeasurementOptions
 
     for share in shares or ():
         if not 0 < share <= 1:
             raise CallerError(f"--share {share:g}: expected a share above 0 up to 1, e.g. 0.99")
     return MeasurementOptions(
-        deadline_s=_time_s("--deadline", deadline),
+        deadline_s=None if deadline is None else time_s_of("--deadline", deadline),
         quantiles=tuple(shares or QUANTILES),
         windows=tuple(sorted(set(window or WINDOWS))),
-        outage_s=_time_s("--outage", outage),
+        outage_s=None if outage is None else time_s_of("--outage", outage),
     )
-
-
-def _time_s(option: str, text: str | None) -> float | None:
-    from noack.impairments.quantities import OWN_TIME_S
-
-    if text is None:
-        return None
-    try:
-        time_s = OWN_TIME_S.read(text)
-        if not 0 < time_s < 1e9:
-            raise ValueError
-    except ValueError:
-        raise CallerError(f"{option} {text}: expected {OWN_TIME_S.expected}") from None
-    return time_s

@@ -18,7 +18,7 @@ from noack.protocol.probe_format import (
     PROBE_BYTES,
     SHORTEST_PERIOD_NS,
 )
-from noack.runtime.address import parse_address, text_of
+from noack.runtime.address import parse_address, parse_destination, text_of
 from noack.runtime.command_line import print_to_stderr
 
 _ADDRESS = re.compile(r".*:[0-9]{1,5}")
@@ -54,27 +54,27 @@ def period_ns_of(rate: str) -> int:
     return period_ns
 
 
-def time_ns_of(option: str, text: str) -> int:
-    """Return a positive time such as ``60s`` in ns."""
+def time_s_of(option: str, text: str) -> float:
+    """Return a positive time such as ``60s``."""
     try:
         time_s = OWN_TIME_S.read(text)
         if not 0 < time_s <= 10**8:
             raise ValueError
     except ValueError:
         raise CallerError(f"{option} {text}: expected {OWN_TIME_S.expected}") from None
-    return round(time_s * NS_PER_S)
+    return time_s
 
 
 def receive_live(address: str, options: LiveOptions) -> ProbeResult:
     """Receive one probe."""
-    silence_s = time_ns_of("--silence", options.silence) / NS_PER_S
+    silence_s = time_s_of("--silence", options.silence)
     return listen(parse_address(address, "--listen"), silence_s, options.save, _log)
 
 
 def send_live(address: str, options: LiveOptions) -> ProbeResult:
     """Send a probe to a listener."""
     period_ns = period_ns_of(options.rate)
-    planned = max(time_ns_of("--for", options.duration) // period_ns, 1)
+    planned = max(round(time_s_of("--for", options.duration) * NS_PER_S) // period_ns, 1)
     if planned > MAX_PROBES:
         raise CallerError(f"--for {options.duration}: {planned} datagrams; at most {MAX_PROBES}")
     if not PROBE_BYTES <= options.size_bytes <= MAX_PROBE_BYTES:
@@ -83,7 +83,7 @@ def send_live(address: str, options: LiveOptions) -> ProbeResult:
         )
     wait_ns = max(_SHORTEST_WAIT_NS, round(2 * (options.deadline_s or 0) * NS_PER_S))
     plan = ProbePlan(period_ns, planned, options.size_bytes, options.round_trip, wait_ns)
-    to = parse_address(address, "address")
+    to = parse_destination(address, "address")
     way = "round trip" if options.round_trip else "one way"
     _log(f"{planned} datagrams to {text_of(to)}, one every {period_ns / 1e6:g} ms, {way}")
     return send(to, plan, options.save, _log)

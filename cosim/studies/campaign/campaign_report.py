@@ -15,7 +15,7 @@ from rich.table import Table
 from cosim.output.report.figure_files import inline
 from cosim.output.report.report_page import templates
 from cosim.studies.campaign.campaign_figures import figures
-from cosim.studies.campaign.campaign_summary import CampaignSummary
+from cosim.studies.campaign.campaign_summary import CampaignSummary, GridPointResult
 from cosim.studies.campaign.chunk_store import RUNS, Store
 from cosim.studies.campaign.draw_statistics import Estimate
 from cosim.studies.campaign.metrics import METRICS
@@ -66,7 +66,7 @@ def page(summary: CampaignSummary, store: Store, base: Mapping[str, Any]) -> str
         f"seed {campaign.seed}",
         verdict=_verdict(summary),
         tone="bad" if summary.breaches else "doubt" if remarks else "good",
-        remarks=remarks,
+        remarks=[*remarks, *_bursts(summary)],
         figures=[
             (name, Markup(inline(figure, name, caption)), caption)
             for name, figure, caption in figures(summary, store)
@@ -101,7 +101,7 @@ def print_summary(console: Console, summary: CampaignSummary) -> None:
             style="dim",
             highlight=False,
         )
-    remarks = list(_unfinished(summary))
+    remarks = [*_unfinished(summary), *_bursts(summary)]
     for remark in remarks[:_MOST_REMARKS]:
         console.print(remark, style="yellow", markup=False, highlight=False)
     if len(remarks) > _MOST_REMARKS:
@@ -205,6 +205,16 @@ def _unfinished(summary: CampaignSummary) -> Iterator[str]:
     for found in summary.found:
         others = {how: count for how, count in found.ended.items() if how != "finished"}
         if others:
-            where = ", ".join(f"{axis} {label}" for axis, label in found.point.labels.items())
             counts = ", ".join(f"{n:,} {how.replace('_', ' ')}" for how, n in others.items())
-            yield f"At {where} not all runs reached the horizon: {counts}"
+            yield f"{_at(found)} not all runs reached the horizon: {counts}"
+
+
+def _bursts(summary: CampaignSummary) -> Iterator[str]:
+    """Return, for each grid point without an enforced guarantee, how often it was exceeded."""
+    for found in summary.found:
+        if found.bursts is not None:
+            yield f"{_at(found)} {found.bursts.text}"
+
+
+def _at(found: GridPointResult) -> str:
+    return "At " + ", ".join(f"{axis} {label}" for axis, label in found.point.labels.items())

@@ -7,6 +7,7 @@ import numpy as np
 
 from cosim.simulation.batch.batch_interface import ROW
 from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS, UNDECIDED
+from cosim.studies.campaign.burst_frequency import BurstFrequency, burst_frequency
 from cosim.studies.campaign.campaign_file import Campaign, label_of
 from cosim.studies.campaign.campaign_grid import Point
 from cosim.studies.campaign.chunk_store import Store
@@ -37,6 +38,8 @@ class GridPointResult(NamedTuple):
     breaches: int
     """Number of runs in which ‖e_c‖ exceeds its certified bound: an error in the theory or the
     code."""
+    bursts: BurstFrequency | None
+    """How often a burst was longer than M − 1; None if the network enforces the guarantee."""
 
 
 class ComparedResult(NamedTuple):
@@ -72,6 +75,7 @@ class CampaignSummary(NamedTuple):
                     "axes": dict(found.point.labels),
                     "ended": dict(found.ended),
                     "certified_error": found.point.certified_error,
+                    "bursts": None if found.bursts is None else found.bursts._asdict(),
                     "metrics": {name: e._asdict() for name, e in found.estimates.items()},
                 }
                 for found in self.found
@@ -110,6 +114,7 @@ def _found(point: Point, store: Store) -> GridPointResult:
         {how: int((status == code).sum()) for code, how in _ENDED.items() if code in status},
         {name: estimate(values) for name, values in metrics.items()},
         int((used[np.isfinite(used)] > 1 + _ROUNDING).sum()),
+        burst_frequency(point.scenario, metrics),
     )
 
 

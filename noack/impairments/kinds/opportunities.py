@@ -72,17 +72,12 @@ def apply(packet: PacketContext, stage: OpportunityStage, memory: StageMemory) -
 def _read(reader: WordReader) -> Table:
     name = reader.file("a file with delivery opportunities, in ms")
     table: Table = {"times_ms": reader.values(COUNT, _EXPECTED)} if name == "at" else {"file": name}
-    while True:
-        if reader.accept("overhead"):
-            table["overhead_bytes"] = reader.value(SIGNED_COUNT)
-        elif reader.accept("queue"):
-            table["queue"] = reader.value(COUNT)
-        elif reader.accept("bytes"):
-            table["queue_bytes"] = reader.value(COUNT)
-        elif reader.accept("from"):
-            table["offset_s"] = read_offset(reader)
-        else:
-            return table
+    return reader.options(table, {
+        "overhead": ("overhead_bytes", lambda reader: reader.value(SIGNED_COUNT)),
+        "queue": ("queue", lambda reader: reader.value(COUNT)),
+        "bytes": ("queue_bytes", lambda reader: reader.value(COUNT)),
+        "from": ("offset_s", read_offset),
+    })  # fmt: skip
 
 
 class Opportunities(Impairment):
@@ -221,12 +216,8 @@ class Opportunities(Impairment):
         if self.file is None:
             return self
         file = NamedFile(self.file, folder, place)
-        times_ms = _times_ms(file)
-        read = self.model_copy(update={"times_ms": times_ms, "file": None})
-        try:
-            require_inside(self.offset_s, read.length_ns)
-        except ValueError as error:
-            file.wrong(str(error))
+        read = self.model_copy(update={"times_ms": _times_ms(file), "file": None})
+        require_inside(self.offset_s, read.length_ns, file)
         return read
 
 

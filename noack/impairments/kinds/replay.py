@@ -36,6 +36,7 @@ from noack.impairments.word_reader import WordReader
 from noack.settings.named_file import NamedFile
 from noack.settings.section import Probability
 from noack.traces.packet_trace import LOST_NS, PacketTrace
+from noack.traces.shipped_traces import find_trace
 from noack.traces.trace_formats import read_trace
 
 MOST_RECORDS = 1_000_000
@@ -46,19 +47,13 @@ _EXPECTED = "records of sending time and delay, e.g. 0ms+12ms,50ms+lost"
 def _read(reader: WordReader) -> Table:
     name = reader.file("a file with a packet trace")
     table: Table = _read_records(reader) if name == "records" else {"file": name}
-    while True:
-        if reader.accept("by"):
-            table["by"] = reader.word("packet or time")
-        elif reader.accept("from"):
-            table["offset_s"] = read_offset(reader)
-        elif reader.accept("share"):
-            table["delay_share"] = reader.value(PERCENT)
-        elif reader.accept("relative"):
-            table["clocks_differ"] = True
-        elif reader.accept("once"):
-            table["repeat"] = False
-        else:
-            return table
+    return reader.options(table, {
+        "by": ("by", lambda reader: reader.word("packet or time")),
+        "from": ("offset_s", read_offset),
+        "share": ("delay_share", lambda reader: reader.value(PERCENT)),
+        "relative": ("clocks_differ", lambda _: True),
+        "once": ("repeat", lambda _: False),
+    })  # fmt: skip
 
 
 def _read_records(reader: WordReader) -> Table:
@@ -80,7 +75,8 @@ class Replay(Impairment):
 
     kind: Literal["replay"] = "replay"
     file: Annotated[str, Field(min_length=1)] | None = None
-    """The trace, e.g. CSV with the columns sequence, sent_ms and received_ms."""
+    """The trace, e.g. CSV with the columns sequence, sent_ms and received_ms; or the name of
+    a shipped one."""
     sent_ns: _Records | None = None
     """Instead of a file: sending times since the first, which is 0."""
     delays_ns: _Records | None = None
@@ -254,10 +250,10 @@ class Replay(Impairment):
         if self.file is None:
             return self
         file = NamedFile(self.file, folder, place)
+        path = find_trace(self.file, folder, file.named)
         trace = read_trace(
-            file.path, place=file.named, clocks_differ=self.clocks_differ,
-            most_packets=MOST_RECORDS,
-        )  # fmt: skip
+            path, place=file.named, clocks_differ=self.clocks_differ, most_packets=MOST_RECORDS
+        )
         return self.of(trace, file)
 
     def of(self, trace: PacketTrace, file: NamedFile) -> Self:
@@ -269,8 +265,5 @@ class Replay(Impairment):
             "file": None, "clocks_differ": False,
         }  # fmt: skip
         read = self.model_copy(update=update)
-        try:
-            require_inside(self.offset_s, read.length_ns)
-        except ValueError as error:
-            file.wrong(str(error))
+        require_inside(self.offset_s, read.length_ns, file)
         return read

@@ -13,7 +13,7 @@ from cosim.analysis.fidelity import Fidelity, compute_fidelity, fidelity_for_sum
 from cosim.analysis.step_schedule import IncomparableError, live_run
 from cosim.analysis.summary_model import NoFidelityPart
 from cosim.output.fidelity_table import summary_rows
-from cosim.record.run_record import Rows, RunRecord
+from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous.network_fates import network_fates
 from cosim.simulation.virtual_time import Network, simulate
 from noack.config.resolution import resolve
@@ -24,6 +24,7 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
+from tests.cosim.record.changed_records import changed
 
 LANE = Path(__file__).parents[3] / "scenarios" / "lane_following.toml"
 
@@ -41,11 +42,6 @@ def record() -> RunRecord:
 @pytest.fixture(scope="module")
 def fidelity(record: RunRecord) -> Fidelity:
     return compute_fidelity(record)
-
-
-def with_rows(record: RunRecord, **changed: Rows) -> RunRecord:
-    rows = {table: changed.get(table, record[table]) for table in record.tables}
-    return RunRecord(record.scenario, rows, record.notices, record.reports)
 
 
 def test_the_difference_to_the_ideal_loop_is_explained(fidelity: Fidelity) -> None:
@@ -146,8 +142,7 @@ def test_a_record_of_another_plant_is_not_explained(record: RunRecord) -> None:
     assert plant.A is not None
     A = tuple(tuple(1.05 * entry for entry in row) for row in plant.A)
     other = record.scenario.model_copy(update={"plant": plant.model_copy(update={"A": A})})
-    rows = {table: record[table] for table in record.tables}
-    fidelity = compute_fidelity(RunRecord(other, rows, record.notices, record.reports))
+    fidelity = compute_fidelity(changed(record, scenario=other))
     assert fidelity.explained_relative > 0.1
     assert not fidelity.explained
     assert "too large" in fidelity.verdict
@@ -156,7 +151,7 @@ def test_a_record_of_another_plant_is_not_explained(record: RunRecord) -> None:
 def test_a_plant_that_missed_its_input_once_is_not_explained(record: RunRecord) -> None:
     steps = record[PLANT_STEP].copy()
     steps["x"][200:] += 0.1
-    assert not compute_fidelity(with_rows(record, plant_step=steps)).explained
+    assert not compute_fidelity(changed(record, {PLANT_STEP: steps})).explained
 
 
 def test_at_rest_there_is_nothing_to_explain() -> None:
@@ -204,7 +199,7 @@ def test_a_paper_loop_with_more_events_than_the_run_is_compared() -> None:
 def test_gaps_in_the_record_are_reported(
     record: RunRecord, table: str, rows: Any, why: str
 ) -> None:
-    broken = with_rows(record, **{table: record[table][rows]})
+    broken = changed(record, {table: record[table][rows]})
     with pytest.raises(IncomparableError, match=why):
         compute_fidelity(broken)
     summary = fidelity_for_summary(broken)
@@ -214,7 +209,7 @@ def test_gaps_in_the_record_are_reported(
 
 def test_an_interrupted_run_is_compared_up_to_its_end(record: RunRecord) -> None:
     """The sensor was the first to end."""
-    short = with_rows(record, sensor_measurement=record[SENSOR_MEASUREMENT][:250])
+    short = changed(record, {SENSOR_MEASUREMENT: record[SENSOR_MEASUREMENT][:250]})
     fidelity = compute_fidelity(short)
     assert fidelity.samples == 250
     assert fidelity.explained_relative < 1e-9
@@ -224,7 +219,7 @@ def test_a_diverged_run_is_reported(record: RunRecord) -> None:
     steps = record[PLANT_STEP].copy()
     steps["x"][300:] = math.nan
     with pytest.raises(IncomparableError, match="diverged"):
-        compute_fidelity(with_rows(record, plant_step=steps))
+        compute_fidelity(changed(record, {PLANT_STEP: steps}))
 
 
 def test_an_accumulation_of_events_is_reported() -> None:
@@ -265,4 +260,4 @@ def test_a_record_with_impossible_times_is_not_compared(
     rows = record[table].copy()
     rows[column][len(rows) // 2] = value
     with pytest.raises(IncomparableError, match=f"{table} has times that no run has"):
-        compute_fidelity(with_rows(record, **{table: rows}))
+        compute_fidelity(changed(record, {table: rows}))

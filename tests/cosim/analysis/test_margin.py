@@ -23,6 +23,12 @@ HELD = {
 }
 
 
+DEADLINE = [
+    "--set", 'trigger={policy="deadline", interval_s=0.8, rule={policy="absolute", delta=1}}',
+    "--set", "plant.rate_hz=5", "--set", "controller.rate_hz=5", "--set", "mode=zoh",
+]  # fmt: skip
+
+
 def held_integrator(**settings: object) -> Scenario:
     """The double integrator, x held between updates every 0.1 s."""
     return noack.with_settings(noack.load("double_integrator"), {**HELD, **settings})
@@ -69,6 +75,18 @@ def test_constraints_that_cap_the_losses_themselves() -> None:
     assert "every M ≥ 2" in found.verdict
 
 
+def test_events_at_unknown_times() -> None:
+    done = CliRunner().invoke(app, ["margin", "double_integrator", *DEADLINE, "--json"])
+    assert done.exit_code == 0, done.output
+    document = json.loads(done.stdout)
+    assert (document["shortest_s"], document["period_s"]) == (0.2, 0.8)
+    last = document["caps"][-1]
+    assert last["verdict"] == "destabilised"
+    assert len(last["intervals_s"]) == len(last["pattern"].replace("L", "D").split("D")) - 1
+    shown = CliRunner().invoke(app, ["margin", "double_integrator", *DEADLINE, "--no-period"])
+    assert "with updates 0.2 to 0.8 s apart" in " ".join(shown.output.split())
+
+
 def test_command_as_json_and_as_a_table() -> None:
     words = ["margin", "lane_periodic", "--no-period", "--most", "2"]
     done = CliRunner().invoke(app, [*words, "--json"])
@@ -84,7 +102,8 @@ def test_command_as_json_and_as_a_table() -> None:
 @pytest.mark.parametrize(
     ("words", "status", "message"),
     [
-        (["lane_following"], 2, "time-triggered"),
+        (["lane_following"], 2, "a longest time between"),
+        (["double_integrator", *DEADLINE, "--play", "--no-period"], 2, "--play: the times between"),
         (["lane_periodic", "--play", "--json"], 2, "--play"),
         (["lane_periodic", "--play", "--most", "1", "--no-period"], 2, "no destabilising pattern"),
         (["lane_periodic", "--accuracy", "2"], 2, "--accuracy 2: expected"),

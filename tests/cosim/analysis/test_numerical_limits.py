@@ -16,6 +16,7 @@ from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
 from noack.core.errors import CallerError, ExitStatus
+from tests.cosim.record.changed_records import changed
 
 
 def scenario(content: dict[str, Any], rate_hz: float = 100.0, **settings: Any) -> Scenario:
@@ -193,9 +194,9 @@ def test_a_damaged_value_in_a_record_is_located(
     record = simulate(
         scenario(content, **plant([[0.0, 1.0], [0.0, 0.0]], [[0], [1]], [[-1.0, -1.7]]))
     )
-    rows = {name: record[name].copy() for name in record.tables}
-    rows[table][column][len(rows[table]) // 2] = value
-    damaged = RunRecord(record.scenario, rows, [], record.reports)
+    rows = record[table].copy()
+    rows[column][len(rows) // 2] = value
+    damaged = changed(record, {table: rows})
     found = replay(damaged).first_difference
     assert found is not None
     assert (found.table, found.column.rstrip("0123456789[]_")) == (table, column.rstrip("_"))

@@ -6,7 +6,7 @@ The record is a simulated one; live records are replayed in tests/integration.
 import json
 import math
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 from controller_node.controller import controller_of
 from cosim.analysis.replay import replay
 from cosim.analysis.replay.replay_result import difference
-from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
 from noack.config.scenario_file import load, validate
@@ -36,6 +35,7 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import LOOP_ROLES
 from tests.cosim.live.outage import Reborn, simulate_with
+from tests.cosim.record.changed_records import changed, flipped
 
 ROOT = Path(__file__).parents[3]
 SHORT = (
@@ -50,21 +50,6 @@ FILLED = [table for table in RECORD.tables if len(RECORD[table]) or table not in
 """No parameter changes in this run."""
 FROM_OUTSIDE = ("input", "now_ns")
 """Columns with separate tests: they record the process's clock and input order."""
-
-
-def changed(rows: Mapping[str, Rows], reports: Any = RECORD.reports) -> RunRecord:
-    every = {table: RECORD[table] for table in RECORD.tables} | dict(rows)
-    return RunRecord(RECORD.scenario, every, RECORD.notices, reports, "simulated")
-
-
-def flipped(table: str, row: int, column: str, byte: int, bit: int) -> RunRecord:
-    rows = RECORD[table].copy()
-    raw = bytearray(rows[column][row].tobytes())
-    raw[byte] ^= 1 << bit
-    rows[column][row] = np.frombuffer(raw, rows.dtype[column].base).reshape(
-        rows.dtype[column].shape
-    )
-    return changed({table: rows})
 
 
 def columns() -> Iterator[tuple[str, str]]:
@@ -96,7 +81,7 @@ def test_a_flipped_bit_is_found_and_named(table: str, column: str, data: st.Data
     rows = RECORD[table]
     row = data.draw(st.integers(0, len(rows) - 1))
     byte = data.draw(st.integers(0, rows.dtype[column].itemsize - 1))
-    found = replay(flipped(table, row, column, byte, data.draw(st.integers(0, 7))))
+    found = replay(flipped(RECORD, table, row, column, 8 * byte + data.draw(st.integers(0, 7))))
     first = found.first_difference
     assert found.bit_exact is False
     assert first is not None
@@ -117,8 +102,8 @@ def test_a_flipped_bit_is_found_and_named(table: str, column: str, data: st.Data
 @given(st.data())
 def test_a_wrong_input_number_is_found(table: str, data: st.DataObject) -> None:
     row = data.draw(st.integers(0, len(RECORD[table]) - 1))
-    byte, bit = data.draw(st.integers(0, 7)), data.draw(st.integers(0, 7))
-    found = replay(flipped(table, row, "input", byte, bit))
+    bit = data.draw(st.integers(0, 63))
+    found = replay(flipped(RECORD, table, row, "input", bit))
     first = found.first_difference
     assert first is not None
     # Either of two rows with the same number may be the wrong one.
@@ -129,7 +114,7 @@ def test_a_wrong_input_number_is_found(table: str, data: st.DataObject) -> None:
 
 @pytest.mark.parametrize("table", FILLED)
 def test_a_time_that_decreases_is_found(table: str) -> None:
-    found = replay(flipped(table, len(RECORD[table]) - 1, "now_ns", 7, 7))
+    found = replay(flipped(RECORD, table, len(RECORD[table]) - 1, "now_ns", 63))
     assert found.first_difference is not None
     assert found.first_difference.column in ("now_ns", "t_ns")  # netem's t_ns is its now_ns
 
@@ -137,7 +122,7 @@ def test_a_time_that_decreases_is_found(table: str) -> None:
 def test_a_timer_before_its_deadline_is_found() -> None:
     rows = RECORD[PLANT_STEP].copy()
     rows["now_ns"][7] -= 1
-    first = replay(changed({PLANT_STEP: rows})).first_difference
+    first = replay(changed(RECORD, {PLANT_STEP: rows})).first_difference
     assert first is not None
     assert (first.table, first.row, first.column) == (PLANT_STEP, 7, "now_ns")
 
@@ -146,7 +131,7 @@ def test_a_timer_before_its_deadline_is_found() -> None:
 def test_missing_rows_are_reported(table: str) -> None:
     rows = RECORD[table]
     cut = len(rows) // 2
-    found = replay(changed({table: np.delete(rows, [cut])}))
+    found = replay(changed(RECORD, {table: np.delete(rows, [cut])}))
     number = int(rows["input"][cut])
     process = OWNER[table]
     assert found.bit_exact  # up to the gap
@@ -161,7 +146,9 @@ def test_missing_rows_are_reported(table: str) -> None:
 def test_rows_missing_at_the_end_are_reported(role: str) -> None:
     owned = {table: RECORD[table] for table in RECORD.tables if OWNER[table] == role}
     last = max(int(rows["input"][-1]) for rows in owned.values() if len(rows))
-    found = replay(changed({table: rows[rows["input"] < last] for table, rows in owned.items()}))
+    found = replay(
+        changed(RECORD, {table: rows[rows["input"] < last] for table, rows in owned.items()})
+    )
     assert found.bit_exact
     assert found.gaps == [f"{role}: rows are missing from input {last} on"]
 
@@ -169,7 +156,7 @@ def test_rows_missing_at_the_end_are_reported(role: str) -> None:
 def test_a_difference_before_a_gap_is_still_found() -> None:
     rows = RECORD[PLANT_STEP].copy()
     rows["x"][3, 1] = math.nextafter(rows["x"][3, 1], math.inf)
-    found = replay(changed({PLANT_STEP: np.delete(rows, [30])}))
+    found = replay(changed(RECORD, {PLANT_STEP: np.delete(rows, [30])}))
     assert found.first_difference is not None
     assert found.first_difference.row == 3
     assert len(found.gaps) == 1
@@ -178,7 +165,7 @@ def test_a_difference_before_a_gap_is_still_found() -> None:
 @pytest.mark.parametrize("process", LOOP_ROLES)
 def test_a_process_without_a_report_is_named(process: str) -> None:
     reports = {role: report for role, report in RECORD.reports.items() if role != process}
-    found = replay(changed({}, reports=reports))
+    found = replay(changed(RECORD, reports=reports))
     assert found.bit_exact
     assert found.gaps == [
         f"{process}: left no report; whether its last rows are missing is not known"
@@ -192,7 +179,7 @@ def test_a_message_that_no_process_sent_is_found() -> None:
     rows["sequence"][last] += 1
     steps = RECORD[PLANT_STEP].copy()
     steps["actuation"][steps["actuation"] == last] += 1
-    first = replay(changed({PLANT_ACTUATION: rows, PLANT_STEP: steps})).first_difference
+    first = replay(changed(RECORD, {PLANT_ACTUATION: rows, PLANT_STEP: steps})).first_difference
     assert first is not None
     assert (first.table, first.row, first.column) == (PLANT_ACTUATION, last, "sequence")
     assert first.what == "was never sent"
@@ -208,7 +195,7 @@ def test_a_delivery_of_a_dropped_update_is_found() -> None:
     for column in ("t_ns", "x"):
         deliveries[column][row] = events[column][lost]
     deliveries["sequence"][row] = lost
-    found = replay(changed({CONTROLLER_DELIVERY: deliveries}))
+    found = replay(changed(RECORD, {CONTROLLER_DELIVERY: deliveries}))
     differences = {leg.leg: leg.difference for leg in found.messages}
     delivery = differences["netem → controller"]
     assert delivery is not None
@@ -236,7 +223,7 @@ def test_a_changed_machine_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_values_that_a_machine_refuses_are_a_difference() -> None:
     rows = RECORD[SENSOR_MEASUREMENT].copy()
     rows["t_ns"][20] = -(2**62)  # e^(−αt) overflows
-    found = replay(changed({SENSOR_MEASUREMENT: rows}))
+    found = replay(changed(RECORD, {SENSOR_MEASUREMENT: rows}))
     sensor = next(account for account in found.processes if account.process == "sensor")
     assert sensor.difference is not None
     assert "cannot take this input" in sensor.difference.what
@@ -245,7 +232,9 @@ def test_values_that_a_machine_refuses_are_a_difference() -> None:
 
 
 def test_an_empty_record_is_not_reported_as_exact() -> None:
-    found = replay(changed({table: RECORD[table][:0] for table in RECORD.tables}, reports={}))
+    found = replay(
+        changed(RECORD, {table: RECORD[table][:0] for table in RECORD.tables}, reports={})
+    )
     assert found.bit_exact is None
     assert found.inputs == 0
 
@@ -270,14 +259,14 @@ def test_every_bit_of_a_value_is_shown() -> None:
     nans = [struct.unpack("<d", struct.pack("<Q", 0x7FF8 << 48 | i))[0] for i in (0, 1)]
     shown = difference(CONTROLLER_STEP, 0, 0, "", "u_1", nans[0], nans[1])
     assert shown.recorded_hex != shown.replayed_hex
-    json.dumps(replay(flipped(PLANT_STEP, 1, "x", 7, 6)).document(), allow_nan=False)
+    json.dumps(replay(flipped(RECORD, PLANT_STEP, 1, "x", 62)).document(), allow_nan=False)
 
 
 def test_the_document_is_json() -> None:
     rows = RECORD[PLANT_STEP].copy()
     rows["x"][3, 1] = math.nan
     rows["u"][5] = math.inf
-    found = replay(changed({PLANT_STEP: rows}))
+    found = replay(changed(RECORD, {PLANT_STEP: rows}))
     document = json.loads(json.dumps(found.document(), allow_nan=False, ensure_ascii=False))
     assert document["bit_exact"] is False
     first = document["first_difference"]
@@ -309,6 +298,6 @@ def test_an_update_before_the_first_tick_of_a_restarted_controller_is_replayed(
         rows[CONTROLLER_STEP] = rows[CONTROLLER_STEP][~again]
         rows[CONTROLLER_DELIVERY] = taken[taken["input"] <= GENERATION]
     notice = {"process": "controller", "level": RESTART, "t_ns": 0, "text": "restarted"}
-    found = replay(RunRecord(resolved, rows, [notice], {}, "live"))
+    found = replay(changed(record, rows, notices=[notice], reports={}, kind="live"))
     assert found.bit_exact, found.verdict()
     assert found.verdict()["inputs"] == sum(map(len, rows.values()))

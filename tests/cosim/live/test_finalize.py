@@ -21,7 +21,6 @@ from cosim.record.run_directory import (
 )
 from cosim.record.run_ending import EndingFile, RunEnding
 from cosim.record.run_record import (
-    RunRecord,
     finish_record,
     load_record,
     write_record,
@@ -34,6 +33,7 @@ from noack.config.scenario_file import dumps, load
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.protocol.record_tables import PLANT_STEP
 from noack.runtime.spool import SPOOL, SpoolWriter
+from tests.cosim.record.changed_records import changed
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +139,7 @@ def test_a_run_that_cannot_be_replayed_fails(
 def test_a_run_whose_record_is_lost_fails(run_dir: Path) -> None:
     record = load_record(run_dir)
     no_rows = {table: record[table][:0] for table in record.tables}
-    write_record(RunRecord(record.scenario, no_rows, [], {}), run_dir)
+    write_record(changed(record, no_rows, reports={}), run_dir)
     (run_dir / REPORTS_FILE).unlink()  # the total number of rows is unknown
     outcome = finalize(ended_well(run_dir), report=False)
     assert outcome.status == ExitStatus.FAILED
@@ -149,10 +149,9 @@ def test_a_run_whose_record_is_lost_fails(run_dir: Path) -> None:
 @pytest.mark.parametrize("cut", [slice(-40, None), slice(100, 140)])
 def test_a_run_whose_rows_are_missing_fails(run_dir: Path, cut: slice) -> None:
     record = load_record(run_dir)
-    rows = {table: record[table] for table in record.tables}
-    lost = len(rows[PLANT_STEP][cut])
-    rows[PLANT_STEP] = np.delete(rows[PLANT_STEP], cut)
-    write_record(RunRecord(record.scenario, rows, [], record.reports), run_dir)
+    steps = record[PLANT_STEP]
+    lost = len(steps[cut])
+    write_record(changed(record, {PLANT_STEP: np.delete(steps, cut)}), run_dir)
     with EndingFile(run_dir) as file:
         file.store(ExitStatus.OK, "horizon", 1.5)
     outcome = finalize(ended_well(run_dir), report=False)

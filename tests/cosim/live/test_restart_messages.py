@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from cosim.analysis.run_summary import summarise
-from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
 from noack.protocol.machine_interface import GENERATION, RESTART
 from noack.protocol.record_tables import SENSOR_MEASUREMENT
+from tests.cosim.record.changed_records import changed
 
 
 def test_a_restart_without_rows_is_listed(content: dict[str, Any]) -> None:
@@ -22,10 +22,8 @@ def test_a_restart_without_rows_is_listed(content: dict[str, Any]) -> None:
         {"process": "sensor", "level": RESTART, "t_ns": k * 10_000_000, "text": f"after {k}"}
         for k in (1, 2)
     ]
-    tables = {table: record[table] for table in record.tables} | {SENSOR_MEASUREMENT: rows}
-    restarts = summarise(RunRecord(record.scenario, tables, notices, {}), 0, "").to_json()[
-        "restarts"
-    ]
+    restarted = changed(record, {SENSOR_MEASUREMENT: rows}, notices=notices, reports={})
+    restarts = summarise(restarted, 0, "").to_json()["restarts"]
     last_s = rows["now_ns"][49] * 1e-9
     found = {one["generation"]: (one["last_s"], one["first_s"], one["what"]) for one in restarts}
     assert found == {
@@ -44,8 +42,8 @@ def test_missing_first_rows_of_a_restart_are_counted(content: dict[str, Any], ne
     if newest == 2:
         rows["input"][80:] -= 37
     notices = [{"process": "sensor", "level": RESTART, "t_ns": 0, "text": "newest"}]
-    tables = {table: record[table] for table in record.tables} | {SENSOR_MEASUREMENT: rows}
-    summary = summarise(RunRecord(record.scenario, tables, notices, {}), 0, "").to_json()
+    restarted = changed(record, {SENSOR_MEASUREMENT: rows}, notices=notices, reports={})
+    summary = summarise(restarted, 0, "").to_json()
     assert summary["missing_by_table"]["sensor"] == 7
     if newest == 2:
         assert [one["what"] for one in summary["restarts"]] == [None, "newest"]

@@ -22,14 +22,15 @@ from tests.fuzz.parsers.fates import SPECS, TABLE
 def test_a_fate_file_gives_the_first_intact_delivery(tmp_path: Path) -> None:
     path = tmp_path / "fates.parquet"
     pq.write_table(TABLE.replace_schema_metadata(description(SPECS, 0)), path)
-    trace, notes = read_source([path])
+    trace = read_source([path])
     assert (
-        notes[0] == "flow 1: up forward, flow 0, 4 packets; --flow chooses another of the 3 flows"
+        trace.notes[0]
+        == "flow 1: up forward, flow 0, 4 packets; --flow chooses another of the 3 flows"
     )
     assert trace.sent_ns.tolist() == [0, 10, 20, 30]
     # Delivered; dropped; corrupted, but its copy is intact and arrives 9 ns later; forced.
     assert trace.delay_ns.tolist() == [5, -1, 9, 5]
-    assert len(read_source([path], SourceOptions(flow=3)).trace) == 1
+    assert len(read_source([path], SourceOptions(flow=3))) == 1
     with pytest.raises(CallerError, match="has no flow 4; its flows are 1 to 3"):
         read_source([path], SourceOptions(flow=4))
     incomplete = TABLE.replace_schema_metadata(description(SPECS, 7))
@@ -59,11 +60,14 @@ def test_opportunities_delay_a_probe_until_the_next_one(tmp_path: Path) -> None:
     path = tmp_path / "link.up"
     times_ms = [0, 30, 31, 100, 200]
     path.write_text("".join(f"{t}\n" for t in times_ms))
-    trace, notes = read_source([path], SourceOptions(period_ns=20_000_000))
+    trace = read_source([path], SourceOptions(period_ns=20_000_000))
     # An opportunity at the very time of an arrival is lost, as in mahimahi.
     expected = [min(t for t in times_ms if t > at) - at for at in range(0, 200, 20)]
     assert trace.delay_ns.tolist() == [one * 10**6 for one in expected]
-    assert "5 in 0.2 s, 0.3008 Mbit/s; longest time without one: 100 ms, before 0.2 s" in notes[0]
+    assert (
+        "5 in 0.2 s, 0.3008 Mbit/s; longest time without one: 100 ms, before 0.2 s"
+        in trace.notes[0]
+    )
 
 
 def test_sources_that_are_none(tmp_path: Path) -> None:

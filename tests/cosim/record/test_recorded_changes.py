@@ -40,6 +40,7 @@ from noack.protocol.topology import LOOP_ROLES
 from noack.protocol.wire_format import Flow, Message
 from plant_server.plant import plant_of
 from sensor_node.sensor import sensor_of
+from tests.cosim.record.changed_records import changed
 
 MS = 1_000_000
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
@@ -186,11 +187,10 @@ def test_a_restarted_process_applies_the_parameters_in_force() -> None:
 
 def test_differing_changes_of_two_processes_are_found() -> None:
     record = run_with([(1_003 * MS, {"trigger.beta": 0.5})])
-    rows = {table: record[table].copy() for table in record.tables}
-    rows[NETEM_SETTING]["t_ns"] += 1
-    rows[NETEM_SETTING]["since_ns"] += 1
-    other = RunRecord(record.scenario, rows, record.notices, record.reports, "simulated")
-    found = replay(other).first_difference
+    settings = record[NETEM_SETTING].copy()
+    settings["t_ns"] += 1
+    settings["since_ns"] += 1
+    found = replay(changed(record, {NETEM_SETTING: settings})).first_difference
     assert found is not None
     assert found.what == "another process received another change"
 

@@ -42,6 +42,7 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.wire_format import Flow, read_header
 from noack.theory.assumptions import AssumptionStatus, assumptions
+from tests.cosim.record.changed_records import flipped
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 COARSE = ("plant.rate_hz=100", "controller.rate_hz=100", "horizon_s=6")
@@ -239,23 +240,13 @@ def test_a_run_is_replayed_bit_for_bit(messy: RunRecord) -> None:
     assert (messy[NETEM_RELEASE]["flow"] == ACKNOWLEDGEMENTS).any()
 
 
-def altered(record: RunRecord, table: str, row: int, column: str, bit: int) -> RunRecord:
-    rows = record[table].copy()
-    raw = bytearray(rows[column][row].tobytes())
-    raw[bit // 8] ^= 1 << bit % 8
-    kind = rows.dtype[column]
-    rows[column][row] = np.frombuffer(raw, kind.base).reshape(kind.shape)
-    every = {name: record[name] for name in record.tables} | {table: rows}
-    return RunRecord(record.scenario, every, record.notices, record.reports, "simulated")
-
-
 @pytest.mark.parametrize("bit", [0, 62])
 def test_a_flipped_bit_of_an_acknowledgement_is_found(messy: RunRecord, bit: int) -> None:
     rows = messy[SENSOR_ACKNOWLEDGEMENT]
     for column in rows.dtype.names:
         if column == "now_ns" and bit < 62:
             continue  # nothing that the sensor does depends on it
-        other = altered(messy, SENSOR_ACKNOWLEDGEMENT, len(rows) // 2, column, bit)
+        other = flipped(messy, SENSOR_ACKNOWLEDGEMENT, len(rows) // 2, column, bit)
         first = replay(other).first_difference
         assert first is not None
         if column not in ("input", "now_ns"):
@@ -270,7 +261,7 @@ def test_a_flipped_bit_of_a_packet_is_found_in_its_row(
     row = int(np.flatnonzero(messy[NETEM_PACKET]["flow"] == flow)[5])
     # Two bits of the flow: one changes the direction, the other makes it invalid.
     for bit in (0, 5) if column == "flow" else (0,):
-        first = replay(altered(messy, NETEM_PACKET, row, column, bit)).first_difference
+        first = replay(flipped(messy, NETEM_PACKET, row, column, bit)).first_difference
         assert first is not None
         assert first.table == NETEM_PACKET
         assert column == "flow" or first.row == row

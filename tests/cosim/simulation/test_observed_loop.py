@@ -31,6 +31,7 @@ from noack.protocol.record_tables import NO_SEQUENCE, PLANT_STEP, SENSOR_MEASURE
 from noack.theory.assumptions import assumptions
 from sensor_node.sensor import sensor_of
 from tests.cosim.live.outage import Deaf, Reborn, simulate_with
+from tests.cosim.record.changed_records import changed
 
 NOISE = {"C": [[1.0, 0.0]], "noise_std": [0.02]}
 KALMAN = {"kind": "kalman", "initial_std": [0.4, 0.4]}
@@ -119,12 +120,7 @@ def test_a_replay_finds_an_output_that_the_plant_did_not_measure(observed: dict[
     record = run(observed)
     rows = record[SENSOR_MEASUREMENT].copy()
     rows["y"][7] += 1e-12
-    changed = RunRecord(
-        record.scenario,
-        {table: record[table] for table in record.tables} | {SENSOR_MEASUREMENT: rows},
-        record.notices, record.reports, "simulated",
-    )  # fmt: skip
-    found = replay(changed)
+    found = replay(changed(record, {SENSOR_MEASUREMENT: rows}))
     assert not found.bit_exact
     assert found.first_difference is not None
     assert (found.first_difference.row, found.first_difference.column[0]) == (7, "y")
@@ -148,11 +144,10 @@ def test_a_restarted_sensor_restarts_its_estimate_and_is_replayed(
     expected = 0.5 + weight * (rows["y"][again, 0] - 0.5)
     np.testing.assert_allclose(rows["x"][again], [expected, 0.0], rtol=1e-12)
     notice = {"process": "sensor", "level": RESTART, "t_ns": at_ns, "text": "started anew"}
-    tables = {table: record[table] for table in record.tables}
-    again_record = RunRecord(scenario, tables, [notice], {}, "live")
+    again_record = changed(record, notices=[notice], reports={}, kind="live")
     found = replay(again_record)
     assert found.bit_exact, found.first_difference
-    assert found.inputs == sum(map(len, tables.values()))
+    assert found.inputs == sum(map(record.count, record.tables))
     verdicts = {str(claim.verdict) for claim in ClaimEvaluation(again_record).judge()}
     assert verdicts <= {"held", "void"}
 

@@ -57,7 +57,7 @@ def one_input(data: bytes) -> None:
         other.write_bytes(pcapng_of(*_ARRIVED) if choices.flag() else path.read_bytes())
         paths.append(other)
     with refusal((str(path), str(other), "expected one file", "--sequence-at")):
-        trace = read_source(paths, options).trace
+        trace = read_source(paths, options)
         received = trace.received_ns[~trace.lost]
         assert (received >= trace.sent_ns[~trace.lost]).all()
 

@@ -228,6 +228,8 @@ def test_rates_are_read_as_tc_reads_them(text: str, rate_bps: int) -> None:
         ("rate 1mbit queue 0", "rate 1mbit queue 0: queue should be greater than or equal to 1"),
         ("queue 5", "queue: goes right after opportunities FILE, or after rate RATE"),
         ("replay", "replay: a value is missing: a file with a packet trace"),
+        ("replay t.csv once by time once", "replay t.csv once by time once: once is given twice"),
+        ("opportunities t.up queue 5 queue 6", "queue 5 queue: queue is given twice"),
         ("replay t.csv by chance", "by chance: by should be 'packet' or 'time'"),
         ("replay t.csv from 2", "from 2: expected a time in s, ms, us or ns, e.g. 10ms"),
         ("replay t.csv share 101%", "share 101%: expected a percentage from 0% to 100%"),

@@ -14,6 +14,7 @@ from cosim.simulation.continuous.continuous_run import (
 from noack.config.resolution import LoopMatrices
 from noack.core.linear_systems import Vector
 from noack.trigger.decaying import DecayingTrigger
+from noack.trigger.trigger_policy import Policy
 from tests.noack.theory.loops import System
 
 _MOST_EVENTS = 3000
@@ -36,11 +37,16 @@ def loop_of(system: System) -> LoopMatrices:
     )  # fmt: skip
 
 
-def observe(system: System, periods: float, seed: int, samples: int = 200) -> Iterator[Observed]:
-    """Runs over some time constants with several loss patterns: the maximum, none, random."""
+def observe(
+    system: System, periods: float, seed: int, samples: int = 200, policy: Policy | None = None
+) -> Iterator[Observed]:
+    """Runs over some time constants with several loss patterns: the maximum, none, random.
+
+    The policy is the paper's unless another one is given.
+    """
     horizon_s = periods / float(np.abs(np.linalg.eigvals(system.A + system.B @ system.K)).max())
     loop = loop_of(system)
-    trigger = DecayingTrigger(system.beta, system.alpha, weight=loop.weight)
+    trigger = policy or DecayingTrigger(system.beta, system.alpha, weight=loop.weight)
     continuous = ContinuousLoop(loop, trigger)
     rng = np.random.default_rng(seed)
     for share in (1.0, 0.0, 0.6):

@@ -26,6 +26,7 @@ from noack.theory.gains import ErrorGains, PlantGains
 
 Reals = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+Steps = NDArray[np.int64]
 
 RUNS, STEPS = 128, 240
 
@@ -170,6 +171,10 @@ def times_s(system: System) -> Reals:
     return np.arange(STEPS) * system.step_s
 
 
+EventRule = Callable[[int, Steps, Reals, Reals], Flags]
+"""Which runs have an event at a test, from the step, the steps since each last event, x and e_s."""
+
+
 class Plants(NamedTuple):
     """Plants between which each run switches arbitrarily."""
 
@@ -197,6 +202,7 @@ def simulate(
     plants: Plants | None = None,
     pushes: Reals | None = None,
     estimate: Estimate = exact_state,
+    rule: "EventRule | None" = None,
 ) -> Trace:
     """Simulate all runs at once.
 
@@ -208,6 +214,7 @@ def simulate(
         plants: replace the system's own plant.
         pushes: (runs, STEPS, n) disturbances that are added to ẋ, constant in each step.
         estimate: what the sensor knows of x; errors are the larger of those to it and to x.
+        rule: replaces the decaying threshold.
     """
     runs, n, K, W = len(delivered), len(system.A), system.K.T, system.weight.T
     pool = [(system.A, system.B)] if plants is None else plants.pool
@@ -232,6 +239,8 @@ def simulate(
             tested = norms((x_s - known) @ W)
             trace[0, :, step] = np.maximum(trace[0, :, step], tested)
             event = tested > threshold
+            if rule is not None:
+                event = rule(step, step - last_event, x, x_s - x)
             event |= step == 0 and not system.known_start
             shortest = min(
                 shortest, int((step - last_event)[event & (events > 0)].min(initial=10**9))

@@ -10,6 +10,7 @@ from noack.theory.destabilising_cycle import spectral_radius_below
 from noack.theory.interval_matrix import IntervalMatrix, exactly
 from noack.theory.invariant_polytopes import InvariantPolytopes
 from noack.theory.joint_spectral_radius import joint_spectral_radius
+from noack.theory.quadratic_norms import norms_above, quadratic_norms, remembering
 from noack.theory.switched_system import Edge, strongly_connected
 
 GOLDEN_RATIO = (1 + 5**0.5) / 2
@@ -135,6 +136,51 @@ def test_no_polytopes_prove_too_much(seed: int) -> None:
     assert polytopes.bound() >= value
     polytopes.grow(30)
     assert polytopes.bound() >= value
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_no_quadratic_norms_prove_too_much(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    (system,) = strongly_connected(random_graph(rng))
+    exact = joint_spectral_radius(system.edges, accuracy=1e-3)
+    upper = quadratic_norms(system).upper
+    remembered = quadratic_norms(remembering(system, 2)).upper
+    assert exact.lower <= upper <= 1.5 * exact.upper  # at most √n times as large, n ≤ 3, but for d
+    assert exact.lower <= remembered <= upper * (1 + 1e-2)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_many_edges_between_two_nodes(seed: int) -> None:
+    """A rotation that lasts longer and longer, and a decay: no cycle is faster than the slowest."""
+    rng = np.random.default_rng(seed)
+    turns = [rng.uniform(0.5, 0.9) * _rotation(angle) for angle in rng.uniform(0, 7, 90)]
+    edges = [edge(0, 0, turn, k % 3 + 1) for k, turn in enumerate(turns)]
+    change = rng.normal(size=(2, 2))
+    moved = [one._replace(matrix=exactly(change @ one.matrix.middle @ np.linalg.inv(change)))
+             for one in edges]  # fmt: skip
+    value = max(np.abs(np.linalg.det(turn)) ** (0.5 / (k % 3 + 1)) for k, turn in enumerate(turns))
+    found = joint_spectral_radius(moved)
+    assert found.vertices == 0
+    assert found.lower == pytest.approx(value, rel=1e-9)
+    assert value * (1 - 1e-12) <= found.upper <= value * 1.001
+
+
+def _rotation(angle: float) -> Matrix:
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_norms_above_holds_for_every_matrix_of_an_enclosure(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    middle = rng.normal(size=(3, *rng.integers(1, 7, 2))) * 10.0 ** rng.integers(-9, 9)
+    sharp = np.linalg.norm(middle, 2, axis=(1, 2))
+    np.testing.assert_allclose(norms_above(exactly(middle)), sharp, rtol=1e-11)
+    assert (norms_above(exactly(middle)) >= sharp).all()
+    radius = np.abs(middle) * 1e-3
+    above = norms_above(IntervalMatrix(middle, radius))
+    for _ in range(50):
+        end = middle + radius * rng.choice([-1, 1], middle.shape)
+        assert (np.linalg.norm(end, 2, axis=(1, 2)) <= above).all()
 
 
 @pytest.mark.parametrize("seed", range(20))

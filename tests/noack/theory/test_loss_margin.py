@@ -22,10 +22,13 @@ from noack.impairments.loss_guarantee import (
     LossGuarantee,
     LossHistory,
 )
-from noack.theory.loss_margin import LossMargin, bursts_of, capped
+from noack.theory.delivery_graph import EventTimes, bursts_of
+from noack.theory.loss_margin import LossMargin, capped
 
 ROOT = Path(__file__).parents[3]
 PERIODIC = 'trigger={policy="periodic", period_s=0.0997}'
+DWELL = '{policy="dwell", interval_s=0.11, rule={policy="absolute", delta=1}}'
+DEADLINE = f'{{policy="deadline", interval_s=0.3, rule={DWELL}}}'
 DELAYED = 'network.impairments=[{kind="delay", delay_s=0.0333}]'
 
 
@@ -57,7 +60,7 @@ def test_maps_are_those_of_a_simulated_run(name: str, settings: Sequence[str]) -
 
     steps, tested = run["plant_step"], run["sensor_measurement"]
     sent_ns = tested["t_ns"][tested["event"] >= 0]
-    assert set(np.diff(sent_ns)) == {margin.period_ns}
+    assert set(np.diff(sent_ns)) == {margin.longest_ns}
     delivered = np.flatnonzero(fates[: len(sent_ns)])
     assert len(delivered) > 15
 
@@ -97,10 +100,13 @@ def test_the_destabilising_pattern_grows_as_computed_in_a_simulated_run() -> Non
     assert found.lower <= found.upper <= found.lower * (1 + 1e-3)
 
 
-def held_loop(resolved: Scenario, pattern: Sequence[bool]) -> Matrix:
+def held_loop(
+    resolved: Scenario, pattern: Sequence[bool], intervals_s: Sequence[float] = ()
+) -> Matrix:
     """The map of (x, x_c, u) over a pattern, with the controller's ticks half a step later.
 
-    It is computed step by step, without :mod:`noack.theory`.
+    It is computed step by step, without :mod:`noack.theory`. By default the updates are 0.1 s
+    apart.
     """
     loop, h_ns = loop_of(resolved), resolved.timing.plant_period_ns
     n, m = loop.n, loop.m
@@ -108,9 +114,9 @@ def held_loop(resolved: Scenario, pattern: Sequence[bool]) -> Matrix:
     half = expm(loop.H * h_ns / 2 * 1e-9)
     eye = np.eye(2 * n + m)
     x, x_c, u = eye[:n], eye[n : 2 * n], eye[2 * n :]
-    for delivered in pattern:
+    for delivered, interval_s in zip(pattern, intervals_s or [0.1] * len(pattern), strict=True):
         x_c = x if delivered else x_c
-        for _ in range(round(0.1e9) // h_ns):
+        for _ in range(round(interval_s * 1e9 / h_ns)):
             x_c = half @ x_c
             x, u = Ad @ x + Bd @ u, loop.K @ x_c
             x_c = half @ x_c
@@ -152,6 +158,60 @@ def test_no_pattern_grows_faster_than_the_upper_bound(guarantee: LossGuarantee) 
     assert LossMargin(resolved).stability(worse).lower > found.upper
 
 
+@pytest.mark.parametrize("mode", ["model", "zoh"])
+def test_no_events_of_any_times_grow_faster_than_the_upper_bound(mode: str) -> None:
+    resolved = scenario(
+        "unstable_pendulum", f"mode={mode}", "plant.rate_hz=50", "controller.rate_hz=50",
+        f"trigger={DEADLINE}",
+    )  # fmt: skip
+    margin, guarantee = LossMargin(resolved), LossGuarantee((LongestBurst(2),))
+    assert (margin.shortest_ns, margin.longest_ns) == (120_000_000, 300_000_000)
+    found, rng = margin.stability(guarantee), np.random.default_rng(0)
+
+    def growth(pattern: Sequence[bool], intervals_s: Sequence[float]) -> float:
+        radius = np.abs(np.linalg.eigvals(held_loop(resolved, pattern, intervals_s))).max()
+        return float(radius) ** (0.3 / sum(intervals_s))
+
+    assert admissible(guarantee, found.pattern)
+    assert all(0.1199 < one < 0.3001 for one in found.intervals_s)
+    assert growth(found.pattern, found.intervals_s) == pytest.approx(found.lower, rel=1e-9)
+    fastest = 0.0
+    for _ in range(400):
+        pattern = (True, *(rng.random(rng.integers(1, 8)) < 0.4))
+        intervals_s = rng.choice([0.12, 0.2, 0.28, 0.3], len(pattern)).tolist()
+        if admissible(guarantee, pattern):
+            fastest = max(fastest, growth(pattern, intervals_s))
+    assert 0.8 * found.lower < fastest <= found.upper <= found.lower * 1.05
+    one_more = growth((True, False, False, False), [0.3] * 4)
+    assert one_more > found.upper
+
+
+def test_times_between_two_events() -> None:
+    def intervals(trigger: str) -> tuple[int, int]:
+        margin = LossMargin(scenario("double_integrator", "plant.rate_hz=50", f"trigger={trigger}"))
+        return margin.shortest_ns // 1_000_000, margin.longest_ns // 1_000_000
+
+    rule = 'rule={policy="absolute", delta=1}'
+    assert intervals(f'{{policy="deadline", interval_s=0.3, {rule}}}') == (20, 300)
+    assert intervals(DEADLINE) == (120, 300)
+    periodic = 'rule={policy="periodic", period_s=0.21}'
+    assert intervals(f'{{policy="deadline", interval_s=0.5, {periodic}}}') == (220, 220)
+    threshold = "beta=0.5, alpha_per_s=0.2, growth_per_s=1, mismatch_per_s=1"
+    times = "shortest_s=0.1, longest_s=0.45"
+    assert intervals(f'{{policy="self_triggered", {threshold}, {times}}}') == (100, 460)
+
+
+def test_edges_are_all_times_between_two_deliveries() -> None:
+    times = EventTimes(2, 4)
+    bursts = bursts_of(LossGuarantee((LongestBurst(2),)), 1, times)
+    assert {one.steps for one in bursts} == {*range(2, 5), *range(4, 9), *range(6, 13)}
+    for one in bursts:
+        intervals = one.intervals(times)
+        assert len(intervals) == one.losses + 1
+        assert sum(intervals) == one.steps
+        assert all(2 <= interval <= 4 for interval in intervals)
+
+
 @pytest.mark.parametrize("guarantee", GUARANTEES, ids=lambda one: one.meaning)
 @pytest.mark.parametrize("slots", [1, 3])
 def test_paths_are_the_admissible_patterns(guarantee: LossGuarantee, slots: int) -> None:
@@ -177,7 +237,11 @@ def test_paths_are_the_admissible_patterns(guarantee: LossGuarantee, slots: int)
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (('trigger={policy="decaying", beta=0.1, alpha_per_s=0.1}',), "time-triggered"),
+        (('trigger={policy="decaying", beta=0.1, alpha_per_s=0.1}',), "a longest time between"),
+        (
+            (f"trigger={DEADLINE}", DELAYED),
+            "a delay of 0.0333 s; expected less than the period between two measurements",
+        ),
         ((DELAYED.replace("0.0333", "0.2"),), "less than the period"),
         ((DELAYED.replace("}", ", jitter_s=0.001}"),), "network.impairments.0: delay: .* constant"),
         (("network.mansd=9000",), "more than 5,000 transitions"),

@@ -255,12 +255,12 @@ def test_the_assumptions_are_checked_for_the_scenario() -> None:
     resolved = shipped()
     found = certify(resolved, NetworkConditions(4, 0.002, 0.002, 0.004, 0.005, 0.004))
     verdicts = [assumption.verdict for assumption in found.assumptions]
-    assert verdicts == [AssumptionStatus.HOLDS] * 3 + [AssumptionStatus.ASSUMED] * 4 + [
+    assert verdicts == [AssumptionStatus.HOLDS] * 4 + [AssumptionStatus.ASSUMED] * 4 + [
         AssumptionStatus.HOLDS, AssumptionStatus.NOT_NEEDED,
     ]  # fmt: skip
     free = resolved.network.model_copy(update={"enforce_mansd": False})
     found = certify(resolved.model_copy(update={"network": free}), ideal_conditions(resolved))
-    assert found.assumptions[2].verdict == AssumptionStatus.ASSUMED
+    assert found.assumptions[3].verdict == AssumptionStatus.ASSUMED
 
 
 def test_the_lane_example_in_a_weight_from_any_lyapunov_function() -> None:

@@ -1,7 +1,13 @@
 """A certificate's bound of ‖e_s‖ with a sampled trigger: a multiple of the threshold."""
 
-from cosim.analysis.claims.claim_definition import Bound, CertifiedClaim
+from cosim.analysis.claims.claim_definition import (
+    ROUNDING,
+    Bound,
+    CertifiedClaim,
+    upper_shares,
+)
 from cosim.analysis.claims.run_evidence import RunEvidence, Samples
+from noack.core.linear_systems import row_norms
 from noack.theory.scenario_certificates import ScenarioCertificate
 
 
@@ -11,7 +17,8 @@ def _bound(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate)
     formula = f"‖e_s‖ ≤ {{:.4g}} {certificate.level}"
     if (late := certificate.floor_constants) is not None:
         formula += f", from {certificate.floor_from_s:.4g} s on {late.overshoot:.4g} ε"
-    shares = samples.joined.e_s_norm / certificate.sensor_error(samples.t_s)
+    slack = ROUNDING * row_norms(samples.joined.x)
+    shares = upper_shares(samples.joined.e_s_norm, certificate.sensor_error(samples.t_s) + slack)
     void, overshoot = run.violation_of(certificate), certificate.constants.overshoot
     return Bound(formula, samples.t_s, shares, void, overshoot)
 

@@ -6,29 +6,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.record.run_record import Rows, RunRecord
+from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import Network, simulate
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
 from noack.protocol.record_tables import OWNER, SENSOR_MEASUREMENT
 from noack.protocol.wire_format import read_header
+from tests.cosim.record.changed_records import changed
 
 MS = 1_000_000
 
 Make = Callable[..., Scenario]
-
-
-def changed(record: RunRecord, **tables: Rows) -> RunRecord:
-    """The record with some tables replaced."""
-    rows = {table: tables.get(table, record[table]) for table in record.tables}
-    return RunRecord(record.scenario, rows, record.notices, record.reports, record.kind)
-
-
-def of_scenario(record: RunRecord, scenario: Scenario) -> RunRecord:
-    """The same rows with another scenario."""
-    rows = {table: record[table] for table in record.tables}
-    return RunRecord(scenario, rows, record.notices, record.reports, record.kind)
 
 
 def network_of(decide: Callable[[int], int | None]) -> Network:
@@ -46,7 +35,7 @@ def network_of(decide: Callable[[int], int | None]) -> Network:
 def without(record: RunRecord, *processes: str) -> RunRecord:
     """The record without the rows of some processes."""
     gone = {table: record[table][:0] for table in record.tables if OWNER[table] in processes}
-    return changed(record, **gone)
+    return changed(record, gone)
 
 
 def event_s(record: RunRecord, number: int) -> float:

@@ -21,11 +21,11 @@ from noack.theory.certificate import NetworkConditions
 from noack.theory.run_conditions import nominal_conditions
 from tests.cosim.analysis.claims.conftest import (
     Make,
-    changed,
     event_s,
     network_of,
     without,
 )
+from tests.cosim.record.changed_records import changed
 
 PERIODS_NS = [1_000_000, 2_000_000, 3_000_000, 5_000_000, 7_000_000, 2_020_000, 13_370_000]
 
@@ -125,7 +125,7 @@ def test_an_update_that_never_arrives_is_late_from_its_event_on(make: Make) -> N
     """The network forwarded it; it was lost in a socket or with a dead controller."""
     whole = simulate(make(), network_of(lambda n: 0))
     deliveries = whole[CONTROLLER_DELIVERY]
-    record = changed(whole, **{CONTROLLER_DELIVERY: deliveries[deliveries["sequence"] < 12]})
+    record = changed(whole, {CONTROLLER_DELIVERY: deliveries[deliveries["sequence"] < 12]})
     when_s, why = violation_of(record)
     assert when_s == pytest.approx(event_s(record, 12))
     assert "an update took effect after" in why
@@ -139,7 +139,7 @@ def test_missing_measurements_are_reported_at_the_last_measurement_before_them(
     run: RunRecord, gone: slice, when_s: float, gap_s: float
 ) -> None:
     rows = np.delete(run[SENSOR_MEASUREMENT], gone)
-    found = violation_of(changed(run, **{SENSOR_MEASUREMENT: rows}))
+    found = violation_of(changed(run, {SENSOR_MEASUREMENT: rows}))
     assert found == (pytest.approx(when_s), f"no measurement for {gap_s} s, 0.01 s allowed")
 
 
@@ -160,7 +160,7 @@ def held(run: RunRecord, first: int, last: int, by: int) -> RunRecord:
     """Steps ``first`` to ``last`` − 1 apply inputs that are older by ``by`` steps."""
     steps = run[PLANT_STEP].copy()
     steps["actuation"][first:last] -= by
-    return changed(run, **{PLANT_STEP: steps})
+    return changed(run, {PLANT_STEP: steps})
 
 
 def test_an_old_input_is_reported_when_it_exceeds_the_maximum_age(run: RunRecord) -> None:
@@ -183,7 +183,7 @@ def test_an_update_late_at_the_model_is_late_even_if_the_plant_was_later(
 ) -> None:
     deliveries = run[CONTROLLER_DELIVERY].copy()
     deliveries["model_t_ns"][5] += 30_000_000
-    when_s, why = violation_of(changed(run, **{CONTROLLER_DELIVERY: deliveries}))
+    when_s, why = violation_of(changed(run, {CONTROLLER_DELIVERY: deliveries}))
     assert when_s == pytest.approx(deliveries["t_ns"][5] * 1e-9)
     assert why == "an update took effect after 0.03 s, 0.01 s allowed"
 
@@ -219,7 +219,7 @@ def test_losses_are_derived_from_the_controller_without_network_rows(
 
 def until(run: RunRecord, end_s: float, *names: str) -> RunRecord:
     cut = {name: run[name][run[name]["now_ns"] < end_s * 1e9] for name in names}
-    return changed(run, **cut)
+    return changed(run, cut)
 
 
 def test_the_last_input_of_a_dead_controller_grows_old(make: Make) -> None:
@@ -230,7 +230,7 @@ def test_the_last_input_of_a_dead_controller_grows_old(make: Make) -> None:
     last = int(steps["actuation"][steps["t_ns"] < died_s * 1e9].max())
     steps["actuation"] = np.minimum(steps["actuation"], last)
     record = until(
-        until(changed(run, **{PLANT_STEP: steps}), died_s, PLANT_ACTUATION),
+        until(changed(run, {PLANT_STEP: steps}), died_s, PLANT_ACTUATION),
         known_s, CONTROLLER_STEP, CONTROLLER_DELIVERY,
     )  # fmt: skip
     found = read_conditions(record)
@@ -243,10 +243,10 @@ def test_the_last_input_of_a_dead_controller_grows_old(make: Make) -> None:
 def test_inputs_of_unrecorded_ticks_have_the_largest_possible_age(run: RunRecord) -> None:
     ticks, inputs = run[CONTROLLER_STEP], run[PLANT_ACTUATION]
     gap = slice(300, 310)
-    record = changed(run, **{CONTROLLER_STEP: np.delete(ticks, gap)})
+    record = changed(run, {CONTROLLER_STEP: np.delete(ticks, gap)})
     # The plant's record has the times of the missing ticks.
     assert read_conditions(record).hold.largest() == pytest.approx(0.015)
-    record = changed(record, **{PLANT_ACTUATION: np.delete(inputs, gap)})
+    record = changed(record, {PLANT_ACTUATION: np.delete(inputs, gap)})
     when_s, why = violation_of(record)
     assert when_s == pytest.approx(3.01)
     assert "an input was" in why
@@ -259,7 +259,7 @@ def test_every_table_may_be_empty(run: RunRecord) -> None:
     assert found.first_violation(allowed(run)) is not None
     step = np.zeros(1, run[PLANT_STEP].dtype)
     step["actuation"] = NO_SEQUENCE
-    assert read_conditions(changed(empty, **{PLANT_STEP: step})).start_s == np.inf
+    assert read_conditions(changed(empty, {PLANT_STEP: step})).start_s == np.inf
 
 
 def test_a_stale_update_at_the_end_of_the_run_is_not_lost(make: Make) -> None:

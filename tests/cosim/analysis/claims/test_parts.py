@@ -27,6 +27,7 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import LOOP_ROLES
 from tests.cosim.analysis.claims.conftest import MS, Make
+from tests.cosim.record.changed_records import changed
 
 CONTENT: dict[str, Any] = {
     "name": "changing",
@@ -130,9 +131,7 @@ def test_a_part_without_a_delivery_is_void_with_the_reason() -> None:
 
 def test_claims_are_void_if_a_process_did_not_receive_a_change() -> None:
     record = run_with((2.005, {"trigger.beta": 0.04}))
-    rows = {table: record[table] for table in record.tables}
-    rows[CONTROLLER_SETTING] = rows[CONTROLLER_SETTING][:0]
-    deaf = RunRecord(record.scenario, rows, record.notices, record.reports, "simulated")
+    deaf = changed(record, {CONTROLLER_SETTING: record[CONTROLLER_SETTING][:0]})
     (last,) = [one for one in RunClaims(deaf).judge() if one.from_s > 0]
     assert "not every process received the change" in last.why
 
@@ -171,7 +170,7 @@ def stopped(record: RunRecord, reached_ns: dict[str, int]) -> RunRecord:
         | {"ended": "stopped by the user (SIGINT)", "reached_ns": reached_ns[role]}
         for role in LOOP_ROLES
     }
-    return RunRecord(record.scenario, rows, record.notices, reports, "live")
+    return changed(record, rows, reports=reports, kind="live")
 
 
 @pytest.mark.parametrize("order", [*permutations(LOOP_ROLES)][::5], ids="-".join)
@@ -202,7 +201,7 @@ def test_a_violation_before_the_stop_voids_the_claims(make: Make) -> None:
     quick = scenario.model_copy(
         update={"controller": scenario.controller.model_copy(update={"rate_hz": 100.0})}
     )
-    record = RunRecord(quick, slow.source, slow.notices, slow.reports)
+    record = changed(slow, scenario=quick)
     cut = stopped(record, dict.fromkeys(LOOP_ROLES, STOP_NS))
     assert ClaimVerdict.VOID in {claim.verdict for claim in RunClaims(cut).judge()}
 
@@ -230,6 +229,4 @@ def test_a_complete_run_is_judged_to_its_end(run: RunRecord) -> None:
         reports = {**unknown.reports, "netem": report} if report else {
             role: unknown.reports[role] for role in LOOP_ROLES if role != "netem"
         }  # fmt: skip
-        rows = {table: unknown[table] for table in unknown.tables}
-        died = RunRecord(unknown.scenario, rows, [], reports)
-        assert common_end_ns(died) is None
+        assert common_end_ns(changed(unknown, reports=reports)) is None

@@ -14,7 +14,8 @@ from cosim.record.align import AlignedRun, align_tables
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT
-from tests.cosim.analysis.claims.conftest import MS, Make, network_of, of_scenario
+from tests.cosim.analysis.claims.conftest import MS, Make, network_of
+from tests.cosim.record.changed_records import changed
 
 
 def delta_of(record: RunRecord) -> float | None:
@@ -88,7 +89,7 @@ def test_theorem_1_does_not_apply_without_events_or_with_a_weight(make: Make) ->
     assert delta_of(simulate(quiet)) is None
     record = simulate(make())
     weighted = make(trigger={"weight": [[2.0, 0.0], [0.0, 1.0]]})
-    assert delta_of(of_scenario(record, weighted)) is None
+    assert delta_of(changed(record, scenario=weighted)) is None
     assert delta_of(record) is not None
     assert record[SENSOR_MEASUREMENT]["t_ns"][1] == 10 * MS
 

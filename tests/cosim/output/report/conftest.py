@@ -12,6 +12,7 @@ from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
 from noack.protocol.record_tables import PLANT_STEP
+from tests.cosim.record.changed_records import changed, copied
 
 HOSTILE = "</title></svg><script>alert('x')</script> & \"$\\frac{1}{2}$\""
 
@@ -37,13 +38,13 @@ def make_record(scenario: Scenario, largest: float = 1.0) -> RunRecord:
         largest: factor of the plant's last state.
     """
     record = simulate(scenario)
-    rows = {table: record[table].copy() for table in record.tables}
+    rows = copied(record)
     for filled in rows.values():
         filled["now_ns"] += 1000 * (1 + np.arange(len(filled)) % 97)
     x = rows[PLANT_STEP]["x"]
     with np.errstate(all="ignore"):
         x *= np.geomspace(1.0, largest, len(x))[:, None]
-    return RunRecord(scenario, rows, [], {})
+    return changed(record, rows, notices=[], reports={}, kind="live")
 
 
 @pytest.fixture

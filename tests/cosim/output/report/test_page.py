@@ -26,6 +26,7 @@ from cosim.record.run_record import RunRecord
 from noack.config.scenario_file import dumps as scenario_toml
 from noack.core.errors import ExitStatus, MachineError
 from tests.cosim.output.report.conftest import HOSTILE, make_record, scenario_of
+from tests.cosim.record.changed_records import changed
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
 FIGURES = ["states", "errors", "state-norm", "input", "inter-event", "losses"]
@@ -241,7 +242,7 @@ def lone(content: dict[str, Any], *present: str) -> RunRecord:
     """A run with only these tables."""
     record = make_record(scenario_of(content))
     rows = {t: record[t][: None if t in present else 0] for t in record.tables}
-    return RunRecord(record.scenario, rows, [], {})
+    return changed(record, rows)
 
 
 CASES = {

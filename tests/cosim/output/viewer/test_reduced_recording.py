@@ -23,6 +23,7 @@ from noack.config.scenario_file import load
 from noack.core.errors import ExitStatus
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from tests.cosim.output.viewer.test_viewer import read, series
+from tests.cosim.record.changed_records import changed, copied
 
 PART_STEPS, COLUMNS = 500, 10
 S = 1_000_000_000
@@ -35,13 +36,13 @@ Times = NDArray[np.int64]
 def with_peaks(record: RunRecord) -> RunRecord:
     """Give single rows values far from those around them."""
     draws = np.random.default_rng(5)
-    rows = {table: record[table].copy() for table in record.tables}
+    rows = copied(record)
     for table, columns in ((CONTROLLER_STEP, ("u",)), (SENSOR_MEASUREMENT, ("x", "x_s"))):
         for column in columns:
             for row in draws.integers(0, len(rows[table]), PEAKS):
                 entry = draws.integers(rows[table][column].shape[1])
                 rows[table][column][row, entry] = draws.normal(scale=1e3)
-    return RunRecord(record.scenario, rows, record.notices, record.reports, "live")
+    return changed(record, rows, kind="live")
 
 
 def require_envelope(t_ns: Times, values: Floats, kept_ns: Times, kept: Floats) -> None:

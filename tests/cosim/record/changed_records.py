@@ -1,0 +1,32 @@
+"""Copies of a record that differ in some places."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from cosim.record.run_record import Rows, RunRecord
+
+NO_CHANGE: Mapping[str, Rows] = {}
+
+
+def copied(record: RunRecord) -> dict[str, Rows]:
+    """The rows of all tables, to be changed in place."""
+    return {table: record[table].copy() for table in record.tables}
+
+
+def changed(record: RunRecord, rows: Mapping[str, Rows] = NO_CHANGE, **others: Any) -> RunRecord:
+    """The record with other rows of some tables, or another scenario, notices, reports or kind."""
+    every = {table: rows.get(table, record[table]) for table in record.tables}
+    kept = {name: getattr(record, name) for name in ("scenario", "notices", "reports", "kind")}
+    return RunRecord(rows=every, **(kept | others))
+
+
+def flipped(record: RunRecord, table: str, row: int, column: str, bit: int) -> RunRecord:
+    """The record with a flipped bit of one value."""
+    rows = record[table].copy()
+    raw = bytearray(rows[column][row].tobytes())
+    raw[bit // 8] ^= 1 << bit % 8
+    kind = rows.dtype[column]
+    rows[column][row] = np.frombuffer(raw, kind.base).reshape(kind.shape)
+    return changed(record, {table: rows})

@@ -1,0 +1,74 @@
+"""Certificates of every trigger policy: random loops exceed none, and each broken copy is caught.
+
+The policies are written again in ``event_rules``, and the loops are simulated in ``loops``.
+"""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+from noack.config.resolution import policy_of
+from noack.theory.certificate import NetworkConditions
+from noack.theory.scenario_certificates import certify
+from tests.noack.theory.broken_policies import BROKEN_POLICIES, INSTANT
+from tests.noack.theory.exact_loops import observe
+from tests.noack.theory.loops import (
+    ROUNDING,
+    SEARCH,
+    System,
+    networks,
+    random_system,
+    seeds,
+    simulate,
+    systems,
+)
+from tests.noack.theory.policy_loops import KINDS, exceeded_by, policy_case
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@settings(SEARCH, max_examples=5)
+@given(systems() | systems(step_share=0.002), seeds)
+def test_no_bound_of_a_policy_is_exceeded(kind: str, system: System, seed: int) -> None:
+    resolved, rule, system = policy_case(kind, system, seed)
+    certificate = certify(resolved, system.conditions)
+    if certificate.constants is not None:
+        trace = simulate(system, *networks(seed, system), rule=rule)
+        assert exceeded_by(trace, certificate, system) == []
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS.keys() - {"lyapunov"}))
+@settings(SEARCH, max_examples=3)
+@given(systems(**INSTANT), seeds)
+def test_no_bound_of_a_policy_is_exceeded_in_continuous_time(
+    kind: str, system: System, seed: int
+) -> None:
+    resolved, _, system = policy_case(kind, system, seed)
+    certificate = certify(resolved, NetworkConditions(system.mansd))
+    if certificate.constants is None:
+        return
+    least_s = certificate.inter_event_s or 0.0
+    for run, samples in observe(system, 6.0, seed, policy=policy_of(resolved)):
+        slack = ROUNDING - 1
+        for seen, bound in (
+            (run.system.norms(samples.e_s), certificate.sensor_error(samples.t_s)),
+            (run.system.norms(samples.e_c), certificate.controller_error(samples.t_s)),
+            (np.linalg.norm(samples.x, axis=1), certificate.state(samples.t_s)),
+        ):
+            assert (seen <= ROUNDING * bound + slack * certificate.state(samples.t_s)).all()
+        assert np.diff(run.event_s).min(initial=np.inf) >= least_s / ROUNDING - 1e-9
+
+
+@pytest.mark.parametrize("mistake", BROKEN_POLICIES)
+def test_runs_exceed_a_broken_certificate_of_a_policy(mistake: str) -> None:
+    kind, broken, where = BROKEN_POLICIES[mistake]
+    for seed in range(60):
+        system = random_system(np.random.default_rng(seed), **where)
+        resolved, rule, system = policy_case(kind, system, seed)
+        wrong, right = (one(resolved, system.conditions) for one in (broken, certify))
+        if wrong.constants is None:
+            continue
+        trace = simulate(system, *networks(seed, system), rule=rule)
+        if exceeded_by(trace, wrong, system):
+            assert exceeded_by(trace, right, system) == []
+            return
+    pytest.fail("no run exceeds it")
