@@ -42,6 +42,12 @@ IDEAL = "paper"
 SCHEDULE = "schedule"
 """The scenario's rates, and the lateness that it allows."""
 
+_PERSISTENT = {
+    "‖e_c‖": "delta", "‖e_s‖": "overshoot", "‖u − Kx‖": "input_error", "‖x‖": "state",
+    "‖x̂ − x‖": "estimation_error",
+}  # fmt: skip
+"""Rows of the bounds that are added under disturbances, noise or an observer."""
+
 MOST_LATE = 1000
 _MOST_S = 10.0
 
@@ -72,8 +78,8 @@ class Certificates:
         weight: W, if noack chose it.
 
     Raises:
-        CallerError: its updates are acknowledged, its plant is nonlinear or disturbed, or its
-            state is not measured exactly.
+        CallerError: its updates are acknowledged, its plant or controller is nonlinear, or its
+            settings change.
     """
 
     scenario: Scenario
@@ -90,7 +96,7 @@ class Certificates:
 
     def __init__(self, scenario: Scenario, late_periods: int, weight: Matrix | None = None) -> None:
         scenario.coverage.require_unchanging()
-        scenario.coverage.require_exact()
+        scenario.coverage.require_certifiable()
         self.scenario, self.weight = scenario, weight
         self._scheduled = nominal_conditions(scenario, late_periods)
         conditions = {IDEAL: ideal_conditions(scenario), SCHEDULE: self._scheduled}
@@ -195,7 +201,7 @@ def _theorem_2(scenario: Scenario, certificate: ScenarioCertificate) -> Theorem2
         return None
     if constants.rate_per_s != trigger.alpha_per_s:
         return None
-    if trigger.floor or trigger.weight is not None:
+    if trigger.floor or trigger.weight is not None or not scenario.coverage.is_undisturbed:
         return None
     return theorem_2(loop_of(scenario), trigger.beta, trigger.alpha_per_s, constants.delta)
 
@@ -295,6 +301,8 @@ def _in_words(found: Certificates) -> Iterator[str]:
         late = ""
         if (floor := certificate.floor_constants) is not None:
             late = f"; from {certificate.floor_from_s:.4g} s on, ‖x‖ ≤ {floor.state:.4g}"
+        if (rest := certificate.persistent_constants) is not None:
+            late = f" + {rest.state:.4g}"
         apart = ""
         if (spacing_s := certificate.inter_event_s) is not None:
             apart = f" The inter-event time is at least {_limit(spacing_s)}."
@@ -341,6 +349,11 @@ def _print_constants(console: Console, found: Certificates) -> None:
         "scenario's plant. box: every plant of the uncertainty box. updates outstanding: maximum "
         "number of updates lost or in flight. inter-event time: minimum.[/]"
     )
+    if not found.scenario.coverage.is_undisturbed:
+        console.print(
+            "[dim]The rows with + are added: they are the bounds from disturbances, noise and the "
+            "threshold's floor. With noise or an observer, e_s and e_c are x_s − x̂ and x_c − x̂.[/]"
+        )
     for under, certificate in found:
         if certificate.void:
             console.print(
@@ -363,8 +376,8 @@ def _constants(found: Certificates) -> Iterator[tuple[str, list[str], str]]:
     def constant(name: str) -> list[str]:
         return row(lambda c: getattr(c.constants, name))
 
-    def after_floor(name: str) -> list[str]:
-        return row(lambda c: getattr(c.floor_constants, name, None))
+    def after(name: str, which: str) -> list[str]:
+        return row(lambda c: getattr(getattr(c, which), name, None))
 
     delta_2 = state_2 = spacing_2 = NONE
     if (theorem := found.theorem_2) is not None:
@@ -381,10 +394,13 @@ def _constants(found: Certificates) -> Iterator[tuple[str, list[str], str]]:
     yield "X, bound of ‖x‖", constant("state"), state_2
     yield "inter-event time, s", row(lambda c: c.inter_event_s), spacing_2
     yield "loop gain (< 1)", constant("loop_gain"), NONE
+    if any(c.persistent_constants for c in certificates):
+        for label, name in _PERSISTENT.items():
+            yield f"+ without decay: {label}", after(name, "persistent_constants"), NONE
     if any(c.floor_constants for c in certificates):
         yield "floor reached at, s", row(lambda c: c.floor_from_s), NONE
-        yield "bound of ‖e_c‖/ε from then on", after_floor("delta"), NONE
-        yield "bound of ‖x‖ from then on", after_floor("state"), NONE
+        yield "bound of ‖e_c‖/ε from then on", after("delta", "floor_constants"), NONE
+        yield "bound of ‖x‖ from then on", after("state", "floor_constants"), NONE
 
 
 def _print_limits(console: Console, found: Certificates) -> None:

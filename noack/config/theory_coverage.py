@@ -38,13 +38,18 @@ class TheoryCoverage:
         return self.beyond_theory is None
 
     @property
-    def beyond_theory(self) -> str | None:
-        """The first setting that certificates do not cover; None if all are."""
-        return self._beyond_linear or self.scenario.trigger.beyond_exact
+    def is_undisturbed(self) -> bool:
+        """Whether nothing disturbs the plant, and the sensor measures x."""
+        return self.knows_state and not self.scenario.plant.disturbances
 
     @property
-    def _beyond_linear(self) -> str | None:
-        """The first setting besides the trigger with which the loop is not ẋ = A x + B K x_c."""
+    def beyond_theory(self) -> str | None:
+        """The first setting that certificates do not cover; None if all are."""
+        return self._beyond_certificates or self.scenario.trigger.beyond_exact
+
+    @property
+    def _beyond_certificates(self) -> str | None:
+        """The first setting besides the trigger that certificates do not cover."""
         scenario = self.scenario
         if scenario.protocol.acknowledges:
             return 'network.protocol = "ack": updates are acknowledged'
@@ -52,6 +57,14 @@ class TheoryCoverage:
             return f'plant.system.kind = "{scenario.plant.system.kind}": the plant is not linear'
         if not scenario.controller.is_linear:
             return f'controller.kind = "{scenario.controller.kind}": u is not K x_c'
+        return None
+
+    @property
+    def _beyond_linear(self) -> str | None:
+        """The first setting besides the trigger with which the loop is not ẋ = A x + B K x_c."""
+        scenario = self.scenario
+        if (why := self._beyond_certificates) is not None:
+            return why
         if scenario.plant.disturbances:
             kinds = ", ".join(one.kind for one in scenario.plant.disturbances)
             return f"plant.disturbances ({kinds}): the plant is disturbed"
@@ -70,6 +83,11 @@ class TheoryCoverage:
             )
         if any(self.scenario.controller.setpoint or ()):
             raise CallerError("controller.setpoint: needs the set point 0")
+
+    def require_certifiable(self) -> None:
+        """Raise CallerError if no certificate covers the scenario."""
+        if (why := self.beyond_theory) is not None:
+            raise CallerError(f"{why}; no certificate covers this")
 
     def require_exact(self) -> None:
         """Raise CallerError if exact simulation does not cover the scenario."""

@@ -53,21 +53,20 @@ class DisturbanceSettings(ScenarioSection):
         return np.zeros(len(self.entries))
 
     @property
-    def normal_entries(self) -> int:
-        """Number of entries with a normally distributed value at every step, which has no bound."""
-        return 0
-
-    @property
     def longest_s(self) -> float:
         """The time from the first value other than 0 to the last one; by default infinite."""
         return math.inf
 
-    @abstractmethod
-    def extent(self, normal: float) -> Matrix:
-        """Return columns, (entries, k): the signal is their sum with k factors from −1 to 1.
+    def extent(self) -> Matrix:
+        """Return columns, (entries, k): the signal is their sum with k factors from −1 to 1."""
+        return np.zeros((len(self.entries), 0))
 
-        ``normal`` is the assumed bound of every value that has a standard normal distribution.
+    def deviations(self) -> Matrix:
+        """Return columns, (entries, k), whose factors are standard normal, independent by step.
+
+        The signal is the sum of what ``extent`` and ``deviations`` describe.
         """
+        return np.zeros((len(self.entries), 0))
 
     @abstractmethod
     def signal(self, steps: range, source: SignalSource) -> Matrix:

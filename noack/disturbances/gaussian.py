@@ -30,12 +30,8 @@ class GaussianDisturbance(DisturbanceSettings):
     def variance(self) -> Vector:
         return np.square(self.std)
 
-    @property
-    def normal_entries(self) -> int:
-        return int(np.count_nonzero(self.std))
-
-    def extent(self, normal: float) -> Matrix:
-        return normal * np.diag(self.std)
+    def deviations(self) -> Matrix:
+        return np.diag(self.std)
 
     def signal(self, steps: range, source: SignalSource) -> Matrix:
         unit = normals(source.seed, *source.stream, rows=steps, width=len(self.std))

@@ -25,7 +25,7 @@ class SineDisturbance(DisturbanceSettings):
     phase_rad: FiniteFloat = 0.0
     """Phase at t = 0."""
 
-    def extent(self, normal: float) -> Matrix:
+    def extent(self) -> Matrix:
         return np.array(self.amplitude)[:, None]
 
     def signal(self, steps: range, source: SignalSource) -> Matrix:

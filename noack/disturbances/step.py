@@ -37,7 +37,7 @@ class StepDisturbance(DisturbanceSettings):
     def longest_s(self) -> float:
         return math.inf if self.until_s is None else self.until_s - self.from_s
 
-    def extent(self, normal: float) -> Matrix:
+    def extent(self) -> Matrix:
         return np.array(self.amplitude)[:, None]
 
     def signal(self, steps: range, source: SignalSource) -> Matrix:

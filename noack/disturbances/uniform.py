@@ -30,7 +30,7 @@ class UniformDisturbance(DisturbanceSettings):
     def variance(self) -> Vector:
         return np.square(self.bound) / 3
 
-    def extent(self, normal: float) -> Matrix:
+    def extent(self) -> Matrix:
         return np.diag(self.bound)
 
     def signal(self, steps: range, source: SignalSource) -> Matrix:

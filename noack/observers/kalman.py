@@ -5,6 +5,7 @@ At every step of the plant x̂ ← Âd x̂ + B̂d u, P ← Âd P Âdᵀ + Q. At 
 symmetric and positive semidefinite for any rounding error of L.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar, Literal, Self
 
@@ -102,6 +103,14 @@ class KalmanSettings(ObserverSettings):
             return None
         return np.asarray(np.linalg.solve(C @ predicted @ C.T + R, C @ predicted).T)
 
+    def gains(self, assumed: EstimationModel) -> Iterator[Matrix]:
+        filter_ = self.estimator(assumed, np.zeros(len(assumed.Ad)))
+        while True:
+            yield filter_.gain
+            filter_.correct(np.zeros(len(assumed.C)))
+            for _ in range(assumed.steps):
+                filter_.predict(np.zeros(assumed.Bd.shape[1]))
+
     def estimator(self, assumed: EstimationModel, x: Vector) -> "KalmanObserver":
         return KalmanObserver(assumed, x, np.diag(np.square(self.initial_std)))
 
@@ -133,9 +142,15 @@ class KalmanObserver:
         self.x = Ad @ self.x + Bd @ u
         self.covariance = Ad @ self.covariance @ Ad.T + Q
 
+    @property
+    def gain(self) -> Matrix:
+        """L of the next measurement, (n, p)."""
+        C, R, P = self.model.C, self.model.R, self.covariance
+        return np.asarray(np.linalg.solve(C @ P @ C.T + R, C @ P).T)
+
     def correct(self, y: Vector) -> None:
         C, R, P = self.model.C, self.model.R, self.covariance
-        L = np.linalg.solve(C @ P @ C.T + R, C @ P).T
+        L = self.gain
         rest = np.eye(len(P)) - L @ C
         self.x = self.x + L @ (y - C @ self.x)
         P = rest @ P @ rest.T + L @ R @ L.T

@@ -4,7 +4,9 @@ x̂(t_k) = x̂⁻ + L (y − C x̂⁻), where x̂⁻ ← Âd x̂ + B̂d u at eve
 the model, the error follows e(t_k) = (I − L C) Â^(T) e(t_(k−1)).
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import repeat
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -81,6 +83,9 @@ class LuenbergerSettings(ObserverSettings):
 
     def steady_gain(self, assumed: EstimationModel) -> Matrix:
         return np.array(self.gain)
+
+    def gains(self, assumed: EstimationModel) -> Iterator[Matrix]:
+        return repeat(np.array(self.gain))
 
     def estimator(self, assumed: EstimationModel, x: Vector) -> "LuenbergerObserver":
         return LuenbergerObserver(assumed, np.array(self.gain), x)

@@ -1,6 +1,7 @@
 """The settings and the interface that every kind of observer has."""
 
 from abc import abstractmethod
+from collections.abc import Iterator
 from typing import Any, ClassVar, Protocol, Self
 
 from noack.core.linear_systems import Matrix, Vector
@@ -61,6 +62,10 @@ class ObserverSettings(ScenarioSection):
     @abstractmethod
     def steady_gain(self, assumed: EstimationModel) -> Matrix | None:
         """Return L in the steady state, (n, p); None if none is found."""
+
+    @abstractmethod
+    def gains(self, assumed: EstimationModel) -> Iterator[Matrix]:
+        """Yield L of every measurement, (n, p), without end."""
 
     @abstractmethod
     def estimator(self, assumed: EstimationModel, x: Vector) -> StateObserver:

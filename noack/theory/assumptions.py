@@ -16,9 +16,11 @@ from noack.config.state_estimation import SteadyState, steady_state
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.theory.certificate import Constants, NetworkConditions
+from noack.theory.persistent_causes import normal_bounds
 from noack.theory.run_conditions import certified_delay_s
 
 _NOT_COVERED = "not covered by the theorems and the certificates"
+_NOT_BY_THEOREMS = "not covered by the theorems"
 
 
 class AssumptionStatus(StrEnum):
@@ -65,7 +67,7 @@ def assumptions(resolved: Scenario) -> list[Assumption]:
     if resolved.plant.disturbances:
         kinds = ", ".join(f"{one.kind} at the {one.at}" for one in resolved.plant.disturbances)
         found.append(
-            _violated("nothing disturbs the plant", "eq:plant", f"{kinds}: {_NOT_COVERED}")
+            _violated("nothing disturbs the plant", "eq:plant", f"{kinds}: {_NOT_BY_THEOREMS}")
         )
     return found + _estimated(loop, resolved)
 
@@ -100,7 +102,8 @@ def _estimated(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:
         p = resolved.message_sizes.outputs
         entries = "1 entry" if p == 1 else f"{p} entries"
         how = f"by an observer ({resolved.observer.kind}), from y of {entries}"
-    found = [_violated("the sensor measures x", "Section II", f"x is known {how}: {_NOT_COVERED}")]
+    why = f"x is known {how}: {_NOT_BY_THEOREMS}"
+    found = [_violated("the sensor measures x", "Section II", why)]
     decays = estimation.radius < 1
     if resolved.observer is not None:
         error = (
@@ -235,6 +238,7 @@ def certificate_assumptions(
     decay: dict[str, float],
     constants: Constants | None,
     void: str | None,
+    loop_gain: float,
     promise: str,
     kept: float | None,
 ) -> list[Assumption]:
@@ -258,14 +262,30 @@ def certificate_assumptions(
             holds, why = False, "a hold does not decay: the certified bounds are constant"
         found.append(_checked(f"α is below the decay rate of {of}", source, holds, why))
     found += _conditions(conditions, resolved, kept)
+    found += _bounded_causes(resolved)
     if constants is None:
         found.append(_violated("there is a certificate", "certificate", void or ""))
     else:
-        why = f"the loop gain of the errors is {constants.loop_gain:.3g}, below 1"
+        why = f"the loop gain of the errors is {loop_gain:.3g}, below 1"
         found.append(_checked("small-gain condition", "certificate", True, why))
     why = "the bounds rest on (I1), which holds for every plant"
     what, source = "A is unstable with distinct eigenvalues", "Proposition 1"
     return [*found, Assumption(what, source, AssumptionStatus.NOT_NEEDED, why)]
+
+
+def _bounded_causes(resolved: Scenario) -> list[Assumption]:
+    """Return that disturbances and noise stay within their bounds."""
+    if resolved.coverage.is_undisturbed:
+        return []
+    what, source = "disturbances and noise stay within their bounds", "certificate"
+    if (normal := normal_bounds(resolved)) is None:
+        return [Assumption(what, source, AssumptionStatus.HOLDS, "by their settings")]
+    why = (
+        f"normal values have no bound; {normal.limit:.3g} standard deviations are assumed, and "
+        "the like for their sums; a run exceeds one of these with a probability of at most "
+        f"{resolved.certificate.exceedance_probability:g}"
+    )
+    return [Assumption(what, source, AssumptionStatus.ASSUMED, why)]
 
 
 def _conditions(

@@ -65,7 +65,7 @@ class BoxGains(PlantGains):
         R, box = self.error.split_K[1], float(np.linalg.norm(self.halfwidth_A, 2))
         # ‖e^{As}‖ ≤ e^{μs}; the logarithmic norm μ of a sum is at most the sum of both norms.
         mu = max(logarithmic_norm(self.A) + box, 0.0) + self.alpha_per_s
-        pushes = self._forcing.columns
+        pushes = self._forcing.limited
         size = float(np.linalg.norm(self.start, 2) + start_s * np.linalg.norm(pushes, axis=0).sum())
         size *= math.exp(mu * start_s)
         rate = float(np.linalg.norm(R @ self.A, 2)) + float(np.linalg.norm(R, 2)) * box
@@ -87,7 +87,7 @@ class BoxGains(PlantGains):
         differs = R.any() or not self._rows
         columns = np.concatenate([nominal, self._directions], axis=1)
         forced = columns if differs else self._directions
-        disturbed = self._forcing.columns
+        disturbed = self._forcing.limited
         return self.error.growth(forced, self.input_matrix, disturbed, until_s, cells)
 
     @cached_property

@@ -18,7 +18,8 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from noack.config.resolution import LoopMatrices
-from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
+from noack.core.clock import NS_PER_S
+from noack.core.linear_systems import Matrix, Vector, discretise, spectral_abscissa
 from noack.theory.enclosure import (
     KernelBounds,
     ResponseBounds,
@@ -47,8 +48,20 @@ class Coefficients(NamedTuple):
     gain: float
 
 
+class NormalForcing(NamedTuple):
+    """Disturbances D ξ, ξ of k independent standard normal values, constant over each period."""
+
+    columns: Matrix
+    """D, (n, k)."""
+    period_s: float
+    limit: float
+    """Assumed bound of every single value of ξ."""
+    radius: float
+    """Assumed bound of ‖v‖ for n independent standard normal values v, at every period's end."""
+
+
 class Forcing(NamedTuple):
-    """Disturbances: ẋ = Ax + Bu + Σ_i D_i s_i, |s_i| ≤ 1 at every time."""
+    """Disturbances: ẋ = Ax + Bu + Σ_i D_i s_i, |s_i| ≤ 1 at every time, and normal ones."""
 
     columns: Matrix
     """D_i, (n, k)."""
@@ -56,6 +69,14 @@ class Forcing(NamedTuple):
     """The time for which s_i is not 0, (k,); infinite if it never ends."""
     at_input: Vector
     """Bound of what is added to u, included in the columns, (m,)."""
+    normal: NormalForcing | None = None
+
+    @property
+    def limited(self) -> Matrix:
+        """Columns with the bounds of all values, normal ones included, (n, k')."""
+        if self.normal is None:
+            return self.columns
+        return np.hstack([self.columns, self.normal.limit * self.normal.columns])
 
 
 class Growth(NamedTuple):
@@ -243,7 +264,34 @@ class PlantGains:
         for followed, duration_s in zip(self._disturbed, self._forcing.durations_s, strict=True):
             kernel = followed.through(C)
             total += min(kernel.integral(), duration_s * kernel.sup())
-        return total
+        return total + self._normally_disturbed(C)
+
+    def _normally_disturbed(self, C: Matrix) -> float:
+        """Return the part from normal disturbances: their sum in x is normal, too.
+
+        At the end of a period x = S v, S Sᵀ the stationary covariance. Within it C e^{Mτ} x, M = A
+        + BK, is bounded by Taylor's formula.
+        """
+        normal = self._forcing.normal
+        if normal is None:
+            return 0.0
+        M, h, S = self.closed_loop, normal.period_s, self._deviations
+        growth = float(np.exp(np.linalg.norm(M, 2) * h))
+        bend = 0.5 * h**2 * growth * np.linalg.norm(C, 2) * np.linalg.norm(M @ M @ S, 2)
+        spread = np.linalg.norm(C @ S, 2) + h * np.linalg.norm(C @ M @ S, 2) + bend
+        pushed = np.linalg.norm(normal.columns, axis=0).sum() * np.linalg.norm(C, 2) * growth * h
+        return float(normal.radius * spread + normal.limit * pushed) * (1 + 1e-6)
+
+    @cached_property
+    def _deviations(self) -> Matrix:
+        """S with S Sᵀ the stationary covariance of x under the normal disturbances."""
+        from scipy.linalg import solve_discrete_lyapunov
+
+        normal = self._forcing.normal
+        assert normal is not None
+        period_ns = round(normal.period_s * NS_PER_S)
+        step, pushed = discretise(self.closed_loop, normal.columns, period_ns)
+        return deviations(np.asarray(solve_discrete_lyapunov(step, pushed @ pushed.T)))
 
     @cached_property
     def _disturbed(self) -> list[ResponseBounds]:
@@ -275,7 +323,7 @@ class PlantGains:
         free = response_until(drift, self.start, start_s)
         R = self.error.split_K[1]
         error = free.through(R).sup_on_grid()
-        for column in self._forcing.columns.T:
+        for column in self._forcing.limited.T:
             pushed = response_until(drift, column[:, None], start_s)
             error += pushed.through(R).integral_on_grid()
         return error, {
@@ -284,8 +332,14 @@ class PlantGains:
 
     def growth(self, until_s: float, cells: int) -> Growth:
         """Return the growth of ‖e_s‖_W over ``until_s``, on a grid."""
-        mismatch, disturbed = self.split_mismatch[0], self._forcing.columns
+        mismatch, disturbed = self.split_mismatch[0], self._forcing.limited
         return self.error.growth(mismatch, self.input_matrix, disturbed, until_s, cells)
+
+
+def deviations(covariance: Matrix) -> Matrix:
+    """Return S with S Sᵀ = the covariance, (n, n)."""
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def error_gains(loop: LoopMatrices, alpha_per_s: float) -> ErrorGains:

@@ -2,8 +2,9 @@
 
 import contextlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,9 +22,11 @@ from noack.theory.certificate import (
     VoidError,
     solve,
 )
+from noack.theory.disturbed_certificate import DisturbedCertificate, PlantAt
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.gains import ErrorGains, PlantGains, error_gains
 from noack.theory.run_conditions import kept_probability
+from noack.theory.superposition import SHARES
 from noack.theory.trigger_bounds import TriggerBounds
 
 OWN_PLANT = "the scenario's plant"
@@ -37,9 +40,6 @@ _TOO_LARGE = "intermediate results are too large or too small for floating point
 
 Change = Callable[[NetworkConditions, float], NetworkConditions]
 """Sets a time of the conditions."""
-
-PlantAt = Callable[[ErrorGains, Matrix, float], PlantGains]
-"""Returns the plant's gains from the gains of the models, the start of x, and α."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,9 @@ class ScenarioCertificate:
     """The constants from ``floor_from_s`` on, with ε in place of βe^{−αt} and without decay."""
     void: str | None
     """Reason for having no certificate; None if there is one."""
+    persistent_constants: Constants | None = None
+    """The constants, in units of 1 and without decay, whose bounds are added to those of
+    ``constants`` under disturbances, noise or an observer."""
 
     @property
     def source(self) -> str:
@@ -104,15 +107,20 @@ class ScenarioCertificate:
         """Bound of ‖x‖ at times (k,); NaN without a certificate."""
         return self._envelope(t_s, lambda c, level: c.state)
 
+    def estimation_error(self, t_s: Matrix) -> Matrix:
+        """Bound of ‖x̂ − x‖_W at measurements (k,); NaN without a certificate."""
+        return self._envelope(t_s, lambda c, level: c.estimation_error)
+
     def to_json(self) -> dict[str, Any]:
         """Return all fields for JSON."""
-        constants, late = self.constants, self.floor_constants
+        constants, late, rest = self.constants, self.floor_constants, self.persistent_constants
         return asdict(self) | {
             "conditions": self.conditions._asdict()
             | {"constraints": [rule.name for rule in self.conditions.constraints]},
             "assumptions": [assumption._asdict() for assumption in self.assumptions],
             "constants": None if constants is None else constants._asdict(),
             "floor_constants": None if late is None else late._asdict(),
+            "persistent_constants": None if rest is None else rest._asdict(),
             "inter_event_s": self.inter_event_s,
             "floor_from_s": None if self.floor == 0 else self.floor_from_s,
         }
@@ -125,6 +133,8 @@ class ScenarioCertificate:
         if self.floor_constants is not None:
             late = scale(self.floor_constants, self.floor)
             bound = np.where(t_s < self.floor_from_s, bound, late)
+        if self.persistent_constants is not None:
+            bound = bound + scale(self.persistent_constants, 1.0)
         return np.asarray(bound)
 
 
@@ -243,29 +253,40 @@ class CertificateScope:
         self._errors: dict[float, ErrorGains] = {}
         self._plants: dict[tuple[float, float, bytes], PlantGains] = {}
 
-    def certificate(self, conditions: NetworkConditions) -> ScenarioCertificate:
-        """Return the certificate under some conditions; a void certificate has the reason."""
+    def certificate(
+        self, conditions: NetworkConditions, shares: Sequence[float] = SHARES
+    ) -> ScenarioCertificate:
+        """Return the certificate under some conditions; a void certificate has the reason.
+
+        ``shares`` are those of :func:`solve_divided`; with fewer of them δ may be shorter.
+        """
         trigger = self._trigger
         first: Constants | None = None
         late: Constants | None = None
+        rest: Constants | None = None
         void = None
         try:
             with np.errstate(all="ignore"):
-                first, late = self._phases(conditions)
+                if self._resolved.coverage.is_undisturbed:
+                    first, late = self._phases(conditions)
+                else:
+                    first, rest = self._disturbed_phases(conditions, shares)
         except (NotDecayingError, VoidError) as error:
             void = str(error)
         except (OverflowError, np.linalg.LinAlgError):
             void = _TOO_LARGE
         found = ScenarioCertificate(
             self.name, trigger.beta, trigger.alpha_per_s, trigger.floor,
-            self._loop.weight is not None, conditions, (), first, late, void,
+            self._loop.weight is not None, conditions, (), first, late, void, rest,
         )  # fmt: skip
         kept = None
         if not self._resolved.network.enforce_mansd:
             kept = kept_probability(self._resolved, conditions.guarantee, found.inter_event_s)
         assumptions = certificate_assumptions(
-            self._resolved, conditions, self._decay, first, void, trigger.text(), kept
-        )
+            self._resolved, conditions, self._decay, first, void,
+            max((one.loop_gain for one in (first, rest) if one is not None), default=0.0),
+            trigger.text(), kept,
+        )  # fmt: skip
         return replace(found, assumptions=tuple(assumptions))
 
     def largest(self, conditions: NetworkConditions, change: Change, most_s: float = 10.0) -> float:
@@ -275,7 +296,8 @@ class CertificateScope:
         """
 
         def stands(value_s: float) -> bool:
-            return self.certificate(change(conditions, value_s)).constants is not None
+            certificate = self.certificate(change(conditions, value_s), SHARES[:1])
+            return certificate.constants is not None
 
         if stands(most_s):
             return most_s
@@ -292,15 +314,39 @@ class CertificateScope:
         first = self._first_phase(conditions)
         if 0 < trigger.floor < trigger.beta and first.rate_per_s == trigger.alpha_per_s:
             late = _at_floor(first, trigger.floor / trigger.beta)
+        return self._checked(first, late)
+
+    def _disturbed_phases(
+        self, conditions: NetworkConditions, shares: Sequence[float]
+    ) -> tuple[Constants, Constants | None]:
+        """Return the constants, and those that are added to them under persistent causes."""
+        alpha = self._trigger.alpha_per_s
+        decays = not self._held and below(alpha, min(self._decay.values()))
+        return self._checked(*self._disturbed.constants(conditions, decays=decays, shares=shares))
+
+    @cached_property
+    def _disturbed(self) -> DisturbedCertificate:
+        return DisturbedCertificate(
+            self._resolved, self._plant_at, self._trigger, self._start_error
+        )
+
+    def _checked(
+        self, first: Constants, other: Constants | None
+    ) -> tuple[Constants, Constants | None]:
+        """Return the constants.
+
+        Raises:
+            VoidError: they do not cover the inputs at the start, or are not finite.
+        """
         if first.input_error < self._start_error:
             raise VoidError(
                 f"at its start the input was {self._start_error:.3g} from Kx; a certificate "
                 f"covers at most {first.input_error:.3g}"
             )
-        for constants in (first, late):
+        for constants in (first, other):
             if constants is not None and not _is_finite(constants):
                 raise VoidError(_TOO_LARGE)
-        return first, late
+        return first, other
 
     def _first_phase(self, conditions: NetworkConditions) -> Constants:
         trigger, decay = self._trigger, min(self._decay.values())

@@ -7,6 +7,8 @@ threshold, which is at most βe^{−αt} + ε. Both use the same δ. An event ne
 least λβe^{−αt} + (1 − λ)ε, for any λ in [0, 1].
 """
 
+from collections.abc import Sequence
+
 from noack.theory.certificate import (
     NO_BACKGROUND,
     Background,
@@ -16,8 +18,8 @@ from noack.theory.certificate import (
     solve_sum,
 )
 
-_SHARES = (0.5, 0.2, 0.8)
-"""Tried values of λ."""
+SHARES = (0.5, 0.2, 0.8)
+"""Values of λ that are tried."""
 
 
 def solve_divided(
@@ -27,8 +29,9 @@ def solve_divided(
     background: Background = NO_BACKGROUND,
     *,
     structured: bool = True,
+    shares: Sequence[float] = SHARES,
 ) -> tuple[Constants, Constants]:
-    """Return the constants of both parts, with the λ for which δ is longest.
+    """Return the constants of both parts, with the λ of ``shares`` for which δ is longest.
 
     Raises:
         VoidError: the loop gain of one part is not below 1.
@@ -45,5 +48,5 @@ def solve_divided(
         first, second = solve_sum(parts, conditions, background, structured=structured)
         return first, second
 
-    tried = [solved(share) for share in (_SHARES if floor > 0 else (0.5,))]
+    tried = [solved(share) for share in (shares if floor > 0 else shares[:1])]
     return max(tried, key=lambda found: found[0].inter_event_s or 0.0)

@@ -65,6 +65,8 @@ class Samples:
     """Bounds of ‖e_c‖_W from (I1) and from eq:LossEv3, (k,) each; NaN before the start."""
     residual: Reals
     """Residual of (I1), (k,)."""
+    true_x: Reals
+    """x of the plant, (k, n), where the sensor estimates it, too; NaN where it is not recorded."""
     inter_event_s: tuple[Reals, Reals]
     """Times of the events, without the run's first, and the times since the event before."""
 
@@ -72,6 +74,13 @@ class Samples:
     def t_s(self) -> Reals:
         """Times of the measurements, (k,)."""
         return np.asarray(self.joined.t_ns * 1e-9)
+
+    @cached_property
+    def with_x(self) -> NDArray[np.bool_]:
+        """Where the plant's own state is known, (k,)."""
+        if self.true_x is self.joined.x:
+            return np.ones(len(self.true_x), dtype=bool)
+        return np.asarray(np.isfinite(self.true_x).all(axis=1))
 
 
 class SampleFacts(NamedTuple):
@@ -113,7 +122,8 @@ class RunEvidence:
             passed = event_ns[1:] * 1e-9, np.diff(event_ns) * 1e-9
             last_ns = event_ns[-1:]
             both = bounds[:, 0], bounds[:, 1]
-            yield Samples(joined, common, both, residual.take(part), passed)
+            true_x = joined.x if part.true_x is None else part.true_x
+            yield Samples(joined, common, both, residual.take(part), true_x, passed)
 
     @cached_property
     def facts(self) -> SampleFacts:
@@ -244,6 +254,7 @@ class RunEvidence:
         scenario, loop = self.record.scenario, self.record.loop
         if (
             not scenario.coverage.is_certifiable
+            or not scenario.coverage.is_undisturbed
             or not scenario.coverage.is_decaying
             or loop.weight is not None
             or scenario.decaying.floor > 0

@@ -16,6 +16,8 @@ def _bound(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate)
     formula = f"‖e_c‖ ≤ {{:.4g}} {certificate.level}"
     if (late := certificate.floor_constants) is not None:
         formula += f", from {certificate.floor_from_s:.4g} s on {late.delta:.4g} ε"
+    if (rest := certificate.persistent_constants) is not None:
+        formula += f" + {rest.delta:.4g}"
     values, void = certificate.controller_error(samples.t_s), run.violation_of(certificate)
     return controller_error_bound(run, samples, formula, values, certificate.constants.delta, void)
 

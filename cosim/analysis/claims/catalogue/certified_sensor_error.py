@@ -17,6 +17,8 @@ def _bound(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate)
     formula = f"‖e_s‖ ≤ {{:.4g}} {certificate.level}"
     if (late := certificate.floor_constants) is not None:
         formula += f", from {certificate.floor_from_s:.4g} s on {late.overshoot:.4g} ε"
+    if (rest := certificate.persistent_constants) is not None:
+        formula += f" + {rest.overshoot:.4g}"
     slack = ROUNDING * row_norms(samples.joined.x)
     shares = upper_shares(samples.joined.e_s_norm, certificate.sensor_error(samples.t_s) + slack)
     void, overshoot = run.violation_of(certificate), certificate.constants.overshoot

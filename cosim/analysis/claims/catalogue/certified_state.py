@@ -14,8 +14,12 @@ def _bound(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate)
         formula += f" e^(−{constants.rate_per_s:.3g}t)"
     if (late := certificate.floor_constants) is not None:
         formula += f", from {certificate.floor_from_s:.4g} s on {late.state:.4g}"
-    shares = upper_shares(row_norms(samples.joined.x), certificate.state(samples.t_s))
-    return Bound(formula, samples.t_s, shares, run.violation_of(certificate), constants.state)
+    if (rest := certificate.persistent_constants) is not None:
+        formula += f" + {rest.state:.4g}"
+    here = samples.with_x
+    t_s, void = samples.t_s[here], run.violation_of(certificate)
+    shares = upper_shares(row_norms(samples.true_x[here]), certificate.state(t_s))
+    return Bound(formula, t_s, shares, void, constants.state)
 
 
 def _envelope(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> Envelope:

@@ -13,6 +13,7 @@ def _bound(run: RunEvidence, samples: Samples) -> Bound | None:
     scenario = run.record.scenario
     if (
         not scenario.coverage.is_certifiable
+        or not scenario.coverage.is_undisturbed
         or not scenario.coverage.is_decaying
         or scenario.decaying.floor > 0
     ):

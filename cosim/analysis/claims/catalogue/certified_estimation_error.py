@@ -1,0 +1,26 @@
+"""A certificate's bound of ‖x̂ − x‖_W at the measurements, with noise or an observer."""
+
+import numpy as np
+
+from cosim.analysis.claims.claim_definition import Bound, CertifiedClaim, upper_shares
+from cosim.analysis.claims.run_evidence import RunEvidence, Samples
+from noack.core.linear_systems import row_norms
+from noack.theory.scenario_certificates import ScenarioCertificate
+
+
+def _bound(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> Bound | None:
+    scenario, loop = run.record.scenario, run.record.loop
+    if certificate.constants is None or scenario.coverage.knows_state:
+        return None
+    weight = np.eye(loop.n) if loop.weight is None else loop.weight
+    here = samples.with_x
+    t_s = samples.t_s[here]
+    errors = row_norms((samples.joined.x[here] - samples.true_x[here]) @ weight.T)
+    first, rest = certificate.constants, certificate.persistent_constants
+    formula = f"‖x̂ − x‖ ≤ {{:.4g}} e^(−{first.rate_per_s:.3g}t)"
+    formula += "" if rest is None else f" + {rest.estimation_error:.4g}"
+    shares = upper_shares(errors, certificate.estimation_error(t_s))
+    return Bound(formula, t_s, shares, run.violation_of(certificate), first.estimation_error)
+
+
+CLAIM = CertifiedClaim("the estimation error is bounded", _bound)

@@ -1,0 +1,124 @@
+"""The certificate of a loop with disturbances, noise or an observer.
+
+The bounds are those of what decays (the start, βe^{−αt}, the first estimate) plus those of what
+persists (disturbances, noise, the floor). If α is too large, all are bounded together, without
+decay.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from noack.config.resolution import loop_of
+from noack.config.scenario import Scenario
+from noack.core.linear_systems import Matrix
+from noack.theory.certificate import (
+    Background,
+    Constants,
+    NetworkConditions,
+    Part,
+    TriggerBound,
+    VoidError,
+    solve_sum,
+)
+from noack.theory.enclosure import NotDecayingError
+from noack.theory.estimation_error import EstimationError
+from noack.theory.gains import ErrorGains, Forcing, PlantGains, error_gains
+from noack.theory.persistent_causes import forcing_of
+from noack.theory.superposition import SHARES, solve_divided
+from noack.theory.trigger_bounds import TriggerBounds
+
+PlantAt = Callable[[ErrorGains, Matrix, float], PlantGains]
+"""Returns the plant's gains from the gains of the models, the start of x, and α."""
+
+
+@dataclass(frozen=True)
+class DisturbedCertificate:
+    """Computes the constants of a resolved scenario; ``start_error`` as for CertificateScope."""
+
+    resolved: Scenario
+    plant_at: PlantAt
+    trigger: TriggerBounds
+    start_error: float
+
+    def constants(
+        self, conditions: NetworkConditions, *, decays: bool, shares: Sequence[float] = SHARES
+    ) -> tuple[Constants, Constants | None]:
+        """Return the constants that decay and those to be added; without decay only one.
+
+        ``decays``: α is below the decay rates of the models and of the plant. ``shares`` are those
+        of :func:`solve_divided`.
+
+        Raises:
+            VoidError: the loop gain is not below 1, or the estimation error is not known.
+            NotDecayingError: a mode of the loop or of the observer does not decay.
+        """
+        if self.resolved.observer is not None and (
+            self.start_error or loop_of(self.resolved).setpoint is not None
+        ):
+            raise VoidError("after a change or at a set-point the estimation error is not known")
+        conditions = self.trigger.tested(conditions)
+        background = Background(input_error=self.start_error)
+        structured = self.start_error == 0.0
+        if decays and self.resolved.coverage.is_decaying:
+            try:
+                return solve_divided(
+                    self._decaying, self._persistent, conditions, background,
+                    structured=structured, shares=shares,
+                )  # fmt: skip
+            except NotDecayingError:
+                pass
+        level, floor = max(self.trigger.beta, self.trigger.floor), self.trigger.floor
+        bound = self.trigger.bound(conditions, level, floor or None)
+        part = self._together._replace(bound=bound)
+        (found,) = solve_sum([part], conditions, background, structured=structured)
+        return found, None
+
+    @cached_property
+    def _decaying(self) -> Part:
+        alpha_per_s = self.trigger.alpha_per_s
+        plant = self._plant(alpha_per_s)
+        bound = TriggerBound(self.trigger.beta, None)
+        estimation = self._estimation.decaying(alpha_per_s)
+        return Part(plant.error, plant, bound, estimation)
+
+    @cached_property
+    def _persistent(self) -> Part:
+        plant = self._plant(0.0)
+        at_rest = replace(plant, start=np.zeros_like(plant.start), forcing=self._forcing(plant))
+        bound = TriggerBound(self.trigger.floor, None, unit=1.0)
+        return Part(plant.error, at_rest, bound, self._estimation.persistent())
+
+    @cached_property
+    def _together(self) -> Part:
+        """All causes without decay; the trigger's bound depends on the conditions."""
+        plant = self._plant(0.0)
+        pushed = replace(plant, forcing=self._forcing(plant))
+        first, rest = self._estimation.decaying(0.0), self._estimation.persistent()
+        estimation = rest._replace(fixed=rest.fixed + first.fixed)
+        return Part(plant.error, pushed, TriggerBound(0.0, None), estimation)
+
+    def _plant(self, alpha_per_s: float) -> PlantGains:
+        loop = loop_of(self.resolved)
+        plant = self.plant_at(error_gains(loop, alpha_per_s), loop.x0[:, None], alpha_per_s)
+        outputs = {**self._estimation.further_outputs, **self.trigger.outputs}
+        return replace(plant, further_outputs=outputs)
+
+    def _forcing(self, plant: PlantGains) -> Forcing | None:
+        return forcing_of(self.resolved, plant.B)
+
+    @cached_property
+    def _estimation(self) -> EstimationError:
+        """The estimation error of the plant.
+
+        Raises:
+            VoidError: the plant is not known.
+        """
+        loop = loop_of(self.resolved)
+        models = error_gains(loop, 0.0)
+        plant = self.plant_at(models, loop.x0[:, None], 0.0)
+        if self.resolved.observer is not None and not plant.is_one_plant:
+            raise VoidError("an observer's error is bounded for one plant only, not for a box")
+        return EstimationError(self.resolved, plant.A, plant.B, self._forcing(plant))
