@@ -77,6 +77,11 @@ class TriggerBounds:
         return not (self.beta or self.floor or self.area)
 
     @property
+    def is_constant(self) -> bool:
+        """Whether the threshold has a constant, and no part that decays."""
+        return not self.beta and not self.is_homogeneous
+
+    @property
     def outputs(self) -> Mapping[str, Matrix]:
         """S of each share sup‖S x‖ of the threshold, by name."""
         shares = () if self.promise is None else self.promise.shares
@@ -141,6 +146,24 @@ class TriggerBounds:
         return found[0]._replace(
             unit=level or 1.0, apart_s=apart_s, due_s=due_s, also=tuple(found[1:])
         )
+
+    def divided(
+        self, conditions: NetworkConditions, apart_s: float
+    ) -> tuple[TriggerBound, TriggerBound]:
+        """Return the bounds without their constants, and with them, both in units of 1.
+
+        ``apart_s`` is a known lower bound of the inter-event time.
+
+        Raises: as :meth:`bound`.
+        """
+        whole = self.bound(conditions, self.floor, self.floor or None)
+        parts = []
+        for share in (0.0, 1.0):
+            every = [
+                one._replace(beta=share * one.beta, reached=None, also=()) for one in whole.every
+            ]
+            parts.append(every[0]._replace(also=tuple(every[1:]), apart_s=apart_s, unit=1.0))
+        return parts[0], parts[1]
 
     def text(self) -> str:
         """Return in words what the rule promises about e_s."""
