@@ -55,15 +55,6 @@ def find_shipped(name: str, folder: str) -> Path:
     raise CallerError(f"{shown}: no such file, nor a shipped {kind}; {_hint(name, names)}")
 
 
-def find_trace(name: str) -> Path:
-    """Return the path of a packet trace given by path, or by the name of a shipped one."""
-    path = Path(name)
-    if len(path.parts) == 1 and not path.exists():
-        found = [*(_place("scenarios") / "traces").glob("*/*.csv")]
-        return next((one for one in found if one.stem == name), path)
-    return path
-
-
 def shipped_names(folder: str) -> list[str]:
     """Return the names of the scenarios or campaigns that come with noack."""
     return sorted(file.stem for file in _place(folder).glob("*.toml"))

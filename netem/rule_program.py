@@ -148,7 +148,9 @@ def new_losses(program: LinkProgram, *, restarted: bool) -> list[int]:
     losses directly before the first packet as a window may have.
     """
     width = loss_width(program)
-    assumed = max((window.losses for window in program.windows), default=1) if restarted else 0
+    if not restarted:
+        return [0] * width
+    assumed = max((window.losses for window in program.windows), default=1)
     return [-min(-place % width, assumed) for place in range(width)]
 
 

@@ -11,6 +11,7 @@ from cosim.measurement.measurement_tables import print_measurement
 from cosim.measurement.network_file import Form, write_network
 from cosim.measurement.network_measurement import Measurement
 from noack.config.scenario import Scenario
+from noack.core.errors import CallerError
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,15 @@ class OutputRequest:
     form: Form = "trace"
     scenario: Scenario | None = None
     """A scenario whose certificates are compared with the network."""
+
+    def __post_init__(self) -> None:
+        """Refuse wrong names before anything is measured."""
+        if self.page is not None and self.page.suffix != ".html":
+            raise CallerError(f"--out {self.page}: a measurement is written as .html")
+        if self.network is not None and self.network.suffix != ".toml":
+            raise CallerError(
+                f"--write {self.network}: the name of a [network] section ends in .toml"
+            )
 
 
 def report(found: Measurement, request: OutputRequest, console: Console | None) -> dict[str, Any]:

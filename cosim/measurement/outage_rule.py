@@ -55,7 +55,7 @@ def find_outages(bursts: LossBursts) -> OutageRule:
         flags = np.zeros(count, bool)
         flags[order[: k + 1]] = True
         if _elliott(bursts, flags, int(lengths[k]), count - k) < LEVEL:
-            return OutageRule(flags, f"bursts of {lengths[k]} or more losses: so long a burst has "
+            return OutageRule(flags, f"bursts of {lengths[k]} or more losses: this has "
                               f"a probability below {LEVEL:g} under the fitted chain")  # fmt: skip
     flags = np.zeros(count, bool)
     if 0 < count < FEWEST_BURSTS:

@@ -12,6 +12,7 @@ from cosim.analysis.model_comparison import linearisation_rows
 from cosim.analysis.run_summary import Summary
 from cosim.output.assumptions_table import print_assumptions
 from cosim.output.fidelity_table import summary_rows
+from netem.words.words_to_settings import settings_of
 from noack.core.number_format import NONE, number, ratio, seconds, whole
 
 Numbers = tuple[tuple[str, str], ...]
@@ -114,6 +115,10 @@ def _lost(summary: Summary) -> tuple[str, str]:
 
 def _longest_burst(summary: Summary) -> tuple[str, str]:
     cap, longest = summary["mansd"], summary["longest_loss_burst"]
+    words = [f"mansd {cap}", *summary.get("constraints", ())]
+    limit = settings_of(" ".join(words)).longest_burst
+    if limit != cap:
+        return f"longest loss burst (at most {limit} allowed)", str(longest)
     return f"longest loss burst (cap M − 1 = {cap})", str(longest)
 
 

@@ -12,7 +12,7 @@ from netem.words.words_to_settings import GRAMMAR, KEYWORDS, parse, require_no_d
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings, read_files
 from noack.impairments.quantities import OWN_TIME_S
-from noack.runtime.address import parse_address
+from noack.runtime.address import parse_address, parse_destination
 from noack.runtime.command_line import Parser
 from noack.runtime.process_entry import add_options
 
@@ -154,7 +154,7 @@ def specs_of(options: argparse.Namespace) -> tuple[LinkSpec, ...]:
     if options.listen is None or options.to is None:
         raise CallerError("--listen and --to must be given together")
     listen = parse_address(options.listen, "--listen")
-    to = parse_address(options.to, "--to", listen)
+    to = parse_destination(options.to, "--to", listen)
     forward, reverse, seed = _directions(options)
     return (
         LinkSpec(

@@ -78,27 +78,27 @@ def _carry_queue(
 
 def _carry_losses(row: int, old: LinkProgram, before: LinkMemory, after: LinkMemory) -> None:
     """Transfer the outcomes of the last packets; an unknown outcome counts as a delivery."""
-    packets, losses = before.flows[row].packets, after.losses[row]
-    mask = len(losses) - 1
-    losses[packets & mask] = 0
-    for number in range(packets - 1, packets - mask - 1, -1):
-        lost = 1 if _was_lost(row, old, before, number) else 0
-        losses[number & mask] = losses[(number + 1) & mask] - lost
-
-
-def _was_lost(row: int, old: LinkProgram, before: LinkMemory, number: int) -> bool:
-    """Whether it is known that a packet was lost."""
-    flow, losses, recent_ns = before.flows[row], before.losses[row], before.recent_ns[row]
-    ago = flow.packets - number
-    if counts_losses(old):
-        mask = len(losses) - 1
-        return ago <= mask and losses[(number + 1) & mask] > losses[number & mask]
-    if ago > flow.packets:
-        return False
-    if old.tracks and old.mansd >= 0:
-        width = old.mansd + 1
-        return ago <= width and recent_ns[number % width] < 0
-    return ago <= flow.consecutive_losses
+    flow, known, losses = before.flows[row], before.losses[row], after.losses[row]
+    packets, mask, width = flow.packets, len(losses) - 1, old.mansd + 1
+    counted, listed = counts_losses(old), old.tracks and old.mansd >= 0
+    if counted:
+        count = len(known) - 1
+        if count == mask:
+            losses[:] = known
+            return
+    elif listed:
+        count = min(width, packets)
+    else:
+        count = flow.consecutive_losses
+    so_far = 0
+    for number in range(packets - min(count, mask), packets):
+        lost = True
+        if counted:
+            lost = known[(number + 1) & count] > known[number & count]
+        elif listed:
+            lost = before.recent_ns[row][number % width] < 0
+        so_far += 1 if lost else 0
+        losses[(number + 1) & mask] = so_far
 
 
 def _is_same_guarantee(old: LinkProgram, new: LinkProgram) -> bool:

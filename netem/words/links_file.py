@@ -18,7 +18,7 @@ from netem.words.words_to_settings import settings_of
 from noack.config import toml_file
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings, read_files
-from noack.runtime.address import parse_address
+from noack.runtime.address import parse_address, parse_destination
 from noack.settings.section import ScenarioSection, Seed
 
 
@@ -78,7 +78,7 @@ class LinkTable(ScenarioSection):
         listen = parse_address(self.listen, f"{place}.listen")
         return LinkSpec(
             listen=listen,
-            to=parse_address(self.to, f"{place}.to", listen),
+            to=parse_destination(self.to, f"{place}.to", listen),
             forward=read_files(self.words or self.forward, folder, f"{place}.forward"),
             reverse=read_files(self.reverse, folder, f"{place}.reverse"),
             **self.model_dump(include={"name", "seed", "return_path", "idle_s", "most_clients"}),

@@ -39,6 +39,14 @@ def parse_address(text: str, what: str, like: Address | None = None) -> Address:
     return (f"{host}%{scope}" if scope else str(host)), int(port)
 
 
+def parse_destination(text: str, what: str, like: Address | None = None) -> Address:
+    """As :func:`parse_address`, for an address to which datagrams are sent: port 0 is refused."""
+    address = parse_address(text, what, like)
+    if address[1] == 0:
+        raise CallerError(f"{what}: expected a port from 1 to 65535; found {text!r}")
+    return address
+
+
 def text_of(address: Address) -> str:
     """``host:port``, with an IPv6 address in brackets."""
     host, port = address[:2]

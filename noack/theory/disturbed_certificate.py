@@ -25,8 +25,8 @@ from noack.theory.certificate import (
     solve_sum,
 )
 from noack.theory.enclosure import NotDecayingError
-from noack.theory.estimation_error import EstimationError
 from noack.theory.gains import ErrorGains, Forcing, PlantGains, error_gains
+from noack.theory.observer_error import EstimationError
 from noack.theory.persistent_causes import forcing_of
 from noack.theory.superposition import SHARES, solve_divided, soonest
 from noack.theory.trigger_bounds import TriggerBounds

@@ -28,6 +28,7 @@ class Solution(NamedTuple):
 
 def solve_inequalities(F: Matrix, g: Vector) -> Solution:
     """Return the smallest bound of v that follows, for F of shape (k, k) and g of shape (k,)."""
+    F = np.where(F.any(axis=1) | (g > 0), F, 0.0)  # a signal that is 0 affects nothing
     sizes = g + F @ (g + F @ g)  # a right side of the size of x makes w/x dimensionless
     least = sizes[sizes > 0].min(initial=math.inf)
     least = least if math.isfinite(least) else 1.0

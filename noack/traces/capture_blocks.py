@@ -67,7 +67,8 @@ def captured_packets(file: IO[bytes]) -> Iterator[CapturedPacket]:
             count += 1
             yield packet
     except CutCaptureError:
-        raise CutCaptureError(f"is cut off after packet {count}") from None
+        where = f"after packet {count}" if count else "before the end of its first packet"
+        raise CutCaptureError(f"is cut off {where}") from None
     except ValueError as error:
         raise ValueError(f"after packet {count}: {error}") from None
     except struct.error:

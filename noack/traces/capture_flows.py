@@ -57,7 +57,8 @@ class CaptureFlows:
             if len(counts) > _MOST_FLOWS:
                 raise ValueError(f"has more than {_MOST_FLOWS} flows; filter the capture first")
         if not counts:
-            raise ValueError("has no UDP datagrams")
+            cut = self.notes[0].partition(";")[0] if self.notes else ""
+            raise ValueError(f"has no UDP datagrams{': ' if cut else ''}{cut}")
         self.names, self._counts = zip(*counts.most_common(), strict=True)
 
     def choose(self, number: int) -> CapturedFlow:

@@ -1,12 +1,10 @@
-"""Round trips measured by IRTT: the JSON document of ``irtt client -o FILE``, also compressed.
+"""Round trips measured by IRTT: the JSON document of ``irtt client -o FILE``.
 
 Only ``round_trips`` is read, entry by entry; the times are those of the client's monotonic clock.
 Source: irtt-client(1), JSON FORMAT.
 """
 
-import gzip
 import json
-import zlib
 from array import array
 from collections import Counter
 from collections.abc import Iterator
@@ -22,7 +20,6 @@ _PIECE = 2**16
 _LONGEST_ENTRY = 2**16
 _LONGEST_BEGINNING = 2**22
 _KEY = '"round_trips"'
-_GZIP = b"\x1f\x8b"
 _MOST = 2**62
 _WAYS = {"true_up": "forward", "true_down": "in reverse", "true": "on an unknown way"}
 
@@ -51,18 +48,12 @@ def read_irtt(file: IO[bytes], most_packets: int) -> PacketTrace:
         )  # fmt: skip
     except TraceRecordError as error:
         raise ValueError(f"round trip {error.row + 1}: {error}") from None
-    except (OSError, EOFError, zlib.error) as error:
-        raise ValueError(f"cannot be decompressed: {error}") from None
     notes = [f"lost {_WAYS[way]}: {ways[way]}" for way in _WAYS if ways[way]]
     return trace.noted("delays are those of round trips", *notes)
 
 
 def _texts(file: IO[bytes]) -> Iterator[str]:
-    file.seek(0)
-    compressed = file.read(2) == _GZIP
-    file.seek(0)
-    stream: Any = gzip.GzipFile(fileobj=file) if compressed else file
-    while piece := stream.read(_PIECE):
+    while piece := file.read(_PIECE):
         yield piece.decode("ascii", errors="replace")  # only numbers and fixed words are used
 
 
@@ -122,9 +113,6 @@ def _values(entry: Any, place: int) -> tuple[int, int, int, str]:
 
 
 def _is_irtt(head: bytes) -> bool:
-    if head.startswith(_GZIP):
-        with suppress(zlib.error):
-            head = zlib.decompressobj(31).decompress(head, 4096)
     return head.lstrip()[:1] == b"{" and (b'"irtt"' in head or b'"round_trips"' in head)
 
 

@@ -1,17 +1,20 @@
 """Formats of packet traces, one module of this folder each; :func:`read_trace` finds the format."""
 
+import gzip
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import IO
+from typing import IO, Any
 
 from noack.core.errors import CallerError, one_line, why
 from noack.core.file_access import open_regular
 from noack.traces.packet_trace import MAX_PACKETS, PacketTrace
 
 _HEAD_BYTES = 4096
+_GZIP = b"\x1f\x8b"
 
 
 @dataclass(frozen=True)
@@ -59,16 +62,29 @@ def read_trace(
     known = [*formats, *_formats()]
     try:
         with open_regular(path) as file:
-            head = file.read(_HEAD_BYTES)
-            file.seek(0)
+            head, file = _decompressed(file)
             found = next((one for one in known if one.recognises(head)), None)
             if found is None:
-                names = ", ".join(one.name for one in known)
+                names = ", ".join(sorted(one.name for one in known))
                 raise ValueError(
-                    f"not a packet trace; known formats: {names}; a CSV file begins with a "
-                    "header, e.g. sequence,sent_ms,received_ms"
+                    f"not a packet trace; {names} can be read, also compressed by gzip; a CSV file "
+                    "begins with a header, e.g. sequence,sent_ms,received_ms"
                 )
             return found.read(file, most_packets, clocks_differ)
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise CallerError(f"{place or path}: cannot be decompressed: {one_line(error)}") from None
     except (OSError, ValueError) as error:
         reason = f"cannot be read: {why(error)}" if isinstance(error, OSError) else one_line(error)
         raise CallerError(f"{place or path}: {reason}") from None
+
+
+def _decompressed(file: IO[bytes]) -> tuple[bytes, IO[bytes]]:
+    """Return how a file begins, and the file from its beginning, decompressed if necessary."""
+    head = file.read(_HEAD_BYTES)
+    file.seek(0)
+    if not head.startswith(_GZIP):
+        return head, file
+    content: Any = gzip.GzipFile(fileobj=file)
+    head = content.read(_HEAD_BYTES)
+    content.seek(0)
+    return head, content

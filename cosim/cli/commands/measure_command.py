@@ -4,8 +4,8 @@ from typing import TYPE_CHECKING
 
 from cosim.cli import command as cli
 from cosim.cli import measure_options as given
-from cosim.shipped_files import find_trace
 from noack.core.errors import CallerError, ExitStatus
+from noack.traces.shipped_traces import find_trace
 
 if TYPE_CHECKING:
     from cosim.measurement.live.live_measurement import LiveOptions
@@ -58,6 +58,8 @@ def measure(
     from cosim.measurement.trace_sources import SourceOptions
 
     options = _options(deadline, share, window, outage)
+    if settings and for_scenario is None:
+        raise CallerError("--set: replaces a value of the scenario of --for-scenario; give one")
     scenario = None if for_scenario is None else cli.load_scenario(for_scenario, settings)
     request = OutputRequest(out, write, form.value, scenario)
     live = LiveOptions(rate, duration, size, round_trip, silence, save, options.deadline_s)

@@ -18,7 +18,7 @@ from noack.protocol.probe_format import (
     PROBE_BYTES,
     SHORTEST_PERIOD_NS,
 )
-from noack.runtime.address import parse_address, text_of
+from noack.runtime.address import parse_address, parse_destination, text_of
 from noack.runtime.command_line import print_to_stderr
 
 _ADDRESS = re.compile(r".*:[0-9]{1,5}")
@@ -83,7 +83,7 @@ def send_live(address: str, options: LiveOptions) -> ProbeResult:
         )
     wait_ns = max(_SHORTEST_WAIT_NS, round(2 * (options.deadline_s or 0) * NS_PER_S))
     plan = ProbePlan(period_ns, planned, options.size_bytes, options.round_trip, wait_ns)
-    to = parse_address(address, "address")
+    to = parse_destination(address, "address")
     way = "round trip" if options.round_trip else "one way"
     _log(f"{planned} datagrams to {text_of(to)}, one every {period_ns / 1e6:g} ms, {way}")
     return send(to, plan, options.save, _log)

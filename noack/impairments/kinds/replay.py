@@ -36,6 +36,7 @@ from noack.impairments.word_reader import WordReader
 from noack.settings.named_file import NamedFile
 from noack.settings.section import Probability
 from noack.traces.packet_trace import LOST_NS, PacketTrace
+from noack.traces.shipped_traces import find_trace
 from noack.traces.trace_formats import read_trace
 
 MOST_RECORDS = 1_000_000
@@ -74,7 +75,8 @@ class Replay(Impairment):
 
     kind: Literal["replay"] = "replay"
     file: Annotated[str, Field(min_length=1)] | None = None
-    """The trace, e.g. CSV with the columns sequence, sent_ms and received_ms."""
+    """The trace, e.g. CSV with the columns sequence, sent_ms and received_ms; or the name of
+    a shipped one."""
     sent_ns: _Records | None = None
     """Instead of a file: sending times since the first, which is 0."""
     delays_ns: _Records | None = None
@@ -248,10 +250,10 @@ class Replay(Impairment):
         if self.file is None:
             return self
         file = NamedFile(self.file, folder, place)
+        path = find_trace(self.file, folder, file.named)
         trace = read_trace(
-            file.path, place=file.named, clocks_differ=self.clocks_differ,
-            most_packets=MOST_RECORDS,
-        )  # fmt: skip
+            path, place=file.named, clocks_differ=self.clocks_differ, most_packets=MOST_RECORDS
+        )
         return self.of(trace, file)
 
     def of(self, trace: PacketTrace, file: NamedFile) -> Self:

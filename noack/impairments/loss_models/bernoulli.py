@@ -60,8 +60,8 @@ class BernoulliLoss(CorrelatedChance, LossModel):
         how = self.correlation_meaning or ", each independently"
         if self.keep:
             return (
-                f"loses packets{self.correlation_meaning}, so many that "
-                f"{brief_percent(self.probability)} of all are lost in the end"
+                f"loses packets{self.correlation_meaning}, with the probability for which "
+                f"{brief_percent(self.probability)} are lost after the guarantee"
             )
         return f"loses {brief_percent(self.probability)} of the packets{how}"
 

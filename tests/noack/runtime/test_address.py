@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from noack.core.errors import CallerError
-from noack.runtime.address import Address, family_of, parse_address, text_of
+from noack.runtime.address import Address, family_of, parse_address, parse_destination, text_of
 
 
 @given(st.one_of(st.ip_addresses(v=4), st.ip_addresses(v=6)), st.integers(0, 65_535))
@@ -58,3 +58,9 @@ def test_a_mistake_gets_one_line(text: str, says: str) -> None:
         parse_address(text, "here")
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_destination_has_a_port() -> None:
+    assert parse_destination(":9001", "--to") == ("127.0.0.1", 9001)
+    with pytest.raises(CallerError, match="--to: expected a port from 1 to 65535; found ':0'"):
+        parse_destination(":0", "--to")

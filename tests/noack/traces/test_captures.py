@@ -120,7 +120,7 @@ def test_captures_that_do_not_say_what_was_lost() -> None:
         ([pcap_of(*sent)], "has one end only"),
         ([pcap_of()], "has no UDP datagrams"),
         ([pcap_of(*sent, link_type=101)[:-3]], "has one end only"),
-        ([b"\n\r\r\n\0\0\0\0"], "has no UDP datagrams"),
+        ([b"\n\r\r\n\0\0\0\0"], "has no UDP datagrams: the capture is cut off before the end"),
     ):
         with pytest.raises(ValueError, match=message):
             trace_of(*files)

@@ -1,6 +1,7 @@
 """Packet traces and the CSV format: against a reader of a few lines, and on wrong files."""
 
 import csv
+import gzip
 from fractions import Fraction
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from noack.core.errors import CallerError
+from noack.impairments.kinds.replay import Replay
 from noack.traces.packet_trace import TraceRecordError, packet_trace
 from noack.traces.trace_formats import read_trace
 
@@ -85,7 +87,7 @@ def test_clocks_that_differ_give_relative_delays() -> None:
 
 
 WRONG = {
-    "": "not a packet trace; known formats: pcap, CSV, IRTT",
+    "": "not a packet trace; CSV, IRTT, pcap can be read, also compressed by gzip",
     "\x00\x01": "not a packet trace",
     "sent_ms,received_ms\n": "has no packets",
     "sent_ms,received\n1,2\n": "line 1: has no column received_ms (or _s, _us, _ns); its columns: ",
@@ -127,3 +129,23 @@ def test_other_things_than_files(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "missing", Path("/dev/zero")):
         with pytest.raises(CallerError, match=str(path)):
             read_trace(path)
+
+
+def test_compressed_files_are_read_like_others(tmp_path: Path) -> None:
+    content = b"sequence,sent_ms,received_ms\n0,0,31.5\n1,50.1,\n2,100.2,129.7\n"
+    path = tmp_path / "trace.csv.gz"
+    path.write_bytes(gzip.compress(content))
+    assert read_trace(path).delay_ns.tolist() == [31_500_000, -1, 29_500_000]
+    for wrong in (gzip.compress(content)[:-9], gzip.compress(content)[:5], b"\x1f\x8bxxxxxxxxxx"):
+        path.write_bytes(wrong)
+        with pytest.raises(CallerError, match=r"trace\.csv\.gz: cannot be decompressed"):
+            read_trace(path)
+
+
+def test_a_replay_takes_the_name_of_a_shipped_trace(tmp_path: Path) -> None:
+    found = Replay(file="urban_n78_40kmh").without_files(tmp_path, "")
+    assert len(found.delays_ns or ()) == 3174
+    (tmp_path / "urban_n78_40kmh").write_text("sent_ms,received_ms\n0,1\n")  # a file is preferred
+    assert Replay(file="urban_n78_40kmh").without_files(tmp_path, "").delays_ns == (1_000_000,)
+    with pytest.raises(CallerError, match="rural: no such file, nor a shipped trace; there are"):
+        Replay(file="rural").without_files(tmp_path, "")

@@ -1,0 +1,37 @@
+"""Packet traces that come with noack, found by name."""
+
+from pathlib import Path
+
+from noack.core.errors import CallerError, shortened
+
+_LONGEST = 100
+
+
+def find_trace(name: str, folder: Path = Path(), named: str = "") -> Path:
+    """Return the path of a trace given by path, or by the name of a shipped one.
+
+    Args:
+        name: as the user gave it.
+        folder: a relative path is relative to it.
+        named: what a message calls the name; by default the name.
+
+    Raises:
+        CallerError: a bare name that is neither that of a file nor that of a shipped trace.
+    """
+    path = folder / name
+    if len(Path(name).parts) != 1 or Path(name).suffix or len(name) > _LONGEST or path.exists():
+        return path
+    shipped = {one.stem: one for one in _folder().glob("*/*.csv")}
+    if name in shipped:
+        return shipped[name]
+    raise CallerError(
+        f"{named or shortened(name)}: no such file, nor a shipped trace; "
+        f"there are {', '.join(sorted(shipped))}"
+    )
+
+
+def _folder() -> Path:
+    """Return their folder: in the installed package, or in the repository."""
+    root = Path(__file__).parents[2]
+    installed = root / "cosim" / "scenarios" / "traces"
+    return installed if installed.is_dir() else root / "scenarios" / "traces"
