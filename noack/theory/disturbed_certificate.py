@@ -77,7 +77,9 @@ class DisturbedCertificate:
         bound = self.trigger.bound(conditions, level, floor or None)
         part = self._together._replace(bound=bound)
         (found,) = solve_sum([part], conditions, background, structured=structured)
-        if decays and not self.trigger.beta and not self.start_error and len(shares) > 1:
+        # The mean of an integral bounds e_s over a time that suits only one of several parts.
+        is_divided = not self.trigger.beta and not self.trigger.area and not self.start_error
+        if decays and is_divided and len(shares) > 1:
             with contextlib.suppress(VoidError, NotDecayingError):
                 return self._of_constant_threshold(conditions, found.inter_event_s or 0.0)
         return found, None
@@ -94,8 +96,14 @@ class DisturbedCertificate:
             VoidError: the loop gain is not below 1, at any rate.
             NotDecayingError: a mode of the loop or of the observer does not decay.
         """
-        of_start, of_rest = self.trigger.divided(conditions, apart_s)
-        rest = self._persistent._replace(bound=of_rest)
+        found: list[tuple[float, TriggerBound, Part]] = []
+        for of_start, of_rest in self.trigger.divided(conditions, apart_s):
+            rest = self._persistent._replace(bound=of_rest)
+            with contextlib.suppress(VoidError):
+                found.append((solve_sum([rest], conditions)[0].state, of_start, rest))
+        if not found:
+            raise VoidError("no bound of e_s alone has a certificate")
+        _, of_start, rest = min(found, key=lambda one: one[0])
 
         def solved(rate_per_s: float) -> tuple[Constants, Constants]:
             start = self._at_rate(rate_per_s, of_start)

@@ -149,21 +149,18 @@ class TriggerBounds:
 
     def divided(
         self, conditions: NetworkConditions, apart_s: float
-    ) -> tuple[TriggerBound, TriggerBound]:
-        """Return the bounds without their constants, and with them, both in units of 1.
+    ) -> list[tuple[TriggerBound, TriggerBound]]:
+        """Return each bound without its constant, and with it, both in units of 1.
 
-        ``apart_s`` is a known lower bound of the inter-event time.
+        Parts of the signals may be added only if they use the same bound. ``apart_s`` is a known
+        lower bound of the inter-event time.
 
         Raises: as :meth:`bound`.
         """
         whole = self.bound(conditions, self.floor, self.floor or None)
-        parts = []
-        for share in (0.0, 1.0):
-            every = [
-                one._replace(beta=share * one.beta, reached=None, also=()) for one in whole.every
-            ]
-            parts.append(every[0]._replace(also=tuple(every[1:]), apart_s=apart_s, unit=1.0))
-        return parts[0], parts[1]
+        times = {"apart_s": apart_s, "due_s": whole.due_s, "unit": 1.0, "reached": None, "also": ()}
+        alone = [one._replace(**times) for one in whole.every]
+        return [(one._replace(beta=0.0), one) for one in alone]
 
     def text(self) -> str:
         """Return in words what the rule promises about e_s."""
