@@ -74,13 +74,17 @@ class TheoryCoverage:
             return "plant.measurement: the state is measured with noise"
         return None
 
-    def require_unchanging(self) -> None:
-        """Raise CallerError if the settings change, or the set point is not 0."""
+    def require_constant(self) -> None:
+        """Raise CallerError if the settings change."""
         if self.scenario.changes:
             raise CallerError(
                 "changes: needs settings that stay the same during the run; "
                 "leave changes out, or use --set changes=[]"
             )
+
+    def require_unchanging(self) -> None:
+        """Raise CallerError if the settings change, or the set point is not 0."""
+        self.require_constant()
         if any(self.scenario.controller.setpoint or ()):
             raise CallerError("controller.setpoint: needs the set point 0")
 
