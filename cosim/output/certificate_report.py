@@ -216,9 +216,12 @@ def _theorem_2(scenario: Scenario, certificate: ScenarioCertificate) -> Theorem2
 
 
 def with_weight(
-    resolved: Scenario, which: str, progress: Callable[[float], None] = lambda share: None
+    resolved: Scenario,
+    which: str,
+    late_periods: int = 0,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> tuple[Scenario, Matrix | None]:
-    """Return the scenario with the requested weight, and W if noack chose it.
+    """Return the scenario with the requested weight, and W if noack chose it for its schedule.
 
     Raises:
         CallerError: the choice is unknown, or no weight can be chosen for this scenario.
@@ -231,7 +234,7 @@ def with_weight(
         try:
             weight = choose_weight(
                 loop_of(resolved), trigger.beta, trigger.alpha_per_s,
-                resolved.network.longest_burst, progress,
+                nominal_conditions(resolved, late_periods), progress,
             )  # fmt: skip
         except NotDecayingError as error:
             raise CallerError(f"weight chosen: {error}") from None
@@ -263,7 +266,7 @@ def certificates_of(
     allowed = resolved.certificate.late_periods if late_periods is None else late_periods
     if not 0 <= allowed <= MOST_LATE:
         raise CallerError(f"late: {allowed} steps; give 0 to {MOST_LATE}")
-    weighted, W = with_weight(resolved, weight, progress)
+    weighted, W = with_weight(resolved, weight, allowed, progress)
     return Certificates(weighted, allowed, W)
 
 
