@@ -158,8 +158,10 @@ class TriggerBounds:
         Raises: as :meth:`bound`.
         """
         whole = self.bound(conditions, self.floor, self.floor or None)
-        times = {"apart_s": apart_s, "due_s": whole.due_s, "unit": 1.0, "reached": None, "also": ()}
-        alone = [one._replace(**times) for one in whole.every]
+        alone = [
+            one._replace(apart_s=apart_s, due_s=whole.due_s, unit=1.0, reached=None, also=())
+            for one in whole.every
+        ]
         return [(one._replace(beta=0.0), one) for one in alone]
 
     def text(self) -> str:
