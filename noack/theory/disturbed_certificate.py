@@ -15,7 +15,6 @@ from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix
 from noack.theory.certificate import (
-    Background,
     Constants,
     NetworkConditions,
     Part,
@@ -60,12 +59,11 @@ class DisturbedCertificate:
         ):
             raise VoidError("after a change or at a set-point the estimation error is not known")
         conditions = self.trigger.tested(conditions)
-        background = Background(input_error=self.start_error)
         structured = self.start_error == 0.0
         if decays and self.resolved.coverage.is_decaying:
             try:
                 return solve_divided(
-                    self._decaying, self._persistent, conditions, background,
+                    self._decaying, self._persistent, conditions, self.start_error,
                     structured=structured, shares=shares,
                 )  # fmt: skip
             except NotDecayingError:
@@ -73,7 +71,7 @@ class DisturbedCertificate:
         level, floor = max(self.trigger.beta, self.trigger.floor), self.trigger.floor
         bound = self.trigger.bound(conditions, level, floor or None)
         part = self._together._replace(bound=bound)
-        (found,) = solve_sum([part], conditions, background, structured=structured)
+        (found,) = solve_sum([part], conditions, self.start_error, structured=structured)
         return found, None
 
     @cached_property

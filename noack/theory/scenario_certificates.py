@@ -16,7 +16,6 @@ from noack.settings.matrices import Rows
 from noack.theory.assumptions import Assumption, below, certificate_assumptions
 from noack.theory.box import BoxGains
 from noack.theory.certificate import (
-    Background,
     Constants,
     NetworkConditions,
     VoidError,
@@ -250,8 +249,7 @@ class CertificateScope:
         decays = math.inf if self._held or due else -spectral_abscissa(self._loop.H)
         self._decay = {"the models": decays, "A + BK": -spectral_abscissa(closed_loop)}
         self._plant_at = plant_at
-        self._errors: dict[float, ErrorGains] = {}
-        self._plants: dict[tuple[float, float, bytes], PlantGains] = {}
+        self._plants: dict[float, PlantGains] = {}
 
     def certificate(
         self, conditions: NetworkConditions, shares: Sequence[float] = SHARES
@@ -351,23 +349,22 @@ class CertificateScope:
     def _first_phase(self, conditions: NetworkConditions) -> Constants:
         trigger, decay = self._trigger, min(self._decay.values())
         beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
-        start = self._loop.x0[:, None]
         if trigger.is_homogeneous:
-            return self._fastest(conditions, decay, start)
+            return self._fastest(conditions, decay)
         if not self._held and below(alpha, decay) and floor < beta:
             try:
-                return self._solve(conditions, alpha, alpha, start, beta, beta)
+                return self._solve(conditions, alpha, beta, beta)
             except NotDecayingError:
                 if floor > 0:
                     raise
-                return self._slower(conditions, alpha, start)
+                return self._slower(conditions, alpha)
         # Certify a slower decay or none; the smallest event level is then the floor, if any.
         is_constant = self._held or floor > 0 or trigger.area > 0
         slower = 0.0 if is_constant else max(_SLOWER * decay, 0.0)
         level = max(beta, floor)
-        return self._solve(conditions, slower, slower, start, level, floor or None)
+        return self._solve(conditions, slower, level, floor or None)
 
-    def _fastest(self, conditions: NetworkConditions, decay: float, start: Matrix) -> Constants:
+    def _fastest(self, conditions: NetworkConditions, decay: float) -> Constants:
         """Return bounds for a threshold that is a share of the state: any rate may be certified.
 
         The rate is the one at which the bound of ‖x‖ falls to a tenth of ‖x(0)‖ first.
@@ -375,24 +372,22 @@ class CertificateScope:
         Raises:
             VoidError: there are no bounds, not even without decay.
         """
-        size = float(np.linalg.norm(start)) or 1.0
+        size = float(np.linalg.norm(self._loop.x0)) or 1.0
         found: list[tuple[float, Constants]] = []
         # Inputs of an earlier run are bounded without a rate.
         decays = math.isfinite(decay) and decay > 0 and self._start_error == 0.0
         for share in _SHARES_OF_DECAY if decays and not self._held else ():
             rate = share * decay
             try:
-                one = self._solve(conditions, rate, rate, start, 0.0, None)
+                one = self._solve(conditions, rate, 0.0, None)
             except (NotDecayingError, VoidError):
                 break  # larger rates have larger gains
             found.append((math.log(max(10 * one.state / size, 1.0)) / rate, one))
         if not found:
-            return self._solve(conditions, 0.0, 0.0, start, 0.0, None)
+            return self._solve(conditions, 0.0, 0.0, None)
         return min(found, key=lambda one: one[0])[1]
 
-    def _slower(
-        self, conditions: NetworkConditions, alpha_per_s: float, start: Matrix
-    ) -> Constants:
+    def _slower(self, conditions: NetworkConditions, alpha_per_s: float) -> Constants:
         """Return bounds that decay more slowly than the threshold, for a box too large for α.
 
         Raises:
@@ -401,32 +396,27 @@ class CertificateScope:
         for share in _SHARES_OF_ALPHA:
             rate = share * alpha_per_s
             with contextlib.suppress(NotDecayingError):
-                return self._solve(conditions, rate, rate, start, self._trigger.beta, None)
+                return self._solve(conditions, rate, self._trigger.beta, None)
         raise NotDecayingError("the uncertainty box is too large for the loop's gains")
 
     def _solve(
         self,
         conditions: NetworkConditions,
-        error_alpha_per_s: float,
-        plant_alpha_per_s: float,
-        start: Matrix,
+        alpha_per_s: float,
         level: float,
         reached: float | None,
     ) -> Constants:
-        if error_alpha_per_s not in self._errors:
-            self._errors[error_alpha_per_s] = error_gains(self._loop, error_alpha_per_s)
-        error = self._errors[error_alpha_per_s]
-        key = (error_alpha_per_s, plant_alpha_per_s, start.tobytes())
-        if key not in self._plants:
-            self._plants[key] = replace(
-                self._plant_at(error, start, plant_alpha_per_s),
+        if alpha_per_s not in self._plants:
+            error = error_gains(self._loop, alpha_per_s)
+            self._plants[alpha_per_s] = replace(
+                self._plant_at(error, self._loop.x0[:, None], alpha_per_s),
                 further_outputs=self._trigger.outputs,
             )
-        background = Background(input_error=self._start_error)
+        plant = self._plants[alpha_per_s]
         # Inputs of an earlier run are covered by their norm only.
-        structured = self._start_error == 0.0
+        earlier = self._start_error
         bound = self._trigger.bound(conditions, level, reached)
-        return solve(error, self._plants[key], conditions, bound, background, structured=structured)
+        return solve(plant.error, plant, conditions, bound, earlier, structured=earlier == 0.0)
 
 
 def _at_floor(first: Constants, share: float) -> Constants:

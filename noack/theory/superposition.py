@@ -10,8 +10,6 @@ least λβe^{−αt} + (1 − λ)ε, for any λ in [0, 1].
 from collections.abc import Sequence
 
 from noack.theory.certificate import (
-    NO_BACKGROUND,
-    Background,
     Constants,
     NetworkConditions,
     Part,
@@ -26,7 +24,7 @@ def solve_divided(
     decaying: Part,
     persistent: Part,
     conditions: NetworkConditions,
-    background: Background = NO_BACKGROUND,
+    earlier_error: float = 0.0,
     *,
     structured: bool = True,
     shares: Sequence[float] = SHARES,
@@ -45,7 +43,7 @@ def solve_divided(
             part._replace(bound=part.bound._replace(reached=level))
             for part, level in zip((decaying, persistent), reached, strict=True)
         ]
-        first, second = solve_sum(parts, conditions, background, structured=structured)
+        first, second = solve_sum(parts, conditions, earlier_error, structured=structured)
         return first, second
 
     tried = [solved(share) for share in (shares if floor > 0 else shares[:1])]
