@@ -84,7 +84,8 @@ def _carry_losses(row: int, old: LinkProgram, before: LinkMemory, after: LinkMem
     if counted:
         count = len(known) - 1
         if count == mask:
-            losses[:] = known
+            for place in range(len(losses)):
+                losses[place] = known[place]
             return
     elif listed:
         count = min(width, packets)
