@@ -1,4 +1,7 @@
-"""Compiled rules and the same rules in Python make the same decisions, bit for bit."""
+"""Compiled rules and the same rules in Python make the same decisions, bit for bit.
+
+So do their memories of the flows.
+"""
 
 from dataclasses import astuple
 from typing import Any
@@ -13,9 +16,8 @@ from netem.engine.many_decisions import admit_many
 from netem.link_machine import Link
 from netem.rule_program import program_of
 from netem.rules.settings_change import carry
+from netem.words.words_to_settings import settings_of
 from noack.impairments.link_records import (
-    Counters,
-    FlowState,
     LinkMemory,
     LinkProgram,
     PacketDecision,
@@ -27,10 +29,26 @@ from noack.impairments.link_settings import LinkSettings
 from tests.netem import any_settings
 
 FLOWS = 4
+Batch = list[tuple[int, int, int]]
+"""Flow, size, and time of each datagram."""
 arrivals = st.lists(
-    st.tuples(st.integers(0, FLOWS - 1), st.integers(0, 2000), st.integers(0, 3_000_000)),
+    st.tuples(
+        st.integers(0, FLOWS - 1),
+        st.integers(0, 2000),
+        st.integers(0, 3_000_000) | st.integers(0, 10**7),
+    ),
     min_size=1,
     max_size=120,
+)
+recorded_decisions = st.builds(
+    RecordedDecision, fate=st.integers(0, 5), delay_ns=st.integers(-1, 10**7),
+    copy_delay_ns=st.just(-1) | st.integers(0, 10**7), bit=st.integers(-1, 9),
+    copy_bit=st.integers(-1, 9),
+)  # fmt: skip
+EVERYTHING = settings_of(
+    "loss gemodel 10% 20% 90% duplicate 10% corrupt 10% 50% delay 5ms 3ms distribution "
+    "paretonormal lossrel 50% reorder 10% rate 10mbit queue 20 blackout 0.5s-0.6s every 1s "
+    "mansd 4 limit 1000000"
 )
 
 
@@ -43,7 +61,7 @@ class Compiled:
         self._first_delivered = own.first_delivered
         self._seen: set[int] = set()
 
-    def decide(self, batch: list[tuple[int, int, int]]) -> list[tuple[Any, ...]]:
+    def decide(self, batch: Batch) -> list[tuple[Any, ...]]:
         flows, sizes, times = (np.array(column, np.int64) for column in zip(*batch, strict=True))
         for flow in set(flows.tolist()) - self._seen:
             self._seen.add(flow)
@@ -60,7 +78,9 @@ class Compiled:
         state = state._replace(
             flows=self.state.flows, link=self.state.link, counters=self.state.counters
         )
-        program = compiled_program(plain)
+        program = compiled_program(plain)._replace(
+            decisions=self.program.decisions, decisions_begin=self.program.decisions_begin
+        )
         compile_rule(carry)(self.program, self.state, program, state, np.full(FLOWS, -1))
         self.program, self.state = program, state
 
@@ -69,30 +89,66 @@ def row_of(flow: int) -> int:
     return FLOWS - 1 - flow
 
 
-def ascending(batch: list[tuple[int, int, int]]) -> list[tuple[int, int, int]]:
+def ascending(batch: Batch) -> Batch:
     times = np.cumsum([gap for _, _, gap in batch]).tolist()
     return [(flow, size, t) for (flow, size, _), t in zip(batch, times, strict=True)]
 
 
-@settings(max_examples=120)
-@given(own=any_settings.harsh, other=st.none() | any_settings.harsh, batch=arrivals)
+def check_same(compiled: Compiled, plain: Link, batch: Batch) -> list[tuple[Any, ...]]:
+    """Compare the decisions and the link's whole memory; return the decisions."""
+    decisions = compiled.decide(batch)
+    assert decisions == [astuple(plain.decide(*arrival)) for arrival in batch]
+    found: Any = compiled.state
+    expected = plain._state
+    for flow, row in plain._rows.items():
+        own = row_of(flow)
+        assert found.flows[own].tolist() == astuple(expected.flows[row])
+        assert found.memory[own].tolist() == [*map(astuple, expected.memory[row])]
+        for rows, of_plain in (
+            (found.recent_ns, expected.recent_ns),
+            (found.losses, expected.losses),
+        ):
+            np.testing.assert_array_equal(rows[own], of_plain[row])
+    np.testing.assert_array_equal(found.departures_ns, expected.departures_ns)
+    if expected.queues:
+        queues = array_of(found.queues.dtype, expected.queues)
+        np.testing.assert_array_equal(found.queues, queues)
+    assert found.counters.tolist() == astuple(expected.counters)
+    assert found.link.tolist() == astuple(expected.link)
+    return decisions
+
+
+@settings(max_examples=150)
+@given(
+    own=any_settings.harsh | any_settings.computable,
+    other=st.none() | any_settings.harsh,
+    batch=arrivals.map(ascending),
+    recorded=st.just([]) | st.lists(st.lists(recorded_decisions, max_size=8), max_size=3),
+)
 def test_compiled_and_plain_rules_agree(
-    own: LinkSettings, other: LinkSettings | None, batch: list[tuple[int, int, int]]
+    own: LinkSettings,
+    other: LinkSettings | None,
+    batch: Batch,
+    recorded: list[list[RecordedDecision]],
 ) -> None:
-    plain, compiled = Link(own, 3, "a"), Compiled(own)
-    batch = ascending(batch)
-    half = len(batch) // 2
-    parts = [batch] if other is None or not half else [batch[:half], batch[half:]]
-    for number, part in enumerate(parts):
-        if number and other is not None:
-            plain.change(other)
-            compiled.change(other)
-        assert compiled.decide(part) == [astuple(plain.decide(*arrival)) for arrival in part]
-    assert Counters(*compiled.state.counters.tolist()) == plain.counters  # type: ignore[attr-defined]
-    for flow in range(FLOWS):
-        expected = plain.flow(flow)
-        found = FlowState(*compiled.state.flows[row_of(flow)].tolist())  # type: ignore[attr-defined]
-        assert expected is None or found == expected
+    plain, compiled = Link(own, 3, "a", decisions=recorded), Compiled(own, decisions=recorded)
+    half = len(batch) if other is None else len(batch) // 2
+    if half:
+        check_same(compiled, plain, batch[:half])
+    if other is not None:
+        plain.change(other)
+        compiled.change(other)
+        check_same(compiled, plain, batch[half:])
+
+
+def test_many_decisions_of_all_impairments_are_the_same() -> None:
+    """Five thousand datagrams, with all impairments together."""
+    rng = np.random.default_rng(5)
+    limits = (FLOWS, 1500, 2_000_000)
+    batch = ascending(list(zip(*(rng.integers(0, n, 5_000).tolist() for n in limits), strict=True)))
+    decisions = check_same(Compiled(EVERYTHING), Link(EVERYTHING, 3, "a"), batch)
+    fate = list(PacketDecision.__slots__).index("fate")
+    assert {decision[fate] for decision in decisions} == set(range(6))
 
 
 @pytest.mark.parametrize("mansd", [None, 2])

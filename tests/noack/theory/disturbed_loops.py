@@ -141,7 +141,7 @@ def simulate_disturbed(loop: DisturbedLoop, rng: np.random.Generator) -> Trace:
         *networks(int(rng.integers(2**32)), loop.system),
         floor=loop.floor,
         pushes=pushes,
-        estimate=lambda step, x, u: x + noise[:, step],
+        estimate=lambda step, x, inputs: x + noise[:, step],
     )
 
 

@@ -184,11 +184,11 @@ class Plants(NamedTuple):
     """(runs, STEPS) the index of each run's plant in each step."""
 
 
-Estimate = Callable[[int, Reals, Reals], Reals]
-"""Returns x̂ at a step, from x and the input of the step before, (runs, n) and (runs, m)."""
+Estimate = Callable[[int, Reals, list[Reals]], Reals]
+"""Returns x̂ at a step, from x and the inputs since the last test, (runs, n) and (runs, m)."""
 
 
-def exact_state(step: int, x: Reals, u: Reals) -> Reals:
+def exact_state(step: int, x: Reals, inputs: list[Reals]) -> Reals:
     """A sensor that measures x."""
     return x
 
@@ -230,12 +230,12 @@ def simulate(
     synchronised = np.full(runs, system.known_start)
     commands: list[tuple[Reals, Flags]] = []
     trace, shortest, every = np.zeros((5, runs, STEPS)), 10**9, np.arange(runs)
-    u = np.zeros((runs, K.shape[1]))
+    inputs: list[Reals] = []
     for step in range(STEPS):
         threshold = max(system.beta * np.exp(-system.alpha * step * system.step_s), floor)
         trace[0, :, step], known = norms((x_s - x) @ W), x
         if step % system.sample_steps == 0:
-            known = estimate(step, x, u)
+            known, inputs = estimate(step, x, inputs), []
             tested = norms((x_s - known) @ W)
             trace[0, :, step] = np.maximum(trace[0, :, step], tested)
             event = tested > threshold
@@ -266,6 +266,7 @@ def simulate(
         nothing = (np.zeros((runs, K.shape[1])), np.zeros(runs, bool))
         u, has_input = commands[step - system.lag] if step >= system.lag else nothing
         u = np.where(has_input[:, None], u, 0.0)
+        inputs.append(u)
         for i, value in enumerate(
             (
                 np.maximum(norms((x_c - x) @ W), norms((x_c - known) @ W)) * synchronised,
