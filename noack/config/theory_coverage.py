@@ -11,6 +11,13 @@ if TYPE_CHECKING:
     from noack.config.scenario import Scenario
 
 
+UNCERTIFIED_ACKNOWLEDGEMENTS = (
+    "x_s is reset only when an acknowledgement returns, so ‖e_s‖ exceeds the threshold while the "
+    "sensor waits, and (I1), on which every bound rests, does not hold"
+)
+"""Why the baseline with acknowledgements has no certificate."""
+
+
 @dataclass(frozen=True)
 class TheoryCoverage:
     """Which of the paper's theorems, the certificates and the exact simulation cover a scenario."""
@@ -52,7 +59,7 @@ class TheoryCoverage:
         """The first setting besides the trigger that certificates do not cover."""
         scenario = self.scenario
         if scenario.protocol.acknowledges:
-            return 'network.protocol = "ack": updates are acknowledged'
+            return f'network.protocol = "ack": {UNCERTIFIED_ACKNOWLEDGEMENTS}'
         if not self.is_linear:
             return f'plant.system.kind = "{scenario.plant.system.kind}": the plant is not linear'
         if not scenario.controller.is_linear:

@@ -19,7 +19,7 @@ of at least δ, it holds by induction over the events; the largest such δ is us
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from types import MappingProxyType
 from typing import NamedTuple
@@ -28,7 +28,7 @@ import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, LossRule
-from noack.theory.gains import Coefficients, ErrorGains, Growth, Output, PlantGains
+from noack.theory.gains import Coefficients, ErrorGains, Output, PlantGains
 from noack.theory.loss_accumulation import LossAccumulation
 from noack.theory.nonnegative_system import Solution, solve_inequalities
 
@@ -288,12 +288,13 @@ class _Step:
             {output: error.missing(output, dropouts, spacing_s) for output in kernels},
             0.0,
             0.0,
-            {output: self._drifted(output).totals for output in kernels},
+            self._drift,
         )
 
     @cached_property
-    def _drifted(self) -> Callable[[Output], Growth]:
-        return self._plant.growths(self._conditions.delay_s, _COARSE)
+    def _drift(self) -> Mapping[Output, tuple[float, float, float]]:
+        of = self._plant.growths(self._conditions.delay_s, _COARSE)
+        return {output: of(output).totals for output in self._error.outputs}
 
     def _constants(self, bound: "_ErrorBound", events: int, spacing_s: float) -> Constants:
         from_errors = self._from_errors(bound, spacing_s)
