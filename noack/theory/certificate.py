@@ -233,7 +233,11 @@ def solve_sum(
     for _ in range(_ATTEMPTS):
         if spacing_s <= least_s:
             break
-        found_s = min(step.inter_event_s(spacing_s) for step in steps)
+        found_s = math.inf
+        for step in reversed(steps):  # what persists usually comes first
+            found_s = min(found_s, step.inter_event_s(spacing_s))
+            if found_s <= least_s:
+                break
         if found_s >= spacing_s:
             return constants(spacing_s, spacing_s)
         # Iterate from above to the largest spacing that is consistent with itself.

@@ -177,8 +177,11 @@ class ErrorGains:
         def kernel(D: Matrix) -> KernelBounds:
             return response_until(self.scaled_H, D, until_s, cells).through(self.weight)
 
-        areas = [kernel(column[:, None]).area for column in disturbed.T]
-        return Growth(kernel(mismatch), kernel(forced), np.sum([np.zeros(cells), *areas], axis=0))
+        areas = np.zeros(cells)
+        if disturbed.size:
+            followed = response_until(self.scaled_H, disturbed, until_s, cells)
+            areas = followed.areas_of_columns(self.weight)
+        return Growth(kernel(mismatch), kernel(forced), areas)
 
     def stretch(self, until_s: float) -> float:
         """Return sup‖e^{(H+αI)τ}‖_W over τ ≤ ``until_s``, the growth of a sampled error."""
