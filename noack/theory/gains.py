@@ -266,7 +266,10 @@ class PlantGains:
         total = 0.0
         for followed, duration_s in zip(self._disturbed, self._forcing.durations_s, strict=True):
             kernel = followed.through(C)
-            total += min(kernel.integral(), duration_s * kernel.sup())
+            at_most = kernel.integral()
+            if np.isfinite(duration_s):
+                at_most = min(at_most, float(duration_s) * kernel.sup())
+            total += at_most
         return total + self._normally_disturbed(C)
 
     def _normally_disturbed(self, C: Matrix) -> float:
