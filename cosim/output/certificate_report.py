@@ -26,12 +26,14 @@ from noack.theory.paper_bounds import Theorem2, theorem_2
 from noack.theory.run_conditions import ideal_conditions, nominal_conditions
 from noack.theory.scenario_certificates import (
     BOX,
+    OWN_PLANT,
     CertificateScope,
     ScenarioCertificate,
     box,
     outside_box,
     own_plant,
 )
+from noack.theory.setpoint_shift import about_setpoint, void_at_setpoint
 from noack.theory.unlimited_losses import UnlimitedLosses, unlimited_losses
 from noack.theory.weight import choose_weight
 from noack.trigger.decaying import DecayingSettings
@@ -83,7 +85,9 @@ class Certificates:
     """
 
     scenario: Scenario
-    """The resolved scenario of the certificates, with the requested weight."""
+    """The resolved scenario of the certificates, with the requested weight, about its set-point."""
+    setpoint: tuple[float, ...] | None
+    """x_r; all bounds of x are those of x − x_r. None: 0."""
     theorem_2: Theorem2 | None
     """Theorem 2 by the paper's formula, with Δ of ``paper``; None if it cannot be evaluated."""
     weight: Matrix | None
@@ -95,12 +99,16 @@ class Certificates:
     unpredictable: str | None
 
     def __init__(self, scenario: Scenario, late_periods: int, weight: Matrix | None = None) -> None:
-        scenario.coverage.require_unchanging()
+        scenario.coverage.require_constant()
         scenario.coverage.require_certifiable()
+        self.setpoint, void = scenario.controller.setpoint, void_at_setpoint(scenario)
+        if OWN_PLANT in void:
+            raise CallerError(f"controller.setpoint: {void[OWN_PLANT]}")
+        scenario = about_setpoint(scenario)
         self.scenario, self.weight = scenario, weight
         self._scheduled = nominal_conditions(scenario, late_periods)
         conditions = {IDEAL: ideal_conditions(scenario), SCHEDULE: self._scheduled}
-        scopes = (own_plant(scenario), box(scenario))
+        scopes = (own_plant(scenario), None if BOX in void else box(scenario))
         self._scopes = [scope for scope in scopes if scope is not None]
         self._certificates = [
             (under, scope.certificate(of)) for under, of in conditions.items()
@@ -156,6 +164,7 @@ class Certificates:
         """Return all certificates as one document, as ``noack certify --json`` prints it."""
         return {
             "scenario": self.scenario.name,
+            "setpoint": self.setpoint,
             "weight": None if self.weight is None else self.weight.tolist(),
             "paper": {
                 "assumptions": [a._asdict() for a in assumptions(self.scenario)],
@@ -207,9 +216,12 @@ def _theorem_2(scenario: Scenario, certificate: ScenarioCertificate) -> Theorem2
 
 
 def with_weight(
-    resolved: Scenario, which: str, progress: Callable[[float], None] = lambda share: None
+    resolved: Scenario,
+    which: str,
+    late_periods: int = 0,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> tuple[Scenario, Matrix | None]:
-    """Return the scenario with the requested weight, and W if noack chose it.
+    """Return the scenario with the requested weight, and W if noack chose it for its schedule.
 
     Raises:
         CallerError: the choice is unknown, or no weight can be chosen for this scenario.
@@ -222,7 +234,7 @@ def with_weight(
         try:
             weight = choose_weight(
                 loop_of(resolved), trigger.beta, trigger.alpha_per_s,
-                resolved.network.longest_burst, progress,
+                nominal_conditions(resolved, late_periods), progress,
             )  # fmt: skip
         except NotDecayingError as error:
             raise CallerError(f"weight chosen: {error}") from None
@@ -254,7 +266,7 @@ def certificates_of(
     allowed = resolved.certificate.late_periods if late_periods is None else late_periods
     if not 0 <= allowed <= MOST_LATE:
         raise CallerError(f"late: {allowed} steps; give 0 to {MOST_LATE}")
-    weighted, W = with_weight(resolved, weight, progress)
+    weighted, W = with_weight(resolved, weight, allowed, progress)
     return Certificates(weighted, allowed, W)
 
 
@@ -272,6 +284,8 @@ def _limits(scope: CertificateScope, scheduled: NetworkConditions) -> NetworkLim
 def print_certificates(console: Console, found: Certificates) -> None:
     """Print the tables."""
     _print_constants(console, found)
+    if any(found.setpoint or ()):
+        console.print("[dim]x is the distance from the set-point, x − x_r.[/]")
     _print_limits(console, found)
     if (outside := outside_box(found.scenario)) is not None:
         console.print(f"[yellow]the box certificates do not cover this plant:[/] {outside}")

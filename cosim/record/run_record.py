@@ -129,7 +129,9 @@ class RunRecord:
         ``derive`` gets a table's name and some of its rows, in order.
         """
         rows = DerivedRows(self.source, derive)
-        return RunRecord(scenario, rows, self.notices, self.reports, self.kind, self.earlier)
+        derived = RunRecord(scenario, rows, self.notices, self.reports, self.kind, self.earlier)
+        derived.tables = self.tables  # they are those of the run that was recorded
+        return derived
 
     def lives(self, role: str) -> list[Life]:
         """The generations of a process, in order."""

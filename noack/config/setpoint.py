@@ -2,7 +2,8 @@
 
 A set point is an equilibrium of the model, Âx_r + B̂u_r = 0. With u = K(x_c − x_r) + u_r both
 models follow dx/dt = H(x − x_r). All statements about x, x_s and x_c then hold for x − x_r, x_s −
-x_r and x_c − x_r.
+x_r and x_c − x_r, with a constant disturbance if the plant does not rest at x_r
+(:mod:`noack.theory.setpoint_shift`).
 """
 
 import numpy as np

@@ -11,6 +11,13 @@ if TYPE_CHECKING:
     from noack.config.scenario import Scenario
 
 
+UNCERTIFIED_ACKNOWLEDGEMENTS = (
+    "x_s is reset only when an acknowledgement returns, so ‖e_s‖ exceeds the threshold while the "
+    "sensor waits, and (I1), on which every bound rests, does not hold"
+)
+"""Why the baseline with acknowledgements has no certificate."""
+
+
 @dataclass(frozen=True)
 class TheoryCoverage:
     """Which of the paper's theorems, the certificates and the exact simulation cover a scenario."""
@@ -52,7 +59,7 @@ class TheoryCoverage:
         """The first setting besides the trigger that certificates do not cover."""
         scenario = self.scenario
         if scenario.protocol.acknowledges:
-            return 'network.protocol = "ack": updates are acknowledged'
+            return f'network.protocol = "ack": {UNCERTIFIED_ACKNOWLEDGEMENTS}'
         if not self.is_linear:
             return f'plant.system.kind = "{scenario.plant.system.kind}": the plant is not linear'
         if not scenario.controller.is_linear:
@@ -74,13 +81,17 @@ class TheoryCoverage:
             return "plant.measurement: the state is measured with noise"
         return None
 
-    def require_unchanging(self) -> None:
-        """Raise CallerError if the settings change, or the set point is not 0."""
+    def require_constant(self) -> None:
+        """Raise CallerError if the settings change."""
         if self.scenario.changes:
             raise CallerError(
                 "changes: needs settings that stay the same during the run; "
                 "leave changes out, or use --set changes=[]"
             )
+
+    def require_unchanging(self) -> None:
+        """Raise CallerError if the settings change, or the set point is not 0."""
+        self.require_constant()
         if any(self.scenario.controller.setpoint or ()):
             raise CallerError("controller.setpoint: needs the set point 0")
 

@@ -13,6 +13,7 @@ import numpy as np
 from noack.config.resolution import LoopMatrices, loop_of
 from noack.config.scenario import Scenario
 from noack.config.state_estimation import SteadyState, steady_state
+from noack.config.theory_coverage import UNCERTIFIED_ACKNOWLEDGEMENTS
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.theory.certificate import Constants, NetworkConditions
@@ -60,7 +61,9 @@ def assumptions(resolved: Scenario) -> list[Assumption]:
         found.append(_violated("the input is u = K x_c", "eq:ModCont", why))
     if resolved.protocol.acknowledges:
         what = "the sensor resets x_s at every event; nothing is acknowledged"
-        found.append(_violated(what, "Section II", f'protocol = "ack": {_NOT_COVERED}'))
+        found.append(
+            _violated(what, "Section II", f'protocol = "ack": {UNCERTIFIED_ACKNOWLEDGEMENTS}')
+        )
     if linear:
         found.append(_unstable_and_distinct(loop.A))
     found += [_mansd(resolved), _continuous_time(resolved)]

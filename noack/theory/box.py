@@ -22,7 +22,7 @@ import numpy as np
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.contraction import logarithmic_norm
 from noack.theory.enclosure import NotDecayingError, ResponseBounds, response
-from noack.theory.gains import Coefficients, Growth, Output, PlantGains
+from noack.theory.gains import Coefficients, Columns, Output, PlantGains
 
 
 @dataclass(frozen=True)
@@ -80,15 +80,15 @@ class BoxGains(PlantGains):
         found[Output.MISMATCH] += float(np.linalg.norm(w))
         return error, found
 
-    def growth(self, until_s: float, cells: int) -> Growth:
-        """Return the growth of ‖e_s‖_W over ``until_s``, on a grid."""
+    @property
+    def columns(self) -> Columns:
+        """The columns through which e_s is driven; the model error is added to the mismatch."""
         nominal, R = self.split_mismatch
         # If H is the closed loop of the box's centre, there is no nominal mismatch.
         differs = R.any() or not self._rows
         columns = np.concatenate([nominal, self._directions], axis=1)
         forced = columns if differs else self._directions
-        disturbed = self._forcing.limited
-        return self.error.growth(forced, self.input_matrix, disturbed, until_s, cells)
+        return super().columns._replace(mismatch=forced)
 
     @cached_property
     def _rows(self) -> list[int]:

@@ -5,7 +5,7 @@ its guarantee about losses, and the input is held. With all signals scaled by e^
 
     sup‖C e_c‖  ≤ (‖C W⁻¹‖ + Σ_{j<N} sup_{τ≥jδ} ‖C e^{(H+αI)τ} W⁻¹‖) β̃ = D_C β̃          (I1)
     sup‖C x‖    ≤ free_C + gain_C q + Γ_C β̃,   Γ_C ≤ gain_C D_K       (plant, input error p)
-    q           ≤ σ (sup‖KH x‖ + D_KH β̃) + r(σ) (sup‖x‖_W + D_W β̃)    (input of age ≤ σ)
+    q           ≤ Σ_{C = σKH, ½σ²KH², r(σ)W} (sup‖C x‖ + D_C β̃)       (input of age ≤ σ)
     π = sup‖p‖  ≤ D_K β̃ + q
     β̃ = sup‖e_s‖_W ≤ ḡβ + I_E sup‖R_E x‖ + I_B π                      (between two tests)
 
@@ -19,7 +19,8 @@ of at least δ, it holds by induction over the events; the largest such δ is us
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -27,7 +28,7 @@ import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, LossRule
-from noack.theory.gains import Coefficients, ErrorGains, Output, PlantGains
+from noack.theory.gains import Coefficients, ErrorGains, Growth, Output, PlantGains
 from noack.theory.loss_accumulation import LossAccumulation
 from noack.theory.nonnegative_system import Solution, solve_inequalities
 
@@ -36,6 +37,7 @@ _SETTLED = 1e-3
 _ATTEMPTS = 200
 _PICARD_ROUNDS = 8
 _COARSE, _FINE = 64, 256
+_SIGNALS = 6
 
 
 class NetworkConditions(NamedTuple):
@@ -93,6 +95,10 @@ class Constants(NamedTuple):
 
 class VoidError(ArithmeticError):
     """There is no certificate; the message has the reason."""
+
+    def __init__(self, reason: str, loop_gain: float = math.inf) -> None:
+        super().__init__(reason)
+        self.loop_gain = loop_gain
 
 
 class TriggerBound(NamedTuple):
@@ -234,10 +240,13 @@ def solve_sum(
         if spacing_s <= least_s:
             break
         found_s = math.inf
-        for step in reversed(steps):  # what persists usually comes first
-            found_s = min(found_s, step.inter_event_s(spacing_s))
-            if found_s <= least_s:
-                break
+        try:
+            for step in reversed(steps):  # what persists usually comes first
+                found_s = min(found_s, step.inter_event_s(spacing_s))
+                if found_s <= least_s:
+                    break
+        except VoidError:
+            break
         if found_s >= spacing_s:
             return constants(spacing_s, spacing_s)
         # Iterate from above to the largest spacing that is consistent with itself.
@@ -267,27 +276,64 @@ class _Step:
 
     def constants(self, spacing_s: float, inter_event_s: float | None) -> Constants:
         """Return all constants, given inter-event times of at least ``spacing_s``."""
-        events = self._missing(spacing_s)
-        shares = {
-            output: self._error.now(output) + self._missing_gain(output, events, spacing_s)
-            for output in self._error.outputs
-        }
-        from_errors = self._from_errors(events, spacing_s, shares[Output.GAIN])
-        signals = self._signals(shares, from_errors)
+        return self._best(spacing_s)[0]._replace(inter_event_s=inter_event_s)
+
+    def _best(self, spacing_s: float) -> tuple[Constants, float]:
+        """Return the tighter constants of both bounds of e_c, and D_K's part of the present e_s."""
+        error, events = self._error, self._missing(spacing_s)
+        bounds = [_ErrorBound(
+            {output: error.now(output) for output in error.outputs},
+            {output: self._missing_gain(output, events, spacing_s) for output in error.outputs},
+            self._missing_gain(Output.GAIN, events - self._conditions.dropouts, spacing_s),
+            error.now(Output.GAIN),
+        )]  # fmt: skip
+        if self._conditions.delay_s > 0 and error.decays:
+            bounds.append(self._drifting(spacing_s))
+        found, void = [], VoidError("")
+        for bound in bounds:
+            try:
+                found.append((self._constants(bound, events, spacing_s), bound.own))
+            except VoidError as error_:
+                void = min(void, error_, key=lambda one: one.loop_gain)
+        if not found:
+            raise void
+        return min(found, key=lambda one: one[0].state)
+
+    def _drifting(self, spacing_s: float) -> "_ErrorBound":
+        """Return the bound of e_c by its value d ago, and by what has driven it since.
+
+        d ago, e_c consisted of e_s and of the errors of events that are lost.
+        """
+        error, dropouts, kernels = self._error, self._conditions.dropouts, self._error.kernels
+        return _ErrorBound(
+            {output: kernel.sup() for output, kernel in kernels.items()},
+            {output: error.missing(output, dropouts, spacing_s) for output in kernels},
+            0.0,
+            0.0,
+            {output: self._drifted(output).totals for output in kernels},
+        )
+
+    @cached_property
+    def _drifted(self) -> Callable[[Output], Growth]:
+        return self._plant.growths(self._conditions.delay_s, _COARSE)
+
+    def _constants(self, bound: "_ErrorBound", events: int, spacing_s: float) -> Constants:
+        from_errors = self._from_errors(bound, spacing_s)
+        signals = self._signals(bound, from_errors)
         loop_gain, solved = self._solved(signals)
         sensor_error = float(solved[1] + solved[2])
         state = dict(zip(self._states, signals.free + signals.states @ solved, strict=True))
         return Constants(
             self._error.alpha_per_s,
             events,
-            shares[Output.WEIGHTED] * sensor_error / self.unit,
+            float(signals.errors[Output.WEIGHTED] @ solved + solved[2]) / self.unit,
             sensor_error / self.unit,
             float(signals.errors[Output.GAIN] @ solved + solved[0]),
             self._start_error,
             float(state[Output.STATE]),
             float(state[Output.WEIGHTED]),
             float(state[Output.MISMATCH]),
-            inter_event_s,
+            None,
             loop_gain,
             float(solved[2]),
         )
@@ -297,38 +343,44 @@ class _Step:
         """The unit of Δ and β̃/β."""
         return self._bound.beta if self._bound.unit is None else self._bound.unit
 
-    def _signals(
-        self, shares: Mapping[Output, float], from_errors: Mapping[str, float]
-    ) -> "_Signals":
-        """Return how all outputs depend on (q, β̃, η).
+    def _signals(self, bound: "_ErrorBound", from_errors: Mapping[str, float]) -> "_Signals":
+        """Return how all outputs depend on (q, β̃, η, π, sup‖R_E x‖, 1).
 
         An event's x_s − x̂ is at most β̃ + η, the present x_s − x at most β̃.
         """
         free = np.array([state.free for state in self._states.values()])
-        now = self._error.now(Output.GAIN)
+        still = (0.0, 0.0, 0.0)
+        by_input = np.array(bound.drift.get(Output.GAIN, still))
+        present = bound.present[Output.GAIN]
         states = [
-            (gain, from_errors[name], from_errors[name] - gain * now)
+            (gain, from_errors[name], from_errors[name] - gain * present, *(gain * by_input))
             for name, (_, gain) in self._states.items()
         ]
         errors = {
-            output: np.array([0.0, share, share - self._error.now(output)])
-            for output, share in shares.items()
+            output: np.array([0.0, now + gone, gone, *bound.drift.get(output, still)])
+            for (output, now), gone in zip(
+                bound.present.items(), bound.missing.values(), strict=True
+            )
         }
         return _Signals(list(self._states), free, np.array(states), errors)
 
     def _solved(self, signals: "_Signals") -> tuple[float, Vector]:
-        """Return the loop gain and the bounds of (q, β̃, η).
+        """Return the loop gain and the bounds of the signals.
 
         Raises:
             VoidError: the loop gain is not below 1.
         """
         free, errors = signals.free, signals.errors
+        hold_s = self._conditions.hold_s
         held: dict[str, float] = {
-            Output.GAIN_RATE: self._conditions.hold_s, Output.WEIGHTED: self._remainder,
-        }  # fmt: skip
+            Output.GAIN_RATE: hold_s,
+            Output.GAIN_CURVATURE: hold_s**2 / 2,
+            Output.WEIGHTED: self._remainder,
+        }
         beyond = max(self._start_error, self._background.input_error)
         at_growth = np.maximum(free, signals.row({Output.MISMATCH: self._background.mismatch}))
-        input_error = errors[Output.GAIN] + np.array([1.0, 0.0, 0.0])
+        held_input, _, estimated, *_ = np.eye(_SIGNALS)
+        input_error = errors[Output.GAIN] + held_input
 
         through = signals.row(held)
         from_errors = sum(gain * errors[Output(output)] for output, gain in held.items())
@@ -339,21 +391,24 @@ class _Step:
             through @ signals.states + estimation.from_input * input_error,
             estimation.fixed + float(through @ free) + estimation.from_input * beyond,
         )
+        through = signals.row({Output.MISMATCH: 1.0})
+        of_mismatch = (through @ signals.states, float(through @ at_growth))
+        others = ((input_error, beyond), of_mismatch, (0.0 * input_error, 1.0))
 
         def solved(growing: _Growing) -> Solution:
             through = signals.row(growing.shares)
-            after = np.array([0.0, 0.0, growing.estimation])
-            F = through @ signals.states + growing.input_error * input_error + after
+            F = through @ signals.states + growing.input_error * input_error
+            F += growing.estimation * estimated
             fixed = growing.fixed + through @ at_growth + growing.input_error * beyond
-            grown = (F, max(self._background.sensor_error, fixed))
-            return solve_inequalities(*map(np.array, zip(of_age, grown, of_estimate, strict=True)))
+            rows = (of_age, (F, max(self._background.sensor_error, fixed)), of_estimate, *others)
+            return solve_inequalities(*map(np.array, zip(*rows, strict=True)))
 
         # Of each bound one growth applies, and all bounds hold.
         found = [_largest([solved(one) for one in growths]) for growths in self._growths]
         gain = min(one.loop_gain for one in found)
         bounds = [one.bound for one in found if one.bound is not None]
         if not bounds:
-            raise VoidError(f"the loop gain of the errors is {gain:.3g}, not below 1")
+            raise VoidError(f"the loop gain of the errors is {gain:.3g}, not below 1", gain)
         return gain, np.min(bounds, axis=0)
 
     def _missing_gain(self, output: Output, events: int, spacing_s: float) -> float:
@@ -361,20 +416,20 @@ class _Step:
             return self._error.missing(output, events, spacing_s)
         return self._error.missing_until(output, events, self._bound.due_s)
 
-    def _from_errors(self, events: int, spacing_s: float, share: float) -> Mapping[str, float]:
-        """Return Γ_C for every output, from D_K, the ``share``, and from the losses in windows.
+    def _from_errors(self, bound: "_ErrorBound", spacing_s: float) -> Mapping[str, float]:
+        """Return Γ_C for every output, from D_K and from the losses in windows.
 
         The second is computed only where it can be smaller: where all lost updates together have
         less effect than the longest burst at its largest.
         """
+        present = bound.present[Output.GAIN] + bound.in_flight
+        share = bound.present[Output.GAIN] + bound.missing[Output.GAIN]
         found = {output: gain * share for output, (_, gain) in self._states.items()}
         if self._lost is None:
             return found
-        error, windows = self._error, self._conditions.guarantee.windows
-        in_flight = events - self._conditions.dropouts
-        present = error.now(Output.GAIN) + self._missing_gain(Output.GAIN, in_flight, spacing_s)
+        windows = self._conditions.guarantee.windows
         density = min(window.losses / window.packets for window in windows)
-        lasting = density * error.kernels[Output.GAIN].integral()
+        lasting = density * self._error.kernels[Output.GAIN].integral()
         if not lasting < (share - present) * spacing_s:
             return found
         for output, (_, gain) in self._states.items():
@@ -384,8 +439,7 @@ class _Step:
 
     def inter_event_s(self, spacing_s: float) -> float:
         """Return the time that ‖e_s‖_W needs to the next event, given the spacing before it."""
-        found = self.constants(spacing_s, None)
-        own = self._error.now(Output.GAIN)
+        found, own = self._best(spacing_s)
         sensor_error = found.overshoot * self.unit - found.estimation_error
         others = found.input_error - own * sensor_error
         estimation = found.estimation_error
@@ -417,16 +471,34 @@ class _Step:
         return dropouts + math.ceil(delay_s / spacing_s)
 
 
+class _ErrorBound(NamedTuple):
+    """sup‖C e_c‖ ≤ (present_C + missing_C) β̃ + drift_C · (π, sup‖R_E x‖, 1), for every output C."""
+
+    present: Mapping[Output, float]
+    """The gain of e_s, now or where the drift begins."""
+    missing: Mapping[Output, float]
+    """The gain of the events that are missing then."""
+    in_flight: float
+    """The part of missing_K that is not lost."""
+    own: float
+    """The part of present_K that is the e_s of now."""
+    drift: Mapping[Output, tuple[float, float, float]] = MappingProxyType({})
+    """The gains of what has driven e_c since then; none without a delay."""
+
+
 class _Signals(NamedTuple):
-    """The outputs of x and e_c as linear functions of (q, β̃, η), η = sup‖x̂ − x‖_W."""
+    """The outputs of x and e_c as linear functions of (q, β̃, η, π, sup‖R_E x‖, 1).
+
+    η = sup‖x̂ − x‖_W.
+    """
 
     names: list[str]
     free: Vector
     """(k,) the constant part of sup‖C x‖."""
     states: Matrix
-    """(k, 3)"""
+    """(k, 6)"""
     errors: Mapping[Output, Vector]
-    """(3,) of sup‖C e_c‖."""
+    """(6,) of sup‖C e_c‖."""
 
     def row(self, gains: Mapping[str, float]) -> Vector:
         """Return gains of the outputs, by name, as an array (k,)."""

@@ -5,6 +5,7 @@ persists (disturbances, noise, the floor). If α is too large, all are bounded t
 decay.
 """
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -27,7 +28,7 @@ from noack.theory.enclosure import NotDecayingError
 from noack.theory.gains import ErrorGains, Forcing, PlantGains, error_gains
 from noack.theory.observer_error import EstimationError
 from noack.theory.persistent_causes import forcing_of
-from noack.theory.superposition import SHARES, solve_divided
+from noack.theory.superposition import SHARES, solve_divided, soonest
 from noack.theory.trigger_bounds import TriggerBounds
 
 PlantAt = Callable[[ErrorGains, Matrix, float], PlantGains]
@@ -42,6 +43,8 @@ class DisturbedCertificate:
     plant_at: PlantAt
     trigger: TriggerBounds
     start_error: float
+    slowest_per_s: float
+    """The decay rate of the models and of A + BK, the smaller one."""
 
     def constants(
         self, conditions: NetworkConditions, *, decays: bool, shares: Sequence[float] = SHARES
@@ -74,15 +77,49 @@ class DisturbedCertificate:
         bound = self.trigger.bound(conditions, level, floor or None)
         part = self._together._replace(bound=bound)
         (found,) = solve_sum([part], conditions, background, structured=structured)
+        # The mean of an integral bounds e_s over a time that suits only one of several parts.
+        is_divided = not self.trigger.beta and not self.trigger.area and not self.start_error
+        if decays and is_divided and len(shares) > 1:
+            with contextlib.suppress(VoidError, NotDecayingError):
+                return self._of_constant_threshold(conditions, found.inter_event_s or 0.0)
         return found, None
+
+    def _of_constant_threshold(
+        self, conditions: NetworkConditions, apart_s: float
+    ) -> tuple[Constants, Constants]:
+        """Return the constants of what the start causes, and of what persists.
+
+        The threshold has no rate; that of :func:`soonest` is taken. ``apart_s`` is a lower bound of
+        the inter-event time, certified without dividing the causes.
+
+        Raises:
+            VoidError: the loop gain is not below 1, at any rate.
+            NotDecayingError: a mode of the loop or of the observer does not decay.
+        """
+        found: list[tuple[float, TriggerBound, Part]] = []
+        for of_start, of_rest in self.trigger.divided(conditions, apart_s):
+            rest = self._persistent._replace(bound=of_rest)
+            with contextlib.suppress(VoidError):
+                found.append((solve_sum([rest], conditions)[0].state, of_start, rest))
+        if not found:
+            raise VoidError("no bound of e_s alone has a certificate")
+        _, of_start, rest = min(found, key=lambda one: one[0])
+
+        def solved(rate_per_s: float) -> tuple[Constants, Constants]:
+            start = self._at_rate(rate_per_s, of_start)
+            first, second = solve_sum([start, rest], conditions)
+            return first, second
+
+        return soonest(solved, self.slowest_per_s, loop_of(self.resolved).x0)
 
     @cached_property
     def _decaying(self) -> Part:
-        alpha_per_s = self.trigger.alpha_per_s
-        plant = self._plant(alpha_per_s)
-        bound = TriggerBound(self.trigger.beta, None)
-        estimation = self._estimation.decaying(alpha_per_s)
-        return Part(plant.error, plant, bound, estimation)
+        return self._at_rate(self.trigger.alpha_per_s, TriggerBound(self.trigger.beta, None))
+
+    def _at_rate(self, rate_per_s: float, bound: TriggerBound) -> Part:
+        """What the start causes, scaled by a rate."""
+        plant = self._plant(rate_per_s)
+        return Part(plant.error, plant, bound, self._estimation.decaying(rate_per_s))
 
     @cached_property
     def _persistent(self) -> Part:

@@ -9,7 +9,7 @@ and, by identity (I1), e_c is e_s plus the contributions of the missing events. 
 interest are the weighted norm W, the state itself, E x, and K H x (the error rate of a held input).
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
@@ -39,6 +39,7 @@ class Output(StrEnum):
     MISMATCH = "E"
     GAIN = "K"
     GAIN_RATE = "KH"
+    GAIN_CURVATURE = "KHH"
 
 
 class Coefficients(NamedTuple):
@@ -79,15 +80,32 @@ class Forcing(NamedTuple):
         return np.hstack([self.columns, self.normal.limit * self.normal.columns])
 
 
+class Columns(NamedTuple):
+    """The columns through which e_s is driven."""
+
+    mismatch: Matrix
+    """L_E, E = L_E R_E"""
+    input_error: Matrix
+    """B U"""
+    disturbed: Matrix
+    """D_i"""
+
+
 class Growth(NamedTuple):
-    """The growth of ‖e_s‖_W after a reset."""
+    """The growth of ‖C e_s‖ after a reset; C = W if no output is named."""
 
     mismatch: KernelBounds
-    """‖W e^{Hτ} L_E‖, E = L_E R_E"""
+    """‖C e^{Hτ} L_E‖, E = L_E R_E"""
     input_error: KernelBounds
-    """‖W e^{Hτ} B U‖"""
+    """‖C e^{Hτ} B U‖"""
     forced: Vector
-    """Σ_i ∫‖W e^{Hτ} D_i‖ over each cell of the grid, from the disturbances."""
+    """Σ_i ∫‖C e^{Hτ} D_i‖ over each cell of the grid, from the disturbances."""
+
+    @property
+    def totals(self) -> tuple[float, float, float]:
+        """The integrals over the grid: of the input error, the mismatch, the disturbances."""
+        disturbed = float(self.forced.sum())
+        return self.input_error.integral_on_grid(), self.mismatch.integral_on_grid(), disturbed
 
 
 @dataclass(frozen=True)
@@ -118,7 +136,12 @@ class ErrorGains:
     def outputs(self) -> Mapping[Output, Matrix]:
         """C of each output C e_c."""
         R = self.split_K[1]
-        return {Output.WEIGHTED: self.weight, Output.GAIN: R, Output.GAIN_RATE: R @ self.H}
+        return {
+            Output.WEIGHTED: self.weight,
+            Output.GAIN: R,
+            Output.GAIN_RATE: R @ self.H,
+            Output.GAIN_CURVATURE: R @ self.H @ self.H,
+        }
 
     @cached_property
     def kernels(self) -> Mapping[Output, KernelBounds]:
@@ -169,19 +192,22 @@ class ErrorGains:
         """Whether e^{(H+αI)τ} decays, or is constant in a hold."""
         return not self.scaled_H.any() or spectral_abscissa(self.scaled_H) < 0
 
-    def growth(
-        self, mismatch: Matrix, forced: Matrix, disturbed: Matrix, until_s: float, cells: int
-    ) -> Growth:
-        """Return the growth of ‖e_s‖_W if E x, B p and disturbances act through these columns."""
+    def growth(self, columns: Columns, until_s: float, cells: int) -> Callable[[Output], Growth]:
+        """Return the growth of every output C e_s, with what drives e_s through these columns."""
 
-        def kernel(D: Matrix) -> KernelBounds:
-            return response_until(self.scaled_H, D, until_s, cells).through(self.weight)
+        def followed(D: Matrix) -> ResponseBounds:
+            return response_until(self.scaled_H, D, until_s, cells)
 
-        areas = np.zeros(cells)
-        if disturbed.size:
-            followed = response_until(self.scaled_H, disturbed, until_s, cells)
-            areas = followed.areas_of_columns(self.weight)
-        return Growth(kernel(mismatch), kernel(forced), areas)
+        mismatch, forced = followed(columns.mismatch), followed(columns.input_error)
+        disturbed = followed(columns.disturbed) if columns.disturbed.size else None
+
+        def of(output: Output) -> Growth:
+            C, areas = self.outputs[output], np.zeros(cells)
+            if disturbed is not None:
+                areas = disturbed.areas_of_columns(C)
+            return Growth(mismatch.through(C), forced.through(C), areas)
+
+        return of
 
     def stretch(self, until_s: float) -> float:
         """Return sup‖e^{(H+αI)τ}‖_W over τ ≤ ``until_s``, the growth of a sampled error."""
@@ -191,12 +217,15 @@ class ErrorGains:
         return followed.through(self.weight).sup_on_grid()
 
     def hold_remainder(self, hold_s: float) -> float:
-        """Bound ‖K(e^{−Hσ} − I + Hσ) W^{−1}‖, |σ| ≤ ``hold_s``, by ½σ² sup‖K H² e^{−Hs} W^{−1}‖."""
+        """Bound ‖K(e^{−Hσ} − I + Hσ − ½H²σ²) W^{−1}‖ for |σ| ≤ ``hold_s``.
+
+        It is at most σ³/6 sup‖K H³ e^{−Hs} W^{−1}‖.
+        """
         if hold_s == 0:
             return 0.0
-        curvature = self.split_K[1] @ self.H @ self.H
+        third = self.outputs[Output.GAIN_CURVATURE] @ self.H
         responses = (response_until(G, self.inverse_weight, hold_s, 16) for G in (-self.H, self.H))
-        return 0.5 * hold_s**2 * max(one.through(curvature).sup_on_grid() for one in responses)
+        return hold_s**3 / 6 * max(one.through(third).sup_on_grid() for one in responses)
 
 
 @dataclass(frozen=True)
@@ -243,6 +272,7 @@ class PlantGains:
             Output.WEIGHTED: self.error.weight,
             Output.MISMATCH: self.split_mismatch[1],
             Output.GAIN_RATE: self.error.outputs[Output.GAIN_RATE],
+            Output.GAIN_CURVATURE: self.error.outputs[Output.GAIN_CURVATURE],
             **self.further_outputs,
         }
 
@@ -336,10 +366,18 @@ class PlantGains:
             output: error * start_s * self.forced[output].sup() for output in self.outputs
         }
 
+    @property
+    def columns(self) -> Columns:
+        """The columns through which e_s is driven."""
+        return Columns(self.split_mismatch[0], self.input_matrix, self._forcing.limited)
+
     def growth(self, until_s: float, cells: int) -> Growth:
         """Return the growth of ‖e_s‖_W over ``until_s``, on a grid."""
-        mismatch, disturbed = self.split_mismatch[0], self._forcing.limited
-        return self.error.growth(mismatch, self.input_matrix, disturbed, until_s, cells)
+        return self.growths(until_s, cells)(Output.WEIGHTED)
+
+    def growths(self, until_s: float, cells: int) -> Callable[[Output], Growth]:
+        """Return the growth of every output C e_s over ``until_s``, on a grid."""
+        return self.error.growth(self.columns, until_s, cells)
 
 
 def deviations(covariance: Matrix) -> Matrix:

@@ -26,14 +26,13 @@ from noack.theory.disturbed_certificate import DisturbedCertificate, PlantAt
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.gains import ErrorGains, PlantGains, error_gains
 from noack.theory.run_conditions import kept_probability
-from noack.theory.superposition import SHARES
+from noack.theory.superposition import SHARES, soonest
 from noack.theory.trigger_bounds import TriggerBounds
 
 OWN_PLANT = "the scenario's plant"
 BOX = "every plant of the uncertainty box"
 _SLOWER = 0.9
 _SHARES_OF_ALPHA = (0.8, 0.6, 0.4, 0.2)
-_SHARES_OF_DECAY = (0.05, 0.2, 0.4, 0.7)
 
 _RESOLUTION = 1e-3
 _TOO_LARGE = "intermediate results are too large or too small for floating point"
@@ -65,7 +64,7 @@ class ScenarioCertificate:
     """Reason for having no certificate; None if there is one."""
     persistent_constants: Constants | None = None
     """The constants, in units of 1 and without decay, whose bounds are added to those of
-    ``constants`` under disturbances, noise or an observer."""
+    ``constants`` under disturbances, noise, an observer or a constant threshold."""
 
     @property
     def source(self) -> str:
@@ -87,7 +86,9 @@ class ScenarioCertificate:
     @property
     def unit(self) -> str:
         """The unit of Δ and β̃: β or ε; empty for 1."""
-        return "ε" if self.floor > self.beta else "β" if self.beta else ""
+        if self.beta > 0 and self.beta >= self.floor:
+            return "β"
+        return "ε" if self.floor > 0 and self.persistent_constants is None else ""
 
     @property
     def level(self) -> str:
@@ -267,7 +268,7 @@ class CertificateScope:
         void = None
         try:
             with np.errstate(all="ignore"):
-                if self._resolved.coverage.is_undisturbed:
+                if self._resolved.coverage.is_undisturbed and not self._trigger.is_constant:
                     first, late = self._phases(conditions)
                 else:
                     first, rest = self._disturbed_phases(conditions, shares)
@@ -327,8 +328,9 @@ class CertificateScope:
     @cached_property
     def _disturbed(self) -> DisturbedCertificate:
         return DisturbedCertificate(
-            self._resolved, self._plant_at, self._trigger, self._start_error
-        )
+            self._resolved, self._plant_at, self._trigger, self._start_error,
+            min(self._decay.values()),
+        )  # fmt: skip
 
     def _checked(
         self, first: Constants, other: Constants | None
@@ -362,33 +364,24 @@ class CertificateScope:
                     raise
                 return self._slower(conditions, alpha, start)
         # Certify a slower decay or none; the smallest event level is then the floor, if any.
-        is_constant = self._held or floor > 0 or trigger.area > 0
-        slower = 0.0 if is_constant else max(_SLOWER * decay, 0.0)
+        slower = 0.0 if self._held or floor > 0 else max(_SLOWER * decay, 0.0)
         level = max(beta, floor)
         return self._solve(conditions, slower, slower, start, level, floor or None)
 
     def _fastest(self, conditions: NetworkConditions, decay: float, start: Matrix) -> Constants:
         """Return bounds for a threshold that is a share of the state: any rate may be certified.
 
-        The rate is the one at which the bound of ‖x‖ falls to a tenth of ‖x(0)‖ first.
-
         Raises:
             VoidError: there are no bounds, not even without decay.
         """
-        size = float(np.linalg.norm(start)) or 1.0
-        found: list[tuple[float, Constants]] = []
         # Inputs of an earlier run are bounded without a rate.
-        decays = math.isfinite(decay) and decay > 0 and self._start_error == 0.0
-        for share in _SHARES_OF_DECAY if decays and not self._held else ():
-            rate = share * decay
-            try:
-                one = self._solve(conditions, rate, rate, start, 0.0, None)
-            except (NotDecayingError, VoidError):
-                break  # larger rates have larger gains
-            found.append((math.log(max(10 * one.state / size, 1.0)) / rate, one))
-        if not found:
-            return self._solve(conditions, 0.0, 0.0, start, 0.0, None)
-        return min(found, key=lambda one: one[0])[1]
+        if not self._held and 0 < decay < math.inf and self._start_error == 0.0:
+            with contextlib.suppress(NotDecayingError, VoidError):
+                return soonest(
+                    lambda rate: (self._solve(conditions, rate, rate, start, 0.0, None),),
+                    decay, self._loop.x0,
+                )[0]  # fmt: skip
+        return self._solve(conditions, 0.0, 0.0, start, 0.0, None)
 
     def _slower(
         self, conditions: NetworkConditions, alpha_per_s: float, start: Matrix

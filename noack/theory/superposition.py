@@ -8,8 +8,13 @@ least λβe^{−αt} + (1 − λ)ε, for any λ in [0, 1].
 """
 
 import contextlib
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
+from typing import TypeVar
 
+import numpy as np
+
+from noack.core.linear_systems import Vector
 from noack.theory.certificate import (
     NO_BACKGROUND,
     Background,
@@ -19,7 +24,10 @@ from noack.theory.certificate import (
     VoidError,
     solve_sum,
 )
+from noack.theory.enclosure import NotDecayingError
 
+_RATES = (0.05, 0.2, 0.4, 0.7)
+"""Rates that are tried, as shares of the loop's decay rate."""
 SHARES = (0.5, 0.2, 0.8)
 """Values of λ that are tried."""
 
@@ -59,3 +67,31 @@ def solve_divided(
             return solved(None)
     tried = [solved(share) for share in shares or SHARES[:1]]
     return max(tried, key=lambda found: found[0].inter_event_s or 0.0)
+
+
+Found = TypeVar("Found", bound=Sequence[Constants])
+
+
+def soonest(solved: Callable[[float], Found], decay_per_s: float, start: Vector) -> Found:
+    """Return the constants for a rate, where none is given.
+
+    It is the rate at which the first constants' bound of ‖x‖ falls to ‖x(0)‖/10 first.
+
+    Args:
+        solved: returns constants for a rate in 1/s.
+        decay_per_s: the decay rate of the loop.
+        start: x(0), (n,).
+
+    Raises: what ``solved`` raises at the smallest rate.
+    """
+    size, found = float(np.linalg.norm(start)) or 1.0, list[tuple[float, Found]]()
+    for share in _RATES:
+        rate_per_s = share * decay_per_s
+        try:
+            one = solved(rate_per_s)
+        except (NotDecayingError, VoidError):
+            if not found:
+                raise
+            break  # larger rates have larger gains
+        found.append((math.log(max(10 * one[0].state / size, 1.0)) / rate_per_s, one))
+    return min(found, key=lambda one: one[0])[1]

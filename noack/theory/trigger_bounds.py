@@ -77,6 +77,11 @@ class TriggerBounds:
         return not (self.beta or self.floor or self.area)
 
     @property
+    def is_constant(self) -> bool:
+        """Whether the threshold has a constant, and no part that decays."""
+        return not self.beta and not self.is_homogeneous
+
+    @property
     def outputs(self) -> Mapping[str, Matrix]:
         """S of each share sup‖S x‖ of the threshold, by name."""
         shares = () if self.promise is None else self.promise.shares
@@ -141,6 +146,23 @@ class TriggerBounds:
         return found[0]._replace(
             unit=level or 1.0, apart_s=apart_s, due_s=due_s, also=tuple(found[1:])
         )
+
+    def divided(
+        self, conditions: NetworkConditions, apart_s: float
+    ) -> list[tuple[TriggerBound, TriggerBound]]:
+        """Return each bound without its constant, and with it, both in units of 1.
+
+        Parts of the signals may be added only if they use the same bound. ``apart_s`` is a known
+        lower bound of the inter-event time.
+
+        Raises: as :meth:`bound`.
+        """
+        whole = self.bound(conditions, self.floor, self.floor or None)
+        alone = [
+            one._replace(apart_s=apart_s, due_s=whole.due_s, unit=1.0, reached=None, also=())
+            for one in whole.every
+        ]
+        return [(one._replace(beta=0.0), one) for one in alone]
 
     def text(self) -> str:
         """Return in words what the rule promises about e_s."""

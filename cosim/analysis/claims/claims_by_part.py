@@ -13,7 +13,6 @@ the last time that all of them reached, because the loop is incomplete after it.
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -42,13 +41,11 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.life_cycle import HORIZON
-from noack.theory.scenario_certificates import BOX, OWN_PLANT
+from noack.theory.persistent_causes import forcing_of
+from noack.theory.setpoint_shift import about_setpoint, void_at_setpoint
 
 _TIMES = ("t_ns", "now_ns", "model_t_ns", "release_ns", "copy_ns")
 _STATES = ("x", "x_s", "x_c", "x_c_before", "x_s_before")
-_AT_REST = 1e-9
-"""The set-point is an equilibrium if |A x_r + B u_r| is at most this share of its larger term."""
-
 _PACES = {
     "plant": (PLANT_STEP, "t_ns"),
     "sensor": (SENSOR_MEASUREMENT, "t_ns"),
@@ -84,7 +81,7 @@ class RunClaims:
         record = self._judged
         changes = [made for made in changes_of(record) if made.touches_claims]
         first_ns = changes[0].first_ns if changes else NEVER_NS
-        part = RunPart(record, 0.0, _seconds(first_ns), None, _void(record, record.scenario))
+        part = RunPart(record, 0.0, _seconds(first_ns), None, void_at_setpoint(record.scenario))
         own = record if self._setpoint is None else _part_of(record, record.scenario, 0, None)
         found: list[ClaimEvaluation | Claim] = [ClaimEvaluation(own, part)]
         for made, after in zip(changes, [*changes[1:], None], strict=False):
@@ -159,7 +156,7 @@ class RunClaims:
             origin_ns / NS_PER_S,
             _seconds(until_ns) - origin_ns / NS_PER_S,
             _start_error(own, ClaimEvaluation(own).started_s),
-            _void(record, made.scenario),
+            void_at_setpoint(made.scenario),
         )
         return ClaimEvaluation(own, part)
 
@@ -210,9 +207,9 @@ def _part_of(
     batches = record.source.batches(SENSOR_MEASUREMENT)
     first = next(filter(len, (derive(SENSOR_MEASUREMENT, rows) for rows in batches)), None)
     x_0 = np.array(scenario.plant.initial_state) - x_r if first is None else first["x"][0]
+    scenario = about_setpoint(scenario)
     update = {
         "plant": scenario.plant.model_copy(update={"initial_state": tuple(x_0.tolist())}),
-        "controller": scenario.controller.model_copy(update={"setpoint": None}),
         "horizon_s": max(scenario.horizon_s - origin_ns / NS_PER_S, 1e-9),
         "changes": (),
     }
@@ -248,7 +245,7 @@ def _start_error(own: RunRecord, started_s: float) -> float:
     """sup‖u − Kx‖ e^{αt} over the steps until the plant applied the first input of the part.
 
     u is constant within a step. So ‖u − Kx‖ is at most the larger of its values at both ends, plus
-    a term for the curvature of x: Δt²/8 sup‖K A ẋ‖, with ẋ = e^{As}(Ax + Bu).
+    a term for the curvature of x: Δt²/8 sup‖K A ẋ‖, with ẋ = e^{As}(Ax + Bu + Dw), w constant.
     """
     alpha = own.scenario.trigger.threshold_decay_per_s
     largest, last = 0.0, np.zeros(0, own.tables[PLANT_STEP])
@@ -270,31 +267,11 @@ def _input_error(own: RunRecord, steps: Rows, alpha_per_s: float) -> float:
     ends = np.maximum(row_norms(u - x[:-1] @ loop.K.T), row_norms(u - x[1:] @ loop.K.T))
     speed = x[:-1] @ loop.A.T + u @ loop.B.T
     grown = math.exp(min(float(np.linalg.norm(loop.A, 2)) * dt_s, 700.0))
-    bend = dt_s**2 / 8 * grown * row_norms(speed @ (loop.K @ loop.A).T)
+    pushes, forcing = 0.0, forcing_of(own.scenario, loop.B)
+    if forcing is not None:
+        pushes = float(np.linalg.norm(loop.K @ loop.A @ forcing.limited, axis=0).sum())
+    bend = dt_s**2 / 8 * grown * (row_norms(speed @ (loop.K @ loop.A).T) + pushes)
     return float(((ends + bend) * np.exp(alpha_per_s * steps["t_ns"][1:] * 1e-9)).max())
-
-
-def _void(record: RunRecord, scenario: Scenario) -> Mapping[str, str]:
-    """Return by scope why there is no certificate: the set-point may not be an equilibrium."""
-    setpoint = setpoint_of(scenario)
-    if setpoint is None or not scenario.coverage.is_linear:
-        return {}
-    x_r, u_r = setpoint
-    loop, plant = record.loop, scenario.plant
-    drift, push = loop.A @ x_r, loop.B @ u_r
-    largest = max(float(np.abs(drift).max()), float(np.abs(loop.A).max() * np.abs(x_r).max()))
-    if float(np.abs(drift + push).max()) > _AT_REST * largest:
-        why = (
-            "the plant does not rest at the set-point as the model does (A x_r + B u_r ≠ 0); a "
-            "certificate does not cover this constant disturbance"
-        )
-        return {OWN_PLANT: why, BOX: why}
-    half_A, half_B = plant.uncertainty_A, plant.uncertainty_B
-    moved = np.zeros(loop.n) if half_A is None else np.array(half_A) @ np.abs(x_r)
-    moved = moved + (0.0 if half_B is None else np.array(half_B) @ np.abs(u_r))
-    if moved.any():
-        return {BOX: "not every plant of the box rests at the set-point, A x_r + B u_r ≠ 0"}
-    return {}
 
 
 def common_end_ns(record: RunRecord) -> int | None:

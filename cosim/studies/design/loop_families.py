@@ -10,6 +10,7 @@ from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
+from noack.theory.certificate import NetworkConditions
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.weight import choose_weight
 
@@ -104,7 +105,8 @@ def _normed(scenario: Scenario, norm: str, progress: Callable[[float], None]) ->
     alpha_per_s = MOST_RATE * decay_rate(scenario) / RATE_STEP
     beta = _LEVEL * float(np.linalg.norm(loop.x0))
     try:
-        weight = choose_weight(nominal, beta, alpha_per_s, scenario.network.longest_burst, progress)
+        conditions = NetworkConditions(scenario.network.longest_burst)
+        weight = choose_weight(nominal, beta, alpha_per_s, conditions, progress)
     except NotDecayingError as error:
         raise CallerError(f"--weights chosen: {error}") from None
     return with_norm(scenario, weight)

@@ -263,3 +263,19 @@ def test_a_box_too_large_for_alpha_is_certified_at_a_slower_rate() -> None:
     assert slower is not None
     assert 0 < slower.rate_per_s < 0.6
     assert slower.inter_event_s is None
+
+
+def test_a_set_point_is_certified_in_its_own_coordinates() -> None:
+    """The lane rests at any lateral position; the pendulum does not rest where its model does."""
+    moved = Certificates(scenario("lane_following", "controller.setpoint=[0.0, 0.0, 0.0, 3.0]"), 2)
+    zero = scenario("lane_following", "plant.initial_state=[0.5, 0.0, 0.1, 0.0]")
+    assert constants(moved.schedule) == constants(Certificates(zero, 2).schedule)
+    assert moved.to_json()["setpoint"] == (0.0, 0.0, 0.0, 3.0)
+    tilted = Certificates(scenario("unstable_pendulum", "controller.setpoint=[0.1, 0.0]"), 2)
+    loop = loop_of(tilted.scenario)
+    x_r, H_of_plant = np.array([0.1, 0.0]), loop.A + loop.B @ loop.K
+    given = loop_of(scenario("unstable_pendulum", "controller.setpoint=[0.1, 0.0]"))
+    assert given.setpoint_input is not None
+    rest = -np.linalg.solve(H_of_plant, loop.A @ x_r + loop.B @ given.setpoint_input)
+    persistent = tilted.paper.state(np.array([1e3]))[0]
+    assert 0 < np.linalg.norm(rest) < persistent < 30 * np.linalg.norm(rest)

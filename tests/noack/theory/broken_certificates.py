@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 
 from noack.theory.certificate import Constants
-from noack.theory.gains import Coefficients, ErrorGains, Output, PlantGains
+from noack.theory.enclosure import constant_kernel
+from noack.theory.gains import Coefficients, ErrorGains, Growth, Output, PlantGains
 from tests.noack.theory.loops import System
 
 
@@ -43,6 +44,29 @@ class NoMismatch(PlantGains):
     @property
     def states(self) -> dict[Output, Coefficients]:  # type: ignore[override]
         return {**super().states, Output.MISMATCH: Coefficients(0.0, 0.0)}
+
+
+class NoDrift(PlantGains):
+    """Ignores what drives e_c while updates are in flight."""
+
+    def growth(self, until_s: float, cells: int) -> Growth:
+        return super().growths(until_s, cells)(Output.WEIGHTED)
+
+    def growths(self, until_s: float, cells: int) -> Callable[[Output], Growth]:
+        still = constant_kernel(0.0)
+        return lambda output: Growth(still, still, np.zeros(1))
+
+
+class NoCurvature(ErrorGains):
+    """Bounds the age of an input by the rate of K x_c only."""
+
+    @property
+    def outputs(self) -> dict[Output, np.ndarray]:  # type: ignore[override]
+        found = dict(super().outputs)
+        return found | {Output.GAIN_CURVATURE: 0 * found[Output.GAIN_CURVATURE]}
+
+    def hold_remainder(self, hold_s: float) -> float:
+        return 0.0
 
 
 class OnlyTheFirstMoment(ErrorGains):
@@ -85,6 +109,16 @@ MUTANTS: dict[str, tuple[Callable[[System], Constants], dict[str, Any]]] = {
     "no hold": (
         without_condition("hold_s"),
         {"mansd": 0, "hold_steps": 4, "delay_steps": 0, "beta": 0.01, "step_share": 0.03},
+    ),
+    "no drift in flight": (
+        with_gains(ErrorGains, NoDrift),
+        {"mansd": 0, "delay_steps": 4, "sample_steps": 1, "hold_steps": 0, "beta": 0.01,
+         "mismatch": 0.5, "step_share": 0.03},
+    ),
+    "no curvature of an old input": (
+        with_gains(NoCurvature, PlantGains),
+        {"n": 1, "m": 1, "mansd": 0, "sample_steps": 1, "hold_steps": 4, "lag_steps": 2,
+         "delay_steps": 0, "beta": 0.01, "step_share": 0.2, "mismatch": 0.0},
     ),
     "no start": (
         without_condition("start_s"),

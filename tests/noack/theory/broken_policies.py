@@ -74,8 +74,10 @@ INSTANT = {"delay_steps": 0, "hold_steps": 0, "known_start": True, "window": (1,
 FAR = {"n": 1, "m": 1, "mismatch": 0.5, "step_share": 0.01, "sample_steps": 1, **INSTANT}
 
 BROKEN_POLICIES: dict[str, tuple[str, Callable[[Scenario, Conditions], Any], dict[str, Any]]] = {
-    "absolute, one loss less": ("absolute", without_one_loss, {**FAR, "mansd": 1, "beta": 0.01}),
-    "mixed, one loss less": ("mixed", without_one_loss, {**FAR, "mansd": 1, "beta": 0.01}),
+    **{
+        f"{kind}, one loss less": (kind, without_one_loss, {**FAR, "mansd": 1, "beta": 0.01})
+        for kind in ("absolute", "mixed", "quadratic", "deadline", "self_triggered")
+    },
     "relative, no share": ("relative", with_trigger(NoShares), {**FAR, "mansd": 0}),
     "mixed, no share": ("mixed", with_trigger(NoShares), {**FAR, "mansd": 0, "beta": 0.01}),
     "quadratic, no cross term": (

@@ -107,7 +107,7 @@ class Growing:
 
     def __call__(self, step: int, since: Steps, x: Reals, e_s: Reals) -> Flags:
         size = np.einsum("ri,ri->r", x, x)
-        self._size = np.where((since <= self.every) | (step == 0), size, self._size)
+        self._size = np.where(since <= self.every, size, self._size if step else size)
         return np.asarray(size > self.factor * self._size)
 
 

@@ -52,7 +52,7 @@ def _mixed(system: System, rng: Rng) -> Case:
 def _quadratic(system: System, rng: Rng) -> Case:
     n, grid = len(system.A), int(rng.integers(1, 3)) * system.sample_steps
     error = rng.uniform(-1, 1, (n, n)) + 1.5 * np.eye(n)
-    cross = 0.02 * rng.uniform(-1, 1, (n, n))
+    cross = float(rng.choice([0.02, 0.3])) * rng.uniform(-1, 1, (n, n))
     Q = np.block([[-(0.03**2) * np.eye(n), cross.T], [cross, error.T @ error]])
     epsilon = float(rng.choice([0.0, system.beta**2]))
     settings = {
