@@ -220,8 +220,12 @@ def solve_sum(
     for _ in range(_ATTEMPTS):
         if spacing_s <= least_s:
             break
+        found_s = math.inf
         try:
-            found_s = min(step.inter_event_s(spacing_s) for step in steps)
+            for step in reversed(steps):  # what persists usually comes first
+                found_s = min(found_s, step.inter_event_s(spacing_s))
+                if found_s <= least_s:
+                    break
         except VoidError:
             break
         if found_s >= spacing_s:

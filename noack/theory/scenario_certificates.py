@@ -257,7 +257,7 @@ class CertificateScope:
     ) -> ScenarioCertificate:
         """Return the certificate under some conditions; a void certificate has the reason.
 
-        ``shares`` are those of :func:`solve_divided`; with fewer of them δ may be shorter.
+        ``shares`` are those of :func:`solve_divided`; with fewer δ may be shorter.
         """
         trigger = self._trigger
         first: Constants | None = None
@@ -295,7 +295,7 @@ class CertificateScope:
         """
 
         def stands(value_s: float) -> bool:
-            certificate = self.certificate(change(conditions, value_s), SHARES[:1])
+            certificate = self.certificate(change(conditions, value_s), ())
             return certificate.constants is not None
 
         if stands(most_s):
