@@ -133,8 +133,8 @@ def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argpars
     return options
 
 
-def specs_of(options: argparse.Namespace) -> tuple[LinkSpec, ...]:
-    """Return the links that the command line describes.
+def specs_of(options: argparse.Namespace, *, read: bool = True) -> tuple[LinkSpec, ...]:
+    """Return the links that the command line describes; ``read`` the files that they name.
 
     Raises:
         CallerError: the command line has a mistake.
@@ -144,7 +144,7 @@ def specs_of(options: argparse.Namespace) -> tuple[LinkSpec, ...]:
             if getattr(options, name):
                 shown = name if name == "words" else f"--{name.replace('_', '-')}"
                 raise CallerError(f"{shown}: with --links, set this in the file")
-        return load_links(options.links)
+        return load_links(options.links, read=read)
     if options.explain:
         options.listen = options.listen or _EXAMPLE_LISTEN
         options.to = options.to or _EXAMPLE_TO
@@ -156,13 +156,15 @@ def specs_of(options: argparse.Namespace) -> tuple[LinkSpec, ...]:
     listen = parse_address(options.listen, "--listen")
     to = parse_destination(options.to, "--to", listen)
     forward, reverse, seed = _directions(options)
+    if read:
+        forward, reverse = (read_files(one, Path()) for one in (forward, reverse))
     return (
         LinkSpec(
             name=LINK_NAME,
             listen=listen,
             to=to,
-            forward=read_files(forward, Path()),
-            reverse=read_files(reverse, Path()),
+            forward=forward,
+            reverse=reverse,
             seed=seed,
             return_path=not options.one_way,
             idle_s=LinkSpec.idle_s if options.idle is None else _idle_s(options.idle),

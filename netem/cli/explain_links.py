@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from netem.engine.relay_interface import LinkSpec
-from netem.words.tc_command import tc_command
+from netem.words.tc_command import TcCommand, tc_command
 from netem.words.words_to_settings import text_of
 from noack.core.errors import shortened
 from noack.impairments.kept_loss import expected_loss, with_kept_loss
@@ -24,10 +24,16 @@ _NARROW_WIDTH, _WIDE_WIDTH = 20, 44
 """Minimum and maximum columns for words."""
 
 
-def explain(specs: Sequence[LinkSpec], *, as_json: bool, as_file: bool) -> None:
+def explain(
+    specs: Sequence[LinkSpec], written: Sequence[LinkSpec], *, as_json: bool, as_file: bool
+) -> None:
     """Print the effect of links' settings on standard output, as tables or as JSON.
 
-    ``as_file``: tables have the links as a file of links instead of their names.
+    Args:
+        specs: the links.
+        written: the same links, with the names of files instead of their content: what tables show.
+        as_json: JSON, with the content.
+        as_file: tables have the links as a file of links instead of their names.
     """
     if as_json:
         links = [
@@ -41,17 +47,17 @@ def explain(specs: Sequence[LinkSpec], *, as_json: bool, as_file: bool) -> None:
         print(json.dumps({"links": links}, indent=2))
         return
     console = Console(highlight=False)
-    for number, spec in enumerate(specs):
+    for number, (spec, named) in enumerate(zip(specs, written, strict=True)):
         if number:
             console.print()
         if not as_file:
             seed = f", seed {spec.seed}" if spec.seed else ""
             addresses = f"{address_text(spec.listen)} → {address_text(spec.to)}"
             console.print(Text(f"{spec.name}: {addresses}{seed}", "bold underline"))
-        _print_link(console, spec)
+        _print_link(console, spec, named)
         if as_file:
             console.print(Text("\nas a file of links (--links)", "bold"))
-            toml = tomli_w.dumps({"link": [_link_table(spec)]}).strip()
+            toml = tomli_w.dumps({"link": [_link_table(named)]}).strip()
             console.print(Text(shortened(toml, _MAX_TOML)), soft_wrap=True)  # for copying
 
 
@@ -94,37 +100,41 @@ def settings_meaning(settings: LinkSettings) -> list[tuple[str, str]]:
     return found
 
 
-def _print_link(console: Console, spec: LinkSpec) -> None:
+def _print_link(console: Console, spec: LinkSpec, named: LinkSpec) -> None:
     if spec.return_path and spec.forward == spec.reverse:
-        _print_direction(console, "both directions, each by itself", spec.forward)
+        _print_direction(console, "both directions, each by itself", spec.forward, named.forward)
         return
-    _print_direction(console, "forward, from clients to the server", spec.forward)
+    _print_direction(console, "forward, from clients to the server", spec.forward, named.forward)
     console.print()
     if spec.return_path:
-        _print_direction(console, "reverse, from the server to clients", spec.reverse)
+        title = "reverse, from the server to clients"
+        _print_direction(console, title, spec.reverse, named.reverse)
     else:
         console.print(Text("reverse: not relayed; the server's answers are discarded", "bold"))
 
 
-def _print_direction(console: Console, title: str, settings: LinkSettings) -> None:
+def _print_direction(
+    console: Console, title: str, settings: LinkSettings, named: LinkSettings
+) -> None:
     if settings == LinkSettings():
         console.print(Text(f"{title}: no impairment", "bold"))
         return
     console.print(Text(f"{title}, in this order", "bold"))
-    console.print(_table(settings, console.width))
+    console.print(_table(settings, named, console.width))
     console.print(Text(f"\nexpected loss rate: {_rate_text(settings)}"))
-    _print_tc(console, settings)
+    _print_tc(console, tc_command(settings, named))
 
 
-def _table(settings: LinkSettings, width: int) -> Table:
+def _table(settings: LinkSettings, named: LinkSettings, width: int) -> Table:
     table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, show_header=False)
     table.add_column(justify="right", style="dim")
     most = min(max(2 * width // 5, _NARROW_WIDTH), _WIDE_WIDTH)
     table.add_column(max_width=most, overflow="fold", style="bold")
     table.add_column(overflow="fold")
-    for number, one in enumerate(settings.impairments, 1):
+    pairs = zip(settings.impairments, named.impairments, strict=True)
+    for number, (one, other) in enumerate(pairs, 1):
         # As text: a bracket in a file's name is not markup.
-        words, meaning = shortened(one.text(), 200), one.meaning()
+        words, meaning = shortened(other.text(), 200), one.meaning()
         table.add_row(str(number), Text(words), Text(meaning))
     if not settings.impairments:
         table.add_row("", "", "no impairment")
@@ -144,8 +154,7 @@ def _rate_text(settings: LinkSettings) -> str:
     return f"{text}, {prediction.note}" if prediction.note else text
 
 
-def _print_tc(console: Console, settings: LinkSettings) -> None:
-    tc = tc_command(settings)
+def _print_tc(console: Console, tc: TcCommand) -> None:
     lacks = ", ".join(tc.lacks)
     if tc.words is None:
         console.print(Text(f"not possible with tc, which lacks: {lacks}"))

@@ -101,7 +101,8 @@ def alone(arguments: Sequence[str]) -> ExitStatus:
         return ExitStatus.OK
     specs = emulator_options.specs_of(options)
     if options.explain:
-        explain(specs, as_json=options.json, as_file=options.links is None)
+        written = emulator_options.specs_of(options, read=False)
+        explain(specs, written, as_json=options.json, as_file=options.links is None)
         return ExitStatus.OK
     totals = relay(specs, options)
     if options.json:

@@ -69,18 +69,22 @@ class LinkTable(ScenarioSection):
             raise ValueError("words: is short for forward; give one of them")
         return self
 
-    def spec(self, folder: Path, place: str) -> LinkSpec:
-        """Return the link for a relay; resolves its addresses and reads its files in a folder.
+    def spec(self, folder: Path, place: str, *, read: bool = True) -> LinkSpec:
+        """Return the link for a relay; resolves its addresses, and reads its files in a folder.
 
         Raises:
             CallerError: the table has a mistake; one line, which begins with ``place``.
         """
         listen = parse_address(self.listen, f"{place}.listen")
+        forward, reverse = self.words or self.forward, self.reverse
+        if read:
+            forward = read_files(forward, folder, f"{place}.forward")
+            reverse = read_files(reverse, folder, f"{place}.reverse")
         return LinkSpec(
             listen=listen,
             to=parse_destination(self.to, f"{place}.to", listen),
-            forward=read_files(self.words or self.forward, folder, f"{place}.forward"),
-            reverse=read_files(self.reverse, folder, f"{place}.reverse"),
+            forward=forward,
+            reverse=reverse,
             **self.model_dump(include={"name", "seed", "return_path", "idle_s", "most_clients"}),
         )
 
@@ -101,15 +105,16 @@ class LinksFile(ScenarioSection):
         return self
 
 
-def load_links(path: Path) -> tuple[LinkSpec, ...]:
-    """Read a links file.
+def load_links(path: Path, *, read: bool = True) -> tuple[LinkSpec, ...]:
+    """Read a links file; ``read`` also the files that it names.
 
     Raises:
         CallerError: one line per mistake, each with file, key, value and remedy.
     """
     links = toml_file.validated(LinksFile, toml_file.read(path, LinksFile), str(path)).link
     specs = tuple(
-        link.spec(path.parent, f"{path}: link.{number}") for number, link in enumerate(links)
+        link.spec(path.parent, f"{path}: link.{number}", read=read)
+        for number, link in enumerate(links)
     )
     listening: dict[object, str] = {}
     for number, spec in enumerate(specs):

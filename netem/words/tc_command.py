@@ -24,19 +24,23 @@ class TcCommand(NamedTuple):
     """Differences in behaviour."""
 
 
-def tc_command(settings: LinkSettings) -> TcCommand:
-    """Return the nearest words of tc's own netem, and the settings that they leave out."""
+def tc_command(settings: LinkSettings, named: LinkSettings | None = None) -> TcCommand:
+    """Return the nearest words of tc's own netem, and the settings that they leave out.
+
+    ``named`` are the same settings, with the names of files instead of their content.
+    """
     supported: list[Impairment] = []
     lacks: list[str] = []
-    wanted = [one for one in settings.impairments if one.tc_text()]
-    for one in wanted:
+    pairs = zip(settings.impairments, (named or settings).impairments, strict=True)
+    wanted = [(one, other.text()) for one, other in pairs if one.tc_text()]
+    for one, words in wanted:
         if share := getattr(one, "loss_correlation", 0.0):
             lacks.append(f"lossrel {percent_text(share)} (a delay correlated with loss)")
         what = one.tc_lacks(supported)
         if any(other.kind == one.kind for other in supported):
             what = f"a second {one.kind}"
         if what:
-            lacks.append(f"{shortened(one.text(), _LONGEST)} ({what})")
+            lacks.append(f"{shortened(words, _LONGEST)} ({what})")
         else:
             supported.append(one)
     if settings.mansd is not None:
@@ -46,9 +50,9 @@ def tc_command(settings: LinkSettings) -> TcCommand:
         lacks.append("first (that the first packet of each flow is delivered)")
     if wanted and not supported:
         return TcCommand(None, tuple(lacks), ())
-    words = " ".join([f"limit {settings.limit}", *(one.tc_text() for one in supported)])
+    text = " ".join([f"limit {settings.limit}", *(one.tc_text() for one in supported)])
     notes = [note for one in supported for note in one.tc_notes()]
     order = [_FIXED_ORDER.index(one.kind) for one in supported if one.kind in _FIXED_ORDER]
     if order != sorted(order):
         notes.append(f"its order is fixed: {', '.join(_FIXED_ORDER)}")
-    return TcCommand(words, tuple(lacks), tuple(dict.fromkeys(notes)))
+    return TcCommand(text, tuple(lacks), tuple(dict.fromkeys(notes)))

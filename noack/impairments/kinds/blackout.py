@@ -146,7 +146,9 @@ class Blackout(Impairment):
                 begin_s, end_s = map(OWN_TIME_S.read, line.split())
             except ValueError:
                 shown = shortened(line, 40)
-                file.wrong(f"line {number}: {shown!r}: expected begin and end, e.g. 2s 3500ms")
+                file.wrong(
+                    f"line {number}: {shown!r}: expected begin and end with units, e.g. 2s 3500ms"
+                )
             intervals_s.append((begin_s, end_s))
             try:
                 _require_order(intervals_s[-2:], self.every_s)
