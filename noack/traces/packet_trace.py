@@ -108,7 +108,7 @@ def packet_trace(
         received = received - (received - sent)[~lost].min()
     received = np.where(lost, sent, received)
     early = (
-        "is received before it is sent; if two clocks were read, say so: --clocks different "
+        "is received before it is sent; if two clocks were read, give --clocks different "
         "(noack measure), relative (noack netem), clocks_differ = true (TOML)"
     )
     _refuse(np.flatnonzero(received < sent), row, early)
