@@ -58,7 +58,7 @@ OBSERVED = Kind(
             _certified_as(
                 lambda loop: replace(loop, A_model=loop.system.A, B_model=loop.system.B)
             ),
-            partial(_draw, noise=0.01, push=0.02, differs=0.02, known_start=True, **_LUENBERGER),
+            partial(_draw, noise=0.001, push=0.002, differs=0.3, known_start=True, **_LUENBERGER),
         ),
         "the first estimate is exact": Broken(
             _certified_as(

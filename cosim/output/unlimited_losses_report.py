@@ -69,7 +69,8 @@ def sentences(found: UnlimitedLosses) -> Iterator[str]:
             f"Under the paper's conditions ‖e_c‖ e^(αt)/β at events has a {at}, and x decays "
             f"almost surely, at every rate below {found.paper_rate_per_s:.3g} /s."
         )
-    yield (
-        "These are statements about many runs: one run cannot violate a mean. The probabilities "
-        "are lower bounds; a campaign shows the frequencies."
-    )
+    if found.moments or found.bursts:
+        yield (
+            "These are statements about many runs: one run cannot violate a mean. The "
+            "probabilities are lower bounds; a campaign shows the frequencies."
+        )

@@ -19,7 +19,7 @@ of at least δ, it holds by induction over the events; the largest such δ is us
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from types import MappingProxyType
 from typing import NamedTuple
@@ -28,7 +28,7 @@ import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, LossRule
-from noack.theory.gains import Coefficients, ErrorGains, Growth, Output, PlantGains
+from noack.theory.gains import Coefficients, ErrorGains, Output, PlantGains
 from noack.theory.loss_accumulation import LossAccumulation
 from noack.theory.nonnegative_system import Solution, solve_inequalities
 
@@ -135,26 +135,6 @@ class TriggerBound(NamedTuple):
         return (self, *self.also)
 
 
-class Background(NamedTuple):
-    """Bounds from an earlier phase of the run, which still have effects in this phase.
-
-    An event of the earlier phase may still be missing in this phase. Two successive tests or events
-    may be in different phases.
-    """
-
-    sensor_error: float = 0.0
-    """Bound of β̃."""
-    mismatch: float = 0.0
-    """Bound of sup‖R_E x‖."""
-    input_error: float = 0.0
-    """Bound of sup‖p‖."""
-    inter_event_s: float = _LONGEST_S
-    """Bound of the inter-event time."""
-
-
-NO_BACKGROUND = Background()
-
-
 class EstimationBound(NamedTuple):
     """Bound of the estimation error at every measurement, where the trigger tests x̂ instead of x.
 
@@ -176,7 +156,7 @@ def solve(
     plant: PlantGains,
     conditions: NetworkConditions,
     bound: TriggerBound,
-    background: Background = NO_BACKGROUND,
+    earlier_error: float = 0.0,
     *,
     estimation: EstimationBound = _MEASURED,
     structured: bool = True,
@@ -186,12 +166,14 @@ def solve(
     ``structured``: at every time, p = u − Kx consists of the errors of the events and of the age of
     the input. Otherwise it is only known that its norm is at most π.
 
+    ``earlier_error``: bound of sup‖p‖ while the plant still applies inputs of an earlier run.
+
     Raises:
         VoidError: the loop gain is not below 1.
         NotDecayingError: a mode of the loop decays more slowly than the threshold.
     """
     part = Part(error, plant, bound, estimation)
-    (found,) = solve_sum([part], conditions, background, structured=structured)
+    (found,) = solve_sum([part], conditions, earlier_error, structured=structured)
     return found
 
 
@@ -207,7 +189,7 @@ class Part(NamedTuple):
 def solve_sum(
     parts: Sequence[Part],
     conditions: NetworkConditions,
-    background: Background = NO_BACKGROUND,
+    earlier_error: float = 0.0,
     *,
     structured: bool = True,
 ) -> list[Constants]:
@@ -216,14 +198,13 @@ def solve_sum(
     All inequalities are linear in functions of time, for given events. So the causes may be
     divided: what decays is one part, what persists another one. The threshold is at least the sum
     of the parts' ``reached``, so the next event needs one part that reaches its own. The
-    ``background`` is that of the first part.
+    ``earlier_error`` is that of the first part.
 
     Raises: as :func:`solve`.
     """
-    backgrounds = [background, *[NO_BACKGROUND] * (len(parts) - 1)]
-    steps = [
-        _Step(part, conditions, before) for part, before in zip(parts, backgrounds, strict=True)
-    ]
+    first, *others = parts
+    steps = [_Step(first, conditions, earlier_error)]
+    steps += [_Step(part, conditions, 0.0) for part in others]
     if structured and parts[0].plant.is_one_plant:
         for step in steps:
             step.use_windows()
@@ -235,12 +216,16 @@ def solve_sum(
     least_s = max(conditions.spacing_s, apart_s)
     if any(all(one.reached is None for one in part.bound.every) for part in parts):
         return constants(least_s, apart_s or None)
-    spacing_s = background.inter_event_s
+    spacing_s = _LONGEST_S
     for _ in range(_ATTEMPTS):
         if spacing_s <= least_s:
             break
+        found_s = math.inf
         try:
-            found_s = min(step.inter_event_s(spacing_s) for step in steps)
+            for step in reversed(steps):  # what persists usually comes first
+                found_s = min(found_s, step.inter_event_s(spacing_s))
+                if found_s <= least_s:
+                    break
         except VoidError:
             break
         if found_s >= spacing_s:
@@ -253,12 +238,13 @@ def solve_sum(
 class _Step:
     """One iteration: all constants for an assumed spacing of events."""
 
-    def __init__(self, part: Part, conditions: NetworkConditions, background: Background) -> None:
+    def __init__(self, part: Part, conditions: NetworkConditions, earlier_error: float) -> None:
         self._error, self._plant, self._bound, self._estimation = error, plant, bound, _ = part
-        self._conditions, self._background = conditions, background
+        self._conditions = conditions
         self._lost: LossAccumulation | None = None
         self._remainder = error.hold_remainder(conditions.hold_s)
         self._start_error, start = plant.start_up(conditions.start_s)
+        self._beyond = max(self._start_error, earlier_error)
         self._states = {
             output: Coefficients(free + start[output], gain)
             for output, (free, gain) in plant.states.items()
@@ -306,12 +292,13 @@ class _Step:
             {output: error.missing(output, dropouts, spacing_s) for output in kernels},
             0.0,
             0.0,
-            {output: self._drifted(output).totals for output in kernels},
+            self._drift,
         )
 
     @cached_property
-    def _drifted(self) -> Callable[[Output], Growth]:
-        return self._plant.growths(self._conditions.delay_s, _COARSE)
+    def _drift(self) -> Mapping[Output, tuple[float, float, float]]:
+        of = self._plant.growths(self._conditions.delay_s, _COARSE)
+        return {output: of(output).totals for output in self._error.outputs}
 
     def _constants(self, bound: "_ErrorBound", events: int, spacing_s: float) -> Constants:
         from_errors = self._from_errors(bound, spacing_s)
@@ -373,8 +360,7 @@ class _Step:
             Output.GAIN_CURVATURE: hold_s**2 / 2,
             Output.WEIGHTED: self._remainder,
         }
-        beyond = max(self._start_error, self._background.input_error)
-        at_growth = np.maximum(free, signals.row({Output.MISMATCH: self._background.mismatch}))
+        beyond = self._beyond
         held_input, _, estimated, *_ = np.eye(_SIGNALS)
         input_error = errors[Output.GAIN] + held_input
 
@@ -388,15 +374,15 @@ class _Step:
             estimation.fixed + float(through @ free) + estimation.from_input * beyond,
         )
         through = signals.row({Output.MISMATCH: 1.0})
-        of_mismatch = (through @ signals.states, float(through @ at_growth))
+        of_mismatch = (through @ signals.states, float(through @ free))
         others = ((input_error, beyond), of_mismatch, (0.0 * input_error, 1.0))
 
         def solved(growing: _Growing) -> Solution:
             through = signals.row(growing.shares)
             F = through @ signals.states + growing.input_error * input_error
             F += growing.estimation * estimated
-            fixed = growing.fixed + through @ at_growth + growing.input_error * beyond
-            rows = (of_age, (F, max(self._background.sensor_error, fixed)), of_estimate, *others)
+            fixed = growing.fixed + through @ free + growing.input_error * beyond
+            rows = (of_age, (F, fixed), of_estimate, *others)
             return solve_inequalities(*map(np.array, zip(*rows, strict=True)))
 
         # Of each bound one growth applies, and all bounds hold.
@@ -444,8 +430,8 @@ class _Step:
             first_passage_s(
                 self._plant,
                 one.reached - estimation,
-                max(found.mismatch, self._background.mismatch),
-                max(others, self._start_error, self._background.input_error),
+                found.mismatch,
+                max(others, self._beyond),
                 own,
                 estimation,
             )

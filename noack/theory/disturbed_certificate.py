@@ -16,7 +16,6 @@ from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix
 from noack.theory.certificate import (
-    Background,
     Constants,
     NetworkConditions,
     Part,
@@ -63,12 +62,11 @@ class DisturbedCertificate:
         ):
             raise VoidError("after a change or at a set-point the estimation error is not known")
         conditions = self.trigger.tested(conditions)
-        background = Background(input_error=self.start_error)
         structured = self.start_error == 0.0
         if decays and self.resolved.coverage.is_decaying:
             try:
                 return solve_divided(
-                    self._decaying, self._persistent, conditions, background,
+                    self._decaying, self._persistent, conditions, self.start_error,
                     structured=structured, shares=shares,
                 )  # fmt: skip
             except NotDecayingError:
@@ -76,7 +74,7 @@ class DisturbedCertificate:
         level, floor = max(self.trigger.beta, self.trigger.floor), self.trigger.floor
         bound = self.trigger.bound(conditions, level, floor or None)
         part = self._together._replace(bound=bound)
-        (found,) = solve_sum([part], conditions, background, structured=structured)
+        (found,) = solve_sum([part], conditions, self.start_error, structured=structured)
         # The mean of an integral bounds e_s over a time that suits only one of several parts.
         is_divided = not self.trigger.beta and not self.trigger.area and not self.start_error
         if decays and is_divided and len(shares) > 1:

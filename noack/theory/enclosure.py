@@ -132,6 +132,17 @@ class ResponseBounds:
             rate,
         )
 
+    def areas_of_columns(self, C: Matrix) -> Stack:
+        """Return bounds of Σ_i ∫‖C e^{Gτ} D_i‖ over each cell, for the columns D_i of D."""
+        steps_s, n, columns = np.diff(self.edges_s), len(C.T), self.states.shape[2]
+        rounding = frobenius_norms(product(np.abs(C), np.abs(self.states)))
+        norms = np.linalg.norm(product(C, self.states), axis=1).sum(axis=1)
+        # The sum over the columns is at most √columns times the Frobenius norm.
+        norms = norms + np.sqrt(columns) * EPSILON * n * rounding
+        middle = 0.5 * (norms[:-1] + norms[1:])
+        bend = np.sqrt(columns) * self._bends.over(C)
+        return np.asarray((steps_s * middle + steps_s**3 / 12 * bend) * _ROUNDING)
+
 
 def norm_bounds(C: Matrix, states: Stack) -> Stack:
     """Return upper bounds of ‖C Y‖ for a stack of Y, (k, n, r) → (k,), including rounding."""

@@ -199,13 +199,13 @@ class ErrorGains:
             return response_until(self.scaled_H, D, until_s, cells)
 
         mismatch, forced = followed(columns.mismatch), followed(columns.input_error)
-        disturbed = [followed(column[:, None]) for column in columns.disturbed.T]
+        disturbed = followed(columns.disturbed) if columns.disturbed.size else None
 
         def of(output: Output) -> Growth:
-            C = self.outputs[output]
-            areas = [one.through(C).area for one in disturbed]
-            total = np.sum([np.zeros(cells), *areas], axis=0)
-            return Growth(mismatch.through(C), forced.through(C), total)
+            C, areas = self.outputs[output], np.zeros(cells)
+            if disturbed is not None:
+                areas = disturbed.areas_of_columns(C)
+            return Growth(mismatch.through(C), forced.through(C), areas)
 
         return of
 
@@ -296,7 +296,10 @@ class PlantGains:
         total = 0.0
         for followed, duration_s in zip(self._disturbed, self._forcing.durations_s, strict=True):
             kernel = followed.through(C)
-            total += min(kernel.integral(), duration_s * kernel.sup())
+            at_most = kernel.integral()
+            if np.isfinite(duration_s):
+                at_most = min(at_most, float(duration_s) * kernel.sup())
+            total += at_most
         return total + self._normally_disturbed(C)
 
     def _normally_disturbed(self, C: Matrix) -> float:

@@ -16,7 +16,6 @@ from noack.settings.matrices import Rows
 from noack.theory.assumptions import Assumption, below, certificate_assumptions
 from noack.theory.box import BoxGains
 from noack.theory.certificate import (
-    Background,
     Constants,
     NetworkConditions,
     VoidError,
@@ -251,15 +250,14 @@ class CertificateScope:
         decays = math.inf if self._held or due else -spectral_abscissa(self._loop.H)
         self._decay = {"the models": decays, "A + BK": -spectral_abscissa(closed_loop)}
         self._plant_at = plant_at
-        self._errors: dict[float, ErrorGains] = {}
-        self._plants: dict[tuple[float, float, bytes], PlantGains] = {}
+        self._plants: dict[float, PlantGains] = {}
 
     def certificate(
         self, conditions: NetworkConditions, shares: Sequence[float] = SHARES
     ) -> ScenarioCertificate:
         """Return the certificate under some conditions; a void certificate has the reason.
 
-        ``shares`` are those of :func:`solve_divided`; with fewer of them δ may be shorter.
+        ``shares`` are those of :func:`solve_divided`; with fewer δ may be shorter.
         """
         trigger = self._trigger
         first: Constants | None = None
@@ -297,7 +295,7 @@ class CertificateScope:
         """
 
         def stands(value_s: float) -> bool:
-            certificate = self.certificate(change(conditions, value_s), SHARES[:1])
+            certificate = self.certificate(change(conditions, value_s), ())
             return certificate.constants is not None
 
         if stands(most_s):
@@ -353,22 +351,21 @@ class CertificateScope:
     def _first_phase(self, conditions: NetworkConditions) -> Constants:
         trigger, decay = self._trigger, min(self._decay.values())
         beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
-        start = self._loop.x0[:, None]
         if trigger.is_homogeneous:
-            return self._fastest(conditions, decay, start)
+            return self._fastest(conditions, decay)
         if not self._held and below(alpha, decay) and floor < beta:
             try:
-                return self._solve(conditions, alpha, alpha, start, beta, beta)
+                return self._solve(conditions, alpha, beta, beta)
             except NotDecayingError:
                 if floor > 0:
                     raise
-                return self._slower(conditions, alpha, start)
+                return self._slower(conditions, alpha)
         # Certify a slower decay or none; the smallest event level is then the floor, if any.
         slower = 0.0 if self._held or floor > 0 else max(_SLOWER * decay, 0.0)
         level = max(beta, floor)
-        return self._solve(conditions, slower, slower, start, level, floor or None)
+        return self._solve(conditions, slower, level, floor or None)
 
-    def _fastest(self, conditions: NetworkConditions, decay: float, start: Matrix) -> Constants:
+    def _fastest(self, conditions: NetworkConditions, decay: float) -> Constants:
         """Return bounds for a threshold that is a share of the state: any rate may be certified.
 
         Raises:
@@ -378,14 +375,12 @@ class CertificateScope:
         if not self._held and 0 < decay < math.inf and self._start_error == 0.0:
             with contextlib.suppress(NotDecayingError, VoidError):
                 return soonest(
-                    lambda rate: (self._solve(conditions, rate, rate, start, 0.0, None),),
+                    lambda rate: (self._solve(conditions, rate, 0.0, None),),
                     decay, self._loop.x0,
                 )[0]  # fmt: skip
-        return self._solve(conditions, 0.0, 0.0, start, 0.0, None)
+        return self._solve(conditions, 0.0, 0.0, None)
 
-    def _slower(
-        self, conditions: NetworkConditions, alpha_per_s: float, start: Matrix
-    ) -> Constants:
+    def _slower(self, conditions: NetworkConditions, alpha_per_s: float) -> Constants:
         """Return bounds that decay more slowly than the threshold, for a box too large for α.
 
         Raises:
@@ -394,32 +389,27 @@ class CertificateScope:
         for share in _SHARES_OF_ALPHA:
             rate = share * alpha_per_s
             with contextlib.suppress(NotDecayingError):
-                return self._solve(conditions, rate, rate, start, self._trigger.beta, None)
+                return self._solve(conditions, rate, self._trigger.beta, None)
         raise NotDecayingError("the uncertainty box is too large for the loop's gains")
 
     def _solve(
         self,
         conditions: NetworkConditions,
-        error_alpha_per_s: float,
-        plant_alpha_per_s: float,
-        start: Matrix,
+        alpha_per_s: float,
         level: float,
         reached: float | None,
     ) -> Constants:
-        if error_alpha_per_s not in self._errors:
-            self._errors[error_alpha_per_s] = error_gains(self._loop, error_alpha_per_s)
-        error = self._errors[error_alpha_per_s]
-        key = (error_alpha_per_s, plant_alpha_per_s, start.tobytes())
-        if key not in self._plants:
-            self._plants[key] = replace(
-                self._plant_at(error, start, plant_alpha_per_s),
+        if alpha_per_s not in self._plants:
+            error = error_gains(self._loop, alpha_per_s)
+            self._plants[alpha_per_s] = replace(
+                self._plant_at(error, self._loop.x0[:, None], alpha_per_s),
                 further_outputs=self._trigger.outputs,
             )
-        background = Background(input_error=self._start_error)
+        plant = self._plants[alpha_per_s]
         # Inputs of an earlier run are covered by their norm only.
-        structured = self._start_error == 0.0
+        earlier = self._start_error
         bound = self._trigger.bound(conditions, level, reached)
-        return solve(error, self._plants[key], conditions, bound, background, structured=structured)
+        return solve(plant.error, plant, conditions, bound, earlier, structured=earlier == 0.0)
 
 
 def _at_floor(first: Constants, share: float) -> Constants:

@@ -7,6 +7,7 @@ threshold, which is at most βe^{−αt} + ε. Both use the same δ. An event ne
 least λβe^{−αt} + (1 − λ)ε, for any λ in [0, 1].
 """
 
+import contextlib
 import math
 from collections.abc import Callable, Sequence
 from typing import TypeVar
@@ -15,8 +16,6 @@ import numpy as np
 
 from noack.core.linear_systems import Vector
 from noack.theory.certificate import (
-    NO_BACKGROUND,
-    Background,
     Constants,
     NetworkConditions,
     Part,
@@ -35,12 +34,14 @@ def solve_divided(
     decaying: Part,
     persistent: Part,
     conditions: NetworkConditions,
-    background: Background = NO_BACKGROUND,
+    earlier_error: float = 0.0,
     *,
     structured: bool = True,
     shares: Sequence[float] = SHARES,
 ) -> tuple[Constants, Constants]:
     """Return the constants of both parts, with the λ of ``shares`` for which δ is longest.
+
+    Without ``shares`` δ is searched for only if there is no certificate otherwise.
 
     Raises:
         VoidError: the loop gain of one part is not below 1.
@@ -48,16 +49,21 @@ def solve_divided(
     """
     beta, floor = decaying.bound.beta, persistent.bound.beta
 
-    def solved(share: float) -> tuple[Constants, Constants]:
-        reached = (share * beta, (1 - share) * floor) if floor > 0 else (None, None)
+    def solved(share: float | None) -> tuple[Constants, Constants]:
+        reached = (None, None) if share is None else (share * beta, (1 - share) * floor)
         parts = [
             part._replace(bound=part.bound._replace(reached=level))
             for part, level in zip((decaying, persistent), reached, strict=True)
         ]
-        first, second = solve_sum(parts, conditions, background, structured=structured)
+        first, second = solve_sum(parts, conditions, earlier_error, structured=structured)
         return first, second
 
-    tried = [solved(share) for share in (shares if floor > 0 else shares[:1])]
+    if floor == 0:
+        return solved(None)
+    if not shares:
+        with contextlib.suppress(VoidError):
+            return solved(None)
+    tried = [solved(share) for share in shares or SHARES[:1]]
     return max(tried, key=lambda found: found[0].inter_event_s or 0.0)
 
 

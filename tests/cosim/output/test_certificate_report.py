@@ -279,3 +279,22 @@ def test_a_set_point_is_certified_in_its_own_coordinates() -> None:
     rest = -np.linalg.solve(H_of_plant, loop.A @ x_r + loop.B @ given.setpoint_input)
     persistent = tilted.paper.state(np.array([1e3]))[0]
     assert 0 < np.linalg.norm(rest) < persistent < 30 * np.linalg.norm(rest)
+
+
+def test_a_time_triggered_loop_shows_whether_all_patterns_are_stable() -> None:
+    found = certificates_of(load(ROOT / "scenarios/lane_periodic.toml", []))
+    assert found.paper.constants is None
+    assert found.stability is not None
+    assert found.stability.verdict == "stable"
+
+
+@pytest.mark.parametrize(
+    ("trigger", "why"),
+    [
+        ('{policy="lyapunov", rate_per_s=0.3}', "deadline"),
+        ('{policy="relative", sigma=1e-4}', "accumulate"),
+    ],
+)
+def test_a_policy_without_a_certificate_says_why(trigger: str, why: str) -> None:
+    found = certificates_of(load(ROOT / "scenarios/lane_following.toml", [f"trigger={trigger}"]))
+    assert why in (found.paper.void or "")

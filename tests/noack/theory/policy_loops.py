@@ -120,20 +120,23 @@ KINDS: dict[str, Callable[[System, Rng], Case]] = {
 }  # fmt: skip
 
 
-def policy_case(kind: str, system: System, seed: int) -> tuple[Scenario, EventRule, System]:
+def policy_case(
+    kind: str, system: System, seed: int, push: float = 0.0
+) -> tuple[Scenario, EventRule, System]:
     """Return a loop with a policy: its scenario, the same rule, and the loop in whole ns.
 
-    In a third of the cases the loop is in zero-order hold.
+    In a third of the cases the loop is in zero-order hold. ``push`` bounds a disturbance of each
+    state.
     """
     rng = np.random.default_rng(seed)
     system = replace(system, step_s=max(round(system.step_s * 1e9), 1) / 1e9)
     if rng.uniform() < 1 / 3:
         system = replace(system, H=np.zeros_like(system.H))
     settings, rule = KINDS[kind](system, rng)
-    return scenario_with(system, settings), rule, system
+    return scenario_with(system, settings, push), rule, system
 
 
-def scenario_with(system: System, trigger: dict[str, Any]) -> Scenario:
+def scenario_with(system: System, trigger: dict[str, Any], push: float) -> Scenario:
     """The system's matrices with a trigger; the rates have no effect where conditions are given."""
     mode = "model" if system.H.any() else "zoh"
     model: Matrix = system.H - system.B @ system.K if mode == "model" else system.A
@@ -150,6 +153,9 @@ def scenario_with(system: System, trigger: dict[str, Any]) -> Scenario:
         "trigger": trigger,
         "network": {"mansd": system.mansd, "loss": {"model": "worst_case"}},
     }  # fmt: skip
+    if push:
+        bound = [push] * len(system.A)
+        content["plant"]["disturbances"] = [{"kind": "uniform", "at": "state", "bound": bound}]
     return resolve(validate(content, "test"))
 
 

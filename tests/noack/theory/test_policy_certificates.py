@@ -6,15 +6,18 @@ The policies are written again in ``event_rules``, and the loops are simulated i
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from noack.config.resolution import policy_of
 from noack.theory.certificate import NetworkConditions
 from noack.theory.scenario_certificates import certify
 from tests.noack.theory.broken_policies import BROKEN_POLICIES, INSTANT
+from tests.noack.theory.disturbed_loops import DisturbedLoop, signals
 from tests.noack.theory.exact_loops import observe
 from tests.noack.theory.loops import (
     ROUNDING,
     SEARCH,
+    STEPS,
     System,
     networks,
     random_system,
@@ -33,6 +36,21 @@ def test_no_bound_of_a_policy_is_exceeded(kind: str, system: System, seed: int) 
     certificate = certify(resolved, system.conditions)
     if certificate.constants is not None:
         trace = simulate(system, *networks(seed, system), rule=rule)
+        assert exceeded_by(trace, certificate, system) == []
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@settings(SEARCH, max_examples=3)
+@given(systems(step_share=0.002), st.sampled_from([0.02, 0.3]), seeds)
+def test_no_bound_of_a_policy_is_exceeded_under_disturbances(
+    kind: str, system: System, push: float, seed: int
+) -> None:
+    resolved, rule, system = policy_case(kind, system, seed, push)
+    certificate, n = certify(resolved, system.conditions), len(system.A)
+    if certificate.constants is not None:
+        loop = DisturbedLoop(system, push * np.eye(n), (STEPS,) * n, np.zeros(n), 0.0)
+        pushes, _ = signals(loop, np.random.default_rng(seed))
+        trace = simulate(system, *networks(seed, system), rule=rule, pushes=pushes)
         assert exceeded_by(trace, certificate, system) == []
 
 

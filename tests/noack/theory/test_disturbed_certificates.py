@@ -1,0 +1,130 @@
+"""Disturbances and noise of scenarios: boxes, normal values, and the shipped scenarios' bounds."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from noack.config.resolution import resolve
+from noack.config.scenario_file import load
+from noack.theory.box import BoxGains
+from noack.theory.certificate import Part, TriggerBound, VoidError
+from noack.theory.enclosure import NotDecayingError
+from noack.theory.gains import ErrorGains, Forcing, NormalForcing, PlantGains
+from noack.theory.run_conditions import allowed_conditions
+from noack.theory.scenario_certificates import ScenarioCertificate, certify, certify_box
+from noack.theory.superposition import solve_divided
+from tests.noack.theory.disturbed_loops import Sum, random_disturbed_loop, signals
+from tests.noack.theory.loops import RUNS, STEPS, Plants, System, networks, random_system, simulate
+
+ROOT = Path(__file__).parents[3]
+
+
+def box_certificate(system: System, columns: np.ndarray, half: float, floor: float) -> Sum:
+    def plant(alpha: float, start: np.ndarray, forcing: Forcing | None) -> PlantGains:
+        models = ErrorGains(system.H, system.K, system.weight, alpha)
+        halves = np.full_like(system.A, half), np.full_like(system.B, half)
+        return BoxGains(models, system.A, system.B, start, alpha, *halves, forcing=forcing)
+
+    k, m = columns.shape[1], system.B.shape[1]
+    forcing = Forcing(columns, np.full(k, np.inf), np.zeros(m))
+    first = plant(system.alpha, system.x0[:, None], None)
+    rest = plant(0.0, np.zeros((len(system.A), 1)), forcing)
+    return Sum(system, *solve_divided(
+        Part(first.error, first, TriggerBound(system.beta, None)),
+        Part(rest.error, rest, TriggerBound(floor, None, unit=1.0)),
+        system.conditions,
+    ))  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_plant_of_a_disturbed_box_exceeds_its_bounds(seed: int) -> None:
+    """Each run switches between plants of the box at every step."""
+    rng = np.random.default_rng(seed)
+    while True:
+        loop = random_disturbed_loop(rng, mismatch=0.0, noise=0.0, n=2, lasting=STEPS, floor=0.3)
+        half = 0.02
+        try:
+            found = box_certificate(loop.system, loop.columns, half, loop.floor)
+        except (VoidError, NotDecayingError):
+            continue
+        break
+    system = loop.system
+    pool = [
+        tuple(M + half * rng.choice([-1.0, 1.0], M.shape) for M in (system.A, system.B))
+        for _ in range(6)
+    ]
+    plants = Plants(pool, rng.integers(0, 6, (RUNS, STEPS)))  # type: ignore[arg-type]
+    pushes, _ = signals(loop, rng)
+    drawn = networks(seed, system)
+    trace = simulate(system, *drawn, floor=loop.floor, pushes=pushes, plants=plants)
+    shares = found.shares(trace)
+    assert max(shares.values()) <= 1 + 1e-9, shares
+    # Without the disturbance the bounds would be exceeded, or come closer.
+    narrow = box_certificate(system, 1e-6 * loop.columns, half, loop.floor).shares(trace)
+    assert narrow["x"] > shares["x"]
+
+
+def test_the_response_to_normal_disturbances_stays_within_its_radius() -> None:
+    """Of many normal runs, at most about the assumed share exceeds the bound; it is not far off."""
+    rng, period_s = np.random.default_rng(0), 0.02
+    for _ in range(5):
+        system = random_system(rng, n=2, mismatch=0.0)
+        models = ErrorGains(system.H, system.K, system.weight, 0.0)
+        D, radius = rng.normal(size=(2, 2)), 3.0
+        normal = NormalForcing(D, period_s, limit=radius, radius=radius)
+        forcing = Forcing(np.zeros((2, 0)), np.zeros(0), np.zeros(system.B.shape[1]), normal)
+        start = np.zeros((2, 1))
+        plant = PlantGains(models, system.A, system.B, start, 0.0, forcing=forcing)
+        M, C = plant.closed_loop, rng.normal(size=(1, 2))
+        bound = plant.disturbed(C)
+        # Euler's method with small steps, independent of matrix exponentials.
+        x, fine, largest = np.zeros((400, 2)), 50, np.zeros(400)
+        for _ in range(int(10 / -np.linalg.eigvals(M).real.max() / period_s)):
+            push = rng.normal(size=(400, 2)) @ D.T
+            for _ in range(fine):
+                x = x + period_s / fine * (x @ M.T + push)
+            largest = np.maximum(largest, np.abs(x @ C.T)[:, 0])
+        stationary = np.abs(x @ C.T)[:, 0]
+        assert (stationary > bound).mean() < 0.03  # chi squared with 2 degrees beyond 3²: 0.011
+        assert largest.max() > 0.3 * bound
+
+
+FIGURES: dict[str, dict[str, Any]] = {
+    "lane_crosswind": {"state": 27.42, "delta": 3.723},
+    "pendulum_observed": {"state": 9.537, "delta": 2.463, "estimation_error": 0.09161},
+}
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_the_shipped_disturbed_scenarios_have_their_documented_bounds(name: str) -> None:
+    rest = scheduled(name).persistent_constants
+    assert rest is not None
+    text = (ROOT / "docs" / "theory.md").read_text(encoding="utf-8")
+    for key, value in FIGURES[name].items():
+        assert getattr(rest, key) == pytest.approx(value, rel=1e-3)
+        assert f"{value:.3g}" in text
+
+
+def scheduled(name: str, *settings: str) -> ScenarioCertificate:
+    resolved = resolve(load(ROOT / "scenarios" / f"{name}.toml", settings))
+    return certify(resolved, allowed_conditions(resolved))
+
+
+def test_a_smaller_probability_never_has_smaller_bounds() -> None:
+    name, likely = "pendulum_observed", "certificate.exceedance_probability=0.5"
+    more, less = scheduled(name), scheduled(name, likely)
+    assert more.persistent_constants is not None
+    assert less.persistent_constants is not None
+    for key in ("state", "delta", "overshoot", "estimation_error", "input_error"):
+        assert getattr(less.persistent_constants, key) < getattr(more.persistent_constants, key)
+
+
+def test_a_box_with_an_observer_has_no_certificate_and_says_so() -> None:
+    path = ROOT / "scenarios" / "pendulum_observed.toml"
+    box = ["plant.uncertainty_A=[[0, 0], [0, 0.1]]"]
+    resolved = resolve(load(path, box))
+    found = certify_box(resolved, allowed_conditions(resolved))
+    assert found is not None
+    assert "for one plant only, not for a box" in (found.void or "")
