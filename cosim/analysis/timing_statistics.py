@@ -28,10 +28,13 @@ def lateness_parts(record: RunRecord, role: str) -> Iterator[NDArray[np.float64]
     """Yield the wall time between a process's actions and their nominal times in µs, in order.
 
     The nominal time is the deadline for plant and controller, the time of the measurement for the
-    sensor, and the arrival of the datagram at its socket for the network.
+    sensor, and the arrival of the datagram at its socket for the network. The plain engine of the
+    network does not know the arrival; its rows have ``now_ns`` there, and are left out.
     """
     for rows in record.source.batches(_STEPS[role], ("now_ns", "t_ns")):
-        yield np.asarray((rows["now_ns"] - rows["t_ns"]) / (1e3 * record.scenario.speed))
+        late_ns = rows["now_ns"] - rows["t_ns"]
+        known = late_ns[late_ns != 0] if role == "netem" else late_ns
+        yield np.asarray(known / (1e3 * record.scenario.speed))
 
 
 def lateness_us(record: RunRecord, role: str) -> NDArray[np.float64]:

@@ -27,8 +27,9 @@ Sources = Annotated[
     list[str] | None,
     typer.Argument(
         metavar="FILE...|ADDRESS",
-        help="A packet trace, the name of a shipped one, captures of both ends, a run "
-        "directory; or the address of a listener, to which a probe is sent.",
+        help="A packet trace, the name of a shipped one, captures of both ends, a fate file, a "
+        "run directory, delivery opportunities; or the address of a listener, to which a probe "
+        "is sent.",
     ),
 ]
 Listen = Annotated[
@@ -47,7 +48,8 @@ Silence = Annotated[
     str,
     typer.Option(
         metavar="TIME",
-        help="Once a probe has begun, a listener ends after so long without a datagram.",
+        help="Once a probe has begun, a listener ends after so long without a datagram. It waits "
+        "for a probe until Ctrl-C.",
     ),
 ]
 Save = Annotated[
@@ -72,8 +74,11 @@ Deadline = Annotated[
     typer.Option(metavar="TIME", help="Packets that take longer count as lost, e.g. 100ms."),
 ]
 Shares = Annotated[
-    list[float] | None,
-    typer.Option(help="Share of loss bursts and packets for which M is given; repeatable."),
+    list[str] | None,
+    typer.Option(
+        metavar="SHARE",
+        help="Share of loss bursts and packets for which M is given, e.g. 99%; repeatable.",
+    ),
 ]
 Windows = Annotated[
     list[int] | None,

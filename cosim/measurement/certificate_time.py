@@ -69,6 +69,8 @@ class CertificateTime:
     """Share of the time in which any of the conditions was violated."""
     causes: tuple[VoidShare, ...]
     """Those that were violated."""
+    kept: dict[str, str]
+    """Those that were never violated, with the worst value in words."""
 
     @property
     def first_s(self) -> float | None:
@@ -91,7 +93,8 @@ def certificate_time(trace: PacketTrace, scenario: Scenario) -> CertificateTime:
     allowed = allowed_conditions(resolved)
     delay_ns = network_delay_ns(resolved, resolved.certificate.late_periods)
     end_ns = int(max(trace.sent_ns[-1], trace.received_ns.max()))
-    spans = [one for one in _violations(trace, allowed, delay_ns, end_ns) if len(one.begin_ns)]
+    every = list(_violations(trace, allowed, delay_ns, end_ns))
+    spans = [one for one in every if len(one.begin_ns)]
     whole = max(end_ns, 1)
     union_ns = _covered_ns(
         np.concatenate([_NONE, *(one.begin_ns for one in spans)]),
@@ -114,12 +117,17 @@ def certificate_time(trace: PacketTrace, scenario: Scenario) -> CertificateTime:
             )
             for one in spans
         ),
+        kept={
+            one.cause: f"kept: {one.text}" if one.worst else "kept"
+            for one in every
+            if not len(one.begin_ns) and not one.cause.endswith(ORDER)
+        },
     )
 
 
 @dataclass(frozen=True, eq=False)
 class _Spans:
-    """The k intervals in which a condition is violated."""
+    """The k intervals in which a condition is violated; if there are none, its worst value."""
 
     cause: str
     begin_ns: Times
@@ -148,13 +156,14 @@ def _violations(
         )
         which = dropped > rule.limit
         for suffix, these in (("", which), (ORDER, (every > rule.limit) & ~which)):
-            worst = float(every[these].max(initial=0))
+            values = every if suffix else dropped
+            worst = float((every[these] if these.any() else values).max(initial=0))
             yield _Spans(
                 rule.name + suffix, sent_ns[these], until_ns[these], worst, rule.violation(worst)
             )
     delays = trace.received_ns - sent_ns
     beyond = ~found.lost & ~overtaken & (delays > delay_ns)
-    worst = float(delays[beyond].max(initial=0)) * 1e-9
+    worst = float(delays[~found.lost & ~overtaken].max(initial=0)) * 1e-9
     yield _Spans(
         DELAY, sent_ns[beyond] + delay_ns, trace.received_ns[beyond], worst,
         f"an update was in the network for {worst:.4g} s, {allowed_s:.4g} s allowed",

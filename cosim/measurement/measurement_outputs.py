@@ -11,7 +11,7 @@ from cosim.measurement.measurement_tables import print_measurement
 from cosim.measurement.network_file import Form, write_network
 from cosim.measurement.network_measurement import Measurement
 from noack.config.scenario import Scenario
-from noack.core.errors import CallerError
+from noack.core.file_access import require_suffix
 
 
 @dataclass(frozen=True)
@@ -26,12 +26,10 @@ class OutputRequest:
 
     def __post_init__(self) -> None:
         """Refuse wrong names before anything is measured."""
-        if self.page is not None and self.page.suffix != ".html":
-            raise CallerError(f"--out {self.page}: a measurement is written as .html")
-        if self.network is not None and self.network.suffix != ".toml":
-            raise CallerError(
-                f"--write {self.network}: the name of a [network] section ends in .toml"
-            )
+        if self.page is not None:
+            require_suffix(self.page, "--out", ".html")
+        if self.network is not None:
+            require_suffix(self.network, "--write", ".toml")
 
 
 def report(found: Measurement, request: OutputRequest, console: Console | None) -> dict[str, Any]:

@@ -7,8 +7,7 @@ from cosim.measurement.measurement_figures import measurement_figures
 from cosim.measurement.measurement_tables import measurement_tables, void_remarks
 from cosim.measurement.network_measurement import Measurement
 from cosim.output.report.report_page import templates
-from noack.core.errors import CallerError
-from noack.core.file_access import write_whole
+from noack.core.file_access import require_suffix, write_whole
 
 
 def write_page(found: Measurement, void: CertificateTime | None, path: Path) -> Path:
@@ -18,8 +17,7 @@ def write_page(found: Measurement, void: CertificateTime | None, path: Path) -> 
         CallerError: the name does not end in .html.
         MachineError: the page cannot be written.
     """
-    if path.suffix != ".html":
-        raise CallerError(f"--out {path}: a measurement is written as .html")
+    require_suffix(path, "--out", ".html")
     template = templates(Path(__file__).parent).get_template("measurement.html.jinja")
     html = template.render(
         found=found,

@@ -54,16 +54,16 @@ def measurement_tables(
             for one in found.quantiles
         ],
     )  # fmt: skip
-    yield TextTable(
-        "(m, K): most losses m in any K consecutive packets",
-        ("K", "m", "m in windows without an outage")[: 3 if found.is_outage.any() else 2],
-        [
-            (str(window), str(every), NONE if usual is None else str(usual))[
-                : 3 if found.is_outage.any() else 2
-            ]
-            for window, (every, usual) in found.windows.items()
-        ],
-    )
+    if found.windows:
+        columns = 3 if found.is_outage.any() else 2
+        yield TextTable(
+            "(m, K): most losses m in any K consecutive packets",
+            ("K", "m", "m in windows without an outage")[:columns],
+            [
+                (str(window), str(every), NONE if usual is None else str(usual))[:columns]
+                for window, (every, usual) in found.windows.items()
+            ],
+        )
     if found.models:
         yield TextTable(
             "loss models" + _without(found),
@@ -183,6 +183,8 @@ def _outage_rows(found: Measurement) -> Iterator[tuple[str, str, str]]:
 def _void_rows(void: CertificateTime) -> Iterator[tuple[str, str, str, str]]:
     for one in void.causes:
         yield one.cause, percent(one.share), f"{one.first_s:.3f} s", one.text
+    for cause, text in void.kept.items():
+        yield cause, percent(0.0), NONE, text
     first = NONE if void.first_s is None else f"{void.first_s:.3f} s"
     yield "any of them", percent(void.share), first, ""
 

@@ -11,8 +11,8 @@ from cosim.measurement.network_measurement import Measurement
 from noack.config import toml_file
 from noack.config.scenario_file import toml_text
 from noack.config.sections.network_section import NetworkSection
-from noack.core.errors import CallerError, printable
-from noack.core.file_access import write_whole
+from noack.core.errors import printable
+from noack.core.file_access import require_suffix, write_whole
 from noack.impairments.link_settings import read_files
 from noack.traces.packet_trace import LOST_NS, PacketTrace
 
@@ -29,8 +29,7 @@ def write_network(found: Measurement, path: Path, form: Form) -> list[Path]:
         CallerError: the name does not end in .toml, or the emulator cannot reproduce the network.
         MachineError: a file cannot be written.
     """
-    if path.suffix != ".toml":
-        raise CallerError(f"--write {path}: the name of a [network] section ends in .toml")
+    require_suffix(path, "--write", ".toml")
     written = [path]
     if form == "trace":
         trace_path = path.with_suffix(".csv")

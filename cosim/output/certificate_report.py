@@ -344,9 +344,10 @@ def _stability_in_words(found: Certificates) -> Iterator[str]:
 def _print_constants(console: Console, found: Certificates) -> None:
     trigger = found.scenario.trigger
     norm = "‖W·‖" if trigger.weight is not None else "‖·‖"
+    guarantee = next(iter(found))[1].conditions.guarantee  # its longest burst counts all rules
     table = Table(
         title=f"{found.scenario.name}: certified bounds, "
-        f"{found.scenario.network.guarantee.meaning}; event: {trigger.description}; norm {norm}"
+        f"{guarantee.meaning}; event: {trigger.description}; norm {norm}"
     )
     table.add_column("")
     for under, certificate in found:

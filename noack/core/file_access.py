@@ -8,7 +8,13 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
-from noack.core.errors import MachineError, why
+from noack.core.errors import CallerError, MachineError, why
+
+
+def require_suffix(path: Path, option: str, suffix: str) -> None:
+    """Raise CallerError if the name of a file to be written, given by an option, ends otherwise."""
+    if path.suffix != suffix:
+        raise CallerError(f"{option} {path}: the file's name must end in {suffix}")
 
 
 def write_whole(path: Path, content: str | bytes, *, make_folder: bool = True) -> Path:

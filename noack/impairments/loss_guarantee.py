@@ -125,8 +125,10 @@ class DeliveriesBetweenBursts:
 
     @property
     def meaning(self) -> str:
-        count = "1 delivery" if self.deliveries == 1 else f"{self.deliveries} deliveries"
-        return f"at least {count} in a row between two bursts of losses"
+        count = (
+            "1 delivery" if self.deliveries == 1 else f"{self.deliveries} consecutive deliveries"
+        )
+        return f"at least {count} between two bursts of losses"
 
     def after(self, state: int, lost: bool) -> tuple[int, int]:
         if not lost:

@@ -108,7 +108,8 @@ def packet_trace(
         received = received - (received - sent)[~lost].min()
     received = np.where(lost, sent, received)
     early = (
-        "is received before it is sent; if the two clocks differ, only relative delays are known"
+        "is received before it is sent; if two clocks were read, give --clocks different "
+        "(noack measure), relative (noack netem), clocks_differ = true (TOML)"
     )
     _refuse(np.flatnonzero(received < sent), row, early)
     return _with_missing(number, sent, np.where(lost, LOST_NS, received))

@@ -46,6 +46,7 @@ def read_trace(
     clocks_differ: bool = False,
     most_packets: int = MAX_PACKETS,
     formats: Sequence[TraceFormat] = (),
+    others: Sequence[str] = (),
 ) -> PacketTrace:
     """Return the trace in a file.
 
@@ -55,6 +56,7 @@ def read_trace(
         clocks_differ: see :func:`noack.traces.packet_trace.packet_trace`.
         most_packets: most packets of the trace.
         formats: further formats, beside those of this folder.
+        others: what the caller reads besides; for a message.
 
     Raises:
         CallerError: one line; the file cannot be read, or is not a trace.
@@ -67,7 +69,8 @@ def read_trace(
             if found is None:
                 names = ", ".join(sorted(one.name for one in known))
                 raise ValueError(
-                    f"not a packet trace; {names} can be read, also compressed by gzip; a CSV file "
+                    f"not a packet trace; {names} can be read, also compressed by gzip"
+                    f"{''.join(f', {one}' for one in others)}; a CSV file "
                     "begins with a header, e.g. sequence,sent_ms,received_ms"
                 )
             return found.read(file, most_packets, clocks_differ)

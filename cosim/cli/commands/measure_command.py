@@ -54,19 +54,28 @@ def measure(
 
     from cosim.measurement.live.live_measurement import LiveOptions, period_ns_of
     from cosim.measurement.measurement_outputs import OutputRequest, report
-    from cosim.measurement.network_measurement import Measurement
+    from cosim.measurement.network_measurement import Measurement, MeasurementOptions
     from cosim.measurement.trace_sources import SourceOptions
 
     options = _options(deadline, share, window, outage)
     if settings and for_scenario is None:
         raise CallerError("--set: replaces a value of the scenario of --for-scenario; give one")
     scenario = None if for_scenario is None else cli.load_scenario(for_scenario, settings)
+    if form is given.NetworkForm.MODEL and write is None:
+        raise CallerError("--as model: is the form of --write; give its FILE.toml")
     request = OutputRequest(out, write, form.value, scenario)
     live = LiveOptions(rate, duration, size, round_trip, silence, save, options.deadline_s)
     how = SourceOptions(
         None if clocks is None else clocks is given.ClockRelation.DIFFERENT,
         flow, sequence_at, period_ns_of(rate),
     )  # fmt: skip
+    if _is_one_way_sender(sources, listen, live) and (
+        options != MeasurementOptions(deadline_s=options.deadline_s) or request != OutputRequest()
+    ):
+        raise CallerError(
+            "the sender of a one-way probe does not know what arrives: give the options of the "
+            "measurement to the listener, or add --round-trip"
+        )
     result, name = _result(sources or [], listen, live, how)
     if result.trace is None:  # the sender of a one-way probe does not know what arrived
         if json:
@@ -85,40 +94,60 @@ def _result(
     sources: list[str], listen: str | None, live: "LiveOptions", how: "SourceOptions"
 ) -> tuple["ProbeResult", str]:
     """Return the result of a probe or of reading files, and a name for it."""
-    from cosim.measurement.live.live_measurement import is_address, receive_live, send_live
+    from cosim.measurement.live.live_measurement import (
+        LIVE_OPTIONS,
+        is_address,
+        receive_live,
+        send_live,
+    )
     from cosim.measurement.live.probe_result import ProbeResult
-    from cosim.measurement.trace_sources import read_source
+    from cosim.measurement.trace_sources import FILE_OPTIONS, read_source, refuse_unused
 
     if listen is not None:
-        if live.round_trip:
-            raise CallerError("--round-trip: is for the sender; the listener learns it")
         if sources:
             raise CallerError(f"--listen {listen}: receives a probe, and reads no {sources[0]}")
+        refuse_unused(live, LIVE_OPTIONS, "a listener; the sender has it", "silence", "save")
+        refuse_unused(how, FILE_OPTIONS, "a live probe", "period_ns")
         return receive_live(listen, live), f"probe received at {listen}"
     if not sources:
         raise CallerError("expected a file, the address of a listener, or --listen ADDRESS")
     if len(sources) == 1 and is_address(sources[0]):
+        refuse_unused(live, {"silence": "--silence"}, "a sender; the listener has it")
+        refuse_unused(how, FILE_OPTIONS, "a live probe", "period_ns")
         return send_live(sources[0], live), f"probe of {sources[0]}"
-    if live.save is not None or live.round_trip:
-        option = "--round-trip" if live.save is None else f"--save {live.save}"
-        raise CallerError(f"{option}: is for live probes, and {sources[0]} is no address")
+    refuse_unused(live, LIVE_OPTIONS, f"{sources[0]}, which is no address of a listener", "rate")
     trace = read_source([*map(find_trace, sources)], how)
     return ProbeResult(trace, trace.notes, None), " ".join(sources)
 
 
+def _is_one_way_sender(sources: list[str] | None, listen: str | None, live: "LiveOptions") -> bool:
+    from cosim.measurement.live.live_measurement import is_address
+
+    one = sources is not None and len(sources) == 1 and is_address(sources[0])
+    return one and listen is None and not live.round_trip
+
+
+def _share(text: str) -> float:
+    percent = text.endswith("%")
+    try:
+        share = float(text.removesuffix("%")) / (100 if percent else 1)
+    except ValueError:
+        share = 0.0
+    if not 0 < share <= 1:
+        raise CallerError(f"--share {text}: expected a share, e.g. 0.99 or 99%")
+    return share
+
+
 def _options(
-    deadline: str | None, shares: list[float] | None, window: list[int] | None, outage: str | None
+    deadline: str | None, shares: list[str] | None, window: list[int] | None, outage: str | None
 ) -> "MeasurementOptions":
     from cosim.measurement.burst_statistics import WINDOWS
     from cosim.measurement.live.live_measurement import time_s_of
     from cosim.measurement.network_measurement import QUANTILES, MeasurementOptions
 
-    for share in shares or ():
-        if not 0 < share <= 1:
-            raise CallerError(f"--share {share:g}: expected a share above 0 up to 1, e.g. 0.99")
     return MeasurementOptions(
         deadline_s=None if deadline is None else time_s_of("--deadline", deadline),
-        quantiles=tuple(shares or QUANTILES),
+        quantiles=tuple(map(_share, shares)) if shares else QUANTILES,
         windows=tuple(sorted(set(window or WINDOWS))),
         outage_s=None if outage is None else time_s_of("--outage", outage),
     )

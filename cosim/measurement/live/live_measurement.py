@@ -39,6 +39,13 @@ class LiveOptions:
     deadline_s: float | None = None
 
 
+LIVE_OPTIONS = {
+    "rate": "--rate", "duration": "--for", "size_bytes": "--size", "round_trip": "--round-trip",
+    "silence": "--silence", "save": "--save",
+}  # fmt: skip
+"""Options of the command line, by field of :class:`LiveOptions`."""
+
+
 def is_address(source: str) -> bool:
     """Whether a source is an address to probe, not a file."""
     return _ADDRESS.fullmatch(source) is not None and not Path(source).exists()

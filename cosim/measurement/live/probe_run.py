@@ -76,11 +76,16 @@ def send(
         sender = ProbeSender(
             plan, secrets.randbits(64), host_number(), time.monotonic_ns(), rows.add
         )
+        refused = 0
         while not sender.is_over(now_ns := time.monotonic_ns()):
             wait_ns = sender.next_deadline_ns() - now_ns
             if wait_ns <= 0:
                 socket.send(sender.on_timer(time.monotonic_ns()))
                 wait_ns = 0
+                if sender.ends <= 1:  # a send reports the failure of the one before
+                    if socket.send_errors and not refused:
+                        log(f"{socket.last_send_error}: is a listener running there?")
+                    refused = min(socket.send_errors, sender.sent)
             select.select([socket.endpoint], (), (), min(wait_ns * 1e-9, _LONGEST_WAIT_S))
             for _ in range(_BATCH):
                 if (arrival := socket.receive()) is None:
@@ -89,9 +94,9 @@ def send(
             rows.flush()
             if signals.received is not None:
                 sender.stop(time.monotonic_ns())
-        if socket.send_errors:
-            reason = f"{socket.send_errors} sends failed: {socket.last_send_error}"
-            if socket.send_errors >= sender.sent:
+        if refused:
+            reason = f"{refused} of {sender.sent} sends failed: {socket.last_send_error}"
+            if refused == sender.sent:
                 raise PeerError(f"{text_of(address)}: {reason}; is a listener running there?")
             log(reason)
         result = _consistent(sender.finish, socket)

@@ -70,7 +70,8 @@ class ProbeSender:
         self._to_send = plan.planned
         self._late = self._longest_late_ns = 0
         self._late_ns = min(_LATE_NS, plan.period_ns)
-        self._ends = 0
+        self.ends = 0
+        """Number of END datagrams sent so far."""
         self._ended_ns = 0
         self._all_answers: int | None = None
         self._numbers, self._newest, self._seen = array("Q"), array("Q"), bytearray()
@@ -87,12 +88,12 @@ class ProbeSender:
         """Return when :meth:`on_timer` is due."""
         if self.sent < self._to_send:
             return self._content.scheduled_ns(self.sent)
-        return self._ended_ns + self._ends * _END_PERIOD_NS
+        return self._ended_ns + self.ends * _END_PERIOD_NS
 
     def on_timer(self, now_ns: int) -> bytes:
         """Return the datagram that is due; ``now_ns`` becomes its time of sending."""
         if self.sent >= self._to_send:
-            self._ends += 1
+            self.ends += 1
             end = self._content._replace(
                 kind=ProbeKind.END, sequence=self.sent, sent_ns=now_ns, planned=self._to_send,
                 number=self._late, newest=self._longest_late_ns,
@@ -144,7 +145,7 @@ class ProbeSender:
         if self.sent < self._to_send:
             return False
         if not self._plan.is_round_trip:
-            return self._ends >= _ENDS
+            return self.ends >= _ENDS
         complete = self._all_answers is not None and len(self._numbers) >= self.sent
         return complete or now_ns > self._ended_ns + max(self._plan.wait_ns, 0)
 

@@ -131,6 +131,8 @@ def _parameters(scenario: Scenario) -> Iterator[tuple[str, str]]:
     yield "trigger", trigger.description
     yield "norm of errors", "‖e‖₂" if trigger.weight is None else "‖W e‖₂, W from the scenario"
     yield "M − 1", f"{network.mansd}" + ("" if network.enforce_mansd else ", not enforced")
+    if network.constraints:
+        yield "constraints on losses", ", ".join(one.text() for one in network.constraints)
     yield "loss", f"{model} ({details})" if details else model
     if scenario.protocol.acknowledges:
         timeout_ms = 1e-6 * scenario.timing.acknowledgement_timeout_ns

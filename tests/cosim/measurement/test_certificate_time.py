@@ -85,6 +85,7 @@ def test_every_rule_of_the_guarantee_counts() -> None:
     found = certificate_time(packet_trace(sent * MS, (sent + 1) * MS, lost), scenario)
     (one,) = found.causes
     assert (one.cause, one.worst, one.first_s) == ("atmost 2 in 5", 3, pytest.approx(0.06))
+    assert found.kept["dropouts"] == "kept: 1 consecutive updates lost, 2 allowed"
     assert one.share == pytest.approx(11 / 141)
 
 
@@ -95,6 +96,9 @@ def test_the_certificates_of_the_scenario_are_named() -> None:
     assert [one.cause for one in found.causes] == [DELAY]
     assert found.causes[0].worst == pytest.approx(9.744)
     slow = lane(impairments=[{"kind": "delay", "delay_s": 9.8}])
-    assert certificate_time(trace, slow).share == 0.0
+    kept = certificate_time(trace, slow)
+    assert kept.share == 0.0
+    assert kept.kept["dropouts"] == "kept"  # nothing was lost
+    assert kept.kept[DELAY].startswith("kept: an update was in the network for 9.744 s, 9.8")
     acknowledged = certificate_time(trace, noack.load("lane_acknowledged"))
     assert all(reason is not None for reason in acknowledged.certificates.values())

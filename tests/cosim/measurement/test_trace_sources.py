@@ -77,7 +77,7 @@ def test_sources_that_are_none(tmp_path: Path) -> None:
         ([tmp_path], SourceOptions(), str(tmp_path)),
         ([tmp_path / "none"], SourceOptions(), "No such file"),
         ([csv, csv], SourceOptions(), "expected one file, or two captures"),
-        ([csv], SourceOptions(sequence_at="0:4"), "not a capture"),
+        ([csv], SourceOptions(sequence_at="0:4"), "--sequence-at: has no effect on a packet trace"),
     ):
         with pytest.raises(CallerError, match=message) as refused:
             read_source(paths, options)

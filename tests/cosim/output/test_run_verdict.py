@@ -148,3 +148,9 @@ def test_a_live_run_has_latency_and_deadlines_in_its_table(outcome: Outcome) -> 
     punctual = outcome.summary | {"lateness_us": {"plant": late}}
     assert dict(short_numbers(punctual))["deadlines missed"] == "none"
     assert rows["sensor-to-controller latency p50 / p99"] == "600 / 900 µs"
+
+
+def test_the_longest_burst_is_shown_with_the_limit_of_all_rules(outcome: Outcome) -> None:
+    assert "longest loss burst (cap M − 1 = 4)" in dict(short_numbers(outcome.summary))
+    limited = outcome.summary | {"constraints": ["atmost 3 in 8"]}
+    assert "longest loss burst (at most 3 allowed)" in dict(short_numbers(limited))  # type: ignore[arg-type]

@@ -119,6 +119,13 @@ def test_each_direction_is_explained(explain: Explain, arguments: str, titles: l
     assert [line for line in lines if line.startswith(("forward", "reverse", "both"))] == titles
 
 
+def test_a_trace_is_shown_by_its_name(explain: Explain) -> None:
+    out = explain("replay", "rural_n8_10kmh", "from", "2s", "share", "50%")
+    assert "2178 packets in 129.6 s" in " ".join(out.split())
+    assert 'file = "rural_n8_10kmh", offset_s = 2.0, delay_share = 0.5' in out
+    assert len(out) < 2000
+
+
 def test_each_link_of_a_file_is_explained(explain: Explain, links_file: Path) -> None:
     out = explain("--links", str(links_file))
     uplink, video = out.split("\n\nvideo: 127.0.0.1:9002 → 127.0.0.1:9003\n")
