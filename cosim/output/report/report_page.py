@@ -124,8 +124,8 @@ def templates(folder: Path = Path(__file__).parent) -> Environment:
 def _parameters(scenario: Scenario) -> Iterator[tuple[str, str]]:
     trigger, network = scenario.trigger, scenario.network
     every = scenario.plant.measure_every
-    loss = network.loss.model_dump()
-    model = loss.pop("model").replace("_", "-")
+    loss = network.loss.model_dump(exclude={"model"}, exclude_defaults=True)
+    model = network.loss.model.replace("_", "-")
     details = ", ".join(f"{_words(key)} {_shown(value)}" for key, value in loss.items())
     yield "between updates", "model Â + B̂K" if scenario.mode == "model" else "zero-order hold"
     yield "trigger", trigger.description

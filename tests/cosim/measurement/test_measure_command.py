@@ -174,3 +174,13 @@ def test_mistakes_are_one_line(words: list[object], message: str) -> None:
     assert result.exit_code in (1, 2)
     (line,) = result.stderr.strip().splitlines()
     assert message in line
+
+
+def test_one_packet_has_no_windows_and_shares_may_be_percentages(tmp_path: Path) -> None:
+    path = tmp_path / "one.csv"
+    path.write_text("sent_ms,received_ms\n0,5\n")
+    result = measure(path, "--share", "99%")
+    assert result.exit_code == 0
+    assert "99 %" in result.stdout
+    assert "(m, K)" not in result.stdout
+    assert "(m, K)" in measure(RURAL).stdout
