@@ -155,8 +155,8 @@ def new_losses(program: LinkProgram, *, restarted: bool) -> list[int]:
 
 
 def recent_width(program: LinkProgram) -> int:
-    """Length of a flow's ring of release times."""
-    return program.mansd + 1 if program.tracks and program.mansd >= 0 else 1
+    """Length of a flow's ring of release times, a power of 2."""
+    return 1 << program.mansd.bit_length() if program.tracks and program.mansd >= 0 else 1
 
 
 def loss_width(program: LinkProgram) -> int:

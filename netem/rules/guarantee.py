@@ -57,54 +57,60 @@ def hold_back_until(
 ) -> int:
     """Return the earliest time, not before ``desired_ns``, at which ``packet`` may leave.
 
-    ``recent_ns`` is a ring of the mansd + 1 previous packets' release times; −1 for packets that
-    are not effectively delivered. The others ascend. Without a maximum of consecutive losses, only
-    the first packet can be needed.
+    ``recent_ns`` is a ring of the previous packets' release times, of mansd + 1 at least; −1 for
+    packets that are not effectively delivered. The others ascend. Without a maximum of consecutive
+    losses, only the first packet can be needed.
     """
     release_ns = max(desired_ns, flow.first_release_ns)
-    width = program.mansd + 1
-    oldest = max(packet - width, 0)
-    delivered = _newest(recent_ns, width, oldest, packet)
-    while delivered >= oldest and recent_ns[delivered % width] > release_ns:
-        delivered = _newest(recent_ns, width, oldest, delivered)
+    mask, oldest = len(recent_ns) - 1, max(packet - program.mansd - 1, 0)
+    delivered = _newest(recent_ns, oldest, packet)
+    while delivered >= oldest and recent_ns[delivered & mask] > release_ns:
+        delivered = _newest(recent_ns, oldest, delivered)
     first = delivered + 1
     if delivered < oldest:
         delivered = -1
+    needed = 0
     for number in range(first, packet):
-        time_ns = recent_ns[number % width]
+        time_ns = recent_ns[number & mask]
         if time_ns > release_ns:
-            if may_lose_after(program, losses, delivered, packet):
+            if needed == 0:
+                needed = needed_after(program, losses, delivered, packet)
+            if needed == 0:
                 break
+            needed -= 1
             release_ns = time_ns
         if time_ns >= 0:
             delivered = number
     return release_ns
 
 
-def _newest(recent_ns: Sequence[int], width: int, oldest: int, end: int) -> int:
+def _newest(recent_ns: Sequence[int], oldest: int, end: int) -> int:
     """Return the newest effectively delivered packet below ``end``; below ``oldest``: none."""
-    number = end - 1
-    while number >= oldest and recent_ns[number % width] < 0:
+    number, mask = end - 1, len(recent_ns) - 1
+    while number >= oldest and recent_ns[number & mask] < 0:
         number -= 1
     return number
 
 
-def may_lose_after(
-    program: LinkProgram, losses: Sequence[int], delivered: int, packet: int
-) -> bool:
-    """Whether all packets between ``delivered`` and ``packet`` may be lost; −1: all before it."""
+def needed_after(program: LinkProgram, losses: Sequence[int], delivered: int, packet: int) -> int:
+    """Return 0 if all packets between ``delivered`` and ``packet`` may be lost; −1: all before it.
+
+    Else at least so many of the effectively delivered ones between them must remain so: each takes
+    one loss from every window.
+    """
     burst = packet - 1 - delivered
-    if burst > program.mansd:
-        return False
+    needed = 1 if burst > program.mansd else 0
     if not counts_losses(program):
-        return True
+        return needed
     mask = len(losses) - 1
     before = losses[(delivered + 1) & mask]
     for number in range(len(program.windows)):
         window = program.windows[number]
-        if before + burst - losses[(packet - window.packets) & mask] > window.losses:
-            return False
-    return before == losses[(delivered + 1 - program.recovery) & mask]
+        beyond = before + burst - losses[(packet - window.packets) & mask] - window.losses
+        needed = max(needed, beyond)
+    if needed == 0 and before != losses[(delivered + 1 - program.recovery) & mask]:
+        needed = 1
+    return needed
 
 
 def make_stale(
@@ -115,13 +121,13 @@ def make_stale(
     release_ns: int,
 ) -> int:
     """Mark the earlier packets that leave after ``release_ns`` as stale; return how many."""
-    width, mask = program.mansd + 1, len(losses) - 1
-    oldest, stale, first = max(packet - width, 0), 0, packet
-    number = _newest(recent_ns, width, oldest, packet)
-    while number >= oldest and recent_ns[number % width] > release_ns:
-        recent_ns[number % width] = NEVER_NS
+    times, mask = len(recent_ns) - 1, len(losses) - 1
+    oldest, stale, first = max(packet - program.mansd - 1, 0), 0, packet
+    number = _newest(recent_ns, oldest, packet)
+    while number >= oldest and recent_ns[number & times] > release_ns:
+        recent_ns[number & times] = NEVER_NS
         stale, first = stale + 1, number
-        number = _newest(recent_ns, width, oldest, number)
+        number = _newest(recent_ns, oldest, number)
     if counts_losses(program):
         for number in range(first, packet):
             losses[(number + 1) & mask] = losses[number & mask] + 1

@@ -146,7 +146,7 @@ def settle(program: LinkProgram, state: LinkMemory, row: int, decision: PacketDe
         flow.longest_loss_burst = max(flow.longest_loss_burst, losses)
         counters.longest_loss_burst = max(counters.longest_loss_burst, losses)
     if program.tracks and program.mansd >= 0:
-        recent_ns[packet % (program.mansd + 1)] = effective_ns
+        recent_ns[packet & (len(recent_ns) - 1)] = effective_ns
     note_outcome(program, losses_before, packet, effective_ns == NEVER_NS)
     decision.consecutive_losses = flow.consecutive_losses
     count(counters, decision.fate)

@@ -79,7 +79,8 @@ def _carry_queue(
 def _carry_losses(row: int, old: LinkProgram, before: LinkMemory, after: LinkMemory) -> None:
     """Transfer the outcomes of the last packets; an unknown outcome counts as a delivery."""
     flow, known, losses = before.flows[row], before.losses[row], after.losses[row]
-    packets, mask, width = flow.packets, len(losses) - 1, old.mansd + 1
+    packets, mask = flow.packets, len(losses) - 1
+    times_ns = before.recent_ns[row]
     counted, listed = counts_losses(old), old.tracks and old.mansd >= 0
     if counted:
         count = len(known) - 1
@@ -88,7 +89,7 @@ def _carry_losses(row: int, old: LinkProgram, before: LinkMemory, after: LinkMem
                 losses[place] = known[place]
             return
     elif listed:
-        count = min(width, packets)
+        count = min(old.mansd + 1, packets)
     else:
         count = flow.consecutive_losses
     so_far = 0
@@ -97,7 +98,7 @@ def _carry_losses(row: int, old: LinkProgram, before: LinkMemory, after: LinkMem
         if counted:
             lost = known[(number + 1) & count] > known[number & count]
         elif listed:
-            lost = before.recent_ns[row][number % width] < 0
+            lost = times_ns[number & (len(times_ns) - 1)] < 0
         so_far += 1 if lost else 0
         losses[(number + 1) & mask] = so_far
 
@@ -125,14 +126,16 @@ def _carry_releases(
     packets that are in flight at the change.
     """
     flow, width = before.flows[row], new.mansd + 1
+    times_ns, older_ns = after.recent_ns[row], before.recent_ns[row]
+    mask = len(times_ns) - 1
     if old.tracks:
         if old.mansd >= 0 and new.mansd >= 0:
-            old_width = old.mansd + 1
-            for number in range(max(flow.packets - min(width, old_width), 0), flow.packets):
-                after.recent_ns[row][number % width] = before.recent_ns[row][number % old_width]
+            kept = min(width, old.mansd + 1)
+            for number in range(max(flow.packets - kept, 0), flow.packets):
+                times_ns[number & mask] = older_ns[number & (len(older_ns) - 1)]
         if not _is_same_guarantee(old, new):
             flow.first_release_ns = max(flow.first_release_ns, latest_ns)
     elif new.mansd >= 0:
         delivered = flow.packets - 1 - flow.consecutive_losses
         if delivered >= 0 and flow.consecutive_losses < width:
-            after.recent_ns[row][delivered % width] = 0
+            times_ns[delivered & mask] = 0
