@@ -10,12 +10,12 @@ its guarantee about losses, and the input is held. With all signals scaled by e^
     β̃ = sup‖e_s‖_W ≤ ḡβ + I_E sup‖R_E x‖ + I_B π                      (between two tests)
 
 with at most N missing events: the longest burst of losses, and ⌈d/δ⌉ in flight. Γ_C is smaller if
-few updates may be lost in a window (:mod:`noack.theory.loss_accumulation`). A policy's
-threshold may contain more than β, see :class:`TriggerBound`. These inequalities are linear in q
-and β̃ and hold on every [0, T]. So their solution (:mod:`noack.theory.nonnegative_system`) bounds
-the run if the loop gain is below 1. The minimum inter-event
-time δ is the time that ‖e_s‖_W needs from 0 to β under these bounds. If an assumed δ gives a time
-of at least δ, it holds by induction over the events; the largest such δ is used.
+few updates may be lost in a window (:mod:`noack.theory.loss_accumulation`). A policy's threshold
+may contain more than β (:mod:`noack.theory.error_growth`). These inequalities are linear in q and β̃
+and hold on every [0, T]. So their solution (:mod:`noack.theory.nonnegative_system`) bounds the run
+if the loop gain is below 1. The minimum inter-event time δ is the time that ‖e_s‖_W needs from 0 to
+β under these bounds. If an assumed δ gives a time of at least δ, it holds by induction over the
+events; the largest such δ is used.
 """
 
 import math
@@ -28,15 +28,20 @@ import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, LossRule
+from noack.theory.error_growth import (
+    COARSE_CELLS,
+    LONGEST_S,
+    ErrorGrowth,
+    TriggerBound,
+    first_passage_s,
+    growths_of,
+)
 from noack.theory.gains import Coefficients, ErrorGains, Output, PlantGains
 from noack.theory.loss_accumulation import LossAccumulation
 from noack.theory.nonnegative_system import Solution, solve_inequalities
 
-_SHORTEST_S, _LONGEST_S = 1e-9, 1e6
 _SETTLED = 1e-3
 _ATTEMPTS = 200
-_PICARD_ROUNDS = 8
-_COARSE, _FINE = 64, 256
 _SIGNALS = 6
 
 
@@ -99,40 +104,6 @@ class VoidError(ArithmeticError):
     def __init__(self, reason: str, loop_gain: float = math.inf) -> None:
         super().__init__(reason)
         self.loop_gain = loop_gain
-
-
-class TriggerBound(NamedTuple):
-    """What a trigger guarantees about e_s, scaled.
-
-    After each of its tests ‖e_s‖_W ≤ β + Σ_C share_C sup‖C x‖.
-    """
-
-    beta: float
-    """β, in the units of ‖W x‖."""
-    reached: float | None
-    """The smallest ‖e_s‖_W at an event; None if it may be arbitrarily small."""
-    shares: Mapping[str, float] = MappingProxyType({})
-    """share_C by the name of C in :attr:`PlantGains.outputs`."""
-    untested_s: float = 0.0
-    """After an event the trigger is not tested for this time: e_s grows from 0 for up to h more."""
-    is_tested: bool = True
-    """Whether there is a test at all; without one, only the time since the event bounds e_s."""
-    ago_s: float = 0.0
-    """The bound is that of ‖e_s‖_W at some time up to this long before the test. An event comes no
-    earlier than this after the last one, unless ‖e_s‖_W has exceeded ``reached``."""
-    apart_s: float = 0.0
-    """Events are at least this far apart, whatever happens to e_s."""
-    due_s: float = math.inf
-    """Events are at most this far apart."""
-    also: tuple["TriggerBound", ...] = ()
-    """Further bounds that hold at the same time; only their e_s is used, not their times."""
-    unit: float | None = None
-    """Unit of the constants Δ and β̃/β; by default β."""
-
-    @property
-    def every(self) -> tuple["TriggerBound", ...]:
-        """This bound and the further ones."""
-        return (self, *self.also)
 
 
 class EstimationBound(NamedTuple):
@@ -216,7 +187,7 @@ def solve_sum(
     least_s = max(conditions.spacing_s, apart_s)
     if any(all(one.reached is None for one in part.bound.every) for part in parts):
         return constants(least_s, apart_s or None)
-    spacing_s = _LONGEST_S
+    spacing_s = LONGEST_S
     for _ in range(_ATTEMPTS):
         if spacing_s <= least_s:
             break
@@ -249,7 +220,7 @@ class _Step:
             output: Coefficients(free + start[output], gain)
             for output, (free, gain) in plant.states.items()
         }
-        self._growths = [_growths(plant, conditions.sampling_s, one) for one in bound.every]
+        self._growths = [growths_of(plant, conditions.sampling_s, one) for one in bound.every]
 
     def use_windows(self) -> None:
         """Use how many updates may be lost in a window, too."""
@@ -297,7 +268,7 @@ class _Step:
 
     @cached_property
     def _drift(self) -> Mapping[Output, tuple[float, float, float]]:
-        of = self._plant.growths(self._conditions.delay_s, _COARSE)
+        of = self._plant.growths(self._conditions.delay_s, COARSE_CELLS)
         return {output: of(output).totals for output in self._error.outputs}
 
     def _constants(self, bound: "_ErrorBound", events: int, spacing_s: float) -> Constants:
@@ -377,7 +348,7 @@ class _Step:
         of_mismatch = (through @ signals.states, float(through @ free))
         others = ((input_error, beyond), of_mismatch, (0.0 * input_error, 1.0))
 
-        def solved(growing: _Growing) -> Solution:
+        def solved(growing: ErrorGrowth) -> Solution:
             through = signals.row(growing.shares)
             F = through @ signals.states + growing.input_error * input_error
             F += growing.estimation * estimated
@@ -487,98 +458,8 @@ class _Signals(NamedTuple):
         return np.array([gains.get(name, 0.0) for name in self.names])
 
 
-class _Growing:
-    """The growth of e_s without a test: from the bound after a test, or from 0 after an event.
-
-    sup‖e_s‖_W ≤ ``fixed`` + ``estimation`` η + Σ_C ``shares``_C sup‖C x‖ + ``input_error`` sup‖p‖
-    """
-
-    def __init__(self, plant: PlantGains, longest_s: float, after: TriggerBound) -> None:
-        stretch, outputs = plant.error.stretch(longest_s), plant.outputs
-        self.fixed, self.input_error = stretch * after.beta, 0.0
-        # The trigger tests x_s − x̂, and may compare it with x̂.
-        self.estimation = stretch * (1 + sum(
-            share * float(np.linalg.norm(outputs[C] @ plant.error.inverse_weight, 2))
-            for C, share in after.shares.items()
-        ))  # fmt: skip
-        shares = {C: stretch * share for C, share in after.shares.items()}
-        if longest_s > 0:
-            growth = plant.growth(longest_s, _COARSE)
-            mismatch = growth.mismatch.integral_on_grid()
-            shares[Output.MISMATCH] = shares.get(Output.MISMATCH, 0.0) + mismatch
-            self.input_error = growth.input_error.integral_on_grid()
-            self.fixed += float(growth.forced.sum())
-        self.shares: Mapping[str, float] = shares
-
-
-def _growths(plant: PlantGains, sampling_s: float, bound: TriggerBound) -> list[_Growing]:
-    """Return the growth from the bound after a test, and from 0 after an event."""
-    found = []
-    if bound.is_tested:
-        found.append(_Growing(plant, sampling_s + bound.ago_s, bound))
-    if bound.untested_s > 0 or not bound.is_tested:
-        found.append(_Growing(plant, sampling_s + bound.untested_s, TriggerBound(0.0, None)))
-    return found
-
-
 def _largest(found: Sequence[Solution]) -> Solution:
     """Return the larger of several solutions; no bound if one has none."""
     bounds = [one.bound for one in found if one.bound is not None]
     gain = max(one.loop_gain for one in found)
     return Solution(gain, np.max(bounds, axis=0) if len(bounds) == len(found) else None)
-
-
-def first_passage_s(
-    plant: PlantGains,
-    level: float,
-    mismatch: float,
-    input_error: float,
-    own: float,
-    start: float = 0.0,
-) -> float:
-    """Return a time before which ‖e_s‖_W, starting at ``start``, cannot reach ``level``.
-
-    Let ρ(r) = sup_{s≤r} ‖e_s‖_W. The part of e_c that equals the present e_s is bounded by ρ:
-
-        ρ(r) ≤ ∫₀^r ‖W e^{Hs} L_E‖ sup‖R_E x‖ + ‖W e^{Hs} B U‖ (π' + own · ρ(r−s)) ds
-
-    and further terms from the disturbances and ``start``. This is iterated from ρ = ``level``;
-    every iterate is a bound until the level is reached.
-
-    ``level`` is ‖e_s‖_W at an event, ``mismatch`` sup‖R_E x‖, ``own`` ‖K W^{−1}‖, and
-    ``input_error`` π', the input error without the effect of the present e_s.
-    """
-    if level <= start:
-        return 0.0
-    window_s, cells = _first_window_s(plant, level, mismatch, input_error + own * level), _COARSE
-    known_s = 0.0
-    while True:
-        growth = plant.growth(window_s, cells)
-        areas = growth.mismatch.area * mismatch + growth.input_error.area * input_error
-        fixed = np.cumsum(areas + growth.forced)
-        if start:
-            fixed += start * plant.error.stretch(window_s)
-        rho = np.full(cells, level)
-        for _ in range(_PICARD_ROUNDS):
-            echo = np.convolve(growth.input_error.area, rho)[:cells]
-            rho = np.minimum(level, fixed + own * echo)
-        crossed = np.flatnonzero(rho >= level)
-        if len(crossed):
-            known_s = max(known_s, float(growth.mismatch.edges_s[crossed[0]]))
-            if cells == _FINE:
-                return known_s
-            window_s, cells = float(growth.mismatch.edges_s[crossed[0] + 1]), _FINE
-        elif window_s >= _LONGEST_S:
-            return window_s
-        else:  # not reached, also after a coarse grid's overestimate: extend the window
-            known_s, window_s = window_s, 2 * window_s
-
-
-def _first_window_s(plant: PlantGains, level: float, mismatch: float, input_error: float) -> float:
-    """Return the first search window: twice the time to ``level`` at the initial speed, limited."""
-    start = plant.growth(_SHORTEST_S, 1)
-    speed = start.mismatch.sup_on_grid() * mismatch + start.input_error.sup_on_grid() * input_error
-    speed += float(start.forced.sum()) / _SHORTEST_S
-    if not speed > 0:
-        return _LONGEST_S
-    return min(max(2 * level / speed, _SHORTEST_S), _LONGEST_S)

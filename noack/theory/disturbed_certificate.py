@@ -15,15 +15,9 @@ import numpy as np
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix
-from noack.theory.certificate import (
-    Constants,
-    NetworkConditions,
-    Part,
-    TriggerBound,
-    VoidError,
-    solve_sum,
-)
+from noack.theory.certificate import Constants, NetworkConditions, Part, VoidError, solve_sum
 from noack.theory.enclosure import NotDecayingError
+from noack.theory.error_growth import TriggerBound
 from noack.theory.gains import ErrorGains, Forcing, PlantGains, error_gains
 from noack.theory.observer_error import EstimationError
 from noack.theory.persistent_causes import forcing_of

@@ -17,9 +17,10 @@ import numpy as np
 
 from noack.config.resolution import LoopMatrices
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
-from noack.theory.certificate import NetworkConditions, TriggerBound, VoidError, solve
+from noack.theory.certificate import NetworkConditions, VoidError, solve
 from noack.theory.contraction import Stack, product
 from noack.theory.enclosure import KernelBounds, NotDecayingError, response
+from noack.theory.error_growth import TriggerBound
 from noack.theory.gains import Coefficients, ErrorGains, Output, PlantGains
 
 _ROUNDS_PER_SCALE, _ROUNDS, _ROUNDS_PER_ENTRY = 15, 40, 12

@@ -7,12 +7,8 @@ from typing import Any
 import numpy as np
 from scipy.linalg import expm
 
-from noack.theory.certificate import (
-    Constants,
-    EstimationBound,
-    Part,
-    TriggerBound,
-)
+from noack.theory.certificate import Constants, EstimationBound, Part
+from noack.theory.error_growth import TriggerBound
 from noack.theory.gains import ErrorGains, Forcing, Growth, PlantGains
 from noack.theory.superposition import solve_divided
 from tests.noack.theory.loops import (

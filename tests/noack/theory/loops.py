@@ -21,7 +21,8 @@ from noack.impairments.loss_guarantee import (
     LossGuarantee,
     LossRule,
 )
-from noack.theory.certificate import Constants, NetworkConditions, TriggerBound, VoidError, solve
+from noack.theory.certificate import Constants, NetworkConditions, VoidError, solve
+from noack.theory.error_growth import TriggerBound
 from noack.theory.gains import ErrorGains, PlantGains
 
 Reals = NDArray[np.float64]

@@ -9,8 +9,9 @@ import pytest
 from noack.config.resolution import resolve
 from noack.config.scenario_file import load
 from noack.theory.box import BoxGains
-from noack.theory.certificate import Part, TriggerBound, VoidError
+from noack.theory.certificate import Part, VoidError
 from noack.theory.enclosure import NotDecayingError
+from noack.theory.error_growth import TriggerBound
 from noack.theory.gains import ErrorGains, Forcing, NormalForcing, PlantGains
 from noack.theory.run_conditions import allowed_conditions
 from noack.theory.scenario_certificates import ScenarioCertificate, certify, certify_box

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix
-from noack.theory.certificate import NetworkConditions, first_passage_s
+from noack.theory.certificate import NetworkConditions
+from noack.theory.error_growth import first_passage_s
 from noack.theory.gains import Output
 from tests.noack.theory.loops import SEARCH, System, certified_or_skipped, systems
 

@@ -13,7 +13,8 @@ from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix
 from noack.impairments.loss_guarantee import LongestBurst, LossesInWindow, LossWindow
-from noack.theory.certificate import NetworkConditions, TriggerBound, solve
+from noack.theory.certificate import NetworkConditions, solve
+from noack.theory.error_growth import TriggerBound
 from noack.theory.gains import ErrorGains, Output, PlantGains
 from noack.theory.loss_accumulation import LossAccumulation
 from tests.noack.theory.loops import SEARCH, System, systems
