@@ -106,7 +106,7 @@ def test_the_model_follows_the_newest_update_and_its_time_never_runs_back(
             message, row = tick(controller)
             model_ns = max(model_ns, row["t_ns"])
             assert message.t_ns == model_ns  # the time of the model state used for the input
-            u = safe if newest is None else K @ controller.x_c
+            u = safe if newest is None else product(K, controller.x_c)
             assert message.vector.tobytes() == u.tobytes() == row["u"].tobytes()
         else:
             event_ms, gap = item
