@@ -208,7 +208,7 @@ class _Gathered:
 
     def take(self, role: str, output: Record | Notice) -> None:
         if isinstance(output, Notice):
-            self.notices.append(output._asdict() | {"process": role})
+            self.notices.append(output.line() | {"process": role})
             return
         rows = self._rows[output.table]
         rows.append(output.row)

@@ -64,8 +64,13 @@ def resolve(scenario: Scenario) -> Scenario:
     Raises:
         CallerError: the numbers are so large that one step of the plant or model is not finite; an
             observer is set, but an unstable mode is unobservable in the measurement; or a module
-            that the plant needs is not installed.
+            that the plant needs is not installed; or the scenario has [[loops]], see
+            :func:`noack.config.loops.loops_of`.
     """
+    if scenario.loops is not None:
+        raise CallerError(
+            f"{scenario.name}: it has [[loops]]; this is for the scenario of one loop only"
+        )
     scenario.plant.system.require_installed()
     model = _explicit_model(scenario.model)
     A, B = np.array(model.A), np.array(model.B)
