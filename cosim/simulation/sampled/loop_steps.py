@@ -124,6 +124,9 @@ class Runs(NamedTuple):
     """The largest scaled ‖x‖, (N,)."""
     cost: Array
     """∫‖x‖² dt, as a sum over the steps, (N,)."""
+    error_at: Numbers
+    """Step of the largest ‖W e_c‖, (N,)."""
+    state_at: Numbers
 
 
 class Scratch(NamedTuple):
@@ -145,11 +148,11 @@ class Condition(NamedTuple):
 
 
 def follow(
-    loop: Loop, rule: Rule, scales: Scales, runs: Runs, last: int, tests: bool, own: Scratch
+    loop: Loop, rule: Rule, scales: Scales, runs: Runs, last: Numbers, tests: bool, own: Scratch
 ) -> None:
-    """Advance each run to its next event or step ``last``; without ``tests``, to the latter."""
+    """Advance each run to its next event or its ``last`` step; without ``tests``, to the latter."""
     for i in range(len(runs.step)):
-        follow_one(loop, rule, scales, runs, i, last, tests, own)
+        follow_one(loop, rule, scales, runs, i, last[i], tests, own)
 
 
 def follow_one(
@@ -174,14 +177,13 @@ def follow_one(
         if not size < LARGEST:
             runs.error[i] = runs.state[i] = runs.cost[i] = math.inf
             break
-        runs.state[i] = max(runs.state[i], size * scales.state[k])
+        if size * scales.state[k] > runs.state[i]:
+            runs.state[i], runs.state_at[i] = size * scales.state[k], k
         runs.cost[i] += size * size * h_s if k > 0 else 0.0
         if k % loop.every == 0:
             measure(loop, runs, i, k // loop.every, own)
             if k > loop.known_from:
-                subtract(runs.x_c[i], runs.y[i], own.a)
-                multiply(scales.weight, own.a, own.b)
-                runs.error[i] = max(runs.error[i], length(own.b) * scales.error[k])
+                note_error(scales, runs, i, k, own)
             place(own.z, runs.y[i], runs.x_s[i])
             following = auxiliary_rate(rule, own)
             dt_s = (k - measured) * h_s
@@ -193,6 +195,14 @@ def follow_one(
                 break
         finish(loop, runs, i, k, own)
     runs.step[i] = k
+
+
+def note_error(scales: Scales, runs: Runs, i: int, k: int, own: Scratch) -> None:
+    """Keep the largest ‖W e_c‖."""
+    subtract(runs.x_c[i], runs.y[i], own.a)
+    error = math.sqrt(square(scales.weight, own.a)) * scales.error[k]
+    if error > runs.error[i]:
+        runs.error[i], runs.error_at[i] = error, k
 
 
 def advance(loop: Loop, runs: Runs, i: int, k: int, own: Scratch) -> None:

@@ -23,7 +23,6 @@ from plant_server.measurement import measurement_model_of
 _NO_FORECAST = Forecast(1.0, 1.0, 0.0, 0.0, 0.0, 0.0)
 
 
-
 class SampledLoop:
     """The loop of a resolved scenario; every delivered update takes the longest certified delay.
 
@@ -60,7 +59,7 @@ class SampledLoop:
 
     def start(self) -> Runs:
         """Return one run at its start: after the delivered first packet, if there is one."""
-        n, m, known = self.matrices.n, self.matrices.m, self.known_start
+        n, known = self.matrices.n, self.known_start
         runs = self.empty(1)
         x0 = self.matrices.x0
         runs.x[0], runs.auxiliary[0], runs.step[0] = x0, self._first_auxiliary, -1
@@ -79,12 +78,12 @@ class SampledLoop:
     def empty(self, count: int) -> Runs:
         """Return runs at 0."""
         n, m, r = self.matrices.n, self.matrices.m, self._under_way
-        states = [np.zeros((count, n)) for _ in range(4)]
-        inputs = [np.zeros((count, m)) for _ in range(2)]
         return Runs(
-            np.zeros(count, np.int64), *states, *inputs, np.full((count, r), -1.0),
-            np.zeros((count, r, n)), np.zeros(count), np.zeros(count, np.bool_),
-            *(np.zeros(count) for _ in range(3)),
+            np.zeros(count, np.int64), np.zeros((count, n)), np.zeros((count, n)),
+            np.zeros((count, n)), np.zeros((count, n)), np.zeros((count, m)),
+            np.zeros((count, m)), np.full((count, r), -1.0), np.zeros((count, r, n)),
+            np.zeros(count), np.zeros(count, np.bool_), np.zeros(count), np.zeros(count),
+            np.zeros(count), np.zeros(count, np.int64), np.zeros(count, np.int64),
         )  # fmt: skip
 
     def update(self, runs: Runs, delivered: Any) -> None:
@@ -95,8 +94,8 @@ class SampledLoop:
         runs.sent[rows, place] = runs.step[rows]
         runs.updates[rows, place] = runs.y[rows]
 
-    def follow(self, runs: Runs, scales: Scales, last: int, *, tests: bool = True) -> None:
-        """Advance runs to their next events, at most to the step ``last``, in place.
+    def follow(self, runs: Runs, scales: Scales, last: Numbers, *, tests: bool = True) -> None:
+        """Advance runs in place to their next events, at most to their steps ``last``, (N,).
 
         Without ``tests`` there are no events.
         """
@@ -175,7 +174,9 @@ def _pushes(resolved: Scenario, matrices: LoopMatrices, steps: int) -> Matrix:
     m, found = matrices.m, np.zeros((steps, matrices.n))
     for step in range(steps):
         d, w = disturbance(step)
-        found[step] = (through[:, :m] @ d if len(d) else 0.0) + (through[:, m:] @ w if len(w) else 0.0)
+        for part, at in ((d, through[:, :m]), (w, through[:, m:])):
+            if len(part):
+                found[step] += at @ part
     return found
 
 

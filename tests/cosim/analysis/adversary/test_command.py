@@ -18,7 +18,7 @@ def run(*arguments: str) -> tuple[int, str, str]:
 
 
 def test_json_contains_all_results() -> None:
-    status, stdout, stderr = run("--json")
+    status, stdout, stderr = run("--json", "--trigger", "continuous")
     assert status == ExitStatus.OK, stderr
     document = json.loads(stdout)
     assert document["horizon_s"] == 6.0
@@ -43,7 +43,9 @@ def test_the_text_output_shows_the_patterns_of_one_objective() -> None:
 
 
 def test_settings_replace_values_of_the_scenario() -> None:
-    status, stdout, _ = run("--objective", "error", "--set", "network.mansd=0", "--json")
+    status, stdout, _ = run(
+        "--objective", "error", "--set", "network.mansd=0", "--json", "--trigger", "continuous"
+    )
     assert status == ExitStatus.OK
     assert json.loads(stdout)["worst"]["error"]["value"] == pytest.approx(1.0, rel=1e-6)
 
