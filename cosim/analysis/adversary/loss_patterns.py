@@ -63,6 +63,7 @@ def guess(search: PatternSearch, own: Pattern, rng: np.random.Generator) -> floa
     tried = [own, *_candidates(search.guarantee, events, rng)]
     values, patterns = follow(flow, automaton, tried)
     search.nodes += events + sum(map(len, patterns))
+    search.runs += len(patterns)
     for i in np.argsort(-values, kind="stable")[:_IMPROVED]:
         improve(search, patterns[i], float(values[i]), _NODES_FOR_A_GUESS)
     return flow.horizon_s / (events + 1)
@@ -102,6 +103,7 @@ def improve(search: PatternSearch, pattern: Pattern, value: float, most_nodes: i
         changed = [(*pattern[:i], not one, *pattern[i + 1 :]) for i, one in enumerate(pattern)]
         values, patterns = follow(flow, automaton, changed)
         visited += sum(map(len, patterns))
+        search.runs += len(patterns)
         top = int(values.argmax())
         if not values[top] > value:
             break

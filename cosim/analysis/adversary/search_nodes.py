@@ -98,6 +98,8 @@ class PatternSearch:
         """The largest value so far."""
         self.nodes = 0
         """Segments between events that were computed."""
+        self.runs = 0
+        """Runs that were computed up to the horizon."""
         self._report = report
         self._log = DecisionLog()
         self._entry: int | None = None
@@ -130,6 +132,7 @@ class PatternSearch:
         if candidates[top] > self.value:
             self.value, self._entry = float(candidates[top]), int(nodes.entry[top])
         self.nodes += len(nodes.t_s)
+        self.runs += int((~segments.is_event).sum())
         self._report(self.step, self.nodes, self.value)
         events = np.flatnonzero(segments.is_event)
         after_loss = self.automaton.after_loss(nodes.state[events])

@@ -93,7 +93,7 @@ def _find_sampled(
     lossless = run_of(flow, lambda event: True)
     return Worst(
         objective, flow.horizon_s, reported(worst.value, objective), worst.at_s, worst.delivered,
-        worst.event_s, exact, search.nodes, reported(lossless.value, objective),
+        worst.event_s, exact, search.nodes, search.runs, reported(lossless.value, objective),
         reported(own.value, objective), flow.certified, time.monotonic() - began_s,
     )  # fmt: skip
 
@@ -130,6 +130,7 @@ def _find_continuous(
         tuple(run.event_s.tolist()),
         exact and math.isclose(valued.value, search.value, rel_tol=_CONFIRMED),
         search.nodes,
+        search.runs,
         reported(evaluate(simulated(()), measure).value, objective),
         reported(evaluate(own, measure).value, objective),
         certified_value(certificate, measure, horizon_s, valued),

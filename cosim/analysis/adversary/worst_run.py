@@ -42,6 +42,8 @@ class Worst:
     """Whether every admissible pattern was covered; otherwise others may be worse."""
     nodes: int
     """Segments between events that were computed."""
+    runs: int
+    """Runs up to the horizon; if every pattern was covered, those of this search alone."""
     lossless: float | None
     """The value without losses."""
     own: float | None
@@ -160,7 +162,10 @@ def print_worst(
     for worst in found:
         at = "" if worst.at_s is None else f"worst at {worst.at_s:.6f} s; "
         how = "all patterns searched" if worst.exact else "not all patterns searched"
-        speed = f"{worst.nodes:,} segments, {worst.nodes / worst.elapsed_s:,.0f} per second"
+        speed = (
+            f"{worst.runs:,} runs; {worst.nodes:,} segments, "
+            f"{worst.nodes / worst.elapsed_s:,.0f} per second"
+        )
         console.print(f"{worst.objective.value}: {at}{how} ({speed})")
         console.print(f"  {worst.text}", soft_wrap=True, highlight=False)
     if trigger == "sampled" and _is_shaped(certificate):
