@@ -19,13 +19,6 @@ class AdversaryAim(StrEnum):
     ALL = "all"
 
 
-class AdversaryTrigger(StrEnum):
-    """When ``noack adversary`` tests the trigger."""
-
-    SAMPLED = "sampled"
-    CONTINUOUS = "continuous"
-
-
 @cli.command(cli.THEORY, 20, [
     ("noack adversary lane_following", "all objectives"),
     ("noack adversary lane_following --objective error --json", "the controller's error only"),
@@ -54,18 +47,13 @@ def adversary(
         ),
     ] = 500_000,
     beam: Annotated[int, typer.Option(help="Width of the beam search, in runs.", min=0)] = 512,
-    trigger: Annotated[
-        AdversaryTrigger,
-        typer.Option(
-            help="Search the loop as the processes run it (sampled), or the paper's loop without "
-            'delays (continuous; for the policy "decaying").'
-        ),
-    ] = AdversaryTrigger.SAMPLED,
+    trigger: cli.TriggerOption = cli.TriggerMode.SAMPLED,
     settings: cli.SetOption = None,
     json: cli.JsonOption = False,
 ) -> int:
     """Search for the worst losses that the network may cause; compare them with the bounds.
 
+    The loop is that of the processes; with --trigger continuous it is the paper's, without delays.
     Exit status 1: a certified bound was exceeded.
     """
     from cosim.analysis.adversary import Objective, conditions_of, find_worst
@@ -76,7 +64,7 @@ def adversary(
 
     given = [] if horizon is None else [f"horizon_s={horizon}"]
     resolved = resolve(cli.load_scenario(scenario, [*(settings or ()), *given]))
-    continuous = trigger is AdversaryTrigger.CONTINUOUS
+    continuous = trigger is cli.TriggerMode.CONTINUOUS
     certificate = certify(resolved, conditions_of(resolved, continuous=continuous))
     aims = list(Objective) if objective is AdversaryAim.ALL else [Objective(objective.value)]
     with search_status() as report:
