@@ -14,7 +14,6 @@ import numpy as np
 from netem.duplex_link import ACKNOWLEDGEMENT_LINK
 from netem.engine.batched_directions import BatchedDirection
 from netem.engine.epoll_object import Epoll
-from netem.engine.object_code import NativeFunction
 from netem.engine.pump import pump_layout
 from netem.engine.pump.client_table import insert
 from netem.engine.pump.pump_layout import Array
@@ -35,6 +34,7 @@ from noack.protocol.record_tables import (
     PACKET_HEAD_BYTES,
 )
 from noack.runtime.address import Address
+from noack.runtime.native.object_code import NativeFunction
 from noack.runtime.real_time_loop import RowSink
 
 _ROWS = 256

@@ -4,7 +4,6 @@ from typing import Any
 
 from netem.engine.pump import pump_layout as layout
 from netem.engine.pump.client_table import find, key_of
-from netem.engine.pump.libc_calls import ENOMEM, array_at
 from netem.engine.pump.payload_store import blocks_for, keep, pop, push
 from netem.engine.pump.pump_clock import simulated_ns_of
 from netem.engine.pump.pump_events import has_room, report_arrival
@@ -13,6 +12,7 @@ from netem.engine.pump.pump_records import record_packet, record_release
 from netem.rules.link_rules import admit, leave
 from noack.impairments.link_records import NEVER_NS, LinkMemory, LinkProgram, PacketDecision
 from noack.protocol.wire_format import HEADER_BYTES
+from noack.runtime.native.libc_calls import ENOMEM, array_at
 
 _HEAD_BYTES = 16
 """Header of a control message: length, level and kind."""

@@ -3,10 +3,10 @@
 They are numbered in the order of these calls: a replay calls the rules in the same order.
 """
 
-from netem.engine.pump.libc_calls import address_of, array_at, memcpy
 from netem.engine.pump.pump_layout import PACKET_ROW, Memory
 from noack.impairments.link_records import PacketDecision
 from noack.protocol.record_tables import PACKET_HEAD_BYTES
+from noack.runtime.native.libc_calls import address_of, array_at, memcpy
 
 _ROW_BYTES = PACKET_ROW.itemsize
 _HEAD = PACKET_ROW.fields["head"][1]  # type: ignore[index]
