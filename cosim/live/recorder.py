@@ -179,7 +179,7 @@ class Recorder:
         if self._scenario.loops is None:
             record = finish_record(self._run_dir)
         else:
-            record = finish_shared_record(self._run_dir).network
+            record = finish_shared_record(self._run_dir)
         if self._feed is not None:
             try:
                 self._feed.advance(final=True)

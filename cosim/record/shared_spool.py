@@ -80,9 +80,7 @@ def finish_shared_record(run_dir: Path) -> RunRecord:
     return finish_record(run_dir)
 
 
-def _make_directory(
-    run_dir: Path, folder: Path, loop: Scenario, place: Mapping[str, int]
-) -> None:
+def _make_directory(run_dir: Path, folder: Path, loop: Scenario, place: Mapping[str, int]) -> None:
     """Make the run directory of a loop; remove the spool of an interrupted attempt."""
     shutil.rmtree(folder / SPOOL, ignore_errors=True)
     if (folder / LOOP_FILE).is_file():

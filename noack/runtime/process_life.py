@@ -254,7 +254,9 @@ class RunProcess:
                     "rehearsal": self._rehearsal.report() if self._rehearsal else {},
                     "channel": channel.report(),
                     "rows": telemetry.totals(),
-                    "rows_by_loop": telemetry.totals_by_loop(),
+                    **(
+                        {"rows_by_loop": by_loop} if (by_loop := telemetry.totals_by_loop()) else {}
+                    ),
                     "generation": self.start.generation,
                     "instance": self.plane.instance,
                     "reached_ns": reached_ns,
