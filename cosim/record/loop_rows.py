@@ -71,5 +71,5 @@ def _shift(rows: Rows, phase_ns: int) -> None:
         if name in (rows.dtype.names or ()):
             is_time = rows[name] >= 0 if name in _NEVER else slice(None)
             rows[name][is_time] -= phase_ns
-    if "since_ns" in (rows.dtype.names or ()):
-        np.maximum(rows["t_ns"], 0, out=rows["t_ns"])
+            if "since_ns" in (rows.dtype.names or ()) and name != "now_ns":
+                np.maximum(rows[name], 0, out=rows[name])  # a change before the loop begins

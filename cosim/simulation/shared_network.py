@@ -66,7 +66,7 @@ def simulate_loops(scenario: Scenario, progress: Progress | None = None) -> Shar
     machines: dict[str, Machine[Any]] = {
         "plant": Fleet([plant_of(loop) for loop in loops], phases),
         "sensor": Fleet([sensor_of(loop) for loop in loops], phases),
-        "netem": network_of(scenario),
+        "netem": network_of(scenario, loops=len(loops)),
         "controller": Fleet([controller_of(loop) for loop in loops], phases),
     }
     entries = [loop.message_sizes.entries for loop in loops]

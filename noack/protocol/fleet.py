@@ -59,7 +59,7 @@ class Fleet:
         for loop, (machine, phase_ns) in enumerate(
             zip(self.machines, self._phases_ns, strict=True)
         ):
-            own = change._replace(t_ns=change.t_ns - phase_ns)
+            own = change._replace(t_ns=max(change.t_ns - phase_ns, 0))
             announced = machine.announce(own, now_ns - phase_ns)  # type: ignore[attr-defined]
             outputs += [_of_loop(loop, output) for output in announced]
         return outputs

@@ -12,6 +12,7 @@ from cosim.record.shared_run import SharedRun
 from cosim.simulation.shared_network import simulate_loops
 from cosim.simulation.virtual_time import simulate
 from noack.config.loops import loops_of, phases_ns
+from noack.config.parameter_changes import LATE
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
 from noack.protocol.machine_interface import GENERATION
@@ -52,7 +53,7 @@ def same(one: RunRecord, other: RunRecord, *but: str) -> None:
 
 
 @pytest.mark.parametrize("protocol", ["none", "ack"])
-@pytest.mark.parametrize("delay", [[], [{"kind": "delay", "mean_ms": 12.0, "jitter_ms": 9.0}]])
+@pytest.mark.parametrize("delay", [[], [{"kind": "delay", "delay_s": 0.012, "jitter_s": 0.009}]])
 def test_the_first_loop_is_the_run_without_loops(
     short: Content, protocol: str, delay: list[Content]
 ) -> None:
@@ -70,7 +71,7 @@ def test_the_first_loop_is_the_run_without_loops(
 def test_a_loop_on_a_network_without_losses_is_the_same_loop_alone(short: Content) -> None:
     """In its own time: every loop has another phase, and another seed of each kind."""
     short["network"]["loss"] = {"model": "lossless"}
-    short["network"]["impairments"] = [{"kind": "delay", "mean_ms": 3.0}]
+    short["network"]["impairments"] = [{"kind": "delay", "delay_s": 0.003}]
     scenario = validate(short | {"loops": [{"name": "a", "count": 5}]}, "here")
     shared = simulate_loops(scenario)
     assert len(set(phases_ns(scenario))) == 5
@@ -142,10 +143,12 @@ def test_a_replay_is_exact_and_finds_a_changed_bit(crowded: Content) -> None:
 
 
 def test_a_change_concerns_every_loop(short: Content) -> None:
-    short["changes"] = [{"at_s": 1.0, "set": {"trigger.beta": 0.5, "network.mansd": 1}}]
+    changes = [{"trigger.beta": 0.005}, {"trigger.beta": 0.5, "network.mansd": 1}]
+    short["changes"] = [{"at_s": 1.0 * i, "set": one} for i, one in enumerate(changes)]
     shared = run(short, {"name": "a", "count": 3})
     for record in shared.loops:
-        assert len(record[NETEM_SETTING]) == len(record["sensor_setting"]) == 1
+        assert len(record[NETEM_SETTING]) == len(record["sensor_setting"]) == 2
+        assert not [one for one in record.notices if one["level"] == LATE]
         assert replay(record).bit_exact
     assert replay(shared.network).bit_exact
 
@@ -154,10 +157,10 @@ def test_a_missing_row_of_the_network_leaves_its_number_free(crowded: Content) -
     scenario = validate(crowded | {"loops": [{"name": "a", "count": 3}]}, "here")
     network = simulate_loops(scenario).network
     rows = {table: network[table].copy() for table in network.tables}
-    for table in (NETEM_PACKET, NETEM_RELEASE):  # the second half is of a restarted emulator
-        half = rows[table]["now_ns"] > 10**9
-        first = min(int(rows[one]["input"][rows[one]["now_ns"] > 10**9].min())
-                    for one in (NETEM_PACKET, NETEM_RELEASE))  # fmt: skip
+    # The second half is of a restarted emulator.
+    halves = {one: rows[one]["now_ns"] > 10**9 for one in (NETEM_PACKET, NETEM_RELEASE)}
+    first = min(rows[one]["input"][half].min() for one, half in halves.items())
+    for table, half in halves.items():
         rows[table]["input"][half] += GENERATION - first
     for missing in (0, 2):
         rows[NETEM_PACKET] = np.delete(rows[NETEM_PACKET], np.s_[5 : 5 + missing])
