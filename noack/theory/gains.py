@@ -352,6 +352,20 @@ class PlantGains:
         return response(self.closed_loop, self.input_matrix)
 
     @cached_method
+    def on_grid(self, until_s: float, cells: int) -> tuple[Vector, Mapping[str, Vector]]:
+        """Return the gains of a missing event's error, and of the input error, on equal cells.
+
+        Returns:
+            sup‖R e^{(H+αI)τ} W^{−1}‖ over each cell, and ∫‖C e^{(A+BK+αI)τ} B U‖ over each cell for
+            every output.
+        """
+        error = self.error
+        lost = response_until(error.scaled_H, error.inverse_weight, until_s, cells)
+        forced = response_until(self.closed_loop, self.input_matrix, until_s, cells)
+        areas = {output: forced.through(C).area for output, C in self.outputs.items()}
+        return lost.through(error.outputs[Output.GAIN]).highest, areas
+
+    @cached_method
     def start_up(self, start_s: float) -> tuple[float, Mapping[str, float]]:
         """Return the effect of zero input before ``start_s``, where p = −K x.
 
