@@ -9,7 +9,7 @@ from noack.theory.scenario_certificates import CertificateScope
 
 MOST_S = 10.0
 """No larger times are tried."""
-_LEAST_S = 1e-6
+_LEAST_S, _USUAL_S = 1e-6, 1e-3
 _RESOLUTION = 1e-3
 _WIDER = 4.0
 
@@ -49,7 +49,7 @@ def largest(loop_gain: Callable[[float], float], usual_s: float) -> float:
     if loop_gain(MOST_S) < 1:
         return MOST_S
     low, high = (0.0, math.nan), (MOST_S, math.inf)
-    tried_s, step = min(max(usual_s, _LEAST_S), MOST_S / _WIDER), 0
+    tried_s, step = min(usual_s or _USUAL_S, MOST_S / _WIDER), 0
     while high[0] > _LEAST_S and high[0] - low[0] > _RESOLUTION * high[0]:
         gain = loop_gain(tried_s)
         step += 1
