@@ -40,7 +40,7 @@ from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, MachineError, PeerError, why
 from noack.core.file_access import write_whole
 from noack.protocol.machine_interface import RESTART
-from noack.protocol.record_tables import NO_SEQUENCE, OWNER, PLANT_STEP, SENSOR_MEASUREMENT
+from noack.protocol.record_tables import LOOP, NO_SEQUENCE, OWNER, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.protocol.wire_format import MAX_LOOPS, VERSION, Flow, read_header
 from noack.runtime.control_messages import LogLine, ProcessReport, parse_message
@@ -249,17 +249,20 @@ def _write(
 def finish_record(run_dir: Path) -> RunRecord:
     """Convert a run's spool to its record, and remove the spool.
 
-    It merges all spools and removes duplicate rows.
+    It merges all spools and removes duplicate rows. Of a run with [[loops]], it converts the part
+    of the network; see :func:`cosim.record.shared_spool.finish_shared_record`.
 
     Raises:
         MachineError: the record cannot be written; the spool is kept.
     """
     scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
-    spool, folder, types = run_dir / SPOOL, run_dir / RECORD, tables_of(scenario)
-    tables = {table: _merged(folder, spool, table, dtype) for table, dtype in types.items()}
-    notices = _notices(folder, spool)
+    is_network = scenario.loops is not None
+    types = network_tables() if is_network else tables_of(scenario)
+    spool, folder = run_dir / SPOOL, run_dir / RECORD
+    tables = {table: recorded_rows(run_dir, table, dtype) for table, dtype in types.items()}
+    notices = [one for one in _notices(folder, spool) if one.get(LOOP) is None]
     try:
-        _write(folder, tables, types, loop_of(scenario), notices)
+        _write(folder, tables, types, None if is_network else loop_of(scenario), notices)
         if spool.is_dir():  # moved in one step, so that an incomplete spool is never read
             done = spool.with_name(f"{SPOOL}.done")
             shutil.rmtree(done, ignore_errors=True)  # of an earlier attempt that was interrupted
@@ -272,13 +275,13 @@ def finish_record(run_dir: Path) -> RunRecord:
     return load_record(run_dir)
 
 
-def _merged(folder: Path, spool: Path, table: str, dtype: np.dtype[np.void]) -> Iterator[Rows]:
+def recorded_rows(run_dir: Path, table: str, dtype: np.dtype[np.void]) -> Iterator[Rows]:
     """Yield the rows of a table from an earlier record and from the spool."""
     from cosim.record.table_files import group_segments
 
-    path = folder / f"{table}.parquet"
+    path = run_dir / RECORD / f"{table}.parquet"
     recorded = group_segments(path, dtype) if path.is_file() else ()
-    yield from merged([*recorded, *spool_segments(spool, table, dtype)], dtype)
+    yield from merged([*recorded, *spool_segments(run_dir / SPOOL, table, dtype)], dtype)
 
 
 def updates_in(
