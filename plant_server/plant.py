@@ -2,11 +2,11 @@
 
 At grid time t_k = k h the plant advances its system to t_k under the input held since t_{k−1}. Then
 it measures, and latches the newest actuation received; the input that is due of it is held until
-t_{k+1} (``input_buffer.py``). A late step has the same length h, and the plant catches up. The watchdog chooses the input when no actuation
-has been received for too long (``watchdog.py``). The scenario defines the system
-(``noack.plants``), its disturbance from t_k until t_{k+1} (``disturbance_signal.py``) and its
-measurement (``measurement.py``). If the system fails, x is NaN from then on, as in a plant that
-diverges, and a notice gives the reason.
+t_{k+1} (``input_buffer.py``). A late step has the same length h, and the plant catches up. The
+watchdog chooses the input when no actuation has been received for too long (``watchdog.py``). The
+scenario defines the system (``noack.plants``), its disturbance from t_k until t_{k+1}
+(``disturbance_signal.py``) and its measurement (``measurement.py``). If the system fails, x is NaN
+from then on, as in a plant that diverges, and a notice gives the reason.
 """
 
 from collections.abc import Sequence

@@ -65,7 +65,8 @@ def validate(content: Mapping[str, Any], source: str) -> Scenario:
 
 
 def _with_files(scenario: Scenario, path: Path, source: str) -> Scenario:
-    network, update = scenario.network, {}
+    network = scenario.network
+    update: dict[str, Any] = {}
     for place, section in network.directions.items():
         read = _read(section, path.parent, f"{source}: {place}")
         _, _, key = place.partition(".")

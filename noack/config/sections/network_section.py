@@ -78,8 +78,8 @@ class NetworkSection(DirectionSection):
     """none: updates are not acknowledged, the paper's loop. ack: the baseline for comparison; the
     controller acknowledges each update, and x_s is reset only by an acknowledgement."""
     acknowledgements: AcknowledgementSection | None = None
-    """The direction from controller to sensor, for protocol = "ack"; by default without loss. It has no effect if
-    protocol = "none"."""
+    """The direction from controller to sensor, for protocol = "ack"; by default without loss.
+    It has no effect if protocol = "none"."""
     actuation: ActuationSection | None = None
     """The direction from controller to plant; by default the controller sends its actuations to
     the plant directly, without loss or delay."""

@@ -77,8 +77,9 @@ class WatchdogSection(ScenarioSection):
     default as soon as an actuation is missing: after the time for which its inputs last, plus the
     longest delay."""
     policy: Literal["hold", "zero", "model"] = "hold"
-    """hold: the plant keeps the last input of the newest actuation; zero: the input is 0; model: the input of the
-    controller's model, propagated from the newest actuation, which then carries x_c."""
+    """hold: the plant keeps the last input of the newest actuation; zero: the input is 0; model:
+    the input of the controller's model, propagated from the newest actuation, which then carries
+    x_c."""
 
 
 class PlantSection(ScenarioSection):
