@@ -1,7 +1,7 @@
 """Both directions of a link as one machine, for a loop with acknowledged updates.
 
-Flow 0 uses the forward direction, flow 1 the reverse direction. The two are independent: each has
-its own settings, random streams and guarantee.
+The flows 0 to N − 1 of a run with N loops use the forward direction, the next N the reverse
+direction. The two are independent: each has its own settings, random streams and guarantee.
 """
 
 from collections.abc import Sequence
@@ -10,7 +10,6 @@ from netem.link_machine import Datagram, link_of, update_link_of
 from noack.config.parameter_changes import FixedMachine
 from noack.config.scenario import Scenario
 from noack.protocol.machine_interface import BEGINNING, Machine, Notice, Record, Start
-from noack.protocol.record_tables import ACKNOWLEDGEMENTS, UPDATES
 
 ACKNOWLEDGEMENT_LINK = "acknowledgement"
 """Name of the link from controller to sensor; part of its random streams' names."""
@@ -20,27 +19,33 @@ class Duplex(FixedMachine):
     """The machine of a network with a reverse direction."""
 
     def __init__(
-        self, forward: Machine[Datagram], reverse: Machine[Datagram], *, first_number: int = 0
+        self,
+        forward: Machine[Datagram],
+        reverse: Machine[Datagram],
+        *,
+        first_number: int = 0,
+        loops: int = 1,
     ) -> None:
-        self._links = {UPDATES: forward, ACKNOWLEDGEMENTS: reverse}
+        self._links = (forward, reverse)
+        self._loops = loops
         self._inputs = first_number
 
     def next_deadline_ns(self) -> int | None:
         """Time of the next departure in either direction; None: nothing is in flight."""
-        due = (link.next_deadline_ns() for link in self._links.values())
+        due = (link.next_deadline_ns() for link in self._links)
         return min((t_ns for t_ns in due if t_ns is not None), default=None)
 
     def on_timer(self, now_ns: int) -> Sequence[Datagram | Record | Notice]:
-        """Forward the datagram that is due; if one is due in each direction, the one of flow 0."""
+        """Forward the datagram that is due; if one is due in each direction, the forward one."""
         next_ns = self.next_deadline_ns()
-        link = next(link for link in self._links.values() if link.next_deadline_ns() == next_ns)
+        link = next(link for link in self._links if link.next_deadline_ns() == next_ns)
         return self._numbered(link.on_timer(now_ns))
 
     def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
         """Process a datagram; return it if it is neither lost nor delayed."""
-        if message.flow not in self._links:
+        if not 0 <= message.flow < 2 * self._loops:
             raise ValueError(f"a network with a reverse direction has no flow {message.flow}")
-        return self._numbered(self._links[message.flow].handle(message, now_ns))
+        return self._numbered(self._links[message.flow // self._loops].handle(message, now_ns))
 
     def _numbered(
         self, outputs: Sequence[Datagram | Record | Notice]
@@ -54,7 +59,10 @@ class Duplex(FixedMachine):
 
 
 def network_of(
-    resolved: Scenario, start: Start = BEGINNING, forward: Machine[Datagram] | None = None
+    resolved: Scenario,
+    start: Start = BEGINNING,
+    forward: Machine[Datagram] | None = None,
+    loops: int = 1,
 ) -> Machine[Datagram]:
     """Return the network of a resolved scenario; ``forward`` replaces the link of the updates."""
     forward = update_link_of(resolved, start) if forward is None else forward
@@ -63,4 +71,4 @@ def network_of(
     reverse = link_of(
         resolved.network.reverse.link, resolved.seeds.loss, ACKNOWLEDGEMENT_LINK, start
     )
-    return Duplex(forward, reverse, first_number=start.first_number)
+    return Duplex(forward, reverse, first_number=start.first_number, loops=loops)

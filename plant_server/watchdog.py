@@ -19,6 +19,7 @@ import numpy as np
 
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, Propagator, Vector
+from noack.core.ordered_arithmetic import product
 from noack.protocol.machine_interface import Notice
 from noack.protocol.record_tables import NO_SEQUENCE
 from noack.protocol.wire_format import NO_VECTOR
@@ -73,8 +74,7 @@ class PredictedInput:
             self._from, self._x, self._t_ns = newest.sequence, newest.x_c, newest.t_ns
         self._x = self._propagate(self._x, t_ns - self._t_ns)
         self._t_ns = t_ns
-        predicted: Vector = newest.u + (self._K @ self._x - self._K @ newest.x_c)
-        return predicted
+        return newest.u + (product(self._K, self._x) - product(self._K, newest.x_c))
 
 
 def too_old(t_ns: Any, newest_ns: Any, timeout_ns: int) -> Any:

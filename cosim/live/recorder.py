@@ -146,7 +146,7 @@ class Recorder:
         if not is_of_loss_alone(change.settings):
             self._monitor.end_at(change.t_ns / NS_PER_S)
         if self._feed is not None:
-            self._feed.log(notice._asdict())
+            self._feed.log(notice.line())
 
     def acknowledge(self) -> None:
         """Confirm to each process which of its rows are on disk, so that it can drop them.
@@ -232,7 +232,7 @@ class Recorder:
             self.note(notice)
             self._progress.add_void(text)
             if self._feed is not None:
-                self._feed.log(notice._asdict())
+                self._feed.log(notice.line())
         if self._monitor.stopped is not None and not self._blind_reported:
             self._blind_reported = True
             self._progress.add_void(

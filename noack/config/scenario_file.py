@@ -10,12 +10,13 @@ from typing import Any
 import tomli_w
 
 from noack.config import toml_file
+from noack.config.loops import with_loop_tables
 from noack.config.matrix_files import with_matrices
 from noack.config.scenario import Scenario
 from noack.config.scenario_checks import check_kept_loss
 from noack.config.sections.network_section import AcknowledgementSection, NetworkSection
 from noack.core.errors import CallerError, printable, shortened
-from noack.settings.named_file import file_tables, located, with_tables
+from noack.settings.named_file import FileSettings, file_tables, located, with_tables
 
 _ENTRY = r"""[-+\w.]+|"[^"\\\n]*\""""
 _ROW = re.compile(rf"\[\n((?:\s*(?:{_ENTRY}),\n)+)\s*\]")
@@ -74,11 +75,15 @@ def _with_files(scenario: Scenario, path: Path, source: str) -> Scenario:
         check_kept_loss(scenario)
     except ValueError as error:
         raise CallerError(f"{source}: {error}") from None
-    tables = {
-        place: located(table, path.parent, f"{source}: {place}")
-        for place, table in file_tables(scenario)
-    }
-    return with_tables(scenario, tables)
+
+    def tables(within: str, one: Scenario) -> dict[str, FileSettings]:
+        return {
+            place: located(table, path.parent, f"{source}: {within}{place}")
+            for place, table in file_tables(one)
+        }
+
+    scenario = with_tables(scenario, tables("", scenario))
+    return with_loop_tables(scenario, lambda place, one: tables(f"{place}.", one))
 
 
 def _read(

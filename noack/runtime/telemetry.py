@@ -104,7 +104,7 @@ class TelemetryBuffer:
 
     def notice(self, notice: Notice) -> None:
         """Publish a line for the run's log at once."""
-        self._send(NOTICES, 1, json.dumps(notice._asdict()).encode())
+        self._send(NOTICES, 1, json.dumps(notice.line()).encode())
 
     def flush(self) -> None:
         """Publish all collected rows; send again what was lost."""

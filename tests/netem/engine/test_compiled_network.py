@@ -54,9 +54,12 @@ DELAYING: Scenario = resolve(
 class Both:
     """Both machines; each input is given to both."""
 
-    def __init__(self, resolved: Any, start: Start, sockets: list[socket.socket]) -> None:
-        self.plain: Machine[Datagram] = network_of(resolved, start)
-        self.compiled: Any = CompiledNetwork(resolved, start, compiled_pump())
+    def __init__(
+        self, resolved: Any, start: Start, sockets: list[socket.socket], loops: int | None
+    ) -> None:
+        self.loops = loops or 1
+        self.plain: Machine[Datagram] = network_of(resolved, start, loops=self.loops)
+        self.compiled: Any = CompiledNetwork(resolved, start, compiled_pump(), loops)
         sender, self._sensor, self._controller, *receivers = sockets
         peers = {name_of(self._sensor): receivers[0], name_of(self._controller): receivers[1]}
         # A clock that stays far behind the times that the test passes.
@@ -92,7 +95,7 @@ class Both:
     def _taken(self, outputs: Any) -> list[Any]:
         for output in outputs:
             if isinstance(output, Datagram):
-                self._expected[output.flow].append(output.data)
+                self._expected[output.flow // self.loops].append(output.data)
         return [output for output in outputs if not isinstance(output, Datagram)]
 
     def _compare(self, expected: Any, found: Any) -> None:
@@ -102,9 +105,9 @@ class Both:
 
 
 @contextmanager
-def both(resolved: Any, start: Start = BEGINNING) -> Iterator[Both]:
+def both(resolved: Any, start: Start = BEGINNING, loops: int | None = None) -> Iterator[Both]:
     with endpoints(*["127.0.0.1"] * 5) as sockets:
-        machines = Both(resolved, start, sockets)
+        machines = Both(resolved, start, sockets, loops)
         with closing(machines.compiled):
             yield machines
 
@@ -138,6 +141,36 @@ def test_any_arrivals_give_the_same_rows_and_datagrams(
         machines.received()
     inputs = [record.row[0] for record in machines.rows]
     assert inputs == list(range(inputs[0], inputs[0] + len(inputs)))
+
+
+@settings(max_examples=100)
+@given(
+    any_settings.harsh, st.sampled_from(["none", "ack"]), st.sampled_from([1, 3, 200]),
+    st.lists(
+        st.tuples(
+            st.sampled_from([0, 1, 10_000, 1_000_000]), st.integers(32, 72), st.integers(0, 1),
+            st.integers(0, 199),
+        ),
+        max_size=60,
+    ),
+)  # fmt: skip
+def test_the_flows_of_several_loops_are_told_apart_by_the_header(
+    link: LinkSettings, protocol: str, loops: int, steps: list[tuple[int, int, int, int]]
+) -> None:
+    """The two directions have 2 · ``loops`` flows in all."""
+    now_ns = 0
+    with both(network(link, link, protocol), loops=loops) as machines:
+        for gap_ns, size, direction, number in steps:
+            now_ns += gap_ns
+            loop = number % loops
+            flow = loop + loops * direction * (protocol == "ack")
+            data = bytes(6) + loop.to_bytes(2, "little") + bytes(size - 8)
+            machines.arrive(data, flow, now_ns)
+        for data in (bytes(31), bytes(6) + loops.to_bytes(2, "little") + bytes(24)):
+            machines.compiled.handle(Datagram(0, data), now_ns)
+        machines.let_out(NEVER_NS)
+        machines.received()
+        assert machines.compiled.of_no_loop == 2
 
 
 def test_at_equal_times_updates_leave_before_acknowledgements() -> None:
