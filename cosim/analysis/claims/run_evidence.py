@@ -250,8 +250,10 @@ class RunEvidence:
     def missing_events(self, samples: Samples, bounds: KnownStateBounds) -> NDArray[np.int64]:
         """Return how many events are missing in the input since the newest event, (k,).
 
-        Before the plant applied the first input of the controller, this is not known.
+        In a part that begins with inputs of the part before, it is unknown until the first input.
         """
+        if self.part.start_error is None:
+            return samples.since_event.missing
         event_s = samples.t_s - samples.since_event.age_s
         early = event_s + bounds.delay_s < self.started_s - 1e-9
         return np.asarray(np.where(early, UNKNOWN, samples.since_event.missing))
