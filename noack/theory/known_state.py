@@ -59,29 +59,31 @@ class KnownStatePart:
     @cached_property
     def controller_errors(self) -> Vector:
         """Scaled bounds of ‖e_c‖_W by the number of missing events; the last holds for any."""
-        found, top = self.constants, self.constants.delta * self.unit
-        error = found.overshoot * self.unit
-        every = np.append(self._gains(Output.WEIGHTED) * error, top)
-        return np.asarray(np.minimum(every, top))
+        found = self.constants
+        return self._by_missing(Output.WEIGHTED, self._event_error, found.delta * self.unit)
 
     @cached_property
     def input_errors(self) -> Vector:
         """Scaled bounds of ‖u − Kx‖ by the number of missing events; the last holds for any."""
-        found, gains = self.constants, self._gains(Output.GAIN)
-        top = max(found.input_error, found.start_error)
-        # An event's x_s − x̂ is at most β̃ + η, the present x_s − x at most β̃.
-        error = found.overshoot * self.unit
-        known = gains * error - gains[0] * found.estimation_error + found.held_input
-        return np.asarray(np.minimum(np.append(known, top), top))
+        found = self.constants
+        largest = max(found.input_error, found.start_error)
+        return self._by_missing(Output.GAIN, found.received_input_error, largest)
 
-    def _gains(self, output: Output) -> Vector:
-        """Return D_{C,j}, as far as a number of missing events bounds it."""
+    @property
+    def _event_error(self) -> float:
+        """β̃ + η, the largest x_s − x̂ at an event, scaled."""
+        return self.constants.overshoot * self.unit
+
+    def _by_missing(self, output: Output, none: float, largest: float) -> Vector:
+        """Return none + Σ_{i<j} sup_{τ≥iδ} ‖C e^{(H+αI)τ} W^{−1}‖ (β̃ + η) for each j."""
         error, most = self.plant.error, self.constants.missing_events
-        now = error.now(output)
-        if not error.decays:
-            return np.array([now])
-        ages_s = (self.constants.inter_event_s or 0.0) * np.arange(most, dtype=np.float64)
-        return now + np.append(0.0, np.cumsum(error.kernels[output].sups(ages_s)))
+        found = np.array([none])
+        if error.decays:
+            ages_s = (self.constants.inter_event_s or 0.0) * np.arange(most, dtype=np.float64)
+            found = none + np.append(0.0, np.cumsum(error.kernels[output].sups(ages_s))) * (
+                self._event_error
+            )
+        return np.asarray(np.minimum(np.append(found, largest), largest))
 
     def deviation(self, age_s: Vector, missing: Counts, delay_s: float) -> Vector:
         """Return the scaled bound of the deviation from the prediction, (k,)."""

@@ -419,7 +419,8 @@ def _at_floor(first: Constants, share: float) -> Constants:
     times: for s ≤ t, θ(s) ≤ θ(t) e^{α(t−s)}, which is all that their proof uses of βe^{−αt}.
     """
     scaled = (
-        "input_error", "start_error", "state", "state_weighted", "mismatch", "held_input",
+        "input_error", "start_error", "state", "state_weighted", "mismatch",
+        "received_input_error",
     )  # fmt: skip
     return first._replace(rate_per_s=0.0, **{name: share * getattr(first, name) for name in scaled})
 

@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.linalg import expm
 
+from noack.theory.certificate import Constants
+from noack.theory.gains import Output
 from noack.theory.known_state import KnownStateBounds, KnownStatePart
 from tests.noack.theory.disturbed_loops import DisturbedLoop, random_disturbed_loop
 from tests.noack.theory.loops import STEPS, System, Trace, random_system, times_s
@@ -91,11 +93,21 @@ def _misread(**changes: Any) -> Mistake:
 
 
 def _with_constants(**changes: float) -> Mistake:
-    def change(bounds: KnownStateBounds) -> KnownStateBounds:
-        parts = [replace(p, constants=p.constants._replace(**changes)) for p in bounds.parts]
+    return _with_parts(lambda part: part.constants._replace(**changes))
+
+
+def _with_parts(change: Callable[[KnownStatePart], Constants]) -> Mistake:
+    def changed(bounds: KnownStateBounds) -> KnownStateBounds:
+        parts = [replace(part, constants=change(part)) for part in bounds.parts]
         return replace(bounds, parts=tuple(parts))
 
-    return Mistake(change)
+    return Mistake(changed)
+
+
+def _without_age(part: KnownStatePart) -> Constants:
+    """u is K x_c: the input error is at most ‖KW^{−1}‖β̃."""
+    own = part.plant.error.now(Output.GAIN) * part.constants.overshoot * part.unit
+    return part.constants._replace(received_input_error=own)
 
 
 _INSTANT = {"disturbed": False, "beta": 0.01, "sample_steps": 1, "delay_steps": 0}
@@ -112,7 +124,7 @@ BROKEN: dict[str, tuple[Mistake, dict[str, Any]]] = {
          "hold_steps": 0, "step_share": 0.03},
     ),
     "no age of the input": (
-        _with_constants(held_input=0.0),
+        _with_parts(_without_age),
         {"n": 1, "m": 1, "mansd": 0, "hold_steps": 4, "lag_steps": 2, "step_share": 0.1,
          **_INSTANT},
     ),

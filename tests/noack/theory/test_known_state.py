@@ -41,7 +41,7 @@ def scalar(**constants: float) -> KnownStateBounds:
     given = {
         "rate_per_s": 0.5, "missing_events": 2, "delta": 2.8, "overshoot": 1.0, "input_error": 9.9,
         "start_error": 0.0, "state": 1.0, "state_weighted": 1.0, "mismatch": 1.0,
-        "inter_event_s": 0.2, "loop_gain": 0.5, "held_input": 0.1,
+        "inter_event_s": 0.2, "loop_gain": 0.5, "received_input_error": 4.1,
     }  # fmt: skip
     part = KnownStatePart(plant, Constants(**given | constants), 1.0)  # type: ignore[arg-type]
     return KnownStateBounds((part,), 0.1, np.zeros((1, 0)))
