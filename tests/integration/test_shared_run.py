@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from cosim.analysis.replay import replay
-from cosim.record.run_record import RunRecord, load_record
+from cosim.record.run_record import RunRecord, load_record, updates_in
 from noack.config.loops import phases_ns
 from noack.protocol.record_tables import NETEM_PACKET, PLANT_STEP, Fate
 from tests.integration import conftest as live
+from tests.integration.test_restarts import goes_on, spooled
 
 SCENARIO = """
 name = "three"
@@ -76,7 +77,7 @@ def loop_of(run: live.Finished, name: str) -> dict[str, Any]:
 
 def test_one_loop_diverges_and_the_others_go_on(finished: live.Finished) -> None:
     assert finished.status == 1
-    assert finished.summary["exit"]["reason"].startswith("1 of 3 loops failed (wild: ")
+    assert finished.summary["exit"]["reason"].startswith("1 of 3 loops failed (wild diverged at ")
     assert loop_of(finished, "wild")["diverged_at_s"] > 1.0
     for name in NAMES:
         record = record_of(finished, name)
@@ -111,11 +112,14 @@ def test_each_loop_and_the_network_are_replayed_bit_by_bit(finished: live.Finish
 
 
 def test_loops_begin_at_their_phases(finished: live.Finished) -> None:
-    phases = phases_ns(load_record(finished.run_dir, network=True).scenario)
+    """An update's time is that of its loop; the network records the time of the run."""
+    network = load_record(finished.run_dir, network=True)
+    phases, packets = phases_ns(network.scenario), network[NETEM_PACKET]
     assert len(set(phases)) == 3
-    for name in NAMES:
-        steps = record_of(finished, name)[PLANT_STEP]
-        assert (steps["now_ns"] >= steps["t_ns"]).all()
+    for flow, phase_ns in enumerate(phases):
+        of_one = packets[packets["flow"] == flow]
+        _, _, events_ns = updates_in(of_one)
+        assert (of_one["now_ns"] - events_ns >= phase_ns).all()
 
 
 def test_a_killed_sensor_is_one_named_failure_and_the_record_is_kept(
@@ -129,10 +133,33 @@ def test_a_killed_sensor_is_one_named_failure_and_the_record_is_kept(
         running.child("sensor").send_signal(signal.SIGKILL)
         run = running.finish()
     assert run.status == 1
-    assert run.summary["exit"]["reason"].startswith("sensor was killed")
+    assert run.summary["exit"]["reason"] == "sensor died: killed by SIGKILL"
     assert not (run.run_dir / "spool").exists()
     for name in NAMES:
         assert loop_of(run, name)["exit"] == run.summary["exit"]
+        assert record_of(run, name).count(PLANT_STEP) > 0
+        assert replay(record_of(run, name)).bit_exact is not None
+
+
+def test_restarted_processes_serve_all_loops_again(scenario: Path, tmp_path: Path) -> None:
+    with live.begun(tmp_path) as start:
+        running = start(
+            *live.settings(horizon_s=4000.0, recovery__rejoin_within_s=60),
+            command=("run", str(scenario)),
+        )
+        running.wait_started()
+        for role, table in (("sensor", "sensor_measurement"), ("netem", "netem_packet")):
+            live.wait_for(lambda table=table: len(spooled(running, table)) > 0)
+            before = live.child_of(running.process, role)
+            assert before is not None
+            before.kill()
+            live.wait_for(lambda role=role: goes_on(running, role))
+        running.process.send_signal(signal.SIGINT)
+        run = running.finish()
+    assert run.status == 130
+    assert run.summary["replay"]["bit_exact"] is True
+    for name in NAMES:
         record = record_of(run, name)
-        assert record.count(PLANT_STEP) > 0
-        assert {one.role for one in replay(record).processes} >= {"plant", "sensor"}
+        assert replay(record).bit_exact
+        assert len(record.life_numbers("sensor").begun) == 2
+        assert len(record.life_numbers("netem").begun) == 2
