@@ -28,6 +28,7 @@ from cosim.record.record_source import (
 from cosim.record.record_source import Rows as Rows
 from cosim.record.run_directory import (
     LOOP_FILE,
+    LOOPS,
     RECORD,
     REPORTS_FILE,
     SCENARIO_FILE,
@@ -40,7 +41,7 @@ from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, MachineError, PeerError, why
 from noack.core.file_access import write_whole
 from noack.protocol.machine_interface import RESTART
-from noack.protocol.record_tables import NO_SEQUENCE, OWNER, PLANT_STEP, SENSOR_MEASUREMENT
+from noack.protocol.record_tables import LOOP, NO_SEQUENCE, OWNER, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.protocol.wire_format import MAX_LOOPS, VERSION, Flow, read_header
 from noack.runtime.control_messages import LogLine, ProcessReport, parse_message
@@ -191,11 +192,16 @@ class RunRecord:
         return BATCH_ROWS * period_ns
 
 
-def load_record(run_dir: Path) -> RunRecord:
+def load_record(run_dir: Path, *, network: bool = False) -> RunRecord:
     """Read the record of a run directory.
 
+    Args:
+        run_dir: the run directory.
+        network: return the record of the network, if several loops share it.
+
     Raises:
-        CallerError: the path is no run directory, or the record is unfinished or damaged.
+        CallerError: the path is no run directory, or the record is unfinished or damaged; or it is
+            that of a run of several loops.
     """
     # Imported here because pyarrow takes 0.1 s: a run does not wait for it.
     from cosim.record.table_files import StoredTables
@@ -208,6 +214,9 @@ def load_record(run_dir: Path) -> RunRecord:
             f"{run_dir}: has no numeric record; `noack summary` finalises an interrupted run"
         )
     scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
+    if scenario.loops is not None and not network:
+        one = run_dir / LOOPS / scenario.loops[0].names[0]
+        raise CallerError(f"{run_dir}: a run of several loops; name one of them, e.g. {one}")
     tables = tables_of(scenario) if scenario.loops is None else network_tables()
     rows = StoredTables(folder, tables)
     reports, earlier = _reports(run_dir, rows)
@@ -249,17 +258,20 @@ def _write(
 def finish_record(run_dir: Path) -> RunRecord:
     """Convert a run's spool to its record, and remove the spool.
 
-    It merges all spools and removes duplicate rows.
+    It merges all spools and removes duplicate rows. Of a run with [[loops]], it converts the part
+    of the network; see :func:`cosim.record.shared_spool.finish_run_record`.
 
     Raises:
         MachineError: the record cannot be written; the spool is kept.
     """
     scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
-    spool, folder, types = run_dir / SPOOL, run_dir / RECORD, tables_of(scenario)
-    tables = {table: _merged(folder, spool, table, dtype) for table, dtype in types.items()}
-    notices = _notices(folder, spool)
+    is_network = scenario.loops is not None
+    types = network_tables() if is_network else tables_of(scenario)
+    spool, folder = run_dir / SPOOL, run_dir / RECORD
+    tables = {table: recorded_rows(run_dir, table, dtype) for table, dtype in types.items()}
+    notices = [one for one in _notices(folder, spool) if one.get(LOOP) is None]
     try:
-        _write(folder, tables, types, loop_of(scenario), notices)
+        _write(folder, tables, types, None if is_network else loop_of(scenario), notices)
         if spool.is_dir():  # moved in one step, so that an incomplete spool is never read
             done = spool.with_name(f"{SPOOL}.done")
             shutil.rmtree(done, ignore_errors=True)  # of an earlier attempt that was interrupted
@@ -269,16 +281,16 @@ def finish_record(run_dir: Path) -> RunRecord:
             f"{folder}: the record cannot be written: {why(error)}; what was recorded is kept "
             f"in {spool}, and `noack summary {run_dir}` finishes it"
         ) from None
-    return load_record(run_dir)
+    return load_record(run_dir, network=True)
 
 
-def _merged(folder: Path, spool: Path, table: str, dtype: np.dtype[np.void]) -> Iterator[Rows]:
+def recorded_rows(run_dir: Path, table: str, dtype: np.dtype[np.void]) -> Iterator[Rows]:
     """Yield the rows of a table from an earlier record and from the spool."""
     from cosim.record.table_files import group_segments
 
-    path = folder / f"{table}.parquet"
+    path = run_dir / RECORD / f"{table}.parquet"
     recorded = group_segments(path, dtype) if path.is_file() else ()
-    yield from merged([*recorded, *spool_segments(spool, table, dtype)], dtype)
+    yield from merged([*recorded, *spool_segments(run_dir / SPOOL, table, dtype)], dtype)
 
 
 def updates_in(

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from noack.config.feature_kinds import AnyObserver
-from noack.config.loops import loop_scenario
+from noack.config.loops import loop_scenario, loops_of
 from noack.config.named_models import NAMED_MODELS
 from noack.config.scenario import Scenario
 from noack.config.sections.model_section import ModelSection
@@ -99,6 +99,15 @@ def resolve(scenario: Scenario) -> Scenario:
         drawn |= {"draw": "given", "A": rows_of(A), "B": rows_of(B)}
     update = {"model": model, "plant": plant.model_copy(update=drawn)}
     return scenario.model_copy(update=update | {"observer": _observer(scenario, model)})
+
+
+def resolved_loops(scenario: Scenario) -> tuple[Scenario, ...]:
+    """Return the resolved scenario of each loop of a run; that of the run without [[loops]].
+
+    Raises:
+        CallerError: as :func:`resolve`.
+    """
+    return tuple(map(resolve, loops_of(scenario)))
 
 
 def loop_of(resolved: Scenario) -> LoopMatrices:

@@ -107,7 +107,11 @@ class FleetDecoder:
     def report(self) -> dict[str, object]:
         """Counters of all loops together, for the run's summary."""
         rejected = {reason.value: n for reason, n in self.rejected.items() if n}
-        return {"accepted": self.accepted, "rejected": rejected}
+        return {"accepted": self.accepted, "rejected": rejected, "loops": self.reports()}
+
+    def reports(self) -> list[dict[str, object]]:
+        """Counters of each loop."""
+        return [one.report() for one in self.decoders]
 
 
 def _of_loop(loop: int, output: Any) -> Any:
