@@ -98,7 +98,8 @@ def _print_constants(console: Console, found: Certificates) -> None:
         "[dim]Each bound of a norm is multiplied by e^(−rate·t). paper: no sampling, no delay, no "
         "hold. schedule: the scenario's rates, plus the lateness that it allows. plant: the "
         "scenario's plant. box: every plant of the uncertainty box. updates outstanding: maximum "
-        "number of updates lost or in flight. inter-event time: minimum.[/]"
+        "number of updates lost or in flight. no update missing: while the controller has every "
+        "update, which sharpens the bound of x from an event on. inter-event time: minimum.[/]"
     )
     if not found.scenario.coverage.is_undisturbed:
         console.print(

@@ -43,6 +43,7 @@ def constant_rows(
     yield f"Δ, bound of ‖e_c‖{unit}", constant("delta"), delta_2
     yield f"bound of ‖e_s‖{unit}", constant("overshoot"), "1"
     yield "bound of ‖u − Kx‖", constant("input_error"), NONE
+    yield "· no update missing", constant("received_input_error"), NONE
     yield "X, bound of ‖x‖", constant("state"), state_2
     yield "inter-event time, s", row(lambda c: c.inter_event_s), spacing_2
     yield "loop gain (< 1)", constant("loop_gain"), NONE

@@ -87,6 +87,12 @@ class Seen(NamedTuple):
     """(steps, m, runs)"""
     shortest: Steps
     """(runs,) the shortest inter-event time in steps."""
+    states: Reals
+    """(2, steps, n, runs): x, and what the sensor knows of it."""
+    is_event: Flags
+    """(steps, runs)"""
+    received: Steps
+    """(steps, runs) number of the newest update that has arrived."""
 
 
 @njit(cache=True)
@@ -139,6 +145,8 @@ def follow(
                 if goes or (step == 0 and not schedule.known_start):
                     _send(run, step, own, given, state, seen, estimate)
         _deliver(step % len(state.arrives), state)
+        seen.states[0, step], seen.states[1, step] = x, estimate
+        seen.received[step] = state.newest
         _command(step, schedule, own, state)
         u, has_input[:] = seen.inputs[step], False
         if step >= schedule.lag:
@@ -164,7 +172,7 @@ def _send(
     if number > 0:
         seen.shortest[run] = min(seen.shortest[run], step - state.last_event[run])
     state.x_s[:, run] = estimate[:, run]
-    state.last_event[run] = step
+    state.last_event[run], seen.is_event[step, run] = step, True
     if given.delivered[run, number]:
         delay = given.delays[run, number]
         slot = (step + delay) % len(state.arrives)

@@ -157,6 +157,13 @@ class Trace(NamedTuple):
     state_weighted: Reals
     input_error: Reals
     inter_event_s: float
+    x: Reals
+    """(runs, STEPS, n)"""
+    known: Reals
+    """What the sensor knows of x, (runs, STEPS, n)."""
+    is_event: Flags
+    received: Steps
+    """Number of the newest update that the controller has received, from 1 on; 0 for none."""
 
     def shares(self, system: System, certified: Constants) -> dict[str, Reals]:
         """Each signal divided by its bound, (runs, STEPS) or a number; at most 1 if it holds."""
@@ -240,7 +247,9 @@ def simulate(
         system.known_start, system.sample_steps, system.hold_steps, system.lag
     )  # fmt: skip
     seen = Seen(
-        np.zeros((5, STEPS, runs)), np.zeros((STEPS, m, runs)), np.full(runs, 10**9)
+        np.zeros((5, STEPS, runs)), np.zeros((STEPS, m, runs)), np.full(runs, 10**9),
+        np.zeros((2, STEPS, n, runs)), np.zeros((STEPS, runs), dtype=bool),
+        np.zeros((STEPS, runs), dtype=np.int64),
     )  # fmt: skip
     # What is called here is called at every test; otherwise all steps are compiled.
     every = system.sample_steps if rule or estimate is not exact_state else STEPS
@@ -254,7 +263,10 @@ def simulate(
         last = min(step + every, STEPS)
         follow(step, last, schedule, own, given, state, seen, known, event)
     shortest_s = int(seen.shortest.min()) * system.step_s
-    return Trace(*seen.trace.transpose(0, 2, 1), shortest_s)
+    return Trace(
+        *seen.trace.transpose(0, 2, 1), shortest_s, *seen.states.transpose(0, 3, 1, 2),
+        seen.is_event.T, seen.received.T,
+    )  # fmt: skip
 
 
 def norms(rows: Reals) -> Reals:
