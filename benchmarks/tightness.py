@@ -125,8 +125,4 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-BENCHMARK = Benchmark(
-    "tightness", "The adversary against the certificates", measure, _arguments
-)
-    "tightness", "The adversary's worst against certificates", measure, _arguments
-)
+BENCHMARK = Benchmark("tightness", "The adversary against the certificates", measure, _arguments)
