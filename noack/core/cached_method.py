@@ -2,16 +2,12 @@
 
 from collections.abc import Callable
 from functools import wraps
-from typing import Concatenate, ParamSpec, TypeVar
+from typing import Any, TypeVar, cast
 
-Self = TypeVar("Self")
-Arguments = ParamSpec("Arguments")
-Result = TypeVar("Result")
+Method = TypeVar("Method", bound=Callable[..., Any])
 
 
-def cached_method(
-    method: Callable[Concatenate[Self, Arguments], Result],
-) -> Callable[Concatenate[Self, Arguments], Result]:
+def cached_method(method: Method) -> Method:
     """Compute a method once for each combination of arguments; they must be hashable.
 
     The object must not change. Unlike :func:`functools.cache` this needs no hash of the object, and
@@ -20,11 +16,11 @@ def cached_method(
     results = f"results of {method.__qualname__}"
 
     @wraps(method)
-    def found(self: Self, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+    def found(self: Any, *args: Any, **kwargs: Any) -> Any:
         known = self.__dict__.setdefault(results, {})
         key = (args, tuple(kwargs.items()))
         if key not in known:
             known[key] = method(self, *args, **kwargs)
-        return known[key]  # type: ignore[no-any-return]
+        return known[key]
 
-    return found
+    return cast("Method", found)

@@ -77,4 +77,4 @@ def _interpolated(low: tuple[float, float], high: tuple[float, float]) -> float:
         return math.sqrt(low_s * high_s)
     share = math.log(1 / below) / math.log(above / below)
     share = min(max(share, 0.01), 0.99)
-    return low_s * (high_s / low_s) ** share
+    return low_s * math.exp(share * math.log(high_s / low_s))

@@ -245,15 +245,15 @@ class EstimationError:
         total, W = self._peak(sources[-2:], 0.0), self._weight
         growth, scale, steps = self._growth(alpha_per_s), 1.0, self._steps(0.0)
         old, settled = sources[0], sources[-1]
-        largest = _sizes(W, old) - total
+        largest = float(_sizes(W, old)) - total
         for step, new in zip(steps[1:-1], sources[1:-1], strict=True):
             old, scale = np.concatenate([step @ old, new]), scale * growth
             settled = np.concatenate([steps[-1] @ settled, sources[-1]])
-            largest = max(largest, scale * (_sizes(W, old) - total))
+            largest = max(largest, scale * (float(_sizes(W, old)) - total))
         # From then on the effects of these sources, and those with settled gains, follow F.
         factor, _ = _contraction(growth * steps[-1])
         seen = float(np.linalg.norm(W @ np.linalg.inv(factor), 2))
-        return max(largest, scale * seen * _sizes(factor, old - settled), 0.0) * _ROUNDING
+        return max(largest, scale * seen * float(_sizes(factor, old - settled)), 0.0) * _ROUNDING
 
 
 def _sizes(C: Matrix, stacks: Stack) -> Stack:
