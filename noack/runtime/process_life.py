@@ -27,10 +27,13 @@ from noack.protocol.machine_interface import BEGINNING, RESTART, Machine, Notice
 from noack.protocol.record_tables import OWNER
 from noack.protocol.topology import (
     CHANGEABLE,
+    ENDS,
     LOOP_ROLES,
+    RECEIVES,
     RECORDER,
-    ROUTES,
-    SENDER,
+    SENDS,
+    receiver_of,
+    sender_to,
 )
 from noack.protocol.wire_format import Decoder, Encoder, Flow, Message
 from noack.runtime.address import Address
@@ -158,21 +161,22 @@ class RunProcess:
         Args:
             new_machine: makes a machine; another of the first loop is made for rehearsals.
         """
-        route, protocol = ROUTES[self.role], self.scenario.protocol
-        acknowledged_by = protocol.acknowledged_by(self.role)
-        acknowledges_to = protocol.acknowledgement_routes.get(self.role)
+        role, network = self.role, self.scenario.network.flows
+        receives, sends, answer = RECEIVES[role], SENDS[role], Flow.ACKNOWLEDGEMENT
+        answers = answer in network and role in ENDS[answer]
+        is_answered = answers and role == ENDS[answer].receiver
 
         def channel(endpoint: socket.socket, addresses: Mapping[str, Address]) -> MessageSocket:
-            by = addresses[acknowledged_by] if acknowledged_by else None
+            by = addresses["netem"]
             return MessageSocket(
                 endpoint,
-                self._decoder(route.receives, not_before_ns=self._admitted_ns),
+                self._decoder(receives, not_before_ns=self._admitted_ns),
                 self._encoder(),
-                route.sends,
-                source=addresses[SENDER[self.role]],
-                destination=addresses[route.to],
-                acknowledgements=(self._decoder(Flow.ACKNOWLEDGEMENT), by) if by else None,
-                acknowledges_to=addresses[acknowledges_to] if acknowledges_to else None,
+                sends,
+                source=addresses[sender_to(role, receives, network)],
+                destination=addresses[receiver_of(role, sends, network)],
+                acknowledgements=(self._decoder(answer), by) if is_answered else None,
+                acknowledges_to=by if answers and not is_answered else None,
             )
 
         with ExitStack() as stack:
@@ -180,12 +184,12 @@ class RunProcess:
                 endpoint = stack.enter_context(closing(bind(0, "realtime.rehearse")))
                 own: Address = endpoint.getsockname()
                 copy = MessageSocket(
-                    endpoint, self._decoder(route.receives, 1), self._encoder(), route.sends,
+                    endpoint, self._decoder(receives, 1), self._encoder(), sends,
                     source=own, destination=own,
                 )  # fmt: skip
-                entries = self.loops[0].message_sizes.entries(route.receives)
+                entries = self.loops[0].message_sizes.entries(receives)
                 machine = self._machine(new_machine, 1)
-                rehearsal = Rehearsal(machine, copy, self._encoder(), route.receives, entries)
+                rehearsal = Rehearsal(machine, copy, self._encoder(), receives, entries)
                 self._rehearsal = stack.enter_context(closing(rehearsal))
             self.run(self._machine(new_machine), channel)
 
