@@ -178,8 +178,10 @@ def _sharpened(found: Constants, part: "Part", conditions: NetworkConditions) ->
     size = found.overshoot * unit
 
     def lost(spacing_s: float | None) -> float:
-        """Bound ‖e_c‖_W just after an event, if all missing events are lost."""
-        return error.missing(Output.WEIGHTED, dropouts, spacing_s or 0.0) * size
+        """Bound ‖e_c‖_W up to a lost event: before it, one event less is missing than may be."""
+        if dropouts == 0:
+            return 0.0
+        return (1 + error.missing(Output.WEIGHTED, dropouts - 1, spacing_s or 0.0)) * size
 
     ellipsoids = InvariantEllipsoids(plant, found.delta * unit)
     while True:
@@ -194,7 +196,8 @@ def _sharpened(found: Constants, part: "Part", conditions: NetworkConditions) ->
         known = ellipsoids.sharpened(
             known, found.delta * unit, lost(found.inter_event_s), bound.reached
         )
-        delta = (lost(known.inter_event_s) + size) / unit
+        missing = error.missing(Output.WEIGHTED, dropouts, known.inter_event_s or 0.0)
+        delta = (1 + missing) * size / unit
         found = found._replace(**known._asdict(), delta=min(delta, found.delta))
         if not found.delta < (1 - _SETTLED) * before.delta:
             return found

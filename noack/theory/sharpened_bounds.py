@@ -3,9 +3,9 @@
 Given ‖e_c‖_W ≤ D at all times, an ellipsoid ‖Λx‖ ≤ 1 is found that x never leaves
 (:mod:`noack.theory.delivery_flow`). It bounds x and E x, and the flow from it bounds K e_c. After
 an event e_s begins at 0; after r it is C_r z(t_k), C_r = (0, I) e^{Fr} − e^{(H+αI)r} (0, I), as
-long as no update is received. At the event z(t_k) is (ξ, 0), or ‖e_c‖_W ≤ D', the bound of lost
-events alone. So the next event comes later than certified without the flow, and D is smaller with
-this longer time. Every step uses bounds that hold already.
+long as no update is received. At the event z(t_k) is (ξ, 0), or up to it ‖e_c‖_W ≤ D', since one
+event less is missing than may be. So the next event comes later than certified without the flow,
+and D is smaller with this longer time. Every step uses bounds that hold already.
 
 Λ comes from a Lyapunov equation with three parameters. They are chosen by samples; what they give
 is checked with all enclosures.
@@ -62,7 +62,7 @@ class InvariantEllipsoids:
         Args:
             known: bounds that hold.
             limit: D, a bound of ‖e_c‖_W.
-            lost: the same at a lost event, where all missing events are lost.
+            lost: the same up to a lost event, at which one event less is missing than may be.
             level: ‖e_s‖_W at an event, at least; None if it may be arbitrarily small.
         """
         reach = self.within(limit)
