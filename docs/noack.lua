@@ -18,7 +18,7 @@ local f = {
     version = ProtoField.uint8("noack.version", "Version"),
     flow = ProtoField.uint8("noack.flow", "Flow", base.DEC, FLOWS),
     dimension = ProtoField.uint16("noack.dimension", "Dimension"),
-    reserved = ProtoField.uint16("noack.reserved", "Reserved", base.HEX),
+    loop = ProtoField.uint16("noack.loop", "Loop"),
     run_id = ProtoField.uint64("noack.run_id", "Run id", base.HEX),
     sequence = ProtoField.uint64("noack.sequence", "Sequence number"),
     t_ns = ProtoField.int64("noack.t_ns", "Event time (ns)"),
@@ -70,7 +70,7 @@ function noack.dissector(tvb, pinfo, tree)
     local version_item = root:add(f.version, tvb(2, 1))
     local flow_item = root:add(f.flow, tvb(3, 1))
     local dimension_item = root:add_le(f.dimension, tvb(4, 2))
-    root:add_le(f.reserved, tvb(6, 2))
+    root:add_le(f.loop, tvb(6, 2))
     root:add_le(f.run_id, tvb(8, 8))
     root:add_le(f.sequence, tvb(16, 8))
     root:add_le(f.t_ns, tvb(24, 8))

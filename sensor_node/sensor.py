@@ -15,6 +15,7 @@ from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, norm
 from noack.core.model_flow import ModelFlow
+from noack.core.ordered_arithmetic import product
 from noack.protocol.machine_interface import BEGINNING, Notice, Output, Record, Start
 from noack.protocol.record_tables import (
     NO_SEQUENCE,
@@ -122,7 +123,7 @@ class Sensor:
         t_ns, x = message.t_ns, message.vector
         row = (
             self._count(), message.sequence, t_ns, now_ns, x, x_s,
-            norm(e_s if self._weight is None else self._weight @ e_s),
+            norm(e_s if self._weight is None else product(self._weight, e_s)),
             decision.left, decision.right, self._events if event else NO_SEQUENCE,
         )  # fmt: skip
         record = Record(SENSOR_MEASUREMENT, row)

@@ -79,7 +79,7 @@ class TelemetryStore:
 
     def add_own_notice(self, notice: Notice) -> None:
         """Store a line of the recorder's own for the log."""
-        payload = json.dumps(notice._asdict()).encode()
+        payload = json.dumps(notice.line()).encode()
         self._writer.append(notices_of(RECORDER), 0, payload)
 
     def load(self, on_rows: Callable[[str, Rows], None]) -> None:

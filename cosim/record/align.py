@@ -209,8 +209,7 @@ def _at(
     propagate = flow.propagate
     for step_ns in np.unique(dt_ns[known]):
         which = known & (dt_ns == step_ns)
-        states = track.x_c[index[which]]
-        x_c[which] = states @ propagate.transition(int(step_ns)).T if step_ns else states
+        x_c[which] = propagate.rows(track.x_c[index[which]], int(step_ns))
     return x_c, received
 
 

@@ -11,16 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from netem.duplex_link import ACKNOWLEDGEMENT_LINK
 from netem.engine.batched_directions import BatchedDirection
 from netem.engine.epoll_object import Epoll
-from netem.engine.object_code import NativeFunction
 from netem.engine.pump import pump_layout
 from netem.engine.pump.client_table import insert
 from netem.engine.pump.pump_layout import Array
 from netem.engine.pump_memory import PumpMemory
 from netem.engine.relay_sockets import packed_name, stamp_arrivals
-from netem.link_machine import UPDATE_LINK, Datagram, at_start, due_settings
+from netem.link_machine import Datagram, at_start, due_settings, link_name
 from netem.rules.settings_change import carry
 from noack.config.parameter_changes import ChangeSchedule, ParameterChange
 from noack.config.scenario import Scenario
@@ -35,6 +33,7 @@ from noack.protocol.record_tables import (
     PACKET_HEAD_BYTES,
 )
 from noack.runtime.address import Address
+from noack.runtime.native.object_code import NativeFunction
 from noack.runtime.real_time_loop import RowSink
 
 _ROWS = 256
@@ -56,27 +55,34 @@ class CompiledNetwork:
         resolved: the resolved scenario.
         start: where in the run it begins.
         run_pump: the pump, from :mod:`netem.engine.native_pump`.
+        loops: number of the run's loops; None in a run of one loop without numbers.
     """
 
-    def __init__(self, resolved: Scenario, start: Start, run_pump: NativeFunction) -> None:
-        self._run_pump = run_pump
+    def __init__(
+        self, resolved: Scenario, start: Start, run_pump: NativeFunction, loops: int | None = None
+    ) -> None:
+        self._run_pump, self._loops = run_pump, loops or 1
         self._memory = PumpMemory(1, segment=False, taps=0, row_count=_ROWS)
+        while len(self._memory.memory.clients) < self._loops:
+            self._memory.add_clients()
         pump, clients = self._memory.pump, self._memory.memory.clients
         pump["inputs"] = pump["first_number"] = start.first_number
-        clients["number"][0] = 0
-        duplex, network = resolved.protocol.acknowledges, resolved.network
-        links = (
-            (network.link, UPDATE_LINK),
-            (network.reverse.link if duplex else LinkSettings(), ACKNOWLEDGEMENT_LINK),
-        )
+        pump["loops"], pump["by_loop"] = self._loops, loops is not None
+        flows = np.arange(self._loops)
+        clients["number"][flows] = clients["place"][flows] = flows
+        network = resolved.network
+        links = [(network.link_of(flow), link_name(flow)) for flow in network.flows]
         self._directions: list[BatchedDirection] = []
+        if len(links) == 1:  # the pump has two directions; nothing arrives in the second
+            links.append((LinkSettings(), "none"))
         for number, (settings, name) in enumerate(links):
             first, names = at_start(settings, name, start)
             direction = BatchedDirection(
                 first, resolved.seeds.loss, names, number, self._memory.memory, _carry,
                 restarted=start.is_restart,
             )  # fmt: skip
-            direction.start_flow(0, number)
+            for loop in range(self._loops):
+                direction.start_flow(loop, number * self._loops + loop)
             self._directions.append(direction)
         self._schedule = ChangeSchedule(resolved, lambda one: one.network.link)
         self._reached_ns = -1
@@ -89,17 +95,16 @@ class CompiledNetwork:
         clock: RunClock,
         sender: socket.socket,
         receivers: Mapping[Address, socket.socket],
-        destination: Address,
+        destinations: Sequence[Address],
         spin_ns: int = 0,
     ) -> None:
         """Use these sockets from now on.
 
         Args:
             clock: the run's clock.
-            sender: an unconnected socket, which sends all datagrams but acknowledgements.
-            receivers: a socket connected to each peer, the sensor first, then the controller if it
-                acknowledges updates.
-            destination: the controller.
+            sender: an unconnected socket, which sends the updates.
+            receivers: a socket connected to the source of each direction, the sensor first.
+            destinations: where each direction ends.
             spin_ns: busy-wait for this time before a departure.
         """
         memory, pump = self._memory.memory, self._memory.pump
@@ -112,14 +117,15 @@ class CompiledNetwork:
         pump["stamps"] = 1
         self._memory.read_controls()
         self._sensor, name_bytes = packed_name(next(iter(receivers)))
-        memory.clients["name_bytes"][0] = name_bytes
-        memory.clients["name"][0] = np.frombuffer(self._sensor, np.uint8)
+        memory.clients["name_bytes"][: self._loops] = name_bytes
+        memory.clients["name"][: self._loops] = np.frombuffer(self._sensor, np.uint8)
         with np.errstate(over="ignore"):
             row = memory.clients.view(np.recarray)
             insert(memory.table, row, 0, np.frombuffer(self._sensor, np.int64))
-        controller, memory.directions["name_bytes"] = packed_name(destination)
-        memory.directions["name"] = np.frombuffer(controller, np.uint8)
-        memory.directions["sends"] = pump_layout.SERVER_NAME, pump_layout.CLIENT_NAME
+        memory.directions["sends"] = pump_layout.SERVER_NAME
+        for direction, destination in zip(memory.directions, destinations, strict=False):
+            name, direction["name_bytes"] = packed_name(destination)
+            direction["name"] = np.frombuffer(name, np.uint8)
         memory.directions["full"][0] = 1  # refuse other sources
 
     def close(self) -> None:
@@ -154,7 +160,7 @@ class CompiledNetwork:
         memory.in_headers["size_bytes"][0] = len(message.data)
         memory.in_headers["control_bytes"][0] = 0  # the arrival is unknown
         memory.in_names[0] = np.frombuffer(self._sensor, np.int64)
-        pump["batch_socket"] = self._memory.first_path if message.flow else 0
+        pump["batch_socket"] = self._memory.first_path if message.flow >= self._loops else 0
         pump["batch_next"], pump["batch_end"], pump["ready"], pump["ready_next"] = 0, 1, 0, 0
         return self.on_timer(now_ns)
 
@@ -174,6 +180,11 @@ class CompiledNetwork:
     def refused(self) -> int:
         """Datagrams of other sources."""
         return int(self._memory.memory.directions["refused"][0])
+
+    @property
+    def of_no_loop(self) -> int:
+        """Datagrams of the peers without the number of a loop of the run."""
+        return int(self._memory.pump["no_loop"])
 
     @property
     def sent(self) -> int:
@@ -228,7 +239,7 @@ class _RowList(list[Record]):
 def _carry(
     old: LinkProgram, before: LinkMemory, new: LinkProgram, after: LinkMemory, latest_ns: Array
 ) -> None:
-    """Carry the state over without compiled code: there is one flow only."""
+    """Carry the state over without compiled code: there are few flows."""
     tables = [type(one)._make(map(_as_records, one)) for one in (old, before, new, after)]
     carry(*tables, latest_ns.tolist())  # type: ignore[call-arg, arg-type]
 

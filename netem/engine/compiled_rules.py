@@ -3,7 +3,7 @@
 The compiled code is kept in the user's cache; see :mod:`noack.core.code_cache`.
 """
 
-import importlib
+import importlib.util
 import inspect
 import pkgutil
 from collections.abc import Callable, Iterator, Sequence
@@ -18,7 +18,7 @@ import netem.engine.pump
 import netem.rules
 import noack.impairments
 from netem import relay_events
-from netem.engine import histogram, object_code
+from netem.engine import histogram
 from netem.rule_program import empty_state, loss_width, new_flow, recent_width
 from noack.core import code_cache
 from noack.core.code_cache import cache_folder, compiler
@@ -38,6 +38,7 @@ from noack.impairments.stage_dispatch import (
     apply_stage,
 )
 from noack.protocol import record_tables
+from noack.runtime.native import object_code
 
 
 def compiled_program(program: LinkProgram) -> LinkProgram:
@@ -186,3 +187,6 @@ def _compiled_modules() -> Iterator[tuple[str, str]]:
             spec: Any = found.module_finder.find_spec(found.name)  # type: ignore[call-arg]
             yield found.name, spec.origin
     yield histogram.__name__, str(histogram.__file__)
+    spec = importlib.util.find_spec("noack.runtime.native.libc_calls")  # loads the compiler
+    assert spec is not None
+    yield spec.name, str(spec.origin)

@@ -8,11 +8,11 @@ import numpy as np
 
 from netem.engine.batched_directions import BatchedDirection
 from netem.engine.compiled_rules import folder, prepare
-from netem.engine.object_code import NativeFunction, code_file, load, load_or_compile
 from netem.engine.pump_memory import PumpMemory
 from netem.rules.settings_change import carry
 from noack.impairments.link_records import PacketDecision, dtype_of
 from noack.impairments.link_settings import LinkSettings
+from noack.runtime.native.object_code import NativeFunction, code_file, load, load_or_compile
 
 _NAME = "run_pump"
 NOT_COMPILED = (

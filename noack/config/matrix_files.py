@@ -35,12 +35,22 @@ def with_matrices(content: Mapping[str, Any], folder: Path, source: str) -> Mapp
     read or lacks a matrix, CallerError has one line, which begins with ``source``.
     """
     read = dict(content)
+    if isinstance(loops := content.get("loops"), list):
+        read["loops"] = [
+            with_matrices(one, folder, f"{source}: loops.{place}") if _is_flat(one) else one
+            for place, one in enumerate(loops)
+        ]
     for table, keys in (("model", ("A", "B", GAIN)), ("plant", ("A", "B"))):
         section = content.get(table)
         if isinstance(section, Mapping) and _can_be_read(section):
             file = NamedFile(section["file"], folder, f"{source}: {table}")
             read[table] = _replaced(section, keys, file)
     return read
+
+
+def _is_flat(loop: object) -> bool:
+    """Whether an entry of [[loops]] is a table without loops of its own."""
+    return isinstance(loop, Mapping) and "loops" not in loop
 
 
 def _can_be_read(section: Mapping[str, Any]) -> bool:

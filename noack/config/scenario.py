@@ -9,9 +9,11 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, FiniteFloat, model_validator
 
 from noack.config.feature_kinds import AnyController, AnyObserver, AnyTrigger
+from noack.config.loops import check_loops
 from noack.config.message_sizes import MessageSizes
 from noack.config.scenario_changes import check_changes
 from noack.config.scenario_checks import check_sections
+from noack.config.sections.loop_section import NAME_PATTERN, LoopSection
 from noack.config.sections.model_section import ModelSection
 from noack.config.sections.network_section import NetworkSection
 from noack.config.sections.plant_section import PlantSection
@@ -37,7 +39,7 @@ MOST_CHANGES = 256  # largest number of scheduled changes in a run
 class Scenario(ScenarioSection):
     """A run of the loop, completely described."""
 
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
+    name: Annotated[str, Field(pattern=NAME_PATTERN)]
     """Names the run's directory: letters, digits, _ and -."""
     description: str = ""
     """What the scenario shows."""
@@ -63,6 +65,8 @@ class Scenario(ScenarioSection):
     recovery: RecoverySection = RecoverySection()
     changes: Annotated[tuple[ScheduledChange, ...], Field(max_length=MOST_CHANGES)] = ()
     """Changes of settings during the run, in the order of time."""
+    loops: Annotated[tuple[LoopSection, ...], Field(min_length=1)] | None = None
+    """The loops on the network, if there are several."""
     seeds: SeedsSection = SeedsSection()
     ports: PortsSection = PortsSection()
     realtime: RealtimeSection = RealtimeSection()
@@ -78,6 +82,10 @@ class Scenario(ScenarioSection):
             "network": f"{_said(self.network.loss, 'model')}; M − 1 = {self.network.mansd}",
             "horizon": f"{self.horizon_s:g} s",
         }
+        if self.loops is not None:
+            lines["loops"] = ", ".join(
+                one.name if one.count == 1 else f"{one.count} x {one.name}" for one in self.loops
+            )
         return "\n".join(f"{name:<10} {text}" for name, text in lines.items())
 
     def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
@@ -118,6 +126,7 @@ class Scenario(ScenarioSection):
     def _check(self) -> Self:
         check_sections(self)
         check_changes(self)
+        check_loops(self)
         return self
 
 

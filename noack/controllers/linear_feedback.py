@@ -3,10 +3,9 @@
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-import numpy as np
-
 from noack.controllers.controller_settings import ControllerSettings, ControlModel
 from noack.core.linear_systems import Matrix, Vector
+from noack.core.ordered_arithmetic import product
 
 
 class LinearFeedbackSettings(ControllerSettings):
@@ -31,6 +30,6 @@ class LinearFeedback:
 
     def input(self, t_s: float, x_c: Vector, setpoint: tuple[Vector, Vector] | None) -> Vector:
         if setpoint is None:
-            return np.asarray(self.K.dot(x_c))
+            return product(self.K, x_c)
         x_r, u_r = setpoint
-        return np.asarray(self.K @ (x_c - x_r) + u_r)
+        return product(self.K, x_c - x_r) + u_r

@@ -50,6 +50,13 @@ class Notice(NamedTuple):
     t_ns: int
     level: str
     text: str
+    loop: int | None = None
+    """The number of the loop that it is about, in a run of several loops."""
+
+    def line(self) -> dict[str, Any]:
+        """Return the fields; without the loop, if there is none."""
+        line = self._asdict()
+        return line if self.loop is not None else {k: line[k] for k in line if k != "loop"}
 
 
 Output = Message | Record | Notice

@@ -9,14 +9,15 @@ Layout, version 1, little endian (``docs/wire.md`` has test vectors)::
          2     1  version, 1
          3     1  flow: 1 measurement, 2 update, 3 actuation, 4 acknowledgement
          4     2  dimension n of the vector, 1 to 64; 0 of an acknowledgement
-         6     2  reserved, 0
+         6     2  number of the loop, unsigned, 0 to 65,534; 0 in a run of one loop
          8     8  run id, unsigned
         16     8  sequence number, unsigned, from 0 within a flow; what is acknowledged
         24     8  event time, signed, nanoseconds of simulated time since the run's epoch
         32    8n  vector, float64
      32+8n    16  tag: keyed BLAKE2b over all that precedes it, under the run's key
 
-The tag covers flow, run and sequence number, so that no datagram passes for one of another flow.
+The tag covers flow, loop, run and sequence number, so that no datagram passes for one of another
+flow or loop.
 Content is read only after the tag was verified.
 """
 
@@ -34,6 +35,7 @@ from noack.core.linear_systems import Vector
 MAGIC = b"NA"
 VERSION = 1
 MAX_DIMENSION = 64
+MAX_LOOPS = 65_535
 KEY_BYTES = 32
 TAG_BYTES = 16
 SEQUENCES, TIMES_NS = 2**63, 2**62
@@ -69,6 +71,8 @@ class Message(NamedTuple):
     sequence: int
     t_ns: int
     vector: Vector
+    loop: int = 0
+    """The number of its loop, among the loops of its run."""
 
 
 class Rejection(StrEnum):
@@ -78,6 +82,7 @@ class Rejection(StrEnum):
     VERSION = "version"
     RUN = "run"
     FLOW = "flow"
+    LOOP = "loop"
     TAG = "tag"
     SOURCE = "source"
     RANGE = "range"
@@ -91,6 +96,7 @@ class Header(NamedTuple):
     version: int
     flow: int
     dimension: int
+    loop: int
     run_id: int
     sequence: int
     t_ns: int
@@ -105,13 +111,17 @@ def read_header(datagram: bytes) -> Header | None:
     """Read the header of a datagram without verification; None if it is no datagram of noack."""
     if len(datagram) < HEADER_BYTES or datagram[:2] != MAGIC:
         return None
-    _, version, flow, dimension, _, run_id, sequence, t_ns = _HEADER.unpack_from(datagram)
-    return Header(version, flow, dimension, run_id, sequence, t_ns)
+    return Header(*_HEADER.unpack_from(datagram)[1:])
 
 
 def flow_of(datagram: bytes) -> int | None:
     """The flow field of a datagram, unverified; None if the datagram is too short."""
     return datagram[3] if len(datagram) >= HEADER_BYTES else None
+
+
+def loop_number(datagram: bytes) -> int | None:
+    """The loop field of a datagram, unverified; None if the datagram is too short."""
+    return datagram[6] | datagram[7] << 8 if len(datagram) >= HEADER_BYTES else None
 
 
 class _Tagger:
@@ -148,7 +158,7 @@ class Encoder:
             )
         try:
             header = _HEADER.pack(
-                MAGIC, VERSION, message.flow, vector.size, 0,
+                MAGIC, VERSION, message.flow, vector.size, message.loop,
                 self._run_id, message.sequence, message.t_ns,
             )  # fmt: skip
         except struct.error as error:
@@ -158,7 +168,7 @@ class Encoder:
 
 
 class Decoder:
-    """Turns the datagrams of one flow into messages; all others are counted and rejected.
+    """Turns the datagrams of one flow of a loop into messages; others are counted and rejected.
 
     Only a datagram that is newer than every one accepted before is accepted. A datagram from before
     ``not_before_ns`` is stale: the process before a restart may have accepted it.
@@ -172,8 +182,10 @@ class Decoder:
         key: bytes,
         *,
         not_before_ns: int = 0,
+        loop: int = 0,
     ) -> None:
         self._flow = flow
+        self._loop = loop
         self._size_bytes = datagram_bytes(dimension)
         self._dimension = dimension
         self._vector = struct.Struct(f"<{dimension}d")
@@ -206,7 +218,9 @@ class Decoder:
         # Cheap tests first: they reject most invalid input and name common mistakes.
         if len(datagram) < HEADER_BYTES:
             return Rejection.LENGTH
-        magic, version, flow, dimension, _, run_id, sequence, t_ns = _HEADER.unpack_from(datagram)
+        magic, version, flow, dimension, loop, run_id, sequence, t_ns = _HEADER.unpack_from(
+            datagram
+        )
         if magic != MAGIC or version != VERSION:
             return Rejection.VERSION
         if len(datagram) != self._size_bytes or dimension != self._dimension:
@@ -215,6 +229,8 @@ class Decoder:
             return Rejection.RUN
         if flow != self._flow:
             return Rejection.FLOW
+        if loop != self._loop:
+            return Rejection.LOOP
         if not hmac.compare_digest(self._tag(datagram[:-TAG_BYTES]), datagram[-TAG_BYTES:]):
             return Rejection.TAG
         if not from_peer:
@@ -226,4 +242,4 @@ class Decoder:
         entries = self._vector.unpack_from(datagram, HEADER_BYTES)
         if not all(map(math.isfinite, entries)):
             return Rejection.NOT_FINITE
-        return Message(self._flow, sequence, t_ns, np.array(entries))
+        return Message(self._flow, sequence, t_ns, np.array(entries), loop)

@@ -57,7 +57,7 @@ class ErrorMonitor:
         ``event`` is the sequence number of the event at this measurement, ``received`` that of the
         newest update that the controller has; both are negative for none.
         """
-        self._jumps = self._propagate(self._jumps.T, t_ns - self._t_ns).T
+        self._jumps = self._propagate.rows(self._jumps, t_ns - self._t_ns)
         self._t_ns = t_ns
         if event >= 0:
             self._append(event, e_s)
@@ -110,7 +110,7 @@ class ErrorMonitor:
         if missing := len(self._sequences):
             jumps = []
             for one_ns in times_ns:
-                self._jumps = self._propagate(self._jumps.T, one_ns - self._t_ns).T
+                self._jumps = self._propagate.rows(self._jumps, one_ns - self._t_ns)
                 self._t_ns = one_ns
                 jumps.append(self._jumps)
             norms = row_norms(np.concatenate(jumps) @ self._weight.T)

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Vector, norm
+from noack.core.ordered_arithmetic import norm_of, product
 
 NEVER_NS = math.inf
 
@@ -113,8 +114,9 @@ class TriggerCondition(NamedTuple):
             return ComparisonSides(left, right)  # the same bits as below, in less time
         z = np.concatenate([x, e_s])
         if len(self.form.down) or auxiliary > 0:
-            right = math.hypot(right, norm(self.form.down.dot(z)), math.sqrt(max(auxiliary, 0.0)))
-        return ComparisonSides(norm(self.form.up.dot(z)), right)
+            parts = right, norm(product(self.form.down, z)), math.sqrt(max(auxiliary, 0.0))
+            right = norm_of(parts, 0, len(parts))
+        return ComparisonSides(norm(product(self.form.up, z)), right)
 
     def exceeds(
         self, t_ns: NDArray[Any], z: Matrix, auxiliary: Vector | float = 0.0

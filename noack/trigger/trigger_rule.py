@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector, norm
+from noack.core.ordered_arithmetic import product
 from noack.trigger.self_triggered_interval import Forecast, interval_ns
 from noack.trigger.trigger_condition import (
     NEVER_NS,
@@ -53,9 +54,10 @@ class TriggerRule(NamedTuple):
         level, since_ns, due_ns = self.level, 0.0, self.longest_ns
         if self.from_event:
             # The same bits as the compared norm, so that the event itself does not exceed it.
-            level, since_ns = norm(self.form.up @ np.concatenate([x, np.zeros_like(x)])), t_ns
+            z = np.concatenate([x, np.zeros_like(x)])
+            level, since_ns = norm(product(self.form.up, z)), t_ns
         if self.forecast is not None:
-            size = norm(x if self.weight is None else self.weight @ x)
+            size = norm(x if self.weight is None else product(self.weight, x))
             due_ns = interval_ns(
                 self.forecast, size, t_ns * 1e-9, self.shortest_ns, self.longest_ns
             )

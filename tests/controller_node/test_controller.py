@@ -12,6 +12,7 @@ from controller_node.controller import Controller, controller_of
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
 from noack.controllers.linear_feedback import LinearFeedback
+from noack.core.ordered_arithmetic import product
 from noack.impairments.loss_guarantee import (
     DeliveriesBetweenBursts,
     LongestBurst,
@@ -106,7 +107,7 @@ def test_the_model_follows_the_newest_update_and_its_time_never_runs_back(
             message, row = tick(controller)
             model_ns = max(model_ns, row["t_ns"])
             assert message.t_ns == model_ns  # the time of the model state used for the input
-            u = safe if newest is None else K @ controller.x_c
+            u = safe if newest is None else product(K, controller.x_c)
             assert message.vector.tobytes() == u.tobytes() == row["u"].tobytes()
         else:
             event_ms, gap = item

@@ -1,11 +1,13 @@
 """Both channels of a run's emulator accept the peers' datagrams only, and count the others."""
 
+import itertools
 import socket
 import time
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from netem.duplex_link import network_of
@@ -17,6 +19,7 @@ from noack.config.scenario_file import load
 from noack.core.clock import RunClock
 from noack.protocol.machine_interface import BEGINNING, Notice
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, OWNER
+from noack.protocol.wire_format import Encoder, Flow, Message
 from noack.runtime.address import text_of
 from noack.runtime.real_time_loop import run_loop
 from noack.runtime.telemetry import TelemetryBuffer
@@ -80,17 +83,57 @@ def test_early_and_later_datagrams_are_relayed_and_foreign_ones_counted(engine: 
         assert counts[table] == (EARLY + LATER) * tables[table].itemsize
 
 
+@pytest.mark.parametrize("engine", ["plain", "batched"])
+def test_a_datagram_of_no_loop_of_the_run_is_counted_and_not_relayed(engine: str) -> None:
+    def datagram(loop: int, sequence: int) -> bytes:
+        message = Message(Flow.UPDATE, sequence, 0, np.zeros(2), loop)
+        return Encoder(1, bytes(32)).encode(message)
+
+    sent = [datagram(loop, k) for k, loop in itertools.product(range(5), (0, 1, 2, 65_534))]
+    tables = {table: dtype for table, dtype in tables_of(SCENARIO).items()
+              if OWNER[table] == "netem"}  # fmt: skip
+    flows: list[int] = []
+
+    def publish(table: str, _: bytes, rows: bytes) -> None:
+        if table == NETEM_PACKET:
+            flows.extend(np.frombuffer(rows, tables[table])["flow"].tolist())
+
+    telemetry = TelemetryBuffer(tables, publish)
+    with (
+        endpoints(*["127.0.0.1"] * 2) as (sensor, controller),
+        closing(bind(0, "test")) as endpoint,
+    ):
+        clock = RunClock(time.monotonic_ns(), SCENARIO.speed)
+        machine, shell = opened(engine, endpoint, controller, sensor, clock, loops=2)
+        for data in (*sent, b"short"):
+            sensor.sendto(data, endpoint.getsockname())
+        received: Received = []
+
+        def stop() -> bool:
+            received.extend(drain(controller))
+            return clock.now_ns() > PATIENCE_S * 1e9 or len(received) == 10
+
+        with closing(shell):
+            run_loop(machine, shell, clock, telemetry, end_ns=None, stop=stop)
+            telemetry.flush()
+            report = shell.report()
+    assert sorted(data for data, _ in received) == sorted(d for d in sent if d[6] < 2 and d[7] == 0)
+    assert report["rejected"] == {"loop": 11}
+    assert sorted(flows) == [0] * 5 + [1] * 5
+
+
 def opened(
     engine: str,
     endpoint: socket.socket,
     controller: socket.socket,
     sensor: socket.socket,
     clock: RunClock,
+    loops: int | None = None,
 ) -> tuple[Any, Any]:
-    addresses = endpoint, name_of(controller), name_of(sensor)
+    ways = [(name_of(sensor), name_of(controller))]
     if engine == "plain":
-        return network_of(SCENARIO), RelayShell(*addresses, duplex=False)
-    network = CompiledNetwork(SCENARIO, BEGINNING, compiled_pump())
+        return network_of(SCENARIO), RelayShell(endpoint, ways, loops=loops)
+    network = CompiledNetwork(SCENARIO, BEGINNING, compiled_pump(), loops)
     return network, CompiledShell(
-        *addresses, duplex=False, network=network, clock=clock, spin_us=0.0
+        endpoint, ways, network=network, clock=clock, spin_us=0.0, loops=loops
     )

@@ -5,7 +5,7 @@ are not compared.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +15,6 @@ from cosim.analysis.replay.replay_result import MessagesReplay, difference, firs
 from cosim.record.record_source import Slice
 from cosim.record.run_record import RunRecord
 from noack.protocol.record_tables import (
-    ACKNOWLEDGEMENTS,
     CONTROLLER_DELIVERY,
     NETEM_PACKET,
     PACKET_HEAD_BYTES,
@@ -23,19 +22,18 @@ from noack.protocol.record_tables import (
     SENSOR_ACKNOWLEDGEMENT,
     SENSOR_MEASUREMENT,
     SETTINGS,
-    UPDATES,
+    direction_of,
 )
+from noack.protocol.topology import ENDS
 from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Header, Message, read_header
 
-_HOPS = (
-    ("plant → sensor", SENSOR_MEASUREMENT, "plant", Flow.MEASUREMENT),
-    ("sensor → netem", NETEM_PACKET, "sensor", Flow.UPDATE),
-    ("netem → controller", CONTROLLER_DELIVERY, "sensor", Flow.UPDATE),
-    ("controller → plant", PLANT_ACTUATION, "controller", Flow.ACTUATION),
-    ("controller → netem", NETEM_PACKET, "controller", Flow.ACKNOWLEDGEMENT),
-    ("netem → sensor", SENSOR_ACKNOWLEDGEMENT, "controller", Flow.ACKNOWLEDGEMENT),
-)
-"""Name, the receiver's table, the process that made the messages, and their kind."""
+_RECEIVED = {
+    Flow.MEASUREMENT: SENSOR_MEASUREMENT,
+    Flow.UPDATE: CONTROLLER_DELIVERY,
+    Flow.ACTUATION: PLANT_ACTUATION,
+    Flow.ACKNOWLEDGEMENT: SENSOR_ACKNOWLEDGEMENT,
+}
+"""The table of the last receiver of each flow."""
 _CONTENT, _SENT, _FORWARDED = "content", "sent", "forwarded"
 """Kinds of differences."""
 
@@ -45,24 +43,40 @@ class MessageComparison:
 
     def __init__(self, record: RunRecord, machines: Mapping[str, MachineReplay]) -> None:
         self._record, self._machines = record, machines
-        acknowledges = SENSOR_ACKNOWLEDGEMENT in record.tables
+        network = record.scenario.network.flows
         self._hops = [
-            _Hop(leg, table, machines[sender], flow, acknowledges=acknowledges)
-            for leg, table, sender, flow in _HOPS
-            if acknowledges or flow is not Flow.ACKNOWLEDGEMENT
+            _Hop(leg, table, machines[ENDS[flow].sender], flow, record.number or 0, network)
+            for leg, table, flow in _hops(network)
         ]
 
     def take(self, part: Slice) -> None:
         """Compare the messages of a part that the machines have just replayed."""
-        survivors = [(one.flow, read_header(one.data)) for one in self._machines["netem"].sent]
+        netem = self._machines.get("netem")
+        if netem is None:  # a loop's network is replayed with that of the other loops
+            packets = part[NETEM_PACKET][part[NETEM_PACKET]["release_ns"] >= 0]
+            sent = [*zip(packets["flow"].tolist(), packets["head"].tolist(), strict=True)]
+        else:
+            sent = [(one.flow, one.data) for one in netem.sent]
+        survivors = [(flow, read_header(data)) for flow, data in sent]
         for hop in self._hops:
             hop.take(part, survivors)
 
     def results(self) -> tuple[MessagesReplay, ...]:
         """Return the result of each hop after the last part."""
-        whole = self._machines["netem"].whole
+        whole = "netem" not in self._machines or self._machines["netem"].whole
         found = [hop.result(network_is_whole=whole) for hop in self._hops]
         return (*found, *_compare_changes(self._record))
+
+
+def _hops(network: Sequence[Flow]) -> Iterator[tuple[str, str, Flow]]:
+    """Yield the name of each hop, the receiver's table, and the flow."""
+    for flow, table in _RECEIVED.items():
+        sender, receiver = ENDS[flow]
+        if flow in network:
+            yield f"{sender} → netem", NETEM_PACKET, flow
+            yield f"netem → {receiver}", table, flow
+        elif flow is not Flow.ACKNOWLEDGEMENT:
+            yield f"{sender} → {receiver}", table, flow
 
 
 def _compare_changes(record: RunRecord) -> Iterator[MessagesReplay]:
@@ -104,11 +118,14 @@ class _Hop:
     """The messages of one hop, as received in the run and as sent in the replay."""
 
     def __init__(
-        self, leg: str, table: str, sender: MachineReplay, flow: Flow, *, acknowledges: bool
-    ) -> None:
+        self, leg: str, table: str, sender: MachineReplay, flow: Flow, loop: int,
+        network: Sequence[Flow],
+    ) -> None:  # fmt: skip
         self._leg, self._table, self._sender, self._flow = leg, table, sender, flow
-        self._direction = ACKNOWLEDGEMENTS if flow is Flow.ACKNOWLEDGEMENT else UPDATES
-        self._selects = table == NETEM_PACKET and acknowledges
+        self._loop = loop
+        self._direction = direction_of(flow)
+        self._selects = table == NETEM_PACKET and len(network) > 1
+        self._was_forwarded = table != NETEM_PACKET and flow in network
         self._sent: list[Message] = []
         """Messages that may still be received, in order of their numbers."""
         self._numbers = np.zeros(0, np.int64)
@@ -137,7 +154,7 @@ class _Hop:
                 self._compare_flows()
         else:
             self._compare_vectors()
-        if self._table in (CONTROLLER_DELIVERY, SENSOR_ACKNOWLEDGEMENT):
+        if self._was_forwarded:
             self._survivors |= {
                 header.sequence
                 for flow, header in survivors
@@ -219,7 +236,7 @@ class _Hop:
             if message is None:
                 continue
             self._compared += 1
-            data = encoder.encode(message)
+            data = encoder.encode(message._replace(loop=self._loop))
             expected = data[:PACKET_HEAD_BYTES].ljust(PACKET_HEAD_BYTES, b"\0")
             if head != expected:
                 self._differs(row, "differs from the message sent", "head", head, expected)

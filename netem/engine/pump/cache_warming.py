@@ -7,9 +7,9 @@ memory at each of its clients' tables. Here the same loads of all datagrams wait
 from typing import Any
 
 from netem.engine.pump.client_table import home_of, key_of
-from netem.engine.pump.libc_calls import array_at
 from netem.engine.pump.pump_layout import Memory
 from noack.impairments.link_records import LinkMemory
+from noack.runtime.native.libc_calls import array_at
 
 _FEW = 512
 """The data of this number of clients fits into the caches."""

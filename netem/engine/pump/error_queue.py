@@ -5,8 +5,8 @@ the socket's next call fail once. Therefore the error queue is emptied after a f
 out whether an ICMP error caused the failure.
 """
 
-from netem.engine.pump.libc_calls import ECONNREFUSED, MSG_DONTWAIT, address_of, recvmmsg
 from netem.engine.pump.pump_layout import HEADER, Memory
+from noack.runtime.native.libc_calls import ECONNREFUSED, MSG_DONTWAIT, address_of, recvmmsg
 
 _MSG_ERRQUEUE = 0x2000
 _RECVERR = 0 | 11 << 32

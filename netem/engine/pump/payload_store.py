@@ -1,7 +1,7 @@
 """Stores delayed datagrams: payloads in chained blocks, and a heap ordered by release time."""
 
-from netem.engine.pump.libc_calls import array_at, memcpy
 from netem.engine.pump.pump_layout import BLOCK_BYTES, CHUNK_BLOCKS, Array, Memory
+from noack.runtime.native.libc_calls import array_at, memcpy
 
 
 def blocks_for(size_bytes: int) -> int:

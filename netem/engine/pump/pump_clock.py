@@ -1,7 +1,7 @@
 """The pump's time: simulated nanoseconds since the relay's start."""
 
-from netem.engine.pump.libc_calls import CLOCK_MONOTONIC, clock_ns
 from netem.engine.pump.pump_layout import Memory
+from noack.runtime.native.libc_calls import CLOCK_MONOTONIC, clock_ns
 
 
 def relay_time_ns(memory: Memory) -> int:

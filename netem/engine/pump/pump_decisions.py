@@ -4,7 +4,6 @@ from typing import Any
 
 from netem.engine.pump import pump_layout as layout
 from netem.engine.pump.client_table import find, key_of
-from netem.engine.pump.libc_calls import ENOMEM, array_at
 from netem.engine.pump.payload_store import blocks_for, keep, pop, push
 from netem.engine.pump.pump_clock import simulated_ns_of
 from netem.engine.pump.pump_events import has_room, report_arrival
@@ -12,6 +11,8 @@ from netem.engine.pump.pump_layout import Memory
 from netem.engine.pump.pump_records import record_packet, record_release
 from netem.rules.link_rules import admit, leave
 from noack.impairments.link_records import NEVER_NS, LinkMemory, LinkProgram, PacketDecision
+from noack.protocol.wire_format import HEADER_BYTES
+from noack.runtime.native.libc_calls import ENOMEM, array_at
 
 _HEAD_BYTES = 16
 """Header of a control message: length, level and kind."""
@@ -105,7 +106,7 @@ def decide(
             if pump.taps != 0:
                 report_arrival(memory, number, client_row, address, decision)
             if pump.records != 0:
-                record_packet(memory, number, address, decision)
+                record_packet(memory, number, client_row, address, decision)
             if decision.release_ns != NEVER_NS:
                 _release(memory, state_like, number, client_row, address, decision, 0)
             if decision.copy_ns != NEVER_NS:
@@ -149,8 +150,8 @@ def _arrays_at(like: LinkMemory, direction: Any) -> tuple[Any, Any, Any, Any, An
 def _client_of(memory: Memory, number: int, size_bytes: int) -> int:
     """Return the row of the current packet's client, or why there is none; count a refused packet.
 
-    A packet is refused if it and its copy might not fit into the store, or if it comes from a
-    client beyond the maximum number.
+    A packet is refused if it and its copy might not fit into the store, if it comes from a client
+    beyond the maximum number, or if it is of no loop of the run.
     """
     pump, direction = memory.pump[0], memory.directions[number]
     if direction.keeps != 0 and (
@@ -161,7 +162,8 @@ def _client_of(memory: Memory, number: int, size_bytes: int) -> int:
         memory.errors[number, ENOMEM] += 1
         return _REFUSED
     if number & 1:
-        return pump.batch_socket - pump.first_path
+        row = pump.batch_socket - pump.first_path
+        return row if pump.by_loop == 0 else _row_of_loop(memory, size_bytes)
     key0, key1, key2, key3 = key_of(memory.in_names[pump.batch_next], number >> 1)
     row = find(memory.table, memory.clients, key0, key1, key2, key3)
     if row < 0:
@@ -169,7 +171,19 @@ def _client_of(memory: Memory, number: int, size_bytes: int) -> int:
             return _NO_CLIENT
         direction.refused += 1
         return _REFUSED
-    return row
+    return row if pump.by_loop == 0 else _row_of_loop(memory, size_bytes)
+
+
+def _row_of_loop(memory: Memory, size_bytes: int) -> int:
+    """Return the row of the current packet's loop; count a packet of no loop as refused."""
+    pump = memory.pump[0]
+    if size_bytes >= HEADER_BYTES:
+        words = array_at(memory.time, memory.in_vectors[pump.batch_next].base, 1, 1)
+        loop = (words[0] >> 48) & 0xFFFF
+        if loop < pump.loops:
+            return loop
+    pump.no_loop += 1
+    return _REFUSED
 
 
 def _read_arrival(memory: Memory) -> None:

@@ -2,11 +2,11 @@
 
 from typing import Any
 
-from netem.engine.pump.libc_calls import address_of, array_at, memcpy
 from netem.engine.pump.payload_store import copy_payload
 from netem.engine.pump.pump_layout import CLIENT, DIRECTION, Memory
 from netem.relay_events import EVENT
 from noack.impairments.link_records import NEVER_NS, PacketDecision
+from noack.runtime.native.libc_calls import address_of, array_at, memcpy
 
 _EVENT_BYTES = EVENT.itemsize
 _SOURCE = EVENT.fields["source"][1]  # type: ignore[index]

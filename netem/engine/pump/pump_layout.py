@@ -72,6 +72,9 @@ PUMP = np.dtype(
         ("records", "<i8"),  # 1: write rows of the record
         ("inputs", "<i8"),  # number of the next row of the record
         ("first_number", "<i8"),  # number of the first packet in the record
+        ("loops", "<i8"),  # of a run: number of its loops; the rows of their clients begin at 0
+        ("by_loop", "<i8"),  # 1: a datagram has its loop's number in its header
+        ("no_loop", "<i8"),  # datagrams refused because of this number
         ("packet_rows", "<i8"),  # rows written so far
         ("release_rows", "<i8"),
         ("change_ns", "<i8"),  # time from which other settings apply

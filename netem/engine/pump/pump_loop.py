@@ -1,6 +1,5 @@
 """The pump's loop: wait, receive, decide, send, and release delayed datagrams."""
 
-from netem.engine.pump import libc_calls as libc
 from netem.engine.pump import pump_layout as layout
 from netem.engine.pump.cache_warming import warm_clients
 from netem.engine.pump.error_queue import take_errors
@@ -9,6 +8,7 @@ from netem.engine.pump.pump_decisions import decide, release_due
 from netem.engine.pump.pump_layout import READY_WORDS, SYS_EPOLL_PWAIT2, Memory
 from netem.engine.pump.pump_send import send
 from noack.impairments.link_records import LinkMemory, LinkProgram, PacketDecision
+from noack.runtime.native import libc_calls as libc
 
 _HEADER_BYTES = layout.HEADER.itemsize
 _EPOLLERR = 8

@@ -3,17 +3,19 @@
 They are numbered in the order of these calls: a replay calls the rules in the same order.
 """
 
-from netem.engine.pump.libc_calls import address_of, array_at, memcpy
 from netem.engine.pump.pump_layout import PACKET_ROW, Memory
 from noack.impairments.link_records import PacketDecision
 from noack.protocol.record_tables import PACKET_HEAD_BYTES
+from noack.runtime.native.libc_calls import address_of, array_at, memcpy
 
 _ROW_BYTES = PACKET_ROW.itemsize
 _HEAD = PACKET_ROW.fields["head"][1]  # type: ignore[index]
 _HEAD_WORDS = PACKET_HEAD_BYTES // 8
 
 
-def record_packet(memory: Memory, direction: int, payload: int, decision: PacketDecision) -> None:
+def record_packet(
+    memory: Memory, direction: int, client: int, payload: int, decision: PacketDecision
+) -> None:
     """Write the row of a datagram with its payload's address and the decision."""
     pump = memory.pump[0]
     row = memory.packets[pump.packet_rows]
@@ -21,7 +23,7 @@ def record_packet(memory: Memory, direction: int, payload: int, decision: Packet
     row.sequence = pump.first_number + decision.packet
     row.t_ns = min(pump.arrival_ns, decision.arrival_ns)
     row.now_ns = decision.arrival_ns
-    row.flow = direction
+    row.flow = pump.loops * direction + client
     row.fate = decision.fate
     row.consecutive_losses = decision.consecutive_losses
     row.release_ns = decision.release_ns
@@ -45,7 +47,7 @@ def record_release(memory: Memory, number: int, now_ns: int) -> None:
     row.sequence = pump.first_number + leaving.packet
     row.t_ns = leaving.release_ns
     row.now_ns = now_ns
-    row.flow = leaving.direction
+    row.flow = pump.loops * leaving.direction + leaving.client
     row.copy = leaving.copy
     row.stale = leaving.stale
     pump.release_rows += 1

@@ -1,13 +1,13 @@
 """Sends the queued datagrams: one call per socket, each flow in its order."""
 
 from netem.engine.histogram import bucket_of
-from netem.engine.pump import libc_calls as libc
 from netem.engine.pump import pump_layout as layout
 from netem.engine.pump.error_queue import take_errors
 from netem.engine.pump.payload_store import block_address, blocks_for, drop
 from netem.engine.pump.pump_clock import relay_time_ns
 from netem.engine.pump.pump_events import report_departure
 from netem.engine.pump.pump_layout import Memory
+from noack.runtime.native import libc_calls as libc
 
 _NO_WAIT = libc.MSG_DONTWAIT
 _EINTR = 4

@@ -6,7 +6,15 @@ import struct
 
 import numpy as np
 
-from noack.protocol.wire_format import Decoder, Encoder, Flow, Message, flow_of, read_header
+from noack.protocol.wire_format import (
+    Decoder,
+    Encoder,
+    Flow,
+    Message,
+    flow_of,
+    loop_number,
+    read_header,
+)
 from tests.fuzz.choices import Choices
 
 KEY = bytes(range(32))
@@ -42,14 +50,13 @@ def one_input(data: bytes) -> None:
         if message is not None:
             assert message.sequence > newest
             newest, seen = message.sequence, datagram
-            # Reserved bytes have no meaning and are not stored.
-            assert encoder.encode(message)[:6] == datagram[:6]
-            assert encoder.encode(message)[8:-16] == datagram[8:-16]
+            assert encoder.encode(message) == datagram
 
 
 def _junk(data: bytes) -> None:
     """Without the key, no datagram is accepted."""
     flow_of(data)
+    loop_number(data)
     header = read_header(data)
     assert (header is None) == (len(data) < 32 or data[:2] != b"NA")
     for flow in Flow:
@@ -68,10 +75,10 @@ def _odd(choices: Choices, dimension: int) -> bytes:
     """Return a datagram with the correct key but any header or any content length."""
     magic, version = choices.one([b"NA", b"NB", b"\0\0"]), choices.one([1, 0, 2, 255])
     flow, n = choices.one([1, 2, 3, 4, 0, 5, 255]), choices.one([dimension, 0, 1, 64, 65, 65_535])
-    reserved, run = choices.one([0, 1, 65_535]), choices.one([RUN, RUN ^ 1, 0])
+    loop, run = choices.one([0, 1, 65_535]), choices.one([RUN, RUN ^ 1, 0])
     sequence, t_ns = choices.integer() % 2**64, choices.integer() % 2**63
     numbers = choices.one([dimension, n % 65, 0])
-    content = struct.pack("<2sBBHHQQq", magic, version, flow, n, reserved, run, sequence, t_ns)
+    content = struct.pack("<2sBBHHQQq", magic, version, flow, n, loop, run, sequence, t_ns)
     content += struct.pack(f"<{numbers}d", *(choices.real() for _ in range(numbers)))
     content += choices.take(choices.one([0, 0, 1, 8]))
     return content + _tag(content)
@@ -98,10 +105,10 @@ def _is_sound(datagram: bytes, flow: Flow, dimension: int, newest: int) -> bool:
     """Whether a datagram must be accepted according to ``docs/wire.md``."""
     if len(datagram) != 48 + 8 * dimension or _tag(datagram[:-16]) != datagram[-16:]:
         return False
-    magic, version, kind, n, _, run, sequence, t_ns = struct.unpack_from("<2sBBHHQQq", datagram)
+    magic, version, kind, n, loop, run, sequence, t_ns = struct.unpack_from("<2sBBHHQQq", datagram)
     vector = struct.unpack_from(f"<{dimension}d", datagram, 32)
     return (
-        (magic, version, kind, n, run) == (b"NA", 1, flow.value, dimension, RUN)
+        (magic, version, kind, n, loop, run) == (b"NA", 1, flow.value, dimension, 0, RUN)
         and newest < sequence < 2**63
         and 0 <= t_ns < 2**62
         and all(math.isfinite(entry) for entry in vector)

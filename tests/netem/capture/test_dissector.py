@@ -54,9 +54,11 @@ def fields_of(tshark: Tshark, path: Path) -> list[Fields]:
     return packets
 
 
-def encoded(flow: Flow, sequence: int, t_ns: int, vector: list[float], run_id: int = RUN) -> bytes:
+def encoded(
+    flow: Flow, sequence: int, t_ns: int, vector: list[float], run_id: int = RUN, loop: int = 0
+) -> bytes:
     encoder = Encoder(run_id, bytes(32))
-    return encoder.encode(Message(flow, sequence, t_ns, np.array(vector)))
+    return encoder.encode(Message(flow, sequence, t_ns, np.array(vector), loop))
 
 
 def shown(fields: Fields, name: str) -> str:
@@ -70,6 +72,7 @@ def random_message(rng: random.Random) -> dict[str, Any]:
     return {
         "flow": flow, "sequence": rng.randrange(2**64),
         "t_ns": rng.randrange(-(2**63), 2**63), "run_id": rng.randrange(2**64),
+        "loop": rng.randrange(2**16),
         "vector": [rng.gauss(0, 1) * 10 ** rng.randint(-300, 300) for _ in range(dimension)],
     }  # fmt: skip
 
@@ -89,7 +92,7 @@ def test_every_field_is_shown(dissect: Dissect) -> None:
         assert shown(fields, "version") == "1"
         assert shown(fields, "flow") == str(int(message["flow"]))
         assert shown(fields, "dimension") == str(len(message["vector"]))
-        assert shown(fields, "reserved") == "0x0000"
+        assert shown(fields, "loop") == str(message.get("loop", 0))
         assert shown(fields, "run_id") == f"0x{message['run_id']:016x}"
         assert shown(fields, "sequence") == str(message["sequence"])
         assert shown(fields, "t_ns") == str(message["t_ns"])

@@ -21,6 +21,7 @@ from noack.protocol.wire_format import (
     Header,
     Message,
     Rejection,
+    loop_number,
     read_header,
 )
 
@@ -44,7 +45,7 @@ def datagram(
     version: int = 1,
     flow: int = 2,
     dimension: int | None = None,
-    reserved: int = 0,
+    loop: int = 0,
     run_id: int = RUN,
     sequence: int = 0,
     t_ns: int = 0,
@@ -57,7 +58,7 @@ def datagram(
             version.to_bytes(1, "little"),
             flow.to_bytes(1, "little"),
             (len(values) if dimension is None else dimension).to_bytes(2, "little"),
-            reserved.to_bytes(2, "little"),
+            loop.to_bytes(2, "little"),
             run_id.to_bytes(8, "little"),
             sequence.to_bytes(8, "little"),
             t_ns.to_bytes(8, "little", signed=True),
@@ -84,6 +85,7 @@ def assert_rejected(
 
 class Vector(NamedTuple):
     flow: str
+    loop: int
     run_id: int
     sequence: int
     t_ns: int
@@ -96,7 +98,8 @@ def published_vector(block: str) -> Vector:
     run_id, sequence, t_ns = int(fields["run id"], 16), int(fields["sequence"]), int(fields["t_ns"])
     values = [float(value) for value in fields["vector"].split() if value != "none"]
     data = bytes.fromhex(fields["datagram"])
-    return Vector(fields["flow"].strip(), run_id, sequence, t_ns, values, data)
+    loop = int(fields.get("loop", "0"))
+    return Vector(fields["flow"].strip(), loop, run_id, sequence, t_ns, values, data)
 
 
 VECTORS = [published_vector(block) for block in re.findall(r"```vector\n(.*?)```", PAGE, re.DOTALL)]
@@ -108,26 +111,26 @@ def test_the_page_has_a_vector_for_every_flow_and_names_its_key() -> None:
     assert f"The key of all vectors is `{KEY.hex()}`" in PAGE
 
 
-@pytest.mark.parametrize("vector", VECTORS, ids=lambda v: f"{v.flow}-{v.sequence}")
+@pytest.mark.parametrize("vector", VECTORS, ids=lambda v: f"{v.flow}-{v.loop}-{v.sequence}")
 def test_published_vectors_hold_in_both_directions(vector: Vector) -> None:
-    flow, run_id, sequence, t_ns, values, data = vector
+    flow, loop, run_id, sequence, t_ns, values, data = vector
     by_hand = datagram(
-        values, flow=FLOWS[flow], run_id=run_id, sequence=sequence, t_ns=t_ns, key=KEY
+        values, flow=FLOWS[flow], loop=loop, run_id=run_id, sequence=sequence, t_ns=t_ns
     )
     assert by_hand.hex() == data.hex()
-    message = Message(Flow(FLOWS[flow]), sequence, t_ns, np.array(values))
+    message = Message(Flow(FLOWS[flow]), sequence, t_ns, np.array(values), loop)
     assert Encoder(run_id, KEY).encode(message).hex() == data.hex()
-    decoded = Decoder(Flow(FLOWS[flow]), len(values), run_id, KEY).decode(data)
+    decoded = Decoder(Flow(FLOWS[flow]), len(values), run_id, KEY, loop=loop).decode(data)
     assert decoded is not None
     assert decoded[:3] == message[:3]
     assert decoded.vector.tobytes() == struct.pack(f"<{len(values)}d", *values)
-    assert read_header(data) == Header(1, FLOWS[flow], len(values), run_id, sequence, t_ns)
+    assert read_header(data) == Header(1, FLOWS[flow], len(values), loop, run_id, sequence, t_ns)
     assert read_header(data[:31]) is read_header(b"x" + data) is None
 
 
 def test_the_page_gives_the_reasons_in_the_order_of_the_tests() -> None:
     listed = re.findall(r"^\| (\d+) \| `(\w+)` \|", PAGE, re.MULTILINE)
-    assert [int(order) for order, _ in listed] == list(range(1, 11))
+    assert [int(order) for order, _ in listed] == list(range(1, 12))
     assert [reason for _, reason in listed] == ["length", *(reason for reason, _ in FAULTS)]
     assert {reason for _, reason in listed} == {reason.value for reason in Rejection}
 
@@ -158,9 +161,11 @@ def reason_by_offset(offset: int) -> Rejection:
         return Rejection.FLOW
     if offset in (4, 5):
         return Rejection.LENGTH  # dimension
+    if offset in (6, 7):
+        return Rejection.LOOP
     if 8 <= offset < 16:
         return Rejection.RUN
-    return Rejection.TAG  # reserved, sequence number, time, vector, and the tag itself
+    return Rejection.TAG  # sequence number, time, vector, and the tag itself
 
 
 @given(vectors, sequences, times_ns)
@@ -243,6 +248,7 @@ FAULTS = [
     ("length", {"dimension": 2}),
     ("run", {"run_id": RUN + 1}),
     ("flow", {"flow": 3}),
+    ("loop", {"loop": 1}),
     ("tag", {"key": OTHER_KEY}),
     ("source", {"from_peer": False}),
     ("range", {"t_ns": -1}),
@@ -289,7 +295,18 @@ def test_a_key_has_32_bytes(made: Any, size: int) -> None:
         made(RUN, bytes(size))
 
 
-def test_the_reserved_bytes_are_covered_by_the_tag_and_otherwise_ignored() -> None:
-    data = datagram([1.0, 2.0, 3.0], reserved=0xFFFF)
-    assert_rejected(new_decoder(), data[:6] + b"\0\0" + data[8:], Rejection.TAG)
-    assert new_decoder().decode(data) is not None
+@given(st.integers(0, 65_534), st.integers(0, 65_534))
+def test_a_decoder_accepts_datagrams_of_its_loop_only(sent: int, expected: int) -> None:
+    data = Encoder(RUN, KEY).encode(Message(Flow.UPDATE, 0, 0, np.zeros(3), sent))
+    assert data == datagram([0.0, 0.0, 0.0], loop=sent)
+    assert loop_number(data) == sent
+    assert read_header(data) == Header(1, 2, 3, sent, RUN, 0, 0)
+    decoder = Decoder(Flow.UPDATE, 3, RUN, KEY, loop=expected)
+    if sent != expected:
+        assert_rejected(decoder, data, Rejection.LOOP)
+        return
+    message = decoder.decode(data)
+    assert message is not None
+    assert message.loop == sent
+    # the tag covers the number
+    assert_rejected(new_decoder(), data[:6] + b"\0\0" + data[8:], Rejection.TAG) if sent else None

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from netem.engine.object_code import NativeFunction, compile_native, load, load_or_compile
+from noack.runtime.native.object_code import NativeFunction, compile_native, load, load_or_compile
 
 CELL = np.dtype([("count", "<i8"), ("share", "<f8")])
 
@@ -37,7 +37,7 @@ def arguments() -> tuple[Any, ...]:
 LOAD = """
 import sys
 from pathlib import Path
-from netem.engine.object_code import load
+from noack.runtime.native.object_code import load
 sys.exit(load(Path(sys.argv[1])) is None or "numba" in sys.modules)
 """
 

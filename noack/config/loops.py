@@ -1,0 +1,180 @@
+"""The loops of a scenario: many loops on one network, each an ordinary scenario.
+
+The number of a loop is its place in :func:`loops_of`. A loop begins at its phase: its time 0 is
+that time of the run.
+"""
+
+import json
+from collections.abc import Callable, Mapping
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+from pydantic import BaseModel, ValidationError, create_model
+
+from noack.config.scenario_changes import check_changes
+from noack.config.scenario_checks import check_sections
+from noack.config.sections.loop_section import MOST_LOOPS, LoopSection
+from noack.config.validation_messages import explain
+from noack.core.clock import NS_PER_S
+from noack.core.random_streams import stream, stream_key
+from noack.settings.section import ScenarioSection
+from noack.trigger.periodic_trigger import PeriodicSettings
+
+if TYPE_CHECKING:
+    from noack.config.scenario import Scenario
+
+_KINDS: Mapping[str, tuple[str, ...]] = {
+    "model": ("name", "A", "file"),
+    "plant": (),
+    "trigger": ("policy",),
+    "observer": ("kind",),
+    "controller": ("kind",),
+}
+"""The tables of a loop, each with the keys that make it replace the table of the top level."""
+
+
+def loops_of(scenario: "Scenario") -> "tuple[Scenario, ...]":
+    """Return one scenario per loop, not yet resolved; the scenario itself if it has no [[loops]].
+
+    The first loop has the seeds of the run; those of the others are drawn from these and the loop's
+    number. So a run with one entry of [[loops]] computes what the run without it does.
+    """
+    if scenario.loops is None:
+        return (scenario,)
+    found: list[Scenario] = []
+    for section in scenario.loops:
+        entry = loop_scenario(scenario, section)
+        for name in section.names:
+            seeds = _seeds(scenario, section, len(found))
+            found.append(entry.model_copy(update={"name": name, "seeds": seeds}))
+    return tuple(found)
+
+
+def phases_ns(scenario: "Scenario") -> tuple[int, ...]:
+    """Return when each loop begins: the time of the run at which the time of the loop is 0."""
+    if scenario.loops is None:
+        return (0,)
+    given = [section.phase for section in scenario.loops for _ in range(section.count)]
+    phases = []
+    for number, (phase, loop) in enumerate(zip(given, loops_of(scenario), strict=True)):
+        if phase is None:
+            seed = loop.seeds.initial_state
+            drawn = stream(seed, "phase", str(number)).uniform() if number else 0.0
+            phase = float(drawn)
+        phases.append(int(phase * _period_ns(loop)))
+    return tuple(phases)
+
+
+def with_loop_tables(
+    scenario: "Scenario", change: Callable[[str, "Scenario"], Mapping[str, BaseModel]]
+) -> "Scenario":
+    """Return a scenario with other tables in the entries of [[loops]].
+
+    ``change`` gets the place of an entry, e.g. ``loops.0``, and the scenario of its loops. It
+    returns the new tables by their places, e.g. ``plant.system``; only those of tables that the
+    entry sets itself are used.
+    """
+    if scenario.loops is None:
+        return scenario
+    sections = []
+    for place, section in enumerate(scenario.loops):
+        update: dict[str, Any] = {}
+        changed = change(f"loops.{place}", loop_scenario(scenario, section))
+        for path, table in changed.items():
+            part, _, inner = path.partition(".")
+            content = table.model_dump(mode="json", exclude_none=True)
+            if (own := getattr(section, part)) is not None and (not inner or inner in own):
+                update[part] = own | {inner: content} if inner else content
+        sections.append(section.model_copy(update=update))
+    return scenario.model_copy(update={"loops": tuple(sections)})
+
+
+def loop_scenario(scenario: "Scenario", section: LoopSection) -> "Scenario":
+    """Return the scenario of an entry of [[loops]], with the seeds of the run.
+
+    Raises:
+        ValueError: it is not valid; the message begins with the key within the entry.
+    """
+    content: dict[str, Any] = {} if section.mode is None else {"mode": section.mode}
+    for part, kinds in _KINDS.items():
+        if (given := getattr(section, part)) is None:
+            continue
+        own = getattr(scenario, part)
+        template = {} if own is None else own.model_dump(mode="json", exclude_none=True)
+        content[part] = given if any(kind in given for kind in kinds) else template | given
+    if not content:
+        return scenario.model_copy(update={"loops": None})
+    model = _parts_model(type(scenario), frozenset(content))
+    try:
+        parts = model.model_validate_json(json.dumps(content))
+    except ValidationError as error:
+        raise ValueError(explain(error, "", model)[0].removeprefix(": ")) from None
+    update = {part: getattr(parts, part) for part in content}
+    loop = scenario.model_copy(update=update | {"loops": None})
+    check_sections(loop)
+    check_changes(loop)
+    return loop
+
+
+def check_loops(scenario: "Scenario") -> None:
+    """Raise ValueError unless the loops can run together; the message begins with the key."""
+    names: dict[str, int] = {}
+    rates: dict[str, float] = {}
+    for place, section in enumerate(scenario.loops or ()):
+        try:
+            loop = loop_scenario(scenario, section)
+        except ValueError as error:
+            raise ValueError(f"loops.{place}.{error}") from None
+        rates = rates or _rates(loop)
+        for key, value in _rates(loop).items():
+            if value != rates[key]:
+                raise ValueError(
+                    f"loops.{place}.{key}: all loops have the same periods; that of loops.0 is "
+                    f"{rates[key]:g}"
+                )
+        for name in section.names:
+            if name in names:
+                raise ValueError(
+                    f"loops.{place}.name: the name {name} is already given by loops.{names[name]}"
+                )
+            names[name] = place
+        if len(names) > MOST_LOOPS:
+            raise ValueError(f"loops.{place}.count: a run has at most {MOST_LOOPS} loops")
+
+
+def _rates(loop: "Scenario") -> dict[str, float]:
+    return {
+        "plant.rate_hz": loop.plant.rate_hz,
+        "plant.measure_every": loop.plant.measure_every,
+        "controller.rate_hz": loop.controller.rate_hz,
+    }
+
+
+def _period_ns(loop: "Scenario") -> int:
+    """Return the time between two transmissions of a periodic trigger, else two measurements."""
+    if isinstance(loop.trigger, PeriodicSettings):
+        return round(loop.trigger.period_s * NS_PER_S)
+    return loop.timing.measurement_period_ns
+
+
+def _seeds(scenario: "Scenario", section: LoopSection, number: int) -> Any:
+    given = section.seeds.model_dump(exclude_none=True)
+    if number == 0:
+        return scenario.seeds.model_copy(update=given)
+    drawn = {}
+    for name in ("plant", "initial_state", "disturbance", "noise"):
+        low, high = stream_key(getattr(scenario.seeds, name), "loop", str(number), name)
+        drawn[name] = low | high << 32
+    return scenario.seeds.model_copy(update=drawn | given)
+
+
+@cache
+def _parts_model(scenario: "type[Scenario]", parts: frozenset[str]) -> type[ScenarioSection]:
+    """Return a model of some of a scenario's parts."""
+    fields: dict[str, Any] = {
+        name: (field.annotation, field)
+        for name, field in scenario.model_fields.items()
+        if name in parts
+    }
+    model: type[ScenarioSection] = create_model("LoopParts", __base__=ScenarioSection, **fields)
+    return model
