@@ -58,6 +58,9 @@ _COORDINATOR_AWAY_S = 8.0
 """Four leases of the connection: a connection that a busy machine broke comes back by then."""
 _CHANGES_AT_ONCE = 2
 """Changes taken in the loop every 50 ms: a machine needs some tenths of a millisecond for each."""
+_FEW_LOOPS = 8
+_GATHER_PARTS = 8
+"""Deadlines of more than a few loops are gathered for this part of a period."""
 _GRACE_S = 0.15  # wall time after the horizon for packets in flight
 
 
@@ -291,6 +294,7 @@ class RunProcess:
             end_ns=self._end_ns,
             stop=lambda: self.stopping,
             spin_us=self.scenario.realtime.spin_us,
+            gather_ns=self._gather_ns,
             rehearsal=self._rehearsal,
             news=lambda now_ns: self._announce(changeable, now_ns, next(limits)),
         )
@@ -301,6 +305,17 @@ class RunProcess:
                 Event.STOP, f"overrun: {late_s:g} s late; reduce the speed or the rates"
             )
         return reached_ns
+
+    @property
+    def _gather_ns(self) -> int:
+        """How long to gather the deadlines of many loops: waking up for each takes CPU time.
+
+        The emulator's deadlines are delays, which stay exact.
+        """
+        if self.role == "netem" or len(self._phases_ns) <= _FEW_LOOPS:
+            return 0
+        timing = loops_of(self.scenario)[0].timing
+        return min(timing.plant_period_ns, timing.controller_period_ns) // _GATHER_PARTS
 
     @property
     def _end_ns(self) -> int:
