@@ -1,6 +1,7 @@
 """A simulated run of several loops: its directories, its summary, and the commands that read it."""
 
 import json
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -107,6 +108,19 @@ def test_a_loop_that_diverges_is_named_and_the_others_go_on(tmp_path: Path) -> N
     for name in ("calm-1", "calm-2"):
         assert json.loads((tmp_path / f"latest/loops/{name}/summary.json").read_text())[
             "exit"]["status"] == 0  # fmt: skip
+
+
+def test_check_prints_the_loops_and_refuses_a_link_that_is_too_slow() -> None:
+    done = noack("check", PATH)
+    assert done.exit_code == 0
+    assert tomllib.loads(done.stdout)["loops"][0]["count"] == 10
+    assert "# pendulum-10: begins at 0.00" in done.stdout
+    assert "# network.impairments.0: 100000 bit/s; datagrams that must pass: 920 to " in done.stdout
+    slow = 'network.impairments=[{ kind = "rate", rate_bps = 900 }]'
+    for command in ("check", "simulate"):
+        refused = noack(command, PATH, "--set", slow)
+        assert refused.exit_code == 2
+        assert "need 920 bit/s" in refused.stderr
 
 
 def test_the_number_in_flight_over_time() -> None:
