@@ -14,9 +14,7 @@ with quiet_interrupt():
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the controller in the run that a recorder or launcher has opened."""
     return process_entry.main(
-        "controller",
-        lambda member: member.run_messages(lambda: controller_of(member.scenario, member.start)),
-        arguments,
+        "controller", lambda member: member.run_messages(controller_of), arguments
     )
 
 

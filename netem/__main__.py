@@ -50,18 +50,23 @@ def _in_a_run(node: RunProcess) -> None:
     if pump is None:
         print_to_stderr(NOT_COMPILED)
         node.run(
-            network_of(node.scenario, node.start),
+            network_of(node.scenario, node.start, loops=node.loop_count or 1),
             lambda endpoint, addresses: RelayShell(
-                endpoint, addresses["controller"], addresses["sensor"], duplex=duplex
+                endpoint,
+                addresses["controller"],
+                addresses["sensor"],
+                duplex=duplex,
+                loops=node.loop_count,
             ),
         )
         return
-    network = CompiledNetwork(node.scenario, node.start, pump)
+    network = CompiledNetwork(node.scenario, node.start, pump, node.loop_count)
     node.run(
         network,
         lambda endpoint, addresses: CompiledShell(
             endpoint, addresses["controller"], addresses["sensor"], duplex=duplex,
             network=network, clock=node.clock, spin_us=node.scenario.realtime.spin_us,
+            loops=node.loop_count,
         ),
     )  # fmt: skip
 

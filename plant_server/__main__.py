@@ -14,7 +14,7 @@ with quiet_interrupt():
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the plant in the run that a recorder or launcher has opened."""
     return process_entry.main(
-        "plant", lambda member: member.run_messages(lambda: plant_of(member.scenario)), arguments
+        "plant", lambda member: member.run_messages(lambda loop, _: plant_of(loop)), arguments
     )
 
 

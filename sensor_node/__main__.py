@@ -13,11 +13,7 @@ with quiet_interrupt():
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the sensor in the run that a recorder or launcher has opened."""
-    return process_entry.main(
-        "sensor",
-        lambda member: member.run_messages(lambda: sensor_of(member.scenario, member.start)),
-        arguments,
-    )
+    return process_entry.main("sensor", lambda member: member.run_messages(sensor_of), arguments)
 
 
 if __name__ == "__main__":

@@ -56,7 +56,7 @@ class Loop(Shuttle):
             "netem": DecidedLink(network),
             "controller": self._heard("controller", controller),
         }
-        super().__init__(machines, lambda flow: m if flow is Flow.ACTUATION else n, self._see)
+        super().__init__(machines, [lambda flow: m if flow is Flow.ACTUATION else n], self._see)
 
     def _see(self, role: str, output: Record | Notice) -> None:
         if isinstance(output, Notice):

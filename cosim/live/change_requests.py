@@ -4,6 +4,7 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import Any
 
+from noack.config.loops import loop_scenario
 from noack.config.parameter_changes import (
     ChangeSchedule,
     ParameterChange,
@@ -30,7 +31,11 @@ class ChangeRequests:
     def __init__(self, ticket: Ticket, plane: ControlPlane) -> None:
         self._scenario, self._run_dir = ticket.scenario, ticket.run_dir
         self._plane = plane
-        self._schedule = ChangeSchedule(ticket.scenario)
+        loops = ticket.scenario.loops or ()
+        self._schedule, *self._of_loops = (
+            ChangeSchedule(one)
+            for one in (ticket.scenario, *(loop_scenario(ticket.scenario, one) for one in loops))
+        )
         self.announced: list[dict[str, Any]] = []
         """Announcements of all changes so far."""
         for change in scheduled(ticket.scenario):
@@ -52,7 +57,9 @@ class ChangeRequests:
                 raise CallerError(obstacle)
             if len(self.announced) >= MOST_CHANGES:
                 raise CallerError(f"this run has had {MOST_CHANGES} changes, the maximum")
-            changed(self._schedule.last, settings)  # before the time is chosen, as it may take long
+            # Before the time is chosen, as it may take long.
+            for one in (self._schedule, *self._of_loops):
+                changed(one.last, settings)
             now_ns = clock()
             delay_ns = int(_CHANGE_DELAY_S * NS_PER_S * self._scenario.speed)
             t_ns = -(-max(now_ns + delay_ns, 0) // _MILLISECOND_NS) * _MILLISECOND_NS
@@ -78,7 +85,8 @@ class ChangeRequests:
         Raises:
             CallerError: the change is not valid for this run.
         """
-        self._schedule.announce("", change, 0, 0, -1)
+        for one in (self._schedule, *self._of_loops):
+            one.announce("", change, 0, 0, -1)
         announcement = {
             "number": change.number,
             "t_ns": change.t_ns,

@@ -2,6 +2,7 @@
 
 import shutil
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from cosim.record.run_directory import LEAST_FREE_BYTES
@@ -38,7 +39,7 @@ def needed_bytes(resolved: Scenario) -> int:
     return _UNTIL_THE_END * spool_bytes(resolved)
 
 
-def require_disk_space(resolved: Scenario, runs: Path) -> None:
+def require_disk_space(loops: Sequence[Scenario], runs: Path) -> None:
     """Check that a run's record fits on the disk; warn if it may not.
 
     Raises:
@@ -47,7 +48,7 @@ def require_disk_space(resolved: Scenario, runs: Path) -> None:
     folder = next((one for one in (runs, *runs.absolute().parents) if one.is_dir()), None)
     if folder is None:
         return
-    free, spool = shutil.disk_usage(folder).free, spool_bytes(resolved)
+    free, spool = shutil.disk_usage(folder).free, sum(map(spool_bytes, loops))
     if free >= _UNTIL_THE_END * spool or free < LEAST_FREE_BYTES:  # then no run can begin at all
         return
     text = (

@@ -24,7 +24,7 @@ from cosim.live.start_limit import DEFAULT_S, StartLimit
 from cosim.record.environment import write_environment
 from cosim.record.run_directory import active_run, new_run_dir, point_to_latest, write_scenario
 from cosim.record.run_ending import EndingFile, RunEnding
-from noack.config.resolution import resolve
+from noack.config.resolution import resolved_loops
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError, ExitStatus, NeverStartedError
 from noack.protocol.topology import PLANT, RECORDER, ROLES
@@ -84,13 +84,18 @@ def launch(
     began_ns = time.monotonic_ns()
     with contextlib.ExitStack() as stack:
         server = server or stack.enter_context(fork_server())
-        resolved = resolve(scenario)
-        require_disk_space(resolved, runs)
+        loops = resolved_loops(scenario)
+        resolved = loops[0] if scenario.loops is None else scenario
+        require_disk_space(loops, runs)
         control = resolved.ports.control
+        if live and scenario.loops is not None:
+            raise CallerError("--live shows a run of one loop only; this scenario has [[loops]]")
         if control:
             require_free_tcp_port(control, "ports.control")
         if PLANT in spawn:
-            resolved.plant.system.prepare()  # compile now: the start barrier has a time limit
+            # Compile now: the start barrier has a time limit.
+            for system in {repr(loop.plant.system): loop.plant.system for loop in loops}.values():
+                system.prepare()
         endpoint = f"tcp/{LOOPBACK}:{control or free_tcp_port()}"
         run_dir = new_run_dir(runs, resolved.name)
         resolved = write_scenario(resolved, run_dir)

@@ -57,6 +57,11 @@ class _RunProgress:
         if roles:
             self._print(f"waiting for {', '.join(roles)}")
 
+    @property
+    def _loops(self) -> int | None:
+        loops = self._scenario.loops
+        return None if loops is None else sum(one.count for one in loops)
+
     def started(self, run_dir: Path) -> None:
         """Begin the bar."""
         self._task = self._progress.add_task(self._scenario.name, total=self._scenario.horizon_s)
@@ -79,7 +84,7 @@ class _RunProgress:
         self._print_new("live", [report["live"]] if report["live"] else [], "{}")
         self._print_new("void", report.get("void", []), "[yellow]{}[/]")
         self._print_new("changes", report.get("changes", []), "changed: {}")
-        text = progress_text(report, self._scenario.horizon_s)
+        text = progress_text(report, self._scenario.horizon_s, self._loops)
         if self._task is not None:
             self._progress.update(self._task, completed=report["t_s"], description=text)
         due = math.floor(report["t_s"] / self._scenario.horizon_s * _PLAIN_LINES)
@@ -172,11 +177,12 @@ def search_status() -> Iterator[Callable[[str], Callable[[str, int, float], None
         yield named
 
 
-def progress_text(report: Mapping[str, Any], horizon_s: float) -> str:
-    """The recorder's progress report as one line."""
+def progress_text(report: Mapping[str, Any], horizon_s: float, loops: int | None = None) -> str:
+    """The recorder's progress report as one line; ``loops`` is the number of loops."""
     norm = "-" if report["x_norm"] is None else f"{report['x_norm']:.3g}"
+    of_loops = "" if loops is None else f"{loops} loops  "
     return (
-        f"{report['t_s']:.1f}/{horizon_s:g} s  events {report['events']}  "
+        f"{report['t_s']:.1f}/{horizon_s:g} s  {of_loops}events {report['events']}  "
         f"delivered {report['deliveries']}  longest loss burst {report['longest_loss_burst']}  "
         f"‖x‖ {norm}"
     )

@@ -10,6 +10,7 @@ from cosim.record.run_record import Rows, updates_in
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
+    LOOP,
     NETEM_PACKET,
     SENSOR_MEASUREMENT,
     effective,
@@ -17,7 +18,10 @@ from noack.protocol.record_tables import (
 
 
 class ProgressReport:
-    """Fields of :class:`noack.runtime.control_messages.RunProgress`."""
+    """Fields of :class:`noack.runtime.control_messages.RunProgress`.
+
+    In a run of several loops they are those of all loops together; ‖x‖ is the largest.
+    """
 
     def __init__(self, live: str | None) -> None:
         self._fields: dict[str, Any] = {
@@ -40,7 +44,8 @@ class ProgressReport:
         if table == SENSOR_MEASUREMENT:
             fields["t_s"] = int(rows["t_ns"][-1]) / NS_PER_S
             fields["events"] += int((rows["event"] >= 0).sum())
-            fields["x_norm"] = float(np.linalg.norm(rows["x"][-1]))
+            newest = rows["x"] if LOOP in (rows.dtype.names or ()) else rows["x"][-1:]
+            fields["x_norm"] = float(np.linalg.norm(newest, axis=1).max())
         elif table == CONTROLLER_DELIVERY:
             fields["deliveries"] += len(rows)
             # Includes stale updates, which the emulator cannot know in advance.

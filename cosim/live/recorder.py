@@ -17,7 +17,10 @@ from cosim.live.telemetry_store import TelemetryStore
 from cosim.record.decimate import is_long
 from cosim.record.run_directory import active_run
 from cosim.record.run_record import Rows, RunRecord, finish_record, report_of, write_reports
+from cosim.record.shared_spool import finish_shared_record
+from noack.config.loops import loops_of
 from noack.config.parameter_changes import ParameterChange, change_notice
+from noack.config.resolution import resolve
 from noack.config.runtime_parameters import is_of_loss_alone
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
@@ -66,7 +69,9 @@ class Recorder:
         self._feed: ViewFeed | None = None
         self.lost: MachineError | None = None
         """Why some stored rows are no longer on disk; known at the end."""
-        self._monitor = AssumptionMonitor(scenario)
+        self._monitor = AssumptionMonitor(resolve(loops_of(scenario)[0]))
+        if scenario.loops is not None:
+            self._monitor.stop("the run has several loops")
         self._blind_reported = self._monitoring_ended = False
         session, key = plane.session, plane.key
         self._batches = session.declare_subscriber(
@@ -158,7 +163,7 @@ class Recorder:
             self._plane.acknowledge_rows(role, content)
 
     def finish(self) -> RunRecord:
-        """Write the record; complete the view.
+        """Write the record, of the network if the run has several loops; complete the view.
 
         Raises:
             MachineError: the record cannot be written; the spool is kept.
@@ -171,7 +176,10 @@ class Recorder:
             self.lost = error
         self._store.close()
         write_reports(self._run_dir, self._reports.values())
-        record = finish_record(self._run_dir)
+        if self._scenario.loops is None:
+            record = finish_record(self._run_dir)
+        else:
+            record = finish_shared_record(self._run_dir)
         if self._feed is not None:
             try:
                 self._feed.advance(final=True)
@@ -305,9 +313,10 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
     if process.replaces is not None:
         recorder.note(Notice(process.start.from_ns, RESTART, f"restarted: {process.replaces}"))
     process.join(None)
-    # A restarted recorder writes the view at the end; the launcher writes that of a long run.
-    long = is_long(process.scenario)
-    if view is not None or not (process.start.is_restart or long):
+    # A restarted recorder writes the view at the end; the launcher writes that of a long run. A run
+    # of several loops has none.
+    unseen = process.scenario.loops is not None or is_long(process.scenario)
+    if view is not None or not (process.start.is_restart or unseen):
         try:
             view = view or _open_view(process, None)
             recorder.show_in(view)
@@ -327,7 +336,7 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
             view.close()
     except MachineError as error:
         print_to_stderr(f"noack recorder: {error}; the numeric record is complete")
-    if recorder.view_is_incomplete and not long:
+    if recorder.view_is_incomplete and not unseen:
         from cosim.output.viewer.run_view import write_view
 
         write_view(record, run_dir, run_id)

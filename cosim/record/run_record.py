@@ -7,6 +7,7 @@ import contextlib
 import json
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -25,17 +26,23 @@ from cosim.record.record_source import (
     with_columns,
 )
 from cosim.record.record_source import Rows as Rows
-from cosim.record.run_directory import RECORD, REPORTS_FILE, SCENARIO_FILE, read_object
+from cosim.record.run_directory import (
+    LOOP_FILE,
+    RECORD,
+    REPORTS_FILE,
+    SCENARIO_FILE,
+    read_object,
+)
 from cosim.record.spool_merge import merged, spool_segments
-from noack.config.resolution import LoopMatrices, loop_of, tables_of
+from noack.config.resolution import LoopMatrices, loop_of, network_tables, tables_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, MachineError, PeerError, why
 from noack.core.file_access import write_whole
 from noack.protocol.machine_interface import RESTART
-from noack.protocol.record_tables import NO_SEQUENCE, OWNER, PLANT_STEP, SENSOR_MEASUREMENT
+from noack.protocol.record_tables import LOOP, NO_SEQUENCE, OWNER, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.topology import LOOP_ROLES, RECORDER
-from noack.protocol.wire_format import VERSION, Flow, read_header
+from noack.protocol.wire_format import MAX_LOOPS, VERSION, Flow, read_header
 from noack.runtime.control_messages import LogLine, ProcessReport, parse_message
 from noack.runtime.spool import SPOOL, read_chunks
 from noack.runtime.telemetry import notices_of
@@ -51,15 +58,16 @@ class _Notice(LogLine):
 
 
 class RunRecord:
-    """The record of one run.
+    """The record of one run, or of the network that several loops share.
 
     Args:
-        scenario: the resolved scenario.
+        scenario: the resolved scenario; that of the network has [[loops]].
         rows: the rows of each table, in the order of the machine's inputs, or where to read them.
         notices: the lines of the run's log, each with t_ns, level, text and process.
         reports: each process's final report; a process that died has none.
         kind: live or simulated.
         earlier: the final reports of processes that were restarted later.
+        number: the number of the loop in a run of several loops; None in a run of one.
     """
 
     def __init__(
@@ -70,16 +78,27 @@ class RunRecord:
         reports: Mapping[str, dict[str, Any]],
         kind: Kind = "live",
         earlier: Sequence[dict[str, Any]] = (),
+        number: int | None = None,
     ) -> None:
         self.scenario = scenario
-        self.loop: LoopMatrices = loop_of(scenario)
+        self.number = number
         self.notices = notices
         self.reports = reports
         self.earlier = earlier
         self.kind: Kind = kind
         self.source = rows if isinstance(rows, RecordSource) else RowsInMemory(rows)
-        self.tables = tables_of(scenario)
+        self.tables = network_tables() if self.is_network else tables_of(scenario)
         self._lives: dict[str, list[Life]] = {}
+
+    @property
+    def is_network(self) -> bool:
+        """Whether it is the record of the network that several loops share."""
+        return self.scenario.loops is not None
+
+    @cached_property
+    def loop(self) -> LoopMatrices:
+        """The matrices of the scenario."""
+        return loop_of(self.scenario)
 
     def __getitem__(self, table: str) -> Rows:
         """All rows of a table of ``noack.protocol.record_tables``; for a long run, see `slices`."""
@@ -129,7 +148,9 @@ class RunRecord:
         ``derive`` gets a table's name and some of its rows, in order.
         """
         rows = DerivedRows(self.source, derive)
-        derived = RunRecord(scenario, rows, self.notices, self.reports, self.kind, self.earlier)
+        derived = RunRecord(
+            scenario, rows, self.notices, self.reports, self.kind, self.earlier, self.number
+        )
         derived.tables = self.tables  # they are those of the run that was recorded
         return derived
 
@@ -187,9 +208,13 @@ def load_record(run_dir: Path) -> RunRecord:
             f"{run_dir}: has no numeric record; `noack summary` finalises an interrupted run"
         )
     scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
-    rows = StoredTables(folder, tables_of(scenario))
+    tables = tables_of(scenario) if scenario.loops is None else network_tables()
+    rows = StoredTables(folder, tables)
     reports, earlier = _reports(run_dir, rows)
-    return RunRecord(scenario, rows, _read_notices(folder), reports, kind_of(run_dir), earlier)
+    number = read_object(run_dir / LOOP_FILE).get("number")
+    number = number if isinstance(number, int) and 0 <= number < MAX_LOOPS else None
+    notices = _read_notices(folder)
+    return RunRecord(scenario, rows, notices, reports, kind_of(run_dir), earlier, number)
 
 
 def write_record(record: RunRecord, run_dir: Path) -> None:
@@ -199,14 +224,15 @@ def write_record(record: RunRecord, run_dir: Path) -> None:
         OSError: they cannot be written.
     """
     tables = {table: record.source.batches(table) for table in record.tables}
-    _write(run_dir / RECORD, tables, record.tables, record.loop, record.notices)
+    loop = None if record.is_network else record.loop
+    _write(run_dir / RECORD, tables, record.tables, loop, record.notices)
 
 
 def _write(
     folder: Path,
     tables: Mapping[str, Iterable[Rows]],
     types: Mapping[str, np.dtype[np.void]],
-    loop: LoopMatrices,
+    loop: LoopMatrices | None,
     notices: Iterable[Mapping[str, Any]],
 ) -> None:
     from cosim.record.table_files import write_table
@@ -223,17 +249,20 @@ def _write(
 def finish_record(run_dir: Path) -> RunRecord:
     """Convert a run's spool to its record, and remove the spool.
 
-    It merges all spools and removes duplicate rows.
+    It merges all spools and removes duplicate rows. Of a run with [[loops]], it converts the part
+    of the network; see :func:`cosim.record.shared_spool.finish_shared_record`.
 
     Raises:
         MachineError: the record cannot be written; the spool is kept.
     """
     scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
-    spool, folder, types = run_dir / SPOOL, run_dir / RECORD, tables_of(scenario)
-    tables = {table: _merged(folder, spool, table, dtype) for table, dtype in types.items()}
-    notices = _notices(folder, spool)
+    is_network = scenario.loops is not None
+    types = network_tables() if is_network else tables_of(scenario)
+    spool, folder = run_dir / SPOOL, run_dir / RECORD
+    tables = {table: recorded_rows(run_dir, table, dtype) for table, dtype in types.items()}
+    notices = [one for one in _notices(folder, spool) if one.get(LOOP) is None]
     try:
-        _write(folder, tables, types, loop_of(scenario), notices)
+        _write(folder, tables, types, None if is_network else loop_of(scenario), notices)
         if spool.is_dir():  # moved in one step, so that an incomplete spool is never read
             done = spool.with_name(f"{SPOOL}.done")
             shutil.rmtree(done, ignore_errors=True)  # of an earlier attempt that was interrupted
@@ -246,13 +275,13 @@ def finish_record(run_dir: Path) -> RunRecord:
     return load_record(run_dir)
 
 
-def _merged(folder: Path, spool: Path, table: str, dtype: np.dtype[np.void]) -> Iterator[Rows]:
+def recorded_rows(run_dir: Path, table: str, dtype: np.dtype[np.void]) -> Iterator[Rows]:
     """Yield the rows of a table from an earlier record and from the spool."""
     from cosim.record.table_files import group_segments
 
-    path = folder / f"{table}.parquet"
+    path = run_dir / RECORD / f"{table}.parquet"
     recorded = group_segments(path, dtype) if path.is_file() else ()
-    yield from merged([*recorded, *spool_segments(spool, table, dtype)], dtype)
+    yield from merged([*recorded, *spool_segments(run_dir / SPOOL, table, dtype)], dtype)
 
 
 def updates_in(

@@ -140,18 +140,20 @@ def _read_group(path: Path, group: int, dtype: RowType) -> Rows:
         return np.concatenate([np.zeros(0, dtype), *(_rows(path, one, dtype) for one in batches)])
 
 
-def write_table(path: Path, batches: Iterable[Rows], dtype: RowType, loop: LoopMatrices) -> None:
+def write_table(
+    path: Path, batches: Iterable[Rows], dtype: RowType, loop: LoopMatrices | None
+) -> None:
     """Write a table's file from batches of rows, in row groups of ``_GROUP_ROWS``.
+
+    ``loop`` names states and inputs; the tables of the network have none.
 
     Raises:
         OSError: the file cannot be written.
     """
-    metadata = {
-        "noack_table": path.stem,
-        "process": OWNER[path.stem],
-        "state_names": json.dumps(loop.state_names),
-        "input_names": json.dumps(loop.input_names),
-    }
+    metadata = {"noack_table": path.stem, "process": OWNER[path.stem]}
+    if loop is not None:
+        metadata["state_names"] = json.dumps(loop.state_names)
+        metadata["input_names"] = json.dumps(loop.input_names)
     schema = pa.schema(list(_columns(dtype))).with_metadata(metadata)
     scratch = path.with_suffix(".partial")
     # A dictionary, the default, takes twice the time and the space.

@@ -25,6 +25,7 @@ from noack.config.parameter_changes import (
 )
 from noack.config.resolution import tables_of
 from noack.config.scenario import Scenario
+from noack.protocol.fleet import FleetDecoder
 from noack.protocol.loop_protocol import PROTOCOLS, LoopProtocol
 from noack.protocol.machine_interface import Machine, Notice, Record
 from noack.protocol.record_tables import (
@@ -37,13 +38,18 @@ from noack.protocol.record_tables import (
     Fate,
 )
 from noack.protocol.topology import CHANGEABLE, LOOP_ROLES, RECORDER, ROUTES
-from noack.protocol.wire_format import KEY_BYTES, Decoder, Encoder, Flow, Message
+from noack.protocol.wire_format import KEY_BYTES, Decoder, Encoder, Flow, Message, loop_number
 from noack.runtime.life_cycle import HORIZON
 from plant_server.plant import plant_of
 from sensor_node.sensor import sensor_of
 
 Network = Callable[[bytes, int], int | None]
 """Maps an update's datagram and the current time, ns, to its delay, ns, or to None for a loss."""
+
+Take = Callable[[str, Record | Notice], None]
+"""Called with each row or notice and the role that emitted it."""
+
+AnyDecoder = Decoder | FleetDecoder
 
 Progress = Callable[[int], None]
 """Called from time to time with the simulated time, in ns."""
@@ -115,7 +121,7 @@ class Shuttle:
 
     Args:
         machines: the machine of each role.
-        entries: length of a message's vector, by flow.
+        entries: length of a message's vector by flow, of each loop.
         take: called with each row or notice and the role that emitted it.
         protocol: whether updates are acknowledged.
     """
@@ -123,20 +129,21 @@ class Shuttle:
     def __init__(
         self,
         machines: Mapping[str, Machine[Any]],
-        entries: Callable[[Flow], int],
-        take: Callable[[str, Record | Notice], None],
+        entries: Sequence[Callable[[Flow], int]],
+        take: Take,
         *,
         protocol: LoopProtocol = PROTOCOLS["none"],
     ) -> None:
         self.machines = machines
         self._take = take
         self._encoder = Encoder(RUN_ID, _KEY)
+        self._loops = len(entries)
         self.decoders = {
-            role: Decoder(leg.receives, entries(leg.receives), RUN_ID, _KEY)
+            role: _decoder(leg.receives, entries)
             for role, leg in ROUTES.items()
             if role != "netem"  # netem reads no payload
         }
-        self.acknowledgements = Decoder(Flow.ACKNOWLEDGEMENT, 0, RUN_ID, _KEY)
+        self.acknowledgements = _decoder(Flow.ACKNOWLEDGEMENT, entries)
         self._acknowledgement_routes = protocol.acknowledgement_routes
         self._timers = [
             (machines[role].next_deadline_ns, rank, role) for role, rank in _TIMER_RANKS.items()
@@ -174,7 +181,8 @@ class Shuttle:
     def _receive(self, sender: str, role: str, data: bytes) -> bool:
         message: Datagram | Message | None
         if role == "netem":
-            message = Datagram(ACKNOWLEDGEMENTS if sender == "controller" else UPDATES, data)
+            direction = ACKNOWLEDGEMENTS if sender == "controller" else UPDATES
+            message = Datagram(direction * self._loops + (loop_number(data) or 0), data)
         elif (sender, role) == ("netem", "sensor"):
             message = self.acknowledgements.decode(data)
         else:
@@ -191,31 +199,48 @@ class Shuttle:
             else:
                 forwarded = isinstance(output, Datagram)
                 data = output.data if forwarded else self._encoder.encode(output)
-                answers = output.flow == (ACKNOWLEDGEMENTS if forwarded else Flow.ACKNOWLEDGEMENT)
+                flow = output.flow // self._loops if forwarded else output.flow
+                answers = flow == (ACKNOWLEDGEMENTS if forwarded else Flow.ACKNOWLEDGEMENT)
                 routes = self._acknowledgement_routes if answers else {}
                 to = routes.get(role, ROUTES[role].to)
                 self._sent.append((role, to, data))
 
 
-class _Gathered:
+def _decoder(flow: Flow, entries: Sequence[Callable[[Flow], int]]) -> AnyDecoder:
+    decoders = [
+        Decoder(flow, of_flow(flow), RUN_ID, _KEY, loop=loop)
+        for loop, of_flow in enumerate(entries)
+    ]
+    return decoders[0] if len(decoders) == 1 else FleetDecoder(decoders)
+
+
+class Gathered:
     """Rows and notices, in the order in which they are emitted."""
 
-    def __init__(self, types: Mapping[str, np.dtype[np.void]]) -> None:
-        self._types = types
+    def __init__(
+        self, types: Mapping[str, np.dtype[np.void]], batch_rows: int = _BATCH_ROWS
+    ) -> None:
+        self._types, self._batch_rows = types, batch_rows
         self._rows: dict[str, list[tuple[Any, ...]]] = {table: [] for table in types}
         self._batches: dict[str, list[Rows]] = {table: [] for table in types}
         self.notices: list[dict[str, Any]] = []
 
     def take(self, role: str, output: Record | Notice) -> None:
+        """Take a row or a notice of a role."""
         if isinstance(output, Notice):
-            self.notices.append(output.line() | {"process": role})
+            self.notices.append(output._replace(loop=None).line() | {"process": role})
             return
         rows = self._rows[output.table]
         rows.append(output.row)
-        if len(rows) == _BATCH_ROWS:  # an array needs a fifth of the memory of a list
+        if len(rows) == self._batch_rows:  # an array needs a fifth of the memory of a list
             self._batch(output.table)
 
+    def sorted_notices(self) -> list[dict[str, Any]]:
+        """The notices in the order of their times."""
+        return sorted(self.notices, key=lambda notice: int(notice["t_ns"]))
+
     def rows(self) -> dict[str, Rows]:
+        """Return all rows by table."""
         for table in self._types:
             self._batch(table)
         return {table: np.concatenate(batches) for table, batches in self._batches.items()}
@@ -241,7 +266,7 @@ def simulate(
     """
     if network is not None:
         resolved.coverage.require_unchanging()
-    gathered = _Gathered(tables_of(resolved))
+    gathered = Gathered(tables_of(resolved))
     machines: dict[str, Machine[Any]] = {
         "plant": plant_of(resolved),
         "sensor": sensor_of(resolved),
@@ -249,22 +274,43 @@ def simulate(
         "controller": controller_of(resolved),
     }
     shuttle = Shuttle(
-        machines, resolved.message_sizes.entries, gathered.take, protocol=resolved.protocol
+        machines, [resolved.message_sizes.entries], gathered.take, protocol=resolved.protocol
     )
-    changes = scheduled(resolved)
+    drive(shuttle, resolved, gathered.take, progress)
+    rows = gathered.rows()
+    reports = reports_of(rows, shuttle, resolved)
+    return RunRecord(resolved, rows, gathered.sorted_notices(), reports, "simulated")
+
+
+def drive(
+    shuttle: Shuttle, scenario: Scenario, take: Take, progress: Progress | None = None
+) -> None:
+    """Announce the scenario's changes, and drive the machines until nothing is due."""
+    changes = scheduled(scenario)
     shuttle.announce(changes)
     for change in changes:
-        gathered.take(RECORDER, change_notice(change))
+        take(RECORDER, change_notice(change))
     with np.errstate(all="ignore"):  # a diverging loop overflows and is recorded all the same
         for happened, now_ns in enumerate(shuttle.run()):
             if progress is not None and happened % _HAPPENINGS_PER_WORD == 0:
                 progress(now_ns)
-    rows = gathered.rows()
-    reports = {role: _report(role, rows, shuttle.decoders.get(role)) for role in LOOP_ROLES}
-    if resolved.protocol.acknowledges:
-        reports["sensor"]["channel"]["acknowledgements"] = shuttle.acknowledgements.report()
-    notices = sorted(gathered.notices, key=lambda notice: int(notice["t_ns"]))
-    return RunRecord(resolved, rows, notices, reports, "simulated")
+
+
+def reports_of(
+    rows: Mapping[str, Rows], shuttle: Shuttle, scenario: Scenario, loop: int = 0
+) -> dict[str, dict[str, Any]]:
+    """Return the final report of each role, as of a loop."""
+    decoders = {role: of_loop(one, loop) for role, one in shuttle.decoders.items()}
+    reports = {role: _report(role, rows, decoders.get(role)) for role in LOOP_ROLES}
+    if scenario.protocol.acknowledges:
+        acknowledgements = of_loop(shuttle.acknowledgements, loop)
+        reports["sensor"]["channel"]["acknowledgements"] = acknowledgements.report()
+    return reports
+
+
+def of_loop(decoder: AnyDecoder, loop: int) -> Decoder:
+    """Return the decoder of a loop."""
+    return decoder.decoders[loop] if isinstance(decoder, FleetDecoder) else decoder
 
 
 def _report(role: str, rows: Mapping[str, Rows], decoder: Decoder | None) -> dict[str, Any]:

@@ -15,8 +15,10 @@ from noack.config.scenario_changes import check_changes
 from noack.config.scenario_checks import check_sections
 from noack.config.sections.loop_section import MOST_LOOPS, LoopSection
 from noack.config.validation_messages import explain
+from noack.core.clock import NS_PER_S
 from noack.core.random_streams import stream, stream_key
 from noack.settings.section import ScenarioSection
+from noack.trigger.periodic_trigger import PeriodicSettings
 
 if TYPE_CHECKING:
     from noack.config.scenario import Scenario
@@ -59,7 +61,7 @@ def phases_ns(scenario: "Scenario") -> tuple[int, ...]:
             seed = loop.seeds.initial_state
             drawn = stream(seed, "phase", str(number)).uniform() if number else 0.0
             phase = float(drawn)
-        phases.append(int(phase * loop.timing.measurement_period_ns))
+        phases.append(int(phase * _period_ns(loop)))
     return tuple(phases)
 
 
@@ -146,6 +148,13 @@ def _rates(loop: "Scenario") -> dict[str, float]:
         "plant.measure_every": loop.plant.measure_every,
         "controller.rate_hz": loop.controller.rate_hz,
     }
+
+
+def _period_ns(loop: "Scenario") -> int:
+    """Return the time between two transmissions of a periodic trigger, else two measurements."""
+    if isinstance(loop.trigger, PeriodicSettings):
+        return round(loop.trigger.period_s * NS_PER_S)
+    return loop.timing.measurement_period_ns
 
 
 def _seeds(scenario: "Scenario", section: LoopSection, number: int) -> Any:

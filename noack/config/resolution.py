@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from noack.config.feature_kinds import AnyObserver
+from noack.config.loops import loop_scenario, loops_of
 from noack.config.named_models import NAMED_MODELS
 from noack.config.scenario import Scenario
 from noack.config.sections.model_section import ModelSection
@@ -18,7 +19,7 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, discretise, transition
 from noack.core.random_streams import stream
 from noack.observers.observability import unobservable_mode
-from noack.protocol.record_tables import entry_names, tables
+from noack.protocol.record_tables import OWNER, entry_names, tables
 from noack.settings.matrices import rows_of
 from noack.trigger.policy_settings import ModelMatrices
 from noack.trigger.trigger_policy import Policy
@@ -100,6 +101,15 @@ def resolve(scenario: Scenario) -> Scenario:
     return scenario.model_copy(update=update | {"observer": _observer(scenario, model)})
 
 
+def resolved_loops(scenario: Scenario) -> tuple[Scenario, ...]:
+    """Return the resolved scenario of each loop of a run; that of the run without [[loops]].
+
+    Raises:
+        CallerError: as :func:`resolve`.
+    """
+    return tuple(map(resolve, loops_of(scenario)))
+
+
 def loop_of(resolved: Scenario) -> LoopMatrices:
     """Return the matrices of a resolved scenario."""
     model, plant = resolved.model, resolved.plant
@@ -140,7 +150,16 @@ def setpoint_of(resolved: Scenario) -> tuple[Vector, Vector] | None:
 
 
 def tables_of(resolved: Scenario) -> Mapping[str, np.dtype[np.void]]:
-    """Return the row types of the tables in runs of a resolved scenario."""
+    """Return the row types of the tables in runs of a resolved scenario.
+
+    In a run with [[loops]], the rows of the network are those of all loops; each other row begins
+    with the number of its loop.
+
+    Raises:
+        CallerError: the loops have rows of different sizes.
+    """
+    if resolved.loops is not None:
+        return _tables_of_loops(resolved)
     n, m = resolved.model.dimensions
     acknowledged, predictive = resolved.protocol.acknowledges, resolved.message_sizes.is_predictive
     internal = len(resolved.plant.system.internal_names)
@@ -151,6 +170,25 @@ def tables_of(resolved: Scenario) -> Mapping[str, np.dtype[np.void]]:
         outputs=0 if resolved.observer is None else resolved.message_sizes.outputs,
         inputs_reported=resolved.message_sizes.inputs_reported,
     )  # fmt: skip
+
+
+def network_tables() -> Mapping[str, np.dtype[np.void]]:
+    """Return the row types of the tables of the network, which do not depend on the scenario."""
+    return {table: dtype for table, dtype in tables(1, 1).items() if OWNER[table] == "netem"}
+
+
+def _tables_of_loops(scenario: Scenario) -> Mapping[str, np.dtype[np.void]]:
+    first, *others = (tables_of(loop_scenario(scenario, one)) for one in scenario.loops or ())
+    for place, one in enumerate(others, 1):
+        if one != first:
+            raise CallerError(
+                f"loops.{place}: its vectors have other sizes than those of loops.0; the loops of "
+                "a live run have the same numbers of states, inputs and outputs"
+            )
+    return {
+        table: dtype if OWNER[table] == "netem" else np.dtype([("loop", "<u2"), *dtype.descr])
+        for table, dtype in first.items()
+    }
 
 
 def _observer(scenario: Scenario, model: ModelSection) -> AnyObserver | None:

@@ -59,7 +59,7 @@ class Fleet:
         for loop, (machine, phase_ns) in enumerate(
             zip(self.machines, self._phases_ns, strict=True)
         ):
-            own = change._replace(t_ns=change.t_ns - phase_ns)
+            own = change._replace(t_ns=max(change.t_ns - phase_ns, 0))
             announced = machine.announce(own, now_ns - phase_ns)  # type: ignore[attr-defined]
             outputs += [_of_loop(loop, output) for output in announced]
         return outputs
@@ -107,7 +107,11 @@ class FleetDecoder:
     def report(self) -> dict[str, object]:
         """Counters of all loops together, for the run's summary."""
         rejected = {reason.value: n for reason, n in self.rejected.items() if n}
-        return {"accepted": self.accepted, "rejected": rejected}
+        return {"accepted": self.accepted, "rejected": rejected, "loops": self.reports()}
+
+    def reports(self) -> list[dict[str, object]]:
+        """Counters of each loop."""
+        return [one.report() for one in self.decoders]
 
 
 def _of_loop(loop: int, output: Any) -> Any:

@@ -34,6 +34,9 @@ CHANGE_BYTES = 1024  # width of a change in the record: JSON, padded with zero b
 PACKET_HEAD_BYTES = 32
 """Leading bytes of each datagram that the network emulator records without interpreting them."""
 
+LOOP = "loop"
+"""First column of the tables that the processes of several loops send: the number of the loop."""
+
 NO_SEQUENCE = -1  # stands for "none" in a column of sequence numbers
 
 

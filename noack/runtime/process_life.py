@@ -11,14 +11,18 @@ import socket
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
+from functools import cached_property
 from itertools import chain, repeat
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, cast
 
+from noack.config.loops import loops_of, phases_ns
 from noack.config.parameter_changes import ReconfigurableMachine
-from noack.config.resolution import LoopMatrices, loop_of, tables_of
+from noack.config.resolution import resolved_loops, tables_of
+from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import CallerError, NoackError, PeerError, one_line
+from noack.protocol.fleet import Fleet, FleetDecoder
 from noack.protocol.machine_interface import BEGINNING, RESTART, Machine, Notice, Record, Start
 from noack.protocol.record_tables import OWNER
 from noack.protocol.topology import (
@@ -66,6 +70,9 @@ class ReportingChannel(Channel[T], Protocol[T]):
         ...
 
 
+NewMachine = Callable[[Scenario, Start], Machine[Message]]
+"""Makes the machine of a loop, from its resolved scenario and its beginning in the loop's time."""
+
 OpenChannel = Callable[[socket.socket, Mapping[str, Address]], ReportingChannel[T]]
 
 
@@ -76,7 +83,7 @@ class RunProcess:
         self.role = role
         self.ticket = ticket
         self.scenario = ticket.scenario
-        self.loop: LoopMatrices = loop_of(ticket.scenario)
+        self._phases_ns = phases_ns(ticket.scenario)
         self.plane = plane
         self.life = LifeCycle(role, Side.PROCESS)
         self.updates = ParameterUpdates(plane)
@@ -135,11 +142,21 @@ class RunProcess:
             raise PeerError(self.life.reason) if self.life.reason else error from None
         return parse_message(answer, message)
 
-    def run_messages(self, new_machine: Callable[[], Machine[Message]]) -> None:
-        """Run a machine of the loop's wire format with the process's route in the topology.
+    @cached_property
+    def loops(self) -> tuple[Scenario, ...]:
+        """The resolved scenario of each loop; that of the run, if it has no [[loops]]."""
+        return (self.scenario,) if self.scenario.loops is None else resolved_loops(self.scenario)
+
+    @property
+    def loop_count(self) -> int | None:
+        """Number of loops whose datagrams carry their number; None in a run without [[loops]]."""
+        return None if self.scenario.loops is None else len(self._phases_ns)
+
+    def run_messages(self, new_machine: NewMachine) -> None:
+        """Run the machines of all loops, with the process's route in the topology.
 
         Args:
-            new_machine: returns a new machine; another is made for rehearsals.
+            new_machine: makes a machine; another of the first loop is made for rehearsals.
         """
         route, protocol = ROUTES[self.role], self.scenario.protocol
         acknowledged_by = protocol.acknowledged_by(self.role)
@@ -159,29 +176,50 @@ class RunProcess:
             )
 
         with ExitStack() as stack:
-            if can_rehearse(self.role, self.scenario):
+            if can_rehearse(self.role, self.loops[0]):
                 endpoint = stack.enter_context(closing(bind(0, "realtime.rehearse")))
                 own: Address = endpoint.getsockname()
                 copy = MessageSocket(
-                    endpoint, self._decoder(route.receives), self._encoder(), route.sends,
+                    endpoint, self._decoder(route.receives, 1), self._encoder(), route.sends,
                     source=own, destination=own,
                 )  # fmt: skip
-                entries = self.scenario.message_sizes.entries(route.receives)
-                self._rehearsal = stack.enter_context(
-                    closing(
-                        Rehearsal(new_machine(), copy, self._encoder(), route.receives, entries)
-                    )
-                )
-            self.run(new_machine(), channel)
+                entries = self.loops[0].message_sizes.entries(route.receives)
+                machine = self._machine(new_machine, 1)
+                rehearsal = Rehearsal(machine, copy, self._encoder(), route.receives, entries)
+                self._rehearsal = stack.enter_context(closing(rehearsal))
+            self.run(self._machine(new_machine), channel)
+
+    def _machine(self, new_machine: NewMachine, most: int | None = None) -> Machine[Message]:
+        """Return the machine of all loops, or of the first ones."""
+        if self.scenario.loops is None:
+            return new_machine(self.scenario, self.start)
+        machines = [
+            new_machine(loop, self.start._replace(from_ns=self.start.from_ns - phase_ns))
+            for loop, phase_ns in zip(self.loops[:most], self._phases_ns, strict=False)
+        ]
+        return Fleet(machines, self._phases_ns[:most])
 
     def _encoder(self) -> Encoder:
         return Encoder(self.ticket.run_id, self.ticket.key)
 
-    def _decoder(self, flow: Flow, *, not_before_ns: int = 0) -> Decoder:
-        entries = self.scenario.message_sizes.entries(flow) if flow != Flow.ACKNOWLEDGEMENT else 0
-        return Decoder(
-            flow, entries, self.ticket.run_id, self.ticket.key, not_before_ns=not_before_ns
-        )
+    def _decoder(
+        self, flow: Flow, most: int | None = None, *, not_before_ns: int = 0
+    ) -> Decoder | FleetDecoder:
+        """Return the decoder of a flow of all loops, or of the first ones."""
+        decoders = [
+            Decoder(
+                flow,
+                0 if flow == Flow.ACKNOWLEDGEMENT else loop.message_sizes.entries(flow),
+                self.ticket.run_id,
+                self.ticket.key,
+                not_before_ns=not_before_ns - phase_ns,
+                loop=number,
+            )
+            for number, (loop, phase_ns) in enumerate(
+                zip(self.loops[:most], self._phases_ns, strict=False)
+            )
+        ]
+        return decoders[0] if self.scenario.loops is None else FleetDecoder(decoders)
 
     def run(self, machine: Machine[T], open_channel: OpenChannel[T]) -> None:
         """Join, drive the machine to the horizon, hand over the remaining rows, and report.
@@ -216,6 +254,9 @@ class RunProcess:
                     "rehearsal": self._rehearsal.report() if self._rehearsal else {},
                     "channel": channel.report(),
                     "rows": telemetry.totals(),
+                    **(
+                        {"rows_by_loop": by_loop} if (by_loop := telemetry.totals_by_loop()) else {}
+                    ),
                     "generation": self.start.generation,
                     "instance": self.plane.instance,
                     "reached_ns": reached_ns,
@@ -243,7 +284,7 @@ class RunProcess:
             channel,
             self.clock,
             telemetry,
-            end_ns=self.scenario.timing.horizon_ns + int(_GRACE_S * NS_PER_S * self.scenario.speed),
+            end_ns=self._end_ns,
             stop=lambda: self.stopping,
             spin_us=self.scenario.realtime.spin_us,
             rehearsal=self._rehearsal,
@@ -256,6 +297,12 @@ class RunProcess:
                 Event.STOP, f"overrun: {late_s:g} s late; reduce the speed or the rates"
             )
         return reached_ns
+
+    @property
+    def _end_ns(self) -> int:
+        """When the loop ends: the last horizon of all loops, and time for packets in flight."""
+        grace_ns = int(_GRACE_S * NS_PER_S * self.scenario.speed)
+        return loops_of(self.scenario)[0].timing.horizon_ns + max(self._phases_ns) + grace_ns
 
     def fail(self, error: BaseException) -> None:
         """Stop with an error as the reason."""

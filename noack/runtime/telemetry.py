@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.protocol.machine_interface import GENERATION, Notice, Record
+from noack.protocol.record_tables import LOOP
 from noack.runtime.control_messages import BatchHeader, parse_message
 
 _BATCH_ROWS = 256
@@ -78,6 +79,8 @@ class TelemetryBuffer:
         self._rows = {table: np.zeros(_BATCH_ROWS, dtype) for table, dtype in tables.items()}
         self._filled = dict.fromkeys(tables, 0)
         self._published = dict.fromkeys([*tables, NOTICES], 0)
+        of_loops = [table for table, dtype in tables.items() if LOOP in (dtype.names or ())]
+        self._by_loop = {table: np.zeros(0, np.int64) for table in of_loops}
         self._held: deque[_Batch] = deque()
         self._to_resend: deque[_Batch] = deque()
         self._old = 0
@@ -121,6 +124,10 @@ class TelemetryBuffer:
         """Rows published so far, by table."""
         return dict(self._published)
 
+    def totals_by_loop(self) -> dict[str, list[int]]:
+        """Rows published so far of each loop, up to the last with rows; empty without [[loops]]."""
+        return {table: counts.tolist() for table, counts in self._by_loop.items()}
+
     def resend(self, missing: Mapping[str, list[tuple[int, int]]], publish: Publish) -> int:
         """Publish the held batches again that overlap missing row ranges; return their number."""
         sent = 0
@@ -133,7 +140,12 @@ class TelemetryBuffer:
     def _publish_rows(self, table: str) -> None:
         filled = self._filled[table]
         self._filled[table] = 0
-        self._send(table, filled, self._rows[table][:filled].tobytes())
+        rows = self._rows[table][:filled]
+        if table in self._by_loop:
+            before = self._by_loop[table]
+            self._by_loop[table] = counts = np.bincount(rows[LOOP], minlength=len(before))
+            counts[: len(before)] += before
+        self._send(table, filled, rows.tobytes())
 
     def _send(self, table: str, rows: int, payload: bytes) -> None:
         first = self._published[table]

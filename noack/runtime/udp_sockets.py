@@ -11,6 +11,7 @@ from contextlib import suppress
 from typing import Generic, TypeVar
 
 from noack.core.errors import CallerError
+from noack.protocol.fleet import FleetDecoder
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.wire_format import MAX_DATAGRAM_BYTES, Decoder, Encoder, Flow, Message, flow_of
 from noack.runtime.address import Address, text_of
@@ -248,13 +249,13 @@ class MessageSocket(CountingSocket[Message]):
     def __init__(
         self,
         endpoint: socket.socket,
-        decoder: Decoder,
+        decoder: Decoder | FleetDecoder,
         encoder: Encoder,
         sends: Flow,
         *,
         source: Address,
         destination: Address,
-        acknowledgements: tuple[Decoder, Address] | None = None,
+        acknowledgements: tuple[Decoder | FleetDecoder, Address] | None = None,
         acknowledges_to: Address | None = None,
     ) -> None:
         peers = [source] if acknowledgements is None else [source, acknowledgements[1]]
@@ -287,6 +288,8 @@ class MessageSocket(CountingSocket[Message]):
         report = super().report() | {"sends": self._sends.name.lower()}
         rejected = {reason.value: n for reason, n in self._decoder.rejected.items()}
         report |= {"accepted": self._decoder.accepted, "rejected": self.rejected(rejected)}
+        if isinstance(self._decoder, FleetDecoder):
+            report["loops"] = self._decoder.reports()
         if self._acknowledgements is not None:
             report["acknowledgements"] = self._acknowledgements[0].report()
         return report

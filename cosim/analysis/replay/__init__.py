@@ -29,18 +29,26 @@ __all__ = ["Replay", "replay"]
 def replay(record: RunRecord) -> Replay:
     """Replay a run and compare it with its record; a process is replayed up to its first gap.
 
-    The record is read part by part, so that memory does not grow with the length of the run.
+    In a run of several loops, the network is replayed once, for all of them: ``record`` is that of
+    the network, or that of a loop, whose network is not replayed. The record is read part by part,
+    so that memory does not grow with the length of the run.
     """
     # A diverging run overflows and is replayed all the same.
     with np.errstate(all="ignore"), _without_collection():
-        machines = {role: MachineReplay(role, record) for role in LOOP_ROLES}
-        messages = MessageComparison(record, machines)
+        roles = ("netem",) if record.is_network else LOOP_ROLES
+        machines = {
+            role: MachineReplay(role, record)
+            for role in roles
+            if record.number is None or role != "netem"
+        }
+        messages = None if record.is_network else MessageComparison(record, machines)
         for part in record.slices():
             for machine in machines.values():
                 machine.take(part)
-            messages.take(part)
+            if messages is not None:
+                messages.take(part)
     results = tuple(result for one in machines.values() for result in one.results)
-    return Replay(processes=results, messages=messages.results())
+    return Replay(processes=results, messages=() if messages is None else messages.results())
 
 
 @contextmanager

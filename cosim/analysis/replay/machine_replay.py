@@ -15,6 +15,7 @@ from cosim.record.record_source import Slice
 from cosim.record.run_record import Rows, RunRecord
 from netem.duplex_link import network_of
 from netem.link_machine import Datagram
+from noack.config.loops import loops_of
 from noack.config.parameter_changes import ParameterChange, settings_of
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
@@ -39,7 +40,7 @@ from sensor_node.sensor import sensor_of
 _MACHINES: Mapping[str, Callable[[Scenario, Start], Machine[Any]]] = {
     "plant": lambda scenario, _: plant_of(scenario),
     "sensor": sensor_of,
-    "netem": network_of,
+    "netem": lambda scenario, start: network_of(scenario, start, loops=len(loops_of(scenario))),
     "controller": controller_of,
 }
 _TIMERS = (PLANT_STEP, CONTROLLER_STEP, NETEM_RELEASE)

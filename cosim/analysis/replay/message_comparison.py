@@ -47,20 +47,26 @@ class MessageComparison:
         self._record, self._machines = record, machines
         acknowledges = SENSOR_ACKNOWLEDGEMENT in record.tables
         self._hops = [
-            _Hop(leg, table, machines[sender], flow, acknowledges=acknowledges)
+            _Hop(leg, table, machines[sender], flow, record.number or 0, acknowledges=acknowledges)
             for leg, table, sender, flow in _HOPS
             if acknowledges or flow is not Flow.ACKNOWLEDGEMENT
         ]
 
     def take(self, part: Slice) -> None:
         """Compare the messages of a part that the machines have just replayed."""
-        survivors = [(one.flow, read_header(one.data)) for one in self._machines["netem"].sent]
+        netem = self._machines.get("netem")
+        if netem is None:  # a loop's network is replayed with that of the other loops
+            packets = part[NETEM_PACKET][part[NETEM_PACKET]["release_ns"] >= 0]
+            sent = [*zip(packets["flow"].tolist(), packets["head"].tolist(), strict=True)]
+        else:
+            sent = [(one.flow, one.data) for one in netem.sent]
+        survivors = [(flow, read_header(data)) for flow, data in sent]
         for hop in self._hops:
             hop.take(part, survivors)
 
     def results(self) -> tuple[MessagesReplay, ...]:
         """Return the result of each hop after the last part."""
-        whole = self._machines["netem"].whole
+        whole = "netem" not in self._machines or self._machines["netem"].whole
         found = [hop.result(network_is_whole=whole) for hop in self._hops]
         return (*found, *_compare_changes(self._record))
 
@@ -104,9 +110,11 @@ class _Hop:
     """The messages of one hop, as received in the run and as sent in the replay."""
 
     def __init__(
-        self, leg: str, table: str, sender: MachineReplay, flow: Flow, *, acknowledges: bool
-    ) -> None:
+        self, leg: str, table: str, sender: MachineReplay, flow: Flow, loop: int,
+        *, acknowledges: bool,
+    ) -> None:  # fmt: skip
         self._leg, self._table, self._sender, self._flow = leg, table, sender, flow
+        self._loop = loop
         self._direction = ACKNOWLEDGEMENTS if flow is Flow.ACKNOWLEDGEMENT else UPDATES
         self._selects = table == NETEM_PACKET and acknowledges
         self._sent: list[Message] = []
@@ -219,7 +227,7 @@ class _Hop:
             if message is None:
                 continue
             self._compared += 1
-            data = encoder.encode(message)
+            data = encoder.encode(message._replace(loop=self._loop))
             expected = data[:PACKET_HEAD_BYTES].ljust(PACKET_HEAD_BYTES, b"\0")
             if head != expected:
                 self._differs(row, "differs from the message sent", "head", head, expected)

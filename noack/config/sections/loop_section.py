@@ -44,8 +44,9 @@ class LoopSection(ScenarioSection):
     count: Annotated[int, Field(ge=1, le=MOST_LOOPS)] = 1
     """Number of loops; each draws its plant, initial state, disturbances, noise and phase."""
     phase: Annotated[FiniteFloat, Field(ge=0, lt=1)] | None = None
-    """Start of the loop, as a share of the measurement period after the start of the run. By
-    default drawn by seed, and 0 for the first loop of the run."""
+    """Start of the loop after that of the run, as a share of the time between two transmissions of
+    a periodic trigger, or else between two measurements. By default drawn by seed, and 0 for the
+    first loop of the run."""
     mode: Literal["model", "zoh"] | None = None
     """The loop's mode."""
     model: Table | None = None

@@ -51,6 +51,6 @@ def test_a_run_that_may_not_fit_begins_with_a_warning(
 ) -> None:
     resolved = resolve(scenario_of(content, 1000.0))
     for share, warned in ((1.0, True), (2.9, True), (3.0, False)):
-        with_free(monkeypatch, int(share * spool_bytes(resolved)))
-        require_disk_space(resolved, tmp_path / "not" / "yet")
+        with_free(monkeypatch, int(share * 2 * spool_bytes(resolved)))
+        require_disk_space([resolved] * 2, tmp_path / "not" / "yet")
         assert ("warning: " in capsys.readouterr().err) == warned

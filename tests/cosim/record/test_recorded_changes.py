@@ -17,7 +17,7 @@ from cosim.analysis.summary_model import ClaimVerdict
 from cosim.record.align import align_tables, identity_residual
 from cosim.record.recorded_changes import changes_of
 from cosim.record.run_record import RunRecord
-from cosim.simulation.virtual_time import Shuttle, _Gathered, _report, simulate
+from cosim.simulation.virtual_time import Gathered, Shuttle, _report, simulate
 from netem.duplex_link import network_of
 from netem.link_machine import Datagram, update_link_of
 from noack.config.parameter_changes import ParameterChange
@@ -200,12 +200,12 @@ def test_a_change_received_too_late_is_reported_and_voids_its_claims() -> None:
     resolved = resolve(validate(CONTENT, "here"))
     change = ParameterChange(0, 900 * MS, {"controller.setpoint": [2.0, 0.0]})
     told_ns = {"sensor": 500 * MS, "netem": 500 * MS, "controller": 1_000 * MS}
-    gathered = _Gathered(tables_of(resolved))
+    gathered = Gathered(tables_of(resolved))
     machines: dict[str, Any] = {
         "plant": plant_of(resolved), "sensor": sensor_of(resolved),
         "netem": network_of(resolved), "controller": controller_of(resolved),
     }  # fmt: skip
-    shuttle = Shuttle(machines, resolved.message_sizes.entries, gathered.take)
+    shuttle = Shuttle(machines, [resolved.message_sizes.entries], gathered.take)
     for now_ns in shuttle.run():
         for role in [role for role, at_ns in told_ns.items() if at_ns <= now_ns]:
             shuttle._emit(role, machines[role].announce(change, now_ns))

@@ -54,6 +54,10 @@ def test_each_loop_draws_its_own_plant_state_and_phase(content: dict[str, Any]) 
     assert 0 <= min(phases) <= max(phases) < period_ns
     # Uniform phases: the mean of 200 is within 5 standard errors of one half.
     assert abs(np.mean(phases[1:]) / period_ns - 0.5) < 5 * 12**-0.5 / (count - 1) ** 0.5
+    # Those of a periodic trigger are within its own period.
+    periodic = {"name": "a", "count": count, "trigger": {"policy": "periodic", "period_s": 0.1}}
+    wide = phases_ns(with_loops(content, periodic))
+    assert 80_000_000 < max(wide) < 100_000_000
     # They are functions of the run's seeds and the loop's number.
     fewer = with_loops(content, {"name": "b", "count": 3}, {"name": "c"})
     assert phases_ns(fewer) == phases[:4]

@@ -1,0 +1,199 @@
+"""The record of a live run of several loops, from its spool: that of the network, and of each loop.
+
+In the spool, each row of the plant, the sensor and the controller has the number of its loop in
+front. The rows are distributed to spools of the loops, from which the record of each loop is
+finished as that of a run of one loop.
+"""
+
+import json
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cosim.record.loop_rows import network_rows_by_loop
+from cosim.record.record_source import Rows
+from cosim.record.run_directory import (
+    ENVIRONMENT_FILE,
+    LOOP_FILE,
+    RECORD,
+    REPORTS_FILE,
+    SCENARIO_FILE,
+    read_object,
+    write_scenario,
+)
+from cosim.record.run_record import RunRecord, finish_record, recorded_rows
+from cosim.record.shared_run import loop_directories
+from noack.config.loops import phases_ns
+from noack.config.resolution import network_tables, resolved_loops, tables_of
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import MOST_RECORDED_BYTES, load
+from noack.core.errors import MachineError, why
+from noack.core.file_access import write_whole
+from noack.protocol.machine_interface import GENERATION
+from noack.protocol.record_tables import LOOP, OWNER
+from noack.protocol.topology import LOOP_ROLES, RECORDER
+from noack.runtime.spool import SPOOL, SpoolWriter, read_chunks
+from noack.runtime.telemetry import notices_of
+
+_PART_BYTES = 16 * 1024 * 1024
+"""Rows of a table that are distributed at once."""
+_WRITER = "loops"
+
+
+def finish_shared_record(run_dir: Path) -> RunRecord:
+    """Convert the spool of a run with [[loops]] to the records of its loops and of its network.
+
+    An interrupted attempt can be repeated: the run's spool is removed at the end. Returns the
+    record of the network.
+
+    Raises:
+        MachineError: a record cannot be written; the spool is kept.
+    """
+    scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
+    folders = loop_directories(run_dir, scenario)
+    try:
+        for number, (loop, folder) in enumerate(
+            zip(resolved_loops(scenario), folders, strict=True)
+        ):
+            place = {"number": number, "phase_ns": phases_ns(scenario)[number]}
+            _make_directory(run_dir, folder, loop, place)
+        _distribute(run_dir / SPOOL, scenario, folders)
+        rows = {
+            table: np.concatenate([np.zeros(0, dtype), *recorded_rows(run_dir, table, dtype)])
+            for table, dtype in network_tables().items()
+        }
+        reports = read_object(run_dir / REPORTS_FILE)
+        by_loop = network_rows_by_loop(rows, phases_ns(scenario))
+        for number, (folder, own) in enumerate(zip(folders, by_loop, strict=True)):
+            _spool_network(folder, own)
+            content = _reports_of_loop(reports, number, rows, own)
+            write_whole(folder / REPORTS_FILE, json.dumps(content, indent=2), make_folder=False)
+            finish_record(folder)
+    except OSError as error:
+        raise MachineError(
+            f"{run_dir}: the records of the loops cannot be written: {why(error)}; what was "
+            f"recorded is kept in {run_dir / SPOOL}, and `noack summary {run_dir}` finishes it"
+        ) from None
+    return finish_record(run_dir)
+
+
+def _make_directory(run_dir: Path, folder: Path, loop: Scenario, place: Mapping[str, int]) -> None:
+    """Make the run directory of a loop; remove the spool of an interrupted attempt."""
+    shutil.rmtree(folder / SPOOL, ignore_errors=True)
+    if (folder / LOOP_FILE).is_file():
+        return
+    shutil.rmtree(folder, ignore_errors=True)
+    (folder / "logs").mkdir(parents=True)
+    write_scenario(loop, folder)
+    shutil.copyfile(run_dir / ENVIRONMENT_FILE, folder / ENVIRONMENT_FILE)
+    write_whole(folder / LOOP_FILE, json.dumps(place, indent=2))
+
+
+def _distribute(spool: Path, scenario: Scenario, folders: Sequence[Path]) -> None:
+    """Copy the rows and log lines of a spool to the spools of the loops."""
+    for table, dtype in tables_of(scenario).items():
+        if OWNER[table] == "netem":
+            continue
+        written = np.zeros(len(folders), np.int64)
+        names = [name for name in dtype.names or () if name != LOOP]
+        own = np.dtype([(name, dtype[name]) for name in names])
+        for rows in _parts(spool, table, dtype):
+            order = np.argsort(rows[LOOP], kind="stable")
+            ends = np.cumsum(np.bincount(rows[LOOP], minlength=len(folders)))
+            for loop in np.unique(rows[LOOP]).tolist():
+                if loop >= len(folders):  # damaged
+                    continue
+                chosen = rows[order[ends[loop - 1] if loop else 0 : ends[loop]]]
+                stripped = np.empty(len(chosen), own)
+                for name in names:
+                    stripped[name] = chosen[name]
+                _append(folders[loop], table, int(written[loop]), stripped.tobytes())
+                written[loop] += len(chosen)
+    for role in (*LOOP_ROLES, RECORDER):
+        for number, data in read_chunks(spool, notices_of(role)):
+            _distribute_notice(folders, notices_of(role), number, data)
+
+
+def _distribute_notice(folders: Sequence[Path], table: str, number: int, data: bytes) -> None:
+    """Copy a log line to its loop, or to all loops if it names none."""
+    try:
+        line = json.loads(data)
+        loop = line.pop(LOOP, None)
+        chosen = folders if loop is None else [folders[loop]]
+    except (ValueError, LookupError, AttributeError, TypeError):  # damaged
+        return
+    for folder in chosen:
+        _append(folder, table, number, json.dumps(line).encode())
+
+
+def _parts(spool: Path, table: str, dtype: np.dtype[np.void]) -> Iterator[Rows]:
+    """Yield the rows of a table in a spool, in large parts."""
+    part: list[bytes] = []
+    size_bytes = 0
+    for _, data in read_chunks(spool, table):
+        if len(data) % dtype.itemsize:  # damaged
+            continue
+        part.append(data)
+        size_bytes += len(data)
+        if size_bytes > _PART_BYTES:
+            yield np.frombuffer(b"".join(part), dtype)
+            part, size_bytes = [], 0
+    if part:
+        yield np.frombuffer(b"".join(part), dtype)
+
+
+def _append(folder: Path, table: str, first: int, data: bytes) -> None:
+    """Append a batch to the spool of a loop; its file is not kept open, as there may be many."""
+    writer = SpoolWriter(folder / SPOOL, _WRITER)
+    try:
+        writer.append(table, first, data)
+    finally:
+        writer.close()
+
+
+def _spool_network(folder: Path, rows: Mapping[str, Rows]) -> None:
+    """Write a loop's rows of the network to its spool; they replace those of an earlier attempt."""
+    for table, found in rows.items():
+        (folder / RECORD / f"{table}.parquet").unlink(missing_ok=True)
+        _append(folder, table, 0, found.tobytes())
+
+
+def _reports_of_loop(
+    reports: Mapping[str, Any], number: int, rows: Mapping[str, Rows], own: Mapping[str, Rows]
+) -> dict[str, Any]:
+    """Return the processes' final reports as of one loop.
+
+    ``rows`` are the rows of the network, and ``own`` those of the loop. Rows of the network that
+    are missing in the record are missing in every loop.
+    """
+    found: dict[str, Any] = {}
+    for role, content in reports.items():
+        every = content if isinstance(content, list) else [content]
+        converted = [_report_of_loop(one, number, rows, own) for one in every]
+        found[role] = converted if isinstance(content, list) else converted[0]
+    return found
+
+
+def _report_of_loop(
+    report: dict[str, Any], number: int, rows: Mapping[str, Rows], own: Mapping[str, Rows]
+) -> dict[str, Any]:
+    counts = dict(report["rows"])
+    for table, by_loop in report.get("rows_by_loop", {}).items():
+        counts[table] = by_loop[number] if number < len(by_loop) else 0
+    for table in counts.keys() & own.keys():
+        generation = report.get("generation", 0)
+        counts[table] += _count(own[table], generation) - _count(rows[table], generation)
+    channel = dict(report["channel"])
+    of_loops = channel.pop("loops", [])
+    channel |= of_loops[number] if number < len(of_loops) else {}
+    if "acknowledgements" in channel:
+        channel["acknowledgements"] = channel["acknowledgements"]["loops"][number]
+    rest = {key: value for key, value in report.items() if key != "rows_by_loop"}
+    return rest | {"rows": counts, "channel": channel}
+
+
+def _count(rows: Rows, generation: int) -> int:
+    return int((rows["input"] // GENERATION == generation).sum())

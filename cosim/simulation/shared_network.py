@@ -1,0 +1,88 @@
+"""Several loops on one network in virtual time: the fleets of a live run, without clocks.
+
+The queues of the network couple the loops. A run with one loop computes what the run without
+[[loops]] does, bit for bit.
+"""
+
+from typing import Any
+
+from controller_node.controller import controller_of
+from cosim.record.loop_rows import network_rows_by_loop
+from cosim.record.run_record import RunRecord
+from cosim.record.shared_run import SharedRun
+from cosim.simulation.virtual_time import Gathered, Progress, Shuttle, drive, reports_of
+from netem.duplex_link import network_of
+from noack.config.loops import loops_of, phases_ns
+from noack.config.resolution import network_tables, resolve, tables_of
+from noack.config.scenario import Scenario
+from noack.protocol.fleet import Fleet
+from noack.protocol.machine_interface import Machine, Notice, Record
+from noack.protocol.record_tables import OWNER
+from plant_server.plant import plant_of
+from sensor_node.sensor import sensor_of
+
+_BATCH_ROWS = 256
+"""Rows of a table of a loop until they become an array."""
+
+
+class _GatheredByLoop:
+    """Rows and notices of the network, and of each loop."""
+
+    def __init__(self, loops: list[Scenario]) -> None:
+        self.network = Gathered(network_tables())
+        self.loops = [
+            Gathered(
+                {table: one for table, one in tables_of(loop).items() if OWNER[table] != "netem"},
+                _BATCH_ROWS,
+            )
+            for loop in loops
+        ]
+
+    def take(self, role: str, output: Record | Notice) -> None:
+        """Take a row or a notice; a notice of the network or the recorder concerns all loops."""
+        if isinstance(output, Notice):
+            chosen = (
+                [self.network, *self.loops] if output.loop is None else [self.loops[output.loop]]
+            )
+            for gathered in chosen:
+                gathered.take(role, output)
+        elif OWNER[output.table] == "netem":
+            self.network.take(role, output)
+        else:
+            number, *row = output.row
+            self.loops[number].take(role, Record(output.table, tuple(row)))
+
+
+def simulate_loops(scenario: Scenario, progress: Progress | None = None) -> SharedRun:
+    """Run a scenario with [[loops]] in virtual time; see :func:`simulate`.
+
+    Args:
+        scenario: the scenario, not resolved; speed, ports and real-time settings have no effect.
+        progress: called with the simulated time.
+    """
+    loops = [resolve(loop) for loop in loops_of(scenario)]
+    phases = phases_ns(scenario)
+    gathered = _GatheredByLoop(loops)
+    machines: dict[str, Machine[Any]] = {
+        "plant": Fleet([plant_of(loop) for loop in loops], phases),
+        "sensor": Fleet([sensor_of(loop) for loop in loops], phases),
+        "netem": network_of(scenario, loops=len(loops)),
+        "controller": Fleet([controller_of(loop) for loop in loops], phases),
+    }
+    entries = [loop.message_sizes.entries for loop in loops]
+    shuttle = Shuttle(machines, entries, gathered.take, protocol=scenario.protocol)
+    drive(shuttle, scenario, gathered.take, progress)
+    network_rows = gathered.network.rows()
+    records = []
+    for number, network_of_loop in enumerate(network_rows_by_loop(network_rows, phases)):
+        rows = gathered.loops[number].rows() | network_of_loop
+        reports = reports_of(rows, shuttle, scenario, number)
+        notices = gathered.loops[number].sorted_notices()
+        rows = {table: rows[table] for table in tables_of(loops[number])}
+        records.append(RunRecord(loops[number], rows, notices, reports, "simulated", number=number))
+    reports = reports_of(network_rows, shuttle, scenario)
+    network = RunRecord(
+        scenario, network_rows, gathered.network.sorted_notices(),
+        {"netem": reports["netem"]}, "simulated",
+    )  # fmt: skip
+    return SharedRun(network, records)

@@ -1,0 +1,173 @@
+"""Several loops on one network in virtual time, against the same loops alone and the link's law."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cosim.analysis.replay import replay
+from cosim.record.loop_rows import network_rows_by_loop
+from cosim.record.run_record import RunRecord
+from cosim.record.shared_run import SharedRun
+from cosim.simulation.shared_network import simulate_loops
+from cosim.simulation.virtual_time import simulate
+from noack.config.loops import loops_of, phases_ns
+from noack.config.parameter_changes import LATE
+from noack.config.resolution import resolve
+from noack.config.scenario_file import validate
+from noack.protocol.machine_interface import GENERATION
+from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, NETEM_SETTING, Fate
+from noack.protocol.wire_format import datagram_bytes
+from tests.cosim.record.changed_records import changed
+
+Content = dict[str, Any]
+PERIODIC = {"policy": "periodic", "period_s": 0.05}
+UDP_AND_IP_BYTES = 28
+
+
+@pytest.fixture
+def short(content: Content) -> Content:
+    """Two seconds at 100 Hz, with plants that are drawn and disturbed at random."""
+    content["horizon_s"] = 2.0
+    content["plant"] |= {
+        "rate_hz": 100.0,
+        "draw": "uniform", "uncertainty_A": [[0.0, 0.0], [0.5, 0.5]],
+        "initial_state_halfwidth": [0.5, 0.5],
+        "disturbances": [{"kind": "uniform", "bound": [0.5]}],
+    }  # fmt: skip
+    content["controller"] = {"rate_hz": 100.0}
+    content["trigger"]["beta"] = 0.01
+    return content
+
+
+def run(content: Content, *loops: Content) -> SharedRun:
+    return simulate_loops(validate(content | {"loops": list(loops)}, "here"))
+
+
+def same(one: RunRecord, other: RunRecord, *but: str) -> None:
+    for table in one.tables:
+        for column in one.tables[table].names or ():
+            if (table, column) != (NETEM_PACKET, "head") and column not in but:
+                assert one[table][column].tobytes() == other[table][column].tobytes(), table
+    assert one.notices == other.notices
+
+
+@pytest.mark.parametrize("protocol", ["none", "ack"])
+@pytest.mark.parametrize("delay", [[], [{"kind": "delay", "delay_s": 0.012, "jitter_s": 0.009}]])
+def test_the_first_loop_is_the_run_without_loops(
+    short: Content, protocol: str, delay: list[Content]
+) -> None:
+    """Losses and delays are drawn per flow: other loops do not change the first."""
+    short["network"] |= {"protocol": protocol, "impairments": delay}
+    alone = simulate(resolve(validate(short, "here")))
+    assert len(alone[NETEM_PACKET]) > 10
+    only = run(short, {"name": "only"}).loops[0]
+    assert all(only[t].tobytes() == alone[t].tobytes() for t in alone.tables)
+    assert (only.notices, only.reports) == (alone.notices, alone.reports)
+    if protocol == "none":  # the flow of an acknowledgement has another number among four loops
+        same(run(short, {"name": "a", "count": 4}).loops[0], alone)
+
+
+def test_a_loop_on_a_network_without_losses_is_the_same_loop_alone(short: Content) -> None:
+    """In its own time: every loop has another phase, and another seed of each kind."""
+    short["network"]["loss"] = {"model": "lossless"}
+    short["network"]["impairments"] = [{"kind": "delay", "delay_s": 0.003}]
+    scenario = validate(short | {"loops": [{"name": "a", "count": 5}]}, "here")
+    shared = simulate_loops(scenario)
+    assert len(set(phases_ns(scenario))) == 5
+    for loop, record in zip(loops_of(scenario), shared.loops, strict=True):
+        alone = simulate(resolve(loop))
+        same(record, alone)
+        assert record.reports == alone.reports
+    packets = shared.network[NETEM_PACKET]
+    assert np.bincount(packets["flow"]).tolist() == [len(one[NETEM_PACKET]) for one in shared.loops]
+
+
+@pytest.fixture
+def crowded(short: Content) -> Content:
+    """20 loops send more than twice what the bottleneck carries."""
+    size_bits = 8 * (datagram_bytes(2) + UDP_AND_IP_BYTES)
+    rate_bps = 20 * 20 * size_bits * 2 // 5
+    short["network"] |= {
+        "mansd": 3,
+        "loss": {"model": "bernoulli", "probability": 0.1},
+        "impairments": [{"kind": "rate", "rate_bps": rate_bps, "queue": 5}],
+    }
+    short["trigger"] = PERIODIC
+    return short
+
+
+def test_the_guarantee_holds_per_loop_when_the_shared_queue_overflows(crowded: Content) -> None:
+    shared = run(crowded, {"name": "a", "count": 20})
+    fates = shared.network[NETEM_PACKET]["fate"]
+    assert (fates == Fate.OVERFLOWED).sum() > 100
+    assert (fates == Fate.FORCED).sum() > 10
+    longest = []
+    for one in shared.loops:
+        lost = ~np.isin(one[NETEM_PACKET]["fate"], (Fate.DELIVERED, Fate.FORCED))
+        runs = np.diff(np.flatnonzero(np.diff(np.concatenate([[0], lost, [0]]))))[::2]
+        longest.append(int(runs.max(initial=0)))
+    assert max(longest) == 3
+
+
+def test_the_packets_of_all_loops_leave_one_after_the_other(crowded: Content) -> None:
+    """The gap between departures is at least the transmission time of a packet."""
+    network = run(crowded, {"name": "a", "count": 20}).network
+    left_ns = np.sort(network[NETEM_RELEASE]["t_ns"])
+    (rate,) = crowded["network"]["impairments"]
+    bits = 8 * (datagram_bytes(2) + UDP_AND_IP_BYTES)
+    gap_ns = bits * 10**9 // rate["rate_bps"]
+    assert len(left_ns) > 200
+    # The link is loaded above its rate: it is never idle after its first packet.
+    assert set(np.diff(left_ns).tolist()) <= {gap_ns, gap_ns + 1}
+
+
+def test_a_replay_is_exact_and_finds_a_changed_bit(crowded: Content) -> None:
+    shared = run(crowded, {"name": "a", "count": 3}, {"name": "b", "mode": "zoh"})
+    found = replay(shared.network)
+    assert (found.bit_exact, found.gaps, len(found.processes)) == (True, [], 1)
+    for record in shared.loops:
+        found = replay(record)
+        assert (found.bit_exact, found.gaps, len(found.processes)) == (True, [], 3)
+        assert all(hop.compared > 20 for hop in found.messages)
+    packets = shared.network[NETEM_PACKET].copy()
+    packets["release_ns"][-1] += 1
+    assert replay(changed(shared.network, {NETEM_PACKET: packets})).bit_exact is False
+    packets = shared.loops[2][NETEM_PACKET].copy()
+    head = bytearray(packets["head"][3].tobytes())
+    head[6] = 1  # the number of another loop
+    packets["head"][3] = bytes(head)
+    found = replay(changed(shared.loops[2], {NETEM_PACKET: packets}))
+    assert found.first_difference is not None
+    assert found.first_difference.column == "head"
+
+
+def test_a_change_concerns_every_loop(short: Content) -> None:
+    changes = [{"trigger.beta": 0.005}, {"trigger.beta": 0.5, "network.mansd": 1}]
+    short["changes"] = [{"at_s": 1.0 * i, "set": one} for i, one in enumerate(changes)]
+    shared = run(short, {"name": "a", "count": 3})
+    for record in shared.loops:
+        assert len(record[NETEM_SETTING]) == len(record["sensor_setting"]) == 2
+        assert not [one for one in record.notices if one["level"] == LATE]
+        assert replay(record).bit_exact
+    assert replay(shared.network).bit_exact
+
+
+def test_a_missing_row_of_the_network_leaves_its_number_free(crowded: Content) -> None:
+    scenario = validate(crowded | {"loops": [{"name": "a", "count": 3}]}, "here")
+    network = simulate_loops(scenario).network
+    rows = {table: network[table].copy() for table in network.tables}
+    # The second half is of a restarted emulator.
+    halves = {one: rows[one]["now_ns"] > 10**9 for one in (NETEM_PACKET, NETEM_RELEASE)}
+    first = min(rows[one]["input"][half].min() for one, half in halves.items())
+    for table, half in halves.items():
+        rows[table]["input"][half] += GENERATION - first
+    for missing in (0, 2):
+        rows[NETEM_PACKET] = np.delete(rows[NETEM_PACKET], np.s_[5 : 5 + missing])
+        for own in network_rows_by_loop(rows, phases_ns(scenario)):
+            inputs = np.sort(np.concatenate([one["input"] for one in own.values()]))
+            for generation in (0, 1):
+                numbers = inputs[inputs // GENERATION == generation] % GENERATION
+                assert numbers[0] == 0
+                assert (np.diff(numbers) - 1).sum() == missing * (generation == 0)
+                assert np.unique(numbers).size == numbers.size
