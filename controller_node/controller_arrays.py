@@ -9,6 +9,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from controller_node.loss_check import LossCheck
+from noack.config.fleet_layout import (
+    HEADER_WORDS,
+    NEEDS_MATRIX,
+    NEVER_NS,
+    SENDS,
+    FleetMemory,
+    FleetParts,
+    FleetRole,
+    begin_message,
+    begin_row,
+    copy_reals,
+)
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.controllers.linear_feedback import LinearFeedbackSettings
@@ -21,16 +34,9 @@ from noack.core.model_arrays import (
     find_transition,
 )
 from noack.core.ordered_arithmetic import multiply
-from noack.protocol.fleet_layout import (
-    HEADER_WORDS,
-    NEEDS_MATRIX,
-    NEVER_NS,
-    SENDS,
-    FleetMemory,
-    begin_message,
-    begin_row,
-    copy_reals,
-)
+from noack.impairments.loss_guarantee import LongestBurst
+from noack.protocol.machine_interface import Notice
+from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP
 
 CONTROLLER = np.dtype(
     [(name, "<i8") for name in (
@@ -55,9 +61,7 @@ class ControllerArrays(NamedTuple):
     models: ModelTable
 
 
-def controller_arrays_of(
-    resolved: Sequence[Scenario],
-) -> tuple[ControllerArrays, Transitions] | None:
+def controller_arrays_of(resolved: Sequence[Scenario]) -> FleetParts | None:
     """Return the controllers of resolved scenarios; None if one cannot be compiled."""
     if any(
         not isinstance(one.controller, LinearFeedbackSettings)
@@ -70,7 +74,8 @@ def controller_arrays_of(
     n, m = loops[0].n, loops[0].m
     steps_ns = set[int]()
     controllers = np.zeros(len(loops), CONTROLLER)
-    for row, one in zip(controllers, resolved, strict=True):
+    for place, one in enumerate(resolved):
+        row = controllers[place]
         period_ns, first_ns = one.timing.controller_period_ns, one.timing.controller_phase_ns
         steps_ns |= {period_ns, first_ns, period_ns - first_ns}
         row["period_ns"], row["first_ns"] = period_ns, first_ns
@@ -97,13 +102,42 @@ def controller_arrays_of(
         ),
         models=transitions.table,
     )
-    return arrays, transitions
+    firsts_ns = controllers["first_ns"]
+    due_ns = np.where(firsts_ns <= controllers["horizon_ns"], firsts_ns, NEVER_NS)
+    return FleetParts(arrays, due_ns, transitions, inspect=_LossChecks(resolved))
 
 
-def first_due_ns(own: ControllerArrays) -> NDArray[np.int64]:
-    """Return when each controller's first tick is due."""
-    first: NDArray[np.int64] = own.controllers["first_ns"]
-    return np.where(first <= own.controllers["horizon_ns"], first, NEVER_NS)
+class _LossChecks:
+    """Compares the losses of each loop with the guarantee, from rows of deliveries."""
+
+    def __init__(self, resolved: Sequence[Scenario]) -> None:
+        self._checks = [
+            LossCheck(
+                one.network.guarantee, None,
+                known_start=one.network.initial_sync == "known_state",
+            )
+            for one in resolved
+        ]  # fmt: skip
+        self._all = any(
+            not isinstance(rule, LongestBurst)
+            for one in resolved
+            for rule in one.network.guarantee.rules
+        )
+
+    def __call__(self, rows: NDArray[np.void]) -> Sequence[tuple[int, Notice]]:
+        """Return the violations, each with its loop."""
+        if not self._all:
+            rows = rows[rows["dropouts"] > 0]
+        names = ("loop", "sequence", "dropouts", "t_ns", "now_ns")
+        return [
+            (loop, notice)
+            for loop, sequence, losses, t_ns, now_ns in zip(
+                *(rows[name].tolist() for name in names), strict=True
+            )
+            for notice in self._checks[loop].add(
+                sequence, sequence - losses - 1, losses, t_ns, now_ns
+            )
+        ]
 
 
 def handle(memory: FleetMemory, own: ControllerArrays, loop: int, begin: int, now_ns: int) -> int:
@@ -161,3 +195,6 @@ def on_timer(memory: FleetMemory, own: ControllerArrays, loop: int, now_ns: int)
     due_ns = t_ns + one.period_ns
     memory.loops[loop].due_ns = due_ns if due_ns <= one.horizon_ns else NEVER_NS
     return SENDS
+
+
+CONTROLLER_FLEET = FleetRole(__name__, CONTROLLER_DELIVERY, CONTROLLER_STEP, controller_arrays_of)

@@ -9,23 +9,27 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.config.resolution import loop_of
-from noack.config.scenario import Scenario
-from noack.core.linear_systems import Vector, discretise
-from noack.core.ordered_arithmetic import multiply
-from noack.plants.linear import LinearSettings
-from noack.protocol.fleet_layout import (
+from noack.config.fleet_layout import (
     HEADER_WORDS,
     NEVER_NS,
     NOTES,
     SENDS,
     FleetMemory,
+    FleetParts,
+    FleetRole,
     begin_message,
     begin_row,
     copy_reals,
 )
-from noack.protocol.record_tables import NO_SEQUENCE
+from noack.config.resolution import loop_of
+from noack.config.scenario import Scenario
+from noack.core.linear_systems import Vector, discretise
+from noack.core.ordered_arithmetic import multiply
+from noack.plants.linear import LinearSettings
+from noack.protocol.machine_interface import Notice
+from noack.protocol.record_tables import NO_SEQUENCE, PLANT_ACTUATION, PLANT_STEP
 from plant_server.measurement import measurement_model_of
+from plant_server.watchdog import FALLBACK_NAMES, arrives_again, became_too_old
 
 _IN_TIME = -1
 _ZERO = 1
@@ -56,7 +60,7 @@ class PlantArrays(NamedTuple):
     """(L n m,)"""
 
 
-def plant_arrays_of(resolved: Sequence[Scenario]) -> PlantArrays | None:
+def plant_arrays_of(resolved: Sequence[Scenario]) -> FleetParts | None:
     """Return the plants of resolved scenarios; None if one cannot be compiled."""
     if any(
         not isinstance(one.plant.system, LinearSettings)
@@ -80,13 +84,26 @@ def plant_arrays_of(resolved: Sequence[Scenario]) -> PlantArrays | None:
         for loop, one in zip(loops, resolved, strict=True)
     ]
     inputs = len(loops) * loops[0].m
-    return PlantArrays(
+    arrays = PlantArrays(
         plants=plants,
         x=np.concatenate([np.array(one.plant.initial_state, np.float64) for one in resolved]),
         u=np.zeros(inputs),
         newest_u=np.zeros(inputs),
         Ad=np.concatenate([Ad.ravel() for Ad, _ in discrete]),
         Bd=np.concatenate([Bd.ravel() for _, Bd in discrete]),
+    )
+    return FleetParts(arrays, np.zeros(len(loops), np.int64), notice=_notice)
+
+
+def _notice(own: PlantArrays, fleet: Any) -> Notice:
+    plant = own.plants[fleet["note_loop"]]
+    t_ns, since_ns = int(fleet["note_ns"]), int(fleet["note_since_ns"])
+    if since_ns != _IN_TIME:
+        return arrives_again(t_ns, since_ns)
+    none = plant["newest_sequence"] == NO_SEQUENCE
+    name = FALLBACK_NAMES["zero" if plant["policy"] == _ZERO else "hold"]
+    return became_too_old(
+        t_ns, int(plant["newest_ns"]), int(plant["timeout_ns"]), name, none=bool(none)
     )
 
 
@@ -137,3 +154,6 @@ def _choose_input(memory: FleetMemory, own: PlantArrays, loop: int, t_ns: int) -
     fleet.note_loop, fleet.note_ns, fleet.note_since_ns = loop, t_ns, plant.tripped_ns
     plant.tripped_ns = t_ns if is_old else _IN_TIME
     return NOTES
+
+
+PLANT_FLEET = FleetRole(__name__, PLANT_ACTUATION, PLANT_STEP, plant_arrays_of)

@@ -77,6 +77,10 @@ class PredictedInput:
         return newest.u + (product(self._K, self._x) - product(self._K, newest.x_c))
 
 
+FALLBACK_NAMES = {"hold": "held", "zero": "0", "model": "the model's"}
+"""The input that each policy applies, in words."""
+
+
 def too_old(t_ns: Any, newest_ns: Any, timeout_ns: int) -> Any:
     """Whether an actuation of time ``newest_ns`` is too old at ``t_ns``; also of arrays."""
     return t_ns - newest_ns > timeout_ns
@@ -120,15 +124,29 @@ class Watchdog:
             if tripped_ns is None:
                 return newest.u, ()
             self._tripped_ns = None
-            lasted_s = (t_ns - tripped_ns) / NS_PER_S
-            text = f"actuations arrive again; there was none in time for {lasted_s:.4g} s"
-            return newest.u, (Notice(t_ns, "watchdog", text),)
+            return newest.u, (arrives_again(t_ns, tripped_ns),)
         u = self._fallback(newest, t_ns)
         if tripped_ns is not None:
             return u, ()
         self._tripped_ns = t_ns
-        age_s, timeout_s = ((ns / NS_PER_S) for ns in (t_ns - newest.t_ns, self._timeout_ns))
         none = newest.sequence == NO_SEQUENCE
-        what = "no actuation for" if none else "the newest actuation is too old:"
-        text = f"{what} {age_s:.4g} s, {timeout_s:.4g} s allowed; the input is {self._input_name}"
-        return u, (Notice(t_ns, "watchdog", text),)
+        return u, (
+            became_too_old(t_ns, newest.t_ns, self._timeout_ns, self._input_name, none=none),
+        )
+
+
+def arrives_again(t_ns: int, tripped_ns: int) -> Notice:
+    """Return the notice of the first actuation in time after ``tripped_ns``."""
+    lasted_s = (t_ns - tripped_ns) / NS_PER_S
+    text = f"actuations arrive again; there was none in time for {lasted_s:.4g} s"
+    return Notice(t_ns, "watchdog", text)
+
+
+def became_too_old(
+    t_ns: int, newest_ns: int, timeout_ns: int, input_name: str, *, none: bool
+) -> Notice:
+    """Return the notice of an actuation that is too old; ``none``: there has not been any."""
+    age_s, timeout_s = ((ns / NS_PER_S) for ns in (t_ns - newest_ns, timeout_ns))
+    what = "no actuation for" if none else "the newest actuation is too old:"
+    text = f"{what} {age_s:.4g} s, {timeout_s:.4g} s allowed; the input is {input_name}"
+    return Notice(t_ns, "watchdog", text)

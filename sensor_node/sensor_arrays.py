@@ -6,6 +6,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from noack.config.fleet_layout import (
+    HEADER_WORDS,
+    NEEDS_MATRIX,
+    NEVER_NS,
+    SCRATCH,
+    SENDS,
+    FleetMemory,
+    FleetParts,
+    FleetRole,
+    begin_message,
+    begin_row,
+    copy_reals,
+)
 from noack.config.resolution import loop_of, policy_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Vector
@@ -16,17 +29,7 @@ from noack.core.model_arrays import (
     advance_model,
     find_transition,
 )
-from noack.protocol.fleet_layout import (
-    HEADER_WORDS,
-    NEEDS_MATRIX,
-    SCRATCH,
-    SENDS,
-    FleetMemory,
-    begin_message,
-    begin_row,
-    copy_reals,
-)
-from noack.protocol.record_tables import NO_SEQUENCE
+from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT
 from noack.trigger.trigger_arrays import (
     TRIGGER,
     has_array_form,
@@ -60,7 +63,7 @@ class SensorArrays(NamedTuple):
     models: ModelTable
 
 
-def sensor_arrays_of(resolved: Sequence[Scenario]) -> tuple[SensorArrays, Transitions] | None:
+def sensor_arrays_of(resolved: Sequence[Scenario]) -> FleetParts | None:
     """Return the sensors of resolved scenarios; None if one cannot be compiled."""
     loops = [loop_of(one) for one in resolved]
     policies = [policy_of(one) for one in resolved]
@@ -98,7 +101,7 @@ def sensor_arrays_of(resolved: Sequence[Scenario]) -> tuple[SensorArrays, Transi
         start_condition(
             rows[number], arrays.matrices, 0, arrays.x_s, number * n, n, arrays.z, scratch
         )
-    return arrays, transitions
+    return FleetParts(arrays, np.full(len(loops), NEVER_NS), transitions)
 
 
 def handle(memory: FleetMemory, own: SensorArrays, loop: int, begin: int, now_ns: int) -> int:
@@ -144,3 +147,6 @@ def handle(memory: FleetMemory, own: SensorArrays, loop: int, begin: int, now_ns
 def on_timer(memory: FleetMemory, own: SensorArrays, loop: int, now_ns: int) -> int:
     """Nothing is ever due."""
     return 0
+
+
+SENSOR_FLEET = FleetRole(__name__, SENSOR_MEASUREMENT, None, sensor_arrays_of)

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.protocol.fleet_layout import FleetMemory
+from noack.config.fleet_layout import FleetMemory
 
 Array = NDArray[Any]
 
@@ -51,7 +51,6 @@ DRIVER = np.dtype(
             "message_row_bytes",
             "message_rows",
             "sent",
-            "accepted",
         )
     ]
 )
@@ -84,10 +83,11 @@ class DriverMemory(NamedTuple):
     message_rows: Array
     """(k,) uint8: rows of the table of :func:`handle`."""
     rejected: Array
-    """(reasons,) int64"""
+    """(L, reasons) int64: rejected datagrams; those without a loop count for the first."""
     errors: Array
     """(256,) int64: datagrams that could not be sent, by errno."""
     headers_in: Array
+    vectors_in: Array
     headers_out: Array
     vectors_out: Array
     time: Array

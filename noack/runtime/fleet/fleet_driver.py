@@ -3,7 +3,8 @@
 from collections.abc import Callable
 from typing import Any
 
-from noack.protocol.fleet_layout import NEEDS_MATRIX, NEVER_NS, NOTES, SENDS, STRIDE
+from noack.config.fleet_layout import NEEDS_MATRIX, NEVER_NS, NOTES, SENDS, STRIDE
+from noack.protocol.wire_format import HEADER_BYTES
 from noack.runtime.fleet.deadline_heap import lower_first
 from noack.runtime.fleet.driver_layout import (
     AT_ONCE,
@@ -22,13 +23,19 @@ _NS = 1_000_000_000
 _HEADER_BYTES = HEADER.itemsize
 _NONE = -1
 
-Handle = Callable[..., int]
+Handle = Callable[..., Any]
 
 
-def driver_of(handle: Handle, on_timer: Handle) -> Callable[..., int]:
-    """Return the driver of a role with these two functions."""
+def driver_of(
+    handle: Handle, on_timer: Handle, inline: Callable[[Handle], Any] = lambda function: function
+) -> Callable[..., int]:
+    """Return the driver of a role with these two functions.
 
-    def serve_message(memory: DriverMemory, own: Any) -> int:
+    ``inline`` makes a function known to the compiler.
+    """
+
+    @inline
+    def serve_message(memory: DriverMemory, own: Any) -> Any:
         """Process the current datagram; return a reason to return to Python, or _NONE."""
         driver, fleet = memory.driver[0], memory.fleet
         place = driver.arrived_next
@@ -39,7 +46,7 @@ def driver_of(handle: Handle, on_timer: Handle) -> Callable[..., int]:
             driver.from_peer != 0,
         )  # fmt: skip
         if loop < 0:
-            memory.rejected[-1 - loop] += 1
+            memory.rejected[claimed_loop(fleet, begin, size_bytes), -1 - loop] += 1
             driver.arrived_next += 1
             return _NONE
         one = fleet.loops[loop]
@@ -47,7 +54,7 @@ def driver_of(handle: Handle, on_timer: Handle) -> Callable[..., int]:
         if outputs == NEEDS_MATRIX:
             return MATRIX_MISSING
         one.newest = fleet.arrived[begin + 2]
-        driver.accepted += 1
+        one.accepted += 1
         driver.arrived_next += 1
         put_row(memory, loop, memory.message_rows, driver.message_rows, driver.message_row_bytes)
         driver.message_rows += 1
@@ -55,7 +62,8 @@ def driver_of(handle: Handle, on_timer: Handle) -> Callable[..., int]:
             put_message(memory, loop)
         return NOTE if outputs & NOTES else _NONE
 
-    def serve_timer(memory: DriverMemory, own: Any, now_ns: int) -> int:
+    @inline
+    def serve_timer(memory: DriverMemory, own: Any, now_ns: int) -> Any:
         """Do the work of the first deadline; return a reason to return to Python, or _NONE."""
         driver, heap = memory.driver[0], memory.heap
         loop = heap[1]
@@ -75,7 +83,7 @@ def driver_of(handle: Handle, on_timer: Handle) -> Callable[..., int]:
             put_message(memory, loop)
         return NOTE if outputs & NOTES else _NONE
 
-    def drive(memory: DriverMemory, own: Any, until_ns: int) -> int:
+    def drive(memory: DriverMemory, own: Any, until_ns: int) -> Any:
         """Drive the fleet until Python is needed, or until a time; return the reason."""
         driver, fleet = memory.driver[0], memory.fleet.fleet[0]
         most_messages = len(memory.message_rows) // driver.message_row_bytes
@@ -103,15 +111,23 @@ def driver_of(handle: Handle, on_timer: Handle) -> Callable[..., int]:
                 if reason != _NONE:
                     return reason
                 works = True
+            if driver.fd_in < 0:
+                return HOUSEKEEPING
             if fleet.out > 0:
                 send(memory)
-            if driver.fd_in < 0 or time_ns(memory) >= until_ns:
+            if time_ns(memory) >= until_ns:
                 return HOUSEKEEPING
             receive(memory)
             if driver.arrived_end == 0 and not wait(memory, until_ns, works):
                 return HOUSEKEEPING
 
     return drive
+
+
+def claimed_loop(fleet: Any, begin: int, size_bytes: int) -> int:
+    """Return the loop that a rejected datagram names; 0 if there is no such loop."""
+    loop = (fleet.arrived[begin] >> 48) & 0xFFFF
+    return int(loop) if size_bytes >= HEADER_BYTES and loop < len(fleet.loops) else 0
 
 
 def put_row(memory: DriverMemory, loop: int, rows: Any, number: int, row_bytes: int) -> None:
@@ -121,9 +137,7 @@ def put_row(memory: DriverMemory, loop: int, rows: Any, number: int, row_bytes: 
     if prefix_bytes != 0:
         memory.data[0] = loop
         libc.memcpy(place, libc.address_of(memory.data), prefix_bytes)
-    libc.memcpy(
-        place + prefix_bytes, libc.address_of(memory.fleet.row), row_bytes - prefix_bytes
-    )
+    libc.memcpy(place + prefix_bytes, libc.address_of(memory.fleet.row), row_bytes - prefix_bytes)
 
 
 def put_message(memory: DriverMemory, loop: int) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.protocol.fleet_layout import HEADER_WORDS
+from noack.config.fleet_layout import HEADER_WORDS
 from noack.protocol.wire_format import (
     HEADER_BYTES,
     KEY_BYTES,

@@ -6,11 +6,15 @@ to ``row``, and a message to the next place of ``out``. They return a sum of :da
 :data:`NOTES`, or :data:`NEEDS_MATRIX`; then they have changed nothing and are called again.
 """
 
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from noack.config.scenario import Scenario
+from noack.core.model_arrays import Transitions
+from noack.protocol.machine_interface import Notice
 from noack.protocol.wire_format import HEADER_BYTES, MAX_DIMENSION, TAG_BYTES
 
 SENDS = 1
@@ -32,6 +36,7 @@ LOOP = np.dtype(
             "phase_ns",  # when the loop begins; all other times are its own
             "due_ns",  # the next deadline; NEVER_NS: none
             "newest",  # sequence number of the newest message accepted; -1: none
+            "accepted",  # messages
             "inputs",  # number of the machine's next input
         )
     ]
@@ -90,3 +95,31 @@ def copy_reals(source: Any, begin: int, result: Any, into: int, count: int) -> N
     """Copy ``count`` numbers."""
     for k in range(count):
         result[into + k] = source[begin + k]
+
+
+class FleetParts(NamedTuple):
+    """The machines of L loops in arrays."""
+
+    arrays: Any
+    """The arrays of the role, a NamedTuple."""
+    due_ns: NDArray[np.int64]
+    """(L,) The first deadline of each loop, in its time."""
+    transitions: Transitions | None = None
+    """Of a role with models, the field ``models`` of its arrays."""
+    notice: Callable[[Any, Any], Notice] | None = None
+    """Returns the line for the log that a machine asked for, from its arrays and FLEET's row."""
+    inspect: Callable[[NDArray[np.void]], Sequence[tuple[int, Notice]]] | None = None
+    """Returns lines for the log about new rows of ``on_message``, each with its loop."""
+
+
+class FleetRole(NamedTuple):
+    """A role whose machines can be in arrays."""
+
+    module: str
+    """The module with its functions ``handle`` and ``on_timer``."""
+    on_message: str
+    """The table of the rows of ``handle``."""
+    on_timer: str | None
+    """The table of the rows of ``on_timer``."""
+    parts_of: Callable[[Sequence[Scenario]], FleetParts | None]
+    """Returns the machines of resolved scenarios; None if one cannot be compiled."""

@@ -1,0 +1,61 @@
+"""The driver of a role's fleet as compiled code, from the user's cache."""
+
+import importlib.util
+import inspect
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from noack.config.fleet_layout import FleetRole
+from noack.core.code_cache import cache_folder
+from noack.runtime.native.object_code import NativeFunction, code_file, load, load_or_compile
+
+_MODULES = (
+    "noack.core.ordered_arithmetic", "noack.core.model_arrays", "noack.trigger.trigger_arrays",
+    "noack.config.fleet_layout", "noack.runtime.fleet.wire_words",
+    "noack.runtime.fleet.deadline_heap", "noack.runtime.native.libc_calls",
+    "noack.runtime.fleet.fleet_driver",
+)  # fmt: skip
+_SOURCES = (
+    "noack.runtime.native.object_code", "noack.runtime.native.socket_structs",
+    "noack.runtime.fleet.driver_layout", "noack.protocol.wire_format",
+)  # fmt: skip
+_OPTIONS: dict[str, Any] = {"_nrt": False, "forceinline": True}
+
+
+@cache
+def kept_driver(role: FleetRole) -> NativeFunction | None:
+    """Return the driver if it has been compiled on this machine, else None."""
+    file = _file(role)
+    return None if file is None else load(file)
+
+
+def compiled_driver(role: FleetRole, arguments: tuple[Any, ...]) -> NativeFunction:
+    """Return the driver; compile it if that has not happened on this machine.
+
+    ``arguments`` are those of a call; their types do not depend on the scenario.
+    """
+    if (kept := kept_driver(role)) is not None:
+        return kept
+    return load_or_compile(_file(role), _jitable(role), lambda: (*arguments, 0))
+
+
+def _jitable(role: FleetRole) -> Any:
+    """Return the driver for the compiler, which knows all functions that it calls."""
+    from numba.extending import register_jitable
+
+    for name in (*_MODULES, role.module):
+        module = importlib.import_module(name)
+        for _, function in inspect.getmembers(module, inspect.isfunction):
+            if function.__module__ == name:
+                register_jitable(**_OPTIONS)(function)
+    from noack.runtime.fleet.fleet_driver import driver_of
+
+    machine: Any = importlib.import_module(role.module)
+    return driver_of(machine.handle, machine.on_timer, register_jitable(**_OPTIONS))
+
+
+def _file(role: FleetRole) -> Path | None:
+    found = [importlib.util.find_spec(name) for name in (*_MODULES, *_SOURCES, role.module)]
+    folder = cache_folder("fleet", [Path(str(spec and spec.origin)) for spec in found])
+    return None if folder is None else code_file(folder, role.module)
