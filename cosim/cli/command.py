@@ -5,6 +5,7 @@ import os
 import pkgutil
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from enum import StrEnum
 from functools import wraps
 from importlib import import_module
 from json import dumps
@@ -102,6 +103,22 @@ SetOption = Annotated[
         metavar="KEY=VALUE",
         help="Replace a value of the scenario, e.g. trigger.beta=0.3.",
         autocompletion=completion.settings,
+    ),
+]
+
+
+class TriggerMode(StrEnum):
+    """When a simulated sensor compares its error with the threshold."""
+
+    SAMPLED = "sampled"
+    CONTINUOUS = "continuous"
+
+
+TriggerOption = Annotated[
+    TriggerMode,
+    typer.Option(
+        help="sampled: test the trigger at each measurement, as in a live run; "
+        "continuous: at all times."
     ),
 ]
 RunsOption = Annotated[Path, typer.Option("--runs", help="Folder of the run directories.")]

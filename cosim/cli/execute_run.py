@@ -72,12 +72,17 @@ def run_processes(
 
 def warn_of_violations(scenario: "Scenario") -> None:
     """Print the assumptions of Theorem 2 that the scenario violates, on standard error."""
+    from noack.config.loops import loop_scenario
     from noack.config.resolution import resolve
     from noack.theory.assumptions import AssumptionStatus, assumptions
 
-    for assumption in assumptions(resolve(scenario)):
-        if assumption.verdict == AssumptionStatus.VIOLATED and assumption.source == "Theorem 2":
-            print(f"noack: warning: violated: {assumption.what}: {assumption.why}", file=sys.stderr)
+    alone = {"": scenario}
+    if scenario.loops is not None:
+        alone = {f"{one.name}: ": loop_scenario(scenario, one) for one in scenario.loops}
+    for name, loop in alone.items():
+        for one in assumptions(resolve(loop)):
+            if one.verdict == AssumptionStatus.VIOLATED and one.source == "Theorem 2":
+                print(f"noack: warning: {name}violated: {one.what}: {one.why}", file=sys.stderr)
 
 
 def finalize_run(ending: "RunEnding", output: RunOutput) -> int:

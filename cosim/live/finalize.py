@@ -15,7 +15,9 @@ from cosim.analysis.loss_statistics import list_violations
 from cosim.analysis.model_comparison import linearisation
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import Outcome, Summary, summarise
-from cosim.analysis.summary_model import ExitPart, RunSummary, can_be_shown
+from cosim.analysis.shared_summary import is_complete
+from cosim.analysis.summary_model import ExitPart, RunSummary, SummaryPart
+from cosim.live.finalize_loops import finalize_loops
 from cosim.live.replay_process import ReplayProcess
 from cosim.record.decimate import is_long
 from cosim.record.run_directory import (
@@ -50,7 +52,9 @@ def finalize(ending: RunEnding, *, report: bool = True, again: bool = False) -> 
     run_dir = ending.run_dir
     with _with_reason(ending), finished_run(run_dir), ExitStack() as stack:
         unfinished = (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir()
-        record = finish_record(run_dir) if unfinished else load_record(run_dir)
+        record = finish_record(run_dir) if unfinished else load_record(run_dir, network=True)
+        if record.is_network:
+            return _finalize_shared(record, ending, again=again)
         replaying = stack.enter_context(ReplayProcess(record, run_dir))
         # A stopped recorder has no time to write the recording of a long run.
         needed = unfinished or (record.kind == "live" and is_long(record.scenario))
@@ -79,6 +83,18 @@ def finalize(ending: RunEnding, *, report: bool = True, again: bool = False) -> 
     return Outcome(run_dir, status, reason, content)
 
 
+def _finalize_shared(network: RunRecord, ending: RunEnding, *, again: bool) -> Outcome:
+    """Finalise each loop of a run of several; write the summary of the run."""
+    summary = finalize_loops(
+        network, ending, lambda loop: finalize(loop, report=False, again=again)
+    )
+    _write_summary(ending.run_dir, summary)
+    status, reason = ExitStatus(summary.exit.status), summary.exit.reason
+    if (ending.status, ending.reason) != (status, reason):
+        _correct_ending(replace(ending, status=status, reason=reason))
+    return Outcome(ending.run_dir, status, reason, summary.model_dump(mode="json"))
+
+
 def _correct_ending(ending: RunEnding) -> None:
     """Let the launcher's file agree with the summary."""
     if (ending.run_dir / ENDING_FILE).is_file():
@@ -97,7 +113,7 @@ def _with_reason(ending: RunEnding) -> Iterator[None]:
         raise MachineError(f"the run failed: {ending.reason}\n{error}") from None
 
 
-def _write_summary(run_dir: Path, summary: RunSummary) -> None:
+def _write_summary(run_dir: Path, summary: SummaryPart) -> None:
     try:
         text = summary.model_dump_json(indent=2)
         write_whole(run_dir / SUMMARY_FILE, text, make_folder=False)
@@ -156,7 +172,7 @@ def reopen(run_dir: Path) -> Outcome:
     summary = read_object(run_dir / SUMMARY_FILE)
     ending = _ending(run_dir, summary)
     # The summary is missing or damaged; or a process that was frozen spooled rows after the end.
-    if not can_be_shown(summary) or (run_dir / SPOOL).is_dir():
+    if not is_complete(summary) or (run_dir / SPOOL).is_dir():
         return finalize(ending, again=True)
     return Outcome(run_dir, ending.status, ending.reason, summary)
 

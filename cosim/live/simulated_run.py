@@ -16,6 +16,8 @@ from cosim.record.run_directory import (
 )
 from cosim.record.run_ending import EndingFile, RunEnding
 from cosim.record.run_record import RunRecord, write_record
+from cosim.record.shared_run import write_shared_run
+from cosim.simulation.shared_network import simulate_loops
 from cosim.simulation.virtual_time import Progress, simulate
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
@@ -47,21 +49,38 @@ def simulate_run(
         CallerError: the scenario's numbers are too large.
         MachineError: the run directory cannot be written.
     """
+    if scenario.loops is not None:
+        return _into_new_run(
+            scenario, runs, lambda run_dir, _: _write_loops(scenario, run_dir, progress)
+        )
     resolved = resolve(scenario)
-    run_dir = new_run_dir(runs, resolved.name)
+
+    def write(run_dir: Path, run_id: int) -> None:
+        record = simulator(write_scenario(resolved, run_dir), progress=progress)
+        reports = json.dumps(record.reports, indent=2)
+        write_whole(run_dir / REPORTS_FILE, reports, make_folder=False)
+        write_record(record, run_dir)
+        if view:
+            from cosim.output.viewer.run_view import write_view  # imports rerun
+
+            write_view(record, run_dir, run_id)
+
+    return _into_new_run(resolved, runs, write)
+
+
+def _write_loops(scenario: Scenario, run_dir: Path, progress: Progress | None) -> None:
+    """Simulate several loops; write their records and that of their network."""
+    write_shared_run(simulate_loops(write_scenario(scenario, run_dir), progress), run_dir)
+
+
+def _into_new_run(scenario: Scenario, runs: Path, write: Callable[[Path, int], None]) -> RunEnding:
+    """Let ``write`` fill a new run directory; remove the directory if it is interrupted."""
+    run_dir = new_run_dir(runs, scenario.name)
     run_id = secrets.randbits(64)  # identifies the recording in the viewer
     try:
         with active_run(run_dir), EndingFile(run_dir) as ending:
-            resolved = write_scenario(resolved, run_dir)
             write_environment(run_dir, "simulated")
-            record = simulator(resolved, progress=progress)
-            reports = json.dumps(record.reports, indent=2)
-            write_whole(run_dir / REPORTS_FILE, reports, make_folder=False)
-            write_record(record, run_dir)
-            if view:
-                from cosim.output.viewer.run_view import write_view  # imports rerun
-
-                write_view(record, run_dir, run_id)
+            write(run_dir, run_id)
             ending.store(ExitStatus.OK, HORIZON)
     except BaseException as error:
         shutil.rmtree(run_dir, ignore_errors=True)

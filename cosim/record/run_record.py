@@ -28,6 +28,7 @@ from cosim.record.record_source import (
 from cosim.record.record_source import Rows as Rows
 from cosim.record.run_directory import (
     LOOP_FILE,
+    LOOPS,
     RECORD,
     REPORTS_FILE,
     SCENARIO_FILE,
@@ -191,11 +192,16 @@ class RunRecord:
         return BATCH_ROWS * period_ns
 
 
-def load_record(run_dir: Path) -> RunRecord:
+def load_record(run_dir: Path, *, network: bool = False) -> RunRecord:
     """Read the record of a run directory.
 
+    Args:
+        run_dir: the run directory.
+        network: return the record of the network, if several loops share it.
+
     Raises:
-        CallerError: the path is no run directory, or the record is unfinished or damaged.
+        CallerError: the path is no run directory, or the record is unfinished or damaged; or it is
+            that of a run of several loops.
     """
     # Imported here because pyarrow takes 0.1 s: a run does not wait for it.
     from cosim.record.table_files import StoredTables
@@ -208,6 +214,9 @@ def load_record(run_dir: Path) -> RunRecord:
             f"{run_dir}: has no numeric record; `noack summary` finalises an interrupted run"
         )
     scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
+    if scenario.loops is not None and not network:
+        one = run_dir / LOOPS / scenario.loops[0].names[0]
+        raise CallerError(f"{run_dir}: a run of several loops; name one of them, e.g. {one}")
     tables = tables_of(scenario) if scenario.loops is None else network_tables()
     rows = StoredTables(folder, tables)
     reports, earlier = _reports(run_dir, rows)
@@ -272,7 +281,7 @@ def finish_record(run_dir: Path) -> RunRecord:
             f"{folder}: the record cannot be written: {why(error)}; what was recorded is kept "
             f"in {spool}, and `noack summary {run_dir}` finishes it"
         ) from None
-    return load_record(run_dir)
+    return load_record(run_dir, network=True)
 
 
 def recorded_rows(run_dir: Path, table: str, dtype: np.dtype[np.void]) -> Iterator[Rows]:

@@ -4,21 +4,18 @@ All runs pass through the same time windows. At the end of each window the runs 
 runs that nearly coincide, one remains. The runs are grouped by the state of the guarantee's
 automaton and their part of the window; from each group first the best run is selected, then the
 second best, and so on. One half of the selection ranks runs by their value so far, the other half
-by their promise: the integral of the output's square over the next window, for the loop without
-events.
+by their promise: what the loop would reach over the next window without events.
 """
 
 import numpy as np
 
-from cosim.analysis.adversary.objective import weight_of
+from cosim.analysis.adversary.pattern_flow import PatternFlow
 from cosim.analysis.adversary.search_nodes import Indices, Nodes, PatternSearch, root, together
-from cosim.analysis.adversary.segments import SegmentFlow
-from noack.core.linear_systems import Matrix, Vector
+from noack.core.linear_systems import Vector
 
 _ALIKE = 1e-4
 _PARTS = 2
 _CROWD = 8
-_POINTS = 12
 
 
 def search_beam(search: PatternSearch, width: int, window_s: float) -> None:
@@ -47,26 +44,22 @@ def search_beam(search: PatternSearch, width: int, window_s: float) -> None:
 class _Choice:
     """The selection of the runs that continue."""
 
-    def __init__(self, flow: SegmentFlow, window_s: float) -> None:
-        self._measure, self._window_s = flow.measure, window_s
-        self._gramian = _gramian(flow, window_s)
+    def __init__(self, flow: PatternFlow, window_s: float) -> None:
+        self._flow, self._window_s = flow, window_s
 
     def thin(self, nodes: Nodes, width: int) -> Nodes:
         """Return at most ``width`` of the runs."""
         if len(nodes.t_s) <= width:
             return nodes
         nodes = nodes.take(self._distinct(nodes))
-        z, kind = self._scaled(nodes), self._kind(nodes)
-        promise = np.einsum("ai,ij,aj->a", z, self._gramian, z)
-        if self._measure.additive:
+        kind = self._kind(nodes)
+        promise = self._flow.promise(nodes.t_s, nodes.z, self._window_s)
+        if self._flow.objective.additive:
             return nodes.take(_turns(nodes.value + promise, kind)[:width])
         by_value = _turns(nodes.value, kind, promise)[: width // 2]
         by_promise = _turns(promise, kind)
         chosen = np.concatenate([by_value, by_promise[~np.isin(by_promise, by_value)]])
         return nodes.take(chosen[:width])
-
-    def _scaled(self, nodes: Nodes) -> Matrix:
-        return np.asarray(nodes.z / self._measure.level(nodes.t_s)[:, None])
 
     def _kind(self, nodes: Nodes) -> Indices:
         since_s = nodes.t_s - nodes.t_s.min()
@@ -75,9 +68,8 @@ class _Choice:
 
     def _distinct(self, nodes: Nodes) -> Indices:
         """Return, for each group of nearly equal runs, the one with the largest value."""
-        z = self._scaled(nodes)
-        size = np.abs(z).max() or 1.0
-        features = np.column_stack([nodes.t_s / self._window_s, z / size, nodes.state])
+        alike = self._flow.features(nodes.t_s, nodes.z)
+        features = np.column_stack([nodes.t_s / self._window_s, alike, nodes.state])
         order = np.argsort(-nodes.value, kind="stable")
         _, first = np.unique(np.round(features[order] / _ALIKE), axis=0, return_index=True)
         return np.asarray(order[np.sort(first)])
@@ -91,21 +83,3 @@ def _turns(score: Vector, kind: Indices, then: Vector | None = None) -> Indices:
     rank = np.empty(len(order), int)
     rank[order] = np.arange(len(order)) - np.repeat(starts, np.diff(starts, append=len(order)))
     return np.asarray(np.lexsort((-then, -score, rank)))
-
-
-def _gramian(flow: SegmentFlow, window_s: float) -> Matrix:
-    """Return ∫₀^window e^{Gᵀs} Cᵀ C e^{Gs} ds, scaled like the objective; CᵀC for event times."""
-    system, measure = flow.system, flow.measure
-    n = system.loop.n
-    if measure.output is None:  # the initial speed of e_s
-        speed = weight_of(system) @ system.generator[n : 2 * n]
-        return np.asarray(speed.T @ speed)
-    from scipy.linalg import expm
-
-    generator = system.generator + measure.rate_per_s * np.eye(3 * n)
-    points, weights = np.polynomial.legendre.leggauss(_POINTS)
-    total = np.zeros_like(generator)
-    for s, weight in zip((points + 1) / 2 * window_s, weights / 2 * window_s, strict=True):
-        y = measure.output @ expm(generator * s)
-        total += weight * (y.T @ y)
-    return total

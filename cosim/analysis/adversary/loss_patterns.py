@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from cosim.analysis.adversary.pattern_flow import PatternFlow
 from cosim.analysis.adversary.search_nodes import (
     DecisionLog,
     Pattern,
@@ -10,7 +11,6 @@ from cosim.analysis.adversary.search_nodes import (
     root,
     together,
 )
-from cosim.analysis.adversary.segments import SegmentFlow
 from cosim.simulation.continuous.continuous_run import MAX_EVENTS, TooManyEventsError
 from noack.core.linear_systems import Vector
 from noack.impairments.loss_guarantee import LossAutomaton, LossGuarantee
@@ -24,7 +24,7 @@ _PERIODS = 24
 
 
 def follow(
-    flow: SegmentFlow, automaton: LossAutomaton, patterns: list[Pattern]
+    flow: PatternFlow, automaton: LossAutomaton, patterns: list[Pattern]
 ) -> tuple[Vector, list[Pattern]]:
     """Run patterns to the horizon; return their values and the applied decisions.
 
@@ -42,7 +42,7 @@ def follow(
     run, value, last = np.arange(count), nodes.value.copy(), nodes.entry.copy()
     for event in range(MAX_EVENTS):
         segments = flow(nodes.t_s, nodes.z)
-        value[run] = flow.measure.joined(nodes.value, segments.value)
+        value[run] = flow.objective.joined(nodes.value, segments.value)
         last[run] = nodes.entry
         going = np.flatnonzero(segments.is_event)
         if not len(going):
@@ -50,7 +50,7 @@ def follow(
         after_loss = automaton.after_loss(nodes.state[going])
         delivered = wanted[run[going], min(event, longest)] | (after_loss < 0)
         state = np.where(delivered, automaton.after_delivery(nodes.state[going]), after_loss)
-        following = after_events(nodes, segments, value[run], going, delivered, state, log)
+        following = after_events(flow, nodes, segments, value[run], going, delivered, state, log)
         run, nodes = run[going], following
     raise TooManyEventsError(f"trigger: more than {MAX_EVENTS} events: they accumulate")
 
@@ -63,6 +63,7 @@ def guess(search: PatternSearch, own: Pattern, rng: np.random.Generator) -> floa
     tried = [own, *_candidates(search.guarantee, events, rng)]
     values, patterns = follow(flow, automaton, tried)
     search.nodes += events + sum(map(len, patterns))
+    search.runs += len(patterns)
     for i in np.argsort(-values, kind="stable")[:_IMPROVED]:
         improve(search, patterns[i], float(values[i]), _NODES_FOR_A_GUESS)
     return flow.horizon_s / (events + 1)
@@ -102,6 +103,7 @@ def improve(search: PatternSearch, pattern: Pattern, value: float, most_nodes: i
         changed = [(*pattern[:i], not one, *pattern[i + 1 :]) for i, one in enumerate(pattern)]
         values, patterns = follow(flow, automaton, changed)
         visited += sum(map(len, patterns))
+        search.runs += len(patterns)
         top = int(values.argmax())
         if not values[top] > value:
             break

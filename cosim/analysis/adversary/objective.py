@@ -29,6 +29,20 @@ class Objective(StrEnum):
     COST = "cost"
     INTER_EVENT = "inter-event"
 
+    @property
+    def additive(self) -> bool:
+        """Whether the values of segments are added; otherwise the largest one is the result."""
+        return self is Objective.COST
+
+    @property
+    def nothing(self) -> float:
+        """The value of a run without segments."""
+        return 0.0 if self.additive else -np.inf
+
+    def joined(self, first: Matrix, second: Matrix) -> Matrix:
+        """Return the value of two successive parts of a run."""
+        return np.asarray(first + second if self.additive else np.maximum(first, second))
+
 
 @dataclass(frozen=True)
 class Measure:
@@ -44,24 +58,10 @@ class Measure:
     floor: float = 0.0
     """The smallest value of the level."""
 
-    @property
-    def additive(self) -> bool:
-        """Whether the values of segments are added; otherwise the largest one is the result."""
-        return self.objective is Objective.COST
-
-    @property
-    def nothing(self) -> float:
-        """The value of a run without segments."""
-        return 0.0 if self.additive else -np.inf
-
     def level(self, t_s: Matrix) -> Matrix:
         """Return the level at times (k,), divided by its value at 0."""
         level = np.exp(-self.rate_per_s * t_s)
         return np.asarray(np.maximum(level, self.floor / self.beta) if self.floor else level)
-
-    def joined(self, first: Matrix, second: Matrix) -> Matrix:
-        """Return the value of two successive parts of a run."""
-        return np.asarray(first + second if self.additive else np.maximum(first, second))
 
 
 def measure_of(

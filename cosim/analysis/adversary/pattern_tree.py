@@ -19,7 +19,7 @@ def search_tree(search: PatternSearch, most_nodes: int, ceiling: Ceiling | None 
     Raises:
         TooManyEventsError: two events at the same time.
     """
-    search.step, most_nodes = "all patterns", most_nodes + search.nodes
+    search.step, most_nodes, before = "all patterns", most_nodes + search.nodes, search.runs
     pile = [root(search.flow)]
     while pile and search.value < float("inf"):
         nodes = _top(pile)
@@ -29,6 +29,7 @@ def search_tree(search: PatternSearch, most_nodes: int, ceiling: Ceiling | None 
             return False
         if len(nodes.t_s):
             pile.append(search.successors(nodes))
+    search.runs -= before  # each pattern counts once
     return True
 
 

@@ -6,13 +6,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.adversary.segments import SegmentFlow, Segments
+from cosim.analysis.adversary.pattern_flow import Flags, PatternFlow, Segments
 from cosim.simulation.continuous.continuous_run import TooManyEventsError
 from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_guarantee import LossAutomaton, LossGuarantee
 
 Indices = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 
 Pattern = tuple[bool, ...]
 """Whether the update of each event is delivered; events after its end are delivered."""
@@ -30,7 +29,7 @@ class Nodes(NamedTuple):
     t_s: Vector
     """(N,)"""
     z: Matrix
-    """(x, e_s, e_c), (N, 3n)."""
+    """The states, as the flow has them, (N, entries)."""
     state: Indices
     """State of the guarantee's automaton, (N,); under a cap alone, the consecutive losses."""
     value: Vector
@@ -44,11 +43,10 @@ class Nodes(NamedTuple):
         return Nodes(*(column[which] for column in columns))
 
 
-def root(flow: SegmentFlow) -> Nodes:
-    """Return the start: sensor and controller have x(0), by the first packet or the scenario."""
-    x0, zero = flow.system.loop.x0, np.zeros(1, int)
-    z = np.concatenate([x0, np.zeros(2 * len(x0))])[None]
-    return Nodes(np.zeros(1), z, zero, np.array([flow.measure.nothing]), zero + START)
+def root(flow: PatternFlow) -> Nodes:
+    """Return the start of all runs."""
+    start, zero = flow.start(), np.zeros(1, int)
+    return Nodes(start.end_s, start.z, zero, start.value, zero + START)
 
 
 def together(parts: Sequence[Nodes]) -> Nodes:
@@ -88,7 +86,7 @@ class PatternSearch:
 
     def __init__(
         self,
-        flow: SegmentFlow,
+        flow: PatternFlow,
         guarantee: LossGuarantee,
         report: SearchReport = lambda step, nodes, value: None,
     ) -> None:
@@ -100,6 +98,8 @@ class PatternSearch:
         """The largest value so far."""
         self.nodes = 0
         """Segments between events that were computed."""
+        self.runs = 0
+        """Runs that were computed up to the horizon."""
         self._report = report
         self._log = DecisionLog()
         self._entry: int | None = None
@@ -123,15 +123,16 @@ class PatternSearch:
         Raises:
             TooManyEventsError: two events at the same time.
         """
-        measure = self.flow.measure
+        objective = self.flow.objective
         segments = self.flow(nodes.t_s, nodes.z, self.value)
-        value = measure.joined(nodes.value, segments.value)
+        value = objective.joined(nodes.value, segments.value)
         # A sum is compared only when the run is complete.
-        candidates = np.where(segments.is_event & measure.additive, -np.inf, value)
+        candidates = np.where(segments.is_event & objective.additive, -np.inf, value)
         top = int(candidates.argmax())
         if candidates[top] > self.value:
             self.value, self._entry = float(candidates[top]), int(nodes.entry[top])
         self.nodes += len(nodes.t_s)
+        self.runs += int((~segments.is_event).sum())
         self._report(self.step, self.nodes, self.value)
         events = np.flatnonzero(segments.is_event)
         after_loss = self.automaton.after_loss(nodes.state[events])
@@ -140,12 +141,12 @@ class PatternSearch:
         delivered = np.repeat([False, True], [int(may.sum()), len(events)])
         after_delivery = self.automaton.after_delivery(nodes.state[events])
         state = np.concatenate([after_loss[may], after_delivery])
-        return after_events(nodes, segments, value, these, delivered, state, self._log)
+        return after_events(self.flow, nodes, segments, value, these, delivered, state, self._log)
 
 
 def after_events(
-    nodes: Nodes, segments: Segments, value: Vector, these: Indices, delivered: Flags,
-    state: Indices, log: DecisionLog,
+    flow: PatternFlow, nodes: Nodes, segments: Segments, value: Vector, these: Indices,
+    delivered: Flags, state: Indices, log: DecisionLog,
 ) -> Nodes:  # fmt: skip
     """Return the runs ``these``, (k,), just after the events at the end of their segments.
 
@@ -160,7 +161,5 @@ def after_events(
     stuck = t_s <= nodes.t_s[these]
     if (stuck & (nodes.entry[these] != START)).any():
         raise TooManyEventsError(f"trigger: the events accumulate at {t_s[stuck][0]:.9g} s")
-    z, n = segments.z[these], segments.z.shape[1] // 3
-    z[:, n : 2 * n] = 0.0
-    z[delivered, 2 * n :] = 0.0
+    z = flow.after_events(t_s, segments.z[these], delivered)
     return Nodes(t_s, z, state, value[these], log.add(nodes.entry[these], delivered))

@@ -12,12 +12,11 @@ derivative, per cell.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cosim.analysis.adversary.objective import Measure, weight_of
+from cosim.analysis.adversary.objective import Measure, Objective, weight_of
+from cosim.analysis.adversary.pattern_flow import Flags, Segments
 from cosim.analysis.adversary.polynomial_curves import Stack, curve_stack, peak_squares, powers
 from cosim.simulation.continuous.continuous_loop import ContinuousLoop
 from cosim.simulation.continuous.exact_flow import DEGREE, taylor_terms
@@ -26,6 +25,7 @@ from noack.core.linear_systems import Matrix, Vector
 _LARGEST = 1e100
 _SLACK = 1e-13
 _POINTS = np.linspace(0.0, 1.0, 17)
+_GRAMIAN_POINTS = 12
 _CLOSE = 0.95
 """A sampled |y|² next to a maximum is at least this share of it; lower points are not refined."""
 
@@ -97,19 +97,6 @@ def _columns(terms: Stack) -> Matrix:
     return np.ascontiguousarray(terms.reshape(-1, terms.shape[2]).T)
 
 
-class Segments(NamedTuple):
-    """The ends of N segments: the next event, or the horizon."""
-
-    end_s: Vector
-    """(N,)"""
-    z: Matrix
-    """(x, e_s, e_c) at the end, before any reset, (N, 3n)."""
-    is_event: NDArray[np.bool_]
-    """Whether the segment ends in an event, not at the horizon or by divergence, (N,)."""
-    value: Vector
-    """The segment's value, (N,); infinite if the loop diverged."""
-
-
 class SegmentFlow:
     """Follows states to their next events, at most to the horizon.
 
@@ -122,6 +109,7 @@ class SegmentFlow:
         self.system, self.measure, self.horizon_s = system, measure, horizon_s
         self.known_start = known_start
         trigger = system.decaying
+        self._gramians: dict[float, Matrix] = {}
         self._floor_from_s = math.inf
         if trigger.floor > 0:
             self._floor_from_s = math.log(trigger.beta / trigger.floor) / trigger.alpha_per_s
@@ -129,12 +117,39 @@ class SegmentFlow:
         self._decaying = _Phase(system, measure, trigger.alpha_per_s, measure.rate_per_s)
         self._floored = _Phase(system, measure, 0.0, late_rate)
 
-    def __call__(self, t_s: Vector, z: Matrix, known: float = -math.inf) -> Segments:
-        """Follow N states z = (x, e_s, e_c), (N, 3n), at times (N,) to their next events.
+    @property
+    def objective(self) -> Objective:
+        """The objective."""
+        return self.measure.objective
 
-        Results below ``known`` may be inaccurate.
-        """
-        measure, nothing = self.measure, np.full(len(t_s), self.measure.nothing)
+    def start(self) -> Segments:
+        """As :meth:`PatternFlow.start`: sensor and controller have x(0)."""
+        x0, zero = self.system.loop.x0, np.zeros(1)
+        z = np.concatenate([x0, np.zeros(2 * len(x0))])[None]
+        return Segments(zero, z, zero > 0, zero + self.objective.nothing)
+
+    def after_events(self, t_s: Vector, z: Matrix, delivered: Flags) -> Matrix:
+        """As :meth:`PatternFlow.after_events`: e_s ← 0, and e_c ← 0 if the update arrives."""
+        z, n = z.copy(), z.shape[1] // 3
+        z[:, n : 2 * n] = 0.0
+        z[delivered, 2 * n :] = 0.0
+        return z
+
+    def features(self, t_s: Vector, z: Matrix) -> Matrix:
+        """As :meth:`PatternFlow.features`."""
+        scaled = z / self.measure.level(t_s)[:, None]
+        return np.asarray(scaled / (np.abs(scaled).max() or 1.0))
+
+    def promise(self, t_s: Vector, z: Matrix, window_s: float) -> Vector:
+        """As :meth:`PatternFlow.promise`: the integral of the output's square."""
+        if window_s not in self._gramians:
+            self._gramians[window_s] = _gramian(self.system, self.measure, window_s)
+        scaled = z / self.measure.level(t_s)[:, None]
+        return np.asarray(np.einsum("ai,ij,aj->a", scaled, self._gramians[window_s], scaled))
+
+    def __call__(self, t_s: Vector, z: Matrix, known: float = -math.inf) -> Segments:
+        """As :meth:`PatternFlow.__call__`, with z = (x, e_s, e_c), (N, 3n)."""
+        measure, nothing = self.measure, np.full(len(t_s), self.measure.objective.nothing)
         found = Segments(t_s.copy(), z.copy(), np.zeros(len(t_s), bool), nothing)
         first_until_s = min(self._floor_from_s, self.horizon_s)
         for phase, from_s, until_s in (
@@ -144,7 +159,7 @@ class SegmentFlow:
             now = (found.end_s >= from_s) & (found.end_s < until_s) & ~found.is_event
             these = np.flatnonzero(now & (found.value < math.inf))
             part = phase.follow(found.end_s[these], found.z[these], until_s, known)
-            found.value[these] = measure.joined(found.value[these], part.value)
+            found.value[these] = measure.objective.joined(found.value[these], part.value)
             found.end_s[these], found.z[these], found.is_event[these] = part[:3]
         if measure.output is None:
             between_events = found.is_event & ((t_s > 0) | (not self.known_start))
@@ -175,13 +190,13 @@ class _Phase:
         if measure.output is not None:
             terms = taylor_terms(generator + rate_per_s * identity, self._width_s)
             output, width_s = measure.output @ terms, self._width_s
-            additive = measure.additive
+            additive = measure.objective.additive
             self._objective = SquareIntegral(output, width_s) if additive else Supremum(output)
 
     def follow(self, t_s: Vector, z: Matrix, until_s: float, known: float) -> Segments:
         """Follow states at times below ``until_s``."""
         count, width_s, measure = len(t_s), self._width_s, self._measure
-        nothing = np.full(count, measure.nothing)
+        nothing = np.full(count, measure.objective.nothing)
         found = Segments(np.full(count, until_s), z.copy(), np.zeros(count, bool), nothing)
         span, level = (until_s - t_s) / width_s, measure.level(t_s)
         trigger = self._system.decaying
@@ -205,7 +220,7 @@ class _Phase:
                 scale = math.exp(self._rate_per_s * width_s * cell) / level[going]
                 so_far = found.value[going]
                 value = self._objective(z * scale[:, None], until, np.maximum(so_far, known))
-                found.value[going] = measure.joined(so_far, value)
+                found.value[going] = measure.objective.joined(so_far, value)
             ended = crossed | (span[going] <= cell + 1)
             found.z[going[ended]] = self._within(z[ended], until[ended])
             going, z = going[~ended], z[~ended] @ self._across
@@ -227,3 +242,20 @@ class _Phase:
         """Return the state at position u ∈ [0, 1] of the cell."""
         terms = (z @ self._state).reshape(len(z), DEGREE + 1, z.shape[1])
         return np.asarray(np.einsum("ak,aki->ai", powers(u, DEGREE), terms))
+
+
+def _gramian(system: ContinuousLoop, measure: Measure, window_s: float) -> Matrix:
+    """Return ∫₀^window e^{Gᵀs} Cᵀ C e^{Gs} ds, scaled like the objective; CᵀC for event times."""
+    n = system.loop.n
+    if measure.output is None:  # the initial speed of e_s
+        speed = weight_of(system) @ system.generator[n : 2 * n]
+        return np.asarray(speed.T @ speed)
+    from scipy.linalg import expm
+
+    generator = system.generator + measure.rate_per_s * np.eye(3 * n)
+    points, weights = np.polynomial.legendre.leggauss(_GRAMIAN_POINTS)
+    total = np.zeros_like(generator)
+    for s, weight in zip((points + 1) / 2 * window_s, weights / 2 * window_s, strict=True):
+        y = measure.output @ expm(generator * s)
+        total += weight * (y.T @ y)
+    return total

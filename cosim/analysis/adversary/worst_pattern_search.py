@@ -2,9 +2,9 @@
 
 The search first evaluates regular and random patterns, improves each by changes of single
 decisions, and runs a beam search. Then it searches all patterns, depth first, up to a number of
-nodes. If this covers all patterns and the reference simulator confirms the value, the result is
-exact: no admissible pattern is worse, within the resolution of
-:mod:`cosim.analysis.adversary.segments`.
+nodes. If this covers all patterns, the result is exact: no admissible pattern is worse. In
+continuous time this is so within the resolution of :mod:`cosim.analysis.adversary.segments`, and
+the reference simulator has to confirm the value.
 """
 
 import math
@@ -17,15 +17,19 @@ from cosim.analysis.adversary.loss_patterns import guess, improve
 from cosim.analysis.adversary.objective import Objective, measure_of
 from cosim.analysis.adversary.pattern_evaluation import evaluate
 from cosim.analysis.adversary.pattern_tree import search_tree
+from cosim.analysis.adversary.sampled_flow import SampledFlow
+from cosim.analysis.adversary.sampled_run import run_of
 from cosim.analysis.adversary.search_nodes import Pattern, PatternSearch, SearchReport
 from cosim.analysis.adversary.segments import SegmentFlow
 from cosim.analysis.adversary.worst_run import Worst, certified_value, reported
 from cosim.simulation.continuous.continuous_loop import continuous_loop_of
 from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
 from cosim.simulation.continuous.network_fates import network_fates
+from cosim.simulation.sampled.sampled_loop import SampledLoop
 from noack.config.scenario import Scenario
 from noack.core.random_streams import stream
-from noack.theory.run_conditions import ideal_conditions
+from noack.theory.certificate import NetworkConditions
+from noack.theory.run_conditions import ideal_conditions, nominal_conditions
 from noack.theory.scenario_certificates import ScenarioCertificate, certify
 
 NODES = 500_000
@@ -38,6 +42,7 @@ def find_worst(
     resolved: Scenario,
     objective: Objective,
     *,
+    continuous: bool = False,
     most_nodes: int = NODES,
     beam: int = BEAM,
     certificate: ScenarioCertificate | None = None,
@@ -45,23 +50,59 @@ def find_worst(
 ) -> Worst:
     """Find the loss pattern that maximises the objective, of all that the guarantee allows.
 
-    The loop is the paper's, in exact continuous time without network delay; the first update is
-    delivered. The same arguments give the same result.
+    The first update is delivered. The same arguments give the same result.
 
     Args:
         resolved: the scenario; its guarantee is used, its loss model only for comparison.
         objective: the objective.
+        continuous: search the paper's loop in exact continuous time without network delay, not the
+            loop as the processes run it; for the policy "decaying" only.
         most_nodes: largest number of nodes of the search through all patterns; 0 for no search.
         beam: width of the beam search; 0 for no search.
         certificate: the certificate to compare with; by default that of the scenario's own plant,
-            for continuous triggering without network delay.
+            for the schedule without lateness, or for the paper's conditions.
         report: receives the progress.
 
     Raises:
-        CallerError: the events accumulate, or the threshold becomes too small before the horizon.
+        CallerError: the loop or its policy is not supported, the events accumulate, or the
+            threshold becomes too small before the horizon.
     """
+    if certificate is None:
+        certificate = certify(resolved, conditions_of(resolved, continuous=continuous))
+    find = _find_continuous if continuous else _find_sampled
+    return find(resolved, objective, certificate, beam, most_nodes, report)
+
+
+def conditions_of(resolved: Scenario, *, continuous: bool) -> NetworkConditions:
+    """Return the conditions of the search: the schedule without lateness, or the paper's."""
+    return ideal_conditions(resolved) if continuous else nominal_conditions(resolved)
+
+
+def _find_sampled(
+    resolved: Scenario, objective: Objective, certificate: ScenarioCertificate, beam: int,
+    most_nodes: int, report: SearchReport,
+) -> Worst:  # fmt: skip
+    began_s = time.monotonic()
+    flow = SampledFlow(SampledLoop(resolved), objective, certificate)
+    own = run_of(flow, network_fates(resolved))
+    first = 0 if flow.loop.known_start else 1
+    search = PatternSearch(flow, resolved.network.guarantee, report)
+    exact = _search(search, own.delivered[first:], beam, most_nodes)
+    pattern = search.pattern
+    worst = run_of(flow, lambda event: event - first >= len(pattern) or pattern[event - first])
+    lossless = run_of(flow, lambda event: True)
+    return Worst(
+        objective, flow.horizon_s, reported(worst.value, objective), worst.at_s, worst.delivered,
+        worst.event_s, exact, search.nodes, search.runs, reported(lossless.value, objective),
+        reported(own.value, objective), flow.certified, time.monotonic() - began_s,
+    )  # fmt: skip
+
+
+def _find_continuous(
+    resolved: Scenario, objective: Objective, certificate: ScenarioCertificate, beam: int,
+    most_nodes: int, report: SearchReport,
+) -> Worst:  # fmt: skip
     began_s, horizon_s = time.monotonic(), resolved.horizon_s
-    certificate = certificate or certify(resolved, ideal_conditions(resolved))
     constants = certificate.constants
     system = continuous_loop_of(resolved)
     measure = measure_of(system, objective, None if constants is None else constants.rate_per_s)
@@ -89,6 +130,7 @@ def find_worst(
         tuple(run.event_s.tolist()),
         exact and math.isclose(valued.value, search.value, rel_tol=_CONFIRMED),
         search.nodes,
+        search.runs,
         reported(evaluate(simulated(()), measure).value, objective),
         reported(evaluate(own, measure).value, objective),
         certified_value(certificate, measure, horizon_s, valued),
@@ -104,7 +146,7 @@ def _search(search: PatternSearch, own: Pattern, beam: int, most_nodes: int) -> 
         search_beam(search, beam, window_s)
     if most_nodes > 0:
         ceiling = None
-        if flow.measure.additive:
+        if isinstance(flow, SegmentFlow) and flow.objective.additive:
             ceiling = cost_ceiling(flow.system, search.guarantee.longest_burst, flow.horizon_s)
         if search_tree(search, most_nodes, ceiling):
             return True

@@ -24,7 +24,8 @@ _BREACH = 1 + 1e-9
 class Worst:
     """The worst run found, for one objective.
 
-    Values are in the objective's own units: Δ, X, ∫‖x‖² dt, seconds between two events.
+    In continuous time the values are Δ, X, ∫‖x‖² dt, and seconds between two events. In the
+    sampled loop Δ is not divided by β, and the bounds may have any shape instead of e^{−rt}.
     """
 
     objective: Objective
@@ -41,12 +42,14 @@ class Worst:
     """Whether every admissible pattern was covered; otherwise others may be worse."""
     nodes: int
     """Segments between events that were computed."""
+    runs: int
+    """Runs up to the horizon; if every pattern was covered, those of this search alone."""
     lossless: float | None
     """The value without losses."""
     own: float | None
     """The value with the losses of the scenario's own network."""
     certified: float | None
-    """The certificate's bound under the paper's conditions; None without a certificate."""
+    """The certificate's bound; None without a certificate."""
     elapsed_s: float = field(compare=False)
     """Wall time of the search."""
 
@@ -121,12 +124,14 @@ def _square_integral(constants: Constants, until_s: float) -> float:
 
 
 def document(
-    found: Sequence[Worst], resolved: Scenario, certificate: ScenarioCertificate
+    found: Sequence[Worst], resolved: Scenario, certificate: ScenarioCertificate, trigger: str
 ) -> dict[str, Any]:
     """Return the results as JSON."""
     return {
         "scenario": resolved.name,
         "mode": resolved.mode,
+        "policy": resolved.trigger.policy,
+        "trigger": trigger,
         "mansd": resolved.network.mansd,
         "guarantee": resolved.network.guarantee.meaning,
         "horizon_s": resolved.horizon_s,
@@ -136,8 +141,9 @@ def document(
 
 
 def print_worst(
-    console: Console, found: Sequence[Worst], resolved: Scenario, certificate: ScenarioCertificate
-) -> None:
+    console: Console, found: Sequence[Worst], resolved: Scenario,
+    certificate: ScenarioCertificate, trigger: str,
+) -> None:  # fmt: skip
     """Print the results and their loss patterns."""
     table = Table(
         title=f"{resolved.name}: worst losses found, {resolved.network.guarantee.meaning}, "
@@ -148,7 +154,7 @@ def print_worst(
     for worst in found:
         values = (worst.lossless, worst.own, worst.value, worst.certified)
         table.add_row(
-            _quantity(worst.objective, certificate),
+            _quantity(worst.objective, certificate, trigger),
             *(number(value, 4) for value in values),
             "[bold red]exceeded[/]" if worst.breaches else number(worst.tightness, 4),
         )
@@ -156,13 +162,22 @@ def print_worst(
     for worst in found:
         at = "" if worst.at_s is None else f"worst at {worst.at_s:.6f} s; "
         how = "all patterns searched" if worst.exact else "not all patterns searched"
-        speed = f"{worst.nodes:,} segments, {worst.nodes / worst.elapsed_s:,.0f} per second"
+        speed = (
+            f"{worst.runs:,} runs; {worst.nodes:,} segments, "
+            f"{worst.nodes / worst.elapsed_s:,.0f} per second"
+        )
         console.print(f"{worst.objective.value}: {at}{how} ({speed})")
         console.print(f"  {worst.text}", soft_wrap=True, highlight=False)
+    if trigger == "sampled" and _is_shaped(certificate):
+        console.print("[dim]Scaled: multiplied by bound(0) / bound(t)[/]")
+    if certificate.void is not None:
+        console.print(f"[dim]Nothing is certified: {certificate.void}[/]")
     console.print("[dim]One letter per event: D delivered, · lost. --json prints their times[/]")
 
 
-def _quantity(objective: Objective, certificate: ScenarioCertificate) -> str:
+def _quantity(objective: Objective, certificate: ScenarioCertificate, trigger: str) -> str:
+    if trigger == "sampled":
+        return _sampled_quantity(objective, certificate)
     rate = certificate.alpha_per_s
     if certificate.constants is not None:
         rate = certificate.constants.rate_per_s
@@ -174,3 +189,22 @@ def _quantity(objective: Objective, certificate: ScenarioCertificate) -> str:
         Objective.COST: "∫ ‖x‖² dt",
         Objective.INTER_EVENT: "inter-event time, s",
     }[objective]
+
+
+def _sampled_quantity(objective: Objective, certificate: ScenarioCertificate) -> str:
+    constants, scaled = certificate.constants, ""
+    if _is_shaped(certificate):
+        scaled = ", scaled"
+    elif constants is not None and constants.rate_per_s:
+        scaled = f" e^({constants.rate_per_s:.3g}t)"
+    return {
+        Objective.ERROR: f"‖e_c‖{scaled}",
+        Objective.STATE: f"‖x‖{scaled}",
+        Objective.COST: "∫ ‖x‖² dt",
+        Objective.INTER_EVENT: "inter-event time, s",
+    }[objective]
+
+
+def _is_shaped(certificate: ScenarioCertificate) -> bool:
+    """Return whether the bounds are not c e^{−rt}."""
+    return certificate.persistent_constants is not None or certificate.floor_constants is not None

@@ -23,6 +23,7 @@ class AdversaryAim(StrEnum):
     ("noack adversary lane_following", "all objectives"),
     ("noack adversary lane_following --objective error --json", "the controller's error only"),
     ("noack adversary unstable_pendulum --horizon 2 --beam 64", "a faster search"),
+    ("noack adversary lane_following --trigger continuous", "the paper's loop, in exact time"),
 ])  # fmt: skip
 def adversary(
     scenario: cli.ScenarioArgument,
@@ -46,34 +47,36 @@ def adversary(
         ),
     ] = 500_000,
     beam: Annotated[int, typer.Option(help="Width of the beam search, in runs.", min=0)] = 512,
+    trigger: cli.TriggerOption = cli.TriggerMode.SAMPLED,
     settings: cli.SetOption = None,
     json: cli.JsonOption = False,
 ) -> int:
     """Search for the worst losses that the network may cause; compare them with the bounds.
 
+    The loop is that of the processes; with --trigger continuous it is the paper's, without delays.
     Exit status 1: a certified bound was exceeded.
     """
-    from cosim.analysis.adversary import Objective, find_worst
+    from cosim.analysis.adversary import Objective, conditions_of, find_worst
     from cosim.analysis.adversary.worst_run import document, print_worst
     from cosim.live.progress import search_status
     from noack.config.resolution import resolve
-    from noack.theory.run_conditions import ideal_conditions
     from noack.theory.scenario_certificates import certify
 
     given = [] if horizon is None else [f"horizon_s={horizon}"]
     resolved = resolve(cli.load_scenario(scenario, [*(settings or ()), *given]))
-    certificate = certify(resolved, ideal_conditions(resolved))
+    continuous = trigger is cli.TriggerMode.CONTINUOUS
+    certificate = certify(resolved, conditions_of(resolved, continuous=continuous))
     aims = list(Objective) if objective is AdversaryAim.ALL else [Objective(objective.value)]
     with search_status() as report:
         found = [
             find_worst(
-                resolved, aim, most_nodes=nodes, beam=beam, certificate=certificate,
-                report=report(aim.value),
+                resolved, aim, continuous=continuous, most_nodes=nodes, beam=beam,
+                certificate=certificate, report=report(aim.value),
             )
             for aim in aims
         ]  # fmt: skip
     if json:
-        cli.print_json(document(found, resolved, certificate))
+        cli.print_json(document(found, resolved, certificate, trigger.value))
     else:
-        print_worst(cli.console(), found, resolved, certificate)
+        print_worst(cli.console(), found, resolved, certificate, trigger.value)
     return ExitStatus.FAILED if any(worst.breaches for worst in found) else ExitStatus.OK

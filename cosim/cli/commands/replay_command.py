@@ -24,7 +24,7 @@ def replay(
 
     path = chosen_run(run_dir, runs)
     with PatientConsole(stderr=True).status("replaying"):
-        found = replay_record(load_record(path))
+        found = replay_record(load_record(path, network=True))
     changed = changed_since(path)
     if json:
         cli.print_json(found.document() | {"changed_since": changed})

@@ -1,9 +1,6 @@
 """``noack simulate``: a run in virtual time."""
 
-from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from cosim.cli import command as cli
 from cosim.cli.execute_run import RunOutput, finalize_run, warn_of_violations
@@ -20,13 +17,6 @@ if TYPE_CHECKING:
 _EVENTS_SHOWN = 40
 
 
-class TriggerMode(StrEnum):
-    """When a simulated sensor compares its error with the threshold."""
-
-    SAMPLED = "sampled"
-    CONTINUOUS = "continuous"
-
-
 @cli.command(cli.RUNS, 30, [
     ("noack simulate lane_following", "the processes of a live run, without sockets"),
     ("noack simulate lane_following --trigger continuous", "the paper's loop, exactly"),
@@ -36,13 +26,7 @@ def simulate(
     scenario: cli.ScenarioArgument,
     *,
     settings: cli.SetOption = None,
-    trigger: Annotated[
-        TriggerMode,
-        typer.Option(
-            help="sampled: test the trigger at each measurement, as in a live run; "
-            "continuous: at all times."
-        ),
-    ] = TriggerMode.SAMPLED,
+    trigger: cli.TriggerOption = cli.TriggerMode.SAMPLED,
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
     report: cli.ReportOption = True,
     verbose: cli.VerboseOption = False,
@@ -54,7 +38,7 @@ def simulate(
     """
     loaded = cli.load_scenario(scenario, settings)
     warn_of_violations(loaded)
-    if trigger is TriggerMode.CONTINUOUS:
+    if trigger is cli.TriggerMode.CONTINUOUS:
         return _simulate_continuously(loaded, json=json)
     from cosim.live.progress import PatientConsole, simulation_bar
     from cosim.live.simulated_run import simulate_run

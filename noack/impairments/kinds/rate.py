@@ -1,8 +1,9 @@
 """A bottleneck with a finite queue, and a discipline for the queue."""
 
 from collections.abc import Sequence
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from noack.impairments.disciplines import DISCIPLINES, Discipline
@@ -81,6 +82,15 @@ class Rate(Impairment):
                 "more rate, a shorter queue or fewer bytes of overhead per cell"
             )
         return self
+
+    def line_bits(self, payload_bytes: Any) -> Any:
+        """Return the bits that a payload needs on the link; for an array, those of each entry."""
+        line_bytes = np.maximum(payload_bytes + self.overhead_bytes, 0)
+        if self.cell_bytes:
+            line_bytes = -(-line_bytes // self.cell_bytes) * (
+                self.cell_bytes + self.cell_overhead_bytes
+            )
+        return 8 * line_bytes
 
     @property
     def rule(self) -> Behaviour | None:

@@ -18,7 +18,7 @@ def run(*arguments: str) -> tuple[int, str, str]:
 
 
 def test_json_contains_all_results() -> None:
-    status, stdout, stderr = run("--json")
+    status, stdout, stderr = run("--json", "--trigger", "continuous")
     assert status == ExitStatus.OK, stderr
     document = json.loads(stdout)
     assert document["horizon_s"] == 6.0
@@ -42,8 +42,26 @@ def test_the_text_output_shows_the_patterns_of_one_objective() -> None:
     assert "cost" not in stdout
 
 
+def test_a_policy_is_searched_in_the_sampled_loop() -> None:
+    """Without losses x_c differs from x by more than δ only where a test comes too late."""
+    trigger = 'trigger={policy="absolute", delta=0.1}'
+    arguments = ("--objective", "error", "--set", trigger, "--set", "network.mansd=0")
+    status, stdout, _ = run(*arguments, "--json")
+    document = json.loads(stdout)
+    worst = document["worst"]["error"]
+    assert status == ExitStatus.OK
+    assert (document["policy"], document["trigger"]) == ("absolute", "sampled")
+    assert document["certificate"]["conditions"]["sampling_s"] == 0.002
+    assert worst["exact"]
+    assert worst["runs"] == 1
+    assert 0.1 < worst["value"] < 0.105
+    assert "‖e_c‖, scaled" in run(*arguments)[1]
+
+
 def test_settings_replace_values_of_the_scenario() -> None:
-    status, stdout, _ = run("--objective", "error", "--set", "network.mansd=0", "--json")
+    status, stdout, _ = run(
+        "--objective", "error", "--set", "network.mansd=0", "--json", "--trigger", "continuous"
+    )
     assert status == ExitStatus.OK
     assert json.loads(stdout)["worst"]["error"]["value"] == pytest.approx(1.0, rel=1e-6)
 

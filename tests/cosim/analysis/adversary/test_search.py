@@ -1,7 +1,8 @@
-"""The adversary's search against all patterns tried one by one, and against certificates."""
+"""The search in continuous time against all patterns tried one by one, and certificates."""
 
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +11,13 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from cosim.analysis.adversary import Objective, Worst, find_worst
+from cosim.analysis.adversary import Objective, Worst
 from cosim.analysis.adversary.beam_search import search_beam
 from cosim.analysis.adversary.cost_bound import cost_ceiling
 from cosim.analysis.adversary.pattern_evaluation import evaluate
 from cosim.analysis.adversary.pattern_tree import search_tree
 from cosim.analysis.adversary.search_nodes import Nodes, PatternSearch
+from cosim.analysis.adversary.worst_pattern_search import find_worst as find_any
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load, validate
@@ -27,6 +29,8 @@ from tests.cosim.analysis.adversary.scenarios import every_run, flow_of, scenari
 LANE = Path(__file__).parents[4] / "scenarios" / "lane_following.toml"
 CAP = LossGuarantee((LongestBurst(4),))
 MANY = settings(suppress_health_check=list(HealthCheck), phases=[Phase.generate])
+
+find_worst = partial(find_any, continuous=True)
 
 
 def signed(worst: Worst) -> float:

@@ -1,0 +1,259 @@
+"""The summary of a run of several loops: the network that they share, and a line for each loop."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, ValidationError, model_validator
+
+from cosim.analysis.run_summary import Outcome
+from cosim.analysis.summary_model import (
+    Count,
+    Counts,
+    ExitPart,
+    Real,
+    ReplayPart,
+    SummaryPart,
+    Text,
+    can_be_shown,
+)
+from cosim.record.run_record import Rows, RunRecord
+from noack.config.loops import phases_ns
+from noack.core.clock import NS_PER_S
+from noack.core.errors import ExitStatus
+from noack.impairments.kinds.rate import Rate
+from noack.protocol.record_tables import NETEM_PACKET, Fate, effective
+
+_BINS = 200
+_MOST_NAMED = 3
+
+
+class LoopPart(SummaryPart):
+    """A loop of the run; the summary of its own run directory has more."""
+
+    name: Text
+    number: Count
+    phase_s: float
+    exit: ExitPart
+    events: Count
+    deliveries: Count
+    drops: Count
+    drops_by_cause: Counts
+    forced_deliveries: Count
+    longest_loss_burst: Count
+    link_share: Real
+    """Share of the bytes that the network forwarded."""
+    delay_mean_s: Real
+    """Mean time of a forwarded datagram in the network."""
+    delay_max_s: Real
+    sup_e_c_norm: Real
+    final_state_norm: Real
+    diverged_at_s: Real
+    claims: Counts
+    """Number of claims by verdict."""
+
+
+class InFlightPart(SummaryPart):
+    """Datagrams inside the network: those that wait, are sent or are delayed."""
+
+    mean: float
+    max: Count
+    width_s: float
+    """Width of the intervals of the two lists."""
+    mean_by_interval: list[float]
+    max_by_interval: list[Count]
+
+
+class NetworkPart(SummaryPart):
+    """The network that all loops share, in the direction of the updates."""
+
+    datagrams: Count
+    forwarded: Count
+    """Of these, some may still be in the network at the end of the run."""
+    forced_deliveries: Count
+    drops_by_cause: Counts
+    longest_loss_burst: Count
+    rate_bps: Count | None
+    """The lowest rate of its bottlenecks; None without one."""
+    utilisation: Real
+    """Share of this rate that the datagrams used that left until the end, with their overhead."""
+    in_flight: InFlightPart
+
+
+class SharedSummary(SummaryPart):
+    """The content of ``summary.json`` of a run of several loops."""
+
+    kind: Literal["live", "simulated"]
+    startup_s: Real
+    scenario: Text
+    mansd: Count
+    constraints: list[str]
+    horizon_s: float
+    speed: float
+    reached_s: float
+    network: NetworkPart
+    loops: Annotated[list[LoopPart], Field(min_length=1)]
+    replay: ReplayPart | None = None
+    """The replay of the network; those of the other processes are in the loops' summaries."""
+    exit: ExitPart
+
+    @model_validator(mode="after")
+    def _numbers_are_in_turn(self) -> Self:
+        if [one.number for one in self.loops] != [*range(len(self.loops))]:
+            raise ValueError("the loops are numbered in turn")
+        return self
+
+
+def is_shared(summary: Mapping[str, Any]) -> bool:
+    """Return whether a summary is that of a run of several loops."""
+    return "loops" in summary
+
+
+def is_complete(summary: Mapping[str, Any]) -> bool:
+    """Return whether a file contains a complete summary of this version, of any kind of run."""
+    if not is_shared(summary):
+        return can_be_shown(summary)
+    try:
+        SharedSummary.model_validate(summary)
+    except ValidationError:
+        return False
+    return True
+
+
+def summarise_shared(
+    network: RunRecord, loops: Sequence[Outcome], end: ExitPart, startup_s: float | None = None
+) -> SharedSummary:
+    """Return the summary of a run, from the record of its network and the outcomes of its loops.
+
+    ``end`` is how the run ended; a run that completed has failed if one of its loops failed.
+    """
+    scenario = network.scenario
+    packets = network[NETEM_PACKET]
+    packets = packets[packets["flow"] < len(loops)]  # the others are acknowledgements
+    forwarded_bytes = np.bincount(
+        packets["flow"], np.where(packets["release_ns"] >= 0, packets["size_bytes"], 0), len(loops)
+    )
+    phases = phases_ns(scenario)
+    parts = [
+        _loop_part(
+            number, phases[number], one, packets[packets["flow"] == number],
+            float(forwarded_bytes[number] / max(forwarded_bytes.sum(), 1)),
+        )
+        for number, one in enumerate(loops)
+    ]  # fmt: skip
+    return SharedSummary(
+        kind=network.kind,
+        startup_s=startup_s,
+        scenario=scenario.name,
+        mansd=scenario.network.mansd,
+        constraints=[one.text() for one in scenario.network.constraints],
+        horizon_s=scenario.horizon_s,
+        speed=scenario.speed,
+        reached_s=min(float(one.summary["reached_s"]) for one in loops),
+        network=_network_part(network, packets, parts),
+        loops=parts,
+        exit=end if end.status != ExitStatus.OK else _end(end, parts),
+    )
+
+
+def _end(end: ExitPart, loops: Sequence[LoopPart]) -> ExitPart:
+    failed = [one for one in loops if one.exit.status != ExitStatus.OK]
+    if not failed:
+        return end
+    named = [f"{one.name} {_brief(one)}" for one in failed[:_MOST_NAMED]]
+    more = len(failed) - len(named)
+    shown = ", ".join(named) + (f" and {more} more" if more else "")
+    reason = f"{len(failed)} of {len(loops)} loops failed ({shown})"
+    return ExitPart(status=int(ExitStatus.FAILED), reason=reason)
+
+
+def _brief(loop: LoopPart) -> str:
+    if loop.diverged_at_s is not None:
+        return f"diverged at {loop.diverged_at_s:.2f} s"
+    return f"failed: {loop.exit.reason}"
+
+
+def _loop_part(
+    number: int, phase_ns: int, outcome: Outcome, packets: Rows, share: float
+) -> LoopPart:
+    summary = outcome.summary
+    delays_s = _delays_ns(packets) / NS_PER_S
+    same = (
+        "events", "deliveries", "drops", "drops_by_cause", "forced_deliveries",
+        "longest_loss_burst", "sup_e_c_norm", "final_state_norm", "diverged_at_s",
+    )  # fmt: skip
+    return LoopPart(
+        name=Path(outcome.run_dir).name,
+        number=number,
+        phase_s=phase_ns / NS_PER_S,
+        exit=ExitPart(status=int(outcome.status), reason=outcome.reason),
+        link_share=share,
+        delay_mean_s=float(delays_s.mean()) if len(delays_s) else None,
+        delay_max_s=float(delays_s.max()) if len(delays_s) else None,
+        claims=dict(Counter(str(claim["verdict"]) for claim in summary["claims"])),
+        **{key: summary[key] for key in same},
+    )
+
+
+def _network_part(network: RunRecord, packets: Rows, loops: Sequence[LoopPart]) -> NetworkPart:
+    fates, forwarded = packets["fate"], packets["release_ns"] >= 0
+    rates = [one for one in network.scenario.network.impairments if isinstance(one, Rate)]
+    slowest = min(rates, key=lambda one: one.rate_bps, default=None)
+    horizon_ns = network.scenario.timing.horizon_ns
+    in_time = forwarded & (packets["release_ns"] <= horizon_ns)
+    bits = 0 if slowest is None else slowest.line_bits(packets["size_bytes"][in_time]).sum()
+    return NetworkPart(
+        datagrams=len(packets),
+        forwarded=int(forwarded.sum()),
+        forced_deliveries=int((fates == Fate.FORCED).sum()),
+        drops_by_cause=dict(sum((Counter(one.drops_by_cause) for one in loops), Counter())),
+        longest_loss_burst=max(one.longest_loss_burst for one in loops),
+        rate_bps=None if slowest is None else slowest.rate_bps,
+        utilisation=(
+            None if slowest is None else float(bits / slowest.rate_bps / horizon_ns * NS_PER_S)
+        ),
+        in_flight=in_flight(packets, horizon_ns),
+    )
+
+
+def _delays_ns(packets: Rows) -> NDArray[np.int64]:
+    """The times of the effectively delivered datagrams in the network."""
+    delivered = packets[effective(packets["fate"])]
+    delays: NDArray[np.int64] = delivered["release_ns"] - delivered["now_ns"]
+    return delays
+
+
+def in_flight(packets: Rows, horizon_ns: int) -> InFlightPart:
+    """Return how many datagrams were inside the network, in intervals of equal width."""
+    begins, ends = [], []
+    for column in ("release_ns", "copy_ns"):
+        delayed = packets[packets[column] > packets["now_ns"]]
+        begins.append(delayed["now_ns"])
+        ends.append(delayed[column])
+    begin_ns, end_ns = np.sort(np.concatenate(begins)), np.sort(np.concatenate(ends))
+    edges_ns = np.linspace(0, horizon_ns, _BINS + 1)
+    # The number of datagrams at t is the number of begins minus the number of ends up to t; its
+    # integral from 0 to t is the sum of the times since each begin, minus that since each end.
+    integral = _time_since(begin_ns, edges_ns) - _time_since(end_ns, edges_ns)
+    at_ns = np.unique(np.concatenate([begin_ns, edges_ns[:-1].astype(np.int64)]))
+    counts = np.searchsorted(begin_ns, at_ns, "right") - np.searchsorted(end_ns, at_ns, "right")
+    places = np.searchsorted(at_ns, edges_ns[:-1].astype(np.int64))
+    largest = np.maximum.reduceat(counts, places)
+    width_ns = horizon_ns / _BINS
+    return InFlightPart(
+        mean=float(integral[-1] / horizon_ns),
+        max=int(largest.max()),
+        width_s=width_ns / NS_PER_S,
+        mean_by_interval=(np.diff(integral) / width_ns).round(6).tolist(),
+        max_by_interval=largest.tolist(),
+    )
+
+
+def _time_since(moments_ns: NDArray[np.int64], at_ns: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the sum over the moments before each time of the time since then."""
+    before = np.searchsorted(moments_ns, at_ns, "right")
+    sums = np.append(0.0, np.cumsum(moments_ns, dtype=np.float64))
+    return np.asarray(before * at_ns - sums[before])

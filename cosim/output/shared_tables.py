@@ -1,0 +1,100 @@
+"""Terminal output of a run of several loops: its network, and its loops, the worst first."""
+
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from cosim.analysis.run_summary import Summary
+from noack.core.errors import ExitStatus
+from noack.core.number_format import number, ratio
+
+_MOST_LOOPS = 12
+_HEADINGS = (
+    "loop", "sent", "lost", "burst", "forced", "link, %", "delay, s", "‖e_c‖", "claims held",
+)  # fmt: skip
+_CAPTION = (
+    "burst: most consecutive losses; forced: delivered by the guarantee; link: share of the "
+    "forwarded bytes; delay and ‖e_c‖: largest"
+)
+
+
+def print_shared(console: Console, summary: Summary, *, verbose: bool = False) -> None:
+    """Print how the run ended, the network, and the loops; without ``verbose`` the worst only."""
+    end, reached = summary["exit"], f"{summary['reached_s']:g} s"
+    if end["status"] == ExitStatus.OK:
+        console.print(f"[green]completed {reached}[/], {len(summary['loops'])} loops")
+    else:
+        reached += f" of {summary['horizon_s']:g} s"
+        console.print(f"[bold red]failed after {reached}:[/] {escape(end['reason'])}")
+    console.print(_network_table(summary))
+    loops = sorted(summary["loops"], key=_badness, reverse=True)
+    shown = loops if verbose else loops[:_MOST_LOOPS]
+    if len(shown) == len(loops):
+        shown = summary["loops"]
+    table = Table(
+        title="loops" + ("" if len(shown) == len(loops) else ", the worst first"), caption=_CAPTION
+    )
+    for place, heading in enumerate(_HEADINGS):
+        table.add_column(heading, justify="right" if place else "left", no_wrap=not place)
+    for loop in shown:
+        table.add_row(*map(escape, _row(loop)))
+    console.print(table)
+    if more := len(loops) - len(shown):
+        console.print(f"and {more} more loops: --verbose shows all")
+
+
+def _badness(loop: dict[str, Any]) -> tuple[Any, ...]:
+    claims = loop["claims"]
+    error = loop["sup_e_c_norm"]
+    return (
+        loop["exit"]["status"] != ExitStatus.OK, claims.get("violated", 0), claims.get("void", 0),
+        loop["longest_loss_burst"], float("inf") if error is None else error,
+    )  # fmt: skip
+
+
+def _network_table(summary: Summary) -> Table:
+    network, flying = summary["network"], summary["network"]["in_flight"]
+    sent = network["datagrams"]
+    lost = sum(network["drops_by_cause"].values())
+    causes = "".join(
+        f", {n} {cause.replace('_', ' ')}" for cause, n in network["drops_by_cause"].items()
+    )
+    rows = [
+        ("datagrams of all loops", f"{sent} ({sent / summary['horizon_s']:.4g} /s)"),
+        ("lost", f"{lost} ({ratio(lost, sent)}){causes}"),
+        ("longest loss burst, cap", f"{network['longest_loss_burst']}, {summary['mansd']}"),
+        ("forced by the guarantee", str(network["forced_deliveries"])),
+        ("in the network: mean, max", f"{flying['mean']:.3g}, {flying['max']} datagrams"),
+    ]
+    if network["rate_bps"] is not None:
+        used = f"{100 * network['utilisation']:.3g} % of {network['rate_bps']:,} bit/s"
+        rows.append(("link used", used.replace(",", " ")))
+    if (replay := summary["replay"]) is not None:
+        exact = {True: "bit-exact", False: "differs", None: "not possible"}[replay["bit_exact"]]
+        rows.append(("replay of the network", exact))
+    kind = "" if summary["kind"] == "live" else f", {summary['kind']}"
+    further = "".join(f", {one}" for one in summary["constraints"])
+    table = Table(
+        title=escape(f"network of {summary['scenario']}, M − 1 = {summary['mansd']}{further}{kind}")
+    )
+    table.add_column("quantity")
+    table.add_column("value", justify="right")
+    for row in rows:
+        table.add_row(*map(escape, row))
+    return table
+
+
+def _row(loop: dict[str, Any]) -> tuple[str, ...]:
+    claims = loop["claims"]
+    held = f"{claims.get('held', 0)} of {sum(claims.values())}"
+    worse = [f"{claims['violated']} violated"] if claims.get("violated") else []
+    if loop["exit"]["status"] != ExitStatus.OK:
+        worse = ["failed"]
+    return (
+        loop["name"], str(loop["events"]), str(loop["drops"]),
+        str(loop["longest_loss_burst"]), str(loop["forced_deliveries"]),
+        number(100 * loop["link_share"]), number(loop["delay_max_s"]),
+        number(loop["sup_e_c_norm"]), ", ".join([held, *worse]),
+    )  # fmt: skip

@@ -1,0 +1,193 @@
+"""Makes the data of a scenario's loop for :mod:`cosim.simulation.sampled.loop_steps`."""
+
+from functools import cache
+from itertools import islice
+from typing import Any
+
+import numpy as np
+
+from cosim.simulation.sampled import loop_steps
+from cosim.simulation.sampled.loop_steps import NO_TICK, Loop, Numbers, Rule, Runs, Scales, Scratch
+from noack.config.resolution import LoopMatrices, loop_of, policy_of
+from noack.config.scenario import Scenario
+from noack.config.state_estimation import assumed_model
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix, Vector, discretise, transition
+from noack.theory.run_conditions import network_delay_ns
+from noack.trigger import self_triggered_interval
+from noack.trigger.self_triggered_interval import Forecast
+from noack.trigger.trigger_rule import TriggerRule
+from plant_server.disturbance_signal import disturbance_of
+from plant_server.measurement import measurement_model_of
+
+_NO_FORECAST = Forecast(1.0, 1.0, 0.0, 0.0, 0.0, 0.0)
+
+
+class SampledLoop:
+    """The loop of a resolved scenario; every delivered update takes the longest certified delay.
+
+    Raises:
+        CallerError: the loop is not linear between events, or the policy is not a rule.
+    """
+
+    def __init__(self, resolved: Scenario) -> None:
+        coverage, timing = resolved.coverage, resolved.timing
+        coverage.require_unchanging()
+        coverage.require_certifiable()
+        if timing.actuation_timeout_ns <= timing.controller_period_ns + timing.plant_period_ns:
+            raise CallerError(
+                "plant.watchdog.timeout_s: shorter than the time between two inputs; "
+                "give a time after which the watchdog acts on a failure only"
+            )
+        policy, self.matrices = policy_of(resolved), loop_of(resolved)
+        self._resolved, n = resolved, self.matrices.n
+        self.last = timing.horizon_ns // timing.plant_period_ns
+        self.step_s = timing.plant_period_ns * 1e-9
+        self.weight = np.eye(n) if self.matrices.weight is None else self.matrices.weight
+        self.delay_ns = network_delay_ns(resolved, 0)
+        self._rule = rule_of(policy.trigger_rule(n), n)
+        self._first_auxiliary = policy.initial_dynamic_variable
+        self._loop = _loop(resolved, self.matrices, self.delay_ns)
+        self._under_way = self.delay_ns // timing.measurement_period_ns + 2
+        size = max(n, len(self._loop.C))
+        self._own = Scratch(np.empty(n), np.empty(size), np.empty(2 * n))
+
+    @property
+    def known_start(self) -> bool:
+        """Whether sensor and controller start from x(0), without a packet."""
+        return self._resolved.network.initial_sync == "known_state"
+
+    def start(self) -> Runs:
+        """Return one run at its start: after the delivered first packet, if there is one."""
+        n, known = self.matrices.n, self.known_start
+        runs = self.empty(1)
+        x0 = self.matrices.x0
+        runs.x[0], runs.auxiliary[0], runs.step[0] = x0, self._first_auxiliary, -1
+        if known:
+            runs.x_s[0] = runs.x_c[0] = x0
+        observer = self._resolved.observer
+        if observer is not None:
+            given = observer.initial_estimate
+            runs.y[0] = (x0 if known else np.zeros(n)) if given is None else np.array(given)
+        if not known:
+            loop_steps.measure(self._loop, runs, 0, 0, self._own)
+            runs.step[0] = 0
+            self.update(runs, np.array([True]))
+        return runs
+
+    def empty(self, count: int) -> Runs:
+        """Return runs at 0."""
+        n, m, r = self.matrices.n, self.matrices.m, self._under_way
+        return Runs(
+            np.zeros(count, np.int64), np.zeros((count, n)), np.zeros((count, n)),
+            np.zeros((count, n)), np.zeros((count, n)), np.zeros((count, m)),
+            np.zeros((count, m)), np.full((count, r), -1.0), np.zeros((count, r, n)),
+            np.zeros(count), np.zeros(count, np.bool_), np.zeros(count), np.zeros(count),
+            np.zeros(count), np.zeros(count, np.int64), np.zeros(count, np.int64),
+        )  # fmt: skip
+
+    def update(self, runs: Runs, delivered: Any) -> None:
+        """Make the events of runs: x_s = y, and send the update of the delivered ones, (N,)."""
+        runs.x_s[:] = runs.y
+        rows = np.flatnonzero(delivered)
+        place = (runs.sent[rows] >= 0).sum(axis=1)
+        runs.sent[rows, place] = runs.step[rows]
+        runs.updates[rows, place] = runs.y[rows]
+
+    def follow(self, runs: Runs, scales: Scales, last: Numbers, *, tests: bool = True) -> None:
+        """Advance runs in place to their next events, at most to their steps ``last``, (N,).
+
+        Without ``tests`` there are no events.
+        """
+        _compiled()(self._loop, self._rule, scales, runs, last, tests, self._own)
+
+
+@cache
+def _compiled() -> Any:
+    from netem.engine.compiled_rules import compile_kept, prepare
+
+    return compile_kept(
+        loop_steps.follow, prepare("sampled", (self_triggered_interval, loop_steps))
+    )
+
+
+def rule_of(rule: TriggerRule, n: int) -> Rule:
+    """Return a trigger rule as numbers."""
+    nothing = np.zeros((0, 2 * n))
+    variable = rule.dynamic_variable
+    gain = (nothing, nothing) if variable is None else variable.gain
+    up, down, gain_up, gain_down = map(_dense, (*rule.form, *gain))
+    return Rule(
+        up=up, down=down, level=float(rule.level), rate_per_s=float(rule.rate_per_s),
+        floor=float(rule.floor), from_event=rule.from_event, grid_ns=round(rule.grid_ns),
+        integrates=rule.integrates, idle_ns=float(rule.idle_ns),
+        longest_ns=float(rule.longest_ns), shortest_ns=float(rule.shortest_ns),
+        forecasts=rule.forecast is not None, forecast=Forecast(
+            *map(float, _NO_FORECAST if rule.forecast is None else rule.forecast)
+        ),
+        weight=np.eye(n) if rule.weight is None else _dense(rule.weight),
+        has_dynamic_variable=variable is not None,
+        decay_per_s=0.0 if variable is None else float(variable.decay_per_s),
+        gain_up=gain_up, gain_down=gain_down,
+    )  # fmt: skip
+
+
+def _loop(resolved: Scenario, matrices: LoopMatrices, delay_ns: int) -> Loop:
+    timing, n, K = resolved.timing, matrices.n, matrices.K
+    period_ns, steps = timing.plant_period_ns, timing.horizon_ns // timing.plant_period_ns
+    A, B = discretise(matrices.A, matrices.B, period_ns)
+    assumed, measurements = assumed_model(resolved), steps // resolved.plant.measure_every + 1
+    gains = np.zeros((0, n, len(assumed.C)))
+    if resolved.observer is not None:
+        gains = np.array(list(islice(resolved.observer.gains(assumed), measurements)))
+    tick_ns, phase_ns = timing.controller_period_ns, timing.controller_phase_ns
+    step_ns = np.arange(steps + 1) * period_ns
+    last_tick_ns = (step_ns + period_ns - 1 - phase_ns) // tick_ns * tick_ns + phase_ns
+    ticks = (last_tick_ns >= step_ns) & (last_tick_ns >= phase_ns)
+    after_ns, tick = np.unique(last_tick_ns[ticks] - step_ns[ticks], return_inverse=True)
+    tick_of = np.full(steps + 1, NO_TICK)
+    tick_of[ticks] = tick
+    acts = np.searchsorted(np.where(ticks, last_tick_ns, step_ns), step_ns + delay_ns)
+    wait = acts - np.arange(steps + 1)
+    waits, age = np.unique(wait, return_inverse=True)
+    safe = resolved.controller.safe_input
+    known = resolved.network.initial_sync == "known_state"
+    return Loop(
+        period_ns, resolved.plant.measure_every, -1 if known else int(wait[0]), A, B,
+        _pushes(resolved, matrices, steps), _dense(assumed.Ad), _dense(assumed.Bd),
+        _dense(assumed.C), _dense(gains), _noise(resolved, measurements, assumed.C),
+        transition(matrices.H, period_ns), tick_of,
+        _dense(np.array([K @ transition(matrices.H, int(s)) for s in after_ns])),
+        wait.astype(np.int64), age.astype(np.int64),
+        _dense(np.array([transition(matrices.H, int(s) * period_ns) for s in waits])),
+        np.zeros(matrices.m) if safe is None else np.array(safe, dtype=np.float64),
+    )  # fmt: skip
+
+
+def _pushes(resolved: Scenario, matrices: LoopMatrices, steps: int) -> Matrix:
+    """Return the changes of x by the disturbance of each step, (steps, n); (0, n) for none."""
+    disturbance = disturbance_of(resolved)
+    if disturbance is None:
+        return np.zeros((0, matrices.n))
+    period_ns = resolved.timing.plant_period_ns
+    _, through = discretise(matrices.A, np.hstack([matrices.B, np.eye(matrices.n)]), period_ns)
+    m, found = matrices.m, np.zeros((steps, matrices.n))
+    for step in range(steps):
+        d, w = disturbance(step)
+        for part, at in ((d, through[:, :m]), (w, through[:, m:])):
+            if len(part):
+                found[step] += at @ part
+    return found
+
+
+def _noise(resolved: Scenario, measurements: int, C: Matrix) -> Matrix:
+    """Return the noise of each measurement, (measurements, p); (0, p) for none."""
+    model = measurement_model_of(resolved)
+    if model is None or not resolved.plant.measurement.is_noisy:
+        return np.zeros((0, len(C)))
+    nothing: Vector = np.zeros(C.shape[1])
+    return np.array([model(nothing, number) for number in range(measurements)])
+
+
+def _dense(matrix: Matrix | Numbers) -> Matrix:
+    return np.ascontiguousarray(matrix, dtype=np.float64)

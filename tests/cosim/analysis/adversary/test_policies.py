@@ -1,0 +1,200 @@
+"""The search of the sampled loop, for every policy, against all patterns run by the machines."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from cosim.analysis.adversary import Objective, conditions_of, find_worst
+from cosim.analysis.adversary.sampled_flow import SampledFlow
+from cosim.analysis.adversary.sampled_run import run_of
+from cosim.analysis.adversary.search_nodes import Pattern
+from cosim.record.run_record import RunRecord
+from cosim.simulation.sampled.sampled_loop import SampledLoop
+from cosim.simulation.virtual_time import simulate
+from noack.config.feature_kinds import POLICIES
+from noack.config.resolution import resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import validate
+from noack.core.errors import CallerError
+from noack.theory.scenario_certificates import ScenarioCertificate, certify
+
+EXAMPLES = {
+    name: example.model_dump(mode="json", exclude_none=True)
+    for name, made in POLICIES.items()
+    if (example := made.example(2)) is not None
+}
+OWN = {
+    "periodic": {"period_s": 0.25},
+    "self_triggered": {"longest_s": 0.6},
+    "decaying": {"beta": 0.2},
+    "dynamic": {"eta_0": 0.0, "sigma": 0.2},
+}
+STEP_S, MOST_EVENTS = 0.05, 8
+SURE = 1e-9
+
+
+def scenario_of(
+    trigger: dict[str, Any], *, horizon_s: float = 8.0, mode: str = "model", **sections: Any
+) -> Scenario:
+    """A small loop with M = 2."""
+    plant = {
+        "draw": "given", "A": [[0.0, 1.0], [2.0, -0.3]], "B": [[0.0], [1.1]],
+        "initial_state": [0.5, -0.2], "rate_hz": 20.0,
+    }  # fmt: skip
+    content = {
+        "name": "small", "mode": mode, "horizon_s": horizon_s,
+        "model": {"A": [[0.0, 1.0], [1.2, -0.3]], "B": [[0.0], [1.0]], "gain": [[-5.0, -3.0]]},
+        "plant": plant | sections.pop("plant", {}),
+        "controller": {"rate_hz": 20.0} | sections.pop("controller", {}),
+        "trigger": trigger,
+        "network": {"mansd": 1, "loss": {"model": "bernoulli", "probability": 0.5}}
+        | sections.pop("network", {}),
+    } | sections  # fmt: skip
+    return resolve(validate(content, "small"))
+
+
+def run(resolved: Scenario, lost: Pattern, delay_ns: int = 0) -> tuple[RunRecord, Pattern]:
+    """Run the machines; of two successive updates, and of the first, one is delivered."""
+    fates: list[bool] = []
+
+    def decide(data: bytes, now_ns: int) -> int | None:
+        wants_loss = len(fates) < len(lost) and lost[len(fates)]
+        fates.append(not (wants_loss and fates and fates[-1]))
+        return delay_ns if fates[-1] else None
+
+    record = simulate(resolved, decide)
+    return record, tuple(fates)
+
+
+def every_run(resolved: Scenario) -> Iterator[tuple[RunRecord, Pattern]]:
+    """All admissible patterns: the next one delivers the last lost update, and loses all after."""
+    prefix: Pattern = ()
+    while True:
+        record, delivered = run(resolved, (*prefix, *(True,) * 100))
+        yield record, delivered
+        lost = [i for i, arrives in enumerate(delivered) if not arrives]
+        if not lost:
+            return
+        prefix = (*(not arrives for arrives in delivered[: lost[-1]]), False)
+
+
+def event_steps(record: RunRecord) -> list[int]:
+    return np.flatnonzero(record["sensor_measurement"]["event"] >= 0).tolist()
+
+
+def value_of(
+    record: RunRecord, delivered: Pattern, objective: Objective, certificate: ScenarioCertificate
+) -> float:
+    """The objective, from the definition."""
+    x, steps, H = record["plant_step"]["x"], event_steps(record), record.loop.H
+    t_s = np.arange(len(x)) * STEP_S
+    if objective is Objective.INTER_EVENT:
+        return -float(np.diff(steps).min()) * STEP_S if len(steps) > 1 else -np.inf
+    if objective is Objective.COST:
+        return float((x[1:] ** 2).sum() * STEP_S)
+    level = np.ones(len(x))
+    if certificate.constants is not None:
+        is_state = objective is Objective.STATE
+        bound = certificate.state(t_s) if is_state else certificate.controller_error(t_s)
+        level = bound / bound[0]
+    if objective is Objective.STATE:
+        return float((np.linalg.norm(x, axis=1) / level).max())
+    W = np.eye(2) if record.loop.weight is None else record.loop.weight
+    arrived = np.array([step for step, arrives in zip(steps, delivered, strict=True) if arrives])
+    worst = 0.0
+    for k in range(1, len(x)):  # just before an update at step k
+        since = int(arrived[arrived < k].max())
+        x_c = expm(H * (k - since) * STEP_S) @ x[since]
+        worst = max(worst, float(np.linalg.norm(W @ (x_c - x[k]))) / level[k])
+    return worst
+
+
+@pytest.mark.parametrize("mode", ["model", "zoh"])
+@pytest.mark.parametrize("policy", EXAMPLES)
+def test_the_search_finds_the_worst_of_all_patterns(policy: str, mode: str) -> None:
+    trigger = EXAMPLES[policy] | OWN.get(policy, {})
+    resolved = scenario_of(trigger, mode=mode)
+    most = max((event_steps(run(resolved, lost)[0]) for lost in ((), (True,) * 100)), key=len)
+    if len(most) > MOST_EVENTS:
+        resolved = scenario_of(trigger, mode=mode, horizon_s=most[MOST_EVENTS] * STEP_S)
+    certificate = certify(resolved, conditions_of(resolved, continuous=False))
+    runs = list(every_run(resolved))
+    assert len(runs) > 4
+    for objective in Objective:
+        expected = max(value_of(*one, objective, certificate) for one in runs)
+        worst = find_worst(resolved, objective, beam=0)
+        found = worst.value if objective is not Objective.INTER_EVENT else -(worst.value or np.inf)
+        assert worst.exact
+        assert found == pytest.approx(expected, rel=SURE)
+        assert not worst.breaches, worst
+        record, delivered = run(resolved, tuple(not arrives for arrives in worst.pattern))
+        assert delivered == worst.pattern, "the guarantee would have forced a delivery"
+        assert worst.event_s == pytest.approx([STEP_S * k for k in event_steps(record)])
+
+
+@pytest.mark.parametrize(
+    "sections",
+    [
+        {"network": {"impairments": [{"kind": "delay", "delay_s": 0.13}]}},
+        {"controller": {"rate_hz": 8.0, "phase": 0.3, "safe_input": [0.4]}},
+        {"controller": {"rate_hz": 62.5, "phase": 0.9}, "network": {"initial_sync": "known_state"}},
+        {
+            "plant": {
+                "measure_every": 2,
+                "disturbances": [
+                    {"kind": "uniform", "at": "input", "bound": [0.3]},
+                    {"kind": "sine", "at": "state", "amplitude": [0.1, 0.2], "hz": 0.7},
+                ],
+                "measurement": {"noise_bound": [0.01, 0.02]},
+            }
+        },
+        {
+            "plant": {"measure_every": 2, "measurement": {"C": [[1.0, 0.0]], "noise_std": [0.02]}},
+            "observer": {"kind": "kalman", "input_std": [0.2], "initial_std": [1.0, 1.0]},
+        },
+    ],
+    ids=["delay", "slow ticks", "fast ticks", "disturbed", "observed"],
+)
+def test_a_pattern_makes_the_run_of_the_machines(sections: dict[str, Any]) -> None:
+    resolved = scenario_of({"policy": "mixed", "sigma": 0.05, "epsilon": 0.05}, **sections)
+    certificate = certify(resolved, conditions_of(resolved, continuous=False))
+    loop = SampledLoop(resolved)
+    lost = tuple((np.random.default_rng(1).uniform(size=100) < 0.5).tolist())
+    record, delivered = run(resolved, lost, loop.delay_ns)
+    flow = SampledFlow(loop, Objective.STATE, certificate)
+    found = run_of(flow, lambda event: event >= len(delivered) or delivered[event])
+    rows = record["sensor_measurement"]
+    expected_s = rows["t_ns"][rows["event"] >= 0] * 1e-9
+    assert len(expected_s) > 4
+    assert found.event_s == pytest.approx(expected_s.tolist())
+    assert found.delivered == delivered
+    x = record["plant_step"]["x"]
+    assert found.value == pytest.approx(value_of(record, delivered, Objective.STATE, certificate))
+    assert len(x) == loop.last + 1
+
+
+def test_losses_of_a_script_play_the_worst_pattern() -> None:
+    resolved = scenario_of(EXAMPLES["mixed"])
+    worst = find_worst(resolved, Objective.ERROR)
+    lost = [event for event, arrives in enumerate(worst.pattern) if not arrives]
+    script = {"mansd": 1, "loss": {"model": "scripted", "lost": lost}}
+    record = simulate(scenario_of(EXAMPLES["mixed"], network=script))
+    assert lost
+    assert event_steps(record) == [round(t_s / STEP_S) for t_s in worst.event_s]
+
+
+@pytest.mark.parametrize(
+    ("scenario", "message"),
+    [
+        ({"policy": "python", "name": "T", "file": "t.py"}, "trigger.policy"),
+        ({"policy": "decaying", "beta": 0.1, "alpha_per_s": 0.2}, "watchdog"),
+    ],
+)
+def test_what_cannot_be_searched_is_refused(scenario: dict[str, Any], message: str) -> None:
+    sections = {"plant": {"watchdog": {"timeout_s": 0.06}}}
+    resolved = scenario_of(scenario, **sections)
+    with pytest.raises(CallerError, match=message):
+        find_worst(resolved, Objective.STATE)

@@ -1,0 +1,109 @@
+"""A simulated run of several loops: its directories, its summary, and the commands that read it."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from cosim.analysis.shared_summary import in_flight, is_complete
+from cosim.cli import app
+from cosim.record.run_record import load_record
+from noack.config.resolution import network_tables
+from noack.protocol.record_tables import NETEM_PACKET
+
+PATH = Path(__file__).parents[3] / "scenarios" / "shared_bottleneck.toml"
+LOOPS = 11
+
+
+def noack(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [*map(str, arguments)])
+
+
+def simulated(folder: Path, *settings: str) -> Result:
+    words = [word for one in settings for word in ("--set", one)]
+    return noack("simulate", PATH, "--runs", folder, "--json", *words)
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs")
+    done = simulated(folder, "horizon_s=3")
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout) == json.loads((folder / "latest/summary.json").read_text())
+    return (folder / "latest").resolve()
+
+
+def test_each_loop_is_a_run_directory_of_its_own(run_dir: Path) -> None:
+    loops = sorted(path.name for path in (run_dir / "loops").iterdir())
+    assert loops == [*(f"pendulum-{i:02}" for i in range(1, 11)), "periodic"]
+    one = run_dir / "loops" / "pendulum-07"
+    assert (one / "scenario.toml").read_text().startswith('name = "pendulum-07"')
+    assert json.loads((one / "loop.json").read_text())["number"] == 6
+    whole = load_record(run_dir, network=True)
+    assert set(whole.tables) == set(network_tables())
+    packets = [load_record(path).count(NETEM_PACKET) for path in (run_dir / "loops").iterdir()]
+    assert sum(packets) == whole.count(NETEM_PACKET) > 50
+
+
+def test_the_summary_adds_up(run_dir: Path) -> None:
+    summary = json.loads((run_dir / "summary.json").read_text())
+    assert is_complete(summary)
+    assert not is_complete(summary | {"loops": summary["loops"][1:]})
+    network, loops = summary["network"], summary["loops"]
+    assert [one["number"] for one in loops] == [*range(LOOPS)]
+    assert sum(one["link_share"] for one in loops) == pytest.approx(1)
+    for one in loops:
+        alone = json.loads((run_dir / "loops" / one["name"] / "summary.json").read_text())
+        assert one["events"] == alone["events"] == one["deliveries"] + one["drops"]
+        assert sum(one["claims"].values()) == len(alone["claims"])
+    assert sum(one["events"] for one in loops) == network["datagrams"]
+    assert sum(network["drops_by_cause"].values()) == sum(one["drops"] for one in loops)
+    # Little's law: the mean number in the network is the rate times the mean time in it.
+    times_s = sum(one["deliveries"] * (one["delay_mean_s"] or 0.0) for one in loops)
+    assert network["in_flight"]["mean"] == pytest.approx(times_s / 3, rel=0.02)
+
+
+def test_commands_read_the_run_and_its_loops(run_dir: Path) -> None:
+    loop = run_dir / "loops" / "periodic"
+    for path in (run_dir, loop):
+        shown = noack("summary", path)
+        assert shown.exit_code == 0, shown.output
+        replayed = noack("replay", path, "--json")
+        assert replayed.exit_code == 0, replayed.output
+        assert json.loads(replayed.stdout)["gaps"] == []
+    assert "bottleneck" in noack("summary", run_dir).stdout
+    assert noack("report", loop).exit_code == 0
+    refused = noack("report", run_dir)
+    assert refused.exit_code == 2
+    assert f"name one of them, e.g. {run_dir / 'loops' / 'pendulum-01'}" in " ".join(
+        refused.stderr.split()
+    )
+
+
+def test_a_loop_that_diverges_is_named_and_the_others_go_on(tmp_path: Path) -> None:
+    own = "A = [[0.0, 1.0], [50.0, 0.0]], B = [[0.0], [1.0]]"
+    wild = f'{{ name = "wild", plant = {{ draw = "given", {own} }} }}'
+    done = simulated(tmp_path, "horizon_s=3", f'loops=[{{ name = "calm", count = 2 }}, {wild}]')
+    assert done.exit_code == 1
+    summary = json.loads(done.stdout)
+    assert "1 of 3 loops failed (wild diverged at " in summary["exit"]["reason"]
+    assert [one["exit"]["status"] for one in summary["loops"]] == [0, 0, 1]
+    assert summary["reached_s"] == 3
+    for name in ("calm-1", "calm-2"):
+        assert json.loads((tmp_path / f"latest/loops/{name}/summary.json").read_text())[
+            "exit"]["status"] == 0  # fmt: skip
+
+
+def test_the_number_in_flight_over_time() -> None:
+    """Two datagrams overlap from 10 to 20 s; a third did not wait, a fourth was lost."""
+    packets = np.zeros(4, network_tables()[NETEM_PACKET])
+    packets["copy_ns"] = -1
+    packets["now_ns"] = np.array([0, 10, 50, 60]) * 10**9
+    packets["release_ns"] = np.array([20 * 10**9, 30 * 10**9, 50 * 10**9, -1])
+    found = in_flight(packets, 100 * 10**9)
+    assert (found.mean, found.max, found.width_s) == (pytest.approx(0.4), 2, 0.5)
+    assert found.max_by_interval[:60] == [1] * 20 + [2] * 20 + [1] * 20
+    assert not any(found.max_by_interval[61:])
+    assert found.mean_by_interval[20:40] == [2.0] * 20

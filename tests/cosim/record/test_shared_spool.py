@@ -1,0 +1,170 @@
+"""The records of a live run of several loops, from a spool with the rows of a simulated one."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cosim.record.environment import write_environment
+from cosim.record.run_directory import REPORTS_FILE, write_scenario
+from cosim.record.run_record import Rows, RunRecord, load_record
+from cosim.record.shared_run import SharedRun, loop_directories
+from cosim.record.shared_spool import finish_shared_record
+from cosim.simulation.shared_network import simulate_loops
+from noack.config.resolution import network_tables, tables_of
+from noack.config.scenario_file import validate
+from noack.core.errors import MachineError
+from noack.protocol.machine_interface import Notice
+from noack.protocol.record_tables import LOOP, NETEM_PACKET, PLANT_STEP
+from noack.runtime.spool import SPOOL, SpoolWriter
+from noack.runtime.telemetry import notices_of
+
+LOOPS = 3
+
+
+@pytest.fixture
+def shared(content: dict[str, Any]) -> SharedRun:
+    content["horizon_s"] = 2.0
+    content["plant"] |= {"rate_hz": 100.0, "initial_state_halfwidth": [0.5, 0.5]}
+    content["controller"] = {"rate_hz": 100.0}
+    content["trigger"]["beta"] = 0.01
+    content["network"]["impairments"] = [{"kind": "delay", "delay_s": 0.012, "jitter_s": 0.009}]
+    content["loops"] = [{"name": "a", "count": 2}, {"name": "b"}]
+    return simulate_loops(validate(content, "here"))
+
+
+def mixed_rows(shared: SharedRun) -> Mapping[str, Rows]:
+    """All rows by table, as the processes emit them: with the loop's number, in order of time."""
+    found = {}
+    for table, dtype in tables_of(shared.network.scenario).items():
+        if table in network_tables():
+            found[table] = shared.network[table]
+            continue
+        parts = []
+        for number, loop in enumerate(shared.loops):
+            rows = np.zeros(loop.count(table), dtype)
+            rows[LOOP] = number
+            for name in loop.tables[table].names or ():
+                rows[name] = loop[table][name]
+            parts.append(rows)
+        rows = np.concatenate(parts)
+        found[table] = rows[np.argsort(rows["now_ns"], kind="stable")]
+    return found
+
+
+def spool(run_dir: Path, table: str, rows: Rows, *, writer: str = "recorder") -> None:
+    """Spool rows in batches of which every third comes late, and every fifth comes twice."""
+    out = SpoolWriter(run_dir / SPOOL, writer)
+    late = []
+    for number, first in enumerate(range(0, len(rows), 7)):
+        batch = rows[first : first + 7].tobytes()
+        late += [(first, batch)] * (number % 3 == 0) + [(first, batch)] * (number % 5 == 0)
+        if number % 3:
+            out.append(table, first, batch)
+    for first, batch in late:
+        out.append(table, first, batch)
+    out.close()
+
+
+def opened(shared: SharedRun, run_dir: Path) -> Path:
+    run_dir.mkdir()
+    write_scenario(shared.network.scenario, run_dir)
+    write_environment(run_dir, "live")
+    return run_dir
+
+
+def same_rows(one: RunRecord, other: RunRecord, *but: str) -> None:
+    for table in one.tables:
+        if table not in but:
+            assert one[table].tobytes() == other[table].tobytes(), table
+
+
+def records(run_dir: Path, shared: SharedRun) -> list[RunRecord]:
+    return [load_record(one) for one in loop_directories(run_dir, shared.network.scenario)]
+
+
+def test_every_row_and_line_reaches_the_record_of_its_loop(
+    shared: SharedRun, tmp_path: Path
+) -> None:
+    run_dir = opened(shared, tmp_path / "run")
+    for table, rows in mixed_rows(shared).items():
+        spool(run_dir, table, rows)
+    out = SpoolWriter(run_dir / SPOOL, "recorder")
+    for number, notice in enumerate((Notice(5, "info", "mine", 1), Notice(7, "info", "all"))):
+        out.append(notices_of("sensor"), number, json.dumps(notice.line()).encode())
+    out.append(notices_of("plant"), 0, b"damaged")
+    out.append(PLANT_STEP, 10**6, b"damaged")
+    out.close()
+    network = finish_shared_record(run_dir)
+    same_rows(network, shared.network)
+    for record, expected in zip(records(run_dir, shared), shared.loops, strict=True):
+        same_rows(record, expected)
+        assert (record.kind, record.number, record.scenario) == (
+            "live", expected.number, expected.scenario,
+        )  # fmt: skip
+    lines = [[line["text"] for line in one.notices] for one in records(run_dir, shared)]
+    assert lines == [["all"], ["mine", "all"], ["all"]]
+    assert [line["text"] for line in network.notices] == ["all"]
+    assert not (run_dir / SPOOL).exists()
+
+
+def test_an_interrupted_attempt_is_repeated_and_later_rows_are_added(
+    shared: SharedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_dir = opened(shared, tmp_path / "run")
+    rows = mixed_rows(shared)
+    later = {table: found[len(found) // 2 :] for table, found in rows.items()}
+    for table, found in rows.items():
+        spool(run_dir, table, found[: len(found) // 2])
+    with monkeypatch.context() as patch:
+        patch.setattr("cosim.record.shared_spool.finish_record", _fail)
+        with pytest.raises(MachineError, match="is kept in"):
+            finish_shared_record(run_dir)
+    finish_shared_record(run_dir)
+    counts = [one.count(PLANT_STEP) for one in records(run_dir, shared)]
+    assert sum(counts) == len(rows[PLANT_STEP]) // 2
+    for table, found in later.items():  # a process that was frozen spools its rows after the end
+        spool(run_dir, table, found, writer="frozen")
+    same_rows(finish_shared_record(run_dir), shared.network)
+    for record, expected in zip(records(run_dir, shared), shared.loops, strict=True):
+        same_rows(record, expected)
+
+
+def _fail(run_dir: Path) -> RunRecord:
+    raise OSError(28, "No space left on device")
+
+
+def test_a_loops_reports_count_its_own_rows_and_datagrams(
+    shared: SharedRun, tmp_path: Path
+) -> None:
+    """A row of the network that is missing is missing in every loop."""
+    run_dir = opened(shared, tmp_path / "run")
+    rows = dict(mixed_rows(shared))
+    rows[NETEM_PACKET] = rows[NETEM_PACKET][:-1]
+    for table, found in rows.items():
+        spool(run_dir, table, found)
+    steps = [one.count(PLANT_STEP) for one in shared.loops]
+    own = [{"accepted": number, "rejected": {"stale": number}} for number in range(LOOPS)]
+    plant = {
+        "ended": "horizon",
+        "rows": {PLANT_STEP: sum(steps), "plant_actuation": 0},
+        "rows_by_loop": {PLANT_STEP: steps, "plant_actuation": []},
+        "channel": {"accepted": 3, "rejected": {"stale": 3}, "loops": own},
+    }
+    netem = {
+        "ended": "horizon",
+        "rows": {table: shared.network.count(table) for table in network_tables()},
+        "channel": {"rejected": {"loop": 2}},
+    }
+    content = {"plant": plant, "netem": netem, "earlier": [plant | {"process": "plant"}]}
+    (run_dir / REPORTS_FILE).write_text(json.dumps(content))
+    finish_shared_record(run_dir)
+    for number, record in enumerate(records(run_dir, shared)):
+        report = record.reports["plant"]
+        assert report["rows"] == {PLANT_STEP: steps[number], "plant_actuation": 0}
+        assert report["channel"] == own[number]
+        missing = record.reports["netem"]["rows"][NETEM_PACKET] - record.count(NETEM_PACKET)
+        assert missing == 1
