@@ -142,7 +142,12 @@ def loops(content: Content) -> Content:
         {},
         {"mode": "zoh"},
         {"controller": {"rate_hz": 100.0, "setpoint": [0.1, 0.0]}},
-        {"network": {"initial_sync": "first_packet", "constraints": [{"losses": 3, "window": 10}]}},
+        {
+            "network": {
+                "initial_sync": "first_packet",
+                "constraints": [{"kind": "at_most", "losses": 3, "window": 10}],
+            }
+        },
         {"plant": {"measure_every": 2, "watchdog": {"policy": "zero", "timeout_s": 0.04}}},
     ],
     ids=["model", "held", "set point", "first event", "watchdog"],
