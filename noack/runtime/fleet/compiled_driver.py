@@ -8,6 +8,7 @@ from typing import Any
 
 from noack.config.fleet_layout import FleetRole
 from noack.core.code_cache import cache_folder
+from noack.runtime.fleet.wire_words import compute_tag
 from noack.runtime.native.object_code import NativeFunction, code_file, load, load_or_compile
 
 _MODULES = (
@@ -17,10 +18,12 @@ _MODULES = (
     "noack.runtime.fleet.fleet_driver",
 )  # fmt: skip
 _SOURCES = (
-    "noack.runtime.native.object_code", "noack.runtime.native.socket_structs",
+    "noack.runtime.native.object_code", "noack.runtime.native.socket_structs", __name__,
     "noack.runtime.fleet.driver_layout", "noack.protocol.wire_format",
 )  # fmt: skip
 _OPTIONS: dict[str, Any] = {"_nrt": False, "forceinline": True}
+_CALLED: dict[str, Any] = {"_nrt": False}
+"""For a function that is long and called at two places."""
 
 
 @cache
@@ -48,7 +51,8 @@ def _jitable(role: FleetRole) -> Any:
         module = importlib.import_module(name)
         for _, function in inspect.getmembers(module, inspect.isfunction):
             if function.__module__ == name:
-                register_jitable(**_OPTIONS)(function)
+                options = _CALLED if function is compute_tag else _OPTIONS
+                register_jitable(**options)(function)
     from noack.runtime.fleet.fleet_driver import driver_of
 
     machine: Any = importlib.import_module(role.module)
