@@ -30,7 +30,8 @@ from cosim.record.run_directory import (
     read_object,
 )
 from cosim.record.run_ending import EndingFile, RunEnding
-from cosim.record.run_record import RunRecord, finish_record, load_record
+from cosim.record.run_record import RunRecord, load_record
+from cosim.record.shared_spool import finish_run_record
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.file_access import write_whole
 from noack.runtime.spool import SPOOL
@@ -52,7 +53,7 @@ def finalize(ending: RunEnding, *, report: bool = True, again: bool = False) -> 
     run_dir = ending.run_dir
     with _with_reason(ending), finished_run(run_dir), ExitStack() as stack:
         unfinished = (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir()
-        record = finish_record(run_dir) if unfinished else load_record(run_dir, network=True)
+        record = finish_run_record(run_dir) if unfinished else load_record(run_dir, network=True)
         if record.is_network:
             return _finalize_shared(record, ending, again=again)
         replaying = stack.enter_context(ReplayProcess(record, run_dir))

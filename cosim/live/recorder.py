@@ -16,8 +16,8 @@ from cosim.live.progress_report import ProgressReport
 from cosim.live.telemetry_store import TelemetryStore
 from cosim.record.decimate import is_long
 from cosim.record.run_directory import active_run
-from cosim.record.run_record import Rows, RunRecord, finish_record, report_of, write_reports
-from cosim.record.shared_spool import finish_shared_record
+from cosim.record.run_record import Rows, RunRecord, report_of, write_reports
+from cosim.record.shared_spool import finish_run_record
 from noack.config.loops import loops_of
 from noack.config.parameter_changes import ParameterChange, change_notice
 from noack.config.resolution import resolve
@@ -176,10 +176,7 @@ class Recorder:
             self.lost = error
         self._store.close()
         write_reports(self._run_dir, self._reports.values())
-        if self._scenario.loops is None:
-            record = finish_record(self._run_dir)
-        else:
-            record = finish_shared_record(self._run_dir)
+        record = finish_run_record(self._run_dir)
         if self._feed is not None:
             try:
                 self._feed.advance(final=True)

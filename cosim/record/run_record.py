@@ -259,7 +259,7 @@ def finish_record(run_dir: Path) -> RunRecord:
     """Convert a run's spool to its record, and remove the spool.
 
     It merges all spools and removes duplicate rows. Of a run with [[loops]], it converts the part
-    of the network; see :func:`cosim.record.shared_spool.finish_shared_record`.
+    of the network; see :func:`cosim.record.shared_spool.finish_run_record`.
 
     Raises:
         MachineError: the record cannot be written; the spool is kept.

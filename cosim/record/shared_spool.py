@@ -43,16 +43,18 @@ _PART_BYTES = 16 * 1024 * 1024
 _WRITER = "loops"
 
 
-def finish_shared_record(run_dir: Path) -> RunRecord:
-    """Convert the spool of a run with [[loops]] to the records of its loops and of its network.
+def finish_run_record(run_dir: Path) -> RunRecord:
+    """Convert the spool of a run to its record; with [[loops]], to those of the loops, too.
 
     An interrupted attempt can be repeated: the run's spool is removed at the end. Returns the
-    record of the network.
+    record of the run, or of the network that the loops share.
 
     Raises:
         MachineError: a record cannot be written; the spool is kept.
     """
     scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
+    if scenario.loops is None:
+        return finish_record(run_dir)
     folders = loop_directories(run_dir, scenario)
     try:
         for number, (loop, folder) in enumerate(

@@ -12,7 +12,7 @@ from cosim.record.environment import write_environment
 from cosim.record.run_directory import REPORTS_FILE, write_scenario
 from cosim.record.run_record import Rows, RunRecord, load_record
 from cosim.record.shared_run import SharedRun, loop_directories
-from cosim.record.shared_spool import finish_shared_record
+from cosim.record.shared_spool import finish_run_record
 from cosim.simulation.shared_network import simulate_loops
 from noack.config.resolution import network_tables, tables_of
 from noack.config.scenario_file import validate
@@ -98,7 +98,7 @@ def test_every_row_and_line_reaches_the_record_of_its_loop(
     out.append(notices_of("plant"), 0, b"damaged")
     out.append(PLANT_STEP, 10**6, b"damaged")
     out.close()
-    network = finish_shared_record(run_dir)
+    network = finish_run_record(run_dir)
     same_rows(network, shared.network)
     for record, expected in zip(records(run_dir, shared), shared.loops, strict=True):
         same_rows(record, expected)
@@ -122,13 +122,13 @@ def test_an_interrupted_attempt_is_repeated_and_later_rows_are_added(
     with monkeypatch.context() as patch:
         patch.setattr("cosim.record.shared_spool.finish_record", _fail)
         with pytest.raises(MachineError, match="is kept in"):
-            finish_shared_record(run_dir)
-    finish_shared_record(run_dir)
+            finish_run_record(run_dir)
+    finish_run_record(run_dir)
     counts = [one.count(PLANT_STEP) for one in records(run_dir, shared)]
     assert sum(counts) == len(rows[PLANT_STEP]) // 2
     for table, found in later.items():  # a process that was frozen spools its rows after the end
         spool(run_dir, table, found, writer="frozen")
-    same_rows(finish_shared_record(run_dir), shared.network)
+    same_rows(finish_run_record(run_dir), shared.network)
     for record, expected in zip(records(run_dir, shared), shared.loops, strict=True):
         same_rows(record, expected)
 
@@ -161,7 +161,7 @@ def test_a_loops_reports_count_its_own_rows_and_datagrams(
     }
     content = {"plant": plant, "netem": netem, "earlier": [plant | {"process": "plant"}]}
     (run_dir / REPORTS_FILE).write_text(json.dumps(content))
-    finish_shared_record(run_dir)
+    finish_run_record(run_dir)
     for number, record in enumerate(records(run_dir, shared)):
         report = record.reports["plant"]
         assert report["rows"] == {PLANT_STEP: steps[number], "plant_actuation": 0}

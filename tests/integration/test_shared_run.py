@@ -1,0 +1,165 @@
+"""Real processes that serve several loops, which share a bottleneck."""
+
+import signal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cosim.analysis.replay import replay
+from cosim.record.run_record import RunRecord, load_record, updates_in
+from noack.config.loops import phases_ns
+from noack.protocol.record_tables import NETEM_PACKET, PLANT_STEP, Fate
+from tests.integration import conftest as live
+from tests.integration.test_restarts import goes_on, spooled
+
+SCENARIO = """
+name = "three"
+horizon_s = 8.0
+speed = 2.0
+recovery = { rejoin_within_s = 0 }
+
+[model]
+A = [[0.0, 1.0], [2.0, 0.0]]
+B = [[0.0], [1.0]]
+gain = [[-6.0, -3.0]]
+
+[plant]
+initial_state = [0.2, 0.0]
+initial_state_halfwidth = [0.1, 0.1]
+rate_hz = 50.0
+
+[controller]
+rate_hz = 50.0
+
+[trigger]
+policy = "periodic"
+period_s = 0.1
+
+[network]
+mansd = 2
+loss = { model = "bernoulli", probability = 0.3 }
+impairments = [{ kind = "rate", rate_bps = 20_000, queue = 2 }]
+
+[[loops]]
+name = "good"
+count = 2
+
+[[loops]]
+name = "wild"
+plant = { draw = "given", A = [[3.0, 0.0], [0.0, 3.0]], B = [[0.0], [0.0]] }
+"""
+NAMES = ("good-1", "good-2", "wild")
+
+
+@pytest.fixture(scope="module")
+def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("scenario") / "three.toml"
+    path.write_text(SCENARIO)
+    return path
+
+
+@pytest.fixture(scope="module")
+def finished(scenario: Path, tmp_path_factory: pytest.TempPathFactory) -> live.Finished:
+    with live.begun(tmp_path_factory.mktemp("shared")) as start:
+        return start(command=("run", str(scenario))).finish()
+
+
+def record_of(run: live.Finished, name: str) -> RunRecord:
+    return load_record(run.run_dir / "loops" / name)
+
+
+def loop_of(run: live.Finished, name: str) -> dict[str, Any]:
+    (found,) = [one for one in run.summary["loops"] if one["name"] == name]
+    return dict(found)
+
+
+def test_one_loop_diverges_and_the_others_go_on(finished: live.Finished) -> None:
+    assert finished.status == 1
+    assert finished.summary["exit"]["reason"].startswith("1 of 3 loops failed (wild diverged at ")
+    assert loop_of(finished, "wild")["diverged_at_s"] > 1.0
+    for name in NAMES:
+        record = record_of(finished, name)
+        assert record.count(PLANT_STEP) == 401
+        assert np.array_equal(record[PLANT_STEP]["sequence"], np.arange(401))
+    for name in NAMES[:2]:
+        assert loop_of(finished, name)["exit"] == {"status": 0, "reason": "horizon"}
+        assert np.linalg.norm(record_of(finished, name)[PLANT_STEP]["x"][-1]) < 0.1
+
+
+def test_the_loops_compete_for_the_bottleneck_and_the_guarantee_holds_for_each(
+    finished: live.Finished,
+) -> None:
+    network = load_record(finished.run_dir, network=True)
+    packets = network[NETEM_PACKET]
+    assert np.array_equal(np.unique(packets["flow"]), [0, 1, 2])
+    assert (packets["fate"] == Fate.OVERFLOWED).any()
+    for flow in range(3):
+        assert packets["consecutive_losses"][packets["flow"] == flow].max() <= 2
+    for name in NAMES:
+        assert loop_of(finished, name)["longest_loss_burst"] <= 2
+        assert record_of(finished, name).count(NETEM_PACKET) == (packets["flow"] == 0).sum()
+
+
+def test_each_loop_and_the_network_are_replayed_bit_by_bit(finished: live.Finished) -> None:
+    assert finished.summary["replay"]["bit_exact"] is True
+    network = replay(load_record(finished.run_dir, network=True))
+    assert network.bit_exact
+    for name in NAMES:
+        found = replay(record_of(finished, name))
+        assert found.bit_exact, found
+
+
+def test_loops_begin_at_their_phases(finished: live.Finished) -> None:
+    """An update's time is that of its loop; the network records the time of the run."""
+    network = load_record(finished.run_dir, network=True)
+    phases, packets = phases_ns(network.scenario), network[NETEM_PACKET]
+    assert len(set(phases)) == 3
+    for flow, phase_ns in enumerate(phases):
+        of_one = packets[packets["flow"] == flow]
+        _, _, events_ns = updates_in(of_one)
+        assert (of_one["now_ns"] - events_ns >= phase_ns).all()
+
+
+def test_a_killed_sensor_is_one_named_failure_and_the_record_is_kept(
+    scenario: Path, tmp_path: Path
+) -> None:
+    with live.begun(tmp_path) as start:
+        running = start(*live.settings(horizon_s=1000.0), command=("run", str(scenario)))
+        running.wait_started()
+        spool = running.runs / "latest" / "spool"
+        live.wait_for(lambda: any(path.stat().st_size for path in spool.glob("sensor_meas*")))
+        running.child("sensor").send_signal(signal.SIGKILL)
+        run = running.finish()
+    assert run.status == 1
+    assert run.summary["exit"]["reason"] == "sensor died: killed by SIGKILL"
+    assert not (run.run_dir / "spool").exists()
+    for name in NAMES:
+        assert loop_of(run, name)["exit"] == run.summary["exit"]
+        assert record_of(run, name).count(PLANT_STEP) > 0
+        assert replay(record_of(run, name)).bit_exact is not None
+
+
+def test_restarted_processes_serve_all_loops_again(scenario: Path, tmp_path: Path) -> None:
+    with live.begun(tmp_path) as start:
+        running = start(
+            *live.settings(horizon_s=4000.0, recovery__rejoin_within_s=60),
+            command=("run", str(scenario)),
+        )
+        running.wait_started()
+        for role, table in (("sensor", "sensor_measurement"), ("netem", "netem_packet")):
+            live.wait_for(lambda table=table: len(spooled(running, table)) > 0)
+            before = live.child_of(running.process, role)
+            assert before is not None
+            before.kill()
+            live.wait_for(lambda role=role: goes_on(running, role))
+        running.process.send_signal(signal.SIGINT)
+        run = running.finish()
+    assert run.status == 130
+    assert run.summary["replay"]["bit_exact"] is True
+    for name in NAMES:
+        record = record_of(run, name)
+        assert replay(record).bit_exact
+        assert len(record.life_numbers("sensor").begun) == 2
+        assert len(record.life_numbers("netem").begun) == 2
