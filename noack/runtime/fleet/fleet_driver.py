@@ -175,13 +175,14 @@ def receive(memory: DriverMemory) -> None:
 def wait(memory: DriverMemory, until_ns: int, rests: bool) -> bool:
     """Wait for a datagram or a deadline, or rest; return False if a signal interrupted it."""
     driver = memory.driver[0]
-    wait_ns = until_ns - time_ns(memory)
+    now_ns = time_ns(memory)
+    wait_ns = until_ns - now_ns
     if driver.due > 0:
-        wait_ns = min(wait_ns, memory.heap[0] - time_ns(memory))
+        wait_ns = min(wait_ns, memory.heap[0] - now_ns)
     if driver.speed != 1.0:
         wait_ns = int(wait_ns / driver.speed)
     watched = 1
-    if rests and driver.rest_ns > 0:
+    if rests and 0 < wait_ns < driver.rest_ns:
         wait_ns = driver.rest_ns
         watched = 0
     wait_ns = max(wait_ns, 0)
