@@ -14,6 +14,7 @@ import numpy as np
 from benchmarks._certificate_kinds import Broken, Kind, Tally
 from benchmarks._certificate_kinds.decaying import DECAYING
 from benchmarks._certificate_kinds.disturbed import DISTURBED
+from benchmarks._certificate_kinds.known_state import KNOWN_STATE
 from benchmarks._certificate_kinds.observed import OBSERVED
 from benchmarks._certificate_kinds.policies import POLICIES
 from benchmarks._certificate_kinds.random_losses import RANDOM_LOSSES
@@ -27,6 +28,7 @@ KINDS: Mapping[str, Kind] = {
         DISTURBED,
         OBSERVED,
         RANDOM_LOSSES,
+        KNOWN_STATE,
         *POLICIES,
     )
 }

@@ -38,7 +38,7 @@ class Loop:
 
     def __init__(self, endpoint: socket.socket, controller: socket.socket, sensor: socket.socket):
         self.scenario = resolve(load(find_scenario("lane_following"), ()))
-        self.addresses = endpoint, controller.getsockname(), sensor.getsockname()
+        self.endpoint, self.ways = endpoint, [(sensor.getsockname(), controller.getsockname())]
         self.clock = RunClock(time.monotonic_ns())
         tables = {table: dtype for table, dtype in tables_of(self.scenario).items()
                   if OWNER[table] == "netem"}  # fmt: skip
@@ -48,7 +48,7 @@ class Loop:
         """Open the compiled emulator."""
         network = CompiledNetwork(self.scenario, BEGINNING, compiled_pump())
         shell = CompiledShell(
-            *self.addresses, duplex=False, network=network, clock=self.clock, spin_us=0.0
+            self.endpoint, self.ways, network=network, clock=self.clock, spin_us=0.0
         )
         shell.tend(0)
 
@@ -60,7 +60,7 @@ class Loop:
 
     def plain(self) -> tuple[RelayShell, Relay]:
         """Open the plain emulator, driven as by :mod:`noack.runtime.real_time_loop`."""
-        link, shell = update_link_of(self.scenario), RelayShell(*self.addresses, duplex=False)
+        link, shell = update_link_of(self.scenario), RelayShell(self.endpoint, self.ways)
 
         def relay(count: int) -> None:
             while link.counters.received < count:

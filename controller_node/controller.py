@@ -7,7 +7,7 @@ advances with ticks and updates and never runs backward. An update older than th
 propagated to the time of that tick. A newer update advances the model to its own time.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -49,6 +49,8 @@ class Controller:
         start: the beginning of the run, or a restart during the run.
         safe_input: the input before the first update, shape (m,); by default 0.
         predictive: whether an actuation also carries x_c, for the plant's watchdog.
+        predictions: number of inputs of an actuation: that of the tick, and those for the
+            following ticks if no update arrives until then; only with a linear law.
         setpoint: x_r and u_r, shapes (n,) and (m,): u = K(x_c − x_r) + u_r; None is 0.
         schedule: the announced changes of its settings; None if they cannot change.
     """
@@ -68,6 +70,7 @@ class Controller:
         start: Start = BEGINNING,
         safe_input: Vector | None = None,
         predictive: bool = False,
+        predictions: int = 1,
         setpoint: tuple[Vector, Vector] | None = None,
         schedule: ChangeSchedule | None = None,
     ) -> None:
@@ -83,7 +86,7 @@ class Controller:
         self._losses = LossCheck(guarantee, schedule, known_start=x0 is not None)
         self._acknowledges = acknowledges
         self._safe_input = np.zeros(inputs) if safe_input is None else safe_input
-        self._predictive = predictive
+        self._predictive, self._predictions = predictive, predictions
         self._knows_state = x0 is not None
         self._inputs = self._first_number = start.first_number
         self._step = max(-(-(start.from_ns - phase_ns) // period_ns), 0)
@@ -157,14 +160,28 @@ class Controller:
         u: Vector = self._safe_input
         failed: Sequence[Notice] = ()
         if self._knows_state:
-            u, failed = self._apply(
-                t_ns, lambda law: law.input(t_ns / NS_PER_S, self.x_c, self._setpoint)
-            )
+            u, failed = self._input(self.x_c, t_ns)
         number = self._first_number + step
         row = (self._count(), number, t_ns, now_ns, self._model_ns, self.x_c, u)
-        carried = np.concatenate([u, self.x_c]) if self._predictive else u
+        carried = u
+        if self._predictive or self._predictions > 1:
+            x_c = (self.x_c,) if self._predictive else ()
+            carried = np.concatenate([u, *self._predicted(u), *x_c])
         actuation = Message(Flow.ACTUATION, number, self._model_ns, carried)
         return (actuation, Record(CONTROLLER_STEP, row), *failed)
+
+    def _predicted(self, u: Vector) -> Iterator[Vector]:
+        """Yield the inputs for the times one period, two periods … after the model's time."""
+        x, t_ns = self.x_c, self._model_ns
+        for _ in range(1, self._predictions):
+            if self._knows_state:
+                x, t_ns = self._flow(x, t_ns, t_ns + self._period_ns), t_ns + self._period_ns
+                u, _ = self._input(x, t_ns)
+            yield u
+
+    def _input(self, x: Vector, t_ns: int) -> tuple[Vector, Sequence[Notice]]:
+        """Return the input for a state of the model at a time, and a failure of the law."""
+        return self._apply(t_ns, lambda law: law.input(t_ns / NS_PER_S, x, self._setpoint))
 
     def _apply(
         self, t_ns: int, method: Callable[[ControlLaw], Vector | None]
@@ -212,6 +229,7 @@ def controller_of(resolved: Scenario, start: Start = BEGINNING) -> Controller:
         start=start,
         safe_input=None if safe_input is None else np.array(safe_input),
         predictive=resolved.message_sizes.is_predictive,
+        predictions=resolved.controller.predictions,
         setpoint=setpoint_of(resolved),
         schedule=None if resolved.protocol.acknowledges else ChangeSchedule(resolved, setpoint_of),
     )

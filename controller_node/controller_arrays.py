@@ -67,6 +67,7 @@ def controller_arrays_of(resolved: Sequence[Scenario]) -> FleetParts | None:
         not isinstance(one.controller, LinearFeedbackSettings)
         or one.protocol.acknowledges
         or one.message_sizes.is_predictive
+        or one.controller.predictions > 1
         for one in resolved
     ):
         return None

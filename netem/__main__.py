@@ -6,7 +6,7 @@ In a run, it is one of the run's processes. On its own, it relays for any UDP pr
 """
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from noack.runtime.signals import quiet_interrupt
 
@@ -16,6 +16,8 @@ with quiet_interrupt():
     from netem.engine.native_pump import NOT_COMPILED, kept_pump
     from netem.run_relay import CompiledShell, RelayShell
     from noack.core.errors import ExitStatus, NoackError
+    from noack.protocol.topology import ENDS
+    from noack.runtime.address import Address
     from noack.runtime.command_line import Parser, failed, print_to_stderr
     from noack.runtime.peer_sockets import has_peer_sockets
     from noack.runtime.process_entry import add_options, join_run
@@ -45,28 +47,25 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
 
 def _in_a_run(node: RunProcess) -> None:
     """Relay by compiled code if it is in the cache: a run does not wait for a compilation."""
-    duplex = node.scenario.protocol.acknowledges
+    flows, loops = node.scenario.network.flows, node.loop_count
+
+    def ways(addresses: Mapping[str, Address]) -> list[tuple[Address, Address]]:
+        return [(addresses[ENDS[one].sender], addresses[ENDS[one].receiver]) for one in flows]
+
     pump = kept_pump() if has_peer_sockets() else None
     if pump is None:
         print_to_stderr(NOT_COMPILED)
         node.run(
-            network_of(node.scenario, node.start, loops=node.loop_count or 1),
-            lambda endpoint, addresses: RelayShell(
-                endpoint,
-                addresses["controller"],
-                addresses["sensor"],
-                duplex=duplex,
-                loops=node.loop_count,
-            ),
+            network_of(node.scenario, node.start, loops=loops or 1),
+            lambda endpoint, addresses: RelayShell(endpoint, ways(addresses), loops=loops),
         )
         return
-    network = CompiledNetwork(node.scenario, node.start, pump, node.loop_count)
+    network = CompiledNetwork(node.scenario, node.start, pump, loops)
     node.run(
         network,
         lambda endpoint, addresses: CompiledShell(
-            endpoint, addresses["controller"], addresses["sensor"], duplex=duplex,
-            network=network, clock=node.clock, spin_us=node.scenario.realtime.spin_us,
-            loops=node.loop_count,
+            endpoint, ways(addresses), network=network, clock=node.clock,
+            spin_us=node.scenario.realtime.spin_us, loops=loops,
         ),
     )  # fmt: skip
 

@@ -29,9 +29,15 @@ from noack.protocol.record_tables import (
     PACKET_HEAD_BYTES,
     Fate,
 )
+from noack.protocol.wire_format import Flow
 
-UPDATE_LINK = "update"
-"""Name of the link from sensor to controller; part of its random streams' names."""
+
+def link_name(flow: Flow) -> str:
+    """Return the name of the link of a flow; part of its random streams' names."""
+    return flow.name.lower()
+
+
+UPDATE_LINK = link_name(Flow.UPDATE)
 
 
 class Datagram(NamedTuple):
@@ -172,10 +178,7 @@ class Link:
 
     def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
         """Process a datagram; return it if it is neither lost nor delayed."""
-        if self._schedule is not None:
-            for settings in due_settings(self._schedule, self._settings, now_ns):
-                self.change(settings)
-            self._reached_ns = now_ns
+        self.reach(now_ns)
         decision = self.decide(message.flow, len(message.data), now_ns)
         head = message.data[:PACKET_HEAD_BYTES].ljust(PACKET_HEAD_BYTES, b"\0")
         row = (
@@ -191,6 +194,13 @@ class Link:
         if decision.copy_ns != NEVER_NS:
             leaving += self._release(message, decision.copy_ns, decision.copy_bit, copy=True)
         return (*leaving, record)
+
+    def reach(self, now_ns: int) -> None:
+        """Apply the changes that are due before a datagram of this time."""
+        if self._schedule is not None:
+            for settings in due_settings(self._schedule, self._settings, now_ns):
+                self.change(settings)
+            self._reached_ns = now_ns
 
     def decide(self, flow: int, size_bytes: int, now_ns: int) -> PacketDecision:
         """Decide for a flow's next packet; the next call overwrites the decision."""

@@ -1,6 +1,6 @@
 """The network emulator's socket in a run: forwards surviving datagrams without reading them.
 
-It accepts datagrams from the sensor's address and, with a reverse direction, from the controller's.
+It accepts datagrams from the sensor's address and, with a second direction, from the controller's.
 In a run of several loops, it reads the loop's number in the header, and no more. Surviving
 datagrams leave from the port at which they arrived.
 """
@@ -21,11 +21,14 @@ from noack.runtime.udp_sockets import MAX_UDP_BYTES, CountingSocket
 
 
 class RelayShell(CountingSocket[Datagram]):
-    """The channel of a link: forwards from source to destination.
+    """The channel of a network: forwards each direction from its source to its destination.
 
-    If it is duplex, also from destination to source. Other senders are ignored. The flow is that of
-    :mod:`netem.duplex_link`. ``loops`` is the number of loops, None in a run of one loop without
-    numbers.
+    Other senders are ignored. The flow is that of :mod:`netem.duplex_link`.
+
+    Args:
+        endpoint: the socket.
+        ways: source and destination of each direction.
+        loops: number of loops; None in a run of one loop without numbers.
     """
 
     most_bytes = MAX_UDP_BYTES
@@ -35,17 +38,15 @@ class RelayShell(CountingSocket[Datagram]):
     def __init__(
         self,
         endpoint: socket.socket,
-        destination: Address,
-        source: Address,
+        ways: Sequence[tuple[Address, Address]],
         *,
-        duplex: bool,
         loops: int | None = None,
     ) -> None:
-        self._directions = {source: 0, destination: 1} if duplex else {source: 0}
+        self._directions = {source: number for number, (source, _) in enumerate(ways)}
+        self._destinations = [destination for _, destination in ways]
         self._loops, self._reads_loop = loops or 1, loops is not None
-        self._source = source
         self._foreign = self._of_no_loop = 0
-        super().__init__(endpoint, destination, list(self._directions))
+        super().__init__(endpoint, self._destinations[0], list(self._directions))
 
     def judge(self, data: bytes, source: Address) -> Datagram | None:
         """Return the datagram if it comes from an accepted address and is of a loop of the run."""
@@ -61,7 +62,7 @@ class RelayShell(CountingSocket[Datagram]):
 
     def send(self, message: Datagram) -> None:
         """Forward a surviving datagram."""
-        self.put(message.data, self._source if message.flow >= self._loops else None)
+        self.put(message.data, self._destinations[message.flow // self._loops])
 
     def report(self) -> dict[str, object]:
         """Return the counters for the run's summary."""
@@ -84,21 +85,19 @@ class CompiledShell(RelayShell):
     def __init__(
         self,
         endpoint: socket.socket,
-        destination: Address,
-        source: Address,
+        ways: Sequence[tuple[Address, Address]],
         *,
-        duplex: bool,
         network: CompiledNetwork,
         clock: RunClock,
         spin_us: float,
         loops: int | None = None,
     ) -> None:
-        super().__init__(endpoint, destination, source, duplex=duplex, loops=loops)
+        super().__init__(endpoint, ways, loops=loops)
         if not self._beside:
             raise PeerError("the system refused to open a socket for each peer")
         self._network, self._passed_on = network, [0, 0]
         receivers = dict(zip(self._directions, self._beside, strict=True))
-        network.open(clock, endpoint, receivers, destination, int(spin_us * 1000))
+        network.open(clock, endpoint, receivers, self._destinations, int(spin_us * 1000))
         self._to_read = [endpoint.fileno(), *(one.fileno() for one in self._beside)]
 
     def tend(self, now_ns: int) -> Sequence[Record | Notice]:

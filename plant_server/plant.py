@@ -1,12 +1,12 @@
 """The plant: a system on a time grid, under held inputs.
 
 At grid time t_k = k h the plant advances its system to t_k under the input held since t_{k−1}. Then
-it measures, and latches the newest actuation received, which it holds until t_{k+1}. A late step
-has the same length h, and the plant catches up. The watchdog chooses the input when no actuation
-has been received for too long (``watchdog.py``). The scenario defines the system
-(``noack.plants``), its disturbance from t_k until t_{k+1} (``disturbance_signal.py``) and its
-measurement (``measurement.py``). If the system fails, x is NaN from then on, as in a plant that
-diverges, and a notice gives the reason.
+it measures, and latches the newest actuation received; the input that is due of it is held until
+t_{k+1} (``input_buffer.py``). A late step has the same length h, and the plant catches up. The
+watchdog chooses the input when no actuation has been received for too long (``watchdog.py``). The
+scenario defines the system (``noack.plants``), its disturbance from t_k until t_{k+1}
+(``disturbance_signal.py``) and its measurement (``measurement.py``). If the system fails, x is NaN
+from then on, as in a plant that diverges, and a notice gives the reason.
 """
 
 from collections.abc import Sequence
@@ -23,6 +23,7 @@ from noack.protocol.machine_interface import FAILED, Notice, Output, Record
 from noack.protocol.record_tables import PLANT_ACTUATION, PLANT_STEP
 from noack.protocol.wire_format import Flow, Message
 from plant_server.disturbance_signal import Disturbance, disturbance_of
+from plant_server.input_buffer import InputBuffer
 from plant_server.measurement import MeasurementModel, measurement_model_of
 from plant_server.watchdog import FALLBACK_NAMES, Fallback, PredictedInput, Watchdog, hold, zero
 
@@ -67,6 +68,7 @@ class Plant:
         self._measurements = 0
         self._failed = False
         self._x, self._z = system.x, system.z
+        self._predictive = len(watchdog.newest.inputs) > 1
         self.u = watchdog.newest.u
         self._applied_input = self.u
         """The input of the system: u with its disturbance."""
@@ -86,19 +88,22 @@ class Plant:
     def handle(self, message: Message, now_ns: int) -> Sequence[Output]:
         """Receive an actuation; it is applied from the next step on."""
         newest = self._watchdog.take(message.vector, message.t_ns, message.sequence)
+        further = (newest.inputs[1:].ravel(), newest.x_c)
         row = (self._count(), message.sequence, message.t_ns, now_ns, newest.u)
-        return (Record(PLANT_ACTUATION, (*row, newest.x_c) if len(newest.x_c) else row),)
+        return (Record(PLANT_ACTUATION, (*row, *(part for part in further if len(part)))),)
 
     def on_timer(self, now_ns: int) -> Sequence[Output]:
         """Make one step under the held input; measure; choose the input from now on."""
         step, t_ns = self._step, self._step * self._period_ns
         failed = self._advance(t_ns) if step > 0 else ()
-        self.u, notices = self._watchdog.input(t_ns)
+        self.u, entry, notices = self._watchdog.input(t_ns)
         disturbed = self._disturb(step)
         self._step += 1
         newest = self._watchdog.newest.sequence
         x, z = self._x, self._z
         row: tuple[Any, ...] = (self._count(), step, t_ns, now_ns, x, self.u, newest)
+        if self._predictive:
+            row = (*row, entry)
         if len(z) or disturbed:
             row = (*row, *(part for part in (z, *disturbed) if len(part)))
         record = Record(PLANT_STEP, row)
@@ -180,6 +185,11 @@ def _watchdog_of(resolved: Scenario) -> Watchdog:
         "model": PredictedInput(loop.H, loop.K, resolved.timing.plant_period_ns),
     }
     policy = resolved.plant.watchdog.policy
+    timing, predictions = resolved.timing, resolved.controller.predictions
     return Watchdog(
-        loop.m, resolved.timing.actuation_timeout_ns, fallbacks[policy], FALLBACK_NAMES[policy]
+        InputBuffer(loop.m, predictions, timing.controller_period_ns),
+        timing.actuation_timeout_ns,
+        fallbacks[policy],
+        FALLBACK_NAMES[policy],
+        timing.missing_actuation_ns,
     )

@@ -29,7 +29,7 @@ from noack.plants.linear import LinearSettings
 from noack.protocol.machine_interface import Notice
 from noack.protocol.record_tables import NO_SEQUENCE, PLANT_ACTUATION, PLANT_STEP
 from plant_server.measurement import measurement_model_of
-from plant_server.watchdog import FALLBACK_NAMES, arrives_again, became_too_old
+from plant_server.watchdog import FALLBACK_NAMES, are_missing, arrive_again
 
 _IN_TIME = -1
 _ZERO = 1
@@ -37,8 +37,8 @@ _ZERO = 1
 PLANT = np.dtype(
     [(name, "<i8") for name in (
         "period_ns", "horizon_ns", "measure_every", "step", "measurements",
-        "newest_ns", "newest_sequence", "timeout_ns", "policy",
-        "tripped_ns",  # since when the newest actuation has been too old; _IN_TIME: it is not
+        "newest_ns", "newest_sequence", "timeout_ns", "notice_ns", "policy",
+        "noticed_ns",  # since when actuations have been reported missing; _IN_TIME: they are not
     )]
 )  # fmt: skip
 
@@ -66,6 +66,7 @@ def plant_arrays_of(resolved: Sequence[Scenario]) -> FleetParts | None:
         not isinstance(one.plant.system, LinearSettings)
         or one.plant.disturbances
         or one.observer is not None
+        or one.controller.predictions > 1
         or measurement_model_of(one) is not None
         or one.plant.watchdog.policy not in ("hold", "zero")
         for one in resolved
@@ -77,8 +78,9 @@ def plant_arrays_of(resolved: Sequence[Scenario]) -> FleetParts | None:
         row["period_ns"], row["horizon_ns"] = one.timing.plant_period_ns, one.timing.horizon_ns
         row["measure_every"] = one.plant.measure_every
         row["timeout_ns"] = one.timing.actuation_timeout_ns
+        row["notice_ns"] = max(one.timing.missing_actuation_ns, one.timing.actuation_timeout_ns)
         row["policy"] = _ZERO if one.plant.watchdog.policy == "zero" else 0
-    plants["newest_sequence"], plants["tripped_ns"] = NO_SEQUENCE, _IN_TIME
+    plants["newest_sequence"], plants["noticed_ns"] = NO_SEQUENCE, _IN_TIME
     discrete = [
         discretise(loop.A, loop.B, one.timing.plant_period_ns)
         for loop, one in zip(loops, resolved, strict=True)
@@ -99,10 +101,10 @@ def _notice(own: PlantArrays, fleet: Any) -> Notice:
     plant = own.plants[fleet["note_loop"]]
     t_ns, since_ns = int(fleet["note_ns"]), int(fleet["note_since_ns"])
     if since_ns != _IN_TIME:
-        return arrives_again(t_ns, since_ns)
+        return arrive_again(t_ns, since_ns)
     none = plant["newest_sequence"] == NO_SEQUENCE
     name = FALLBACK_NAMES["zero" if plant["policy"] == _ZERO else "hold"]
-    return became_too_old(
+    return are_missing(
         t_ns, int(plant["newest_ns"]), int(plant["timeout_ns"]), name, none=bool(none)
     )
 
@@ -149,10 +151,11 @@ def _choose_input(memory: FleetMemory, own: PlantArrays, loop: int, t_ns: int) -
     is_old = t_ns - plant.newest_ns > plant.timeout_ns
     for k in range(loop * fleet.m, (loop + 1) * fleet.m):
         own.u[k] = 0.0 if is_old and plant.policy == _ZERO else own.newest_u[k]
-    if is_old == (plant.tripped_ns != _IN_TIME):
+    is_missing = t_ns - plant.newest_ns > plant.notice_ns
+    if is_missing == (plant.noticed_ns != _IN_TIME):
         return 0
-    fleet.note_loop, fleet.note_ns, fleet.note_since_ns = loop, t_ns, plant.tripped_ns
-    plant.tripped_ns = t_ns if is_old else _IN_TIME
+    fleet.note_loop, fleet.note_ns, fleet.note_since_ns = loop, t_ns, plant.noticed_ns
+    plant.noticed_ns = t_ns if is_missing else _IN_TIME
     return NOTES
 
 

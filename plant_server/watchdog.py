@@ -1,10 +1,10 @@
 """The plant's watchdog: the input that is applied when no actuation has arrived for too long.
 
 At t_k the newest actuation is too old if t_k − t > timeout. Here t is the time of the model state
-x_c from which the actuation was computed; before the first actuation, t = 0. The policy then
-determines the input:
+x_c from which the actuation was computed; before the first actuation, t = 0. Until then its inputs
+are applied (:mod:`plant_server.input_buffer`). The policy then determines the input:
 
-* ``hold``: the newest input, unchanged;
+* ``hold``: the last input of the newest actuation;
 * ``zero``: 0;
 * ``model``: a predictive actuator. It applies the controller's input for the case that no update
   has arrived since t: u + K(x̂ − x_c) with x̂ = e^{H(t_k − t)} x_c. For this an actuation carries
@@ -13,7 +13,7 @@ determines the input:
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -23,20 +23,10 @@ from noack.core.ordered_arithmetic import product
 from noack.protocol.machine_interface import Notice
 from noack.protocol.record_tables import NO_SEQUENCE
 from noack.protocol.wire_format import NO_VECTOR
+from plant_server.input_buffer import Actuation, InputBuffer
 
 NEVER_NS = 2**63 - 1
 """A timeout that no run reaches."""
-
-
-class Actuation(NamedTuple):
-    """An actuation as received by the plant."""
-
-    u: Vector
-    """The input, (m,)."""
-    x_c: Vector
-    """The controller's model state at ``t_ns``, (n,), with policy ``model``; else (0,)."""
-    t_ns: int
-    sequence: int
 
 
 Fallback = Callable[[Actuation, int], Vector]
@@ -44,8 +34,9 @@ Fallback = Callable[[Actuation, int], Vector]
 
 
 def hold(newest: Actuation, t_ns: int) -> Vector:
-    """Return the newest input, of any age."""
-    return newest.u
+    """Return the last input of the actuation, of any age."""
+    u: Vector = newest.inputs[-1]
+    return u
 
 
 def zero(newest: Actuation, t_ns: int) -> Vector:
@@ -89,63 +80,70 @@ def too_old(t_ns: Any, newest_ns: Any, timeout_ns: int) -> Any:
 class Watchdog:
     """Chooses the plant's input at each step, and reports when the newest actuation is too old.
 
-    The fallback chooses the input if the newest actuation is older than the timeout;
-    ``input_name`` describes that input in notices.
+    Args:
+        buffer: has the newest actuation.
+        timeout_ns: the fallback chooses the input if the actuation is older.
+        fallback: the policy.
+        input_name: describes the input of the fallback in notices.
+        notice_ns: age from which a notice reports it; at least the timeout.
     """
 
     def __init__(
         self,
-        inputs: int,
+        buffer: InputBuffer,
         timeout_ns: int = NEVER_NS,
         fallback: Fallback = hold,
         input_name: str = "held",
+        notice_ns: int = 0,
     ) -> None:
-        self._inputs = inputs
+        self._buffer = buffer
+        self.take = buffer.take
         self._timeout_ns = timeout_ns
         self._fallback = fallback
         self._input_name = input_name
-        self._tripped_ns: int | None = None
-        self.newest = Actuation(np.zeros(inputs), NO_VECTOR, 0, NO_SEQUENCE)
+        self._notice_ns = max(notice_ns, timeout_ns)
+        self._noticed_ns: int | None = None
 
-    def take(self, vector: Vector, t_ns: int, sequence: int) -> Actuation:
-        """Store the vector of an actuation, u or [u; x_c]."""
-        if len(vector) == self._inputs:
-            self.newest = Actuation(vector, NO_VECTOR, t_ns, sequence)
-            return self.newest
-        u, x_c = vector[: self._inputs], vector[self._inputs :]
-        # Slices are copied: a slice may have another memory layout than the vectors of a replay.
-        self.newest = Actuation(u.copy(), x_c.copy(), t_ns, sequence)
-        return self.newest
+    @property
+    def newest(self) -> Actuation:
+        """The newest actuation."""
+        return self._buffer.newest
 
-    def input(self, t_ns: int) -> tuple[Vector, tuple[Notice, ...]]:
-        """Return the input that is applied from ``t_ns`` on, shape (m,), and notices."""
-        newest, tripped_ns = self.newest, self._tripped_ns
-        if not too_old(t_ns, newest.t_ns, self._timeout_ns):
-            if tripped_ns is None:
-                return newest.u, ()
-            self._tripped_ns = None
-            return newest.u, (arrives_again(t_ns, tripped_ns),)
-        u = self._fallback(newest, t_ns)
-        if tripped_ns is not None:
-            return u, ()
-        self._tripped_ns = t_ns
+    def input(self, t_ns: int) -> tuple[Vector, int, tuple[Notice, ...]]:
+        """Return the input that is applied from ``t_ns`` on, shape (m,), and notices.
+
+        Between them is the number of the input in the newest actuation; −1: of the fallback.
+        """
+        newest_ns = self._buffer.newest.t_ns
+        if too_old(t_ns, newest_ns, self._timeout_ns):
+            u, entry = self._fallback(self._buffer.newest, t_ns), -1
+        else:
+            u, entry = self._buffer.due(t_ns)
+        if too_old(t_ns, newest_ns, self._notice_ns) == (self._noticed_ns is not None):
+            return u, entry, ()
+        return u, entry, (self._notice(t_ns),)
+
+    def _notice(self, t_ns: int) -> Notice:
+        """Report that actuations are missing, or that they arrive again."""
+        newest, noticed_ns = self._buffer.newest, self._noticed_ns
+        self._noticed_ns = t_ns if noticed_ns is None else None
+        if noticed_ns is not None:
+            return arrive_again(t_ns, noticed_ns)
         none = newest.sequence == NO_SEQUENCE
-        return u, (
-            became_too_old(t_ns, newest.t_ns, self._timeout_ns, self._input_name, none=none),
-        )
+        return are_missing(t_ns, newest.t_ns, self._timeout_ns, self._input_name, none=none)
 
 
-def arrives_again(t_ns: int, tripped_ns: int) -> Notice:
-    """Return the notice of the first actuation in time after ``tripped_ns``."""
-    lasted_s = (t_ns - tripped_ns) / NS_PER_S
+def arrive_again(t_ns: int, noticed_ns: int) -> Notice:
+    """Return the notice of the first actuation after those reported missing at ``noticed_ns``."""
+    lasted_s = (t_ns - noticed_ns) / NS_PER_S
     text = f"actuations arrive again; there was none in time for {lasted_s:.4g} s"
     return Notice(t_ns, "watchdog", text)
 
 
-def became_too_old(
+def are_missing(
     t_ns: int, newest_ns: int, timeout_ns: int, input_name: str, *, none: bool
 ) -> Notice:
-    """Return the notice of an actuation that is too old; ``none``: there has not been any."""
+    """Return the notice of a newest actuation that is too old; ``none``: there is none."""
     age_s, timeout_s = ((ns / NS_PER_S) for ns in (t_ns - newest_ns, timeout_ns))
     what = "no actuation for" if none else "the newest actuation is too old:"
     text = f"{what} {age_s:.4g} s, {timeout_s:.4g} s allowed; the input is {input_name}"

@@ -28,9 +28,10 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
     tables,
 )
-from noack.protocol.topology import ROUTES
+from noack.protocol.topology import RECEIVES, SENDS, receiver_of
 from noack.protocol.wire_format import Decoder, Encoder, Flow, Message, Rejection
 from noack.trigger.decaying import DecayingTrigger
+from plant_server.input_buffer import InputBuffer
 from plant_server.plant import Plant
 from plant_server.watchdog import Watchdog
 from sensor_node.sensor import Sensor
@@ -80,7 +81,9 @@ class Loop(Shuttle):
 
 def linear_plant(A: Matrix, B: Matrix, x0: Vector, horizon_ns: int) -> Plant:
     system = LinearSystem(A, B, x0, step_ns=PERIOD_NS)
-    return Plant(system, Watchdog(B.shape[1]), period_ns=PERIOD_NS, horizon_ns=horizon_ns)
+    return Plant(
+        system, Watchdog(InputBuffer(B.shape[1])), period_ns=PERIOD_NS, horizon_ns=horizon_ns
+    )
 
 
 class Case(NamedTuple):
@@ -223,10 +226,11 @@ def test_nothing_flows_from_the_controller_to_the_sensor(case: Case) -> None:
 
 
 def test_the_sensor_accepts_datagrams_from_the_plant_only() -> None:
-    assert [role for role, leg in ROUTES.items() if leg.to == "sensor"] == ["plant"]
-    assert ROUTES["controller"].to == "plant"
+    to = {role: receiver_of(role, flow) for role, flow in SENDS.items()}
+    assert [role for role, receiver in to.items() if receiver == "sensor"] == ["plant"]
+    assert to["controller"] == "plant"
     for flow in (Flow.UPDATE, Flow.ACTUATION):
-        ear = Decoder(ROUTES["sensor"].receives, 2, RUN, KEY)
+        ear = Decoder(RECEIVES["sensor"], 2, RUN, KEY)
         data = Encoder(RUN, KEY).encode(Message(flow, 0, 0, np.zeros(2)))
         assert ear.decode(data) is None
         assert ear.rejected[Rejection.FLOW] == 1
@@ -234,10 +238,10 @@ def test_the_sensor_accepts_datagrams_from_the_plant_only() -> None:
 
 def test_no_process_of_the_ordinary_loop_accepts_acknowledgements() -> None:
     """Decoders of the loop reject them even under the run's key: each decoder accepts one flow."""
-    assert all(Flow.ACKNOWLEDGEMENT not in (leg.receives, leg.sends) for leg in ROUTES.values())
+    assert Flow.ACKNOWLEDGEMENT not in {*RECEIVES.values(), *SENDS.values()}
     data = Encoder(RUN, KEY).encode(Message(Flow.ACKNOWLEDGEMENT, 0, 0, np.zeros(0)))
     for role in ("plant", "sensor", "controller"):
-        ear = Decoder(ROUTES[role].receives, 1, RUN, KEY)
+        ear = Decoder(RECEIVES[role], 1, RUN, KEY)
         assert ear.decode(data) is None
         assert ear.rejected[Rejection.LENGTH] == 1
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.claims.observed_conditions import DROPOUTS, AssumptionViolation
-from cosim.analysis.summary_model import AcknowledgementsPart, ViolationPart
+from cosim.analysis.summary_model import FlowPart, ViolationPart
 from cosim.record.packet_outcomes import PacketOutcome, packet_outcomes
 from cosim.record.recorded_changes import NEVER_NS, changes_of
 from cosim.record.run_record import RunRecord
@@ -21,7 +21,7 @@ from noack.protocol.record_tables import (
     Fate,
     effective,
 )
-from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.topology import ENDS, LOOP_ROLES
 from noack.protocol.wire_format import Flow
 from noack.runtime.life_cycle import HORIZON
 
@@ -37,15 +37,25 @@ def drops_by_cause(outcomes: PacketOutcome) -> dict[str, int]:
     return {cause: n for cause, n in causes.items() if n}
 
 
-def acknowledgements(record: RunRecord) -> AcknowledgementsPart:
-    """The outcome of the acknowledgements; the controller sends one for each update."""
-    outcomes = packet_outcomes(record, Flow.ACKNOWLEDGEMENT)
-    return AcknowledgementsPart(
-        sent=record.count(CONTROLLER_DELIVERY),
-        lost=int(outcomes.lost.sum()),
-        longest_loss_burst=outcomes.longest_loss_burst(),
-        received=record.count(SENSOR_ACKNOWLEDGEMENT),
-    )
+_SENT_RECEIVED = {
+    Flow.ACKNOWLEDGEMENT: (CONTROLLER_DELIVERY, SENSOR_ACKNOWLEDGEMENT),
+    Flow.ACTUATION: (CONTROLLER_STEP, PLANT_ACTUATION),
+}
+"""The tables with one row for each message sent, and for each message received."""
+
+
+def from_controller(record: RunRecord) -> dict[str, FlowPart]:
+    """The outcome of what the controller sends through the network, by its name."""
+    found = {}
+    for flow in record.scenario.network.flows[1:]:
+        outcomes, (sent, received) = packet_outcomes(record, flow), _SENT_RECEIVED[flow]
+        found[f"{flow.name.lower()}s"] = FlowPart(
+            sent=record.count(sent),
+            lost=int(outcomes.lost.sum()),
+            longest_loss_burst=outcomes.longest_loss_burst(),
+            received=record.count(received),
+        )
+    return found
 
 
 def unintended_losses(record: RunRecord) -> dict[str, int]:
@@ -64,11 +74,14 @@ def unintended_losses(record: RunRecord) -> dict[str, int]:
         "update to controller": _Unmatched().take(outcomes.sequence[outcomes.forwarded], received),
         "actuation": actuated,
     }
-    if record.scenario.protocol.acknowledges:
-        answers = packet_outcomes(record, Flow.ACKNOWLEDGEMENT)
-        arrived = record.columns(SENSOR_ACKNOWLEDGEMENT, "sequence")["sequence"]
-        legs["acknowledgement to netem"] = _Unmatched().take(received, answers.sequence)
-        legs["acknowledgement to sensor"] = _Unmatched().take(
+    for flow in record.scenario.network.flows[1:]:
+        name, answers = flow.name.lower(), packet_outcomes(record, flow)
+        sent, arrived = (
+            record.columns(table, "sequence")["sequence"] for table in _SENT_RECEIVED[flow]
+        )
+        legs.pop(name, None)
+        legs[f"{name} to netem"] = _Unmatched().take(sent, answers.sequence)
+        legs[f"{name} to {ENDS[flow].receiver}"] = _Unmatched().take(
             answers.sequence[answers.forwarded], arrived
         )
     complete = all(record.reports.get(role, {}).get("ended") == HORIZON for role in LOOP_ROLES)

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.loss_statistics import (
-    acknowledgements,
     drops_by_cause,
+    from_controller,
     missing_rows,
     reported_violations,
     unintended_losses,
@@ -130,7 +130,7 @@ def _transmissions(record: RunRecord) -> dict[str, Any]:
         "forced_deliveries": int((outcomes.fate == Fate.FORCED).sum()),
         "longest_loss_burst": max(outcomes.longest_loss_burst(), longest),
         "loss_bursts": {str(n): count for n, count in sorted(Counter(bursts).items())},
-        "acknowledgements": acknowledgements(record) if scenario.protocol.acknowledges else None,
+        **from_controller(record),
         "inter_event_min_s": _or_none(np.min, intervals_s),
         "inter_event_median_s": _or_none(np.median, intervals_s),
         "inter_delivery_median_s": _or_none(np.median, np.diff(deliveries["t_ns"]) * 1e-9),

@@ -67,8 +67,8 @@ class LatencyPart(Quantiles):
     updates: Count
 
 
-class AcknowledgementsPart(SummaryPart):
-    """The outcome of acknowledgements."""
+class FlowPart(SummaryPart):
+    """The outcome of acknowledgements or actuations in the network."""
 
     sent: Count
     lost: Count
@@ -303,7 +303,9 @@ class RunSummary(SummaryPart):
     forced_deliveries: Count
     longest_loss_burst: Count
     loss_bursts: Counts = {}
-    acknowledgements: AcknowledgementsPart | None = None
+    acknowledgements: FlowPart | None = None
+    actuations: FlowPart | None = None
+    """Only if they cross the network."""
     assumption_violations: list[ViolationPart]
     assumptions: list[AssumptionPart]
     restarts: list[RestartPart]

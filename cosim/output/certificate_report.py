@@ -362,7 +362,8 @@ def _print_constants(console: Console, found: Certificates) -> None:
         "[dim]Each bound of a norm is multiplied by e^(−rate·t). paper: no sampling, no delay, no "
         "hold. schedule: the scenario's rates, plus the lateness that it allows. plant: the "
         "scenario's plant. box: every plant of the uncertainty box. updates outstanding: maximum "
-        "number of updates lost or in flight. inter-event time: minimum.[/]"
+        "number of updates lost or in flight. no update missing: while the controller has every "
+        "update, which sharpens the bound of x from an event on. inter-event time: minimum.[/]"
     )
     if not found.scenario.coverage.is_undisturbed:
         console.print(
@@ -406,6 +407,7 @@ def _constants(found: Certificates) -> Iterator[tuple[str, list[str], str]]:
     yield f"Δ, bound of ‖e_c‖{unit}", constant("delta"), delta_2
     yield f"bound of ‖e_s‖{unit}", constant("overshoot"), "1"
     yield "bound of ‖u − Kx‖", constant("input_error"), NONE
+    yield "· no update missing", constant("received_input_error"), NONE
     yield "X, bound of ‖x‖", constant("state"), state_2
     yield "inter-event time, s", row(lambda c: c.inter_event_s), spacing_2
     yield "loop gain (< 1)", constant("loop_gain"), NONE

@@ -97,10 +97,11 @@ def _losses(summary: Summary) -> Iterator[tuple[str, str]]:
     if set(causes) - {"dropped"}:
         for cause, count in causes.items():
             yield f"  of these {cause.replace('_', ' ')}", str(count)
-    if (sent := summary.get("acknowledgements")) is not None:
-        yield "acknowledgements", str(sent["sent"])
-        yield "  lost", f"{sent['lost']} ({ratio(sent['lost'], sent['sent'])})"
-        yield "  longest loss burst", str(sent["longest_loss_burst"])
+    for name in ("acknowledgements", "actuations"):
+        if (sent := summary.get(name)) is not None:
+            yield name, str(sent["sent"])
+            yield "  lost", f"{sent['lost']} ({ratio(sent['lost'], sent['sent'])})"
+            yield "  longest loss burst", str(sent["longest_loss_burst"])
     yield _longest_burst(summary)
     causes = [one["cause"] for one in summary["assumption_violations"]]
     yield "loss bursts beyond M − 1", str(causes.count("dropouts"))

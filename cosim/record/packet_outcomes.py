@@ -6,13 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.record.run_record import Rows, RunRecord, updates_in
-from noack.protocol.record_tables import (
-    ACKNOWLEDGEMENTS,
-    NETEM_PACKET,
-    NETEM_RELEASE,
-    UPDATES,
-    effective,
-)
+from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, direction_of, effective
 from noack.protocol.wire_format import Flow
 
 
@@ -51,7 +45,7 @@ class PacketOutcome(NamedTuple):
 
 
 def packet_outcomes(record: RunRecord, flow: Flow = Flow.UPDATE) -> PacketOutcome:
-    """Return the outcomes of the updates or acknowledgements that reached the network emulator."""
+    """Return the outcomes of a flow's datagrams that reached the network emulator."""
     released = _released(record, flow)
     parts = [_outcomes(rows, flow, *released) for rows in record.source.batches(NETEM_PACKET)]
     parts.append(_outcomes(np.zeros(0, record.tables[NETEM_PACKET]), flow, *released))
@@ -60,8 +54,8 @@ def packet_outcomes(record: RunRecord, flow: Flow = Flow.UPDATE) -> PacketOutcom
 
 def _released(record: RunRecord, flow: Flow) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return the numbers of the delayed datagrams that left, with whether each was stale."""
-    direction = ACKNOWLEDGEMENTS if flow is Flow.ACKNOWLEDGEMENT else UPDATES
-    every = not record.scenario.protocol.acknowledges
+    direction = direction_of(flow)
+    every = len(record.scenario.network.flows) == 1
     releases = record.columns(
         NETEM_RELEASE, "sequence", "flow", "copy", "stale",
         where=lambda rows: np.full(len(rows), every) | (rows["flow"] == direction),

@@ -70,7 +70,7 @@ def simulate_loops(scenario: Scenario, progress: Progress | None = None) -> Shar
         "controller": Fleet([controller_of(loop) for loop in loops], phases),
     }
     entries = [loop.message_sizes.entries for loop in loops]
-    shuttle = Shuttle(machines, entries, gathered.take, protocol=scenario.protocol)
+    shuttle = Shuttle(machines, entries, gathered.take, network=scenario.network.flows)
     drive(shuttle, scenario, gathered.take, progress)
     network_rows = gathered.network.rows()
     records = []

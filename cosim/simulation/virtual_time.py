@@ -26,18 +26,23 @@ from noack.config.parameter_changes import (
 from noack.config.resolution import tables_of
 from noack.config.scenario import Scenario
 from noack.protocol.fleet import FleetDecoder
-from noack.protocol.loop_protocol import PROTOCOLS, LoopProtocol
 from noack.protocol.machine_interface import Machine, Notice, Record
 from noack.protocol.record_tables import (
-    ACKNOWLEDGEMENTS,
     NETEM_PACKET,
     NETEM_RELEASE,
     OWNER,
     PACKET_HEAD_BYTES,
-    UPDATES,
     Fate,
 )
-from noack.protocol.topology import CHANGEABLE, LOOP_ROLES, RECORDER, ROUTES
+from noack.protocol.topology import (
+    CHANGEABLE,
+    ENDS,
+    LOOP_ROLES,
+    PAPER,
+    RECEIVES,
+    RECORDER,
+    receiver_of,
+)
 from noack.protocol.wire_format import KEY_BYTES, Decoder, Encoder, Flow, Message, loop_number
 from noack.runtime.life_cycle import HORIZON
 from plant_server.plant import plant_of
@@ -123,7 +128,7 @@ class Shuttle:
         machines: the machine of each role.
         entries: length of a message's vector by flow, of each loop.
         take: called with each row or notice and the role that emitted it.
-        protocol: whether updates are acknowledged.
+        network: what crosses the network.
     """
 
     def __init__(
@@ -132,19 +137,19 @@ class Shuttle:
         entries: Sequence[Callable[[Flow], int]],
         take: Take,
         *,
-        protocol: LoopProtocol = PROTOCOLS["none"],
+        network: Sequence[Flow] = PAPER,
     ) -> None:
         self.machines = machines
         self._take = take
         self._encoder = Encoder(RUN_ID, _KEY)
         self._loops = len(entries)
         self.decoders = {
-            role: _decoder(leg.receives, entries)
-            for role, leg in ROUTES.items()
+            role: _decoder(flow, entries)
+            for role, flow in RECEIVES.items()
             if role != "netem"  # netem reads no payload
         }
         self.acknowledgements = _decoder(Flow.ACKNOWLEDGEMENT, entries)
-        self._acknowledgement_routes = protocol.acknowledgement_routes
+        self._network = network
         self._timers = [
             (machines[role].next_deadline_ns, rank, role) for role, rank in _TIMER_RANKS.items()
         ]
@@ -181,7 +186,7 @@ class Shuttle:
     def _receive(self, sender: str, role: str, data: bytes) -> bool:
         message: Datagram | Message | None
         if role == "netem":
-            direction = ACKNOWLEDGEMENTS if sender == "controller" else UPDATES
+            direction = [ENDS[flow].sender for flow in self._network].index(sender)
             message = Datagram(direction * self._loops + (loop_number(data) or 0), data)
         elif (sender, role) == ("netem", "sensor"):
             message = self.acknowledgements.decode(data)
@@ -199,11 +204,8 @@ class Shuttle:
             else:
                 forwarded = isinstance(output, Datagram)
                 data = output.data if forwarded else self._encoder.encode(output)
-                flow = output.flow // self._loops if forwarded else output.flow
-                answers = flow == (ACKNOWLEDGEMENTS if forwarded else Flow.ACKNOWLEDGEMENT)
-                routes = self._acknowledgement_routes if answers else {}
-                to = routes.get(role, ROUTES[role].to)
-                self._sent.append((role, to, data))
+                flow = self._network[output.flow // self._loops] if forwarded else output.flow
+                self._sent.append((role, receiver_of(role, flow, self._network), data))
 
 
 def _decoder(flow: Flow, entries: Sequence[Callable[[Flow], int]]) -> AnyDecoder:
@@ -274,7 +276,7 @@ def simulate(
         "controller": controller_of(resolved),
     }
     shuttle = Shuttle(
-        machines, [resolved.message_sizes.entries], gathered.take, protocol=resolved.protocol
+        machines, [resolved.message_sizes.entries], gathered.take, network=resolved.network.flows
     )
     drive(shuttle, resolved, gathered.take, progress)
     rows = gathered.rows()

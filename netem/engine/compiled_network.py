@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from netem.duplex_link import ACKNOWLEDGEMENT_LINK
 from netem.engine.batched_directions import BatchedDirection
 from netem.engine.epoll_object import Epoll
 from netem.engine.pump import pump_layout
@@ -19,7 +18,7 @@ from netem.engine.pump.client_table import insert
 from netem.engine.pump.pump_layout import Array
 from netem.engine.pump_memory import PumpMemory
 from netem.engine.relay_sockets import stamp_arrivals
-from netem.link_machine import UPDATE_LINK, Datagram, at_start, due_settings
+from netem.link_machine import Datagram, at_start, due_settings, link_name
 from netem.rules.settings_change import carry
 from noack.config.parameter_changes import ChangeSchedule, ParameterChange
 from noack.config.scenario import Scenario
@@ -72,12 +71,11 @@ class CompiledNetwork:
         pump["loops"], pump["by_loop"] = self._loops, loops is not None
         flows = np.arange(self._loops)
         clients["number"][flows] = clients["place"][flows] = flows
-        duplex, network = resolved.protocol.acknowledges, resolved.network
-        links = (
-            (network.link, UPDATE_LINK),
-            (network.reverse.link if duplex else LinkSettings(), ACKNOWLEDGEMENT_LINK),
-        )
+        network = resolved.network
+        links = [(network.link_of(flow), link_name(flow)) for flow in network.flows]
         self._directions: list[BatchedDirection] = []
+        if len(links) == 1:  # the pump has two directions; nothing arrives in the second
+            links.append((LinkSettings(), "none"))
         for number, (settings, name) in enumerate(links):
             first, names = at_start(settings, name, start)
             direction = BatchedDirection(
@@ -98,17 +96,16 @@ class CompiledNetwork:
         clock: RunClock,
         sender: socket.socket,
         receivers: Mapping[Address, socket.socket],
-        destination: Address,
+        destinations: Sequence[Address],
         spin_ns: int = 0,
     ) -> None:
         """Use these sockets from now on.
 
         Args:
             clock: the run's clock.
-            sender: an unconnected socket, which sends all datagrams but acknowledgements.
-            receivers: a socket connected to each peer, the sensor first, then the controller if it
-                acknowledges updates.
-            destination: the controller.
+            sender: an unconnected socket, which sends the updates.
+            receivers: a socket connected to the source of each direction, the sensor first.
+            destinations: where each direction ends.
             spin_ns: busy-wait for this time before a departure.
         """
         memory, pump = self._memory.memory, self._memory.pump
@@ -126,9 +123,10 @@ class CompiledNetwork:
         with np.errstate(over="ignore"):
             row = memory.clients.view(np.recarray)
             insert(memory.table, row, 0, np.frombuffer(self._sensor, np.int64))
-        controller, memory.directions["name_bytes"] = packed_name(destination)
-        memory.directions["name"] = np.frombuffer(controller, np.uint8)
-        memory.directions["sends"] = pump_layout.SERVER_NAME, pump_layout.CLIENT_NAME
+        memory.directions["sends"] = pump_layout.SERVER_NAME
+        for direction, destination in zip(memory.directions, destinations, strict=False):
+            name, direction["name_bytes"] = packed_name(destination)
+            direction["name"] = np.frombuffer(name, np.uint8)
         memory.directions["full"][0] = 1  # refuse other sources
 
     def close(self) -> None:

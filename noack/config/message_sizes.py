@@ -42,9 +42,9 @@ class MessageSizes:
 
     @property
     def actuation_entries(self) -> int:
-        """Number of entries of an actuation: u, or u and x_c."""
+        """Number of entries of an actuation: its inputs, with x_c if it is predictive."""
         n, m = self.scenario.model.dimensions
-        return n + m if self.is_predictive else m
+        return m * self.scenario.controller.predictions + n * self.is_predictive
 
     def entries(self, flow: Flow) -> int:
         """Number of entries of a message of a flow."""

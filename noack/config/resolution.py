@@ -166,6 +166,7 @@ def tables_of(resolved: Scenario) -> Mapping[str, np.dtype[np.void]]:
     disturbed = {one.at for one in resolved.plant.disturbances}
     return tables(
         n, m, acknowledged=acknowledged, predictive=predictive, internal=internal,
+        predictions=resolved.controller.predictions,
         disturbed_input="input" in disturbed, disturbed_state="state" in disturbed,
         outputs=0 if resolved.observer is None else resolved.message_sizes.outputs,
         inputs_reported=resolved.message_sizes.inputs_reported,

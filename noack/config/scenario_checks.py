@@ -35,10 +35,8 @@ def check_sections(scenario: "Scenario") -> None:
 def check_kept_loss(scenario: "Scenario") -> None:
     """Raise ValueError if a loss rate cannot be kept; with a trace, as soon as it has been read."""
     network = scenario.network
-    for key, link in (
-        ("network", network.link),
-        ("network.acknowledgements", network.reverse.link),
-    ):
+    for key, section in network.directions.items():
+        link = section.link
         losses = [getattr(one, "loss", None) for one in link.impairments]
         if any(isinstance(one, TraceLoss) for one in losses):
             continue
@@ -121,21 +119,35 @@ def _check_observer(scenario: "Scenario") -> None:
 
 def _check_watchdog(scenario: "Scenario") -> None:
     timing, (n, m) = scenario.timing, scenario.model.dimensions
-    if timing.actuation_timeout_ns < timing.controller_period_ns:
+    if timing.actuation_timeout_ns < timing.predicted_ns:
+        several = "" if scenario.controller.predictions == 1 else " times controller.predictions"
         raise ValueError(
-            "plant.watchdog.timeout_s: shorter than a period of the controller "
-            f"({timing.controller_period_ns / NS_PER_S} s)"
+            f"plant.watchdog.timeout_s: shorter than a period of the controller{several} "
+            f"({timing.predicted_ns / NS_PER_S} s)"
+        )
+    if scenario.controller.predictions > 1 and not scenario.controller.is_linear:
+        raise ValueError(
+            "controller.predictions: needs u = K x_c; "
+            f'not with controller.kind = "{scenario.controller.kind}"'
         )
     if scenario.message_sizes.is_predictive and not scenario.controller.is_linear:
         raise ValueError(
             'plant.watchdog.policy: "model" predicts u = K x_c; '
             f'not with controller.kind = "{scenario.controller.kind}"'
         )
-    if scenario.message_sizes.actuation_entries > MAX_DIMENSION:
+    if scenario.message_sizes.actuation_entries <= MAX_DIMENSION:
+        return
+    predictive = scenario.message_sizes.is_predictive
+    if (predictions := scenario.controller.predictions) > 1:
+        more = f" and {n} of x_c" if predictive else ""
         raise ValueError(
-            'plant.watchdog.policy: with "model" an actuation carries u and x_c, '
-            f"{m} + {n} numbers; at most {MAX_DIMENSION} fit"
+            f"controller.predictions: an actuation carries {predictions} x {m} inputs{more}; "
+            f"at most {MAX_DIMENSION} numbers fit"
         )
+    raise ValueError(
+        'plant.watchdog.policy: with "model" an actuation carries u and x_c, '
+        f"{m} + {n} numbers; at most {MAX_DIMENSION} fit"
+    )
 
 
 def _dimensions(scenario: "Scenario") -> str:

@@ -14,7 +14,7 @@ from noack.config.loops import with_loop_tables
 from noack.config.matrix_files import with_matrices
 from noack.config.scenario import Scenario
 from noack.config.scenario_checks import check_kept_loss
-from noack.config.sections.network_section import AcknowledgementSection, NetworkSection
+from noack.config.sections.network_section import DirectionSection
 from noack.core.errors import CallerError, printable, shortened
 from noack.settings.named_file import FileSettings, file_tables, located, with_tables
 
@@ -65,11 +65,12 @@ def validate(content: Mapping[str, Any], source: str) -> Scenario:
 
 
 def _with_files(scenario: Scenario, path: Path, source: str) -> Scenario:
-    network, place = scenario.network, f"{source}: network"
-    update: dict[str, Any] = _read(network, path.parent, place)
-    if (back := network.acknowledgements) is not None:
-        read = _read(back, path.parent, f"{place}.acknowledgements")
-        update["acknowledgements"] = back.model_copy(update=read)
+    network = scenario.network
+    update: dict[str, Any] = {}
+    for place, section in network.directions.items():
+        read = _read(section, path.parent, f"{source}: {place}")
+        _, _, key = place.partition(".")
+        update |= {key: section.model_copy(update=read)} if key else read
     scenario = scenario.model_copy(update={"network": network.model_copy(update=update)})
     try:
         check_kept_loss(scenario)
@@ -86,9 +87,7 @@ def _with_files(scenario: Scenario, path: Path, source: str) -> Scenario:
     return with_loop_tables(scenario, lambda place, one: tables(f"{place}.", one))
 
 
-def _read(
-    section: NetworkSection | AcknowledgementSection, folder: Path, place: str
-) -> dict[str, Any]:
+def _read(section: DirectionSection, folder: Path, place: str) -> dict[str, Any]:
     impairments = tuple(
         impairment.without_files(folder, f"{place}.impairments.{number}")
         for number, impairment in enumerate(section.impairments)

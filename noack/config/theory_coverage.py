@@ -60,6 +60,8 @@ class TheoryCoverage:
         scenario = self.scenario
         if scenario.protocol.acknowledges:
             return f'network.protocol = "ack": {UNCERTIFIED_ACKNOWLEDGEMENTS}'
+        if scenario.network.actuation is not None:
+            return "network.actuation: actuations may be lost or late"
         if not self.is_linear:
             return f'plant.system.kind = "{scenario.plant.system.kind}": the plant is not linear'
         if not scenario.controller.is_linear:

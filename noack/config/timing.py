@@ -48,9 +48,29 @@ class Timing:
     def actuation_timeout_ns(self) -> int:
         """Age of the newest actuation at which the plant's watchdog acts."""
         timeout_s = self.scenario.plant.watchdog.timeout_s
-        if timeout_s is None:
-            return _WATCHDOG_PERIODS * self.controller_period_ns
-        return round(timeout_s * NS_PER_S)
+        if timeout_s is not None:
+            return round(timeout_s * NS_PER_S)
+        usual_ns = _WATCHDOG_PERIODS * self.controller_period_ns
+        actuation = self.scenario.network.actuation
+        if actuation is None:
+            return max(usual_ns, self.predicted_ns)
+        last_ns = self.predicted_ns + round(actuation.link.longest_delay_s * NS_PER_S)
+        return max(usual_ns, last_ns) if self.scenario.plant.watchdog.policy == "hold" else last_ns
+
+    @property
+    def predicted_ns(self) -> int:
+        """Time for which an actuation has inputs."""
+        return self.scenario.controller.predictions * self.controller_period_ns
+
+    @property
+    def missing_actuation_ns(self) -> int:
+        """Age of the newest actuation from which the plant reports that actuations are missing.
+
+        The loss of a few is expected where they cross the network.
+        """
+        if self.scenario.network.actuation is None:
+            return self.actuation_timeout_ns
+        return max(self.actuation_timeout_ns, _WATCHDOG_PERIODS * self.controller_period_ns)
 
     @property
     def acknowledgement_timeout_ns(self) -> int:

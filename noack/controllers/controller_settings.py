@@ -7,6 +7,7 @@ from pydantic import Field, FiniteFloat, model_validator
 
 from noack.core.errors import NoackError
 from noack.core.linear_systems import Matrix, Vector
+from noack.protocol.wire_format import MAX_DIMENSION
 from noack.settings.matrices import Row
 from noack.settings.section import RateHz, ScenarioSection, require_whole_period
 
@@ -71,6 +72,11 @@ class ControllerSettings(ScenarioSection):
     setpoint: Row | None = None
     """x_r, n entries: the state at which the loop is to rest; by default 0. It must be an
     equilibrium of the model, Âx_r + B̂u_r = 0; then u = K(x_c − x_r) + u_r."""
+
+    predictions: Annotated[int, Field(ge=1, le=MAX_DIMENSION)] = 1
+    """Number of inputs in an actuation: that of the tick, and those of the model for the following
+    ticks. The plant applies each at its time, until a newer actuation arrives (packetised
+    predictive control)."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -5,36 +5,27 @@ Every process and every reader of a record asks the scenario's protocol for a pr
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 
 
 @dataclass(frozen=True)
 class LoopProtocol:
     """A protocol of the loop."""
 
-    acknowledgement_routes: Mapping[str, str]  # to whom each process sends acknowledgements
+    acknowledges: bool
+    """Whether updates are acknowledged, and x_s is reset by acknowledgements only.
+
+    Then the paper's theorems do not apply, and settings cannot change during a run.
+    """
     states_caption: str
     """When x_s and x_c jump, for readers; ``{known}`` is the state that they jump to."""
     error_caption: str  # when the sensor's error is reset, for readers
     summary: str  # one sentence for readers
     reset: str  # when x_s is reset, for readers
 
-    @property
-    def acknowledges(self) -> bool:
-        """Whether updates are acknowledged, and x_s is reset by acknowledgements only.
-
-        Then the paper's theorems do not apply, and settings cannot change during a run.
-        """
-        return bool(self.acknowledgement_routes)
-
-    def acknowledged_by(self, role: str) -> str | None:
-        """Return from whom a process receives acknowledgements; None if from nobody."""
-        return next((by for by, to in self.acknowledgement_routes.items() if to == role), None)
-
 
 PROTOCOLS: Mapping[str, LoopProtocol] = {
     "none": LoopProtocol(
-        acknowledgement_routes=MappingProxyType({}),
+        acknowledges=False,
         states_caption="At every event x_s jumps to {known}; x_c does so only when the update "
         "arrives. ",
         error_caption="The sensor's error ‖e_s‖ = ‖x_s − x‖ is reset when it exceeds the "
@@ -44,7 +35,7 @@ PROTOCOLS: Mapping[str, LoopProtocol] = {
         reset="at every event",
     ),
     "ack": LoopProtocol(
-        acknowledgement_routes=MappingProxyType({"controller": "netem", "netem": "sensor"}),
+        acknowledges=True,
         states_caption="x_c jumps to {known} when an update arrives, x_s when its acknowledgement "
         "arrives. ",
         error_caption="The sensor's error ‖e_s‖ = ‖x_s − x‖ is reset by acknowledgements; without "

@@ -15,6 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from noack.protocol.wire_format import Flow
+
 PLANT_STEP = "plant_step"
 PLANT_ACTUATION = "plant_actuation"
 SENSOR_MEASUREMENT = "sensor_measurement"
@@ -81,6 +83,7 @@ class RecordShape:
     m: int  # inputs
     acknowledged: bool = False  # whether updates are acknowledged
     predictive: bool = False  # whether actuations carry the controller's model state
+    predictions: int = 1  # inputs in an actuation
     internal: int = 0  # entries of the plant's own state z
     disturbed_input: bool = False
     disturbed_state: bool = False
@@ -98,6 +101,7 @@ class Column(NamedTuple):
     entries: Callable[[RecordShape], int] | None = None
     """Length of a vector; None for a single number."""
     dtype: str = "<i8"
+    exists: Callable[[RecordShape], bool] = lambda shape: True
 
 
 def _vector(name: str, unit: str, entries: Callable[[RecordShape], int], meaning: str) -> Column:
@@ -151,6 +155,9 @@ TABLES = (
         _input("u", "applied input from `t_ns` on"),
         Column("actuation", "", "sequence number of the newest actuation; u is its input unless "
                "the watchdog replaced it"),
+        Column("entry", "", "number of the input in that actuation, from 0; −1: the watchdog's "
+               "input; with `controller.predictions` only",
+               exists=lambda shape: shape.predictions > 1),
         _vector("z", "model units", lambda shape: shape.internal,
                 "the system's own state, for a system with more states than x"),
         _vector("d", "model units", lambda shape: shape.m * shape.disturbed_input,
@@ -161,6 +168,8 @@ TABLES = (
     Table(PLANT_ACTUATION, "plant", "actuation received by the plant; `t_ns` is the model time of "
           "its input", (
         _input("u", "input"),
+        _vector("predicted", "model units", lambda shape: shape.m * (shape.predictions - 1),
+                "inputs for the following ticks, with `controller.predictions` only"),
         _vector("x_c", "model units", lambda shape: shape.n * shape.predictive,
                 "the model's state, with `plant.watchdog.policy = \"model\"` only"),
     )),
@@ -197,8 +206,8 @@ TABLES = (
     Table(NETEM_PACKET, "netem", "datagram received by the network emulator; `sequence` counts "
           "the datagrams of its flow, `t_ns` is the arrival at the socket if it is known, else "
           "`now_ns`", (
-        Column("flow", "", "source: 0 the sensor; 1 the controller, with `network.protocol = "
-               "\"ack\"`"),
+        Column("flow", "", "source: 0 the sensor; 1 the controller, if acknowledgements or "
+               "actuations cross the network"),
         Column("fate", "", ", ".join(f"{fate.value} {fate.name.lower()}" for fate in Fate)),
         Column("consecutive_losses", "", "consecutive datagrams up to this one that were not "
                "effectively delivered, as known then"),
@@ -244,6 +253,8 @@ def tables(n: int, m: int, **more: int) -> Mapping[str, np.dtype[np.void]]:
 def _fields(columns: tuple[Column, ...], shape: RecordShape) -> list[tuple[Any, ...]]:
     found: list[tuple[Any, ...]] = []
     for column in columns:
+        if not column.exists(shape):
+            continue
         if column.entries is None:
             found.append((column.name, column.dtype))
         elif (entries := column.entries(shape)) > 0:
@@ -251,5 +262,11 @@ def _fields(columns: tuple[Column, ...], shape: RecordShape) -> list[tuple[Any, 
     return found
 
 
-UPDATES, ACKNOWLEDGEMENTS = 0, 1
-"""The network emulator's flows in a run: from the sensor, and from the controller."""
+UPDATES, ACKNOWLEDGEMENTS, ACTUATIONS = 0, 1, 1
+"""The network emulator's directions: from the sensor; from the controller, which sends
+acknowledgements or actuations through the network, or neither."""
+
+
+def direction_of(flow: Flow) -> int:
+    """The number of the direction of a flow that crosses the network."""
+    return UPDATES if flow is Flow.UPDATE else ACTUATIONS

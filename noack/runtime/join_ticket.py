@@ -49,7 +49,7 @@ def new_ticket(scenario: Scenario, endpoint: str, run_dir: Path, *, launched: bo
         endpoint=endpoint,
         run_dir=str(run_dir),
         launched=launched,
-        kept_losses=found_probabilities(scenario.network.link, scenario.network.reverse.link),
+        kept_losses=found_probabilities(*map(scenario.network.link_of, scenario.network.flows)),
         scenario=scenario,
     )
 

@@ -28,10 +28,13 @@ from noack.protocol.machine_interface import BEGINNING, RESTART, Machine, Notice
 from noack.protocol.record_tables import OWNER
 from noack.protocol.topology import (
     CHANGEABLE,
+    ENDS,
     LOOP_ROLES,
+    RECEIVES,
     RECORDER,
-    ROUTES,
-    SENDER,
+    SENDS,
+    receiver_of,
+    sender_to,
 )
 from noack.protocol.wire_format import Decoder, Encoder, Flow, Message
 from noack.runtime.address import Address
@@ -59,6 +62,9 @@ _COORDINATOR_AWAY_S = 8.0
 """Four leases of the connection: a connection that a busy machine broke comes back by then."""
 _CHANGES_AT_ONCE = 2
 """Changes taken in the loop every 50 ms: a machine needs some tenths of a millisecond for each."""
+_FEW_LOOPS = 8
+_GATHER_PARTS = 8
+"""Deadlines of more than a few loops are gathered for this part of a period."""
 _GRACE_S = 0.15  # wall time after the horizon for packets in flight
 
 
@@ -156,34 +162,37 @@ class RunProcess:
         """Number of loops whose datagrams carry their number; None in a run without [[loops]]."""
         return None if self.scenario.loops is None else len(self._phases_ns)
 
-    def run_messages(self, new_machine: NewMachine, role: FleetRole) -> None:
+    def run_messages(self, new_machine: NewMachine, compiled: FleetRole) -> None:
         """Run the machines of all loops, with the process's route in the topology.
 
         Args:
             new_machine: makes a machine; another of the first loop is made for rehearsals.
-            role: the machines of many loops as compiled code.
+            compiled: the machines of many loops as compiled code.
         """
         fleet = None
         if not self.start.is_restart:
-            fleet = fleet_of(role, self.role, self.scenario, self.ticket.run_id, self.ticket.key)
+            fleet = fleet_of(
+                compiled, self.role, self.scenario, self.ticket.run_id, self.ticket.key
+            )
         if fleet is not None:
             self.run(fleet, partial(self._fleet_socket, fleet=fleet))
             return
-        route, protocol = ROUTES[self.role], self.scenario.protocol
-        acknowledged_by = protocol.acknowledged_by(self.role)
-        acknowledges_to = protocol.acknowledgement_routes.get(self.role)
+        role, network = self.role, self.scenario.network.flows
+        receives, sends, answer = RECEIVES[role], SENDS[role], Flow.ACKNOWLEDGEMENT
+        answers = answer in network and role in ENDS[answer]
+        is_answered = answers and role == ENDS[answer].receiver
 
         def channel(endpoint: socket.socket, addresses: Mapping[str, Address]) -> MessageSocket:
-            by = addresses[acknowledged_by] if acknowledged_by else None
+            by = addresses["netem"]
             return MessageSocket(
                 endpoint,
-                self._decoder(route.receives, not_before_ns=self._admitted_ns),
+                self._decoder(receives, not_before_ns=self._admitted_ns),
                 self._encoder(),
-                route.sends,
-                source=addresses[SENDER[self.role]],
-                destination=addresses[route.to],
-                acknowledgements=(self._decoder(Flow.ACKNOWLEDGEMENT), by) if by else None,
-                acknowledges_to=addresses[acknowledges_to] if acknowledges_to else None,
+                sends,
+                source=addresses[sender_to(role, receives, network)],
+                destination=addresses[receiver_of(role, sends, network)],
+                acknowledgements=(self._decoder(answer), by) if is_answered else None,
+                acknowledges_to=by if answers and not is_answered else None,
             )
 
         with ExitStack() as stack:
@@ -191,22 +200,24 @@ class RunProcess:
                 endpoint = stack.enter_context(closing(bind(0, "realtime.rehearse")))
                 own: Address = endpoint.getsockname()
                 copy = MessageSocket(
-                    endpoint, self._decoder(route.receives, 1), self._encoder(), route.sends,
+                    endpoint, self._decoder(receives, 1), self._encoder(), sends,
                     source=own, destination=own,
                 )  # fmt: skip
-                entries = self.loops[0].message_sizes.entries(route.receives)
+                entries = self.loops[0].message_sizes.entries(receives)
                 machine = self._machine(new_machine, 1)
-                rehearsal = Rehearsal(machine, copy, self._encoder(), route.receives, entries)
+                rehearsal = Rehearsal(machine, copy, self._encoder(), receives, entries)
                 self._rehearsal = stack.enter_context(closing(rehearsal))
             self.run(self._machine(new_machine), channel)
 
     def _fleet_socket(
         self, endpoint: socket.socket, addresses: Mapping[str, Address], fleet: CompiledFleet
     ) -> FleetSocket:
-        route = ROUTES[self.role]
+        role, network = self.role, self.scenario.network.flows
+        receives, sends = RECEIVES[role], SENDS[role]
         return FleetSocket(
-            endpoint, fleet, route.sends, clock=self.clock,
-            source=addresses[SENDER[self.role]], destination=addresses[route.to],
+            endpoint, fleet, sends, clock=self.clock,
+            source=addresses[sender_to(role, receives, network)],
+            destination=addresses[receiver_of(role, sends, network)],
         )  # fmt: skip
 
     def _machine(self, new_machine: NewMachine, most: int | None = None) -> Machine[Message]:
@@ -307,6 +318,7 @@ class RunProcess:
             end_ns=self._end_ns,
             stop=lambda: self.stopping,
             spin_us=self.scenario.realtime.spin_us,
+            gather_ns=self._gather_ns,
             rehearsal=self._rehearsal,
             news=lambda now_ns: self._announce(changeable, now_ns, next(limits)),
         )
@@ -317,6 +329,17 @@ class RunProcess:
                 Event.STOP, f"overrun: {late_s:g} s late; reduce the speed or the rates"
             )
         return reached_ns
+
+    @property
+    def _gather_ns(self) -> int:
+        """How long to gather the deadlines of many loops: waking up for each takes CPU time.
+
+        The emulator's deadlines are delays, which stay exact.
+        """
+        if self.role == "netem" or len(self._phases_ns) <= _FEW_LOOPS:
+            return 0
+        timing = loops_of(self.scenario)[0].timing
+        return min(timing.plant_period_ns, timing.controller_period_ns) // _GATHER_PARTS
 
     @property
     def _end_ns(self) -> int:

@@ -103,6 +103,7 @@ def run_loop(
     end_ns: int | None,
     stop: Callable[[], bool],
     spin_us: float = 0.0,
+    gather_ns: int = 0,
     rehearsal: Rehearsing | None = None,
     news: Callable[[int], Sequence[Record | Notice]] = lambda now_ns: (),
 ) -> int:
@@ -110,14 +111,16 @@ def run_loop(
 
     Every 50 ms of wall time ``stop`` is asked. Before the first step and every 50 ms, ``news``
     passes input from outside the socket to the machine and returns the machine's outputs. The
-    loop busy-waits for the last ``spin_us`` before a deadline. It rehearses between
-    its steps, unless a deadline is near.
+    loop busy-waits for the last ``spin_us`` before a deadline. It may wait ``gather_ns`` longer, to
+    serve the deadlines of that time together. It rehearses between its steps, unless a deadline is
+    near.
 
     Returns:
         How late the machine's next deadline was at the end, in ns; 0 if it was not late.
     """
     kind = _SelfDrivenLoop if isinstance(machine, SelfDrivenMachine) else _Loop
     loop: _Loop[T] = kind(machine, channel, clock, telemetry, spin_us * 1e-6, news)
+    loop.gather_ns = gather_ns
     loop.rehearsal = rehearsal
     # Looked up once: after milliseconds of sleep the code runs cold, and every step counts.
     step, housekeeping_is_due = loop.step, loop.housekeeping_is_due
@@ -149,6 +152,7 @@ class _Loop(Generic[T]):
         self._now_ns, self._wall_s_until = clock.now_ns, clock.wall_s_until
         self._spin_s = spin_s
         self.rehearsal: Rehearsing | None = None
+        self.gather_ns = 0
         self._slept = False
         """Whether the loop has waited since the last housekeeping."""
         self._emit(news(clock.now_ns()))
@@ -173,7 +177,7 @@ class _Loop(Generic[T]):
         else:
             wait_s = self._housekeeping_s - time.monotonic()
             if deadline_ns is not None:
-                left_s = self._wall_s_until(deadline_ns) - self._spin_s
+                left_s = self._wall_s_until(deadline_ns + self.gather_ns) - self._spin_s
                 # Housekeeping that is due too near the deadline is done after it.
                 wait_s = left_s if wait_s <= 0 else min(left_s, wait_s)
             wait_s = max(wait_s, 0.0)

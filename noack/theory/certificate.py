@@ -96,6 +96,8 @@ class Constants(NamedTuple):
     """Loop gain of the errors (small-gain condition); below 1."""
     estimation_error: float = 0.0
     """‖x̂ − x‖_W at the measurements. Where it is not 0, e_s and e_c are x_s − x̂ and x_c − x̂."""
+    received_input_error: float = 0.0
+    """The same as π while the controller has every update: ‖KW^{−1}‖β̃ + q."""
 
 
 class VoidError(ArithmeticError):
@@ -290,6 +292,7 @@ class _Step:
             None,
             loop_gain,
             float(solved[2]),
+            float(self._error.now(Output.GAIN) * solved[1] + solved[0]),
         )
 
     @property

@@ -418,7 +418,10 @@ def _at_floor(first: Constants, share: float) -> Constants:
     With θ(t) = max(βe^{−αt}, ε) in place of βe^{−αt}, all bounds of the first phase hold at all
     times: for s ≤ t, θ(s) ≤ θ(t) e^{α(t−s)}, which is all that their proof uses of βe^{−αt}.
     """
-    scaled = ("input_error", "start_error", "state", "state_weighted", "mismatch")
+    scaled = (
+        "input_error", "start_error", "state", "state_weighted", "mismatch",
+        "received_input_error",
+    )  # fmt: skip
     return first._replace(rate_per_s=0.0, **{name: share * getattr(first, name) for name in scaled})
 
 

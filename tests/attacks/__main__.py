@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from noack.protocol.topology import LOOP_ROLES, SENDER
+from noack.protocol.topology import LOOP_ROLES, RECEIVES, sender_to
 from tests.attacks.attacked import Attacked, attack, may_forge_addresses
 from tests.attacks.checks import CHECKS
 
@@ -21,7 +21,7 @@ def table_of(run: Attacked) -> Table:
     table = Table("", *LOOP_ROLES, title="Hostile datagrams at each port")
     columns = []
     for role in LOOP_ROLES:
-        channel, peer_sent = run.channel(role), run.channel(SENDER[role])["sent"]
+        channel, peer_sent = run.channel(role), run.channel(sender_to(role, RECEIVES[role]))["sent"]
         column: Counter[str] = Counter()
         for (to, sender, kind, _), number in run.sent.items():
             if to == role:

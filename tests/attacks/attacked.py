@@ -25,7 +25,7 @@ from noack.protocol.record_tables import (
     PLANT_ACTUATION,
     SENSOR_MEASUREMENT,
 )
-from noack.protocol.topology import LOOP_ROLES, ROUTES, SENDER
+from noack.protocol.topology import LOOP_ROLES, RECEIVES, sender_to
 from noack.protocol.wire_format import Flow
 from noack.runtime.join_ticket import Ticket, loads
 from tests.attacks.kinds import Target
@@ -112,11 +112,10 @@ class Run:
         loop = loop_of(ticket.scenario)
         return [
             Target(
-                role, ports[role], ports[SENDER[role]], ROUTES[role].receives,
-                loop.m if ROUTES[role].receives is Flow.ACTUATION else loop.n,
-                ticket.run_id, ticket.key,
+                role, ports[role], ports[sender_to(role, flow)], flow,
+                loop.m if flow is Flow.ACTUATION else loop.n, ticket.run_id, ticket.key,
             )
-            for role in LOOP_ROLES
+            for role, flow in RECEIVES.items()
         ]  # fmt: skip
 
     def finish(self, sent: Sent) -> Attacked:

@@ -8,7 +8,7 @@ from noack.protocol.record_tables import (
     PLANT_ACTUATION,
     SENSOR_MEASUREMENT,
 )
-from noack.protocol.topology import LOOP_ROLES, SENDER
+from noack.protocol.topology import LOOP_ROLES, RECEIVES, sender_to
 from noack.runtime.udp_sockets import SHED
 from tests.attacks.attacked import Attacked
 
@@ -31,7 +31,7 @@ def ends_well(run: Attacked) -> Iterator[str]:
 def nothing_is_accepted(run: Attacked) -> Iterator[str]:
     """Each process accepted exactly as many datagrams as its peer sent."""
     for role in LOOP_ROLES:
-        sent = run.channel(SENDER[role])["sent"]
+        sent = run.channel(sender_to(role, RECEIVES[role]))["sent"]
         taken = len(run.record[_TAKEN[role]])
         if not sent == run.accepted(role) == taken:
             yield f"{role}: {sent} from its peer, {run.accepted(role)} accepted, {taken} acted on"

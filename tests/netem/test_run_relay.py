@@ -130,10 +130,10 @@ def opened(
     clock: RunClock,
     loops: int | None = None,
 ) -> tuple[Any, Any]:
-    addresses = endpoint, name_of(controller), name_of(sensor)
+    ways = [(name_of(sensor), name_of(controller))]
     if engine == "plain":
-        return network_of(SCENARIO), RelayShell(*addresses, duplex=False, loops=loops)
+        return network_of(SCENARIO), RelayShell(endpoint, ways, loops=loops)
     network = CompiledNetwork(SCENARIO, BEGINNING, compiled_pump(), loops)
     return network, CompiledShell(
-        *addresses, duplex=False, network=network, clock=clock, spin_us=0.0, loops=loops
+        endpoint, ways, network=network, clock=clock, spin_us=0.0, loops=loops
     )

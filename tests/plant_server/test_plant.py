@@ -15,6 +15,7 @@ from noack.plants.linear import LinearSystem
 from noack.protocol.machine_interface import Record
 from noack.protocol.record_tables import PLANT_ACTUATION, PLANT_STEP, tables
 from noack.protocol.wire_format import Flow, Message
+from plant_server.input_buffer import InputBuffer
 from plant_server.plant import Plant, plant_of
 from plant_server.watchdog import Watchdog
 
@@ -31,7 +32,7 @@ def new_plant(horizon_ns: int = 10**9, measure_every: int = 1) -> Plant:
 
 def linear_plant(A: Matrix, B: Matrix, x0: Vector, period_ns: int = H_NS, **settings: int) -> Plant:
     system = LinearSystem(A, B, x0, step_ns=period_ns)
-    return Plant(system, Watchdog(B.shape[1]), period_ns=period_ns, **settings)
+    return Plant(system, Watchdog(InputBuffer(B.shape[1])), period_ns=period_ns, **settings)
 
 
 def actuation(sequence: int, u: Sequence[float]) -> Message:

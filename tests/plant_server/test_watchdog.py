@@ -11,6 +11,7 @@ from noack.config.scenario_file import validate
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import PLANT_ACTUATION, PLANT_STEP, tables
 from noack.protocol.wire_format import Flow, Message
+from plant_server.input_buffer import InputBuffer
 from plant_server.plant import Plant, plant_of
 from plant_server.watchdog import Watchdog, hold, zero
 
@@ -59,11 +60,11 @@ class Driven:
 
 def test_the_watchdog_trips_when_the_actuation_is_older_than_the_timeout() -> None:
     for fallback, then in ((hold, 2.0), (zero, 0.0)):
-        watchdog = Watchdog(1, 50 * MS, fallback)
+        watchdog = Watchdog(InputBuffer(1), 50 * MS, fallback)
         watchdog.take(np.array([2.0]), 7 * MS, 0)
-        u, said = watchdog.input(57 * MS)
+        u, _, said = watchdog.input(57 * MS)
         assert (u.tolist(), said) == ([2.0], ())
-        u, said = watchdog.input(57 * MS + 1)
+        u, _, said = watchdog.input(57 * MS + 1)
         assert u.tolist() == [then]
         assert [(notice.t_ns, notice.level) for notice in said] == [(57 * MS + 1, "watchdog")]
 

@@ -24,12 +24,14 @@ from cosim.analysis.claims.observed_conditions import (
 from cosim.analysis.claims.trajectory_delta import trajectory_delta
 from cosim.record.align import AlignedRun, IdentityResidual, aligned_parts, in_common
 from cosim.record.run_record import RunRecord
+from cosim.record.since_event import UNKNOWN, EventFollower, SinceEvent
 from noack.config.resolution import policy_of
 from noack.config.scenario import Scenario
 from noack.protocol.record_tables import NO_SEQUENCE
 from noack.protocol.topology import LOOP_ROLES
 from noack.theory.certificate import NetworkConditions
 from noack.theory.error_bounds import ErrorMonitor
+from noack.theory.known_state import KnownStateBounds, known_state_bounds
 from noack.theory.paper_bounds import Theorem2, theorem_2
 from noack.theory.run_conditions import allowed_conditions, ideal_conditions, nominal_conditions
 from noack.theory.scenario_certificates import ScenarioCertificate, certify, certify_box
@@ -69,6 +71,7 @@ class Samples:
     """x of the plant, (k, n), where the sensor estimates it, too; NaN where it is not recorded."""
     inter_event_s: tuple[Reals, Reals]
     """Times of the events, without the run's first, and the times since the event before."""
+    since_event: SinceEvent
 
     @cached_property
     def t_s(self) -> Reals:
@@ -110,7 +113,7 @@ class RunEvidence:
         scenario = self.record.scenario
         monitor = ErrorMonitor(self.record.loop.H, policy_of(scenario))
         residual = IdentityResidual(scenario)
-        last_ns = np.zeros(0, np.int64)
+        last_ns, follower = np.zeros(0, np.int64), EventFollower(scenario)
         for part in aligned_parts(self.record):
             rows, joined = part.rows, part.aligned
             common = _common(scenario, joined)
@@ -123,7 +126,8 @@ class RunEvidence:
             last_ns = event_ns[-1:]
             both = bounds[:, 0], bounds[:, 1]
             true_x = joined.x if part.true_x is None else part.true_x
-            yield Samples(joined, common, both, residual.take(part), true_x, passed)
+            since = follower.take(rows, joined)
+            yield Samples(joined, common, both, residual.take(part), true_x, passed, since)
 
     @cached_property
     def facts(self) -> SampleFacts:
@@ -174,9 +178,13 @@ class RunEvidence:
         return found
 
     @cached_property
+    def _as_read(self) -> ObservedConditions:
+        return read_conditions(self.record)
+
+    @cached_property
     def observed(self) -> ObservedConditions:
         """The conditions under which the run took place."""
-        found = read_conditions(self.record)
+        found = self._as_read
         if self.part.start_error is None:
             return found
         # The certificate's start error covers the inputs before the part's first one.
@@ -196,7 +204,7 @@ class RunEvidence:
     @property
     def started_s(self) -> float:
         """When the plant applied the first input of the controller; infinite if never."""
-        return self.observed.start_s
+        return self._as_read.start_s
 
     def violations(self) -> list[AssumptionViolation]:
         """The assumptions that the run violated, the guarantee included, each at the first time."""
@@ -238,6 +246,29 @@ class RunEvidence:
         if id(certificate) not in known:
             known[id(certificate)] = self.observed.first_violation(certificate.conditions)
         return known[id(certificate)]
+
+    def missing_events(self, samples: Samples, bounds: KnownStateBounds) -> NDArray[np.int64]:
+        """Return how many events are missing in the input since the newest event, (k,).
+
+        In a part that begins with inputs of the part before, it is unknown until the first input.
+        """
+        if self.part.start_error is None:
+            return samples.since_event.missing
+        event_s = samples.t_s - samples.since_event.age_s
+        early = event_s + bounds.delay_s < self.started_s - 1e-9
+        return np.asarray(np.where(early, UNKNOWN, samples.since_event.missing))
+
+    def known_state_bounds(self, certificate: ScenarioCertificate) -> KnownStateBounds | None:
+        """Return the bounds from the newest event of a certificate; None if it has none."""
+        known = self._known_states
+        if id(certificate) not in known:
+            known[id(certificate)] = known_state_bounds(self.record.scenario, certificate)
+        return known[id(certificate)]
+
+    @cached_property
+    def _known_states(self) -> dict[int, KnownStateBounds | None]:
+        """Bounds that are known already, by certificate."""
+        return {}
 
     @cached_property
     def _violations(self) -> dict[int, VoidFrom | None]:

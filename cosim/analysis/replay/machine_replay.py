@@ -32,7 +32,7 @@ from noack.protocol.record_tables import (
     SETTINGS,
     entry_names,
 )
-from noack.protocol.topology import ROUTES
+from noack.protocol.topology import RECEIVES
 from noack.protocol.wire_format import Flow, Message
 from plant_server.plant import plant_of
 from sensor_node.sensor import sensor_of
@@ -61,8 +61,8 @@ def received_vectors(table: str, rows: Rows) -> tuple[Matrix, list[str]]:
     names, columns = rows.dtype.names or (), ["x"]
     if table == SENSOR_ACKNOWLEDGEMENT:
         columns = []
-    elif ROUTES[OWNER[table]].receives is Flow.ACTUATION:
-        columns = [column for column in ("u", "x_c") if column in names]
+    elif RECEIVES[OWNER[table]] is Flow.ACTUATION:
+        columns = [column for column in ("u", "predicted", "x_c") if column in names]
     elif "y" in names:
         columns = ["y", "u_applied"]
     vectors = np.hstack([np.zeros((len(rows), 0)), *(rows[column] for column in columns)])
@@ -356,7 +356,7 @@ def _messages(table: str, rows: Rows) -> Iterator[Message | Datagram | Parameter
             yield Datagram(flow, head.ljust(size_bytes, b"\0")[:size_bytes], t_ns)
     else:
         acknowledges = table == SENSOR_ACKNOWLEDGEMENT
-        flow = Flow.ACKNOWLEDGEMENT if acknowledges else ROUTES[OWNER[table]].receives
+        flow = Flow.ACKNOWLEDGEMENT if acknowledges else RECEIVES[OWNER[table]]
         vectors, _ = received_vectors(table, rows)
         # The copy has the memory layout of the decoder's vector: rounding may depend on it.
         copies = (vector.copy() for vector in vectors)

@@ -5,7 +5,7 @@ are not compared.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +15,6 @@ from cosim.analysis.replay.replay_result import MessagesReplay, difference, firs
 from cosim.record.record_source import Slice
 from cosim.record.run_record import RunRecord
 from noack.protocol.record_tables import (
-    ACKNOWLEDGEMENTS,
     CONTROLLER_DELIVERY,
     NETEM_PACKET,
     PACKET_HEAD_BYTES,
@@ -23,19 +22,18 @@ from noack.protocol.record_tables import (
     SENSOR_ACKNOWLEDGEMENT,
     SENSOR_MEASUREMENT,
     SETTINGS,
-    UPDATES,
+    direction_of,
 )
+from noack.protocol.topology import ENDS
 from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Header, Message, read_header
 
-_HOPS = (
-    ("plant → sensor", SENSOR_MEASUREMENT, "plant", Flow.MEASUREMENT),
-    ("sensor → netem", NETEM_PACKET, "sensor", Flow.UPDATE),
-    ("netem → controller", CONTROLLER_DELIVERY, "sensor", Flow.UPDATE),
-    ("controller → plant", PLANT_ACTUATION, "controller", Flow.ACTUATION),
-    ("controller → netem", NETEM_PACKET, "controller", Flow.ACKNOWLEDGEMENT),
-    ("netem → sensor", SENSOR_ACKNOWLEDGEMENT, "controller", Flow.ACKNOWLEDGEMENT),
-)
-"""Name, the receiver's table, the process that made the messages, and their kind."""
+_RECEIVED = {
+    Flow.MEASUREMENT: SENSOR_MEASUREMENT,
+    Flow.UPDATE: CONTROLLER_DELIVERY,
+    Flow.ACTUATION: PLANT_ACTUATION,
+    Flow.ACKNOWLEDGEMENT: SENSOR_ACKNOWLEDGEMENT,
+}
+"""The table of the last receiver of each flow."""
 _CONTENT, _SENT, _FORWARDED = "content", "sent", "forwarded"
 """Kinds of differences."""
 
@@ -45,11 +43,10 @@ class MessageComparison:
 
     def __init__(self, record: RunRecord, machines: Mapping[str, MachineReplay]) -> None:
         self._record, self._machines = record, machines
-        acknowledges = SENSOR_ACKNOWLEDGEMENT in record.tables
+        network = record.scenario.network.flows
         self._hops = [
-            _Hop(leg, table, machines[sender], flow, record.number or 0, acknowledges=acknowledges)
-            for leg, table, sender, flow in _HOPS
-            if acknowledges or flow is not Flow.ACKNOWLEDGEMENT
+            _Hop(leg, table, machines[ENDS[flow].sender], flow, record.number or 0, network)
+            for leg, table, flow in _hops(network)
         ]
 
     def take(self, part: Slice) -> None:
@@ -69,6 +66,17 @@ class MessageComparison:
         whole = "netem" not in self._machines or self._machines["netem"].whole
         found = [hop.result(network_is_whole=whole) for hop in self._hops]
         return (*found, *_compare_changes(self._record))
+
+
+def _hops(network: Sequence[Flow]) -> Iterator[tuple[str, str, Flow]]:
+    """Yield the name of each hop, the receiver's table, and the flow."""
+    for flow, table in _RECEIVED.items():
+        sender, receiver = ENDS[flow]
+        if flow in network:
+            yield f"{sender} → netem", NETEM_PACKET, flow
+            yield f"netem → {receiver}", table, flow
+        elif flow is not Flow.ACKNOWLEDGEMENT:
+            yield f"{sender} → {receiver}", table, flow
 
 
 def _compare_changes(record: RunRecord) -> Iterator[MessagesReplay]:
@@ -111,12 +119,13 @@ class _Hop:
 
     def __init__(
         self, leg: str, table: str, sender: MachineReplay, flow: Flow, loop: int,
-        *, acknowledges: bool,
+        network: Sequence[Flow],
     ) -> None:  # fmt: skip
         self._leg, self._table, self._sender, self._flow = leg, table, sender, flow
         self._loop = loop
-        self._direction = ACKNOWLEDGEMENTS if flow is Flow.ACKNOWLEDGEMENT else UPDATES
-        self._selects = table == NETEM_PACKET and acknowledges
+        self._direction = direction_of(flow)
+        self._selects = table == NETEM_PACKET and len(network) > 1
+        self._was_forwarded = table != NETEM_PACKET and flow in network
         self._sent: list[Message] = []
         """Messages that may still be received, in order of their numbers."""
         self._numbers = np.zeros(0, np.int64)
@@ -145,7 +154,7 @@ class _Hop:
                 self._compare_flows()
         else:
             self._compare_vectors()
-        if self._table in (CONTROLLER_DELIVERY, SENSOR_ACKNOWLEDGEMENT):
+        if self._was_forwarded:
             self._survivors |= {
                 header.sequence
                 for flow, header in survivors

@@ -7,7 +7,8 @@ Entities of the recording, all on the timeline ``t`` (simulated time since the r
 ``state/<name>``          x, x_s, x_c of one coordinate (3 scalars)
 ``error/norm``            bound of ‖e_c‖ from (I1), ‖e_s‖, threshold, ‖e_c‖ (4 scalars)
 ``error/log10``           decimal logarithms of these and of the certified bound (5 scalars)
-``size/log10``            ‖x‖ and its certified bound as decimal logarithms (2 scalars)
+``size/log10``            decimal logarithms of ‖x‖ (last of 3 scalars) and of its certified bounds:
+                          from x(0), and from the newest event
 ``input``                 u = K x_c (m scalars)
 ``event/interval``        t_i − t_{i−1} in seconds, at every transmission
 ``event/stem``            its stem: 0, interval, NaN
@@ -95,7 +96,9 @@ def styles(
     found[ERROR] = rr.SeriesLines(names=errors[:4], colors=colours[:4], widths=widths[:4])
     found[ERROR_LOG10] = rr.SeriesLines(names=errors, colors=colours, widths=widths)
     found[SIZE_LOG10] = rr.SeriesLines(
-        names=["‖x‖ plant", "certified"], colors=[PLANT, CERTIFIED], widths=[2.5, 2.0]
+        names=["certified from x(0)", "certified from the newest event", "‖x‖ plant"],
+        colors=[CERTIFIED, CERTIFIED, PLANT],
+        widths=[2.0, 1.0, 2.5],
     )
     found[EVENT_CERTIFIED] = rr.SeriesLines(names="certified minimum", colors=CERTIFIED, widths=1.5)
     m = len(input_names)

@@ -86,13 +86,14 @@ class RunView(RecordingFile):
         if live is not None:
             live.show(path)
 
-    def samples(self, aligned: AlignedRun, e_c_bounds: Floats, x_bound: Floats) -> None:
+    def samples(self, aligned: AlignedRun, e_c_bounds: Floats, x_bounds: Floats) -> None:
         """Add k samples.
 
         Args:
             aligned: states, errors and threshold on a common time grid.
             e_c_bounds: (k, 2) bounds of ‖e_c‖, from (I1) and certified; NaN for none.
-            x_bound: (k,) certified bound of ‖x‖; NaN for none.
+            x_bounds: (k, 2) bounds of ‖x‖, certified from x(0) and from the newest event; NaN for
+                none.
         """
         t_ns = aligned.t_ns
         triples = np.stack([aligned.x, aligned.x_s, aligned.x_c], axis=2)
@@ -103,8 +104,8 @@ class RunView(RecordingFile):
         # On a linear scale, a certified bound would flatten everything else.
         self.send(bp.ERROR, t_ns, norms[:, :4])
         self.send(bp.ERROR_LOG10, t_ns, _log10(norms, aligned.threshold))
-        sizes = [np.linalg.norm(aligned.x, axis=1), x_bound]
-        self.send(bp.SIZE_LOG10, t_ns, _log10(np.column_stack(sizes), aligned.threshold))
+        sizes = np.column_stack([x_bounds, np.linalg.norm(aligned.x, axis=1)])
+        self.send(bp.SIZE_LOG10, t_ns, _log10(sizes, aligned.threshold))
 
     def move(self, t_ns: Nanoseconds, frames: Frames) -> None:
         """Add states at times (k,) to the plant's picture, at its frame rate."""

@@ -21,9 +21,11 @@ from cosim.record.decimate import decimate_all
 from cosim.record.estimation_error import true_states
 from cosim.record.recorded_changes import claimed_until_s, model_flow
 from cosim.record.run_record import Rows, updates_in
+from cosim.record.since_event import EventFollower
 from noack.config.resolution import loop_of, policy_of, tables_of
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
+from noack.core.linear_systems import row_norms
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_SETTING,
@@ -37,6 +39,7 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.wire_format import Flow
 from noack.theory.error_bounds import ErrorMonitor
+from noack.theory.known_state import KnownStateBounds, known_state_bounds
 from noack.theory.run_conditions import allowed_conditions
 from noack.theory.scenario_certificates import ScenarioCertificate, certify
 
@@ -75,6 +78,7 @@ class ViewFeed:
         self._undrawn: list[Rows] = []
         self._forced: set[int] = set()
         self._monitor = ErrorMonitor(self._loop.H, policy_of(scenario))
+        self._follower = EventFollower(scenario)
         # Plant steps whose x or z is shown with the measurements at their times.
         self._steps = np.zeros(0, self._types[PLANT_STEP])
         self._has_internal_state = "z" in (self._steps.dtype.names or ())
@@ -159,7 +163,8 @@ class ViewFeed:
         curves = [joined.x, joined.x_s, joined.x_c, joined.e_s_norm, joined.e_c_norm, bounds]
         kept = self._kept(joined.t_ns, np.column_stack(curves))
         thin = AlignedRun._make(values[kept] for values in joined)
-        self._view.samples(thin, bounds[kept], self._certified(t_s[kept], "state"))
+        of_state = np.column_stack([self._certified(t_s, "state"), self._from_event(rows, joined)])
+        self._view.samples(thin, bounds[kept], of_state[kept])
         frames = Frames(t_s, joined.x, joined.x_s, joined.x_c, z)
         shown = self._kept_frames(len(t_s))
         self._view.move(joined.t_ns[shown], frames.at(shown))
@@ -191,6 +196,21 @@ class ViewFeed:
         if self._certificate is None:
             return np.full(len(t_s), np.nan)
         bound = getattr(self._certificate, what)(t_s)
+        return np.asarray(np.where(t_s < self._claimed_until_s, bound, np.nan))
+
+    @cached_property
+    def _known_state(self) -> KnownStateBounds | None:
+        if self._certificate is None:
+            return None
+        return known_state_bounds(self._scenario, self._certificate)
+
+    def _from_event(self, rows: Rows, joined: AlignedRun) -> NDArray[np.float64]:
+        """Return the certified bound of ‖x‖ from the newest event on, (k,); NaN for none."""
+        if (known := self._known_state) is None:
+            return np.full(len(rows), np.nan)
+        t_s, since = np.asarray(rows["t_ns"] * 1e-9), self._follower.take(rows, joined)
+        moved = known.state_deviation(t_s, since.age_s, since.missing)
+        bound = np.fmin(row_norms(since.predicted) + moved, self._certified(t_s, "state"))
         return np.asarray(np.where(t_s < self._claimed_until_s, bound, np.nan))
 
     def _bounds(self, rows: Rows, joined: AlignedRun) -> NDArray[np.float64]:

@@ -73,10 +73,13 @@ class WatchdogSection(ScenarioSection):
 
     timeout_s: Annotated[FiniteFloat, Field(gt=0, le=1e6)] | None = None
     """The newest actuation is too old when its model state is older than this, in simulated time;
-    by default 50 periods of the controller."""
+    by default 50 periods of the controller. If actuations cross the network, zero and model act by
+    default as soon as an actuation is missing: after the time for which its inputs last, plus the
+    longest delay."""
     policy: Literal["hold", "zero", "model"] = "hold"
-    """hold: the plant keeps the newest input; zero: the input is 0; model: the input of the
-    controller's model, propagated from the newest actuation, which then carries x_c."""
+    """hold: the plant keeps the last input of the newest actuation; zero: the input is 0; model:
+    the input of the controller's model, propagated from the newest actuation, which then carries
+    x_c."""
 
 
 class PlantSection(ScenarioSection):

@@ -17,7 +17,7 @@ from noack.config.scenario import Scenario
 from noack.core.clock import RunClock
 from noack.core.errors import CallerError
 from noack.protocol.machine_interface import Notice, Output, Record
-from noack.protocol.topology import ROUTES
+from noack.protocol.topology import RECEIVES, SENDS
 from noack.protocol.wire_format import Encoder, Message
 from noack.runtime.address import Address
 from noack.runtime.fleet import driver_layout as layout
@@ -58,14 +58,14 @@ class CompiledFleet:
         key: bytes,
     ) -> None:
         self._parts, self._own, tables = parts, parts.arrays, tables_of(run)
-        self._route = ROUTES[name]
+        self._sends = SENDS[name]
         self._on_message, timer = role.on_message, role.on_timer
         self._on_timer = role.on_message if timer is None else timer
         self._types = tables[self._on_timer], tables[self._on_message]
         self._encoder = Encoder(run_id, key)
         one = loop_of(loops[0])
-        self._sent = loops[0].message_sizes.entries(self._route.sends)
-        wire = wire_memory(self._route, loops[0].message_sizes, run_id, key)
+        self._sent = loops[0].message_sizes.entries(self._sends)
+        wire = wire_memory(self._sends, RECEIVES[name], loops[0].message_sizes, run_id, key)
         self._memory = driver_memory(parts, phases_ns(run), (one.n, one.m), self._types, wire)
         rest_ns = int(loops[0].timing.plant_period_ns / _REST_SHARE / run.speed)
         self._memory.driver["rest_ns"] = min(rest_ns, _LONGEST_REST_NS)
@@ -131,7 +131,7 @@ class CompiledFleet:
             first, _, sequence, t_ns = fleet.out[begin : begin + HEADER_WORDS].tolist()
             vector = fleet.out_reals[begin + HEADER_WORDS :][: self._sent].copy()
             loop = first >> 48 & 0xFFFF
-            messages.append(Message(self._route.sends, sequence, t_ns, vector, loop))
+            messages.append(Message(self._sends, sequence, t_ns, vector, loop))
         fleet.fleet["out"] = 0
         return [*messages, *outputs.rows]
 

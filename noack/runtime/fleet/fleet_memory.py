@@ -15,8 +15,7 @@ from noack.config.fleet_layout import (
 )
 from noack.config.message_sizes import MessageSizes
 from noack.protocol.record_tables import LOOP as LOOP_COLUMN
-from noack.protocol.topology import MessageRoute
-from noack.protocol.wire_format import MAGIC, VERSION, datagram_bytes
+from noack.protocol.wire_format import MAGIC, VERSION, Flow, datagram_bytes
 from noack.runtime.fleet.driver_layout import BUFFERS, DRIVER, WIRE, Array, DriverMemory, WireMemory
 from noack.runtime.fleet.wire_words import REASONS, keyed_state
 from noack.runtime.native.socket_structs import HEADER, VECTOR
@@ -80,16 +79,16 @@ def driver_memory(
     )
 
 
-def wire_memory(route: MessageRoute, sizes: MessageSizes, run_id: int, key: bytes) -> WireMemory:
+def wire_memory(
+    sends: Flow, receives: Flow, sizes: MessageSizes, run_id: int, key: bytes
+) -> WireMemory:
     """Return what is needed to read and write the datagrams of a process."""
     settings = np.zeros(1, WIRE)
-    sent, received = sizes.entries(route.sends), sizes.entries(route.receives)
-    settings["sends"] = (
-        int.from_bytes(MAGIC, "little") | VERSION << 16 | route.sends << 24 | sent << 32
-    )
+    sent, received = sizes.entries(sends), sizes.entries(receives)
+    settings["sends"] = int.from_bytes(MAGIC, "little") | VERSION << 16 | sends << 24 | sent << 32
     settings["run_id"] = np.uint64(run_id).view(np.int64)
     settings["entries_sent"], settings["entries_received"] = sent, received
-    settings["flow_received"] = route.receives
+    settings["flow_received"] = receives
     return WireMemory(settings, keyed_state(key), np.zeros(8, np.uint64), np.zeros(16, np.uint64))
 
 

@@ -18,7 +18,7 @@ from cosim.record.align import align_tables
 from cosim.record.run_record import RunRecord, load_record, write_record
 from cosim.simulation.continuous.continuous_loop import continuous_loop_of
 from cosim.simulation.virtual_time import simulate
-from netem.duplex_link import ACKNOWLEDGEMENT_LINK, Duplex, network_of
+from netem.duplex_link import Duplex, network_of
 from netem.link_machine import Datagram, Link
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
@@ -197,7 +197,7 @@ def test_each_direction_has_its_own_random_stream() -> None:
     assert count > 5
     assert fates(record, UPDATES)[:count] == fates(other, UPDATES)[:count]
     settings = LinkSettings(impairments=(LossOf(loss=BernoulliLoss(probability=0.5)),))
-    link = Link(settings, record.scenario.seeds.loss, ACKNOWLEDGEMENT_LINK)
+    link = Link(settings, record.scenario.seeds.loss, "acknowledgement")
     answers = fates(record, ACKNOWLEDGEMENTS)
     expected = [Fate(link.decide(ACKNOWLEDGEMENTS, 48, 0).fate) for _ in answers]
     assert answers == expected
@@ -222,7 +222,7 @@ def test_the_summary_counts_acknowledgements(messy: RunRecord) -> None:
         assert summary["unintended_losses"] == summary["missing_samples"] == 0
         assert summary["identity_residual_max"] is None
     assert summarise(messy, 0, "horizon").to_json()["rejected_datagrams"]["sensor"].keys() <= {
-        "length", "version", "run", "flow", "tag", "stale",
+        "length", "version", "run", "flow", "loop", "tag", "stale",
     }  # fmt: skip
     assert summarise(simulate(plain()), 0, "horizon").acknowledgements is None
 

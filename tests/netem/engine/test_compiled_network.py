@@ -23,9 +23,9 @@ from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
 from noack.core.clock import RunClock
 from noack.impairments.link_settings import LinkSettings
-from noack.protocol.loop_protocol import PROTOCOLS
 from noack.protocol.machine_interface import BEGINNING, Machine, Record, Start
 from noack.protocol.record_tables import NETEM_RELEASE
+from noack.protocol.wire_format import Flow
 from tests.netem import any_settings
 from tests.netem.engine.relays import drain, endpoints, name_of
 
@@ -42,13 +42,16 @@ arrivals = st.lists(
 )  # fmt: skip
 
 
-DELAYING: Scenario = resolve(
-    load(
-        Path(__file__).parents[3] / "scenarios" / "lane_following.toml",
-        ['network.impairments=[{kind="delay", delay_s=0.02, jitter_s=0.02},'
-         ' {kind="duplicate", probability=0.3}]'],
-    )
-)  # fmt: skip
+IMPAIRMENTS = '[{kind="delay", delay_s=0.02, jitter_s=0.02}, {kind="duplicate", probability=0.3}]'
+
+
+def delaying(*more: str) -> Scenario:
+    path = Path(__file__).parents[3] / "scenarios" / "lane_following.toml"
+    return resolve(load(path, [f"network.impairments={IMPAIRMENTS}", *more]))
+
+
+DELAYING = delaying()
+BOTH_WAYS = delaying(f"network.actuation={{mansd=3, impairments={IMPAIRMENTS}}}")
 
 
 class Both:
@@ -60,11 +63,13 @@ class Both:
         self.loops = loops or 1
         self.plain: Machine[Datagram] = network_of(resolved, start, loops=self.loops)
         self.compiled: Any = CompiledNetwork(resolved, start, compiled_pump(), loops)
-        sender, self._sensor, self._controller, *receivers = sockets
-        peers = {name_of(self._sensor): receivers[0], name_of(self._controller): receivers[1]}
+        sender, sensor, plant, self._controller, *receivers = sockets
+        peers = {name_of(sensor): receivers[0], name_of(self._controller): receivers[1]}
+        self._other = plant if Flow.ACTUATION in resolved.network.flows else sensor
         # A clock that stays far behind the times that the test passes.
         clock = RunClock(time.monotonic_ns() + NEVER_NS)
-        self.compiled.open(clock, sender, peers, name_of(self._controller))
+        ends = name_of(self._controller), name_of(self._other)
+        self.compiled.open(clock, sender, peers, ends)
         self._expected: dict[int, list[bytes]] = {0: [], 1: []}
         self.rows: list[Record] = []
 
@@ -81,8 +86,8 @@ class Both:
         self._compare(machine.announce(change, now_ns), self.compiled.announce(change, now_ns))
 
     def received(self) -> tuple[list[bytes], list[bytes]]:
-        """Return what the controller and the sensor should have received; check that they did."""
-        found = {0: drain(self._controller), 1: drain(self._sensor)}
+        """Return what the two receivers should have received; check that they did."""
+        found = {0: drain(self._controller), 1: drain(self._other)}
         assert {flow: [data for data, _ in found[flow]] for flow in found} == self._expected
         return self._expected[0], self._expected[1]
 
@@ -106,37 +111,47 @@ class Both:
 
 @contextmanager
 def both(resolved: Any, start: Start = BEGINNING, loops: int | None = None) -> Iterator[Both]:
-    with endpoints(*["127.0.0.1"] * 5) as sockets:
+    with endpoints(*["127.0.0.1"] * 6) as sockets:
         machines = Both(resolved, start, sockets, loops)
         with closing(machines.compiled):
             yield machines
 
 
-def network(
-    forward: LinkSettings, reverse: LinkSettings, protocol: str, seed: int = 0
-) -> SimpleNamespace:
+def network(forward: LinkSettings, reverse: LinkSettings, *flows: Flow) -> SimpleNamespace:
     """Return what the machines read of a scenario."""
-    links = SimpleNamespace(link=forward, reverse=SimpleNamespace(link=reverse))
-    seeds = SimpleNamespace(loss=seed)
-    return SimpleNamespace(protocol=PROTOCOLS[protocol], network=links, seeds=seeds)
+    links = (forward, reverse)
+    network = SimpleNamespace(
+        link=forward, flows=flows, link_of=lambda flow: links[flows.index(flow)]
+    )
+    return SimpleNamespace(network=network, seeds=SimpleNamespace(loss=0))
+
+
+CROSSING = st.sampled_from([
+    (Flow.UPDATE,), (Flow.UPDATE, Flow.ACKNOWLEDGEMENT), (Flow.UPDATE, Flow.ACTUATION)
+])  # fmt: skip
+"""What crosses the network."""
 
 
 @settings(max_examples=150)
 @given(
-    any_settings.harsh, any_settings.harsh, st.sampled_from(["none", "ack"]), arrivals,
+    any_settings.harsh, any_settings.harsh, CROSSING, arrivals,
     st.integers(0, 2),
 )  # fmt: skip
 def test_any_arrivals_give_the_same_rows_and_datagrams(
-    forward: LinkSettings, reverse: LinkSettings, protocol: str, steps: list[Arrival], lives: int
+    forward: LinkSettings,
+    reverse: LinkSettings,
+    crossing: tuple[Flow, ...],
+    steps: list[Arrival],
+    lives: int,
 ) -> None:
     now_ns = 0
-    with both(network(forward, reverse, protocol), Start(generation=lives)) as machines:
+    with both(network(forward, reverse, *crossing), Start(generation=lives)) as machines:
         for number, (gap_ns, size, flow) in enumerate(steps):
             now_ns += gap_ns
             if gap_ns % 3 == 1:
                 machines.let_out(now_ns - gap_ns // 2)
             data = (number.to_bytes(4, "big") * (size // 4 + 1))[:size]
-            machines.arrive(data, flow if protocol == "ack" else 0, now_ns)
+            machines.arrive(data, flow if len(crossing) == 2 else 0, now_ns)
         machines.let_out(NEVER_NS)
         machines.received()
     inputs = [record.row[0] for record in machines.rows]
@@ -145,7 +160,7 @@ def test_any_arrivals_give_the_same_rows_and_datagrams(
 
 @settings(max_examples=100)
 @given(
-    any_settings.harsh, st.sampled_from(["none", "ack"]), st.sampled_from([1, 3, 200]),
+    any_settings.harsh, CROSSING, st.sampled_from([1, 3, 200]),
     st.lists(
         st.tuples(
             st.sampled_from([0, 1, 10_000, 1_000_000]), st.integers(32, 72), st.integers(0, 1),
@@ -155,15 +170,18 @@ def test_any_arrivals_give_the_same_rows_and_datagrams(
     ),
 )  # fmt: skip
 def test_the_flows_of_several_loops_are_told_apart_by_the_header(
-    link: LinkSettings, protocol: str, loops: int, steps: list[tuple[int, int, int, int]]
+    link: LinkSettings,
+    crossing: tuple[Flow, ...],
+    loops: int,
+    steps: list[tuple[int, int, int, int]],
 ) -> None:
     """The two directions have 2 · ``loops`` flows in all."""
     now_ns = 0
-    with both(network(link, link, protocol), loops=loops) as machines:
+    with both(network(link, link, *crossing), loops=loops) as machines:
         for gap_ns, size, direction, number in steps:
             now_ns += gap_ns
             loop = number % loops
-            flow = loop + loops * direction * (protocol == "ack")
+            flow = loop + loops * direction * (len(crossing) == 2)
             data = bytes(6) + loop.to_bytes(2, "little") + bytes(size - 8)
             machines.arrive(data, flow, now_ns)
         for data in (bytes(31), bytes(6) + loops.to_bytes(2, "little") + bytes(24)):
@@ -173,9 +191,9 @@ def test_the_flows_of_several_loops_are_told_apart_by_the_header(
         assert machines.compiled.of_no_loop == 2
 
 
-def test_at_equal_times_updates_leave_before_acknowledgements() -> None:
+def test_at_equal_times_updates_leave_before_actuations() -> None:
     delay = settings_of("delay 1ms")
-    with both(network(delay, delay, "ack")) as machines:
+    with both(network(delay, delay, Flow.UPDATE, Flow.ACTUATION)) as machines:
         for flow in (1, 0, 1, 0):
             machines.arrive(b"%d" % flow, flow, 5)
         machines.let_out(NEVER_NS)
@@ -184,6 +202,7 @@ def test_at_equal_times_updates_leave_before_acknowledgements() -> None:
     assert flows == [0, 0, 1, 1]
 
 
+@pytest.mark.parametrize("scenario", [DELAYING, BOTH_WAYS])
 @pytest.mark.parametrize("generation", [0, 1])
 @settings(max_examples=60)
 @given(
@@ -203,20 +222,23 @@ def test_at_equal_times_updates_leave_before_acknowledgements() -> None:
     arrivals,
 )  # fmt: skip
 def test_changes_during_the_run_apply_from_the_same_datagram_on(
-    generation: int, changes: list[tuple[int, int, dict[str, Any]]], steps: list[Arrival]
+    generation: int,
+    scenario: Scenario,
+    changes: list[tuple[int, int, dict[str, Any]]],
+    steps: list[Arrival],
 ) -> None:
     """Some changes are announced too late."""
     announcements = sorted(changes, key=lambda change: change[0])
     now_ns, numbers = 0, iter(range(len(changes)))
-    with both(DELAYING, Start(generation=generation)) as machines:
-        for gap_ns, size, _ in steps:
+    with both(scenario, Start(generation=generation)) as machines:
+        for gap_ns, size, flow in steps:
             now_ns += gap_ns
             while announcements and announcements[0][0] <= now_ns:
                 announced_ns, ahead_ns, change = announcements.pop(0)
                 when_ns = max(announced_ns + ahead_ns, 0)
                 machines.let_out(now_ns)
                 machines.announce(ParameterChange(next(numbers), when_ns, change), now_ns)
-            machines.arrive(bytes(size), 0, now_ns)
+            machines.arrive(bytes(size), flow * (scenario is not DELAYING), now_ns)
         machines.let_out(NEVER_NS)
         machines.received()
 
@@ -230,11 +252,11 @@ class _Rows(list[Any]):
 def test_arrival_is_when_the_datagram_reached_the_socket(speed: float) -> None:
     """It is read later. The kernel's real-time clock may be adjusted by a millisecond meanwhile."""
     clock = RunClock(time.monotonic_ns() - 10**9, speed)
-    resolved = network(LinkSettings(), LinkSettings(), "none")
+    resolved = network(LinkSettings(), LinkSettings(), Flow.UPDATE)
     with endpoints(*["127.0.0.1"] * 5) as (sender, sensor, controller, *receivers):
         peers = dict(zip((name_of(sensor), name_of(controller)), receivers, strict=True))
         with closing(CompiledNetwork(cast(Scenario, resolved), BEGINNING, compiled_pump())) as one:
-            one.open(clock, sender, peers, name_of(controller))
+            one.open(clock, sender, peers, [name_of(controller)])
             before_ns = clock.now_ns()
             sensor.sendto(b"x", name_of(receivers[0]))
             after_ns = clock.now_ns()

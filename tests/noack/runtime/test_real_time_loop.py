@@ -1,6 +1,7 @@
 """The real-time loop with a socket that always has datagrams."""
 
 import os
+import select
 import time
 from collections.abc import Iterator, Sequence
 from itertools import count
@@ -245,3 +246,37 @@ def test_a_machine_may_drive_itself_between_two_turns_of_housekeeping(
     assert late_ns > 5
     # A busy machine leaves the core to the other threads for a moment.
     assert len(pauses) == (2 if busy else 0)
+
+
+class Late(Ticker):
+    """Records how late its steps are."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.late_ns: list[int] = []
+
+    def on_timer(self, now_ns: int) -> Sequence[Notice]:
+        self.late_ns.append(now_ns - self.served * PERIOD_NS)
+        return super().on_timer(now_ns)
+
+
+def test_deadlines_are_gathered_and_never_served_early(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 200 deadlines in 0.2 s, some 20 are served at each waking up."""
+    clock, machine = RunClock(time.monotonic_ns() + 50 * PERIOD_NS), Late()
+    waits_s: list[float] = []
+
+    def wait(*arguments: Any) -> Any:
+        waits_s.append(arguments[-1])
+        return original(*arguments)
+
+    original = select.select
+    monkeypatch.setattr(select, "select", wait)
+    out, into = os.pipe()  # nothing arrives
+    run_loop(
+        machine, Flooded(out, clock, machine), clock, Log(), end_ns=STEPS * PERIOD_NS,
+        stop=lambda: False, gather_ns=20 * PERIOD_NS,
+    )  # fmt: skip
+    os.close(out)
+    os.close(into)
+    assert min(machine.late_ns) >= 0
+    assert sum(one_s > 0 for one_s in waits_s) < STEPS // 4

@@ -11,7 +11,7 @@ from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
 from noack.protocol.machine_interface import Machine, Output
-from noack.protocol.topology import ROUTES
+from noack.protocol.topology import RECEIVES, SENDS
 from noack.protocol.wire_format import Decoder, Encoder, Flow, Message
 from noack.runtime import rehearsal
 from noack.runtime.rehearsal import Rehearsal, can_rehearse
@@ -42,15 +42,15 @@ def scenario(content: dict[str, Any]) -> Scenario:
 
 @contextmanager
 def rehearsal_of(role: str, scenario: Scenario) -> Iterator[tuple[Rehearsal, Watched]]:
-    flows, machine = ROUTES[role], Watched(MACHINES[role](scenario))
-    entries = scenario.message_sizes.entries(flows.receives)
+    flow, machine = RECEIVES[role], Watched(MACHINES[role](scenario))
+    entries = scenario.message_sizes.entries(flow)
     with closing(bind(0, "test")) as endpoint:
         own = endpoint.getsockname()
         channel = MessageSocket(
-            endpoint, Decoder(flows.receives, entries, 1, KEY), Encoder(1, KEY), flows.sends,
+            endpoint, Decoder(flow, entries, 1, KEY), Encoder(1, KEY), SENDS[role],
             source=own, destination=own,
         )  # fmt: skip
-        rehearsing = Rehearsal(machine, channel, Encoder(1, KEY), flows.receives, entries)  # type: ignore[arg-type]
+        rehearsing = Rehearsal(machine, channel, Encoder(1, KEY), flow, entries)  # type: ignore[arg-type]
         with closing(rehearsing):
             yield rehearsing, machine
 

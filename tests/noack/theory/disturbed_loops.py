@@ -44,6 +44,12 @@ class DisturbedLoop:
         lasting_s = np.array(self.duration_steps) * self.system.step_s
         return Forcing(self.columns, lasting_s, np.zeros(self.system.B.shape[1]))
 
+    def pushed(self, plant: type[PlantGains] = PlantGains) -> PlantGains:
+        """The gains of what persists."""
+        system, at_rest = self.system, np.zeros((len(self.system.A), 1))
+        models = ErrorGains(system.H, system.K, system.weight, 0.0)
+        return plant(models, system.A, system.B, at_rest, 0.0, forcing=self.forcing)
+
     def certify(
         self,
         change: "Callable[[DisturbedLoop], DisturbedLoop]" = lambda loop: loop,
@@ -52,10 +58,8 @@ class DisturbedLoop:
         """The certificate; ``change`` makes it one of another loop."""
         loop = change(self)
         system, floor = loop.system, loop.floor
-        decaying = system.gains()
-        models = ErrorGains(system.H, system.K, system.weight, 0.0)
-        at_rest = np.zeros((len(system.A), 1))
-        pushed = plant(models, system.A, system.B, at_rest, 0.0, forcing=loop.forcing)
+        decaying, pushed = system.gains(), loop.pushed(plant)
+        models = pushed.error
         estimation = EstimationBound(float(np.linalg.norm(np.abs(system.weight) @ loop.noise)))
         first, rest = solve_divided(
             Part(decaying.error, decaying, TriggerBound(system.beta, None)),

@@ -147,6 +147,13 @@ class Trace(NamedTuple):
     state_weighted: Reals
     input_error: Reals
     inter_event_s: float
+    x: Reals
+    """(runs, STEPS, n)"""
+    known: Reals
+    """What the sensor knows of x, (runs, STEPS, n)."""
+    is_event: Flags
+    received: Steps
+    """Number of the newest update that the controller has received, from 1 on; 0 for none."""
 
     def shares(self, system: System, certified: Constants) -> dict[str, Reals]:
         """Each signal divided by its bound, (runs, STEPS) or a number; at most 1 if it holds."""
@@ -231,6 +238,7 @@ def simulate(
     synchronised = np.full(runs, system.known_start)
     commands: list[tuple[Reals, Flags]] = []
     trace, shortest, every = np.zeros((5, runs, STEPS)), 10**9, np.arange(runs)
+    states, flags = np.zeros((2, runs, STEPS, n)), np.zeros((2, runs, STEPS), int)
     inputs: list[Reals] = []
     for step in range(STEPS):
         threshold = max(system.beta * np.exp(-system.alpha * step * system.step_s), floor)
@@ -248,6 +256,7 @@ def simulate(
             )
             x_s = np.where(event[:, None], known, x_s)
             last_event = np.where(event, step, last_event)
+            flags[0, :, step] = event
             sent = np.flatnonzero(event & delivered[every, events])
             in_flight = delays[sent, events[sent]]
             slot = (step + in_flight) % (system.delay_steps + 1)
@@ -260,6 +269,7 @@ def simulate(
         newest = np.where(fresh, arrives[:, slot_now], newest)
         arrives[:, slot_now] = 0
         synchronised = synchronised | fresh
+        states[:, :, step], flags[1, :, step] = (x, known), newest
         if system.hold_steps == 0 or step % system.hold_steps == 0:
             commands.append((x_c @ K, synchronised))
         else:
@@ -284,7 +294,7 @@ def simulate(
         ]
         x = following[0] if plants is None else np.array(following)[plants.which[:, step], every]
         x_s, x_c = x_s @ model[0].model, x_c @ model[0].model
-    return Trace(*trace, shortest * system.step_s)
+    return Trace(*trace, shortest * system.step_s, *states, flags[0] > 0, flags[1])
 
 
 def norms(rows: Reals) -> Reals:

@@ -1,0 +1,210 @@
+"""Actuations over the network: the loop in virtual time against an independent calculation."""
+
+from collections.abc import Iterator
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from cosim.analysis.loss_statistics import from_controller, unintended_losses
+from cosim.analysis.replay import replay
+from cosim.record.packet_outcomes import packet_outcomes
+from cosim.record.run_record import RunRecord
+from cosim.simulation.virtual_time import simulate
+from noack.config.resolution import loop_of, resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import load, validate
+from noack.core.errors import CallerError
+from noack.impairments.loss_models.scripted import ScriptedLoss
+from noack.protocol.record_tables import (
+    NETEM_PACKET,
+    NO_SEQUENCE,
+    PLANT_ACTUATION,
+    PLANT_STEP,
+)
+from noack.protocol.wire_format import Flow
+from tests.cosim.record.changed_records import flipped
+
+SCENARIOS = Path(__file__).parents[3] / "scenarios"
+H_S, TICKS = 0.05, 8
+A, B = np.array([[0.0, 1.0], [1.0, 0.3]]), np.array([[0.0], [1.0]])
+K, TRUE_A = np.array([[-3.0, -2.0]]), np.array([[0.0, 1.1], [1.2, 0.2]])
+LOST_UPDATES = (1,)
+HOW: dict[str, tuple[str, int]] = {
+    "hold": ("hold", 1), "zero": ("zero", 1), "model": ("model", 1), "2 then zero": ("zero", 2),
+    "3 then hold": ("hold", 3), "4 then hold": ("hold", 4), "2 then model": ("model", 2),
+}  # fmt: skip
+
+
+def scenario(how: str, lost: Any = (), **more: Any) -> Scenario:
+    policy, predictions = HOW[how]
+    content: dict[str, Any] = {
+        "name": "lossy", "horizon_s": TICKS * H_S,
+        "model": {"A": A.tolist(), "B": B.tolist(), "gain": K.tolist()},
+        "plant": {
+            "draw": "given", "A": TRUE_A.tolist(), "B": B.tolist(), "initial_state": [1.0, -0.5],
+            "rate_hz": 1 / H_S, "watchdog": {"policy": policy},
+        },
+        "controller": {"rate_hz": 1 / H_S, "predictions": predictions},
+        "trigger": {"policy": "periodic", "period_s": 2 * H_S},
+        "network": {
+            "mansd": 3, "loss": {"model": "scripted", "lost": LOST_UPDATES},
+            "actuation": {"loss": {"model": "scripted", "lost": lost}},
+        },
+    }  # fmt: skip
+    return resolve(validate(content | more, "here"))
+
+
+def expected(how: str, lost: tuple[int, ...]) -> Iterator[tuple[Any, float, int, int]]:
+    """Yield x, u, the newest actuation and its entry at every step: the loop as it is defined."""
+    policy, predictions = HOW[how]
+    both = np.block([[TRUE_A, B], [np.zeros((1, 3))]])
+    model, steps = expm((A + B @ K) * H_S / 2), expm(both * H_S)
+    x, x_c, known, u = np.array([1.0, -0.5]), np.zeros(2), False, 0.0
+    arrived: list[tuple[int, Any]] = []
+    for k in range(TICKS + 1):
+        if k:
+            x = (steps @ np.append(x, u))[:2]
+        tick, sent = arrived[-1] if arrived else (-1, np.zeros(2))
+        # the tick before step k was half a period ago
+        age = (k - 1 - tick) + 0.5 if arrived else k
+        entry, half = -1, 0.0
+        ahead = np.linalg.matrix_power(model, round(2 * age))
+        if age <= predictions or policy == "hold":
+            entry = min(int(age), predictions - 1)
+            u = float((K @ np.linalg.matrix_power(model, 2 * entry) @ sent).item())
+        else:
+            half = float((K @ ahead @ sent).item())
+            u = half if policy == "model" else 0.0
+        yield x, u, tick, entry
+        if k % 2 == 0 and k // 2 not in LOST_UPDATES:
+            x_c, known = x, True
+        x_c = model @ x_c
+        if k not in lost:
+            arrived.append((k, x_c if known else np.zeros(2)))
+        x_c = model @ x_c
+
+
+@pytest.mark.parametrize("how", HOW)
+def test_every_pattern_of_lost_actuations_gives_the_inputs_of_an_independent_loop(
+    how: str,
+) -> None:
+    base = scenario(how)
+    network = base.network
+    assert network.actuation is not None
+    for pattern in product((False, True), repeat=TICKS):
+        lost = tuple(k for k, is_lost in enumerate(pattern) if is_lost)
+        loss = ScriptedLoss(lost=lost)
+        actuation = network.actuation.model_copy(update={"loss": loss})
+        changed = network.model_copy(update={"actuation": actuation})
+        steps = simulate(base.model_copy(update={"network": changed}))[PLANT_STEP]
+        assert len(steps) == TICKS + 1
+        for row, (x, u, newest, entry) in zip(steps, expected(how, lost), strict=True):
+            assert (row["actuation"], "entry" not in steps.dtype.names or row["entry"]) in (
+                (newest, entry), (newest, True),
+            ), (lost, row["sequence"])  # fmt: skip
+            np.testing.assert_allclose(row["x"], x, rtol=1e-9, atol=1e-12)
+            np.testing.assert_allclose(row["u"], u, rtol=1e-9, atol=1e-12)
+
+
+MESSY = """{mansd=2, loss={model="bernoulli", probability=0.4}, impairments=[
+ {kind="delay", delay_s=0.01, jitter_s=0.02}, {kind="duplicate", probability=0.3},
+ {kind="corrupt", probability=0.1}]}""".replace("\n", "")
+
+
+@pytest.fixture(scope="module")
+def messy() -> RunRecord:
+    return simulate(
+        resolve(
+            load(
+                SCENARIOS / "lane_following.toml",
+                [
+                    "plant.rate_hz=100", "controller.rate_hz=50", "horizon_s=6",
+                    f"network.actuation={MESSY}", "controller.predictions=4",
+                    'plant.watchdog.policy="model"', 'network.impairments=[{kind="delay", '
+                    "delay_s=0.01, jitter_s=0.02}]", "trigger.beta=0.05",
+                    "changes=[{at_s=2, set={'network.loss.probability'=0.3}}]",
+                ],
+            )
+        )
+    )  # fmt: skip
+
+
+def test_each_direction_has_its_own_losses_and_guarantee(messy: RunRecord) -> None:
+    updates, actuations = (packet_outcomes(messy, one) for one in messy.scenario.network.flows)
+    assert actuations.longest_loss_burst() == 2
+    assert updates.longest_loss_burst() in (3, 4)
+    part = from_controller(messy)["actuations"]
+    assert part.sent == len(actuations.lost) == 300
+    assert part.lost == actuations.lost.sum() > 90
+    assert set(messy[NETEM_PACKET]["flow"].tolist()) == {0, 1}
+    assert sum(unintended_losses(messy).values()) == 0
+
+
+def test_the_plant_receives_the_inputs_of_the_model(messy: RunRecord) -> None:
+    """Without an update in between, a prediction is what the controller sends later."""
+    loop, received = loop_of(messy.scenario), messy[PLANT_ACTUATION]
+    assert received["predicted"].shape[1] == 3 * loop.m
+    step = expm(loop.H * 0.02)
+    for row in received:
+        inputs = np.array([row["u"], *row["predicted"].reshape(3, -1)])
+        states = [np.linalg.matrix_power(step, j) @ row["x_c"] for j in range(4)]
+        np.testing.assert_allclose(inputs, [loop.K @ x for x in states], rtol=1e-9, atol=1e-12)
+    consecutive = np.flatnonzero(np.diff(received["sequence"]) == 1)
+    same = (received["predicted"][consecutive, : loop.m] == received["u"][consecutive + 1]).all(1)
+    assert same.any()
+    entries = messy[PLANT_STEP]["entry"]
+    assert {0, 1, 2} <= set(entries.tolist())
+
+
+def test_the_run_replays_bit_by_bit_and_a_flipped_bit_is_found(messy: RunRecord) -> None:
+    result = replay(messy)
+    assert result.bit_exact
+    legs = {one.leg: one.compared for one in result.messages}
+    assert legs["controller → netem"] == 300
+    assert legs["netem → plant"] == len(messy[PLANT_ACTUATION])
+    assert "controller → plant" not in legs
+    for table, column in ((PLANT_ACTUATION, "predicted"), (PLANT_STEP, "entry")):
+        assert not replay(flipped(messy, table, 40, column, 1)).bit_exact
+
+
+def test_a_direct_path_and_a_perfect_one_over_the_network_give_the_same_loop() -> None:
+    direct = simulate(resolve(load(SCENARIOS / "lane_following.toml", ["horizon_s=3"])))
+    over = simulate(
+        resolve(
+            load(SCENARIOS / "lane_following.toml", ["horizon_s=3", "network.actuation={limit=9}"])
+        )
+    )
+    for name in ("x", "u", "actuation"):
+        assert (direct[PLANT_STEP][name] == over[PLANT_STEP][name]).all()
+    assert (over[PLANT_STEP]["actuation"][1:] != NO_SEQUENCE).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        (["network.protocol=ack", "network.actuation={mansd=1}"],
+         'network.actuation = {"mansd": 1}: not with protocol = "ack"'),
+        (["controller.predictions=33"],
+         "controller.predictions = 33: an actuation carries 33 x 2 inputs; at most 64 numbers fit"),
+        (["controller.predictions=31", 'plant.watchdog.policy="model"'],
+         "31 x 2 inputs and 4 of x_c; at most 64 numbers fit"),
+        (["controller.predictions=3", "plant.watchdog.timeout_s=0.005"],
+         "shorter than a period of the controller times controller.predictions (0.006 s)"),
+        (["network.actuation.loss={model=\"trace\", file=\"none.csv\"}"],
+         "network.actuation.loss.file"),
+    ],
+)  # fmt: skip
+def test_mistakes_are_named(changes: list[str], says: str) -> None:
+    with pytest.raises(CallerError) as error:
+        load(SCENARIOS / "lane_following.toml", changes)
+    assert says in str(error.value)
+
+
+def test_the_flows_of_the_network_follow_from_its_settings() -> None:
+    assert scenario("hold").network.flows == (Flow.UPDATE, Flow.ACTUATION)
+    paper = load(SCENARIOS / "lane_following.toml")
+    assert paper.network.flows == (Flow.UPDATE,)
