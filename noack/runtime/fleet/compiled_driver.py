@@ -15,7 +15,7 @@ _MODULES = (
     "noack.core.ordered_arithmetic", "noack.core.model_arrays", "noack.trigger.trigger_arrays",
     "noack.config.fleet_layout", "noack.runtime.fleet.wire_words",
     "noack.runtime.fleet.deadline_heap", "noack.runtime.native.libc_calls",
-    "noack.runtime.fleet.fleet_driver",
+    "noack.runtime.fleet.fleet_driver", "noack.runtime.fleet.replay_driver",
 )  # fmt: skip
 _SOURCES = (
     "noack.runtime.native.object_code", "noack.runtime.native.socket_structs", __name__,
@@ -40,11 +40,27 @@ def compiled_driver(role: FleetRole, arguments: tuple[Any, ...]) -> NativeFuncti
     """
     if (kept := kept_driver(role)) is not None:
         return kept
-    return load_or_compile(_file(role), _jitable(role), lambda: (*arguments, 0))
+    machine, inline = _registered(role)
+    from noack.runtime.fleet.fleet_driver import driver_of
+
+    driver = driver_of(machine.handle, machine.on_timer, inline)
+    return load_or_compile(_file(role), driver, lambda: (*arguments, 0))
 
 
-def _jitable(role: FleetRole) -> Any:
-    """Return the driver for the compiler, which knows all functions that it calls."""
+def compiled_replay(role: FleetRole, arguments: tuple[Any, ...]) -> NativeFunction:
+    """Return the replay of a role; compile it if that has not happened on this machine."""
+    file = _file(role, "replay")
+    if file is not None and (kept := load(file)) is not None:
+        return kept
+    machine, _ = _registered(role)
+    from noack.runtime.fleet.replay_driver import replay_driver_of
+
+    replay = replay_driver_of(machine.handle, machine.on_timer)
+    return load_or_compile(file, replay, lambda: (*arguments, 0))
+
+
+def _registered(role: FleetRole) -> tuple[Any, Any]:
+    """Let the compiler know all functions; return the role's module and what adds a function."""
     from numba.extending import register_jitable
 
     for name in (*_MODULES, role.module):
@@ -53,13 +69,10 @@ def _jitable(role: FleetRole) -> Any:
             if function.__module__ == name:
                 options = _CALLED if function is compute_tag else _OPTIONS
                 register_jitable(**options)(function)
-    from noack.runtime.fleet.fleet_driver import driver_of
-
-    machine: Any = importlib.import_module(role.module)
-    return driver_of(machine.handle, machine.on_timer, register_jitable(**_OPTIONS))
+    return importlib.import_module(role.module), register_jitable(**_OPTIONS)
 
 
-def _file(role: FleetRole) -> Path | None:
+def _file(role: FleetRole, what: str = "drive") -> Path | None:
     found = [importlib.util.find_spec(name) for name in (*_MODULES, *_SOURCES, role.module)]
     folder = cache_folder("fleet", [Path(str(spec and spec.origin)) for spec in found])
-    return None if folder is None else code_file(folder, role.module)
+    return None if folder is None else code_file(folder, f"{role.module}-{what}")

@@ -135,6 +135,29 @@ class CompiledFleet:
         fleet.fleet["out"] = 0
         return [*messages, *outputs.rows]
 
+    @property
+    def timer_table(self) -> str:
+        """The table of the rows of timers; that of messages, if there are no timers."""
+        return self._on_timer
+
+    @property
+    def message_table(self) -> str:
+        """The table of the rows of messages."""
+        return self._on_message
+
+    @property
+    def tables(self) -> tuple[str, ...]:
+        """The tables of the role."""
+        return tuple(dict.fromkeys((self._on_timer, self._on_message)))
+
+    def replay(self, code: Driver, tables: tuple[Any, ...], inputs: int) -> int:
+        """Replay recorded inputs (:mod:`noack.runtime.fleet.replay_driver`); return the reason."""
+        while True:
+            reason = code(self._memory, self._own, *tables, inputs)
+            if reason != layout.MATRIX_MISSING:
+                return reason
+            self._add_matrix()
+
     def reports(self) -> list[dict[str, object]]:
         """Counters of each loop, for the run's summary."""
         reports: list[dict[str, object]] = []
@@ -178,17 +201,21 @@ class CompiledFleet:
         assert self._run is not None
         reason = self._run(self._memory, self._own, until_ns)
         if reason == layout.MATRIX_MISSING:
-            transitions = self._parts.transitions
-            assert transitions is not None
-            transitions.add_wanted()
-            if transitions.table is not self._own.models:
-                self._own = self._own._replace(models=transitions.table)
+            self._add_matrix()
         elif reason == layout.NOTE:
             assert self._parts.notice is not None
             fleet = self._memory.fleet.fleet[0]
             notice = self._parts.notice(self._own, fleet)
             self._notices.append(notice._replace(loop=int(fleet["note_loop"])))
         return reason
+
+    def _add_matrix(self) -> None:
+        """Compute the transition matrix that was missing."""
+        transitions = self._parts.transitions
+        assert transitions is not None
+        transitions.add_wanted()
+        if transitions.table is not self._own.models:
+            self._own = self._own._replace(models=transitions.table)
 
     def _pass_rows(self, sink: RecordSink) -> None:
         """Hand over the rows and log lines."""

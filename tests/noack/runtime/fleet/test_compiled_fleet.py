@@ -17,8 +17,9 @@ from noack.config.scenario_file import validate
 from noack.protocol.fleet import Fleet
 from noack.protocol.machine_interface import Machine, Output, Record
 from noack.protocol.wire_format import Flow, Message
-from noack.runtime.fleet.compiled_driver import compiled_driver
+from noack.runtime.fleet.compiled_driver import compiled_driver, compiled_replay
 from noack.runtime.fleet.compiled_fleet import CompiledFleet
+from noack.runtime.fleet.fleet_replay import replay_arguments, replay_fleet
 from plant_server.plant import plant_of
 from plant_server.plant_arrays import PLANT_FLEET
 from sensor_node.sensor import sensor_of
@@ -43,6 +44,13 @@ POLICIES: list[Content] = [
 ]  # fmt: skip
 
 
+def compiled(name: str, run: Scenario) -> CompiledFleet:
+    role, loops = ROLES[name][0], resolved_loops(run)
+    parts = role.parts_of(loops)
+    assert parts is not None
+    return CompiledFleet(name, role, parts, run, loops, RUN_ID, KEY)
+
+
 class Pair:
     """The machines of a role, single and compiled, which get the same inputs."""
 
@@ -51,11 +59,9 @@ class Pair:
         loops = resolved_loops(run)
         self._tables = tables_of(run)
         self._single = Fleet([*map(machine_of, loops)], phases_ns(run))
-        parts = role.parts_of(loops)
-        assert parts is not None
-        self._compiled = CompiledFleet(name, role, parts, run, loops, RUN_ID, KEY)
+        self._compiled = compiled(name, run)
         self._compiled.use(compiled_driver(role, self._compiled.arguments))
-        self.rows = 0
+        self._rows: dict[str, list[Any]] = {}
 
     def due_ns(self) -> int | None:
         due_ns = self._single.next_deadline_ns()
@@ -75,8 +81,15 @@ class Pair:
 
     def _compare(self, single: Sequence[Output], compiled: Sequence[Output]) -> list[Message]:
         assert sorted(map(self._bits, single)) == sorted(map(self._bits, compiled))
-        self.rows += len(single)
+        for output in single:
+            if isinstance(output, Record):
+                self._rows.setdefault(output.table, []).append(output.row)
         return [one for one in single if isinstance(one, Message)]
+
+    @property
+    def rows(self) -> dict[str, Any]:
+        """The rows of the single machines."""
+        return {table: np.array(rows, self._tables[table]) for table, rows in self._rows.items()}
 
     def _bits(self, output: Output) -> str:
         if isinstance(output, Message):
@@ -159,4 +172,19 @@ def test_compiled_machines_have_the_bits_of_the_single_ones(
         loops[key] = loops[key] | value if isinstance(value, dict) else value
     run = validate(loops, "here")
     pairs = drive(run, seed, loss=0.5, delay_ns=60_000_000)
-    assert all(pair.rows > 1000 for pair in pairs.values())
+    assert all(sum(map(len, pair.rows.values())) > 500 for pair in pairs.values())
+
+
+def test_a_replay_finds_every_row_again_and_one_changed_bit(loops: Content) -> None:
+    run = validate(loops, "here")
+    for name, pair in drive(run, 3, loss=0.3, delay_ns=60_000_000).items():
+        rows = pair.rows
+        code = compiled_replay(ROLES[name][0], replay_arguments(compiled(name, run)))
+        count = sum(map(len, rows.values()))
+        assert replay_fleet(compiled(name, run), rows, code) == (count, None)
+        for table, recorded in rows.items():
+            row = len(recorded) // 2
+            changed = recorded.copy()
+            changed.view(np.uint8).reshape(len(recorded), -1)[row, -9] ^= 1
+            found = replay_fleet(compiled(name, run), rows | {table: changed}, code)
+            assert found.differs == (table, row)
