@@ -114,7 +114,7 @@ def tcs_settings(draw: st.DrawFn) -> LinkSettings:
     chain: list[AnyImpairment] = draw(
         st.lists(
             st.one_of(
-                st.builds(LossOf, loss=tcs_losses),
+                st.builds(LossOf, loss=tcs_losses.filter(lambda one: not one.tc_lacks(()))),
                 st.builds(Duplicate, **chance),
                 st.builds(Corrupt, **chance, correlation=correlations),
                 varied(Rate).filter(lambda rate: isinstance(rate.discipline, TailDrop)),
