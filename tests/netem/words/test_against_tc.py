@@ -91,7 +91,7 @@ probabilities = st.floats(0, 1)
 correlations = st.floats(0, 1, exclude_max=True)
 tcs_losses = st.one_of(
     [varied(model) for model in (NoLoss, BernoulliLoss, GilbertElliottLoss, FourStateLoss)]
-).filter(lambda loss: not getattr(loss, "keep", False))
+).filter(lambda loss: not loss.tc_lacks(()))
 tcs_delays = st.builds(
     Delay,
     delay_s=times_s,
@@ -114,7 +114,7 @@ def tcs_settings(draw: st.DrawFn) -> LinkSettings:
     chain: list[AnyImpairment] = draw(
         st.lists(
             st.one_of(
-                st.builds(LossOf, loss=tcs_losses.filter(lambda one: not one.tc_lacks(()))),
+                st.builds(LossOf, loss=tcs_losses),
                 st.builds(Duplicate, **chance),
                 st.builds(Corrupt, **chance, correlation=correlations),
                 varied(Rate).filter(lambda rate: isinstance(rate.discipline, TailDrop)),
