@@ -48,6 +48,19 @@ def test_each_loop_is_a_run_directory_of_its_own(run_dir: Path) -> None:
     assert sum(packets) == whole.count(NETEM_PACKET) > 50
 
 
+def test_processes_finalise_the_loops_of_a_long_run_alike(
+    run_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paths = [run_dir / "summary.json", *sorted(run_dir.glob("loops/*/summary.json"))]
+    before = [path.read_text() for path in paths]
+    for path in paths:
+        path.unlink()
+    monkeypatch.setattr("cosim.live.finalize_loops._MANY_STEPS", 1)
+    monkeypatch.setattr("cosim.live.finalize_loops.cores", lambda: 2)
+    assert noack("summary", run_dir).exit_code == 0
+    assert [path.read_text() for path in paths] == before
+
+
 def test_the_summary_adds_up(run_dir: Path) -> None:
     summary = json.loads((run_dir / "summary.json").read_text())
     assert is_complete(summary)
