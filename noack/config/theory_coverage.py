@@ -116,6 +116,16 @@ class TheoryCoverage:
         if any(self.scenario.controller.setpoint or ()):
             raise CallerError("controller.setpoint: needs the set point 0")
 
+    def require_direct_inputs(self) -> None:
+        """Raise CallerError unless every actuation reaches the plant and carries one input."""
+        direct = self.scenario.network.actuation is None
+        if direct and self.scenario.controller.predictions == 1:
+            return
+        key = "controller.predictions" if direct else "network.actuation"
+        raise CallerError(
+            f"{key}: needs actuations that reach the plant at once and carry one input"
+        )
+
     def require_certifiable(self) -> None:
         """Raise CallerError if no certificate covers the scenario."""
         if (why := self.beyond_theory) is not None:
