@@ -19,7 +19,7 @@ from benchmarks._certificate_kinds.observed import OBSERVED
 from benchmarks._certificate_kinds.policies import POLICIES
 from benchmarks._certificate_kinds.random_losses import RANDOM_LOSSES
 from benchmarks._report import Benchmark, Goal, Row, say
-from cosim.studies.process_pool import interrupts_held, processes
+from cosim.live.process_pool import interrupts_held, processes
 
 KINDS: Mapping[str, Kind] = {
     kind.name: kind

@@ -1,7 +1,6 @@
 """Declaration of ``noack``'s commands, their shared functions, and the entry point."""
 
 import math
-import os
 import pkgutil
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -19,6 +18,7 @@ from cosim.cli.program import NAME, Program, be_patient
 from cosim.record.run_directory import DEFAULT_RUNS as DEFAULT_RUNS
 from cosim.shipped_files import find_shipped
 from noack.core.errors import ExitStatus, NoackError, why
+from noack.core.python_process import cores as cores
 from noack.runtime.command_line import failed
 
 if TYPE_CHECKING:
@@ -225,11 +225,6 @@ def load_scenario(name: str, settings: Sequence[str] | None) -> "Scenario":
     from noack.config.scenario_file import load
 
     return load(find_scenario(name), settings or ())
-
-
-def cores() -> int:
-    """Return the number of processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 def console() -> "Console":

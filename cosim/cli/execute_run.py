@@ -71,13 +71,21 @@ def run_processes(
 
 
 def warn_of_violations(scenario: "Scenario") -> None:
-    """Print the assumptions of Theorem 2 that the scenario violates, on standard error."""
+    """Print the assumptions of Theorem 2 that the scenario violates, on standard error.
+
+    For several loops: also what may go wrong at the bottleneck that they share. Raise CallerError
+    if it cannot carry the datagrams that must pass.
+    """
+    from noack.config.link_load import link_loads, load_warnings, require_capacity
     from noack.config.loops import loop_scenario
     from noack.config.resolution import resolve
     from noack.theory.assumptions import AssumptionStatus, assumptions
 
     alone = {"": scenario}
     if scenario.loops is not None:
+        require_capacity(scenario)
+        for line in load_warnings(link_loads(scenario), scenario):
+            print(f"noack: warning: {line}", file=sys.stderr)
         alone = {f"{one.name}: ": loop_scenario(scenario, one) for one in scenario.loops}
     for name, loop in alone.items():
         for one in assumptions(resolve(loop)):

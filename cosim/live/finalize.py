@@ -4,6 +4,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -86,9 +87,7 @@ def finalize(ending: RunEnding, *, report: bool = True, again: bool = False) -> 
 
 def _finalize_shared(network: RunRecord, ending: RunEnding, *, again: bool) -> Outcome:
     """Finalise each loop of a run of several; write the summary of the run."""
-    summary = finalize_loops(
-        network, ending, lambda loop: finalize(loop, report=False, again=again)
-    )
+    summary = finalize_loops(network, ending, partial(finalize, report=False, again=again))
     _write_summary(ending.run_dir, summary)
     status, reason = ExitStatus(summary.exit.status), summary.exit.reason
     if (ending.status, ending.reason) != (status, reason):

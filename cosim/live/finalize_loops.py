@@ -1,14 +1,23 @@
 """The end of a run of several loops: each loop finalised, and the summary of the whole."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import Outcome
 from cosim.analysis.shared_summary import SharedSummary, summarise_shared
 from cosim.analysis.summary_model import ExitPart, ReplayPart
+from cosim.live.process_pool import interrupts_held, processes
 from cosim.record.run_ending import RunEnding
 from cosim.record.run_record import RunRecord
 from cosim.record.shared_run import loop_directories
+from noack.config.loops import loops_of
+from noack.config.scenario import Scenario
+from noack.core.python_process import cores
+
+_MANY_STEPS = 50_000
+"""Loops with fewer steps of the plant, all together, are finalised in less time than processes
+start."""
 
 
 def finalize_loops(
@@ -19,19 +28,37 @@ def finalize_loops(
     Args:
         network: the record of the network that the loops share.
         ending: how the run ended.
-        finalize_loop: writes the summary of a loop, from how its run ended.
+        finalize_loop: writes the summary of a loop, from how its run ended; it can be pickled.
     """
-    directories = loop_directories(ending.run_dir, network.scenario)
-    outcomes = [
-        finalize_loop(RunEnding(one, 0, ending.status, ending.reason, ending.startup_s))
-        for one in directories
+    endings = [
+        RunEnding(one, 0, ending.status, ending.reason, ending.startup_s)
+        for one in loop_directories(ending.run_dir, network.scenario)
     ]
-    end = ExitPart(status=int(ending.status), reason=ending.reason)
-    summary = summarise_shared(network, outcomes, end, ending.startup_s)
-    if network.kind != "live":
-        return summary
-    try:
-        replayed = ReplayPart(**replay(network).verdict())
-    except Exception as error:  # the run itself did not fail
-        replayed = ReplayPart(bit_exact=None, error=repr(error))
+    with _each(finalize_loop, endings, network.scenario) as outcomes:
+        replayed = _replay(network) if network.kind == "live" else None
+        end = ExitPart(status=int(ending.status), reason=ending.reason)
+        summary = summarise_shared(network, [*outcomes], end, ending.startup_s)
     return summary.model_copy(update={"replay": replayed})
+
+
+@contextmanager
+def _each(
+    finalize_loop: Callable[[RunEnding], Outcome], endings: Sequence[RunEnding], scenario: Scenario
+) -> Iterator[Iterable[Outcome]]:
+    """Finalise the loops, those of a long run in a process for each core; yield the outcomes."""
+    timing = loops_of(scenario)[0].timing
+    workers = min(cores(), len(endings))
+    if workers < 2 or len(endings) * timing.horizon_ns // timing.plant_period_ns < _MANY_STEPS:
+        yield map(finalize_loop, endings)
+        return
+    with processes(workers) as pool:
+        with interrupts_held():
+            outcomes = [pool.submit(finalize_loop, one) for one in endings]
+        yield (one.result() for one in outcomes)
+
+
+def _replay(network: RunRecord) -> ReplayPart:
+    try:
+        return ReplayPart(**replay(network).verdict())
+    except Exception as error:  # the run itself did not fail
+        return ReplayPart(bit_exact=None, error=repr(error))

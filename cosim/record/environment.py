@@ -1,7 +1,6 @@
 """The environment of a run, stored with it: versions, computer, command."""
 
 import json
-import os
 import platform
 import sys
 from datetime import UTC, datetime
@@ -11,6 +10,7 @@ from typing import Any, Literal
 
 from cosim.record.run_directory import ENVIRONMENT_FILE, read_object
 from noack.core.file_access import write_whole
+from noack.core.python_process import cores
 
 Kind = Literal["live", "simulated"]
 """Whether a run used processes (live) or virtual time (simulated)."""
@@ -30,7 +30,7 @@ def environment(kind: Kind) -> dict[str, Any]:
         "system": platform.platform(),
         "machine": platform.machine(),
         "processor": _processor(),
-        "cores": len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count(),
+        "cores": cores(),
     }
 
 

@@ -32,9 +32,9 @@ def carry(
         if was < 0:
             continue
         same = stage.kind == old.stages[was].kind
+        if same:
+            after.queues[place] = before.queues[was]  # type: ignore[index]
         if stage.queue_places > 0:
-            if same:
-                after.queues[place] = before.queues[was]  # type: ignore[index]
             _carry_queue(old.stages[was], before, stage, after)
         if same:
             for row in range(len(before.flows)):

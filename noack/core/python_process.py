@@ -1,6 +1,12 @@
-"""Command of a Python child process that imports nothing from the current folder."""
+"""Python child processes: their command, which imports nothing from the current folder."""
 
+import os
 import sys
+
+
+def cores() -> int:
+    """Return the number of processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 def python_command(*arguments: object) -> list[str]:

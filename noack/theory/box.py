@@ -49,9 +49,10 @@ class BoxGains(PlantGains):
             for output, peaks in self._peaks.items()
         }
         nominal = found[Output.MISMATCH]
-        # sup‖(R_E x, w)‖ ≤ sup‖R_E x‖ + sup‖w‖
+        # sup‖(R_E x, S w)‖ ≤ sup‖R_E x‖ + sup‖S w‖
         found[Output.MISMATCH] = Coefficients(
-            nominal.free + float(np.linalg.norm(free)), nominal.gain + float(np.linalg.norm(gain))
+            nominal.free + float(np.linalg.norm(self._scales * free)),
+            nominal.gain + float(np.linalg.norm(self._scales * gain)),
         )
         return found
 
@@ -77,7 +78,7 @@ class BoxGains(PlantGains):
             output: impulse * peaks.impulse + float(peaks.from_w @ w)
             for output, peaks in self._peaks.items()
         }
-        found[Output.MISMATCH] += float(np.linalg.norm(w))
+        found[Output.MISMATCH] += float(np.linalg.norm(self._scales * w))
         return error, found
 
     @property
@@ -86,8 +87,8 @@ class BoxGains(PlantGains):
         nominal, R = self.split_mismatch
         # If H is the closed loop of the box's centre, there is no nominal mismatch.
         differs = R.any() or not self._rows
-        columns = np.concatenate([nominal, self._directions], axis=1)
-        forced = columns if differs else self._directions
+        pushed = self._directions / self._scales
+        forced = np.concatenate([nominal, pushed], axis=1) if differs else pushed
         return super().columns._replace(mismatch=forced)
 
     @cached_property
@@ -100,6 +101,11 @@ class BoxGains(PlantGains):
     def _directions(self) -> Matrix:
         """The unit vectors of the entries of w that are not 0."""
         return np.eye(len(self.A))[:, self._rows]
+
+    @cached_property
+    def _scales(self) -> Vector:
+        """S: ‖·‖_W of these unit vectors, by which w is scaled where it drives e_s."""
+        return np.asarray(np.linalg.norm(self.error.weight @ self._directions, axis=0))
 
     @cached_property
     def _responses(self) -> tuple[ResponseBounds, list[ResponseBounds]]:

@@ -18,6 +18,7 @@ if the loop gain is below 1. The minimum inter-event time δ is the time that �
 events; the largest such δ is used.
 """
 
+import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -26,8 +27,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.core.linear_systems import Matrix, Vector
+from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, LossRule
+from noack.theory.enclosure import NotDecayingError
 from noack.theory.error_growth import (
     COARSE_CELLS,
     LONGEST_S,
@@ -39,6 +41,7 @@ from noack.theory.error_growth import (
 from noack.theory.gains import Coefficients, ErrorGains, Output, PlantGains
 from noack.theory.loss_accumulation import LossAccumulation
 from noack.theory.nonnegative_system import Solution, solve_inequalities
+from noack.theory.sharpened_bounds import InvariantEllipsoids, SharpenedBounds
 
 _SETTLED = 1e-3
 _ATTEMPTS = 200
@@ -89,7 +92,7 @@ class Constants(NamedTuple):
     state_weighted: float
     """X_W: ‖x‖_W ≤ X_W e^{−αt}."""
     mismatch: float
-    """‖E x‖ ≤ mismatch · e^{−αt}: the rate at which the model deviates from the plant."""
+    """‖E x‖_W ≤ mismatch · e^{−αt}: the rate at which the model deviates from the plant."""
     inter_event_s: float | None
     """δ, lower bound of the inter-event time; None if there is no such bound."""
     loop_gain: float
@@ -147,7 +150,59 @@ def solve(
     """
     part = Part(error, plant, bound, estimation)
     (found,) = solve_sum([part], conditions, earlier_error, structured=structured)
+    if structured and earlier_error == 0.0 and _is_reset_flow(part, conditions):
+        with contextlib.suppress(np.linalg.LinAlgError, NotDecayingError):
+            return _sharpened(found, part, conditions)
     return found
+
+
+def _is_reset_flow(part: "Part", conditions: NetworkConditions) -> bool:
+    """Return whether a loop without inputs follows each delivery, and a test at every time.
+
+    Then :mod:`noack.theory.sharpened_bounds` applies.
+    """
+    error, plant, bound, estimation = part
+    is_ideal = conditions == NetworkConditions(
+        conditions.dropouts, constraints=conditions.constraints
+    )
+    is_plain = bound == TriggerBound(bound.beta, bound.reached, bound.shares, unit=bound.unit)
+    is_known = plant.is_one_plant and plant.forcing is None and estimation == _MEASURED
+    rates_agree = plant.alpha_per_s == error.alpha_per_s
+    return (
+        is_ideal and is_plain and is_known and rates_agree and spectral_abscissa(error.scaled_H) < 0
+    )
+
+
+def _sharpened(found: Constants, part: "Part", conditions: NetworkConditions) -> Constants:
+    """Return the constants with the bounds from the flow between deliveries."""
+    error, plant, bound, _ = part
+    dropouts, unit = conditions.dropouts, bound.beta if bound.unit is None else bound.unit
+    size = found.overshoot * unit
+
+    def lost(spacing_s: float | None) -> float:
+        """Bound ‖e_c‖_W up to a lost event: before it, one event less is missing than may be."""
+        if dropouts == 0:
+            return 0.0
+        return (1 + error.missing(Output.WEIGHTED, dropouts - 1, spacing_s or 0.0)) * size
+
+    ellipsoids = InvariantEllipsoids(plant, found.delta * unit)
+    while True:
+        before = found
+        known = SharpenedBounds(
+            found.input_error,
+            found.state,
+            found.state_weighted,
+            found.mismatch,
+            found.inter_event_s,
+        )
+        known = ellipsoids.sharpened(
+            known, found.delta * unit, lost(found.inter_event_s), bound.reached
+        )
+        missing = error.missing(Output.WEIGHTED, dropouts, known.inter_event_s or 0.0)
+        delta = (1 + missing) * size / unit
+        found = found._replace(**known._asdict(), delta=min(delta, found.delta))
+        if not found.delta < (1 - _SETTLED) * before.delta:
+            return found
 
 
 class Part(NamedTuple):

@@ -261,8 +261,10 @@ class PlantGains:
 
     @cached_property
     def split_mismatch(self) -> tuple[Matrix, Matrix]:
-        """L_E, R_E with E = L_E R_E."""
-        return factors(self.A + self.B @ self.error.K - self.error.H)
+        """L_E, R_E with E = L_E R_E; W L_E has orthonormal columns, so ‖R_E x‖ = ‖E x‖_W."""
+        E = self.A + self.B @ self.error.K - self.error.H
+        L, R = factors(self.error.weight @ E)
+        return self.error.inverse_weight @ L, R
 
     @cached_property
     def outputs(self) -> Mapping[str, Matrix]:

@@ -13,12 +13,16 @@ import numpy as np
 import pytest
 from scipy.linalg import eigvals, solve_continuous_are
 
+from cosim.analysis.claims.claims_by_part import RunClaims
 from cosim.analysis.claims.condition_reader import read_conditions
 from cosim.analysis.claims.run_evidence import scheduled_certificates
 from cosim.analysis.model_comparison import linearisation, linearisation_rows
 from cosim.analysis.run_summary import summarise
+from cosim.analysis.summary_model import ClaimVerdict
 from cosim.record.run_record import RunRecord
+from cosim.simulation.shared_network import simulate_loops
 from cosim.simulation.virtual_time import simulate
+from noack.config.link_load import require_capacity
 from noack.config.resolution import LoopMatrices, loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
@@ -31,7 +35,8 @@ from noack.protocol.record_tables import PLANT_STEP
 from noack.theory.run_conditions import allowed_conditions
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
-NAMES = sorted(path.stem for path in SCENARIOS.glob("*.toml"))
+SHARED = ("shared_bottleneck", "shared_channel")  # several loops on one network
+NAMES = sorted({path.stem for path in SCENARIOS.glob("*.toml")} - {*SHARED})
 ENDS_BELOW = {"f16_lateral": 0.5, "pendulum_observed": 0.5, "lane_5g_rural": 0.5}
 """‖x(T)‖ / ‖x(0)‖. The F-16 starts with sideslip in rad and ends with a small rudder angle in °;
 the pendulum is balanced from noisy angles; the rural network has an outage of ten seconds.
@@ -63,6 +68,21 @@ def test_a_shipped_scenario_meets_its_assumptions_and_settles(name: str) -> None
     internal = record.scenario.plant.system.internal_names
     if internal:
         assert record[PLANT_STEP]["z"].shape[1] == len(internal)
+
+
+@pytest.mark.parametrize("name", SHARED)
+def test_the_loops_of_a_shipped_network_settle_and_keep_what_is_claimed(name: str) -> None:
+    shared = simulate_loops(load(SCENARIOS / f"{name}.toml"))
+    require_capacity(shared.network.scenario)
+    for record in shared.loops:
+        summary = summarise(record, 0, "horizon").to_json()
+        assert summary["exit"]["status"] == 0
+        assert summary["assumption_violations"] == []
+        assert summary["longest_loss_burst"] <= summary["mansd"]
+        assert summary["final_state_norm"] < 0.1 * summary["initial_state_norm"]
+        verdicts = [one.verdict for one in RunClaims(record).judge()]
+        assert ClaimVerdict.HELD in verdicts
+        assert ClaimVerdict.VIOLATED not in verdicts
 
 
 @pytest.mark.parametrize(

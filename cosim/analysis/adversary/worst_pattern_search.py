@@ -10,6 +10,7 @@ the reference simulator has to confirm the value.
 import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 from cosim.analysis.adversary.beam_search import search_beam
 from cosim.analysis.adversary.cost_bound import cost_ceiling
@@ -18,9 +19,10 @@ from cosim.analysis.adversary.objective import Objective, measure_of
 from cosim.analysis.adversary.pattern_evaluation import evaluate
 from cosim.analysis.adversary.pattern_tree import search_tree
 from cosim.analysis.adversary.sampled_flow import SampledFlow
-from cosim.analysis.adversary.sampled_run import run_of
+from cosim.analysis.adversary.sampled_run import SampledRun, run_of
 from cosim.analysis.adversary.search_nodes import Pattern, PatternSearch, SearchReport
 from cosim.analysis.adversary.segments import SegmentFlow
+from cosim.analysis.adversary.worst_disturbance import Bounds, bounds_of, worst_causes
 from cosim.analysis.adversary.worst_run import Worst, certified_value, reported
 from cosim.simulation.continuous.continuous_loop import continuous_loop_of
 from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
@@ -36,6 +38,7 @@ NODES = 500_000
 BEAM = 512
 _NODES_TO_IMPROVE = 200_000
 _CONFIRMED = 1e-5
+_MOST_PUSHES, _TIMES, _GAIN = 10, 6, 1 + 1e-6
 
 
 def find_worst(
@@ -88,14 +91,45 @@ def _find_sampled(
     first = 0 if flow.loop.known_start else 1
     search = PatternSearch(flow, resolved.network.guarantee, report)
     exact = _search(search, own.delivered[first:], beam, most_nodes)
-    pattern = search.pattern
-    worst = run_of(flow, lambda event: event - first >= len(pattern) or pattern[event - first])
-    lossless = run_of(flow, lambda event: True)
+    worst, lossless = _run(flow, search.pattern), run_of(flow, lambda event: True)
+    bounds = bounds_of(resolved) if objective in (Objective.ERROR, Objective.STATE) else None
+    if bounds is not None:
+        exact, (pushed, worst) = False, _push(flow, bounds, worst)
+        again = PatternSearch(pushed, resolved.network.guarantee, report)
+        _search(again, worst.delivered[first:], beam, most_nodes)
+        _, worst = _push(pushed, bounds, max(_run(pushed, again.pattern), worst))
+        search.nodes, search.runs = search.nodes + again.nodes, search.runs + again.runs
     return Worst(
         objective, flow.horizon_s, reported(worst.value, objective), worst.at_s, worst.delivered,
         worst.event_s, exact, search.nodes, search.runs, reported(lossless.value, objective),
         reported(own.value, objective), flow.certified, time.monotonic() - began_s,
     )  # fmt: skip
+
+
+def _run(flow: SampledFlow, pattern: Pattern) -> SampledRun:
+    """Run a pattern that was searched; the first packet is not part of it."""
+    first = 0 if flow.loop.known_start else 1
+    return run_of(flow, lambda event: event - first >= len(pattern) or pattern[event - first])
+
+
+def _push(flow: SampledFlow, bounds: Bounds, worst: SampledRun) -> tuple[SampledFlow, SampledRun]:
+    """Return the flow with worse disturbances and noise, and its run with the same losses.
+
+    They are made worst for the time of the largest value, some events, and the horizon.
+    """
+    first, before = 0 if flow.loop.known_start else 1, -math.inf
+    for _ in range(_MOST_PUSHES):
+        if not worst.value > before * _GAIN:
+            break
+        before, base, events = worst.value, flow, worst
+        some_s = events.event_s[:: len(events.event_s) // _TIMES + 1]
+        for at_s in (events.at_s or 0.0, *some_s, flow.horizon_s):
+            for loop in worst_causes(base, bounds, events, at_s):
+                pushed = replace(flow, loop=loop)
+                found = _run(pushed, events.delivered[first:])
+                if found.value > worst.value:
+                    flow, worst = pushed, found
+    return flow, worst
 
 
 def _find_continuous(

@@ -34,7 +34,10 @@ def check(
     from noack.theory.assumptions import assumptions
     from noack.trigger.trigger_policy import new_trigger
 
-    resolved = resolve(cli.load_scenario(scenario, settings))
+    loaded = cli.load_scenario(scenario, settings)
+    if loaded.loops is not None:
+        return _check_loops(loaded, json=json)
+    resolved = resolve(loaded)
     new_trigger(policy_of(resolved))  # some need a stable loop, others a user's class
     verdicts = [assumption._asdict() for assumption in assumptions(resolved)]
     console = cli.console()
@@ -49,6 +52,37 @@ def check(
     print(scenario_toml(resolved))
     for line in captured.get().splitlines():
         print(f"{_COMMENT}{line}".rstrip())
+    return ExitStatus.OK
+
+
+def _check_loops(scenario: "Scenario", *, json: bool) -> int:
+    """Check each loop and the bottleneck; print the scenario, which is not resolved."""
+    from noack.config.link_load import link_loads, load_warnings, require_capacity
+    from noack.config.loops import phases_ns
+    from noack.config.resolution import policy_of, resolved_loops
+    from noack.config.scenario_file import dumps as scenario_toml
+    from noack.trigger.trigger_policy import new_trigger
+
+    loops, loads = resolved_loops(scenario), link_loads(scenario)
+    for loop in loops:
+        new_trigger(policy_of(loop))
+    require_capacity(scenario)
+    if json:
+        cli.print_json(scenario.model_dump(mode="json"))
+        return ExitStatus.OK
+    print(scenario_toml(scenario))
+    for loop, phase_ns in zip(loops, phases_ns(scenario), strict=True):
+        x0 = ", ".join(f"{value:.4g}" for value in loop.plant.initial_state)
+        print(f"{_COMMENT}{loop.name}: begins at {phase_ns / NS_PER_S:.6f} s, x(0) = ({x0})")
+    for load in loads:
+        delay = load.delay_bound_s
+        print(
+            f"{_COMMENT}{load.key}: {load.rate_bps} bit/s; datagrams that must pass: "
+            f"{load.mandatory_at_least_bps:.0f} to {load.mandatory_at_most_bps:.0f} bit/s; delay: "
+            + ("no bound" if delay is None else f"at most {delay:.4g} s in virtual time")
+        )
+    for line in load_warnings(loads, scenario):
+        print(f"{_COMMENT}warning: {line}")
     return ExitStatus.OK
 
 

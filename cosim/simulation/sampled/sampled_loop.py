@@ -1,10 +1,12 @@
 """Makes the data of a scenario's loop for :mod:`cosim.simulation.sampled.loop_steps`."""
 
+from copy import copy
 from functools import cache
 from itertools import islice
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cosim.simulation.sampled import loop_steps
 from cosim.simulation.sampled.loop_steps import NO_TICK, Loop, Numbers, Rule, Runs, Scales, Scratch
@@ -19,6 +21,8 @@ from noack.trigger.self_triggered_interval import Forecast
 from noack.trigger.trigger_rule import TriggerRule
 from plant_server.disturbance_signal import disturbance_of
 from plant_server.measurement import measurement_model_of
+
+Stack = NDArray[np.float64]
 
 _NO_FORECAST = Forecast(1.0, 1.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -41,7 +45,7 @@ class SampledLoop:
                 "give a time after which the watchdog acts on a failure only"
             )
         policy, self.matrices = policy_of(resolved), loop_of(resolved)
-        self._resolved, n = resolved, self.matrices.n
+        self.resolved, n = resolved, self.matrices.n
         self.last = timing.horizon_ns // timing.plant_period_ns
         self.step_s = timing.plant_period_ns * 1e-9
         self.weight = np.eye(n) if self.matrices.weight is None else self.matrices.weight
@@ -56,7 +60,7 @@ class SampledLoop:
     @property
     def known_start(self) -> bool:
         """Whether sensor and controller start from x(0), without a packet."""
-        return self._resolved.network.initial_sync == "known_state"
+        return self.resolved.network.initial_sync == "known_state"
 
     def start(self) -> Runs:
         """Return one run at its start: after the delivered first packet, if there is one."""
@@ -66,7 +70,7 @@ class SampledLoop:
         runs.x[0], runs.auxiliary[0], runs.step[0] = x0, self._first_auxiliary, -1
         if known:
             runs.x_s[0] = runs.x_c[0] = x0
-        observer = self._resolved.observer
+        observer = self.resolved.observer
         if observer is not None:
             given = observer.initial_estimate
             runs.y[0] = (x0 if known else np.zeros(n)) if given is None else np.array(given)
@@ -75,6 +79,33 @@ class SampledLoop:
             runs.step[0] = 0
             self.update(runs, np.array([True]))
         return runs
+
+    @property
+    def every(self) -> int:
+        """Steps from one measurement to the next."""
+        return self._loop.every
+
+    @property
+    def causes(self) -> tuple[Matrix, Matrix]:
+        """The changes of x by the disturbance of each step, and the noise of each measurement."""
+        return self._loop.push, self._loop.noise
+
+    def with_causes(self, push: Matrix, noise: Matrix) -> "SampledLoop":
+        """Return this loop with other disturbances and noise."""
+        changed = copy(self)
+        changed._loop = self._loop._replace(push=_dense(push), noise=_dense(noise))
+        return changed
+
+    def correction(self, numbers: Numbers) -> Stack:
+        """Return the change of y by noise at each of k measurements, (k, n, p)."""
+        if len(self._loop.gains):
+            return self._loop.gains[numbers]
+        return np.broadcast_to(np.eye(self.matrices.n), (len(numbers), *[self.matrices.n] * 2))
+
+    def measure_at(self, runs: Runs) -> None:
+        """Measure, where the step of a run is one of a measurement; y is 0 before."""
+        for i in np.flatnonzero(runs.step % self.every == 0).tolist():
+            loop_steps.measure(self._loop, runs, i, int(runs.step[i]) // self.every, self._own)
 
     def empty(self, count: int) -> Runs:
         """Return runs at 0."""
@@ -155,8 +186,8 @@ def _loop(resolved: Scenario, matrices: LoopMatrices, delay_ns: int) -> Loop:
     known = resolved.network.initial_sync == "known_state"
     return Loop(
         period_ns, resolved.plant.measure_every, -1 if known else int(wait[0]), A, B,
-        _pushes(resolved, matrices, steps), _dense(assumed.Ad), _dense(assumed.Bd),
-        _dense(assumed.C), _dense(gains), _noise(resolved, measurements, assumed.C),
+        pushes_of(resolved), _dense(assumed.Ad), _dense(assumed.Bd),
+        _dense(assumed.C), _dense(gains), noise_of(resolved),
         transition(matrices.H, period_ns), tick_of,
         _dense(np.array([K @ transition(matrices.H, int(s)) for s in after_ns])),
         wait.astype(np.int64), age.astype(np.int64),
@@ -165,15 +196,21 @@ def _loop(resolved: Scenario, matrices: LoopMatrices, delay_ns: int) -> Loop:
     )  # fmt: skip
 
 
-def _pushes(resolved: Scenario, matrices: LoopMatrices, steps: int) -> Matrix:
+def through_of(resolved: Scenario) -> Matrix:
+    """Return the effect of disturbances of u and of ẋ, held over a step, on x, (n, m + n)."""
+    matrices, period_ns = loop_of(resolved), resolved.timing.plant_period_ns
+    sources = np.hstack([matrices.B, np.eye(matrices.n)])
+    return discretise(matrices.A, sources, period_ns)[1]
+
+
+def pushes_of(resolved: Scenario) -> Matrix:
     """Return the changes of x by the disturbance of each step, (steps, n); (0, n) for none."""
-    disturbance = disturbance_of(resolved)
+    disturbance, (n, m) = disturbance_of(resolved), resolved.model.dimensions
     if disturbance is None:
-        return np.zeros((0, matrices.n))
-    period_ns = resolved.timing.plant_period_ns
-    _, through = discretise(matrices.A, np.hstack([matrices.B, np.eye(matrices.n)]), period_ns)
-    m, found = matrices.m, np.zeros((steps, matrices.n))
-    for step in range(steps):
+        return np.zeros((0, n))
+    through = through_of(resolved)
+    found = np.zeros((resolved.timing.horizon_ns // resolved.timing.plant_period_ns, n))
+    for step in range(len(found)):
         d, w = disturbance(step)
         for part, at in ((d, through[:, :m]), (w, through[:, m:])):
             if len(part):
@@ -181,13 +218,15 @@ def _pushes(resolved: Scenario, matrices: LoopMatrices, steps: int) -> Matrix:
     return found
 
 
-def _noise(resolved: Scenario, measurements: int, C: Matrix) -> Matrix:
+def noise_of(resolved: Scenario) -> Matrix:
     """Return the noise of each measurement, (measurements, p); (0, p) for none."""
     model = measurement_model_of(resolved)
     if model is None or not resolved.plant.measurement.is_noisy:
-        return np.zeros((0, len(C)))
-    nothing: Vector = np.zeros(C.shape[1])
-    return np.array([model(nothing, number) for number in range(measurements)])
+        return np.zeros((0, resolved.message_sizes.outputs))
+    nothing: Vector = np.zeros(resolved.model.dimensions[0])
+    steps = resolved.timing.horizon_ns // resolved.timing.plant_period_ns
+    numbers = range(steps // resolved.plant.measure_every + 1)
+    return np.array([model(nothing, number) for number in numbers])
 
 
 def _dense(matrix: Matrix | Numbers) -> Matrix:

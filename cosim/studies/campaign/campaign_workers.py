@@ -17,8 +17,8 @@ from urllib.parse import urlsplit
 
 from numpy.typing import NDArray
 
+from cosim.live.process_pool import interrupts_held, processes
 from cosim.studies.campaign.worker_identity import arithmetic, difference
-from cosim.studies.process_pool import interrupts_held, processes
 from noack.core.errors import CallerError, PeerError
 
 

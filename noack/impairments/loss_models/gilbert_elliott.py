@@ -5,6 +5,9 @@ probability p, bad → good with probability r. A packet is lost with probabilit
 state and 1 − h in the bad. In the stationary chain the loss rate is
 
     (1 − k) r/(p + r) + (1 − h) p/(p + r).
+
+With ``state = "link"`` all flows share one chain, which may change its state every ``step_s``: a
+bad state concerns all of them at once. Whether a packet is lost is drawn for each packet.
 """
 
 from collections.abc import Sequence
@@ -14,19 +17,36 @@ from typing import Annotated, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
-from noack.impairments.feature import Behaviour, LossModel, StageTables, Table, Word
-from noack.impairments.link_records import DROPPED, PacketContext, RuleStage, StageMemory, refuse
-from noack.impairments.markov_chain import Chain
+from noack.core.clock import NS_PER_S
+from noack.impairments.feature import (
+    Behaviour,
+    Impairment,
+    LossModel,
+    StageTables,
+    Table,
+    Word,
+)
+from noack.impairments.link_records import (
+    DROPPED,
+    PacketContext,
+    QueueState,
+    RuleStage,
+    StageMemory,
+    refuse,
+)
+from noack.impairments.markov_chain import Chain, NotPredictableError
 from noack.impairments.normal import score
 from noack.impairments.philox import draw
 from noack.impairments.quantities import (
     NUMBER,
+    OWN_TIME_S,
     PERCENT,
     brief_number,
     brief_percent,
     number_text,
     percent_text,
     percents_text,
+    time_text,
 )
 from noack.impairments.word_reader import WordReader
 from noack.settings.section import Probability
@@ -47,6 +67,38 @@ class GilbertElliottStage(RuleStage):
     """Share of packets in the bad state: p/(p + r)."""
     scored: int
     """1: a later delay is correlated with the state."""
+    step_ns: int
+    """Time between changes of the link's state; 0: each flow has its own state."""
+
+
+@dataclass(slots=True)
+class ChannelState(QueueState):
+    """The state of the link that all flows share."""
+
+    phase: int = GOOD
+    step: int = 0
+    """Number of the chain's step in which it was in that state."""
+
+
+def change_state(stage: GilbertElliottStage, channel: ChannelState, now_ns: int, u: float) -> None:
+    """Draw the link's state now, given that at the last packet.
+
+    After k steps the probability of the bad state is s + (b − s) λᵏ with b = 1 if the chain was in
+    the bad state, else 0, s = p/(p + r) and λ = 1 − p − r. The power is computed by squaring, so
+    that plain and compiled code have the same bits.
+    """
+    step = now_ns // stage.step_ns
+    steps = max(step - channel.step, 0)
+    channel.step += steps
+    base, power = 1.0 - stage.good_to_bad - stage.bad_to_good, 1.0
+    while steps > 0:
+        if steps & 1:
+            power *= base
+        base *= base
+        steps >>= 1
+    bad = stage.share_bad
+    before = 1.0 if channel.phase == BAD else 0.0
+    channel.phase = BAD if u < bad + (before - bad) * power else GOOD
 
 
 def apply(packet: PacketContext, stage: GilbertElliottStage, memory: StageMemory) -> None:
@@ -56,7 +108,11 @@ def apply(packet: PacketContext, stage: GilbertElliottStage, memory: StageMemory
     highest share p/(p + r) of all scores.
     """
     u, v = draw(packet, stage, 0)
-    if memory.phase == BAD:
+    if stage.step_ns > 0:
+        channel = packet.state.queues[stage.place]
+        change_state(stage, channel, packet.decision.arrival_ns, u)
+        memory.phase = channel.phase
+    elif memory.phase == BAD:
         if u < stage.bad_to_good:
             memory.phase = GOOD
     elif u < stage.good_to_bad:
@@ -77,11 +133,18 @@ def _read_chain(reader: WordReader) -> Table:
         if not reader.number_follows():
             break
         table[key] = reader.value(PERCENT)
-    return table
+    return table | _read_state(reader)
 
 
 def _read_means(reader: WordReader) -> Table:
-    return {"mean_loss": reader.value(PERCENT), "mean_burst": reader.value(NUMBER)}
+    table = {"mean_loss": reader.value(PERCENT), "mean_burst": reader.value(NUMBER)}
+    return table | _read_state(reader)
+
+
+def _read_state(reader: WordReader) -> Table:
+    if not reader.accept("common"):
+        return {}
+    return {"state": "link", "step_s": reader.value(OWN_TIME_S)}
 
 
 class GilbertElliottLoss(LossModel):
@@ -103,16 +166,30 @@ class GilbertElliottLoss(LossModel):
     """Expected share of lost packets, instead of p and r."""
     mean_burst: Annotated[FiniteFloat, Field(ge=1)] | None = None
     """Mean number of consecutive losses, with mean_loss."""
+    state: Literal["link"] | None = None
+    """link: all flows share one state, which may change every step_s; the probabilities of changing
+    state and mean_burst count these steps. By default each flow has its own, which may change with
+    each of its packets."""
+    step_s: Annotated[FiniteFloat, Field(ge=1e-6, le=1e6)] | None = None
+    """Time between two steps of the link's state, for state = "link"."""
 
     words: ClassVar = (
         Word("gemodel", "loss gemodel 1% 10%", _read_chain, grammar="gemodel P [R [1-H [1-K]]]"),
         Word("burst", "loss burst 5% 3", _read_means, grammar="burst MEAN_LOSS MEAN_BURST"),
+        Word(
+            "common",
+            "loss gemodel 1% 10% common 20ms",
+            after="loss gemodel P R",
+            grammar="gemodel|burst ... common STEP",
+        ),
     )
-    behaviour: ClassVar = Behaviour(GilbertElliottStage, apply)
+    behaviour: ClassVar = Behaviour(GilbertElliottStage, apply, ChannelState)
     gives_score: ClassVar = True
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        if (self.state is None) != (self.step_s is None):
+            raise ValueError('step_s: state = "link" and step_s go together')
         chain = (self.good_to_bad, self.bad_to_good)
         means = (self.mean_loss, self.mean_burst)
         if (None in chain) == (None in means) or (None in chain and chain != (None, None)):
@@ -151,18 +228,25 @@ class GilbertElliottLoss(LossModel):
             cls(good_to_bad=p, bad_to_good=r, loss_in_good=good, loss_in_bad=bad)
             for p, r, good, bad in shares
         ]
-        return [*chains, cls(mean_loss=0.4, mean_burst=3.0)]
+        means = cls(mean_loss=0.4, mean_burst=3.0)
+        common = {"state": "link", "step_s": 0.002}
+        return [*chains, means, *(one.model_copy(update=common) for one in (chains[1], means))]
 
     def text(self) -> str:
+        common = "" if self.step_s is None else f" common {time_text(self.step_s)}"
         if self.mean_loss is not None and self.mean_burst is not None:
-            return f"burst {percent_text(self.mean_loss)} {number_text(self.mean_burst)}"
+            return f"burst {percent_text(self.mean_loss)} {number_text(self.mean_burst)}{common}"
         shares = (*self.transitions, self.loss_in_bad, self.loss_in_good)
-        return f"gemodel {percents_text(shares, (None, None, 1.0, 0.0))}"
+        return f"gemodel {percents_text(shares, (None, None, 1.0, 0.0))}{common}"
 
     def meaning(self) -> str:
         p, r = self.transitions
-        bad = f"the bad state begins with probability {brief_percent(p)} per packet"
-        length = f" and lasts {brief_number(1 / r)} packets on average" if r else " and never ends"
+        per, lasts = "per packet", "packets"
+        if self.step_s is not None:
+            per = f"per step of {time_text(self.step_s)}, for all flows at once,"
+            lasts = "steps"
+        bad = f"the bad state begins with probability {brief_percent(p)} {per}"
+        length = f" and lasts {brief_number(1 / r)} {lasts} on average" if r else " and never ends"
         if (self.loss_in_good, self.loss_in_bad) == (0.0, 1.0):
             return f"loses all packets in the bad state; {bad}{length}"
         return (
@@ -179,14 +263,20 @@ class GilbertElliottLoss(LossModel):
             loss_in_bad=self.loss_in_bad,
             share_bad=p / (p + r) if p + r > 0 else 0.0,
             scored=int(tables.scored),
+            step_ns=round((self.step_s or 0.0) * NS_PER_S),
         )
 
     def chains(self) -> Sequence[Chain]:
+        if self.step_s is not None:
+            raise NotPredictableError("losses in a common state depend on when packets arrive")
         p, r = self.transitions
         moves = np.array([[1 - p, p], [r, 1 - r]])
         return (
             Chain(np.array([1.0, 0.0]), moves, np.array([self.loss_in_good, self.loss_in_bad])),
         )
+
+    def tc_lacks(self, before: Sequence[Impairment]) -> str:
+        return "" if self.step_s is None else "a state that all flows share"
 
     def tc_text(self) -> str:
         shares = (*self.transitions, self.loss_in_bad, self.loss_in_good)

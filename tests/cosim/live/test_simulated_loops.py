@@ -1,6 +1,7 @@
 """A simulated run of several loops: its directories, its summary, and the commands that read it."""
 
 import json
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -45,6 +46,19 @@ def test_each_loop_is_a_run_directory_of_its_own(run_dir: Path) -> None:
     assert set(whole.tables) == set(network_tables())
     packets = [load_record(path).count(NETEM_PACKET) for path in (run_dir / "loops").iterdir()]
     assert sum(packets) == whole.count(NETEM_PACKET) > 50
+
+
+def test_processes_finalise_the_loops_of_a_long_run_alike(
+    run_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paths = [run_dir / "summary.json", *sorted(run_dir.glob("loops/*/summary.json"))]
+    before = [path.read_text() for path in paths]
+    for path in paths:
+        path.unlink()
+    monkeypatch.setattr("cosim.live.finalize_loops._MANY_STEPS", 1)
+    monkeypatch.setattr("cosim.live.finalize_loops.cores", lambda: 2)
+    assert noack("summary", run_dir).exit_code == 0
+    assert [path.read_text() for path in paths] == before
 
 
 def test_the_summary_adds_up(run_dir: Path) -> None:
@@ -94,6 +108,19 @@ def test_a_loop_that_diverges_is_named_and_the_others_go_on(tmp_path: Path) -> N
     for name in ("calm-1", "calm-2"):
         assert json.loads((tmp_path / f"latest/loops/{name}/summary.json").read_text())[
             "exit"]["status"] == 0  # fmt: skip
+
+
+def test_check_prints_the_loops_and_refuses_a_link_that_is_too_slow() -> None:
+    done = noack("check", PATH)
+    assert done.exit_code == 0
+    assert tomllib.loads(done.stdout)["loops"][0]["count"] == 10
+    assert "# pendulum-10: begins at 0.00" in done.stdout
+    assert "# network.impairments.0: 100000 bit/s; datagrams that must pass: 920 to " in done.stdout
+    slow = 'network.impairments=[{ kind = "rate", rate_bps = 900 }]'
+    for command in ("check", "simulate"):
+        refused = noack(command, PATH, "--set", slow)
+        assert refused.exit_code == 2
+        assert "need 920 bit/s" in refused.stderr
 
 
 def test_the_number_in_flight_over_time() -> None:

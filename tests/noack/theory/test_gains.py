@@ -43,7 +43,7 @@ def outputs_of(system: System) -> dict[Output, Matrix]:
         Output.GAIN: K,
         Output.GAIN_RATE: K @ H,
         Output.GAIN_CURVATURE: K @ H @ H,
-        Output.MISMATCH: system.A + system.B @ K - H,
+        Output.MISMATCH: system.weight @ (system.A + system.B @ K - H),
     }
 
 
@@ -148,7 +148,7 @@ def test_growth_between_two_tests(system: System, reach: float) -> None:
     for kernel, D in ((growth.mismatch, E), (growth.input_error, system.B @ system.K)):
         # Any bounded signal v that the kernel may act on: ‖D v‖ in units of ‖D v‖.
         v = rng.normal(size=(len(system.H), 1))
-        size = float(np.linalg.norm(D @ v)) if kernel is growth.mismatch else float(
+        size = float(np.linalg.norm(W @ D @ v)) if kernel is growth.mismatch else float(
             np.linalg.norm(system.K @ v)
         )  # fmt: skip
         area = float(np.trapezoid(norms(W, G, D @ v, t_s), t_s))
@@ -224,7 +224,7 @@ def test_the_first_passage_is_that_of_the_volterra_equation(
     G, W = system.H + system.alpha * np.eye(len(system.H)), system.weight
     E = system.A + system.B @ system.K - system.H
     U = np.linalg.svd(system.K, full_matrices=False)[0][:, : np.linalg.matrix_rank(system.K)]
-    L = np.linalg.svd(E)[0][:, : max(np.linalg.matrix_rank(E), 1)]
+    L = np.linalg.solve(W, np.linalg.svd(W @ E)[0][:, : max(np.linalg.matrix_rank(E), 1)])
     steps = 400
     t_s = np.linspace(0, 1.3 * found_s, steps + 1)
     step_s = float(t_s[1])

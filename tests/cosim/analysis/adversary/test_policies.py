@@ -1,6 +1,8 @@
 """The search of the sampled loop, for every policy, against all patterns run by the machines."""
 
 from collections.abc import Iterator
+from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,7 @@ from cosim.analysis.adversary import Objective, conditions_of, find_worst
 from cosim.analysis.adversary.sampled_flow import SampledFlow
 from cosim.analysis.adversary.sampled_run import run_of
 from cosim.analysis.adversary.search_nodes import Pattern
+from cosim.analysis.adversary.worst_disturbance import bounds_of
 from cosim.record.run_record import RunRecord
 from cosim.simulation.sampled.sampled_loop import SampledLoop
 from cosim.simulation.virtual_time import simulate
@@ -198,3 +201,38 @@ def test_what_cannot_be_searched_is_refused(scenario: dict[str, Any], message: s
     resolved = scenario_of(scenario, **sections)
     with pytest.raises(CallerError, match=message):
         find_worst(resolved, Objective.STATE)
+
+
+@pytest.mark.parametrize("objective", [Objective.STATE, Objective.ERROR])
+@pytest.mark.parametrize(
+    "sections",
+    [
+        {"plant": {"disturbances": [{"kind": "uniform", "at": "input", "bound": [3.0]}]}},
+        {"plant": {"measurement": {"noise_bound": [0.05, 0.0]}}},
+        {
+            "plant": {"measurement": {"C": [[1.0, 0.0]], "noise_bound": [0.3]}},
+            "observer": {"kind": "luenberger", "poles_per_s": [-4.0, -5.0]},
+        },
+    ],
+    ids=["disturbance", "noise", "observer"],
+)
+def test_no_signs_are_worse_than_those_found(
+    sections: dict[str, Any], objective: Objective
+) -> None:
+    """Events every 0.15 s, whatever is measured: so the worst signs are those of the responses."""
+    periodic = {"policy": "periodic", "period_s": 0.15}
+    resolved = scenario_of(periodic, horizon_s=0.35, network={"mansd": 0}, **sections)
+    certificate = certify(resolved, conditions_of(resolved, continuous=False))
+    flow = SampledFlow(SampledLoop(resolved), objective, certificate)
+    push, noise = (np.abs(part) for part in flow.loop.causes)
+    bounds = bounds_of(resolved)
+    assert bounds is not None
+    worst = 0.0
+    for signs in product((-1.0, 1.0), repeat=len(noise) if len(noise) else len(push)):
+        sign = np.array(signs)[:, None]
+        causes = (push, sign * bounds.noise) if len(noise) else (sign * bounds.columns.T, noise)
+        run = run_of(replace(flow, loop=flow.loop.with_causes(*causes)), lambda event: True)
+        worst = max(worst, run.value)
+    found = find_worst(resolved, objective)
+    assert found.value == pytest.approx(worst, rel=1e-9)
+    assert not found.exact

@@ -1,0 +1,147 @@
+"""What the loops of a run need of a bottleneck that they share, before the run.
+
+Of any M successive datagrams of a loop, one must pass (M − 1 = the longest burst of losses). Let b
+be the bits of loop k's datagram on the link, d the least and D the largest time between two of its
+transmissions. The datagrams that must pass need between Σ b/(M D) and Σ b/(M d) bits per second.
+
+If r bits per second exceed m = Σ b/(M d), the delay D in a tail-drop queue of Q places is bounded.
+Datagrams leave in their order, so those before the end of a transmission came within D. At most Q
+of them found a free place; of each loop, at most 1 + D/(M d) had to pass. Hence D is at most
+(Q max b + Σ b)/(r − m). If r is even at least Σ b/d, a queue that has been busy for t got at most
+1 + t/d datagrams of each loop, and has sent r t bits: D is at most Σ b/r. A live run adds the
+lateness of its processes.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+from noack.config.loops import loop_scenario
+from noack.config.resolution import policy_of, resolve
+from noack.config.scenario import Scenario
+from noack.core.clock import NS_PER_S
+from noack.core.errors import CallerError
+from noack.impairments.disciplines.tail_drop import TailDrop
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.kinds.rate import Rate
+from noack.protocol.wire_format import datagram_bytes
+from noack.trigger.periodic_trigger import PeriodicSettings
+
+
+class Demand(NamedTuple):
+    """The transmissions of some loops of a kind."""
+
+    loops: int
+    payload_bytes: int
+    least_s: float
+    """Least time between two transmissions of a loop."""
+    largest_s: float
+    """Largest time between two transmissions; infinite if there is none."""
+
+
+class LinkLoad(NamedTuple):
+    """What the loops need of a bottleneck; rates in bits per second."""
+
+    key: str
+    rate_bps: int
+    all_at_most_bps: float
+    """All datagrams, if each loop transmits as often as it can."""
+    mandatory_at_most_bps: float
+    """Of these, those that must pass."""
+    mandatory_at_least_bps: float
+    """Those that must pass, if each loop transmits as rarely as it can."""
+    delay_bound_s: float | None
+    """Bound of a datagram's delay in this queue; None: there is none."""
+
+
+def demands(scenario: Scenario) -> list[Demand]:
+    """Return the transmissions of the loops, by entry of [[loops]].
+
+    Raises:
+        CallerError: a loop cannot be resolved, or its trigger excludes its model.
+    """
+    sections = scenario.loops
+    loops = [scenario] if sections is None else [loop_scenario(scenario, one) for one in sections]
+    counts = [1] if sections is None else [one.count for one in sections]
+    return [_demand(resolve(loop), count) for loop, count in zip(loops, counts, strict=True)]
+
+
+def link_loads(scenario: Scenario) -> list[LinkLoad]:
+    """Return what the loops need of each bottleneck of the network."""
+    loops, network = demands(scenario), scenario.network
+    must_pass = 1 / (network.longest_burst + 1) if network.enforce_mansd else 0.0
+    found = []
+    for place, one in enumerate(network.impairments):
+        if not isinstance(one, Rate):
+            continue
+        bits = [int(one.line_bits(loop.payload_bytes)) for loop in loops]
+        every = sum(b * loop.loops / loop.least_s for b, loop in zip(bits, loops, strict=True))
+        least = sum(b * loop.loops / loop.largest_s for b, loop in zip(bits, loops, strict=True))
+        together = sum(b * loop.loops for b, loop in zip(bits, loops, strict=True))
+        delay_s = None
+        if _is_first(scenario, place) and isinstance(one.discipline, TailDrop):
+            if every <= one.rate_bps:
+                delay_s = together / one.rate_bps
+            elif every * must_pass < one.rate_bps and not network.constraints:
+                spare_bps = one.rate_bps - every * must_pass
+                delay_s = (one.queue * max(bits) + together) / spare_bps
+        found.append(
+            LinkLoad(
+                f"network.impairments.{place}", one.rate_bps,
+                every, every * must_pass, least * must_pass, delay_s,
+            )
+        )  # fmt: skip
+    return found
+
+
+def require_capacity(scenario: Scenario) -> None:
+    """Raise CallerError if a bottleneck cannot carry the datagrams of the loops that must pass."""
+    for load in link_loads(scenario):
+        if load.mandatory_at_least_bps > load.rate_bps:
+            raise CallerError(
+                f"{load.key}.rate_bps = {load.rate_bps}: the datagrams that must pass, one of any "
+                f"{scenario.network.longest_burst + 1} of each loop, need "
+                f"{math.ceil(load.mandatory_at_least_bps)} bit/s; the queue would grow without "
+                "bound"
+            )
+
+
+def load_warnings(loads: Sequence[LinkLoad], scenario: Scenario) -> Iterator[str]:
+    """Yield what may go wrong at the bottlenecks, one line each."""
+    for load in loads:
+        if load.mandatory_at_most_bps > load.rate_bps:
+            yield (
+                f"{load.key}.rate_bps = {load.rate_bps}: if all loops transmit as often as they "
+                f"can, the datagrams that must pass need {math.ceil(load.mandatory_at_most_bps)} "
+                "bit/s; then the queue grows without bound"
+            )
+        certified_s = scenario.certificate.network_delay_s
+        if certified_s is None:
+            certified_s = scenario.network.link.longest_delay_s
+        if load.delay_bound_s is not None and load.delay_bound_s > certified_s:
+            yield (
+                f"{load.key}: datagrams may be delayed by up to {load.delay_bound_s:.3g} s, the "
+                f"certificates cover {certified_s:.3g} s; see certificate.network_delay_s"
+            )
+
+
+def _demand(loop: Scenario, count: int) -> Demand:
+    rule = policy_of(loop).trigger_rule(loop.model.dimensions[0])
+    measured_ns = loop.timing.measurement_period_ns
+    least_ns = max(measured_ns, rule.idle_ns)
+    if rule.forecast is not None:
+        least_ns = max(least_ns, rule.shortest_ns)
+    if isinstance(loop.trigger, PeriodicSettings):
+        least_ns = max(least_ns, rule.longest_ns)
+    # An event that is due between two measurements happens at the later one.
+    largest_ns = math.inf
+    if rule.longest_ns < loop.timing.horizon_ns:
+        largest_ns = math.ceil(rule.longest_ns / measured_ns) * measured_ns
+    size_bytes = datagram_bytes(loop.model.dimensions[0])
+    return Demand(count, size_bytes, least_ns / NS_PER_S, largest_ns / NS_PER_S)
+
+
+def _is_first(scenario: Scenario, place: int) -> bool:
+    """Whether datagrams reach an impairment once each, and as they were sent."""
+    before = scenario.network.impairments[:place]
+    return all(isinstance(one, LossOf) for one in before)

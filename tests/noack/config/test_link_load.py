@@ -1,0 +1,94 @@
+"""What loops need of a bottleneck: the refusal at its limit, and bounds that random loads test."""
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from netem.link_machine import Datagram, Link
+from noack.config.link_load import link_loads, load_warnings, require_capacity
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import validate
+from noack.core.errors import CallerError
+from noack.protocol.wire_format import datagram_bytes
+
+PERIODIC = {"policy": "periodic", "period_s": 0.05}
+BITS = 8 * (datagram_bytes(2) + 28)
+
+
+def scenario_of(
+    content: dict[str, Any], rate_bps: int, queue: int, *loops: dict[str, Any], **network: Any
+) -> Scenario:
+    rate = {"kind": "rate", "rate_bps": rate_bps, "queue": queue}
+    content["network"] |= {"impairments": [rate], **network}
+    return validate(content | {"loops": list(loops)}, "here")
+
+
+@pytest.mark.parametrize(
+    "trigger",
+    [PERIODIC, {"policy": "deadline", "interval_s": 0.049,
+                "rule": {"policy": "decaying", "beta": 0.5, "alpha_per_s": 0.25}}],
+)  # fmt: skip
+def test_the_rate_for_what_must_pass_is_the_limit(
+    content: dict[str, Any], trigger: dict[str, Any]
+) -> None:
+    """At 100 Hz, a deadline of 49 ms means an event every 50 ms at the latest."""
+    content["plant"]["rate_hz"] = 100.0
+    loops = {"name": "a", "count": 30, "trigger": trigger}
+    needed_bps = 30 * BITS / 0.05 / 3
+    require_capacity(scenario_of(content, int(needed_bps), 5, loops))
+    with pytest.raises(CallerError, match=re.escape(f"need {int(needed_bps)} bit/s")):
+        require_capacity(scenario_of(content, int(needed_bps) - 1, 5, loops))
+    # Without the guarantee nothing must pass.
+    require_capacity(scenario_of(content, 1000, 5, loops, enforce_mansd=False))
+
+
+def test_an_event_trigger_is_only_warned_about(content: dict[str, Any]) -> None:
+    loops = {"name": "a", "count": 30}
+    slow = scenario_of(content, 1000, 5, loops)
+    require_capacity(slow)
+    (warning,) = load_warnings(link_loads(slow), slow)
+    assert f"need {30 * BITS * 500 // 3} bit/s" in warning
+    fast = scenario_of(content, 30 * BITS * 500, 5, loops)
+    assert [*load_warnings(link_loads(fast), fast)] == []
+
+
+@settings(max_examples=15)
+@given(
+    loops=st.integers(1, 12),
+    queue=st.integers(1, 8),
+    load=st.sampled_from([0.5, 0.99, 1.0, 1.2, 2.0, 2.9]),
+    seed=st.integers(0, 2**32),
+    together=st.booleans(),
+)
+def test_no_load_exceeds_the_bound_of_the_delay(
+    loops: int, queue: int, load: float, seed: int, together: bool
+) -> None:
+    """Loops that transmit at once, or at random, as often as they may, with M = 3."""
+    rate_bps = int(loops * BITS / 0.05 / load) + 1
+    content = {
+        "name": "small", "horizon_s": 1.0, "model": {"name": "double_integrator"},
+        "plant": {"initial_state": [1.0, 0.0]}, "trigger": PERIODIC,
+        "network": {"mansd": 2, "loss": {"model": "bernoulli", "probability": 0.3}},
+    }  # fmt: skip
+    scenario = scenario_of(content, rate_bps, queue, {"name": "a", "count": loops})
+    (found,) = link_loads(scenario)
+    assert found.delay_bound_s is not None
+    rng = np.random.default_rng(seed)
+    gaps_s = 0.05 * (1 + (rng.random((loops, 200)) < 0.2) * rng.random((loops, 200)))
+    begin_s = 0.0 if together else rng.uniform(0, 0.05, (loops, 1))
+    times_ns = ((begin_s + np.cumsum(gaps_s, axis=1)) * 1e9).round().astype(np.int64)
+    link = Link(scenario.network.link, seed, "x")
+    size = datagram_bytes(2)
+    longest_s = 0.0
+    for place in np.argsort(times_ns, axis=None, kind="stable").tolist():
+        now_ns = int(times_ns.ravel()[place])
+        link.handle(Datagram(place // 200, bytes(size)), now_ns)
+        while (due_ns := link.next_deadline_ns()) is not None and due_ns <= now_ns:
+            link.on_timer(due_ns)
+        if link.decision.release_ns >= 0:
+            longest_s = max(longest_s, (link.decision.release_ns - now_ns) * 1e-9)
+    assert longest_s <= found.delay_bound_s * (1 + 1e-9)

@@ -1,0 +1,168 @@
+"""The flow between two deliveries, against runs in exact continuous time and against samples."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from scipy.linalg import expm
+
+from noack.core.linear_systems import Matrix
+from noack.theory import sharpened_bounds
+from noack.theory.certificate import Constants, NetworkConditions
+from noack.theory.delivery_flow import DeliveryFlow, Reach
+from noack.theory.gains import PlantGains
+from noack.theory.sharpened_bounds import InvariantEllipsoids
+from tests.noack.theory.exact_loops import observe
+from tests.noack.theory.loops import (
+    ROUNDING,
+    SEARCH,
+    System,
+    certified_or_skipped,
+    seeds,
+    systems,
+)
+
+SHARP = ("x", "x_W", "E x", "p", "inter-event time")
+
+
+def weighted(**changes: object) -> System:
+    """A loop whose bounds come from the flow."""
+    values = {
+        "A": np.array([[0.0, 1.0], [2.0, -0.5]]), "B": np.array([[0.0], [1.0]]),
+        "K": np.array([[-6.0, -3.0]]), "H": np.array([[0.1, 1.0], [-3.6, -3.4]]),
+        "weight": np.array([[2.0, 0.4], [0.0, 0.5]]), "x0": np.array([0.4, -0.2]),
+        "alpha": 0.3, "beta": 0.1, "known_start": True, "mansd": 3, "step_s": 0.01,
+        "sample_steps": 1, "delay_steps": 0, "hold_steps": 0, "lag_steps": 0,
+    }  # fmt: skip
+    return System(**(values | changes))  # type: ignore[arg-type]
+
+
+def shares(system: System, found: Constants, seed: int) -> dict[str, float]:
+    """The largest share of each bound that runs use; above 1, the bound is exceeded."""
+    E, largest = system.A + system.B @ system.K - system.H, dict.fromkeys(SHARP, 0.0)
+    W = system.weight
+    for run, samples in observe(system, 12.0, seed):
+        growth = np.exp(system.alpha * samples.t_s)
+        if not system.known_start:  # before event 0 sensor and controller do not agree
+            growth[len(growth) - len(run.before)] = 0.0
+        for name, values, bound in (
+            ("x", samples.x, found.state),
+            ("x_W", samples.x @ W.T, found.state_weighted),
+            ("E x", samples.x @ (W @ E).T, found.mismatch),
+            ("p", samples.e_c @ system.K.T, found.input_error),
+        ):
+            size = float((growth * np.linalg.norm(values, axis=1)).max())
+            largest[name] = max(largest[name], size / max(bound, 1e-12))
+        if len(run.before) > 1:
+            share = (found.inter_event_s or 0.0) / float(np.diff(run.event_s).min())
+            largest["inter-event time"] = max(largest["inter-event time"], share)
+    return largest
+
+
+@settings(SEARCH, max_examples=12)
+@given(systems(mismatch=0.1, hold_steps=0, delay_steps=0), seeds)
+def test_no_sharpened_bound_is_exceeded(system: System, seed: int) -> None:
+    found = certified_or_skipped(system, NetworkConditions(system.mansd))
+    used = shares(system, found, seed)
+    assert {name: share for name, share in used.items() if share > ROUNDING} == {}
+
+
+def test_the_flow_makes_the_bounds_much_smaller_and_runs_come_close_to_them() -> None:
+    system = weighted()
+    sharp = system.certify(NetworkConditions(3))
+    plain = system.certify(NetworkConditions(3), structured=False)
+    assert sharp.state < 0.6 * plain.state
+    assert sharp.mismatch < 0.6 * plain.mismatch
+    assert (sharp.inter_event_s or 0.0) > 1.3 * (plain.inter_event_s or 0.0)
+    used = shares(system, sharp, 1)
+    assert max(used.values()) <= ROUNDING
+    assert {name for name, share in used.items() if share < 0.6} == set()
+
+
+def only_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The ellipsoid need not contain what errors drive x to."""
+    monkeypatch.setattr(Reach, "is_invariant", lambda reach: True)
+    monkeypatch.setattr(
+        InvariantEllipsoids, "_size",
+        lambda self, shape, limit: float(np.linalg.norm(shape @ self.flow.start)),
+    )  # fmt: skip
+
+
+def no_lost_updates(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At an event e_c is 0."""
+    exact = InvariantEllipsoids.sharpened
+    monkeypatch.setattr(
+        InvariantEllipsoids, "sharpened",
+        lambda self, known, limit, lost, level: exact(self, known, limit, 0.0, level),
+    )  # fmt: skip
+
+
+def no_drive_of_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After an event e_s stays what H makes of it."""
+    monkeypatch.setattr(
+        sharpened_bounds, "_error_after", lambda flow, time_s: np.zeros((flow.n, 2 * flow.n))
+    )
+
+
+def no_mismatch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The plant follows its model."""
+    exact = DeliveryFlow.__init__
+
+    def without(flow: DeliveryFlow, plant: PlantGains) -> None:
+        exact(flow, replace(plant, A=plant.error.H - plant.B @ plant.error.K))
+
+    monkeypatch.setattr(DeliveryFlow, "__init__", without)
+
+
+@pytest.mark.parametrize(
+    "broken", [only_the_start, no_lost_updates, no_drive_of_the_error, no_mismatch]
+)
+def test_a_broken_copy_is_exceeded(
+    broken: Callable[[pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    systems = [weighted(), weighted(x0=np.array([0.01, 0.02]))]
+    broken(monkeypatch)
+    used = [shares(one, one.certify(NetworkConditions(3)), 1) for one in systems]
+    assert max(max(one.values()) for one in used) > 1.05
+
+
+def followed(reach: Reach) -> Iterator[Matrix]:
+    """z(τ) as columns, from starts that meet both conditions up to τ, for many τ.
+
+    They are scaled until one condition holds with equality; τ goes beyond the grid.
+    """
+    flow, angles = reach.flow, np.linspace(0.0, np.pi, 181)
+    xi = np.vstack([np.cos(angles), np.sin(angles)])
+    xi /= np.linalg.norm(reach.shape @ xi, axis=0)
+    step_s = float(flow.edges_s[-1]) / 400
+    leap, z = expm(flow.generator * step_s), np.vstack([xi, 0 * xi])
+    largest = np.full(len(angles), 1e-300)
+    for _ in range(600):
+        z = leap @ z
+        largest = np.maximum(largest, np.linalg.norm(z[flow.n :], axis=0))
+        scale = np.minimum(1.0, reach.limit / largest)
+        yield z * scale
+
+
+@settings(SEARCH, max_examples=10)
+@given(systems(n=2, beta=0.3, mismatch=0.5, known_start=True), seeds)
+def test_what_follows_a_delivery_is_bounded(system: System, seed: int) -> None:
+    plant = system.gains()
+    limit = 3 * system.beta
+    reach = InvariantEllipsoids(plant, limit).within(limit)
+    if reach is None:
+        return
+    C = np.random.default_rng(seed).normal(size=(2, 4))
+    bound, sampled, sizes = reach.sup(C), 0.0, 0.0
+    for z in followed(reach):
+        sampled = max(sampled, float(np.linalg.norm(C @ z, axis=0).max()))
+        sizes = max(sizes, float(np.linalg.norm(reach.shape @ z[:2], axis=0).max()))
+    assert sampled <= bound * ROUNDING
+    assert bound <= 2.5 * sampled
+    assert sizes <= ROUNDING  # no x leaves the ellipsoid
+    smaller = Reach(reach.flow, 4 * reach.shape, limit)
+    if smaller.is_invariant():  # only if it is
+        for z in followed(smaller):
+            assert float(np.linalg.norm(smaller.shape @ z[:2], axis=0).max()) <= ROUNDING
