@@ -41,7 +41,14 @@ from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, MachineError, PeerError, why
 from noack.core.file_access import write_whole
 from noack.protocol.machine_interface import RESTART
-from noack.protocol.record_tables import LOOP, NO_SEQUENCE, OWNER, PLANT_STEP, SENSOR_MEASUREMENT
+from noack.protocol.record_tables import (
+    LOOP,
+    NO_SEQUENCE,
+    OWNER,
+    PACKET_HEAD_BYTES,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+)
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.protocol.wire_format import FLOW_OFFSET, MAX_LOOPS, VERSION, Flow, read_header
 from noack.runtime.control_messages import LogLine, ProcessReport, parse_message
@@ -305,7 +312,8 @@ def updates_in(
     """
     indices, sequences, events_ns = [], [], []
     heads = packets["head"]
-    marks = np.ascontiguousarray(heads).view(np.uint8).reshape(len(heads), -1)[:, FLOW_OFFSET]
+    octets = np.ascontiguousarray(heads).view(np.uint8).reshape(len(heads), PACKET_HEAD_BYTES)
+    marks = octets[:, FLOW_OFFSET]
     for i in np.flatnonzero(marks == flow).tolist():
         header = read_header(heads[i].tobytes())
         if header is None or (header.version, header.flow) != (VERSION, flow):

@@ -248,7 +248,7 @@ def test_many_packets_are_thinned_and_an_idle_network_draws_nothing() -> None:
 
 
 @pytest.mark.parametrize(
-    ("flow", "begin", "end"), [(Flow.ACKNOWLEDGEMENT, 10.5, 6.5), (Flow.ACTUATION, 12.5, 0.5)]
+    ("flow", "begin", "end"), [(Flow.ACKNOWLEDGEMENT, 10.5, 6.5), (Flow.ACTUATION, 12.5, 1.0)]
 )
 def test_what_the_controller_sends_is_drawn_to_its_receiver(
     flow: Flow, begin: float, end: float
