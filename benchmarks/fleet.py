@@ -176,7 +176,7 @@ def _rows(
     return [
         Row("samples", len(steps), "", note=f"{len(np.unique(steps[LOOP]))} loops"),
         Row("missing samples", load_.samples - len(measured), "", goal=Goal("==", 0)),
-        Row("missing ticks", load_.samples - len(ticks), "", goal=Goal("==", 0)),
+        Row("missing ticks", load_.samples - load_.loops - len(ticks), "", goal=Goal("==", 0)),
         Row("unintended losses", lost + rejected, "", goal=Goal("==", 0)),
         Row("longest loss burst", burst, "", goal=Goal("<=", CAP)),
         Row("updates", len(packets), "", note=f"{len(packets) / load_.horizon_s:.0f} /s"),
