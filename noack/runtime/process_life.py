@@ -265,7 +265,7 @@ class RunProcess:
             # Before the barrier: locking memory may take a tenth of a second.
             realtime(settings.enabled, settings.fifo_priority, place) as applied,
         ):
-            if isinstance(machine, CompiledFleet):
+            if self.scenario.loops is not None:
                 enlarge_buffer(endpoint, FLEET_BUFFER_BYTES)  # it may be late to the start
             channel = open_channel(endpoint, self.join(endpoint.getsockname()))
             telemetry = self._telemetry()
