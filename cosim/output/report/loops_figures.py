@@ -40,10 +40,10 @@ class QueueLength(NamedTuple):
 def network_figure(over_time: LoopsOverTime, names: Sequence[str], queue: QueueLength) -> Figure:
     """Draw the number of datagrams in the network, and the share of each loop of the bytes."""
     figure, (upper, lower) = _two_panels(_labels(names))
-    t_s = (np.arange(len(queue.mean)) + 0.5) * queue.width_s
+    t_s = np.asarray((np.arange(len(queue.mean)) + 0.5) * queue.width_s, np.float64)
     network, most = printed(palette.NETWORK), np.asarray(queue.largest, dtype=np.float64)
     upper.fill_between(t_s, most, step="mid", color=network, alpha=0.3, linewidth=0)
-    shown = draw.line(upper, t_s, np.asarray(queue.mean), "mean", color=network)
+    shown = draw.line(upper, t_s, np.array(queue.mean, np.float64), "mean", color=network)
     upper.set(title="Datagrams in the network", ylabel="datagrams")
     draw.legend(upper, [(upper.collections[0], "largest of an interval"), *shown])
     ends_s, shares = over_time.shares()
@@ -125,13 +125,13 @@ def _curves(axes: Axes, t_s: Reals, values: Reals, names: Sequence[str]) -> None
         for name, colour, curve in zip(names, palette.SERIES, values, strict=False):
             shown += draw.line(axes, t_s, curve, draw.plain(name), color=printed(colour))
     else:
-        found, colour = quantiles(values), printed(palette.CONTROLLER)
+        found, orange = quantiles(values), printed(palette.CONTROLLER)
         for low, high, alpha, label in _BANDS:
             band = axes.fill_between(
-                t_s, found[low], found[high], color=colour, alpha=alpha, linewidth=0
+                t_s, found[low], found[high], color=orange, alpha=alpha, linewidth=0
             )
             shown.append((band, label))
-        shown += draw.line(axes, t_s, found[_MEDIAN], "median", color=colour)
+        shown += draw.line(axes, t_s, found[_MEDIAN], "median", color=orange)
         dashed = {"color": printed(palette.LOST), "linestyle": (0, (3, 1.5)), "linewidth": 1.0}
         shown += draw.line(axes, t_s, found[_LARGEST], "largest", **dashed)
     draw.legend(axes, shown)

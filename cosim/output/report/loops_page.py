@@ -125,7 +125,7 @@ def _figures(over_time: LoopsOverTime, summary: Mapping[str, Any]) -> list[RunFi
         ),
         RunFigure(
             "map", error_map(over_time, names),
-            "Largest ‖e_c‖ of each loop in each interval; white before its first delivery.",
+            "Largest ‖e_c‖ of each loop in each interval; no colour before its first delivery.",
             f"A row of colours for each of {len(names)} loops: ‖e_c‖ over time.",
         ),
     ]  # fmt: skip
