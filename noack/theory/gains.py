@@ -179,15 +179,19 @@ class ErrorGains:
             self.kernels[output].sups(spacing_s * np.arange(events, dtype=np.float64)).sum()
         )
 
-    @cached_method
     def missing_until(self, output: Output, events: int, due_s: float) -> float:
         """Return Σ_{j<N} sup_{τ ≤ (j+1)L} ‖C e^{(H+αI)τ} W^{−1}‖, for events at most L apart."""
-        total = 0.0
+        return self._all_missing_until(events, due_s)[output]
+
+    @cached_method
+    def _all_missing_until(self, events: int, due_s: float) -> Mapping[Output, float]:
+        totals = dict.fromkeys(self.outputs, 0.0)
         for number in range(events):
             until_s = (number + 1) * due_s
             followed = response_until(self.scaled_H, self.inverse_weight, until_s)
-            total += followed.through(self.outputs[output]).sup_on_grid()
-        return total
+            for output, C in self.outputs.items():
+                totals[output] += followed.through(C).sup_on_grid()
+        return totals
 
     @property
     def decays(self) -> bool:
