@@ -1,4 +1,4 @@
-"""A live run whose updates and actuations cross the network; its network and controller restart."""
+"""A live run whose updates and actuations cross the network."""
 
 import json
 
