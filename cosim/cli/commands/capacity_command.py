@@ -104,7 +104,7 @@ def capacity(
     folder = out or cli.DEFAULT_RUNS / "capacity" / plan.scenario.name
     console = PatientConsole(stderr=True)
     done = execute_campaign(console, plan.campaign(), Path("noack capacity"), start, folder=folder)
-    points = []
+    points: list[capacity_live.LivePoint] = []
     chosen = capacity_live.chosen_points(live.split(",") if live else (), done.summary.found)
     for number, point in enumerate(chosen, 1):
         with console.status(f"live run {number} of {len(chosen)}"):

@@ -111,7 +111,8 @@ class SharedWork(SampledWork):
 
 def _updates(record: RunRecord, from_s: float) -> Rows:
     packets = record[NETEM_PACKET]
-    return packets[(packets["flow"] == 0) & (packets["now_ns"] >= from_s * NS_PER_S)]
+    counted: Rows = packets[(packets["flow"] == 0) & (packets["now_ns"] >= from_s * NS_PER_S)]
+    return counted
 
 
 def _used_up(fates: NDArray[Any], burst: int) -> bool:

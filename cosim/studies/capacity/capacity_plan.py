@@ -86,7 +86,7 @@ class CapacityPlan:
                 "from_s": begin_s, "until_s": end_s,
             }  # fmt: skip
             key = "plant.disturbances"
-            variants = {OWN: {key: own}, COMMON: {key: [*own, pulse]}}
+            variants: dict[str, dict[str, Any]] = {OWN: {key: own}, COMMON: {key: [*own, pulse]}}
             axes.append(Axis(name=DISTURBANCE, variants=variants))
         return Campaign(
             name=self.scenario.name,
