@@ -60,17 +60,17 @@ def examine(kind: Kind, seeds: range, broken: Broken | None = None) -> Tally:
     return Tally(len(seeds), runs, refused, violated, closest)
 
 
-def examine_all(loops: int, kinds: Mapping[str, Kind] = KINDS) -> list[Row]:
-    """Return the rows of every kind, from this number of loops each."""
+def examine_all(loops: int, kinds: Mapping[str, Kind] = KINDS, first: int = 0) -> list[Row]:
+    """Return the rows of every kind, from this number of loops each, with seeds from ``first``."""
     rows = []
     with processes(_WORKERS) as pool:
         for kind in kinds.values():
             for name, broken in ({"": None} | dict(kind.broken)).items():
                 say(f"{kind.name}{f', broken copy: {name}' if name else ''}")
-                count = loops if broken is None else max(loops // _BROKEN_SHARE, 1)
-                chunks = [
-                    range(first, min(first + _CHUNK, count)) for first in range(0, count, _CHUNK)
-                ]
+                part = 1 if broken is None else _BROKEN_SHARE
+                begin, count = first // part, max(loops // part, 1)
+                seeds = range(begin, begin + count)
+                chunks = [seeds[at : at + _CHUNK] for at in range(0, count, _CHUNK)]
                 with interrupts_held():
                     parts = [pool.submit(_examine_chunk, kind.name, name, one) for one in chunks]
                 found = reduce(Tally.plus, (part.result() for part in parts))
@@ -104,11 +104,12 @@ def _row(kind: Kind, broken: str, found: Tally) -> Row:
 def measure(options: argparse.Namespace) -> list[Row]:
     """Examine every kind, or the chosen one."""
     chosen = {name: KINDS[name] for name in options.kind or KINDS}
-    return examine_all(options.loops, chosen)
+    return examine_all(options.loops, chosen, options.first)
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--loops", type=int, default=200, help="certificates: loops per kind")
+    parser.add_argument("--first", type=int, default=0, help="certificates: seed of the first loop")
     parser.add_argument(
         "--kind", action="append", choices=KINDS, help="certificates: only this kind"
     )

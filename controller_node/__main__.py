@@ -7,6 +7,7 @@ from noack.runtime.signals import quiet_interrupt
 
 with quiet_interrupt():
     from controller_node.controller import controller_of
+    from controller_node.controller_arrays import CONTROLLER_FLEET
     from noack.core.errors import ExitStatus
     from noack.runtime import process_entry
 
@@ -14,7 +15,7 @@ with quiet_interrupt():
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the controller in the run that a recorder or launcher has opened."""
     return process_entry.main(
-        "controller", lambda member: member.run_messages(controller_of), arguments
+        "controller", lambda member: member.run_messages(controller_of, CONTROLLER_FLEET), arguments
     )
 
 

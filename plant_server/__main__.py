@@ -9,12 +9,15 @@ with quiet_interrupt():
     from noack.core.errors import ExitStatus
     from noack.runtime import process_entry
     from plant_server.plant import plant_of
+    from plant_server.plant_arrays import PLANT_FLEET
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the plant in the run that a recorder or launcher has opened."""
     return process_entry.main(
-        "plant", lambda member: member.run_messages(lambda loop, _: plant_of(loop)), arguments
+        "plant",
+        lambda member: member.run_messages(lambda loop, _: plant_of(loop), PLANT_FLEET),
+        arguments,
     )
 
 

@@ -25,7 +25,7 @@ from noack.protocol.wire_format import Flow, Message
 from plant_server.disturbance_signal import Disturbance, disturbance_of
 from plant_server.input_buffer import InputBuffer
 from plant_server.measurement import MeasurementModel, measurement_model_of
-from plant_server.watchdog import Fallback, PredictedInput, Watchdog, hold, zero
+from plant_server.watchdog import FALLBACK_NAMES, Fallback, PredictedInput, Watchdog, hold, zero
 
 
 class Plant:
@@ -179,15 +179,17 @@ def system_of(resolved: Scenario) -> PlantSystem:
 
 def _watchdog_of(resolved: Scenario) -> Watchdog:
     loop = loop_of(resolved)
-    fallbacks: dict[str, tuple[Fallback, str]] = {
-        "hold": (hold, "held"),
-        "zero": (zero, "0"),
-        "model": (PredictedInput(loop.H, loop.K, resolved.timing.plant_period_ns), "the model's"),
+    fallbacks: dict[str, Fallback] = {
+        "hold": hold,
+        "zero": zero,
+        "model": PredictedInput(loop.H, loop.K, resolved.timing.plant_period_ns),
     }
+    policy = resolved.plant.watchdog.policy
     timing, predictions = resolved.timing, resolved.controller.predictions
     return Watchdog(
         InputBuffer(loop.m, predictions, timing.controller_period_ns),
         timing.actuation_timeout_ns,
-        *fallbacks[resolved.plant.watchdog.policy],
+        fallbacks[policy],
+        FALLBACK_NAMES[policy],
         timing.missing_actuation_ns,
     )

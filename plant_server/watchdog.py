@@ -68,6 +68,10 @@ class PredictedInput:
         return newest.u + (product(self._K, self._x) - product(self._K, newest.x_c))
 
 
+FALLBACK_NAMES = {"hold": "held", "zero": "0", "model": "the model's"}
+"""The input that each policy applies, in words."""
+
+
 def too_old(t_ns: Any, newest_ns: Any, timeout_ns: int) -> Any:
     """Whether an actuation of time ``newest_ns`` is too old at ``t_ns``; also of arrays."""
     return t_ns - newest_ns > timeout_ns
@@ -121,15 +125,26 @@ class Watchdog:
 
     def _notice(self, t_ns: int) -> Notice:
         """Report that actuations are missing, or that they arrive again."""
-        if self._noticed_ns is not None:
-            lasted_s = (t_ns - self._noticed_ns) / NS_PER_S
-            self._noticed_ns = None
-            text = f"actuations arrive again; there was none in time for {lasted_s:.4g} s"
-            return Notice(t_ns, "watchdog", text)
-        self._noticed_ns = t_ns
-        age_ns = t_ns - self._buffer.newest.t_ns
-        age_s, timeout_s = ((ns / NS_PER_S) for ns in (age_ns, self._timeout_ns))
-        none = self._buffer.newest.sequence == NO_SEQUENCE
-        what = "no actuation for" if none else "the newest actuation is too old:"
-        text = f"{what} {age_s:.4g} s, {timeout_s:.4g} s allowed; the input is {self._input_name}"
-        return Notice(t_ns, "watchdog", text)
+        newest, noticed_ns = self._buffer.newest, self._noticed_ns
+        self._noticed_ns = t_ns if noticed_ns is None else None
+        if noticed_ns is not None:
+            return arrive_again(t_ns, noticed_ns)
+        none = newest.sequence == NO_SEQUENCE
+        return are_missing(t_ns, newest.t_ns, self._timeout_ns, self._input_name, none=none)
+
+
+def arrive_again(t_ns: int, noticed_ns: int) -> Notice:
+    """Return the notice of the first actuation after those reported missing at ``noticed_ns``."""
+    lasted_s = (t_ns - noticed_ns) / NS_PER_S
+    text = f"actuations arrive again; there was none in time for {lasted_s:.4g} s"
+    return Notice(t_ns, "watchdog", text)
+
+
+def are_missing(
+    t_ns: int, newest_ns: int, timeout_ns: int, input_name: str, *, none: bool
+) -> Notice:
+    """Return the notice of a newest actuation that is too old; ``none``: there is none."""
+    age_s, timeout_s = ((ns / NS_PER_S) for ns in (t_ns - newest_ns, timeout_ns))
+    what = "no actuation for" if none else "the newest actuation is too old:"
+    text = f"{what} {age_s:.4g} s, {timeout_s:.4g} s allowed; the input is {input_name}"
+    return Notice(t_ns, "watchdog", text)

@@ -9,11 +9,14 @@ with quiet_interrupt():
     from noack.core.errors import ExitStatus
     from noack.runtime import process_entry
     from sensor_node.sensor import sensor_of
+    from sensor_node.sensor_arrays import SENSOR_FLEET
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the sensor in the run that a recorder or launcher has opened."""
-    return process_entry.main("sensor", lambda member: member.run_messages(sensor_of), arguments)
+    return process_entry.main(
+        "sensor", lambda member: member.run_messages(sensor_of, SENSOR_FLEET), arguments
+    )
 
 
 if __name__ == "__main__":

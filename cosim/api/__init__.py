@@ -18,7 +18,7 @@ from cosim.api.scenarios import from_system as from_system
 from cosim.api.scenarios import load as load
 from cosim.api.scenarios import with_settings as with_settings
 from cosim.measurement.network_measurement import Measurement as Measurement
-from cosim.output.certificate_report import Certificates as Certificates
+from cosim.output.all_certificates import Certificates as Certificates
 from noack.config.scenario import Scenario as Scenario
 from noack.core.errors import NoackError as NoackError
 

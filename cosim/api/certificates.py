@@ -2,7 +2,7 @@
 
 from cosim.analysis.margin_search import MOST_M, MarginResult, find_margin
 from cosim.api.scenarios import Source, load
-from cosim.output.certificate_report import Certificates, certificates_of
+from cosim.output.all_certificates import Certificates, certificates_of
 from noack.config.resolution import resolve
 from noack.theory.joint_spectral_radius import ACCURACY
 

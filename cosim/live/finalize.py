@@ -17,8 +17,8 @@ from cosim.analysis.model_comparison import linearisation
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import Outcome, Summary, summarise
 from cosim.analysis.shared_summary import is_complete
-from cosim.analysis.summary_model import ExitPart, RunSummary, SummaryPart
-from cosim.live.finalize_loops import finalize_loops
+from cosim.analysis.summary_model import ReplayPart, RunSummary, SummaryPart
+from cosim.live.finalize_loops import exit_after_replay, finalize_loops
 from cosim.live.replay_process import ReplayProcess
 from cosim.record.decimate import is_long
 from cosim.record.run_directory import (
@@ -149,16 +149,8 @@ def _with_results(
             results["replay"] = replaying.verdict() or replay(record).verdict()
         except Exception as error:  # the run itself did not fail
             results["replay"] = {"bit_exact": None, "error": repr(error)}
-        results["exit"] = _exit(summary.exit, results["replay"])
+        results["exit"] = exit_after_replay(summary.exit, ReplayPart(**results["replay"]))
     return summary.with_results(**results)
-
-
-def _exit(end: ExitPart, replayed: dict[str, Any]) -> ExitPart:
-    """How the run ended, given its replay: a run that cannot be replayed failed."""
-    if end.status != ExitStatus.OK or replayed["bit_exact"] is not None:
-        return end
-    why = replayed.get("error", "the record has no inputs")
-    return ExitPart(status=ExitStatus.FAILED, reason=f"the run cannot be replayed: {why}")
 
 
 def reopen(run_dir: Path) -> Outcome:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from controller_node.controller_arrays import CONTROLLER_FLEET
 from cosim.live.child_processes import ChildProcesses, Failure, signal_name
 from cosim.live.coordinator import Coordinator
 from cosim.live.disk_space import require_disk_space
@@ -29,10 +30,13 @@ from noack.config.scenario import Scenario
 from noack.core.errors import CallerError, ExitStatus, NeverStartedError
 from noack.protocol.topology import PLANT, RECORDER, ROLES
 from noack.runtime import run_registry
+from noack.runtime.fleet.fleet_choice import prepare as prepare_fleets
 from noack.runtime.join_ticket import Ticket, new_ticket, published
 from noack.runtime.life_cycle import HORIZON
 from noack.runtime.signals import Signals
 from noack.runtime.udp_sockets import LOOPBACK, free_tcp_port, require_free_tcp_port
+from plant_server.plant_arrays import PLANT_FLEET
+from sensor_node.sensor_arrays import SENSOR_FLEET
 
 _STOPPED: Mapping[int, str] = {
     signal.SIGINT: "stopped by the user",
@@ -43,6 +47,11 @@ _POLL_S = 0.01
 _STOP_TIMEOUT_S = 15.0
 _OVERTIME_S, _OVERTIME_SHARE = 20.0, 0.2
 """After the horizon: the recorder sorts the rows, and a long run has many."""
+
+
+_FLEETS = (
+    ("plant", PLANT_FLEET), ("sensor", SENSOR_FLEET), ("controller", CONTROLLER_FLEET),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -96,6 +105,7 @@ def launch(
             # Compile now: the start barrier has a time limit.
             for system in {repr(loop.plant.system): loop.plant.system for loop in loops}.values():
                 system.prepare()
+        prepare_fleets([(name, role) for name, role in _FLEETS if name in spawn], scenario)
         endpoint = f"tcp/{LOOPBACK}:{control or free_tcp_port()}"
         run_dir = new_run_dir(runs, resolved.name)
         resolved = write_scenario(resolved, run_dir)

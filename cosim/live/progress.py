@@ -5,16 +5,18 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from cosim.live.launcher import Watcher
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.runtime.join_ticket import DEFAULT_SESSION
+
+if TYPE_CHECKING:
+    from cosim.live.launcher import Watcher
 
 _PLAIN_LINES = 10
 """Progress lines of a run on a terminal that cannot redraw a line."""
@@ -30,8 +32,10 @@ class PatientConsole(Console):
 @contextmanager
 def progress_line(
     console: Console, scenario: Scenario, session: str | None = None
-) -> Iterator[Watcher]:
+) -> "Iterator[Watcher]":
     """Show the progress of a run while the context lasts."""
+    from cosim.live.launcher import Watcher  # its imports are of no use to the other bars
+
     live = console.is_terminal and not console.is_dumb_terminal
     columns = (BarColumn(bar_width=12), TextColumn("{task.description}"))
     with Progress(*columns, console=console, disable=not live, transient=False) as progress:

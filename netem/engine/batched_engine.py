@@ -18,10 +18,11 @@ from netem.engine.pump.client_table import insert, remove
 from netem.engine.pump_memory import PumpMemory
 from netem.engine.relay_base import RARE_PERIOD_NS, REPORTED_FLOWS, Relay
 from netem.engine.relay_interface import DIRECTIONS, DirectionReport, FlowReport, LinkSpec, Tap
-from netem.engine.relay_sockets import packed_name, stamp_arrivals
+from netem.engine.relay_sockets import stamp_arrivals
 from netem.rules.settings_change import carry
 from noack.impairments.link_records import Counters, PacketDecision, dtype_of
 from noack.impairments.link_settings import LinkSettings
+from noack.runtime.native.socket_structs import packed_name
 from noack.runtime.udp_sockets import LOOPBACK
 
 _COMPILING_S = 15.0

@@ -17,7 +17,7 @@ from netem.engine.pump import pump_layout
 from netem.engine.pump.client_table import insert
 from netem.engine.pump.pump_layout import Array
 from netem.engine.pump_memory import PumpMemory
-from netem.engine.relay_sockets import packed_name, stamp_arrivals
+from netem.engine.relay_sockets import stamp_arrivals
 from netem.link_machine import Datagram, at_start, due_settings, link_name
 from netem.rules.settings_change import carry
 from noack.config.parameter_changes import ChangeSchedule, ParameterChange
@@ -34,6 +34,7 @@ from noack.protocol.record_tables import (
 )
 from noack.runtime.address import Address
 from noack.runtime.native.object_code import NativeFunction
+from noack.runtime.native.socket_structs import packed_name
 from noack.runtime.real_time_loop import RowSink
 
 _ROWS = 256

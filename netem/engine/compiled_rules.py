@@ -38,7 +38,7 @@ from noack.impairments.stage_dispatch import (
     apply_stage,
 )
 from noack.protocol import record_tables
-from noack.runtime.native import object_code
+from noack.runtime.native import object_code, socket_structs
 
 
 def compiled_program(program: LinkProgram) -> LinkProgram:
@@ -127,7 +127,7 @@ def prepare(name: str = "netem", modules: tuple[ModuleType, ...] = ()) -> Path |
 @cache
 def folder(name: str = "netem", modules: tuple[ModuleType, ...] = ()) -> Path | None:
     """Return the cache folder, without loading the compiler; see :func:`prepare`."""
-    more = (*modules, relay_events, record_tables, object_code)
+    more = (*modules, relay_events, record_tables, object_code, socket_structs)
     sources = [*(path for _, path in _compiled_modules()), *(str(one.__file__) for one in more)]
     return cache_folder(name, map(Path, sources))
 

@@ -10,10 +10,11 @@ from contextlib import ExitStack, suppress
 from ipaddress import IPv4Address, IPv6Address, ip_address
 from typing import Any
 
-from netem.engine.pump.pump_layout import NAME_BYTES
 from netem.engine.relay_interface import Address, LinkSpec
 from noack.core.errors import CallerError
 from noack.runtime.address import text_of
+from noack.runtime.native.socket_structs import SocketName as SocketName
+from noack.runtime.native.socket_structs import packed_name as packed_name
 from noack.runtime.udp_sockets import enlarge_buffer
 
 _BUFFER_BYTES = 4 * 1024 * 1024
@@ -30,8 +31,6 @@ _RECVERR = ((socket.IPPROTO_IP, 11), (socket.IPPROTO_IPV6, 25))
 _ERROR_BYTES = 128
 
 Endpoint = socket.socket
-SocketName = tuple[Any, ...]
-"""An address in the form that sockets use: host and port; IPv6: also flow label and scope."""
 
 
 def socket_name(address: Address, what: str) -> SocketName:
@@ -182,19 +181,6 @@ def address_of(name: Sequence[Any]) -> Address:
     """Return a name from ``getsockname`` as an address; a scope follows the host after ``%``."""
     host, scope = str(name[0]).partition("%")[0], name[3] if len(name) > 3 else 0
     return (f"{host}%{scope}" if scope else host), int(name[1])
-
-
-def packed_name(name: SocketName) -> tuple[bytes, int]:
-    """Return a name as the kernel's struct sockaddr, padded to NAME_BYTES, and its length."""
-    host, port = name[:2]
-    if len(name) == 2:
-        packed = struct.pack("=H", socket.AF_INET) + struct.pack("!H", port)
-        packed += socket.inet_pton(socket.AF_INET, host) + bytes(8)
-    else:
-        packed = struct.pack("=H", socket.AF_INET6) + struct.pack("!HI", port, name[2])
-        packed += socket.inet_pton(socket.AF_INET6, host.partition("%")[0])
-        packed += struct.pack("=I", name[3])
-    return packed.ljust(NAME_BYTES, b"\0"), len(packed)
 
 
 def unpacked_address(packed: bytes) -> Address:

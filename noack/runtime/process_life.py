@@ -11,11 +11,12 @@ import socket
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import chain, repeat
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, cast
 
+from noack.config.fleet_layout import FleetRole
 from noack.config.loops import loops_of, phases_ns
 from noack.config.parameter_changes import ReconfigurableMachine
 from noack.config.resolution import resolved_loops, tables_of
@@ -40,6 +41,9 @@ from noack.runtime.address import Address
 from noack.runtime.command_line import print_to_stderr
 from noack.runtime.control_messages import Admission, ControlMessage, RunStart, parse_message
 from noack.runtime.control_plane import ControlPlane, ParameterUpdates
+from noack.runtime.fleet.compiled_fleet import CompiledFleet
+from noack.runtime.fleet.fleet_choice import fleet_of
+from noack.runtime.fleet.fleet_socket import FleetSocket
 from noack.runtime.join_ticket import Ticket
 from noack.runtime.life_cycle import HORIZON, LAUNCHER_GONE, Event, LifeCycle, Side, State
 from noack.runtime.real_time_loop import Channel, run_loop
@@ -158,12 +162,21 @@ class RunProcess:
         """Number of loops whose datagrams carry their number; None in a run without [[loops]]."""
         return None if self.scenario.loops is None else len(self._phases_ns)
 
-    def run_messages(self, new_machine: NewMachine) -> None:
+    def run_messages(self, new_machine: NewMachine, compiled: FleetRole) -> None:
         """Run the machines of all loops, with the process's route in the topology.
 
         Args:
             new_machine: makes a machine; another of the first loop is made for rehearsals.
+            compiled: the machines of many loops as compiled code.
         """
+        fleet = None
+        if not self.start.is_restart:
+            fleet = fleet_of(
+                compiled, self.role, self.scenario, self.ticket.run_id, self.ticket.key
+            )
+        if fleet is not None:
+            self.run(fleet, partial(self._fleet_socket, fleet=fleet))
+            return
         role, network = self.role, self.scenario.network.flows
         receives, sends, answer = RECEIVES[role], SENDS[role], Flow.ACKNOWLEDGEMENT
         answers = answer in network and role in ENDS[answer]
@@ -195,6 +208,17 @@ class RunProcess:
                 rehearsal = Rehearsal(machine, copy, self._encoder(), receives, entries)
                 self._rehearsal = stack.enter_context(closing(rehearsal))
             self.run(self._machine(new_machine), channel)
+
+    def _fleet_socket(
+        self, endpoint: socket.socket, addresses: Mapping[str, Address], fleet: CompiledFleet
+    ) -> FleetSocket:
+        role, network = self.role, self.scenario.network.flows
+        receives, sends = RECEIVES[role], SENDS[role]
+        return FleetSocket(
+            endpoint, fleet, sends, clock=self.clock,
+            source=addresses[sender_to(role, receives, network)],
+            destination=addresses[receiver_of(role, sends, network)],
+        )  # fmt: skip
 
     def _machine(self, new_machine: NewMachine, most: int | None = None) -> Machine[Message]:
         """Return the machine of all loops, or of the first ones."""

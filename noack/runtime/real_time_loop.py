@@ -53,7 +53,7 @@ class RowSink(Protocol):
     """Where rows of the record go."""
 
     def extend_table(self, table: str, rows: NDArray[Any]) -> None:
-        """Add at most 256 rows of a table."""
+        """Add rows of a table."""
         ...
 
 
@@ -89,7 +89,7 @@ class Rehearsing(Protocol):
 class SelfDrivenMachine(Protocol):
     """A machine that waits for its deadlines and messages itself, and sends its messages."""
 
-    def drive(self, until_ns: int, rows: RowSink) -> None:
+    def drive(self, until_ns: int, sink: RecordSink) -> None:
         """Work until about simulated time ``until_ns``; pass on its rows of the record."""
         ...
 

@@ -96,7 +96,11 @@ class TelemetryBuffer:
             self.flush()  # all tables: a reader merges them in the order of publication
 
     def extend_table(self, table: str, rows: NDArray[np.void]) -> None:
-        """Add at most 256 rows of a table."""
+        """Add rows of a table; many are published at once."""
+        if len(rows) >= _BATCH_ROWS:
+            self.flush()
+            self._publish_rows(table, rows)
+            return
         if self._filled[table] + len(rows) > _BATCH_ROWS:
             self.flush()
         begin = self._filled[table]
@@ -113,7 +117,8 @@ class TelemetryBuffer:
         """Publish all collected rows; send again what was lost."""
         for table, filled in self._filled.items():
             if filled:
-                self._publish_rows(table)
+                self._filled[table] = 0
+                self._publish_rows(table, self._rows[table][:filled])
         if rows := self._persisted():
             self._forget(rows)
         for _ in range(min(len(self._to_resend), _RESENT_AT_ONCE)):
@@ -137,15 +142,12 @@ class TelemetryBuffer:
                 sent += 1
         return sent
 
-    def _publish_rows(self, table: str) -> None:
-        filled = self._filled[table]
-        self._filled[table] = 0
-        rows = self._rows[table][:filled]
+    def _publish_rows(self, table: str, rows: NDArray[np.void]) -> None:
         if table in self._by_loop:
             before = self._by_loop[table]
             self._by_loop[table] = counts = np.bincount(rows[LOOP], minlength=len(before))
             counts[: len(before)] += before
-        self._send(table, filled, rows.tobytes())
+        self._send(table, len(rows), rows.tobytes())
 
     def _send(self, table: str, rows: int, payload: bytes) -> None:
         first = self._published[table]

@@ -61,13 +61,13 @@ def bind(port: int, key: str) -> socket.socket:
     return endpoint
 
 
-def enlarge_buffer(endpoint: socket.socket) -> int:
-    """Request a 4 MiB receive buffer; return the size that the kernel set, in bytes."""
+def enlarge_buffer(endpoint: socket.socket, size_bytes: int = _BUFFER_BYTES) -> int:
+    """Request a receive buffer, by default of 4 MiB; return the size that the kernel set."""
     try:
-        endpoint.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _BUFFER_BYTES)
+        endpoint.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, size_bytes)
     except OSError:
         with suppress(OSError):
-            endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+            endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, size_bytes)
     return endpoint.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
 
 

@@ -19,6 +19,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.contraction import logarithmic_norm
 from noack.theory.enclosure import NotDecayingError, ResponseBounds, response
@@ -56,6 +57,7 @@ class BoxGains(PlantGains):
         )
         return found
 
+    @cached_method
     def start_up(self, start_s: float) -> tuple[float, Mapping[str, float]]:
         """Return the effect of zero input before ``start_s``: p = −K x, x' = A x for every A.
 

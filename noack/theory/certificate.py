@@ -136,6 +136,7 @@ def solve(
     *,
     estimation: EstimationBound = _MEASURED,
     structured: bool = True,
+    longest: bool = True,
 ) -> Constants:
     """Return the constants that are certified for all times.
 
@@ -143,14 +144,15 @@ def solve(
     the input. Otherwise it is only known that its norm is at most π.
 
     ``earlier_error``: bound of sup‖p‖ while the plant still applies inputs of an earlier run.
+    ``longest``: search for the longest δ; otherwise only if there is no certificate without it.
 
     Raises:
         VoidError: the loop gain is not below 1.
         NotDecayingError: a mode of the loop decays more slowly than the threshold.
     """
     part = Part(error, plant, bound, estimation)
-    (found,) = solve_sum([part], conditions, earlier_error, structured=structured)
-    if structured and earlier_error == 0.0 and _is_reset_flow(part, conditions):
+    (found,) = solve_sum([part], conditions, earlier_error, structured=structured, longest=longest)
+    if longest and structured and earlier_error == 0.0 and _is_reset_flow(part, conditions):
         with contextlib.suppress(np.linalg.LinAlgError, NotDecayingError):
             return _sharpened(found, part, conditions)
     return found
@@ -220,6 +222,7 @@ def solve_sum(
     earlier_error: float = 0.0,
     *,
     structured: bool = True,
+    longest: bool = True,
 ) -> list[Constants]:
     """Return the constants of several parts, whose bounds hold when they are added.
 
@@ -244,6 +247,9 @@ def solve_sum(
     least_s = max(conditions.spacing_s, apart_s)
     if any(all(one.reached is None for one in part.bound.every) for part in parts):
         return constants(least_s, apart_s or None)
+    if not longest:
+        with contextlib.suppress(VoidError):
+            return constants(least_s, least_s or None)
     spacing_s = LONGEST_S
     for _ in range(_ATTEMPTS):
         if spacing_s <= least_s:

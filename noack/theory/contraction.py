@@ -112,3 +112,37 @@ def product(matrix: Matrix, stack: Stack) -> Stack:
 def frobenius_norms(stack: Stack) -> Stack:
     """Return the Frobenius norms of a stack of matrices, (k, q, r) → (k,)."""
     return np.asarray(np.sqrt(np.einsum("kij,kij->k", stack, stack)))
+
+
+def spectral_norms(stack: Stack) -> Stack:
+    """Return the spectral norms of a stack of matrices, (k, q, r) → (k,).
+
+    They are roots of eigenvalues of Y Yᵀ, whose largest one has a small relative rounding error.
+    """
+    wide = stack.shape[1] < stack.shape[2]
+    products = np.einsum("kij,klj->kil" if wide else "kij,kil->kjl", stack, stack)
+    if not np.isfinite(products).all():  # the norm may be finite
+        return np.asarray(np.linalg.norm(stack, 2, axis=(1, 2)))
+    return np.asarray(np.sqrt(np.maximum(_largest_eigenvalues(products), 0.0)))
+
+
+def _largest_eigenvalues(stack: Stack) -> Stack:
+    """Return the largest eigenvalues of Gram matrices, (k, n, n) → (k,)."""
+    n = stack.shape[1]
+    if n == 1:
+        return stack[:, 0, 0]
+    if n == 2:
+        (a, b), (_, d) = stack.transpose(1, 2, 0)
+        return np.asarray(0.5 * (a + d) + np.hypot(0.5 * (a - d), b))
+    if n > 3:
+        return np.asarray(np.linalg.eigvalsh(stack)[:, -1])
+    # The largest root of the characteristic polynomial, of the matrix with the trace 3.
+    (a, b, c), (_, d, e), (_, _, f) = stack.transpose(1, 2, 0)
+    scale = (a + d + f) / 3
+    a, b, c, d, e, f = np.array([a, b, c, d, e, f]) / np.where(scale > 0, scale, 1.0)
+    a, d, f = a - 1, d - 1, f - 1
+    spread = np.sqrt((a * a + d * d + f * f + 2 * (b * b + c * c + e * e)) / 6)
+    determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
+    cosine = 0.5 * determinant / np.where(spread > 0, spread, 1.0) ** 3
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0)) / 3
+    return np.asarray(scale * (1 + 2 * spread * np.cos(angle)))

@@ -6,7 +6,7 @@ decay.
 """
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -40,12 +40,12 @@ class DisturbedCertificate:
     """The decay rate of the models and of A + BK, the smaller one."""
 
     def constants(
-        self, conditions: NetworkConditions, *, decays: bool, shares: Sequence[float] = SHARES
+        self, conditions: NetworkConditions, *, decays: bool, longest: bool = True
     ) -> tuple[Constants, Constants | None]:
         """Return the constants that decay and those to be added; without decay only one.
 
-        ``decays``: α is below the decay rates of the models and of the plant. ``shares`` are those
-        of :func:`solve_divided`.
+        ``decays``: α is below the decay rates of the models and of the plant. ``longest``: search
+        for the tightest bounds and the longest δ; otherwise any suffice.
 
         Raises:
             VoidError: the loop gain is not below 1, or the estimation error is not known.
@@ -61,17 +61,19 @@ class DisturbedCertificate:
             try:
                 return solve_divided(
                     self._decaying, self._persistent, conditions, self.start_error,
-                    structured=structured, shares=shares,
+                    structured=structured, shares=SHARES if longest else (),
                 )  # fmt: skip
             except NotDecayingError:
                 pass
         level, floor = max(self.trigger.beta, self.trigger.floor), self.trigger.floor
         bound = self.trigger.bound(conditions, level, floor or None)
         part = self._together._replace(bound=bound)
-        (found,) = solve_sum([part], conditions, self.start_error, structured=structured)
+        (found,) = solve_sum(
+            [part], conditions, self.start_error, structured=structured, longest=longest
+        )
         # The mean of an integral bounds e_s over a time that suits only one of several parts.
         is_divided = not self.trigger.beta and not self.trigger.area and not self.start_error
-        if decays and is_divided and len(shares) > 1:
+        if decays and is_divided and longest:
             with contextlib.suppress(VoidError, NotDecayingError):
                 return self._of_constant_threshold(conditions, found.inter_event_s or 0.0)
         return found, None

@@ -31,6 +31,7 @@ from noack.theory.contraction import (
     frobenius_norms,
     logarithmic_norm,
     product,
+    spectral_norms,
 )
 
 _ROUNDING = 1.0 + 1e-9
@@ -147,14 +148,8 @@ class ResponseBounds:
 def norm_bounds(C: Matrix, states: Stack) -> Stack:
     """Return upper bounds of ‖C Y‖ for a stack of Y, (k, n, r) → (k,), including rounding."""
     exact = product(C, states)
-    # Of a vector, the Euclidean norm is the spectral one.
-    norms = (
-        frobenius_norms(exact)
-        if min(exact.shape[1:]) == 1
-        else np.linalg.norm(exact, 2, axis=(1, 2))
-    )
     rounding = frobenius_norms(product(np.abs(C), np.abs(states)))
-    return np.asarray(norms + EPSILON * len(C.T) * rounding)
+    return np.asarray(spectral_norms(exact) + EPSILON * len(C.T) * rounding)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from noack.config.resolution import LoopMatrices
+from noack.core.cached_method import cached_method
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, Vector, discretise, spectral_abscissa
 from noack.theory.enclosure import (
@@ -180,12 +181,17 @@ class ErrorGains:
 
     def missing_until(self, output: Output, events: int, due_s: float) -> float:
         """Return Σ_{j<N} sup_{τ ≤ (j+1)L} ‖C e^{(H+αI)τ} W^{−1}‖, for events at most L apart."""
-        total = 0.0
+        return self._all_missing_until(events, due_s)[output]
+
+    @cached_method
+    def _all_missing_until(self, events: int, due_s: float) -> Mapping[Output, float]:
+        totals = dict.fromkeys(self.outputs, 0.0)
         for number in range(events):
             until_s = (number + 1) * due_s
             followed = response_until(self.scaled_H, self.inverse_weight, until_s)
-            total += followed.through(self.outputs[output]).sup_on_grid()
-        return total
+            for output, C in self.outputs.items():
+                totals[output] += followed.through(C).sup_on_grid()
+        return totals
 
     @property
     def decays(self) -> bool:
@@ -209,6 +215,7 @@ class ErrorGains:
 
         return of
 
+    @cached_method
     def stretch(self, until_s: float) -> float:
         """Return sup‖e^{(H+αI)τ}‖_W over τ ≤ ``until_s``, the growth of a sampled error."""
         if until_s == 0:
@@ -216,6 +223,7 @@ class ErrorGains:
         followed = response_until(self.scaled_H, self.inverse_weight, until_s)
         return followed.through(self.weight).sup_on_grid()
 
+    @cached_method
     def hold_remainder(self, hold_s: float) -> float:
         """Bound ‖K(e^{−Hσ} − I + Hσ − ½H²σ²) W^{−1}‖ for |σ| ≤ ``hold_s``.
 
@@ -349,6 +357,21 @@ class PlantGains:
     def _forced(self) -> ResponseBounds:
         return response(self.closed_loop, self.input_matrix)
 
+    @cached_method
+    def on_grid(self, until_s: float, cells: int) -> tuple[Vector, Mapping[str, Vector]]:
+        """Return the gains of a missing event's error, and of the input error, on equal cells.
+
+        Returns:
+            sup‖R e^{(H+αI)τ} W^{−1}‖ over each cell, and ∫‖C e^{(A+BK+αI)τ} B U‖ over each cell for
+            every output.
+        """
+        error = self.error
+        lost = response_until(error.scaled_H, error.inverse_weight, until_s, cells)
+        forced = response_until(self.closed_loop, self.input_matrix, until_s, cells)
+        areas = {output: forced.through(C).area for output, C in self.outputs.items()}
+        return lost.through(error.outputs[Output.GAIN]).highest, areas
+
+    @cached_method
     def start_up(self, start_s: float) -> tuple[float, Mapping[str, float]]:
         """Return the effect of zero input before ``start_s``, where p = −K x.
 
@@ -377,6 +400,7 @@ class PlantGains:
         """Return the growth of ‖e_s‖_W over ``until_s``, on a grid."""
         return self.growths(until_s, cells)(Output.WEIGHTED)
 
+    @cached_method
     def growths(self, until_s: float, cells: int) -> Callable[[Output], Growth]:
         """Return the growth of every output C e_s over ``until_s``, on a grid."""
         return self.error.growth(self.columns, until_s, cells)

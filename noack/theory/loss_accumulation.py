@@ -23,7 +23,7 @@ import numpy as np
 
 from noack.core.linear_systems import Vector
 from noack.impairments.loss_guarantee import LossWindow
-from noack.theory.enclosure import KernelBounds, response_until
+from noack.theory.enclosure import KernelBounds
 from noack.theory.gains import Output, PlantGains
 
 _CELLS = 2048
@@ -76,17 +76,10 @@ class LossAccumulation:
     @cached_property
     def _effects(self) -> Mapping[str, Vector]:
         """The bound of c over each cell, for every output."""
-        plant, error = self.plant, self.plant.error
-        until_s = self._until_s
-        lost = response_until(error.scaled_H, error.inverse_weight, until_s, _CELLS)
-        g = lost.through(error.outputs[Output.GAIN]).highest
+        g, areas = self.plant.on_grid(self._until_s, _CELLS)
         g = np.where(np.arange(1, _CELLS + 1) * self._cell_s > self.delay_s, g, 0.0)
         ages = np.maximum(g, np.append(0.0, g[:-1]))
-        forced = response_until(plant.closed_loop, plant.input_matrix, until_s, _CELLS)
-        return {
-            output: np.convolve(forced.through(C).area, ages)[:_CELLS]
-            for output, C in plant.outputs.items()
-        }
+        return {output: np.convolve(area, ages)[:_CELLS] for output, area in areas.items()}
 
     def _beyond(self, output: str, most: int, block_s: float) -> float:
         """Bound the sum over the losses that are older than the grid: a falling function f of age.

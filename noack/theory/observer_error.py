@@ -25,6 +25,7 @@ from noack.config.state_estimation import assumed_model
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, discretise
 from noack.theory.certificate import EstimationBound
+from noack.theory.contraction import spectral_norms
 from noack.theory.enclosure import NotDecayingError, factors
 from noack.theory.gains import Forcing
 from noack.theory.persistent_causes import noise_bound, noise_deviations, normal_bounds
@@ -38,6 +39,8 @@ _MOST_GAINS = 1500
 _SETTLED = 1e-9
 _MOST_STEPS = 100_000
 _TAIL_SHARE = 1e-4
+_ENTRIES = 20_000
+"""Of the effects that are computed together."""
 _ROUNDING = 1 + 1e-6
 
 
@@ -219,15 +222,20 @@ class EstimationError:
             largest = max(largest, _sizes(self._weight, old))
         factor, rate = _contraction(steps[-1])
         seen = float(np.linalg.norm(self._weight @ np.linalg.inv(factor), 2))
-        last, total = sources[-1], 0.0
-        for _ in range(_MOST_STEPS):
-            old = steps[-1] @ old
-            total += _sizes(self._weight, last)
-            largest = max(largest, _sizes(self._weight, old) + total)
-            last = steps[-1] @ last
-            rest = seen * (_sizes(factor, last) / (1 - rate) + _sizes(factor, old))
-            if rest <= _TAIL_SHARE * largest:
+        last, total, W = sources[-1], 0.0, self._weight
+        powers = _powers(steps[-1], min(_ENTRIES // max(old.size, last.size) + 1, 256))
+        for _ in range(_MOST_STEPS // (len(powers) - 1)):
+            # The same for every number of further measurements, (powers,).
+            olds, lasts = powers[1:, None] @ old, powers[:, None] @ last
+            totals = total + np.cumsum(_sizes(W, lasts[:-1]))
+            largests = np.maximum.accumulate(np.maximum(_sizes(W, olds) + totals, largest))
+            rests = seen * (_sizes(factor, lasts[1:]) / (1 - rate) + _sizes(factor, olds))
+            enough = np.flatnonzero(rests <= _TAIL_SHARE * largests)
+            number = enough[0] if len(enough) else -1
+            largest, rest, total = largests[number], rests[number], totals[-1]
+            if len(enough):
                 break
+            old, last = olds[-1], lasts[-1]
         return float((largest + rest) * _ROUNDING)
 
     def _excess(self, sources: Sequence[Stack], alpha_per_s: float) -> float:
@@ -237,20 +245,29 @@ class EstimationError:
         total, W = self._peak(sources[-2:], 0.0), self._weight
         growth, scale, steps = self._growth(alpha_per_s), 1.0, self._steps(0.0)
         old, settled = sources[0], sources[-1]
-        largest = _sizes(W, old) - total
+        largest = float(_sizes(W, old)) - total
         for step, new in zip(steps[1:-1], sources[1:-1], strict=True):
             old, scale = np.concatenate([step @ old, new]), scale * growth
             settled = np.concatenate([steps[-1] @ settled, sources[-1]])
-            largest = max(largest, scale * (_sizes(W, old) - total))
+            largest = max(largest, scale * (float(_sizes(W, old)) - total))
         # From then on the effects of these sources, and those with settled gains, follow F.
         factor, _ = _contraction(growth * steps[-1])
         seen = float(np.linalg.norm(W @ np.linalg.inv(factor), 2))
-        return max(largest, scale * seen * _sizes(factor, old - settled), 0.0) * _ROUNDING
+        return max(largest, scale * seen * float(_sizes(factor, old - settled)), 0.0) * _ROUNDING
 
 
-def _sizes(C: Matrix, stack: Stack) -> float:
-    """Return Σ‖C S‖ over a stack."""
-    return float(np.linalg.norm(C @ stack, 2, axis=(1, 2)).sum()) if len(stack) else 0.0
+def _sizes(C: Matrix, stacks: Stack) -> Stack:
+    """Return Σ‖C S‖ over stacks of S, (..., k, n, r) → (...)."""
+    flat = (C @ stacks).reshape(-1, len(C), stacks.shape[-1])
+    return np.asarray(spectral_norms(flat).reshape(stacks.shape[:-2]).sum(axis=-1))
+
+
+def _powers(step: Matrix, count: int) -> Stack:
+    """Return the powers 0 … count of a matrix, (count + 1, n, n)."""
+    found = [np.eye(len(step))]
+    for _ in range(count):
+        found.append(step @ found[-1])
+    return np.array(found)
 
 
 def _contraction(step: Matrix) -> tuple[Matrix, float]:

@@ -18,6 +18,7 @@ from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.theory.enclosure import NotDecayingError, response, response_until
 
 _SHARE, _NEAREST = 1e-2, 0.98
+_GOLDEN = (math.sqrt(5) - 1) / 2
 _CELLS = 256
 
 
@@ -56,23 +57,26 @@ def theorem_2(loop: LoopMatrices, beta: float, alpha_per_s: float, delta: float)
     fastest = -spectral_abscissa(closed)
     if not 0 < alpha_per_s < fastest:
         return None
-    from scipy.optimize import minimize_scalar
 
     def at(share: float) -> Theorem2:
         rate = alpha_per_s + share * (fastest - alpha_per_s)
         return _theorem_2(loop, beta, alpha_per_s, delta, rate)
 
-    # At one end of the range c tends to infinity, at the other end 1/(ᾱ − α) does.
+    # At one end of the range c tends to infinity, at the other end 1/(ᾱ − α) does. The larger of
+    # two values between leaves a smaller range, whose golden section is the other one.
+    low, high = 0.0, _NEAREST
     try:
-        best = minimize_scalar(
-            lambda share: -at(share).inter_event_s,
-            bounds=(0.0, _NEAREST),
-            method="bounded",
-            options={"xatol": _SHARE},
-        )
-        found = at(float(best.x))
+        left, right = at(high - _GOLDEN * (high - low)), at(low + _GOLDEN * (high - low))
+        while high - low > _SHARE:
+            if left.inter_event_s > right.inter_event_s:
+                high = low + _GOLDEN * (high - low)
+                left, right = at(high - _GOLDEN * (high - low)), left
+            else:
+                low = high - _GOLDEN * (high - low)
+                left, right = right, at(low + _GOLDEN * (high - low))
     except NotDecayingError:  # the decay is too slow to compute c in floating point
         return None
+    found = max(left, right, key=lambda one: one.inter_event_s)
     sizes = (found.c, found.state_start, found.state_forced)
     return None if math.isnan(found.inter_event_s) or not all(map(math.isfinite, sizes)) else found
 

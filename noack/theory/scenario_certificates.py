@@ -2,7 +2,7 @@
 
 import contextlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -25,7 +25,7 @@ from noack.theory.disturbed_certificate import DisturbedCertificate, PlantAt
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.gains import ErrorGains, PlantGains, error_gains
 from noack.theory.run_conditions import kept_probability
-from noack.theory.superposition import SHARES, soonest
+from noack.theory.superposition import soonest
 from noack.theory.trigger_bounds import TriggerBounds
 
 OWN_PLANT = "the scenario's plant"
@@ -33,11 +33,7 @@ BOX = "every plant of the uncertainty box"
 _SLOWER = 0.9
 _SHARES_OF_ALPHA = (0.8, 0.6, 0.4, 0.2)
 
-_RESOLUTION = 1e-3
 _TOO_LARGE = "intermediate results are too large or too small for floating point"
-
-Change = Callable[[NetworkConditions, float], NetworkConditions]
-"""Sets a time of the conditions."""
 
 
 @dataclass(frozen=True)
@@ -252,28 +248,14 @@ class CertificateScope:
         self._plant_at = plant_at
         self._plants: dict[float, PlantGains] = {}
 
-    def certificate(
-        self, conditions: NetworkConditions, shares: Sequence[float] = SHARES
-    ) -> ScenarioCertificate:
-        """Return the certificate under some conditions; a void certificate has the reason.
-
-        ``shares`` are those of :func:`solve_divided`; with fewer δ may be shorter.
-        """
-        trigger = self._trigger
-        first: Constants | None = None
-        late: Constants | None = None
-        rest: Constants | None = None
-        void = None
+    def certificate(self, conditions: NetworkConditions) -> ScenarioCertificate:
+        """Return the certificate under some conditions; a void certificate has the reason."""
+        trigger, void = self._trigger, None
+        first, late, rest = None, None, None
         try:
-            with np.errstate(all="ignore"):
-                if self._resolved.coverage.is_undisturbed and not self._trigger.is_constant:
-                    first, late = self._phases(conditions)
-                else:
-                    first, rest = self._disturbed_phases(conditions, shares)
+            first, late, rest = self._constants(conditions)
         except (NotDecayingError, VoidError) as error:
             void = str(error)
-        except (OverflowError, np.linalg.LinAlgError):
-            void = _TOO_LARGE
         found = ScenarioCertificate(
             self.name, trigger.beta, trigger.alpha_per_s, trigger.floor,
             self._loop.weight is not None, conditions, (), first, late, void, rest,
@@ -288,40 +270,56 @@ class CertificateScope:
         )  # fmt: skip
         return replace(found, assumptions=tuple(assumptions))
 
-    def largest(self, conditions: NetworkConditions, change: Change, most_s: float = 10.0) -> float:
-        """Return the largest time for which the changed conditions still have a certificate.
+    def loop_gain(self, conditions: NetworkConditions) -> float:
+        """Return the loop gain of a certificate; at least 1, perhaps infinite, if there is none."""
+        # Whether inputs of an earlier run are covered depends on the constants.
+        try:
+            constants = self._constants(conditions, longest=self._start_error > 0)
+        except VoidError as error:
+            return max(error.loop_gain, 1.0)
+        except NotDecayingError:
+            return math.inf
+        return max(one.loop_gain for one in constants if one is not None)
 
-        It is ``most_s`` if all times have one, and 0 if none has.
+    def _constants(
+        self, conditions: NetworkConditions, *, longest: bool = True
+    ) -> tuple[Constants, Constants | None, Constants | None]:
+        """Return the constants, those from the floor on, and those under persistent causes.
+
+        ``longest``: search for the tightest bounds and the longest δ; otherwise any suffice.
+
+        Raises:
+            VoidError: there is no certificate.
+            NotDecayingError: a mode of the loop decays too slowly.
         """
+        try:
+            with np.errstate(all="ignore"):
+                if self._resolved.coverage.is_undisturbed and not self._trigger.is_constant:
+                    return *self._phases(conditions, longest=longest), None
+                first, rest = self._disturbed_phases(conditions, longest=longest)
+                return first, None, rest
+        except (OverflowError, np.linalg.LinAlgError):
+            raise VoidError(_TOO_LARGE) from None
 
-        def stands(value_s: float) -> bool:
-            certificate = self.certificate(change(conditions, value_s), ())
-            return certificate.constants is not None
-
-        if stands(most_s):
-            return most_s
-        low, high = 0.0, most_s
-        while high > 1e-6 and high - low > _RESOLUTION * high:
-            middle = math.sqrt(low * high) if low > 0 else high / 4
-            low, high = (middle, high) if stands(middle) else (low, middle)
-        return low
-
-    def _phases(self, conditions: NetworkConditions) -> tuple[Constants, Constants | None]:
+    def _phases(
+        self, conditions: NetworkConditions, *, longest: bool
+    ) -> tuple[Constants, Constants | None]:
         """Return the constants, and those after the threshold has reached its floor, if any."""
         trigger, late = self._trigger, None
         conditions = trigger.tested(conditions)
-        first = self._first_phase(conditions)
+        first = self._first_phase(conditions, longest=longest)
         if 0 < trigger.floor < trigger.beta and first.rate_per_s == trigger.alpha_per_s:
             late = _at_floor(first, trigger.floor / trigger.beta)
         return self._checked(first, late)
 
     def _disturbed_phases(
-        self, conditions: NetworkConditions, shares: Sequence[float]
+        self, conditions: NetworkConditions, *, longest: bool
     ) -> tuple[Constants, Constants | None]:
         """Return the constants, and those that are added to them under persistent causes."""
         alpha = self._trigger.alpha_per_s
         decays = not self._held and below(alpha, min(self._decay.values()))
-        return self._checked(*self._disturbed.constants(conditions, decays=decays, shares=shares))
+        found = self._disturbed.constants(conditions, decays=decays, longest=longest)
+        return self._checked(*found)
 
     @cached_property
     def _disturbed(self) -> DisturbedCertificate:
@@ -348,14 +346,17 @@ class CertificateScope:
                 raise VoidError(_TOO_LARGE)
         return first, other
 
-    def _first_phase(self, conditions: NetworkConditions) -> Constants:
+    def _first_phase(self, conditions: NetworkConditions, *, longest: bool) -> Constants:
         trigger, decay = self._trigger, min(self._decay.values())
         beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
         if trigger.is_homogeneous:
+            if not longest:
+                with contextlib.suppress(VoidError):
+                    return self._solve(conditions, 0.0, 0.0, None, longest=False)
             return self._fastest(conditions, decay)
         if not self._held and below(alpha, decay) and floor < beta:
             try:
-                return self._solve(conditions, alpha, beta, beta)
+                return self._solve(conditions, alpha, beta, beta, longest=longest)
             except NotDecayingError:
                 if floor > 0:
                     raise
@@ -363,7 +364,7 @@ class CertificateScope:
         # Certify a slower decay or none; the smallest event level is then the floor, if any.
         slower = 0.0 if self._held or floor > 0 else max(_SLOWER * decay, 0.0)
         level = max(beta, floor)
-        return self._solve(conditions, slower, level, floor or None)
+        return self._solve(conditions, slower, level, floor or None, longest=longest)
 
     def _fastest(self, conditions: NetworkConditions, decay: float) -> Constants:
         """Return bounds for a threshold that is a share of the state: any rate may be certified.
@@ -398,6 +399,8 @@ class CertificateScope:
         alpha_per_s: float,
         level: float,
         reached: float | None,
+        *,
+        longest: bool = True,
     ) -> Constants:
         if alpha_per_s not in self._plants:
             error = error_gains(self._loop, alpha_per_s)
@@ -409,7 +412,10 @@ class CertificateScope:
         # Inputs of an earlier run are covered by their norm only.
         earlier = self._start_error
         bound = self._trigger.bound(conditions, level, reached)
-        return solve(plant.error, plant, conditions, bound, earlier, structured=earlier == 0.0)
+        return solve(
+            plant.error, plant, conditions, bound, earlier,
+            structured=earlier == 0.0, longest=longest,
+        )  # fmt: skip
 
 
 def _at_floor(first: Constants, share: float) -> Constants:

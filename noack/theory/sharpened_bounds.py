@@ -135,6 +135,8 @@ class InvariantEllipsoids:
         Q = math.exp(all_x) / n * np.eye(n)
         for weight, column in ((1.0, flow.BK), (math.exp(x0), flow.start)):
             Q += weight * column @ column.T / max(float((column**2).sum()), 1e-300)
+        if not np.isfinite(Q).all():
+            raise np.linalg.LinAlgError("the squares of the entries overflow")
         X = solve_continuous_lyapunov(flow.closed_loop + rate * np.eye(n), -Q)
         return np.asarray(np.linalg.inv(np.linalg.cholesky(0.5 * (X + X.T))))
 

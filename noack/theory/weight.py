@@ -18,7 +18,7 @@ import numpy as np
 from noack.config.resolution import LoopMatrices
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.theory.certificate import NetworkConditions, VoidError, solve
-from noack.theory.contraction import Stack, product
+from noack.theory.contraction import Stack, product, spectral_norms
 from noack.theory.enclosure import KernelBounds, NotDecayingError, response
 from noack.theory.error_growth import TriggerBound
 from noack.theory.gains import Coefficients, ErrorGains, Output, PlantGains
@@ -172,17 +172,11 @@ def _thinned(generator: Matrix, D: Matrix) -> tuple[Vector, Stack]:
 
 def _sampled(nodes_s: Vector, values: Stack) -> KernelBounds:
     """Return the norms of a kernel from its values at nodes; beyond the last node it is 0."""
-    norms = np.sqrt(np.linalg.eigvalsh(_gram(values))[:, -1].clip(min=0.0))
+    norms = spectral_norms(values)
     ends = np.maximum(norms[:-1], norms[1:])
     return KernelBounds(
         nodes_s, ends, np.diff(nodes_s) * (norms[:-1] + norms[1:]) / 2, 0.0, 0.0, 0.0
     )
-
-
-def _gram(values: Stack) -> Stack:
-    """Return Y Yᵀ or Yᵀ Y, the smaller one."""
-    turned = values.transpose(0, 2, 1)
-    return values @ turned if values.shape[1] <= values.shape[2] else turned @ values
 
 
 def _weight(H: Matrix, alpha_per_s: float, L: Matrix) -> Matrix | None:

@@ -38,7 +38,8 @@ def certify(
     Exit status 1: nothing can be certified.
     """
     from cosim.live.progress import work_bar
-    from cosim.output.certificate_report import certificates_of, print_certificates
+    from cosim.output.all_certificates import certificates_of
+    from cosim.output.certificate_report import print_certificates
 
     loaded = cli.load_scenario(scenario, settings)
     with work_bar("choosing the weight") as progress:

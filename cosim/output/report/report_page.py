@@ -139,6 +139,16 @@ def _parameters(scenario: Scenario) -> Iterator[tuple[str, str]]:
         reverse = network.reverse.loss.model_dump()
         lost = ", ".join(f"{_words(key)} {_shown(value)}" for key, value in reverse.items())
         yield "acknowledgements", f"loss: {lost}; timeout {timeout_ms:g} ms"
+    if (actuation := network.actuation) is not None:
+        lost = ", ".join(
+            f"{_words(key)} {_shown(value)}" for key, value in actuation.loss.model_dump().items()
+        )
+        most = actuation.link.longest_burst
+        yield (
+            "actuations",
+            f"loss: {lost}; "
+            + ("no guarantee" if most is None else f"at most {most} consecutive losses"),
+        )
     yield "initial synchronisation", network.initial_sync.replace("_", " ")
     yield "plant", f"{scenario.plant.rate_hz:g} steps/s"
     yield "measurements", "every step" if every == 1 else f"every {every} steps"

@@ -49,7 +49,7 @@ def open_view(
         picture=picture_of(scenario),
         diagram=None
         if at_once and is_long(scenario)
-        else NetworkDiagram(acknowledged=scenario.protocol.acknowledges),
+        else NetworkDiagram(*scenario.network.flows[1:]),
         live=live,
         indexed=at_once or scenario.horizon_s <= _INDEXED_S * scenario.speed,
     )

@@ -7,8 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.protocol.record_tables import PACKET_HEAD_BYTES
+from noack.runtime.native.socket_structs import HEADER as HEADER
+from noack.runtime.native.socket_structs import NAME_BYTES as NAME_BYTES
+from noack.runtime.native.socket_structs import VECTOR as VECTOR
 
-NAME_BYTES = 32  # room for a socket address; those of IPv6 have 28 bytes
 BLOCK_BYTES = 512  # payloads of delayed datagrams are kept in chained blocks of this size
 CHUNK_BLOCKS = 4096  # number of blocks per allocation
 MOST_BYTES = 65_536  # no received datagram is longer
@@ -189,16 +191,6 @@ SLOT = np.dtype(
 """A stored datagram."""
 ENTRY = np.dtype([("release_ns", "<i8"), ("number", "<i8"), ("slot", "<i8")])
 """An entry of the heap of delayed datagrams."""
-HEADER = np.dtype(
-    [
-        ("name", "<i8"), ("name_bytes", "<u4"), ("pad0", "<u4"), ("vectors", "<i8"),
-        ("n_vectors", "<i8"), ("control", "<i8"), ("control_bytes", "<i8"), ("flags", "<i4"),
-        ("pad1", "<u4"), ("size_bytes", "<i4"), ("pad2", "<u4"),
-    ]
-)  # fmt: skip
-"""struct mmsghdr of 64-bit Linux."""
-VECTOR = np.dtype([("base", "<i8"), ("size_bytes", "<i8")])
-"""struct iovec."""
 CONTROL_BYTES = 64  # Buffer size for the control messages of a received datagram
 ERROR_CONTROL_BYTES = 128
 """Buffer size for the control messages of an error: timestamp, error, address of the reporter."""

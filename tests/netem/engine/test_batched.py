@@ -18,8 +18,9 @@ from netem.engine.compiled_rules import compile_rule
 from netem.engine.pump.client_table import find, insert, key_of, remove
 from netem.engine.pump.payload_store import drop, keep, pop, push
 from netem.engine.pump_memory import PumpMemory
-from netem.engine.relay_sockets import packed_name, socket_name, unpacked_address
+from netem.engine.relay_sockets import socket_name, unpacked_address
 from netem.words.words_to_settings import settings_of
+from noack.runtime.native.socket_structs import packed_name
 from tests.netem.engine.relays import HOSTS, drain, endpoints, link, name_of, running
 
 ROWS = 24

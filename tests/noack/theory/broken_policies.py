@@ -53,8 +53,13 @@ class AThirdOfTheTime(TriggerBounds):
 
     def bound(self, conditions: Conditions, level: float, reached: float | None) -> TriggerBound:
         found, h_s = super().bound(conditions, level, reached), conditions.sampling_s
-        assert not found.is_tested
-        return found._replace(untested_s=(found.untested_s + h_s) / 3 - h_s)
+        assert not all(one.is_tested for one in found.every)
+
+        def wrong(one: TriggerBound) -> TriggerBound:
+            third_s = (one.untested_s + h_s) / 3
+            return one if one.is_tested else one._replace(untested_s=third_s - h_s)
+
+        return wrong(found)._replace(also=tuple(map(wrong, found.also)))
 
 
 def with_trigger(kind: type[TriggerBounds]) -> Callable[[Scenario, Conditions], Any]:
@@ -92,6 +97,12 @@ BROKEN_POLICIES: dict[str, tuple[str, Callable[[Scenario, Conditions], Any], dic
     ),
     "periodic, a third of the period": (
         "periodic", with_trigger(AThirdOfTheTime), {**FAR, "mansd": 0},
+    ),
+    "deadline, a third of the deadline": (
+        "deadline", with_trigger(AThirdOfTheTime), {**FAR, "mansd": 0, "beta": 1.0},
+    ),
+    "self_triggered, a third of the longest time": (
+        "self_triggered", with_trigger(AThirdOfTheTime), {**FAR, "mansd": 0},
     ),
     "deadline of lyapunov, a third of the deadline": (
         "lyapunov", with_trigger(AThirdOfTheTime), {**FAR, "mansd": 0},

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -117,13 +118,16 @@ def signals(loop: DisturbedLoop, rng: np.random.Generator) -> tuple[Reals, Reals
     flips = rng.uniform(size=s.shape) < rng.choice([0.0, 0.02, 0.1], size=(RUNS, 1, 1))
     switching = np.cumprod(np.where(flips, -1, 1), axis=1)
     s[::4] = switching[::4]
-    generators = [system.A + system.B @ system.K, system.A, system.H]
-    for run in range(1, RUNS, 2):  # the largest response of a random output at a random time
-        step = expm(generators[rng.integers(3)].T * system.step_s)
-        costate, until = rng.normal(size=n), int(rng.integers(STEPS // 2, STEPS))
-        for at in range(until - 1, -1, -1):
-            s[run, at] = np.where(costate @ loop.columns >= 0, 1.0, -1.0)
-            costate = step @ costate
+    # The largest response of a random output at a random time.
+    generators = np.array([system.A + system.B @ system.K, system.A, system.H])
+    powers = np.tile(np.eye(n), (STEPS, 3, 1, 1))
+    for age, step in enumerate(repeat(expm(generators * system.step_s), STEPS - 1)):
+        powers[age + 1] = powers[age] @ step
+    outputs, which = rng.normal(size=(RUNS // 2, n)), rng.integers(3, size=RUNS // 2)
+    ages = rng.integers(STEPS // 2, STEPS, RUNS // 2)[:, None] - 1 - np.arange(STEPS)
+    pushed = (powers @ loop.columns)[ages.clip(0), which[:, None]]
+    worst = np.where(np.einsum("rn,rtnk->rtk", outputs, pushed) >= 0, 1.0, -1.0)
+    s[1::2] = np.where(ages[:, :, None] >= 0, worst, s[1::2])
     for i, lasting in enumerate(loop.duration_steps):
         begins = rng.integers(0, STEPS, RUNS)[:, None]
         late = np.arange(STEPS) >= (begins if lasting < STEPS else 0)

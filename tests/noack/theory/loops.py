@@ -1,6 +1,7 @@
 """Random lossy loops, simulated exactly and many at a time; independent of the project's code.
 
-Every signal is propagated by matrix exponentials on a grid finer than every period of the loop.
+Every signal is propagated by matrix exponentials on a grid finer than every period of the loop
+(:mod:`tests.noack.theory.compiled_loops`).
 """
 
 from collections.abc import Callable, Sequence
@@ -24,6 +25,15 @@ from noack.impairments.loss_guarantee import (
 from noack.theory.certificate import Constants, NetworkConditions, VoidError, solve
 from noack.theory.error_growth import TriggerBound
 from noack.theory.gains import ErrorGains, PlantGains
+from tests.noack.theory.compiled_loops import (
+    Given,
+    Propagators,
+    Schedule,
+    Seen,
+    State,
+    allow,
+    follow,
+)
 
 Reals = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -224,104 +234,78 @@ def simulate(
         estimate: what the sensor knows of x; errors are the larger of those to it and to x.
         rule: replaces the decaying threshold.
     """
-    runs, n, K, W = len(delivered), len(system.A), system.K.T, system.weight.T
+    runs, (n, m) = len(delivered), system.B.shape
     pool = [(system.A, system.B)] if plants is None else plants.pool
-    model = [_Propagators(system, A, B) for A, B in pool]
-    x = np.tile(system.x0, (runs, 1))
-    x_s, x_c = x.copy(), x.copy() if system.known_start else np.zeros_like(x)
-    # An update in flight is stored as its value on arrival; 0 in ``arrives`` means no update.
-    arriving, arrives = (
-        np.zeros((runs, system.delay_steps + 1, n)),
-        np.zeros((runs, system.delay_steps + 1), int),
-    )
-    newest, events, last_event = np.zeros(runs, int), np.zeros(runs, int), np.zeros(runs, int)
-    synchronised = np.full(runs, system.known_start)
-    commands: list[tuple[Reals, Flags]] = []
-    trace, shortest, every = np.zeros((5, runs, STEPS)), 10**9, np.arange(runs)
-    states, flags = np.zeros((2, runs, STEPS, n)), np.zeros((2, runs, STEPS), int)
-    inputs: list[Reals] = []
-    for step in range(STEPS):
-        threshold = max(system.beta * np.exp(-system.alpha * step * system.step_s), floor)
-        trace[0, :, step], known = norms((x_s - x) @ W), x
-        if step % system.sample_steps == 0:
-            known, inputs = estimate(step, x, inputs), []
-            tested = norms((x_s - known) @ W)
-            trace[0, :, step] = np.maximum(trace[0, :, step], tested)
-            event = tested > threshold
-            if rule is not None:
-                event = rule(step, step - last_event, x, x_s - x)
-            event |= step == 0 and not system.known_start
-            shortest = min(
-                shortest, int((step - last_event)[event & (events > 0)].min(initial=10**9))
-            )
-            x_s = np.where(event[:, None], known, x_s)
-            last_event = np.where(event, step, last_event)
-            flags[0, :, step] = event
-            sent = np.flatnonzero(event & delivered[every, events])
-            in_flight = delays[sent, events[sent]]
-            slot = (step + in_flight) % (system.delay_steps + 1)
-            arriving[sent, slot] = np.einsum("ri,rij->rj", known[sent], model[0].late[in_flight])
-            arrives[sent, slot] = events[sent] + 1
-            events = events + event
-        slot_now = step % (system.delay_steps + 1)
-        fresh = arrives[:, slot_now] > newest
-        x_c = np.where(fresh[:, None], arriving[:, slot_now], x_c)
-        newest = np.where(fresh, arrives[:, slot_now], newest)
-        arrives[:, slot_now] = 0
-        synchronised = synchronised | fresh
-        states[:, :, step], flags[1, :, step] = (x, known), newest
-        if system.hold_steps == 0 or step % system.hold_steps == 0:
-            commands.append((x_c @ K, synchronised))
-        else:
-            commands.append(commands[-1])
-        nothing = (np.zeros((runs, K.shape[1])), np.zeros(runs, bool))
-        u, has_input = commands[step - system.lag] if step >= system.lag else nothing
-        u = np.where(has_input[:, None], u, 0.0)
-        inputs.append(u)
-        for i, value in enumerate(
-            (
-                np.maximum(norms((x_c - x) @ W), norms((x_c - known) @ W)) * synchronised,
-                norms(x),
-                norms(x @ W),
-                norms(u - x @ K) * has_input,
-            )
-        ):
-            trace[i + 1, :, step] = value
-        push = np.zeros_like(x) if pushes is None else pushes[:, step]
-        following = [
-            own.advance(x, x_c, u, has_input, held=system.hold_steps > 0) + push @ own.pushed
-            for own in model
-        ]
-        x = following[0] if plants is None else np.array(following)[plants.which[:, step], every]
-        x_s, x_c = x_s @ model[0].model, x_c @ model[0].model
-    return Trace(*trace, shortest * system.step_s, *states, flags[0] > 0, flags[1])
+    given = Given(
+        np.maximum(system.beta * np.exp(-system.alpha * times_s(system)), floor),
+        delivered, delays,
+        np.zeros((0, 0), dtype=np.int64) if plants is None else plants.which.T.copy(),
+        np.zeros((0, 0, 0)) if pushes is None else pushes.transpose(1, 2, 0).copy(),
+    )  # fmt: skip
+    state, own = _start(system, runs), _propagators(system, pool)
+    schedule = Schedule(
+        system.known_start, system.sample_steps, system.hold_steps, system.lag
+    )  # fmt: skip
+    seen = Seen(
+        np.zeros((5, STEPS, runs)), np.zeros((STEPS, m, runs)), np.full(runs, 10**9),
+        np.zeros((2, STEPS, n, runs)), np.zeros((STEPS, runs), dtype=bool),
+        np.zeros((STEPS, runs), dtype=np.int64),
+    )  # fmt: skip
+    # What is called here is called at every test; otherwise all steps are compiled.
+    every = system.sample_steps if rule or estimate is not exact_state else STEPS
+    for step in range(0, STEPS, every):
+        known, event, x = np.zeros((n, 0)), np.zeros(0, dtype=bool), state.x.T
+        if estimate is not exact_state:
+            inputs = seen.inputs[max(step - every, 0) : step].transpose(0, 2, 1)
+            known = estimate(step, x, list(inputs)).T.copy()
+        if rule is not None:
+            event = rule(step, step - state.last_event, x, state.x_s.T - x)
+        last = min(step + every, STEPS)
+        follow(step, last, schedule, own, given, state, seen, known, event)
+    shortest_s = int(seen.shortest.min()) * system.step_s
+    return Trace(
+        *seen.trace.transpose(0, 2, 1), shortest_s, *seen.states.transpose(0, 3, 1, 2),
+        seen.is_event.T, seen.received.T,
+    )  # fmt: skip
 
 
 def norms(rows: Reals) -> Reals:
     return np.sqrt(np.einsum("ij,ij->i", rows, rows))
 
 
-class _Propagators:
-    """Propagators over one step, transposed, for states as rows."""
+def _start(system: System, runs: int) -> State:
+    n, m = system.B.shape
+    x, none = np.tile(system.x0[:, None], runs), np.zeros(runs, dtype=np.int64)
+    slots = system.delay_steps + 1
+    return State(
+        x, x.copy(), x.copy() if system.known_start else np.zeros_like(x),
+        np.zeros((slots, n, runs)), np.zeros((slots, runs), dtype=np.int64),
+        none, none.copy(), none.copy(), np.full(runs, system.known_start),
+        np.zeros((STEPS, m, runs)), np.zeros((STEPS, runs), dtype=bool),
+    )  # fmt: skip
 
-    def __init__(self, system: System, A: Matrix, B: Matrix) -> None:
-        (n, m), step_s = B.shape, system.step_s
-        flow, held = np.zeros((2 * n, 2 * n)), np.zeros((n + m, n + m))
-        flow[:n, :n], flow[:n, n:], flow[n:, n:] = A, B @ system.K, system.H
-        held[:n, :n], held[:n, n:] = A, B
-        self.both = expm(flow * step_s).T[:, :n]
-        self.held = expm(held * step_s).T[:, :n]
-        self.free, self.model = expm(A * step_s).T, expm(system.H * step_s).T
-        both = np.block([[A, np.eye(n)], [np.zeros((n, 2 * n))]])
-        self.pushed = expm(both * step_s)[:n, n:].T
-        self.late = np.array([expm(system.H * step_s * k).T for k in range(system.delay_steps + 1)])
 
-    def advance(self, x: Reals, x_c: Reals, u: Reals, has_input: Flags, *, held: bool) -> Reals:
-        """x of all runs one step later; u = K x_c changes with x_c unless it is held."""
-        if held:
-            return np.concatenate([x, u], axis=1) @ self.held
-        together = np.concatenate([x, x_c], axis=1) @ self.both
-        return np.where(has_input[:, None], together, x @ self.free)
+def _propagators(system: System, pool: list[tuple[Matrix, Matrix]]) -> Propagators:
+    """Propagators over one step, for the system or for the plants between which it switches."""
+    (n, m), step_s = system.B.shape, system.step_s
+    both, held = np.zeros((len(pool), 2 * n, 2 * n)), np.zeros((len(pool), n + m, n + m))
+    pushed = np.zeros((len(pool), 2 * n, 2 * n))
+    for i, (A, B) in enumerate(pool):
+        both[i, :n, :n], both[i, :n, n:], both[i, n:, n:] = A, B @ system.K, system.H
+        held[i, :n, :n], held[i, :n, n:] = A, B
+        pushed[i, :n, :n], pushed[i, :n, n:] = A, np.eye(n)
+
+    def propagated(generators: Matrix, columns: slice) -> Matrix:
+        return np.ascontiguousarray(expm(generators * step_s)[:, :n, columns].transpose(0, 2, 1))
+
+    everything = slice(None)
+    late = np.array([k * system.H for k in range(system.delay_steps + 1)])
+    return Propagators(
+        np.ascontiguousarray(system.K.T), np.ascontiguousarray(system.weight.T),
+        propagated(both, everything), propagated(held, everything),
+        propagated(both[:, :n, :n], everything), propagated(pushed, slice(n, None)),
+        np.ascontiguousarray(expm(system.H * step_s).T), propagated(late, everything),
+    )  # fmt: skip
 
 
 def networks(seed: int, system: System) -> tuple[Flags, NDArray[np.int64]]:
@@ -337,17 +321,11 @@ def networks(seed: int, system: System) -> tuple[Flags, NDArray[np.int64]]:
 
 def allowed(lost: Flags, system: System) -> Flags:
     """The losses (runs, events) without those that the guarantee does not allow."""
-    lost, (runs, events) = lost.copy(), lost.shape
+    lost = lost.copy()
     if not system.known_start:
         lost[:, 0] = False
-    run, since = np.zeros(runs, dtype=np.int64), np.full(runs, system.recovery)
     most, width = system.window if system.window[0] < system.window[1] else (1, 1)
-    for event in range(events):
-        recent = lost[:, max(event - width + 1, 0) : event].sum(axis=1)
-        lost[:, event] &= (run < system.mansd) & (recent < most)
-        lost[:, event] &= (run > 0) | (since >= system.recovery)
-        run = np.where(lost[:, event], run + 1, 0)
-        since = np.where(lost[:, event], 0, since + 1)
+    allow(lost, system.mansd, most, width, system.recovery)
     return lost
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix, spectral_abscissa
-from noack.theory.contraction import decay_of
+from noack.theory.contraction import decay_of, spectral_norms
 from noack.theory.enclosure import (
     KernelBounds,
     NotDecayingError,
@@ -316,3 +316,20 @@ def test_many_states_take_little_memory_and_are_enclosed() -> None:
     for t_s in (0.0, 0.3 * end_s, end_s, 3 * end_s, 100.0):
         assert np.linalg.norm(expm(generator * t_s), 2) <= kernel.sup(t_s) * (1 + 1e-12)
     assert math.isfinite(kernel.integral())
+
+
+@pytest.mark.parametrize("rows", range(1, 6))
+@pytest.mark.parametrize("columns", range(1, 6))
+@pytest.mark.parametrize("scale", [1e-100, 1.0, 1e100, 1e200])
+def test_spectral_norms_are_the_largest_singular_values(
+    rows: int, columns: int, scale: float
+) -> None:
+    """Also of matrices of a low rank, of equal singular values, and where squares overflow."""
+    rng = np.random.default_rng(rows * columns)
+    stack = rng.normal(size=(300, rows, columns)) * 10 ** rng.uniform(-8, 8, (300, rows, 1))
+    stack[:100] = stack[:100, :, :1] * rng.normal(size=(100, 1, columns))
+    stack[0], stack[1] = 0.0, np.eye(rows, columns)
+    stack[2:9] = np.eye(rows, columns) + 1e-9 * rng.normal(size=(7, rows, columns))
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = spectral_norms(scale * stack)
+    assert found == pytest.approx(np.linalg.norm(scale * stack, 2, axis=(1, 2)), rel=1e-14)

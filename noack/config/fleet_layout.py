@@ -1,0 +1,125 @@
+"""The memory of the machines of one role of many loops: arrays that compiled code works on.
+
+A role has two functions, which run as they stand or compiled: ``handle`` takes a message, and
+``on_timer`` does what is due. Both write one row of the record, without the loop's number in front,
+to ``row``, and a message to the next place of ``out``. They return a sum of :data:`SENDS` and
+:data:`NOTES`, or :data:`NEEDS_MATRIX`; then they have changed nothing and are called again.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from noack.config.scenario import Scenario
+from noack.core.model_arrays import Transitions
+from noack.protocol.machine_interface import Notice
+from noack.protocol.wire_format import HEADER_BYTES, MAX_DIMENSION, TAG_BYTES
+
+SENDS = 1
+"""A message was written."""
+NOTES = 2
+"""Python writes a line for the log; see the fields of FLEET."""
+NEEDS_MATRIX = -1
+"""A transition matrix is missing in the table."""
+HEADER_WORDS = HEADER_BYTES // 8
+STRIDE = (HEADER_BYTES + TAG_BYTES) // 8 + MAX_DIMENSION + 1
+"""Words of 8 bytes from one datagram's place to the next; one more than the longest has."""
+SCRATCH = 16 * MAX_DIMENSION
+NEVER_NS = 2**63 - 1
+
+LOOP = np.dtype(
+    [
+        (name, "<i8")
+        for name in (
+            "phase_ns",  # when the loop begins; all other times are its own
+            "due_ns",  # the next deadline; NEVER_NS: none
+            "newest",  # sequence number of the newest message accepted; -1: none
+            "accepted",  # messages
+            "inputs",  # number of the machine's next input
+        )
+    ]
+)
+FLEET = np.dtype(
+    [
+        (name, "<i8")
+        for name in (
+            "n", "m", "loops",
+            "out",  # messages that wait to be sent
+            "note_loop", "note_ns", "note_since_ns",
+        )
+    ]
+)  # fmt: skip
+
+
+class FleetMemory(NamedTuple):
+    """The part of the memory that is the same in each role."""
+
+    fleet: NDArray[Any]
+    """(1,) :data:`FLEET`."""
+    loops: NDArray[Any]
+    """(L,) :data:`LOOP`."""
+    out: NDArray[np.int64]
+    """(k STRIDE,) Datagrams to be sent, as words."""
+    out_reals: NDArray[np.float64]
+    """The same memory."""
+    arrived: NDArray[np.int64]
+    """(k STRIDE,) Datagrams received."""
+    arrived_reals: NDArray[np.float64]
+    row: NDArray[np.int64]
+    """(words of the longest row,)"""
+    row_reals: NDArray[np.float64]
+    scratch: NDArray[np.float64]
+
+
+def begin_row(memory: FleetMemory, loop: int, sequence: int, t_ns: int, now_ns: int) -> None:
+    """Write the columns that all tables have."""
+    one = memory.loops[loop]
+    memory.row[0] = one.inputs
+    memory.row[1] = sequence
+    memory.row[2] = t_ns
+    memory.row[3] = now_ns
+    one.inputs += 1
+
+
+def begin_message(memory: FleetMemory, sequence: int, t_ns: int) -> int:
+    """Write number and time of the next message; return where its vector begins."""
+    begin = memory.fleet[0].out * STRIDE
+    memory.out[begin + 2] = sequence
+    memory.out[begin + 3] = t_ns
+    return int(begin + HEADER_WORDS)
+
+
+def copy_reals(source: Any, begin: int, result: Any, into: int, count: int) -> None:
+    """Copy ``count`` numbers."""
+    for k in range(count):
+        result[into + k] = source[begin + k]
+
+
+class FleetParts(NamedTuple):
+    """The machines of L loops in arrays."""
+
+    arrays: Any
+    """The arrays of the role, a NamedTuple."""
+    due_ns: NDArray[np.int64]
+    """(L,) The first deadline of each loop, in its time."""
+    transitions: Transitions | None = None
+    """Of a role with models, the field ``models`` of its arrays."""
+    notice: Callable[[Any, Any], Notice] | None = None
+    """Returns the line for the log that a machine asked for, from its arrays and FLEET's row."""
+    inspect: Callable[[NDArray[np.void]], Sequence[tuple[int, Notice]]] | None = None
+    """Returns lines for the log about new rows of ``on_message``, each with its loop."""
+
+
+class FleetRole(NamedTuple):
+    """A role whose machines can be in arrays."""
+
+    module: str
+    """The module with its functions ``handle`` and ``on_timer``."""
+    on_message: str
+    """The table of the rows of ``handle``."""
+    on_timer: str | None
+    """The table of the rows of ``on_timer``."""
+    parts_of: Callable[[Sequence[Scenario]], FleetParts | None]
+    """Returns the machines of resolved scenarios; None if one cannot be compiled."""

@@ -1,0 +1,1 @@
+"""The machines of many loops in arrays, driven by compiled code."""

@@ -1,0 +1,84 @@
+"""The socket of a fleet of compiled code, which receives the peer's datagrams and sends itself."""
+
+import os
+import select
+import socket
+from collections.abc import Sequence
+
+from noack.core.clock import RunClock
+from noack.core.errors import PeerError
+from noack.protocol.machine_interface import Notice, Record
+from noack.protocol.wire_format import Flow, Message
+from noack.runtime.address import Address
+from noack.runtime.fleet.compiled_fleet import CompiledFleet
+from noack.runtime.udp_sockets import CountingSocket, enlarge_buffer
+
+_BUFFER_BYTES = 64 * 1024 * 1024
+"""At 50,000 datagrams a second this covers a stall of a second."""
+
+
+class FleetSocket(CountingSocket[Message]):
+    """The channel of a compiled fleet.
+
+    It reads the datagrams of other sources every 50 ms, and passes on those that the peer sent
+    before its socket was open.
+
+    Raises:
+        PeerError: the system refused a peer socket.
+    """
+
+    def __init__(
+        self,
+        endpoint: socket.socket,
+        fleet: CompiledFleet,
+        sends: Flow,
+        *,
+        clock: RunClock,
+        source: Address,
+        destination: Address,
+    ) -> None:
+        super().__init__(endpoint, destination, [source])
+        if not self._beside:
+            raise PeerError("the system refused to open a socket for the peer")
+        self._fleet, self._sends, self._source = fleet, sends, source
+        self._outputs: list[Record | Notice] = []
+        self._passed_on = 0
+        enlarge_buffer(self._beside[0], _BUFFER_BYTES)
+        fleet.open(clock, endpoint, self._beside[0], destination)
+        self._to_read = [endpoint.fileno(), self._beside[0].fileno()]
+
+    def judge(self, data: bytes, source: Address) -> Message | None:
+        """Pass a datagram to the fleet, which rejects all but those of the peer."""
+        self._outputs += self._fleet.take(data, from_peer=source == self._source)
+        self._passed_on += 1
+        return None
+
+    def send(self, message: Message) -> None:
+        """Raise: the fleet sends by itself."""
+        raise NotImplementedError
+
+    def tend(self, now_ns: int) -> Sequence[Record | Notice]:
+        """Begin the next interval of housekeeping; read datagrams of other sources."""
+        notices = super().tend(now_ns)
+        for readable in self._to_read:
+            while readable in self.watched and select.select([readable], (), (), 0)[0]:
+                self.receive(readable)
+        del self._to_read[1:]  # from now on the fleet reads the peer's socket
+        outputs, self._outputs = [*notices, *self._outputs], []
+        return outputs
+
+    def report(self) -> dict[str, object]:
+        """Counters, for the run's summary."""
+        self._read_the_rest()
+        fleet = self._fleet
+        read = fleet.accepted + sum(fleet.rejected.values()) - self._passed_on
+        self._sources.add(self._source, max(read, 0))
+        return super().report() | {
+            "sent": fleet.sent,
+            "send_errors": {os.strerror(error): n for error, n in fleet.send_errors.items()},
+            "sends": self._sends.name.lower(),
+            "accepted": fleet.accepted,
+            "rejected": self.rejected(fleet.rejected),
+            "loops": fleet.reports(),
+            "engine": "compiled",
+        }
