@@ -101,14 +101,15 @@ def capacity(
         cli.find_scenario(scenario), settings or [], policy or [], loops=loops, rate_bps=rate_bps,
         period_s=period, deadline_s=deadline, amplitude=disturbance, draws=draws, seed=seed,
     )  # fmt: skip
+    chosen = capacity_live.chosen_points(live, plan)
     folder = out or cli.DEFAULT_RUNS / "capacity" / plan.scenario.name
     console = PatientConsole(stderr=True)
     done = execute_campaign(console, plan.campaign(), Path("noack capacity"), start, folder=folder)
-    points: list[capacity_live.LivePoint] = []
-    chosen = capacity_live.chosen_points(live.split(",") if live else (), done.summary.found)
-    for number, point in enumerate(chosen, 1):
-        with console.status(f"live run {number} of {len(chosen)}"):
-            points += capacity_live.live_points([point], folder / "live")
+    points = []
+    for policy_name, count in chosen:
+        with console.status(f"live: {policy_name}, {count} loops"):
+            at = policy_name, count
+            points.append(capacity_live.live_point(at, done.summary.found, folder / "live"))
     result = capacity_page.CapacityResult(
         plan, done.summary, capacities(done.summary, done.store), points
     )

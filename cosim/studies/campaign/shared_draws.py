@@ -99,7 +99,7 @@ class SharedWork(SampledWork):
         scenario = records[0].scenario
         counted = [_updates(record, self.count_from_s) for record in records]
         burst = scenario.network.longest_burst
-        row["loops_guarantee_used"] = np.mean([_used_up(one["fate"], burst) for one in counted])
+        row["loops_guarantee_used"] = np.mean([used_up(one["fate"], burst) for one in counted])
         delays_ns = np.concatenate(
             [(one["release_ns"] - one["now_ns"])[effective(one["fate"])] for one in counted]
         )
@@ -115,7 +115,7 @@ def _updates(record: RunRecord, from_s: float) -> Rows:
     return counted
 
 
-def _used_up(fates: NDArray[Any], burst: int) -> bool:
+def used_up(fates: NDArray[Any], burst: int) -> bool:
     """Whether ``burst`` ≥ 1 consecutive losses include one in a full queue."""
     losses = overflows = 0
     for fate, delivered in zip(fates, effective(fates), strict=True):

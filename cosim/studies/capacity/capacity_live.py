@@ -5,7 +5,7 @@ prediction intervals of a further simulated draw, mean ± t s √(1 + 1/k).
 """
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,6 +13,7 @@ import numpy as np
 
 from cosim.live.finalize import finalize
 from cosim.live.launcher import launch
+from cosim.record.run_directory import SUMMARY_FILE, read_object
 from cosim.record.run_record import RunRecord, load_record
 from cosim.record.shared_run import loop_directories
 from cosim.studies.campaign.campaign_summary import GridPointResult
@@ -21,8 +22,8 @@ from cosim.studies.campaign.metrics import Metric, measured
 from cosim.studies.campaign.random_draws import seeds_of
 from cosim.studies.campaign.shared_draws import SHARED_ROW, SharedWork
 from cosim.studies.capacity.capacity_criteria import LIMITS
-from cosim.studies.capacity.capacity_plan import DISTURBANCE, LOOPS, OWN, POLICY
-from noack.core.errors import CallerError, MachineError
+from cosim.studies.capacity.capacity_plan import DISTURBANCE, LOOPS, OWN, POLICY, CapacityPlan
+from noack.core.errors import CallerError
 
 
 class LivePoint(NamedTuple):
@@ -51,31 +52,33 @@ class LivePoint(NamedTuple):
         return {**self._asdict(), "run_dir": str(self.run_dir), "outside": self.outside}
 
 
-def chosen_points(texts: Iterable[str], found: Iterable[GridPointResult]) -> list[GridPointResult]:
-    """Return the grid points of POLICY=N, each without the common disturbance.
+def chosen_points(text: str | None, plan: CapacityPlan) -> list[tuple[str, int]]:
+    """Return policy and number of loops of each POLICY=N of a list.
 
     Raises:
         CallerError: the study has no such point.
     """
-    places = {
-        f"{one.point.labels[POLICY]}={one.point.labels[LOOPS]}": one
-        for one in found if one.point.labels.get(DISTURBANCE, OWN) == OWN
-    }  # fmt: skip
-    texts = [text.strip() for text in texts]
-    for text in texts:
-        if text not in places:
-            raise CallerError(f"--live {text}: no such point; they are {', '.join(places)}")
-    return [places[text] for text in texts]
+    points = {f"{name}={count}": (name, count) for name in plan.policies for count in plan.counts}
+    texts = [one.strip() for one in text.split(",")] if text else []
+    for one in texts:
+        if one not in points:
+            raise CallerError(f"--live {one}: no such point; they are {', '.join(points)}")
+    return [points[one] for one in texts]
 
 
-def live_points(chosen: Iterable[GridPointResult], folder: Path) -> Iterator[LivePoint]:
-    """Run grid points live, with the seeds of draw 0; yield their results.
+def live_point(
+    chosen: tuple[str, int], found: Iterable[GridPointResult], folder: Path
+) -> LivePoint:
+    """Run a grid point live, without the common disturbance and with the seeds of draw 0.
 
     Raises:
-        MachineError: a run could not be completed.
+        NoackError: the run could not be started or completed.
     """
-    for one in chosen:
-        yield _live_point(one, folder)
+    places = {
+        (one.point.labels[POLICY], int(one.point.labels[LOOPS])): one
+        for one in found if one.point.labels.get(DISTURBANCE, OWN) == OWN
+    }  # fmt: skip
+    return _live_point(places[chosen], folder)
 
 
 def _live_point(found: GridPointResult, folder: Path) -> LivePoint:
@@ -84,8 +87,6 @@ def _live_point(found: GridPointResult, folder: Path) -> LivePoint:
     name = f"{point.labels[POLICY]}-{point.labels[LOOPS]}"
     scenario = point.scenario.model_copy(update={"seeds": seeds_of(work.seed, 0), "name": name})
     outcome = finalize(launch(scenario, folder), report=False)
-    if not outcome.run_dir.is_dir():
-        raise MachineError(f"{outcome.run_dir}: {outcome.reason}")
     records = _records(outcome.run_dir, scenario)
     rows = np.zeros(1, SHARED_ROW)
     work.measure_loops(records, rows[0])
@@ -113,7 +114,5 @@ def _records(run_dir: Path, scenario: Any) -> list[RunRecord]:
 
 
 def _unintended(run_dir: Path, scenario: Any) -> int:
-    from cosim.record.run_directory import SUMMARY_FILE, read_object
-
     summaries = [read_object(one / SUMMARY_FILE) for one in loop_directories(run_dir, scenario)]
     return sum(int(one.get("unintended_losses") or 0) for one in summaries)
