@@ -5,7 +5,7 @@ A run reaches a limit if
 * guarantee: a loop has used up its guarantee, because of the full queue;
 * deadline: more than :data:`LATE` of the delivered updates are late;
 * cost: the mean cost of the loops is at least :data:`COST_FACTOR` times the mean over all draws of
-  the cost of one loop.
+  the cost of one loop. A run of one loop reaches it only by diverging.
 
 The capacity of a draw is the largest number of loops of the study up to which no run reaches the
 limit: 0 if one loop reaches it, infinite if none does. The estimate is the median over the draws,
@@ -107,6 +107,7 @@ def _capacity(
         "deadline": values("deadline") > LATE,
         "cost": cost >= cost_limit(cost[0]),
     }
+    reached["cost"][0] = np.isinf(cost[0])  # one loop is the reference, however costly its draw
     draws = {limit: carried(counts, one) for limit, one in reached.items()}
     limits = {limit: _estimate(one) for limit, one in draws.items()}
     worst = np.min(np.stack([*draws.values()]), axis=0)
