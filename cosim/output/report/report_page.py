@@ -96,7 +96,7 @@ def page(
         and ReplayDifference(**replay["first_difference"]),
         scenario_toml=scenario_toml,
         environment=environment,
-        environment_rows=[(_words(key), _line(value)) for key, value in environment.items()],
+        environment_rows=environment_rows(environment),
     )  # fmt: skip
 
 
@@ -161,6 +161,11 @@ def _parameters(scenario: Scenario) -> Iterator[tuple[str, str]]:
     yield "‖x(0)‖", f"{np.linalg.norm(x0):.4g}, {len(x0)} states"
     seeds = scenario.seeds
     yield "seeds", f"plant {seeds.plant}, initial state {seeds.initial_state}, loss {seeds.loss}"
+
+
+def environment_rows(environment: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return the properties of the environment, and their values as text."""
+    return [(_words(key), _line(value)) for key, value in environment.items()]
 
 
 def _words(key: str) -> str:
