@@ -247,6 +247,14 @@ class Campaign(ScenarioSection):
         """The axes by name."""
         return {axis.name: axis for axis in self.axes}
 
+    @property
+    def measured_metrics(self) -> set[Metric]:
+        """The metrics of the tables and the figures."""
+        of_figures = {
+            getattr(figure, key, None) for figure in self.figures for key in ("metric", "x", "y")
+        }
+        return {*self.metrics.shown, *(one for one in METRICS if one in of_figures)}
+
     @model_validator(mode="after")
     def _check(self) -> Self:
         if (twice := _repeated([axis.name for axis in self.axes])) is not None:

@@ -16,6 +16,7 @@ from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
 from noack.protocol.fleet import Fleet
 from noack.protocol.machine_interface import Machine, Output, Record
+from noack.protocol.record_tables import PLANT_ACTUATION
 from noack.protocol.wire_format import Flow, Message
 from noack.runtime.fleet.compiled_driver import compiled_driver, compiled_replay
 from noack.runtime.fleet.compiled_fleet import CompiledFleet
@@ -183,6 +184,8 @@ def test_a_replay_finds_every_row_again_and_one_changed_bit(loops: Content) -> N
         count = sum(map(len, rows.values()))
         assert replay_fleet(compiled(name, run), rows, code) == (count, None)
         for table, recorded in rows.items():
+            if table == PLANT_ACTUATION:
+                continue  # it has inputs only
             row = len(recorded) // 2
             changed = recorded.copy()
             changed.view(np.uint8).reshape(len(recorded), -1)[row, -9] ^= 1
