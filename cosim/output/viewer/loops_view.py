@@ -113,9 +113,10 @@ class _LoopPage:
         return found
 
     def pictured(self, name: str) -> rrb.View:
-        """Return the panel of the loop's picture."""
+        """Return the panel of the loop's picture, without the legend: the panel is small."""
         view = panel(self.picture)
         bp.below(view, bp.loop_path(name))
+        view.contents = ["$origin/**", "- $origin/legend/**"]
         view.name = name
         return view
 
