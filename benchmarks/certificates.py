@@ -12,6 +12,7 @@ from functools import reduce
 import numpy as np
 
 from benchmarks._certificate_kinds import Broken, Kind, Tally
+from benchmarks._certificate_kinds.continuous import CONTINUOUS
 from benchmarks._certificate_kinds.decaying import DECAYING
 from benchmarks._certificate_kinds.disturbed import DISTURBED
 from benchmarks._certificate_kinds.known_state import KNOWN_STATE
@@ -25,6 +26,7 @@ KINDS: Mapping[str, Kind] = {
     kind.name: kind
     for kind in (
         DECAYING,
+        CONTINUOUS,
         DISTURBED,
         OBSERVED,
         RANDOM_LOSSES,

@@ -11,7 +11,8 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,6 +32,7 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
+from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.spool import SPOOL, read_chunks
 
 CAP = 2
@@ -90,8 +92,18 @@ def scenario_of(load_: Load) -> str:
     )
 
 
-def run(load_: Load, folder: Path) -> tuple[Path, Mapping[str, list[float]], Mapping[str, float]]:
-    """Run it; return its directory, resident memory over time and CPU time, by process.
+class Measured(NamedTuple):
+    """A run whose processes have reported."""
+
+    run_dir: Path
+    memory_mib: Mapping[str, list[float]]
+    """Resident memory over time, by process."""
+    cpu_s: Mapping[str, float]
+
+
+@contextmanager
+def run(load_: Load, folder: Path) -> Iterator[Measured]:
+    """Run it until all processes have reported; the recorder then waits, and the spool is kept.
 
     Raises:
         MeasurementError: it did not reach its horizon.
@@ -101,21 +113,31 @@ def run(load_: Load, folder: Path) -> tuple[Path, Mapping[str, list[float]], Map
     memory, cpu_s = defaultdict[str, list[float]](list), dict[str, float]()
     command = [sys.executable, "-m", "benchmarks._fleet_run", str(path), str(folder)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        recorder: psutil.Process | None = None
         while process.poll() is None:
             for child in psutil.Process(process.pid).children(recursive=True):
-                try:
+                with suppress(psutil.Error):
                     name = " ".join(child.cmdline())
                     if name.startswith("noack "):
                         memory[name].append(child.memory_info().rss / _KIBI**2)
                         cpu_s[name] = sum(child.cpu_times()[:2])
-                except psutil.Error:
-                    continue
-            time.sleep(1.0)
-        assert process.stdout is not None
-        answer = process.stdout.read().splitlines()
-    if len(answer) < 3 or answer[1] != "0":
-        raise MeasurementError(f"the run failed: {' '.join(answer)}")
-    return Path(answer[0]), memory, cpu_s
+                        recorder = child if name == "noack recorder" else recorder
+            found = [*folder.glob("*/reports.json")]
+            if found and len(json.loads(found[0].read_text() or "{}")) == len(LOOP_ROLES):
+                break
+            time.sleep(0.5)
+        else:
+            assert process.stdout is not None
+            raise MeasurementError(f"the run failed: {process.stdout.read()}")
+        if recorder is not None:
+            recorder.suspend()
+        try:
+            yield Measured(found[0].parent, memory, cpu_s)
+        finally:
+            with suppress(psutil.Error):
+                if recorder is not None:
+                    recorder.kill()
+            process.terminate()
 
 
 def rows_of(run_dir: Path, scenario: Scenario, table: str) -> NDArray[np.void]:
@@ -131,7 +153,13 @@ def figures(load_: Load, folder: Path) -> list[Row]:
     """Return the figures of a run."""
     name = f"{load_.loops:,} loops at {load_.rate_hz:g} Hz, {load_.horizon_s:g} s"
     say(name)
-    run_dir, memory, cpu_s = run(load_, folder)
+    with run(load_, folder) as measured_run:
+        return [row_named(row, f"{name}: {row.name}") for row in _rows(load_, *measured_run)]
+
+
+def _rows(
+    load_: Load, run_dir: Path, memory: Mapping[str, list[float]], cpu_s: Mapping[str, float]
+) -> list[Row]:
     scenario = load(run_dir / "scenario.toml")
     reports: dict[str, Any] = json.loads((run_dir / "reports.json").read_text())
     lost = sum(one["channel"]["lost_in_kernel"] or 0 for one in reports.values())
@@ -145,10 +173,10 @@ def figures(load_: Load, folder: Path) -> list[Row]:
     growth = max(max(one[len(one) // 2 :]) - one[len(one) // 2] for one in memory.values())
     total_s = sum(cpu_s.values())
     period_ms = 1e3 / load_.rate_hz
-    rows = [
+    return [
         Row("samples", len(steps), "", note=f"{len(np.unique(steps[LOOP]))} loops"),
         Row("missing samples", load_.samples - len(measured), "", goal=Goal("==", 0)),
-        Row("missing ticks", load_.samples - len(ticks), "", goal=Goal("==", 0)),
+        Row("missing ticks", load_.samples - load_.loops - len(ticks), "", goal=Goal("==", 0)),
         Row("unintended losses", lost + rejected, "", goal=Goal("==", 0)),
         Row("longest loss burst", burst, "", goal=Goal("<=", CAP)),
         Row("updates", len(packets), "", note=f"{len(packets) / load_.horizon_s:.0f} /s"),
@@ -165,7 +193,6 @@ def figures(load_: Load, folder: Path) -> list[Row]:
                 for k, v in memory.items()
             )),
     ]  # fmt: skip
-    return [row_named(row, f"{name}: {row.name}") for row in rows]
 
 
 def row_named(row: Row, name: str) -> Row:

@@ -18,6 +18,7 @@ from noack.core.errors import CallerError
 from noack.impairments.kept_loss import found_probabilities
 from noack.runtime.control_messages import ChangeRequest, parse_message
 from noack.runtime.control_plane import ControlPlane
+from noack.runtime.fleet.fleet_choice import may_be_compiled
 from noack.runtime.join_ticket import Ticket
 
 _CHANGE_DELAY_S = 0.2
@@ -53,6 +54,11 @@ class ChangeRequests:
         settings = parse_message(ChangeRequest, request).get("settings", {})
         from_s, now_ns = None, clock()
         if settings:
+            if may_be_compiled(self._scenario):
+                raise CallerError(
+                    "the settings of four or more loops cannot be changed while they run; "
+                    "schedule changes in the scenario"
+                )
             if obstacle is not None:
                 raise CallerError(obstacle)
             if len(self.announced) >= MOST_CHANGES:

@@ -1,7 +1,7 @@
 """The end of a run: its record completed, its summary and report written."""
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
@@ -10,20 +10,23 @@ from typing import Any
 
 import numpy as np
 
+from cosim.analysis.claims.claim_definition import Envelope
 from cosim.analysis.claims.claims_by_part import RunClaims
 from cosim.analysis.fidelity import fidelity_for_summary
+from cosim.analysis.loops_over_time import worst_loop
 from cosim.analysis.loss_statistics import list_violations
 from cosim.analysis.model_comparison import linearisation
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import Outcome, Summary, summarise
 from cosim.analysis.shared_summary import is_complete
-from cosim.analysis.summary_model import ExitPart, RunSummary, SummaryPart
-from cosim.live.finalize_loops import finalize_loops
+from cosim.analysis.summary_model import ReplayPart, RunSummary, SummaryPart
+from cosim.live.finalize_loops import exit_after_replay, finalize_loops
 from cosim.live.replay_process import ReplayProcess
 from cosim.record.decimate import is_long
 from cosim.record.run_directory import (
     ENDING_FILE,
     RECORD,
+    RECORDING_FILE,
     REPORT_FILE,
     SCENARIO_FILE,
     SUMMARY_FILE,
@@ -32,10 +35,15 @@ from cosim.record.run_directory import (
 )
 from cosim.record.run_ending import EndingFile, RunEnding
 from cosim.record.run_record import RunRecord, load_record
+from cosim.record.shared_run import loop_directories
 from cosim.record.shared_spool import finish_run_record
+from noack.config.loops import loops_of
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.file_access import write_whole
 from noack.runtime.spool import SPOOL
+
+_FEW_LOOPS = 4
+"""The reports of up to so many loops are written at the end of the run."""
 
 
 @np.errstate(all="ignore")
@@ -56,7 +64,7 @@ def finalize(ending: RunEnding, *, report: bool = True, again: bool = False) -> 
         unfinished = (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir()
         record = finish_run_record(run_dir) if unfinished else load_record(run_dir, network=True)
         if record.is_network:
-            return _finalize_shared(record, ending, again=again)
+            return _finalize_shared(record, ending, report=report, again=again)
         replaying = stack.enter_context(ReplayProcess(record, run_dir))
         # A stopped recorder has no time to write the recording of a long run.
         needed = unfinished or (record.kind == "live" and is_long(record.scenario))
@@ -76,23 +84,43 @@ def finalize(ending: RunEnding, *, report: bool = True, again: bool = False) -> 
         if (ending.status, ending.reason) != (status, reason):
             _correct_ending(replace(ending, status=status, reason=reason))
         content = summary.to_json()
-        try:
-            if report:
+        if report:
+            with _report_is_optional(run_dir):
                 _report(record, content, run_dir, claims)
-        except Exception as error:  # whatever it is, the run itself is not affected
-            (run_dir / REPORT_FILE).unlink(missing_ok=True)
-            print(f"noack: warning: no {REPORT_FILE}: {error}", file=sys.stderr)
     return Outcome(run_dir, status, reason, content)
 
 
-def _finalize_shared(network: RunRecord, ending: RunEnding, *, again: bool) -> Outcome:
-    """Finalise each loop of a run of several; write the summary of the run."""
-    summary = finalize_loops(network, ending, partial(finalize, report=False, again=again))
+def _finalize_shared(
+    network: RunRecord, ending: RunEnding, *, report: bool, again: bool
+) -> Outcome:
+    """Finalise each loop of a run of several; write summary, report and recording of the run."""
+    of_each = report and len(loops_of(network.scenario)) <= _FEW_LOOPS
+    summary = finalize_loops(network, ending, partial(finalize, report=of_each, again=again))
     _write_summary(ending.run_dir, summary)
     status, reason = ExitStatus(summary.exit.status), summary.exit.reason
     if (ending.status, ending.reason) != (status, reason):
         _correct_ending(replace(ending, status=status, reason=reason))
-    return Outcome(ending.run_dir, status, reason, summary.model_dump(mode="json"))
+    content = summary.model_dump(mode="json")
+    if report:
+        with _report_is_optional(ending.run_dir):
+            _loops_report(network, content, ending.run_dir)
+        try:
+            from cosim.output.viewer.loops_view import write_loops_view
+
+            write_loops_view(network, content, ending.run_dir, ending.run_id)
+        except Exception as error:  # likewise
+            print(f"noack: warning: no {RECORDING_FILE}: {error}", file=sys.stderr)
+    return Outcome(ending.run_dir, status, reason, content)
+
+
+@contextmanager
+def _report_is_optional(run_dir: Path) -> Iterator[None]:
+    """Warn if the report cannot be written, whatever the error is: the run is not affected."""
+    try:
+        yield
+    except Exception as error:
+        (run_dir / REPORT_FILE).unlink(missing_ok=True)
+        print(f"noack: warning: no {REPORT_FILE}: {error}", file=sys.stderr)
 
 
 def _correct_ending(ending: RunEnding) -> None:
@@ -149,16 +177,8 @@ def _with_results(
             results["replay"] = replaying.verdict() or replay(record).verdict()
         except Exception as error:  # the run itself did not fail
             results["replay"] = {"bit_exact": None, "error": repr(error)}
-        results["exit"] = _exit(summary.exit, results["replay"])
+        results["exit"] = exit_after_replay(summary.exit, ReplayPart(**results["replay"]))
     return summary.with_results(**results)
-
-
-def _exit(end: ExitPart, replayed: dict[str, Any]) -> ExitPart:
-    """How the run ended, given its replay: a run that cannot be replayed failed."""
-    if end.status != ExitStatus.OK or replayed["bit_exact"] is not None:
-        return end
-    why = replayed.get("error", "the record has no inputs")
-    return ExitPart(status=ExitStatus.FAILED, reason=f"the run cannot be replayed: {why}")
 
 
 def reopen(run_dir: Path) -> Outcome:
@@ -198,15 +218,28 @@ def run_report(run_dir: Path, *, again: bool = False) -> Path:
     outcome, path = reopen(run_dir), run_dir / REPORT_FILE
     if path.is_file() and not again:
         return path
-    record = load_record(run_dir)
+    record = load_record(run_dir, network=True)
+    if record.is_network:
+        return _loops_report(record, outcome.summary, run_dir)
     return _report(record, outcome.summary, run_dir, RunClaims(record))
 
 
 def _report(record: RunRecord, summary: Summary, run_dir: Path, claims: RunClaims) -> Path:
     from cosim.output.report.report_page import write_report  # imports matplotlib
 
+    return write_report(record, summary, run_dir, _envelopes(claims))
+
+
+def _loops_report(network: RunRecord, summary: Summary, run_dir: Path) -> Path:
+    from cosim.output.report.loops_page import write_loops_report  # imports matplotlib
+
+    number = worst_loop(run_dir, summary["loops"]).number
+    worst = load_record(loop_directories(run_dir, network.scenario)[number])
+    return write_loops_report(network, summary, run_dir, _envelopes(RunClaims(worst)))
+
+
+def _envelopes(claims: RunClaims) -> Sequence[Envelope]:
     try:
-        envelopes = claims.envelopes()
+        return claims.envelopes()
     except Exception:  # the report is useful without them
-        envelopes = []
-    return write_report(record, summary, run_dir, envelopes)
+        return []

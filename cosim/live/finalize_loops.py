@@ -13,6 +13,7 @@ from cosim.record.run_record import RunRecord
 from cosim.record.shared_run import loop_directories
 from noack.config.loops import loops_of
 from noack.config.scenario import Scenario
+from noack.core.errors import ExitStatus
 from noack.core.python_process import cores
 
 _MANY_STEPS = 50_000
@@ -38,7 +39,18 @@ def finalize_loops(
         replayed = _replay(network) if network.kind == "live" else None
         end = ExitPart(status=int(ending.status), reason=ending.reason)
         summary = summarise_shared(network, [*outcomes], end, ending.startup_s)
-    return summary.model_copy(update={"replay": replayed})
+    if replayed is None:
+        return summary
+    end = exit_after_replay(summary.exit, replayed)
+    return summary.model_copy(update={"replay": replayed, "exit": end})
+
+
+def exit_after_replay(end: ExitPart, replayed: ReplayPart) -> ExitPart:
+    """How a run ended, given its replay: a run that cannot be replayed failed."""
+    if end.status != ExitStatus.OK or replayed.bit_exact is not None:
+        return end
+    why = replayed.error or "the record has no inputs"
+    return ExitPart(status=int(ExitStatus.FAILED), reason=f"the run cannot be replayed: {why}")
 
 
 @contextmanager

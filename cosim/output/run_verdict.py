@@ -87,6 +87,8 @@ def print_outcome(console: Console, outcome: Outcome, *, verbose: bool = False) 
     summary = outcome.summary
     if is_shared(summary):
         print_shared(console, summary, verbose=verbose)
+        if (report := outcome.run_dir / REPORT_FILE).is_file():
+            console.print(f"report         {report}", highlight=False, soft_wrap=True)
         console.print(f"run directory  {outcome.run_dir}", highlight=False, soft_wrap=True)
         return
     for line in verdict(summary):

@@ -11,10 +11,10 @@ from noack.core.errors import ExitStatus
 from noack.core.number_format import number, ratio
 
 _MOST_LOOPS = 12
-_HEADINGS = (
+HEADINGS = (
     "loop", "sent", "lost", "burst", "forced", "link, %", "delay, s", "‖e_c‖", "claims held",
 )  # fmt: skip
-_CAPTION = (
+CAPTION = (
     "burst: most consecutive losses; forced: delivered by the guarantee; link: share of the "
     "forwarded bytes; delay and ‖e_c‖: largest"
 )
@@ -29,23 +29,24 @@ def print_shared(console: Console, summary: Summary, *, verbose: bool = False) -
         reached += f" of {summary['horizon_s']:g} s"
         console.print(f"[bold red]failed after {reached}:[/] {escape(end['reason'])}")
     console.print(_network_table(summary))
-    loops = sorted(summary["loops"], key=_badness, reverse=True)
+    loops = sorted(summary["loops"], key=badness, reverse=True)
     shown = loops if verbose else loops[:_MOST_LOOPS]
     if len(shown) == len(loops):
         shown = summary["loops"]
     table = Table(
-        title="loops" + ("" if len(shown) == len(loops) else ", the worst first"), caption=_CAPTION
+        title="loops" + ("" if len(shown) == len(loops) else ", the worst first"), caption=CAPTION
     )
-    for place, heading in enumerate(_HEADINGS):
+    for place, heading in enumerate(HEADINGS):
         table.add_column(heading, justify="right" if place else "left", no_wrap=not place)
     for loop in shown:
-        table.add_row(*map(escape, _row(loop)))
+        table.add_row(*map(escape, loop_row(loop)))
     console.print(table)
     if more := len(loops) - len(shown):
         console.print(f"and {more} more loops: --verbose shows all")
 
 
-def _badness(loop: dict[str, Any]) -> tuple[Any, ...]:
+def badness(loop: dict[str, Any]) -> tuple[Any, ...]:
+    """Return a key that is larger for a worse loop."""
     claims = loop["claims"]
     error = loop["sup_e_c_norm"]
     return (
@@ -54,7 +55,8 @@ def _badness(loop: dict[str, Any]) -> tuple[Any, ...]:
     )  # fmt: skip
 
 
-def _network_table(summary: Summary) -> Table:
+def network_rows(summary: Summary) -> list[tuple[str, str]]:
+    """Return the quantities of the network, and their values as text."""
     network, flying = summary["network"], summary["network"]["in_flight"]
     sent = network["datagrams"]
     lost = sum(network["drops_by_cause"].values())
@@ -74,6 +76,10 @@ def _network_table(summary: Summary) -> Table:
     if (replay := summary["replay"]) is not None:
         exact = {True: "bit-exact", False: "differs", None: "not possible"}[replay["bit_exact"]]
         rows.append(("replay of the network", exact))
+    return rows
+
+
+def _network_table(summary: Summary) -> Table:
     kind = "" if summary["kind"] == "live" else f", {summary['kind']}"
     further = "".join(f", {one}" for one in summary["constraints"])
     table = Table(
@@ -81,12 +87,13 @@ def _network_table(summary: Summary) -> Table:
     )
     table.add_column("quantity")
     table.add_column("value", justify="right")
-    for row in rows:
+    for row in network_rows(summary):
         table.add_row(*map(escape, row))
     return table
 
 
-def _row(loop: dict[str, Any]) -> tuple[str, ...]:
+def loop_row(loop: dict[str, Any]) -> tuple[str, ...]:
+    """Return what the table of the loops says of one, under ``HEADINGS``."""
     claims = loop["claims"]
     held = f"{claims.get('held', 0)} of {sum(claims.values())}"
     worse = [f"{claims['violated']} violated"] if claims.get("violated") else []

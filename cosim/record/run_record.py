@@ -41,9 +41,16 @@ from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, MachineError, PeerError, why
 from noack.core.file_access import write_whole
 from noack.protocol.machine_interface import RESTART
-from noack.protocol.record_tables import LOOP, NO_SEQUENCE, OWNER, PLANT_STEP, SENSOR_MEASUREMENT
+from noack.protocol.record_tables import (
+    LOOP,
+    NO_SEQUENCE,
+    OWNER,
+    PACKET_HEAD_BYTES,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+)
 from noack.protocol.topology import LOOP_ROLES, RECORDER
-from noack.protocol.wire_format import MAX_LOOPS, VERSION, Flow, read_header
+from noack.protocol.wire_format import FLOW_OFFSET, MAX_LOOPS, VERSION, Flow, read_header
 from noack.runtime.control_messages import LogLine, ProcessReport, parse_message
 from noack.runtime.spool import SPOOL, read_chunks
 from noack.runtime.telemetry import notices_of
@@ -296,7 +303,7 @@ def recorded_rows(run_dir: Path, table: str, dtype: np.dtype[np.void]) -> Iterat
 def updates_in(
     packets: Rows, flow: Flow = Flow.UPDATE
 ) -> tuple[Rows, NDArray[np.int64], NDArray[np.int64]]:
-    """Select the loop's updates from the packets that reached the network emulator.
+    """Select the loop's messages of a flow from the packets that reached the network emulator.
 
     The emulator reads no payload, so the packets' headers are read here.
 
@@ -304,8 +311,11 @@ def updates_in(
         Their rows of ``netem_packet``, sequence numbers and event times.
     """
     indices, sequences, events_ns = [], [], []
-    for i, head in enumerate(packets["head"]):
-        header = read_header(head.tobytes())
+    heads = packets["head"]
+    octets = np.ascontiguousarray(heads).view(np.uint8).reshape(len(heads), PACKET_HEAD_BYTES)
+    marks = octets[:, FLOW_OFFSET]
+    for i in np.flatnonzero(marks == flow).tolist():
+        header = read_header(heads[i].tobytes())
         if header is None or (header.version, header.flow) != (VERSION, flow):
             continue
         if header.sequence < 2**63 and header.t_ns >= 0:  # others do not fit the record's columns

@@ -164,7 +164,7 @@ def _seeds(scenario: "Scenario", section: LoopSection, number: int) -> Any:
     drawn = {}
     for name in ("plant", "initial_state", "disturbance", "noise"):
         low, high = stream_key(getattr(scenario.seeds, name), "loop", str(number), name)
-        drawn[name] = low | high << 32
+        drawn[name] = (low | high << 32) >> 1  # 63 bits, the range of a TOML integer
     return scenario.seeds.model_copy(update=drawn | given)
 
 

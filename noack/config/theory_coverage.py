@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.plants.linear import LinearSettings
 from noack.trigger.decaying import DecayingSettings
@@ -60,12 +61,28 @@ class TheoryCoverage:
         scenario = self.scenario
         if scenario.protocol.acknowledges:
             return f'network.protocol = "ack": {UNCERTIFIED_ACKNOWLEDGEMENTS}'
-        if scenario.network.actuation is not None:
-            return "network.actuation: actuations may be lost or late"
         if not self.is_linear:
             return f'plant.system.kind = "{scenario.plant.system.kind}": the plant is not linear'
         if not scenario.controller.is_linear:
             return f'controller.kind = "{scenario.controller.kind}": u is not K x_c'
+        return self._beyond_actuation
+
+    @property
+    def _beyond_actuation(self) -> str | None:
+        """Why the age of the applied input has no bound, or the watchdog replaces the input."""
+        timing, policy = self.scenario.timing, self.scenario.plant.watchdog.policy
+        if (gap_ns := timing.actuation_gap_ns) is None:
+            return (
+                "network.actuation: without mansd or constraints, the age of the applied input has "
+                "no bound"
+            )
+        oldest_ns = timing.controller_period_ns + gap_ns
+        if gap_ns and policy != "hold" and timing.actuation_timeout_ns < oldest_ns:
+            return (
+                f'plant.watchdog.policy = "{policy}": it replaces the input after '
+                f"{timing.actuation_timeout_ns / NS_PER_S:g} s, and an actuation may be "
+                f"{oldest_ns / NS_PER_S:g} s old; use more controller.predictions"
+            )
         return None
 
     @property
@@ -74,6 +91,8 @@ class TheoryCoverage:
         scenario = self.scenario
         if (why := self._beyond_certificates) is not None:
             return why
+        if scenario.network.actuation is not None:
+            return "network.actuation: actuations may be lost or late"
         if scenario.plant.disturbances:
             kinds = ", ".join(one.kind for one in scenario.plant.disturbances)
             return f"plant.disturbances ({kinds}): the plant is disturbed"
@@ -97,6 +116,16 @@ class TheoryCoverage:
         if any(self.scenario.controller.setpoint or ()):
             raise CallerError("controller.setpoint: needs the set point 0")
 
+    def require_direct_inputs(self) -> None:
+        """Raise CallerError unless every actuation reaches the plant and carries one input."""
+        direct = self.scenario.network.actuation is None
+        if direct and self.scenario.controller.predictions == 1:
+            return
+        key = "controller.predictions" if direct else "network.actuation"
+        raise CallerError(
+            f"{key}: needs actuations that reach the plant at once and carry one input"
+        )
+
     def require_certifiable(self) -> None:
         """Raise CallerError if no certificate covers the scenario."""
         if (why := self.beyond_theory) is not None:
@@ -107,7 +136,7 @@ class TheoryCoverage:
         if (why := self._beyond_linear) is not None:
             raise CallerError(
                 f"{why}; this needs a linear plant with u = K x_c, without acknowledgements, "
-                "disturbances, noise and observer"
+                "lost actuations, disturbances, noise and observer"
             )
         if (why := self.scenario.trigger.beyond_exact) is not None:
             raise CallerError(why)

@@ -1,5 +1,6 @@
 """The times of a run that follow from its settings: periods, phases, timeouts."""
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -56,6 +57,16 @@ class Timing:
             return max(usual_ns, self.predicted_ns)
         last_ns = self.predicted_ns + round(actuation.link.longest_delay_s * NS_PER_S)
         return max(usual_ns, last_ns) if self.scenario.plant.watchdog.policy == "hold" else last_ns
+
+    @property
+    def actuation_gap_ns(self) -> int | None:
+        """Time by which losses and delays may hold up the newest actuation; None: no bound."""
+        if (actuation := self.scenario.network.actuation) is None:
+            return 0
+        if (burst := actuation.link.longest_burst) is None:
+            return None
+        delay_ns = math.ceil(actuation.link.longest_delay_s * NS_PER_S)
+        return burst * self.controller_period_ns + delay_ns
 
     @property
     def predicted_ns(self) -> int:

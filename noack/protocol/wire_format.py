@@ -43,6 +43,7 @@ SEQUENCES, TIMES_NS = 2**63, 2**62
 too. At 100,000 messages a second, 2⁶³ take three million years."""
 _HEADER = struct.Struct("<2sBBHHQQq")
 HEADER_BYTES = _HEADER.size
+FLOW_OFFSET = 3
 MAX_DATAGRAM_BYTES = HEADER_BYTES + 8 * MAX_DIMENSION + TAG_BYTES
 
 
@@ -116,7 +117,7 @@ def read_header(datagram: bytes) -> Header | None:
 
 def flow_of(datagram: bytes) -> int | None:
     """The flow field of a datagram, unverified; None if the datagram is too short."""
-    return datagram[3] if len(datagram) >= HEADER_BYTES else None
+    return datagram[FLOW_OFFSET] if len(datagram) >= HEADER_BYTES else None
 
 
 def loop_number(datagram: bytes) -> int | None:

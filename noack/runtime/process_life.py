@@ -43,7 +43,7 @@ from noack.runtime.control_messages import Admission, ControlMessage, RunStart, 
 from noack.runtime.control_plane import ControlPlane, ParameterUpdates
 from noack.runtime.fleet.compiled_fleet import CompiledFleet
 from noack.runtime.fleet.fleet_choice import fleet_of
-from noack.runtime.fleet.fleet_socket import FleetSocket
+from noack.runtime.fleet.fleet_socket import FLEET_BUFFER_BYTES, FleetSocket
 from noack.runtime.join_ticket import Ticket
 from noack.runtime.life_cycle import HORIZON, LAUNCHER_GONE, Event, LifeCycle, Side, State
 from noack.runtime.real_time_loop import Channel, run_loop
@@ -52,7 +52,7 @@ from noack.runtime.record_handover import deliver_report, persisted_rows, spool_
 from noack.runtime.rehearsal import Rehearsal, can_rehearse
 from noack.runtime.signals import Signals
 from noack.runtime.telemetry import TelemetryBuffer
-from noack.runtime.udp_sockets import MessageSocket, bind
+from noack.runtime.udp_sockets import MessageSocket, bind, enlarge_buffer
 
 T = TypeVar("T")
 
@@ -265,6 +265,8 @@ class RunProcess:
             # Before the barrier: locking memory may take a tenth of a second.
             realtime(settings.enabled, settings.fifo_priority, place) as applied,
         ):
+            if self.scenario.loops is not None:
+                enlarge_buffer(endpoint, FLEET_BUFFER_BYTES)  # it may be late to the start
             channel = open_channel(endpoint, self.join(endpoint.getsockname()))
             telemetry = self._telemetry()
             if self.replaces is not None:

@@ -219,7 +219,9 @@ def _continuous_time(resolved: Scenario) -> Assumption:
         "Section II",
         AssumptionStatus.IDEALISED,
         "never true of a sampled loop; the certificates allow for the difference. Here: sampled "
-        f"every {period_ms:g} ms, input held for {control_ms:g} ms" + _network_delay(resolved),
+        f"every {period_ms:g} ms, input held for {control_ms:g} ms"
+        + _network_delay(resolved)
+        + _actuation_gap(resolved),
     )
 
 
@@ -233,6 +235,17 @@ def _network_delay(resolved: Scenario) -> str:
     text = f"; the network delays updates by up to {longest_ms:g} ms"
     allowed = f"; the certificates allow for {certified_ms:g} ms"
     return text if certified_ms == longest_ms else text + allowed
+
+
+def _actuation_gap(resolved: Scenario) -> str:
+    if resolved.network.actuation is None:
+        return ""
+    if (gap_ns := resolved.timing.actuation_gap_ns) is None:
+        return "; nothing limits the losses of actuations"
+    text = f"; losses and delays hold up actuations by up to {1e3 * gap_ns / NS_PER_S:g} ms"
+    if resolved.controller.predictions > 1:
+        text += f", and each has inputs for {1e3 * resolved.timing.predicted_ns / NS_PER_S:g} ms"
+    return text
 
 
 def certificate_assumptions(

@@ -205,6 +205,7 @@ class LossMargin:
 
 def require_covered(resolved: Scenario) -> None:
     """Raise CallerError unless the loop is linear, transmits in time, and the watchdog is idle."""
+    resolved.coverage.require_direct_inputs()
     resolved.coverage.require_exact()
     resolved.coverage.require_unchanging()
     timing = resolved.timing

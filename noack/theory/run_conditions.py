@@ -18,7 +18,8 @@ def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> NetworkCond
     first step with an actuation from a tick at or after the update. The model state of an applied
     input ages until the step after it. At equal times, the plant's step comes before arrivals. If
     the network delay has no bound, four times its jitter is used; a run with a longer delay
-    violates the conditions.
+    violates the conditions. Lost and delayed actuations delay updates and make inputs older; of
+    predicted inputs, the plant applies the one whose time has come.
     """
     step_ns, tick_ns = resolved.timing.plant_period_ns, resolved.timing.controller_period_ns
     phase_ns, sample_ns = (
@@ -34,14 +35,23 @@ def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> NetworkCond
     under_way_ns = network_delay_ns(resolved, late_periods)
     if under_way_ns > 0:  # an update in flight for up to this time may just miss a tick
         wait_ns = under_way_ns + tick_ns - 1
-    delay_ns, first_ns = ((t_ns // step_ns + 1) * step_ns for t_ns in (wait_ns, phase_ns))
+    gap_ns = resolved.timing.actuation_gap_ns
+    if gap_ns is None:
+        raise ValueError("the age of the applied input has no bound")
+    delay_ns, first_ns = (
+        ((t_ns + gap_ns) // step_ns + 1) * step_ns for t_ns in (wait_ns, phase_ns)
+    )
+    # With a delay, the newest actuation that has arrived may just be one tick older than that.
+    oldest_ns = gap_ns + (newest_ns if gap_ns % tick_ns == 0 else tick_ns)
+    predicted_ns = resolved.timing.predicted_ns - tick_ns
+    age_ns = max(min(oldest_ns, tick_ns), oldest_ns - predicted_ns)
     start_ns = first_ns if under_way_ns == 0 else max(first_ns + late_ns, delay_ns)
     return NetworkConditions(
         **_losses(resolved),
         sampling_s=sample_ns / NS_PER_S,
         spacing_s=sample_ns / NS_PER_S,
         delay_s=delay_ns / NS_PER_S,
-        hold_s=(newest_ns + step_ns + late_ns) / NS_PER_S,
+        hold_s=(age_ns + step_ns + late_ns) / NS_PER_S,
         start_s=start_ns / NS_PER_S,
     )
 

@@ -113,6 +113,7 @@ class Running:
 
     def finish(self) -> Finished:
         stdout, stderr = self.process.communicate(timeout=PATIENCE_S)
+        assert stdout, (self.process.returncode, stderr)
         summary = json.loads(stdout)
         return Finished(self.process.returncode, summary, stderr, (self.runs / "latest").resolve())
 

@@ -203,6 +203,7 @@ class _Inputs:
 
     def __init__(self, scenario: Scenario) -> None:
         self._period_ns = scenario.timing.plant_period_ns
+        self._tick_ns = scenario.timing.controller_period_ns
         self._timeout_ns = scenario.timing.actuation_timeout_ns
         self._replaces = scenario.plant.watchdog.policy != "hold"
         known = scenario.network.initial_sync == "known_state"
@@ -223,7 +224,11 @@ class _Inputs:
     def steps(self, rows: Rows) -> None:
         with np.errstate(invalid="ignore"):
             sizes = np.abs(rows["u"]).max(axis=1)
-        self._steps.append((rows["t_ns"], rows["actuation"], sizes))
+        # The age of an input that was predicted counts from the time that it is for.
+        ahead_ns = np.zeros(len(rows), np.int64)
+        if "entry" in (rows.dtype.names or ()):
+            ahead_ns = np.maximum(rows["entry"], 0) * self._tick_ns
+        self._steps.append((rows["t_ns"], rows["actuation"], sizes, ahead_ns))
         self.newest_ns = int(rows["t_ns"][-1])
 
     def actuations(self, rows: Rows) -> None:
@@ -249,13 +254,14 @@ class _Inputs:
         Returns:
             Ages of inputs; ages of actuations that the watchdog replaced; sizes of safe inputs.
         """
-        t_ns, newest, sizes = _columns(self._steps, 3)
+        t_ns, newest, sizes, ahead_ns = _columns(self._steps, 4)
         ready = newest <= (_NEVER if ended else self._received)
         ready &= (newest <= self._ticked) | (self._first_with_state(newest) < _NEVER)
         count = int(np.minimum.accumulate(ready).sum())
-        self._steps = [(t_ns[count:], newest[count:], sizes[count:])]
+        self._steps = [(t_ns[count:], newest[count:], sizes[count:], ahead_ns[count:])]
         t_ns, newest, sizes = t_ns[:count], newest[:count], sizes[:count]
-        model_ns = self._model_ns(newest)
+        sent_ns = self._model_ns(newest)
+        model_ns = sent_ns + ahead_ns[:count]
         highest = np.maximum.accumulate(np.append(self._latched, newest))
         there = newest != NO_SEQUENCE
         controlled = there & (highest[1:] >= self._first_with_state(highest[1:]))
@@ -269,13 +275,13 @@ class _Inputs:
             self.started, self.start_ns = True, int(t_ns[np.argmax(controlled)])
         # A late plant step may apply an input with a model time after the step's nominal time.
         age_ns = np.maximum(t_ns + self._period_ns - model_ns, model_ns - t_ns)
-        replaced = controlled & self._replaces & too_old(t_ns, model_ns, self._timeout_ns)
+        replaced = controlled & self._replaces & too_old(t_ns, sent_ns, self._timeout_ns)
         # Until the first input with a state, the certificates assume that the input is 0.
         safe = there & ~controlled & (began | ~(sizes == 0))
         step_s, held = t_ns * 1e-9, controlled & ~replaced
         return (
             SampledSeries(step_s[held], age_ns[held] * 1e-9),
-            SampledSeries(step_s[replaced], (t_ns - model_ns)[replaced] * 1e-9),
+            SampledSeries(step_s[replaced], (t_ns - sent_ns)[replaced] * 1e-9),
             SampledSeries(step_s[safe], sizes[safe]),
         )
 

@@ -96,7 +96,7 @@ def page(
         and ReplayDifference(**replay["first_difference"]),
         scenario_toml=scenario_toml,
         environment=environment,
-        environment_rows=[(_words(key), _line(value)) for key, value in environment.items()],
+        environment_rows=environment_rows(environment),
     )  # fmt: skip
 
 
@@ -139,6 +139,16 @@ def _parameters(scenario: Scenario) -> Iterator[tuple[str, str]]:
         reverse = network.reverse.loss.model_dump()
         lost = ", ".join(f"{_words(key)} {_shown(value)}" for key, value in reverse.items())
         yield "acknowledgements", f"loss: {lost}; timeout {timeout_ms:g} ms"
+    if (actuation := network.actuation) is not None:
+        lost = ", ".join(
+            f"{_words(key)} {_shown(value)}" for key, value in actuation.loss.model_dump().items()
+        )
+        most = actuation.link.longest_burst
+        yield (
+            "actuations",
+            f"loss: {lost}; "
+            + ("no guarantee" if most is None else f"at most {most} consecutive losses"),
+        )
     yield "initial synchronisation", network.initial_sync.replace("_", " ")
     yield "plant", f"{scenario.plant.rate_hz:g} steps/s"
     yield "measurements", "every step" if every == 1 else f"every {every} steps"
@@ -151,6 +161,11 @@ def _parameters(scenario: Scenario) -> Iterator[tuple[str, str]]:
     yield "‖x(0)‖", f"{np.linalg.norm(x0):.4g}, {len(x0)} states"
     seeds = scenario.seeds
     yield "seeds", f"plant {seeds.plant}, initial state {seeds.initial_state}, loss {seeds.loss}"
+
+
+def environment_rows(environment: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return the properties of the environment, and their values as text."""
+    return [(_words(key), _line(value)) for key, value in environment.items()]
 
 
 def _words(key: str) -> str:

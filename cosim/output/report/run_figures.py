@@ -26,6 +26,7 @@ from noack.protocol.record_tables import (
     Fate,
 )
 from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.wire_format import Flow
 
 Envelope = tuple[str, Literal["e_c", "x", "inter_event"], Reals, Reals, BoundKind]
 """A bound: label, bounded quantity, times in s (k,), values (k,), source."""
@@ -241,12 +242,18 @@ def _losses(record: RunRecord) -> RunFigure:
                   "updates", "positions", outcomes.losses_in(rule.window), rule.limit)
         for rule in network.guarantee.rules[:3] if isinstance(rule, LossesInWindow)
     ]  # fmt: skip
-    longest = int(bursts.max(initial=0))
+    longest, both = int(bursts.max(initial=0)), ""
+    if (actuation := network.actuation) is not None:
+        lost = packet_outcomes(record, Flow.ACTUATION).loss_bursts()
+        limit, both = actuation.link.longest_burst, " Last panel: the same of actuations."
+        panels.append(
+            LossPanel("Of actuations", "consecutive lost actuations", "bursts", lost, limit)
+        )
     return RunFigure(
         "losses",
         loss_figure(panels),
         "Effective losses of updates: dropped, corrupted, or delivered out of order. "
-        f"Dashed: the largest number that {kept} allows: {network.guarantee.meaning}.",
+        f"Dashed: the largest number that {kept} allows: {network.guarantee.meaning}.{both}",
         f"{len(bursts)} bursts of losses, the longest of {longest}; at most "
         f"{network.longest_burst} consecutive losses are allowed.",
     )

@@ -37,7 +37,6 @@ from noack.protocol.record_tables import (
     Fate,
     effective,
 )
-from noack.protocol.wire_format import Flow
 from noack.theory.error_bounds import ErrorMonitor
 from noack.theory.known_state import KnownStateBounds, known_state_bounds
 from noack.theory.run_conditions import allowed_conditions
@@ -254,8 +253,8 @@ class ViewFeed:
     def _packets(self, rows: Rows) -> None:
         if not len(rows):
             return
-        if self._scenario.protocol.acknowledges:
-            reverse = updates_in(rows, Flow.ACKNOWLEDGEMENT)[0]
+        for flow in self._scenario.network.flows[1:]:
+            reverse = updates_in(rows, flow)[0]
             self._view.packets(
                 reverse["t_ns"], reverse["release_ns"], reverse["fate"], reverse=True
             )

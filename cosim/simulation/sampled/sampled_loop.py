@@ -38,6 +38,7 @@ class SampledLoop:
         coverage, timing = resolved.coverage, resolved.timing
         coverage.require_unchanging()
         coverage.require_certifiable()
+        coverage.require_direct_inputs()
         if timing.actuation_timeout_ns <= timing.controller_period_ns + timing.plant_period_ns:
             raise CallerError(
                 "plant.watchdog.timeout_s: shorter than the time between two inputs; "

@@ -7,7 +7,6 @@ import numpy as np
 
 from cosim.studies.campaign.draw_statistics import CONFIDENCE
 from cosim.studies.campaign.metrics import Metric
-from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Vector
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
@@ -46,8 +45,8 @@ def burst_frequency(scenario: Scenario, metrics: Mapping[Metric, Vector]) -> Bur
     """Compare; None if the network enforces the guarantee or the losses cannot be predicted."""
     from scipy.stats import binomtest
 
-    network = resolve(scenario).network
-    if network.enforce_mansd:
+    network = scenario.network
+    if network.enforce_mansd or scenario.loops is not None:
         return None
     bursts, packets = metrics["longest_loss_burst"], metrics["transmissions"]
     finished = np.isfinite(bursts)

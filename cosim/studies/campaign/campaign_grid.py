@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.shipped_files import find_shipped
-from cosim.simulation.batch.batch_interface import Setting, run_batch, setting_of
+from cosim.simulation.batch.batch_interface import ROW, Setting, run_batch, setting_of
 from cosim.simulation.continuous.network_fates import timeless
 from cosim.studies.campaign.campaign_file import Campaign, Value
 from cosim.studies.campaign.campaign_workers import Work
 from cosim.studies.campaign.metrics import certified_error
 from cosim.studies.campaign.random_draws import Box, box_of
 from cosim.studies.campaign.sampled_draws import SampledWork, in_virtual_time
+from cosim.studies.campaign.shared_draws import SHARED_ROW, SharedWork
 from noack.config import toml_file
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
@@ -28,6 +29,8 @@ from noack.core.linear_systems import Matrix
 from noack.settings.matrices import Rows, require_shape
 
 SCENARIOS = "scenarios"
+LOOPS = "loops"
+"""The key of an axis over the number of loops."""
 
 
 @dataclass(frozen=True)
@@ -100,15 +103,37 @@ def grid(campaign: Campaign, path: Path) -> list[Point]:
         source = f"{path}: at {', '.join(f'{name} = {label}' for name, label in labels.items())}"
         for axis, i in chosen:
             for key, value in axis.settings[i].items():
-                put(content, key, value, source)
+                if key == LOOPS:
+                    _put_loops(content, value, source)
+                else:
+                    put(content, key, value, source)
         scenario = completed(content, scenario_path, source)
         try:
             work, certified = _work(campaign, scenario)
         except (CallerError, ValueError) as error:
             raise CallerError(f"{source}: {error}") from None
         points.append(Point(number, place, labels, values, scenario, certified, work))
+    if len({point.scenario.loops is None for point in points}) > 1:
+        raise CallerError(f"{path}: axes: either all grid points have loops, or none has")
     _require_effects(campaign, points, path)
     return points
+
+
+def row_type(points: Sequence[Point]) -> np.dtype[np.void]:
+    """Return the type of the rows of runs."""
+    shared = any(point.scenario.loops is not None for point in points)
+    return SHARED_ROW if shared else ROW
+
+
+def _put_loops(content: dict[str, Any], count: Any, source: str) -> None:
+    """Set the number of loops: those of the one entry of [[loops]], or of a new one."""
+    entries = content.get(LOOPS, [{"name": "loop"}])
+    if not isinstance(entries, list) or len(entries) != 1 or not isinstance(entries[0], dict):
+        raise CallerError(
+            f"{source}: loops = {count}: the scenario has several entries of [[loops]]; set a list "
+            "of tables with variants"
+        )
+    content[LOOPS] = [entries[0] | {"count": count}]
 
 
 def _require_effects(campaign: Campaign, points: Sequence[Point], path: Path) -> None:
@@ -131,7 +156,7 @@ def _require_effects(campaign: Campaign, points: Sequence[Point], path: Path) ->
 
 def _work(campaign: Campaign, scenario: Scenario) -> tuple[Work, float | None]:
     """Return the work, and the certified bound Δβ or None."""
-    metrics, resolved = campaign.metrics, resolve(scenario)
+    metrics = campaign.metrics
     n, m = scenario.model.dimensions
     Q = _weight(metrics.Q, "metrics.Q", n, "one row per state")
     R = _weight(metrics.R, "metrics.R", m, "one row per input")
@@ -141,6 +166,14 @@ def _work(campaign: Campaign, scenario: Scenario) -> tuple[Work, float | None]:
         "settle": metrics.settle,
         "most_events": metrics.most_events,
     }
+    if scenario.loops is not None:
+        if campaign.time != "sampled":
+            raise CallerError('loops: a network that several loops share needs time = "sampled"')
+        judges = "loops_claims_held" in campaign.measured_metrics
+        measured |= {"judges": judges, "count_from_s": metrics.count_from_s}
+        work = SharedWork(in_virtual_time(scenario), campaign.seed, **measured)
+        return work, None
+    resolved = resolve(scenario)
     if campaign.time == "sampled":
         return SampledWork(in_virtual_time(scenario), campaign.seed, **measured), None
     if resolved.protocol.acknowledges:

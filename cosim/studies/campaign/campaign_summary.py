@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cosim.simulation.batch.batch_interface import ROW
 from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS, UNDECIDED
 from cosim.studies.campaign.burst_frequency import BurstFrequency, burst_frequency
 from cosim.studies.campaign.campaign_file import Campaign, label_of
@@ -102,7 +101,7 @@ def summarise(campaign: Campaign, store: Store) -> CampaignSummary:
 
 def runs_at(point: Point, store: Store) -> tuple[dict[Metric, Vector], Vector]:
     """Return all metrics of the runs at a grid point, and the status of each run."""
-    columns = store.columns(point.number, ROW.names or ())
+    columns = store.columns(point.number, store.row_type.names or ())
     return measured(columns, point.certified_error), columns["status"]
 
 

@@ -18,9 +18,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from cosim.simulation.batch.batch_interface import ROW
 from cosim.studies.campaign.campaign_file import Campaign
-from cosim.studies.campaign.campaign_grid import Point
+from cosim.studies.campaign.campaign_grid import Point, row_type
 from cosim.studies.campaign.campaign_workers import Chunk
 from cosim.studies.campaign.worker_identity import arithmetic, difference
 from noack.core.errors import CallerError, MachineError, shortened, why
@@ -49,10 +48,14 @@ class Store:
         self._size = size
         text, number = pa.dictionary(pa.int16(), pa.string()), pa.float64()
         axes = points[0].values.items()
+        self.row_type = row_type(points)
         self._schema = pa.schema([
             *((name, text if isinstance(value, str) else number) for name, value in axes),
             ("draw", pa.int64()),
-            *((name, pa.from_numpy_dtype(ROW[name])) for name in ROW.names or ()),
+            *(
+                (name, pa.from_numpy_dtype(self.row_type[name]))
+                for name in self.row_type.names or ()
+            ),
         ])  # fmt: skip
 
     def chunks(self, point: int) -> Iterator[Chunk]:
@@ -76,7 +79,7 @@ class Store:
             for name, value in self.points[chunk.point].values.items()
         }
         columns["draw"] = np.arange(chunk.start, chunk.stop)
-        columns |= {name: np.ascontiguousarray(rows[name]) for name in ROW.names or ()}
+        columns |= {name: np.ascontiguousarray(rows[name]) for name in self.row_type.names or ()}
         buffer = io.BytesIO()
         table = pa.table(columns, self._schema)
         pq.write_table(table, buffer, compression="zstd", write_page_checksum=True)

@@ -22,6 +22,12 @@ Metric = Literal[
     "inter_event_mean_s",
     "settling_s",
     "cost",
+    "cost_worst",
+    "loops_failed",
+    "loops_claims_held",
+    "loops_guarantee_used",
+    "updates_late",
+    "delay_max_s",
     "sup_e_c_scaled",
     "certificate_used",
     "final_norm",
@@ -58,6 +64,12 @@ METRICS: Mapping[Metric, Description] = {
     "inter_event_mean_s": Description("mean interval", "s", logarithmic=True),
     "settling_s": Description("settling time", "s"),
     "cost": Description("cost", "", "∫ xᵀQx + uᵀRu dt", logarithmic=True),
+    "cost_worst": Description("cost of the worst loop", logarithmic=True),
+    "loops_failed": Description("share of loops that failed"),
+    "loops_claims_held": Description("share of loops that hold all claims"),
+    "loops_guarantee_used": Description("share of loops that used up the guarantee"),
+    "updates_late": Description("share of updates that are late"),
+    "delay_max_s": Description("largest delay in the network", "s", logarithmic=True),
     "sup_e_c_scaled": Description("largest error", "", "sup ‖e_c‖ e^(αt)"),
     "certificate_used": Description("bound used", "", "sup ‖e_c‖ e^(αt) / Δβ"),
     "final_norm": Description("final state", "", "‖x‖", logarithmic=True),
@@ -75,6 +87,8 @@ def measured(columns: Mapping[str, NDArray[Any]], certified: float | None) -> di
     for name in METRICS:
         if name in columns:
             values = np.asarray(columns[name], dtype=np.float64)
+            if name == "loops_claims_held" and np.isnan(values).all():  # they were not judged
+                continue
             found[name] = np.where(np.isnan(values) | failed, np.inf, values)
     arrived = columns["deliveries"] / np.maximum(columns["transmissions"], 1)
     found["lost_share"] = np.where(failed, np.inf, 1.0 - arrived)

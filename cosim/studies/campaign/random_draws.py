@@ -87,6 +87,14 @@ def drawn_scenario(scenario: Scenario, seed: int, draw: int) -> Scenario:
     return resolve(scenario.model_copy(update={"plant": plant, "seeds": seeds}))
 
 
+def seeds_of(seed: int, draw: int) -> SeedsSection:
+    """Return the seeds of a run of several loops, from which the loops draw theirs."""
+    draws = range(draw, draw + 1)
+    return SeedsSection(
+        **{name: int(_seeds(seed, name, draws)[0]) for name in SeedsSection.model_fields}
+    )
+
+
 def _seeds(seed: int, name: str, draws: range) -> NDArray[np.uint64]:
     """Return seeds of 63 bits, the range of a TOML integer, (k,)."""
     return words(seed, _STREAM, name, rows=draws, width=1)[:, 0] >> np.uint64(1)

@@ -20,16 +20,23 @@ _COMPILED_FROM_LOOPS = 20
 _ABOUT_S = 25.0
 
 
+def may_be_compiled(run: Scenario) -> bool:
+    """Whether the machines may be compiled; the settings of such a run cannot be changed."""
+    if run.loops is None or run.changes:
+        return False
+    return sum(section.count for section in run.loops) >= _FEWEST_LOOPS
+
+
 def fleet_of(
     role: FleetRole, name: str, run: Scenario, run_id: int, key: bytes
 ) -> CompiledFleet | None:
     """Return the compiled machines of a role; None if the single machines are to be used.
 
-    They are used for few loops, for loops with something that has no compiled form, and if the
-    code is not in the cache.
+    They are used for few loops, for loops with something that has no compiled form, if settings
+    change during the run, and if the code is not in the cache.
     """
     driver = kept_driver(role)
-    if driver is None or run.loops is None:
+    if driver is None or not may_be_compiled(run):
         return None
     fleet = _fleet(role, name, run, resolved_loops(run), (run_id, key))
     if fleet is not None:
@@ -39,7 +46,7 @@ def fleet_of(
 
 def prepare(roles: Sequence[tuple[str, FleetRole]], run: Scenario) -> None:
     """Compile the machines of a run with many loops, unless they are in the cache."""
-    if run.loops is None or len(loops := resolved_loops(run)) < _COMPILED_FROM_LOOPS:
+    if not may_be_compiled(run) or len(loops := resolved_loops(run)) < _COMPILED_FROM_LOOPS:
         return
     for name, role in roles:
         fleet = _fleet(role, name, run, loops, (0, bytes(KEY_BYTES)))
@@ -52,7 +59,7 @@ def prepare(roles: Sequence[tuple[str, FleetRole]], run: Scenario) -> None:
 def _fleet(
     role: FleetRole, name: str, run: Scenario, loops: Sequence[Scenario], wire: tuple[int, bytes]
 ) -> CompiledFleet | None:
-    if len(loops) < _FEWEST_LOOPS or not has_peer_sockets():
+    if not has_peer_sockets():
         return None
     try:
         parts = role.parts_of(loops)

@@ -13,7 +13,10 @@ from noack.runtime.address import Address
 from noack.runtime.fleet.compiled_fleet import CompiledFleet
 from noack.runtime.udp_sockets import CountingSocket, enlarge_buffer
 
-_BUFFER_BYTES = 64 * 1024 * 1024
+_READ_AT_ONCE = 512
+"""Reads by Python in one turn; more would delay the fleet."""
+_ALL = 10_000_000
+FLEET_BUFFER_BYTES = 64 * 1024 * 1024
 """At 50,000 datagrams a second this covers a stall of a second."""
 
 
@@ -42,10 +45,12 @@ class FleetSocket(CountingSocket[Message]):
             raise PeerError("the system refused to open a socket for the peer")
         self._fleet, self._sends, self._source = fleet, sends, source
         self._outputs: list[Record | Notice] = []
-        self._passed_on = 0
-        enlarge_buffer(self._beside[0], _BUFFER_BYTES)
+        self._passed_on, self._begun = 0, False
+        enlarge_buffer(self._beside[0], FLEET_BUFFER_BYTES)
         fleet.open(clock, endpoint, self._beside[0], destination)
-        self._to_read = [endpoint.fileno(), self._beside[0].fileno()]
+        peer = self._beside[0].fileno()
+        # A socket that was empty when already connected has the peer's datagrams only.
+        self._to_read = [endpoint.fileno(), *([] if peer in self._source_of else [peer])]
 
     def judge(self, data: bytes, source: Address) -> Message | None:
         """Pass a datagram to the fleet, which rejects all but those of the peer."""
@@ -61,8 +66,12 @@ class FleetSocket(CountingSocket[Message]):
         """Begin the next interval of housekeeping; read datagrams of other sources."""
         notices = super().tend(now_ns)
         for readable in self._to_read:
-            while readable in self.watched and select.select([readable], (), (), 0)[0]:
+            # At the start, all that came before the peer's socket: the fleet would reject it later.
+            for _ in range(_READ_AT_ONCE if self._begun else _ALL):
+                if readable not in self.watched or not select.select([readable], (), (), 0)[0]:
+                    break
                 self.receive(readable)
+        self._begun = True
         del self._to_read[1:]  # from now on the fleet reads the peer's socket
         outputs, self._outputs = [*notices, *self._outputs], []
         return outputs

@@ -8,8 +8,18 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
+from cosim.analysis.loops_over_time import (
+    INTERVALS,
+    QUANTILES,
+    LoopsOverTime,
+    loops_over_time,
+    quantiles,
+    worst_loop,
+)
 from cosim.analysis.shared_summary import in_flight, is_complete
 from cosim.cli import app
+from cosim.output.report.loops_figures import error_map, norms_figure
+from cosim.record.align import align_tables
 from cosim.record.run_record import load_record
 from noack.config.resolution import network_tables
 from noack.protocol.record_tables import NETEM_PACKET
@@ -89,11 +99,88 @@ def test_commands_read_the_run_and_its_loops(run_dir: Path) -> None:
         assert json.loads(replayed.stdout)["gaps"] == []
     assert "bottleneck" in noack("summary", run_dir).stdout
     assert noack("report", loop).exit_code == 0
-    refused = noack("report", run_dir)
-    assert refused.exit_code == 2
-    assert f"name one of them, e.g. {run_dir / 'loops' / 'pendulum-01'}" in " ".join(
-        refused.stderr.split()
-    )
+    page = run_dir / "report.html"
+    before = page.read_text()
+    assert noack("report", run_dir, "--again").exit_code == 0
+    link = '<a href="loops/periodic/report.html">periodic</a>'
+    assert link not in before
+    assert link in page.read_text()
+
+
+def test_the_loops_over_time(run_dir: Path) -> None:
+    summary = json.loads((run_dir / "summary.json").read_text())
+    network = load_record(run_dir, network=True)
+    records = [load_record(run_dir / "loops" / one["name"]) for one in summary["loops"]]
+    found = loops_over_time(network, records)
+    assert found.errors.shape == found.states.shape == (LOOPS, INTERVALS)
+    for number, one in enumerate(summary["loops"]):
+        assert np.nanmax(found.errors[number]) == one["sup_e_c_norm"]
+    # Loop 6 alone, interval by interval; its time begins at its phase.
+    phase_ns, run = round(1e9 * summary["loops"][6]["phase_s"]), align_tables(records[6])
+    assert phase_ns > 0
+    edges_ns = np.linspace(0, 3e9, INTERVALS + 1)
+    for i in (0, 50, 199):
+        t_ns = run.t_ns + phase_ns
+        inside = (t_ns >= edges_ns[i]) & ((t_ns < edges_ns[i + 1]) | (i == INTERVALS - 1))
+        largest = np.linalg.norm(run.x[inside], axis=1).max()
+        assert found.states[6, i] == pytest.approx(largest, rel=1e-12)
+    packets = network[NETEM_PACKET]
+    left = packets[(packets["release_ns"] >= 0) & (packets["release_ns"] <= 3 * 10**9)]
+    assert found.link_bytes.sum() == left["size_bytes"].sum()
+    ends_s, shares = found.shares()
+    in_second = left[(left["release_ns"] >= 12 * 10**7) & (left["release_ns"] < 24 * 10**7)]
+    of_loop = in_second[in_second["flow"] == 10]["size_bytes"].sum()
+    assert ends_s[1] == pytest.approx(0.24)
+    assert shares[10, 1] == pytest.approx(of_loop / in_second["size_bytes"].sum())
+
+
+def test_quantiles_over_loops_ignore_what_is_unknown() -> None:
+    values = np.random.default_rng(3).normal(size=(50, 7))
+    values[:, 3] = np.nan
+    values[4:, 5] = np.inf
+    found = quantiles(values)
+    np.testing.assert_allclose(found[:, 0], np.quantile(values[:, 0], QUANTILES))
+    np.testing.assert_allclose(found[:, 5], np.quantile(values[:4, 5], QUANTILES))
+    assert np.isnan(found[:, 3]).all()
+
+
+@pytest.mark.parametrize("count", [3, 11, 100])
+def test_figures_of_few_and_many_loops(count: int) -> None:
+    """The curves and the colours have the given values."""
+    values = np.random.default_rng(1).uniform(0.1, 1, (count, INTERVALS))
+    names = [f"loop-{i}" for i in range(count)]
+    over_time = LoopsOverTime(np.linspace(0, 2, INTERVALS + 1), values, 2 * values, values)
+    upper, lower = norms_figure(over_time, names).axes
+    for axes, factor in ((upper, 1), (lower, 2)):
+        drawn = [np.asarray(line.get_ydata()) for line in axes.lines]
+        if count == 3:
+            np.testing.assert_array_equal(drawn, factor * values)
+        else:
+            np.testing.assert_allclose(drawn[0], factor * np.median(values, axis=0))
+            np.testing.assert_array_equal(drawn[1], factor * values.max(axis=0))
+    image = error_map(over_time, names).axes[0].images[0].get_array()
+    np.testing.assert_array_equal(image, values)
+
+
+def test_the_worst_loop(tmp_path: Path) -> None:
+    """A loop that failed, else the largest share of a certified bound, else the largest ‖e_c‖."""
+    loops = [
+        {"name": name, "number": i, "sup_e_c_norm": error, "exit": {"status": 0, "reason": ""}}
+        for i, (name, error) in enumerate((("a", 0.1), ("b", None), ("c", 0.3)))
+    ]
+    assert worst_loop(tmp_path, loops).number == 2
+    (tmp_path / "loops" / "b").mkdir(parents=True)
+    claims = [
+        {"source": "(I1)", "bound": "‖e_c‖ ≤ 1", "ratio": 7.0},
+        {"source": "certificate", "bound": "‖e_c‖ ≤ 1", "ratio": 0.25},
+        {"source": "certificate", "bound": "none", "ratio": None},
+    ]
+    (tmp_path / "loops" / "b" / "summary.json").write_text(json.dumps({"claims": claims}))
+    worst = worst_loop(tmp_path, loops)
+    assert worst.number == 1
+    assert worst.why.endswith(": 25 %")
+    loops[0]["exit"] = {"status": 1, "reason": "diverged"}
+    assert worst_loop(tmp_path, loops) == (0, "diverged")
 
 
 def test_a_loop_that_diverges_is_named_and_the_others_go_on(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from cosim.analysis.loss_statistics import from_controller, unintended_losses
 from cosim.analysis.replay import replay
 from cosim.record.packet_outcomes import packet_outcomes
 from cosim.record.run_record import RunRecord
+from cosim.simulation.shared_network import simulate_loops
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
@@ -208,3 +209,21 @@ def test_the_flows_of_the_network_follow_from_its_settings() -> None:
     assert scenario("hold").network.flows == (Flow.UPDATE, Flow.ACTUATION)
     paper = load(SCENARIOS / "lane_following.toml")
     assert paper.network.flows == (Flow.UPDATE,)
+
+
+def test_each_loop_has_actuations_and_a_guarantee_of_its_own(tmp_path: Path) -> None:
+    path, fast = SCENARIOS / "lane_actuation_loss.toml", ["horizon_s=3", "plant.rate_hz=100"]
+    single = simulate(resolve(load(path, fast)))
+    for count in (1, 3):
+        several = tmp_path / f"{count}.toml"
+        several.write_text(f'{path.read_text()}\n[[loops]]\nname = "car"\ncount = {count}\n')
+        loops = simulate_loops(load(several, fast)).loops
+        bursts = [packet_outcomes(loop, Flow.ACTUATION).longest_loss_burst() for loop in loops]
+        assert bursts == [3] * count
+        assert [from_controller(loop)["actuations"].sent for loop in loops] == [150] * count
+        assert [sum(unintended_losses(loop).values()) for loop in loops] == [0] * count
+        if count == 1:
+            for table in (PLANT_STEP, PLANT_ACTUATION, NETEM_PACKET):
+                names = [name for name in single[table].dtype.names if name != "head"]
+                for name in names:
+                    assert (single[table][name] == loops[0][table][name]).all(), (table, name)

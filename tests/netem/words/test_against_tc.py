@@ -91,7 +91,7 @@ probabilities = st.floats(0, 1)
 correlations = st.floats(0, 1, exclude_max=True)
 tcs_losses = st.one_of(
     [varied(model) for model in (NoLoss, BernoulliLoss, GilbertElliottLoss, FourStateLoss)]
-).filter(lambda loss: not getattr(loss, "keep", False))
+).filter(lambda loss: not loss.tc_lacks(()))
 tcs_delays = st.builds(
     Delay,
     delay_s=times_s,

@@ -1,7 +1,6 @@
 """The flow between two deliveries, against runs in exact continuous time and against samples."""
 
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -9,11 +8,10 @@ from hypothesis import given, settings
 from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix
-from noack.theory import sharpened_bounds
 from noack.theory.certificate import Constants, NetworkConditions
-from noack.theory.delivery_flow import DeliveryFlow, Reach
-from noack.theory.gains import PlantGains
+from noack.theory.delivery_flow import Reach
 from noack.theory.sharpened_bounds import InvariantEllipsoids
+from tests.noack.theory.broken_flow import BROKEN_FLOWS
 from tests.noack.theory.exact_loops import observe
 from tests.noack.theory.loops import (
     ROUNDING,
@@ -81,50 +79,11 @@ def test_the_flow_makes_the_bounds_much_smaller_and_runs_come_close_to_them() ->
     assert {name for name, share in used.items() if share < 0.6} == set()
 
 
-def only_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The ellipsoid need not contain what errors drive x to."""
-    monkeypatch.setattr(Reach, "is_invariant", lambda reach: True)
-    monkeypatch.setattr(
-        InvariantEllipsoids, "_size",
-        lambda self, shape, limit: float(np.linalg.norm(shape @ self.flow.start)),
-    )  # fmt: skip
-
-
-def no_lost_updates(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At an event e_c is 0."""
-    exact = InvariantEllipsoids.sharpened
-    monkeypatch.setattr(
-        InvariantEllipsoids, "sharpened",
-        lambda self, known, limit, lost, level: exact(self, known, limit, 0.0, level),
-    )  # fmt: skip
-
-
-def no_drive_of_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    """After an event e_s stays what H makes of it."""
-    monkeypatch.setattr(
-        sharpened_bounds, "_error_after", lambda flow, time_s: np.zeros((flow.n, 2 * flow.n))
-    )
-
-
-def no_mismatch(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The plant follows its model."""
-    exact = DeliveryFlow.__init__
-
-    def without(flow: DeliveryFlow, plant: PlantGains) -> None:
-        exact(flow, replace(plant, A=plant.error.H - plant.B @ plant.error.K))
-
-    monkeypatch.setattr(DeliveryFlow, "__init__", without)
-
-
-@pytest.mark.parametrize(
-    "broken", [only_the_start, no_lost_updates, no_drive_of_the_error, no_mismatch]
-)
-def test_a_broken_copy_is_exceeded(
-    broken: Callable[[pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("mistake", BROKEN_FLOWS)
+def test_a_broken_copy_is_exceeded(mistake: str) -> None:
     systems = [weighted(), weighted(x0=np.array([0.01, 0.02]))]
-    broken(monkeypatch)
-    used = [shares(one, one.certify(NetworkConditions(3)), 1) for one in systems]
+    with BROKEN_FLOWS[mistake]():
+        used = [shares(one, one.certify(NetworkConditions(3)), 1) for one in systems]
     assert max(max(one.values()) for one in used) > 1.05
 
 

@@ -18,6 +18,7 @@ from cosim.output.palette import CONTROLLER, FORCED, LOST, NETWORK, PLANT, SENSO
 from cosim.output.viewer.pictures.picture import STILL, Columns, Shape, label, lines, style, upright
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import Fate, effective
+from noack.protocol.wire_format import Flow
 
 DIAGRAM = "network"
 LEG_S = 0.15
@@ -56,11 +57,12 @@ class NetworkDiagram:
     """Boxes, arrows between them, and packets.
 
     Args:
-        acknowledged: whether packets also travel in the reverse direction.
+        reverse: what the controller sends through the network: acknowledgements or actuations, if
+            anything.
     """
 
-    def __init__(self, *, acknowledged: bool = False) -> None:
-        self._acknowledged = acknowledged
+    def __init__(self, reverse: Flow | None = None) -> None:
+        self._reverse = reverse
         self._in_flight = np.zeros(0, _PACKET)
         self._drawn_ns = -1
         self._last_ns = {False: -_APART_NS, True: -_APART_NS}
@@ -89,7 +91,7 @@ class NetworkDiagram:
             )  # fmt: skip
             found[f"box/{name}/word"] = label(text, (x, 0.28), colour)
         arrows = [_arrow(a + _HALF_WIDE, b - _HALF_WIDE, 0.0) for a, b in pairwise(_BOXES.values())]
-        if self._acknowledged:
+        if self._reverse is Flow.ACKNOWLEDGEMENT:
             arrows += [
                 _arrow(a - _HALF_WIDE, b + _HALF_WIDE, _REVERSE_Y)
                 for a, b in ((_CONTROLLER, _NETWORK), (_NETWORK, _SENSOR))
@@ -97,15 +99,18 @@ class NetworkDiagram:
         found["arrows"] = lines([line for arrow in arrows for line in arrow], STILL, 0.03)
         home = [(_CONTROLLER, -_HALF_HIGH), (_CONTROLLER, _LOW), (0.0, _LOW), (0.0, -_HALF_HIGH)]
         head = [(-0.14, -_HALF_HIGH - 0.2), (0.0, -_HALF_HIGH), (0.14, -_HALF_HIGH - 0.2)]
-        found["input"] = lines([home, head], STILL, 0.03)
+        inputs = [home, head]
+        if self._reverse is Flow.ACTUATION:  # they cross the network
+            inputs.append([(_NETWORK, -_HALF_HIGH), (_NETWORK, _LOW)])
+        found["input"] = lines(inputs, STILL, 0.03)
         found["input/word"] = label("u = K x_c", (_SENSOR, _LOW + 0.4), STILL)
         found["lost/word"] = label("lost", (_NETWORK + 1.1, -1.0), LOST)
         found["forced/word"] = label("forced", (_NETWORK + _APART / 2, 1.55), FORCED)
         for entity, colour in (
-            ("broadcast", SENSOR), ("delivered", CONTROLLER), ("acknowledgement", NETWORK),
+            ("broadcast", SENSOR), ("delivered", CONTROLLER), ("reverse", NETWORK),
         ):  # fmt: skip
             found[entity] = rr.Points2D.from_fields(
-                radii=_SIZE if entity != "acknowledgement" else 0.6 * _SIZE,
+                radii=_SIZE if entity != "reverse" else 0.6 * _SIZE,
                 colors=colour,
                 draw_order=5.0,
             )
@@ -119,10 +124,10 @@ class NetworkDiagram:
         """Add packets (p,) that follow the previously added ones.
 
         Args:
-            t_ns: times of their broadcasts; for acknowledgements, times of arrival at the network.
+            t_ns: times of their broadcasts; in reverse, times of arrival at the network.
             release_ns: times at which they leave the network.
             fate: their fates in the network.
-            reverse: whether they are acknowledgements.
+            reverse: whether they are from the controller.
 
         If packets are closer to each other than a dot's size, only the first is drawn.
         """
@@ -176,13 +181,19 @@ class NetworkDiagram:
         fall = (now_ns - out_ns) / _FALL_NS
         y = np.where(leaves & ~survives, -_HALF_HIGH - 0.2 - 1.3 * fall, 0.0)
         forced = pairs["fate"] == Fate.FORCED
-        x = np.where(reverse, 2 * _NETWORK - x, x)
-        y = np.where(reverse & (survives | ~leaves), _REVERSE_Y, y)
+        if self._reverse is Flow.ACTUATION:
+            back = np.where(
+                leaves & survives, _NETWORK * (1 - onward), _CONTROLLER - _APART * there
+            )
+            x, y = np.where(reverse, back, x), np.where(reverse, _LOW + 0.4 * y, y)
+        else:
+            x = np.where(reverse, 2 * _NETWORK - x, x)
+            y = np.where(reverse & (survives | ~leaves), _REVERSE_Y, y)
         places = upright(np.column_stack([x, y]))
         what = {
             "broadcast": ~leaves & ~reverse,
             "delivered": leaves & survives & ~forced & ~reverse,
-            "acknowledgement": (survives | ~leaves) & reverse,
+            "reverse": (survives | ~leaves) & reverse,
             "forced": leaves & forced & ~reverse,
             "lost": leaves & ~survives,
         }

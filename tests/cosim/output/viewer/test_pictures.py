@@ -20,6 +20,7 @@ from noack.config.resolution import loop_of, resolve
 from noack.config.scenario_file import load
 from noack.core.linear_systems import Propagator
 from noack.protocol.record_tables import Fate
+from noack.protocol.wire_format import Flow
 
 ROOT = Path(__file__).parents[4]
 S = 1_000_000_000
@@ -246,17 +247,22 @@ def test_many_packets_are_thinned_and_an_idle_network_draws_nothing() -> None:
     assert diagram.advance(100 * S) == {}
 
 
-def test_acknowledgements_are_drawn_in_the_reverse_direction() -> None:
-    diagram = NetworkDiagram(acknowledged=True)
+@pytest.mark.parametrize(
+    ("flow", "begin", "end"), [(Flow.ACKNOWLEDGEMENT, 10.5, 6.5), (Flow.ACTUATION, 12.5, 1.0)]
+)
+def test_what_the_controller_sends_is_drawn_to_its_receiver(
+    flow: Flow, begin: float, end: float
+) -> None:
+    diagram = NetworkDiagram(flow)
     diagram.add(
         np.array([S, 2 * S]), np.array([S, 2 * S]), np.array([Fate.DELIVERED, Fate.DROPPED]),
         reverse=True,
     )  # fmt: skip
     seen = rows_of(diagram, [4 * S])
-    assert seen.keys() == {"acknowledgement", "lost"}
+    assert seen.keys() == {"reverse", "lost"}
     (first, *_, last) = [
-        shapes[0][0] for t_ns, shapes in sorted(seen["acknowledgement"].items())
+        shapes[0][0] for t_ns, shapes in sorted(seen["reverse"].items())
         if shapes and t_ns < 1.5 * S
     ]  # fmt: skip
-    assert first > 10.5
-    assert last < 6.5
+    assert first > begin
+    assert last < end

@@ -1,0 +1,137 @@
+"""The figures of a run of several loops: the network, and the errors and states of all loops."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from cosim.analysis.loops_over_time import LoopsOverTime, quantiles
+from cosim.output import palette
+from cosim.output.report import axes as draw
+from cosim.output.report.figure_style import NotebookFigure, printed, styled
+
+NAMED = len(palette.SERIES)
+"""Up to so many loops have a curve each, in a colour of its own; more are drawn as bands."""
+_PANEL_IN, _BETWEEN_IN = 1.7, 0.35
+_ROW_IN, _LOWEST_IN, _HIGHEST_IN, _BAR_IN = 0.22, 1.2, 4.5, 0.2
+_DECADES = 5
+_MOST_ROWS = 24
+"""Up to so many rows of the map have the names of their loops."""
+_BANDS = ((0, 4, 0.25, "5 to 95 % of the loops"), (1, 3, 0.45, "25 to 75 %"))
+_MEDIAN, _LARGEST = 2, 5
+
+Reals = NDArray[np.float64]
+
+
+class QueueLength(NamedTuple):
+    """Datagrams inside the network in intervals of equal width."""
+
+    width_s: float
+    mean: Sequence[float]
+    largest: Sequence[int]
+
+
+@styled
+def network_figure(over_time: LoopsOverTime, names: Sequence[str], queue: QueueLength) -> Figure:
+    """Draw the number of datagrams in the network, and the share of each loop of the bytes."""
+    figure, (upper, lower) = _two_panels(_labels(names))
+    t_s = np.asarray((np.arange(len(queue.mean)) + 0.5) * queue.width_s, np.float64)
+    network, most = printed(palette.NETWORK), np.asarray(queue.largest, dtype=np.float64)
+    upper.fill_between(t_s, most, step="mid", color=network, alpha=0.3, linewidth=0)
+    shown = draw.line(upper, t_s, np.array(queue.mean, np.float64), "mean", color=network)
+    upper.set(title="Datagrams in the network", ylabel="datagrams")
+    draw.legend(upper, [(upper.collections[0], "largest of an interval"), *shown])
+    ends_s, shares = over_time.shares()
+    _curves(lower, ends_s - ends_s[0] / 2, 100 * shares, names)
+    lower.set(title="Share of the link", ylabel="%", xlabel=draw.TIME)
+    for axes in (upper, lower):
+        axes.set_ylim(bottom=0)
+        draw.finish(axes, over_time.edges_s)
+    return figure
+
+
+@styled
+def norms_figure(over_time: LoopsOverTime, names: Sequence[str]) -> Figure:
+    """Draw ‖e_c‖ and ‖x‖ of all loops on logarithmic axes."""
+    figure, panels = _two_panels(_labels(names))
+    drawn = ((r"$\|e_c\|$ controller", over_time.errors), (r"$\|x\|$ plant", over_time.states))
+    for axes, (label, values) in zip(panels, drawn, strict=True):
+        draw.logarithmic(axes, "y")
+        _curves(axes, over_time.middles_s, draw.finite(values, positive=True), names)
+        axes.set(title=label)
+        draw.limit_log_axis(axes, values, _DECADES)
+        draw.finish(axes, over_time.edges_s)
+    panels[1].set_xlabel(draw.TIME)
+    return figure
+
+
+@styled
+def error_map(over_time: LoopsOverTime, names: Sequence[str]) -> Figure:
+    """Draw ‖e_c‖ of each loop, a row, over time, as colours."""
+    count = len(names)
+    height_in = min(max(count * _ROW_IN, _LOWEST_IN), _HIGHEST_IN)
+    above_in = draw.head_in([])
+    figure = NotebookFigure(figsize=(draw.WIDTH_IN, above_in + height_in + draw.BELOW_IN))
+    width_in = draw.WIDTH_IN - draw.LEFT_IN - draw.RIGHT_IN - 4 * _BAR_IN
+    axes = draw.place(figure, draw.LEFT_IN, above_in, width_in, height_in)
+    values = draw.finite(over_time.errors, positive=True)
+    axes.set(title=r"$\|e_c\|$ of each loop", xlabel=draw.TIME)
+    axes.grid(visible=False)
+    if count <= _MOST_ROWS:
+        axes.set_yticks(range(count), [draw.plain(name) for name in names])
+    else:
+        axes.set_ylabel("number of the loop")
+    if not np.isfinite(values).any():
+        draw.finish(axes)
+        return figure
+    most = float(np.nanmax(values))
+    least = max(float(np.nanmin(values)), most / 10**_DECADES)
+    norm = LogNorm(least, most if most > least else 2 * least)
+    image = axes.imshow(
+        values, aspect="auto", interpolation="nearest", norm=norm, cmap=colormaps["viridis"],
+        extent=(0.0, float(over_time.edges_s[-1]), count - 0.5, -0.5),
+    )  # fmt: skip
+    left_in = draw.WIDTH_IN - draw.RIGHT_IN - 3 * _BAR_IN
+    bar = draw.place(figure, left_in, above_in, _BAR_IN, height_in)
+    figure.colorbar(image, cax=bar)
+    bar.grid(visible=False)
+    return figure
+
+
+def _labels(names: Sequence[str]) -> list[str]:
+    """Return the labels of the curves, for the room of the legend."""
+    bands = [*(label for *_, label in _BANDS), "median", "largest"]
+    return [draw.plain(name) for name in names] if len(names) <= NAMED else bands
+
+
+def _two_panels(labels: Sequence[str]) -> tuple[Figure, list[Axes]]:
+    above_in = draw.head_in(labels)
+    height_in = 2 * (above_in + _PANEL_IN) + _BETWEEN_IN + draw.BELOW_IN
+    figure = NotebookFigure(figsize=(draw.WIDTH_IN, height_in))
+    width_in = draw.WIDTH_IN - draw.LEFT_IN - draw.RIGHT_IN
+    tops_in = (above_in, 2 * above_in + _PANEL_IN + _BETWEEN_IN)
+    return figure, [draw.place(figure, draw.LEFT_IN, top, width_in, _PANEL_IN) for top in tops_in]
+
+
+def _curves(axes: Axes, t_s: Reals, values: Reals, names: Sequence[str]) -> None:
+    """Draw a curve for each of a few loops, (L, k) over (k,), or quantiles over many."""
+    shown: list[draw.Shown] = []
+    if len(names) <= NAMED:
+        for name, colour, curve in zip(names, palette.SERIES, values, strict=False):
+            shown += draw.line(axes, t_s, curve, draw.plain(name), color=printed(colour))
+    else:
+        found, orange = quantiles(values), printed(palette.CONTROLLER)
+        for low, high, alpha, label in _BANDS:
+            band = axes.fill_between(
+                t_s, found[low], found[high], color=orange, alpha=alpha, linewidth=0
+            )
+            shown.append((band, label))
+        shown += draw.line(axes, t_s, found[_MEDIAN], "median", color=orange)
+        dashed = {"color": printed(palette.LOST), "linestyle": (0, (3, 1.5)), "linewidth": 1.0}
+        shown += draw.line(axes, t_s, found[_LARGEST], "largest", **dashed)
+    draw.legend(axes, shown)

@@ -1,0 +1,131 @@
+"""The report of a run of several loops: the network, all loops, and the worst one in detail."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+
+from cosim.analysis.loops_over_time import LoopsOverTime, loops_over_time, worst_loop
+from cosim.output.report.loops_figures import (
+    NAMED,
+    QueueLength,
+    error_map,
+    network_figure,
+    norms_figure,
+)
+from cosim.output.report.report_page import environment_rows, templates
+from cosim.output.report.run_figures import Envelope, RunFigure, pictures
+from cosim.output.shared_tables import CAPTION, HEADINGS, badness, loop_row, network_rows
+from cosim.record.run_directory import (
+    ENVIRONMENT_FILE,
+    LOOPS,
+    REPORT_FILE,
+    SCENARIO_FILE,
+    read_object,
+)
+from cosim.record.run_record import RunRecord, load_record
+from cosim.record.shared_run import loop_directories
+from noack.core.errors import ExitStatus
+from noack.core.file_access import write_whole
+from noack.core.number_format import number
+
+_OF_WORST = ("states", "errors", "losses")
+
+
+def write_loops_report(
+    network: RunRecord,
+    summary: Mapping[str, Any],
+    run_dir: Path,
+    envelopes: Sequence[Envelope] = (),
+) -> Path:
+    """Write the report of a run of several loops; replace an existing one.
+
+    Args:
+        network: the record of the network.
+        summary: the run's summary.
+        run_dir: the run's directory.
+        envelopes: certified bounds of the worst loop.
+
+    Raises:
+        CallerError: the record of a loop is missing.
+        MachineError: the report cannot be written.
+    """
+    directories = loop_directories(run_dir, network.scenario)
+    over_time = loops_over_time(network, map(load_record, directories))
+    worst = worst_loop(run_dir, summary["loops"])
+    drawings = pictures(load_record(directories[worst.number]), envelopes)
+    lines = _verdict(summary)
+    is_bad = summary["exit"]["status"] != ExitStatus.OK or "violated" in lines[1]
+    environment = read_object(run_dir / ENVIRONMENT_FILE)
+    loops = sorted(summary["loops"], key=badness, reverse=True)
+    html = templates().get_template("loops.html.jinja").render(
+        scenario=network.scenario,
+        summary=summary,
+        verdict_lines=lines,
+        verdict_tone="bad" if is_bad else "doubt" if "void" in lines[1] else "good",
+        network=network_rows(dict(summary)),
+        figures=_figures(over_time, summary),
+        worst_name=directories[worst.number].name,
+        worst_why=worst.why[:1].upper() + worst.why[1:],
+        worst_figures=[drawings[name]() for name in _OF_WORST],
+        caption=CAPTION,
+        headings=HEADINGS,
+        loops=[(_link(run_dir, loop["name"]), loop_row(loop)) for loop in loops],
+        scenario_toml=(run_dir / SCENARIO_FILE).read_text(encoding="utf-8"),
+        environment=environment,
+        environment_rows=environment_rows(environment),
+    )  # fmt: skip
+    return write_whole(run_dir / REPORT_FILE, html)
+
+
+def _verdict(summary: Mapping[str, Any]) -> list[str]:
+    """Return how the run ended, and how many claims about its loops have each verdict."""
+    end = summary["exit"]
+    reached = f"{summary['reached_s']:g} s"
+    if end["status"] != ExitStatus.OK:
+        reached = f"failed after {reached} of {summary['horizon_s']:g} s: {end['reason']}"
+    else:
+        reached = f"completed {reached}"
+    counts: dict[str, int] = {}
+    for loop in summary["loops"]:
+        for verdict, count in loop["claims"].items():
+            counts[verdict] = counts.get(verdict, 0) + count
+    claims = ", ".join(f"{count} {verdict}" for verdict, count in sorted(counts.items()))
+    return [reached, f"claims of all loops: {claims or 'none'}"]
+
+
+def _link(run_dir: Path, name: str) -> str | None:
+    """Return the address of a loop's report; None if it is not written."""
+    path = Path(LOOPS, name, REPORT_FILE)
+    return quote(path.as_posix()) if (run_dir / path).is_file() else None
+
+
+def _figures(over_time: LoopsOverTime, summary: Mapping[str, Any]) -> list[RunFigure]:
+    names = [loop["name"] for loop in summary["loops"]]
+    flying = summary["network"]["in_flight"]
+    queue = QueueLength(flying["width_s"], flying["mean_by_interval"], flying["max_by_interval"])
+    drawn = "Each loop has a curve." if len(names) <= NAMED else "Bands: quantiles over the loops."
+    largest = over_time.errors[np.isfinite(over_time.errors)].max(initial=0.0)
+    return [
+        RunFigure(
+            "network", network_figure(over_time, names, queue),
+            "Datagrams that wait, are sent or are delayed in the network; and of the bytes that "
+            f"left it, the share of each loop. {drawn}",
+            f"Above, the number of datagrams in the network over time, up to {flying['max']}. "
+            f"Below, the shares of {len(names)} loops in the bytes that the network forwarded.",
+        ),
+        RunFigure(
+            "loops", norms_figure(over_time, names),
+            "Largest error ‖e_c‖ of the controller's model, and largest norm ‖x‖ of the plant's "
+            f"state, in each of {len(over_time.middles_s)} intervals. {drawn}",
+            f"Norms of {len(names)} loops over time on logarithmic axes; ‖e_c‖ is at most "
+            f"{number(largest)}.",
+        ),
+        RunFigure(
+            "map", error_map(over_time, names),
+            "Largest ‖e_c‖ of each loop in each interval; no colour before its first delivery.",
+            f"A row of colours for each of {len(names)} loops: ‖e_c‖ over time.",
+        ),
+    ]  # fmt: skip

@@ -1,0 +1,58 @@
+"""Mistakes in the bounds from the flow between two deliveries, each as a context."""
+
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+
+from noack.theory import sharpened_bounds
+from noack.theory.delivery_flow import DeliveryFlow, Reach
+from noack.theory.gains import PlantGains
+from noack.theory.sharpened_bounds import InvariantEllipsoids
+
+
+def only_the_start() -> AbstractContextManager[Any]:
+    """The ellipsoid need not contain what errors drive x to."""
+    return patch.multiple(
+        InvariantEllipsoids,
+        within=lambda self, limit: Reach(
+            self.flow, self._chosen / np.linalg.norm(self._chosen @ self.flow.start), limit
+        ),
+    )
+
+
+def no_lost_updates() -> AbstractContextManager[Any]:
+    """At an event e_c is 0."""
+    exact = InvariantEllipsoids.sharpened
+    return patch.object(
+        InvariantEllipsoids, "sharpened",
+        lambda self, known, limit, lost, level: exact(self, known, limit, 0.0, level),
+    )  # fmt: skip
+
+
+def no_drive_of_the_error() -> AbstractContextManager[Any]:
+    """After an event e_s stays what H makes of it."""
+    return patch.object(
+        sharpened_bounds, "_error_after", lambda flow, time_s: np.zeros((flow.n, 2 * flow.n))
+    )
+
+
+def no_mismatch() -> AbstractContextManager[Any]:
+    """The plant follows its model."""
+    exact = DeliveryFlow.__init__
+
+    def without(flow: DeliveryFlow, plant: PlantGains) -> None:
+        exact(flow, replace(plant, A=plant.error.H - plant.B @ plant.error.K))
+
+    return patch.object(DeliveryFlow, "__init__", without)
+
+
+BROKEN_FLOWS: Mapping[str, Callable[[], AbstractContextManager[Any]]] = {
+    "the ellipsoid holds x(0) only": only_the_start,
+    "no lost updates at an event": no_lost_updates,
+    "no drive of e_s": no_drive_of_the_error,
+    "no mismatch in the flow": no_mismatch,
+}
