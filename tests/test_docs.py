@@ -36,7 +36,7 @@ PAGES = (
     "README.md", "docs/record.md", "docs/scenarios.md", "docs/paper.md", "docs/netem.md",
     "docs/netem-programs.md", "docs/campaigns.md", "docs/design.md", "docs/plants.md",
     "docs/library.md", "docs/command-line.md", "docs/howto.md", "docs/guarantees.md",
-    "docs/benchmarks.md", "docs/measure.md",
+    "docs/benchmarks.md", "docs/measure.md", "docs/capacity.md",
 )  # fmt: skip
 
 
@@ -84,6 +84,7 @@ SHORTER = {
     "run": ("--no-report",),
     "adversary": ("--set", "horizon_s=2", "--nodes", "2000"),
     "design": ("--draws", "100"),
+    "capacity": ("--draws", "1", "--loops", "2", "--set", "horizon_s=1"),
     "margin": ("--no-period",),
     "doctor": ("--seconds", "0.1"),
 }
@@ -247,11 +248,12 @@ def test_the_documented_campaign_is_valid(tmp_path: Path) -> None:
     assert len(grid(load_campaign(path), path)) == 9
 
 
-def test_every_option_of_design_is_documented_and_no_other() -> None:
-    text = (ROOT / "docs/design.md").read_text().partition("## Options")[2]
+@pytest.mark.parametrize("command", ["design", "capacity"])
+def test_every_option_is_documented_and_no_other(command: str) -> None:
+    text = (ROOT / f"docs/{command}.md").read_text().partition("## Options")[2]
     rows = [line.split("|")[1] for line in text.splitlines() if line.startswith("| `")]
-    documented = {name for row in rows for name in re.findall("--[A-Za-z]+", row)}
-    parameters = get_command(app).commands["design"].params  # type: ignore[attr-defined]
+    documented = {name for row in rows for name in re.findall("--[A-Za-z-]+", row)}
+    parameters = get_command(app).commands[command].params  # type: ignore[attr-defined]
     known = {name for one in parameters for name in one.opts if name.startswith("--")}
     assert documented | {"--help"} == known | {"--help"}
 

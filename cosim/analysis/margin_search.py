@@ -191,8 +191,12 @@ def find_margin(
         progress: receives what is examined next.
 
     Raises:
-        CallerError: the loop is not covered.
+        CallerError: the loop is not covered, or a number is out of range.
     """
+    if most_m < 1:
+        raise CallerError(f"most_m {most_m}: expected the largest M to examine, 1 or more")
+    if not 1e-8 <= accuracy < 1:
+        raise CallerError(f"accuracy {accuracy:g}: expected a number from 1e-8 to 1, e.g. 1e-4")
     margin, network = LossMargin(resolved), resolved.network
     others = LossGuarantee(
         tuple(rule for rule in network.guarantee.rules if not isinstance(rule, LongestBurst))

@@ -78,6 +78,7 @@ class Program(TyperGroup):
         if not message:
             return ""
         message = message[0].lower() + message[1:].replace("Input should", "should")
+        message = message.replace("Value error, ", "")
         name = next((word for word in words if word in self.commands), None)
         where, command = (f"{name}: ", f"{NAME} {name}") if name else ("", NAME)
         if near := getattr(error, "possibilities", None):

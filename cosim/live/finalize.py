@@ -26,6 +26,7 @@ from cosim.record.decimate import is_long
 from cosim.record.run_directory import (
     ENDING_FILE,
     RECORD,
+    RECORDING_FILE,
     REPORT_FILE,
     SCENARIO_FILE,
     SUMMARY_FILE,
@@ -92,7 +93,7 @@ def finalize(ending: RunEnding, *, report: bool = True, again: bool = False) -> 
 def _finalize_shared(
     network: RunRecord, ending: RunEnding, *, report: bool, again: bool
 ) -> Outcome:
-    """Finalise each loop of a run of several; write the summary and the report of the run."""
+    """Finalise each loop of a run of several; write summary, report and recording of the run."""
     of_each = report and len(loops_of(network.scenario)) <= _FEW_LOOPS
     summary = finalize_loops(network, ending, partial(finalize, report=of_each, again=again))
     _write_summary(ending.run_dir, summary)
@@ -103,6 +104,12 @@ def _finalize_shared(
     if report:
         with _report_is_optional(ending.run_dir):
             _loops_report(network, content, ending.run_dir)
+        try:
+            from cosim.output.viewer.loops_view import write_loops_view
+
+            write_loops_view(network, content, ending.run_dir, ending.run_id)
+        except Exception as error:  # likewise
+            print(f"noack: warning: no {RECORDING_FILE}: {error}", file=sys.stderr)
     return Outcome(ending.run_dir, status, reason, content)
 
 

@@ -310,8 +310,8 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
     if process.replaces is not None:
         recorder.note(Notice(process.start.from_ns, RESTART, f"restarted: {process.replaces}"))
     process.join(None)
-    # A restarted recorder writes the view at the end; the launcher writes that of a long run. A run
-    # of several loops has none.
+    # A restarted recorder writes the view at the end; the launcher writes that of a long run, and
+    # that of a run of several loops.
     unseen = process.scenario.loops is not None or is_long(process.scenario)
     if view is not None or not (process.start.is_restart or unseen):
         try:

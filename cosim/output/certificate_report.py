@@ -101,16 +101,19 @@ def _print_constants(console: Console, found: Certificates) -> None:
         "number of updates lost or in flight. no update missing: while the controller has every "
         "update, which sharpens the bound of x from an event on. inter-event time: minimum.[/]"
     )
-    if not found.scenario.coverage.is_undisturbed:
+    if any(one.persistent_constants for one in certificates):
         console.print(
-            "[dim]The rows with + are added: they are the bounds from disturbances, noise and the "
-            "threshold's floor. With noise or an observer, e_s and e_c are x_s − x̂ and x_c − x̂.[/]"
+            "[dim]The rows with + are added: they are the bounds from disturbances, noise, and the "
+            "threshold's constant or floor. With noise or an observer, e_s and e_c are x_s − x̂ and "
+            "x_c − x̂.[/]"
         )
     for under, certificate in found:
         if certificate.void:
             console.print(
                 f"[yellow]void[/] ({under}, {certificate.scope}): {escape(certificate.void)}"
             )
+    if found.weight is None and trigger.policy == "decaying" and any(c.void for c in certificates):
+        console.print("--weight chosen searches for a norm in which more is certified")
 
 
 def _print_limits(console: Console, found: Certificates) -> None:

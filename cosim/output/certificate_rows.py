@@ -49,7 +49,8 @@ def constant_rows(
     yield "loop gain (< 1)", constant("loop_gain"), NONE
     if any(c.persistent_constants for c in certificates):
         for label, name in _PERSISTENT.items():
-            yield f"+ without decay: {label}", after(name, "persistent_constants"), NONE
+            if any(getattr(c.persistent_constants, name, None) for c in certificates):
+                yield f"+ without decay: {label}", after(name, "persistent_constants"), NONE
     if any(c.floor_constants for c in certificates):
         yield "floor reached at, s", row(lambda c: c.floor_from_s), NONE
         yield "bound of ‖e_c‖/ε from then on", after("delta", "floor_constants"), NONE

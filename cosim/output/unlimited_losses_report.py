@@ -72,5 +72,5 @@ def sentences(found: UnlimitedLosses) -> Iterator[str]:
     if found.moments or found.bursts:
         yield (
             "These are statements about many runs: one run cannot violate a mean. The "
-            "probabilities are lower bounds; a campaign shows the frequencies."
+            "probabilities are bounds; a campaign shows the frequencies."
         )

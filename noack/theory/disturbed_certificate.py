@@ -80,8 +80,8 @@ class DisturbedCertificate:
 
     def _of_constant_threshold(
         self, conditions: NetworkConditions, apart_s: float
-    ) -> tuple[Constants, Constants]:
-        """Return the constants of what the start causes, and of what persists.
+    ) -> tuple[Constants, Constants | None]:
+        """Return the constants of what the start causes, and of what persists, if anything does.
 
         The threshold has no rate; that of :func:`soonest` is taken. ``apart_s`` is a lower bound of
         the inter-event time, certified without dividing the causes.
@@ -98,6 +98,12 @@ class DisturbedCertificate:
         if not found:
             raise VoidError("no bound of e_s alone has a certificate")
         _, of_start, rest = min(found, key=lambda one: one[0])
+
+        if not rest.bound.beta and rest.plant.forcing is None and not rest.estimation.fixed:
+            return soonest(
+                lambda rate_per_s: solve_sum([self._at_rate(rate_per_s, of_start)], conditions),
+                self.slowest_per_s, loop_of(self.resolved).x0,
+            )[0], None  # fmt: skip
 
         def solved(rate_per_s: float) -> tuple[Constants, Constants]:
             start = self._at_rate(rate_per_s, of_start)

@@ -83,7 +83,9 @@ class ScenarioCertificate:
         """The unit of Δ and β̃: β or ε; empty for 1."""
         if self.beta > 0 and self.beta >= self.floor:
             return "β"
-        return "ε" if self.floor > 0 and self.persistent_constants is None else ""
+        is_added = self.persistent_constants is not None
+        decays = self.constants is not None and self.constants.rate_per_s > 0
+        return "ε" if self.floor > 0 and not is_added and not decays else ""
 
     @property
     def level(self) -> str:

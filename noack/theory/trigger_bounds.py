@@ -178,7 +178,8 @@ class TriggerBounds:
             total = " + ".join(filter(None, [level, shares]))
             found.append(f"after each test {bounded} ≤ {total or '0'}")
         if self.has_due_time:
-            found.append(f"an event at the latest {self.rule.longest_ns / NS_PER_S:g} s")
+            longest_s = self.rule.longest_ns / NS_PER_S
+            found.append(f"the next event at the latest {longest_s:g} s after the last one")
         return "; ".join(found)
 
     def _levels(

@@ -172,6 +172,8 @@ def print_worst(
         console.print("[dim]Scaled: multiplied by bound(0) / bound(t)[/]")
     if certificate.void is not None:
         console.print(f"[dim]Nothing is certified: {certificate.void}[/]")
+    elif trigger == "sampled":
+        console.print("[dim]certified: for the scenario's schedule, without lateness[/]")
     console.print("[dim]One letter per event: D delivered, · lost. --json prints their times[/]")
 
 

@@ -27,7 +27,7 @@ Entities of the recording, all on the timeline ``t`` (simulated time since the r
 
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, cast
 from uuid import UUID
 
 import rerun as rr
@@ -70,6 +70,11 @@ _GLOBAL_VIEW = UUID("5c0dca6a-e63f-9cf7-f657-2602590474cc")
 def state_path(name: str) -> str:
     """Return the entity of a state coordinate; its name is escaped."""
     return f"state/{rr.escape_entity_path_part(name)}"
+
+
+def loop_path(name: str) -> str:
+    """Return the entity of a loop, in a recording of several; its name is escaped."""
+    return f"loops/{rr.escape_entity_path_part(name)}"
 
 
 def lateness_path(process: str) -> str:
@@ -146,6 +151,28 @@ def layout(
     picture: Picture | None = None,
     diagram: NetworkDiagram | None = None,
 ) -> rrb.Blueprint:
+    """Lay out the panels of a run; see :func:`panels`."""
+    shown = panels(state_names, input_names, processes, picture=picture, diagram=diagram)
+    return over_time(shown, horizon_s)
+
+
+def over_time(shown: rrb.Container, horizon_s: float) -> rrb.Blueprint:
+    """Return the layout of panels that share the time axis of a run."""
+    return rrb.Blueprint(
+        rrb.Horizontal(shown, _common_time_axis(horizon_s)),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
+        collapse_panels=True,
+    )
+
+
+def panels(
+    state_names: Sequence[str],
+    input_names: Sequence[str],
+    processes: Sequence[str],
+    *,
+    picture: Picture | None = None,
+    diagram: NetworkDiagram | None = None,
+) -> rrb.Container:
     """Lay out the panels: picture, packets and texts on the left, curves on the right.
 
     Plots have no legends, which would cover data; instead, a panel explains the colours.
@@ -161,37 +188,46 @@ def layout(
             _intervals(),
             row_shares=[2, 1, 1],
         )
-        whole = rrb.Horizontal(left, curves, column_shares=[1, 1])
-    else:
-        whole = rrb.Horizontal(
-            rrb.Vertical(_states(state_names), _intervals(), row_shares=[2, 1]),
-            rrb.Vertical(_norms(), _inputs(), texts),
-            column_shares=[2, 1],
-        )
-    return rrb.Blueprint(
-        rrb.Horizontal(whole, _common_time_axis(horizon_s)),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
-        collapse_panels=True,
+        return rrb.Horizontal(left, curves, column_shares=[1, 1])
+    return rrb.Horizontal(
+        rrb.Vertical(_states(state_names), _intervals(), row_shares=[2, 1]),
+        rrb.Vertical(_norms(), _inputs(), texts),
+        column_shares=[2, 1],
     )
+
+
+def below(shown: rrb.Container | rrb.View, folder: str) -> None:
+    """Let panels show the entities below a folder instead of those at the root."""
+    if isinstance(shown, rrb.View):
+        shown.origin = f"{folder}/{shown.origin}"
+        given = shown.contents
+        paths = [given] if isinstance(given, str) else [*cast(Sequence[str], given)]
+        shown.contents = [one if one.startswith("$") else f"/{folder}{one}" for one in paths]
+        overrides = shown.visualizer_overrides
+        shown.visualizer_overrides = {f"{folder}/{path}": one for path, one in overrides.items()}
+        return
+    for part in shown.contents:
+        if isinstance(part, (rrb.Container, rrb.View)):
+            below(part, folder)
 
 
 def _intervals() -> rrb.Container:
     sent = [EVENT_STEM, EVENT, DROP, EVENT_CERTIFIED]
     received = [RECEPTION_STEM, RECEPTION, FORCED, DROP]
     return rrb.Horizontal(
-        _plot("Broadcasting intervals [s]", "event", sent),
-        _plot("Receiving intervals [s]", "reception", received),
+        plot("Broadcasting intervals [s]", "event", sent),
+        plot("Receiving intervals [s]", "reception", received),
     )
 
 
 def _norms() -> rrb.Container:
     return rrb.Tabs(
-        _plot("log10 ‖e‖", ERROR_LOG10), _plot("‖e‖", ERROR), _plot("log10 ‖x‖", SIZE_LOG10)
+        plot("log10 ‖e‖", ERROR_LOG10), plot("‖e‖", ERROR), plot("log10 ‖x‖", SIZE_LOG10)
     )
 
 
 def _inputs() -> rrb.View:
-    return _plot("Control input u = K x_c", INPUT)
+    return plot("Control input u = K x_c", INPUT)
 
 
 def _texts(input_names: Sequence[str], *, lateness: bool) -> rrb.Container:
@@ -199,7 +235,7 @@ def _texts(input_names: Sequence[str], *, lateness: bool) -> rrb.Container:
     return rrb.Tabs(
         ColourKey(input_names).panel(),
         rrb.TextDocumentView(origin=ABOUT, name="About this run"),
-        *([_plot("Lateness [µs]", "lateness", ["$origin/**"])] if lateness else []),
+        *([plot("Lateness [µs]", "lateness", ["$origin/**"])] if lateness else []),
         rrb.TextLogView(
             origin=LOG,
             name="Log",
@@ -224,7 +260,7 @@ def _states(names: Sequence[str]) -> rrb.Container:
 def _page(names: Sequence[str]) -> rrb.Container:
     title = names[0] if len(names) == 1 else f"{names[0]} … {names[-1]}"
     crowded = len(names) > _PAGE_OF_FEW
-    panels = [_plot(f"State {name}", state_path(name)) for name in names]
+    panels = [plot(f"State {name}", state_path(name)) for name in names]
     if len(panels) < _PAGE_OF_FEW:
         return rrb.Vertical(*panels, name=title)
     return rrb.Grid(*panels, grid_columns=3 if crowded else 2, name=title)
@@ -244,7 +280,7 @@ def _common_time_axis(horizon_s: float) -> rrb.View:
     return view
 
 
-def _plot(name: str, origin: str, contents: Sequence[str] = ("$origin",)) -> rrb.TimeSeriesView:
+def plot(name: str, origin: str, contents: Sequence[str] = ("$origin",)) -> rrb.TimeSeriesView:
     """Return a time series; all share the time axis and zoom together."""
     return rrb.TimeSeriesView(
         origin=origin,

@@ -12,9 +12,11 @@ import time
 from pathlib import Path
 from typing import IO, Any
 
+from cosim.analysis.loops_over_time import worst_loop
+from cosim.analysis.shared_summary import is_shared
 from cosim.output.viewer.pictures.picture import TIMELINE
 from cosim.output.viewer.rerun_program import logged_port
-from cosim.record.run_directory import SUMMARY_FILE
+from cosim.record.run_directory import LOOPS, SUMMARY_FILE
 from noack.core.clock import NS_PER_S
 
 _RETRY_S = 0.25
@@ -34,13 +36,24 @@ _SCRIPT = """<script>
 
 
 def opening_time_ns(recording: Path) -> int | None:
-    """Return the time of the largest ‖e_c‖ from the recording's summary; None without a summary."""
+    """Return the time of the largest ‖e_c‖ from the recording's summary; None without a summary.
+
+    Of several loops, it is that of the worst one.
+    """
+    run_dir, begin_s = recording.parent, 0.0
     try:
-        summary: Any = json.loads((recording.parent / SUMMARY_FILE).read_text(encoding="utf-8"))
+        summary = _summary(run_dir)
+        if is_shared(summary):
+            worst = summary["loops"][worst_loop(run_dir, summary["loops"]).number]
+            summary, begin_s = _summary(run_dir / LOOPS / worst["name"]), worst["phase_s"]
         at_s: float = summary["sup_e_c_at_s"]
-        return round(at_s * NS_PER_S)
+        return round((begin_s + at_s) * NS_PER_S)
     except (OSError, ValueError, KeyError, TypeError):
         return None
+
+
+def _summary(run_dir: Path) -> Any:
+    return json.loads((run_dir / SUMMARY_FILE).read_text(encoding="utf-8"))
 
 
 def script_to_open_at(t_ns: int) -> bytes:

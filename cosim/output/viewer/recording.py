@@ -4,7 +4,7 @@ The recording is only for viewing. The run's data are in the Parquet files; a re
 read by similar versions of rerun.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -71,20 +71,33 @@ class RunView(RecordingFile):
         names = (state_names, input_names, processes)
         layout = bp.layout(*names, horizon_s, picture=picture, diagram=diagram)
         super().__init__(path, run_id, layout, indexed=indexed)
+        self._live = live
+        self.describe(title, self._begin(about, *names, picture, diagram))
+        if live is not None:
+            live.show(path)
+
+    def _begin(
+        self,
+        about: str,
+        state_names: Sequence[str],
+        input_names: Sequence[str],
+        processes: Sequence[str],
+        picture: Picture | None,
+        diagram: NetworkDiagram | None,
+    ) -> dict[str, Any]:
+        """Start with empty batches; return the static data, by entity."""
         self._states = [bp.state_path(name) for name in state_names]
         self._lateness = {name: bp.lateness_path(name) for name in processes}
-        self._picture, self._diagram, self._live = picture, diagram, live
+        self._picture, self._diagram = picture, diagram
         self._frame = -1
         self._waiting: list[tuple[Nanoseconds, Frames]] = []
         static: dict[str, Any] = {bp.ABOUT: rr.TextDocument(about, media_type="text/markdown")}
-        static |= bp.styles(*names)
+        static |= bp.styles(state_names, input_names, processes)
         drawings = ((PICTURE, picture), (DIAGRAM, diagram), (COLOUR_KEY, ColourKey(input_names)))
         for parent, drawing in drawings:
             shapes = {} if drawing is None else drawing.scenery()
             static |= {f"{parent}/{entity}": shape for entity, shape in shapes.items()}
-        self.describe(title, static)
-        if live is not None:
-            live.show(path)
+        return static
 
     def samples(self, aligned: AlignedRun, e_c_bounds: Floats, x_bounds: Floats) -> None:
         """Add k samples.
@@ -205,6 +218,49 @@ class RunView(RecordingFile):
             if self._live is not None:
                 self._live.finish()
                 self._live = None
+
+
+class LoopView(RunView):
+    """Shows one of several loops in their common recording, below the entity ``loops/NAME``.
+
+    Args:
+        whole: the recording.
+        name: name of the loop.
+        phase_ns: time of the run at which the loop's own time is 0.
+        about, state_names, input_names, picture, diagram: as those of :class:`RunView`.
+    """
+
+    def __init__(
+        self,
+        whole: RecordingFile,
+        name: str,
+        phase_ns: int,
+        *,
+        about: str,
+        state_names: Sequence[str],
+        input_names: Sequence[str],
+        picture: Picture | None = None,
+        diagram: NetworkDiagram | None = None,
+    ) -> None:
+        self._whole, self._folder, self._phase_ns = whole, bp.loop_path(name), phase_ns
+        self._live = None
+        static = self._begin(about, state_names, input_names, (), picture, diagram)
+        whole.add_static({f"{self._folder}/{entity}": shape for entity, shape in static.items()})
+
+    def send_columns(
+        self, entity: str, t_ns: Nanoseconds, columns: Iterable[rr.ComponentColumn]
+    ) -> None:
+        """Add columns of an entity of the loop at times (k,) of the loop."""
+        times_ns = np.asarray(t_ns) + self._phase_ns
+        self._whole.send_columns(f"{self._folder}/{entity}", times_ns, columns)
+
+    def flush(self) -> None:
+        """Pass buffered data to the operating system."""
+        self._whole.flush()
+
+    def close(self) -> None:
+        """Write the waiting data; the recording stays open."""
+        self._draw()
 
 
 def _log10(norms: Floats, threshold: Floats) -> Floats:

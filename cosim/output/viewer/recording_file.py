@@ -51,6 +51,10 @@ class RecordingFile:
     def describe(self, title: str, static: dict[str, Any]) -> None:
         """Set the recording's title and its static data, by entity."""
         self._stream.send_recording_name(title)
+        self.add_static(static)
+
+    def add_static(self, static: dict[str, Any]) -> None:
+        """Add static data, by entity."""
         for entity, shape in static.items():
             self._stream.log(entity, shape, static=True)
 

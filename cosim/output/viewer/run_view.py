@@ -59,21 +59,29 @@ def write_view(record: RunRecord, run_dir: Path, run_id: int) -> None:
     """Write a run's recording from its record; that of a long run shows extremes only."""
     scenario = record.scenario
     columns = record.slice_columns if is_long(scenario) else None
-    _require_space(run_dir)
+    require_space(run_dir)
     with open_view(scenario, run_dir, run_id, None, record.kind, at_once=True) as view:
-        feed = ViewFeed(scenario, view, columns)
-        for i, part in enumerate(record.slices()):
-            _require_space(run_dir)
-            if i:
-                feed.advance()
-            for table, rows in part.items():
-                feed.add(table, rows)
-        for notice in record.notices:
-            feed.log(notice)
-        feed.advance(final=True)
+        feed_record(ViewFeed(scenario, view, columns), record, run_dir)
 
 
-def _require_space(run_dir: Path) -> None:
+def feed_record(feed: ViewFeed, record: RunRecord, run_dir: Path) -> None:
+    """Pass a record to the view, part by part, while there is space in its folder.
+
+    Raises:
+        ViewError: there is no more space, or the recording cannot be written.
+    """
+    for i, part in enumerate(record.slices()):
+        require_space(run_dir)
+        if i:
+            feed.advance()
+        for table, rows in part.items():
+            feed.add(table, rows)
+    for notice in record.notices:
+        feed.log(notice)
+    feed.advance(final=True)
+
+
+def require_space(run_dir: Path) -> None:
     """Raise ViewError if the disk is nearly full: rerun may wait forever after a failed write."""
     if disk_usage(run_dir).free < _SPARE_BYTES:
         path = run_dir / RECORDING_FILE

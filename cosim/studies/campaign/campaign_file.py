@@ -17,7 +17,7 @@ from cosim.simulation.batch.batch_interface import ROW
 from cosim.studies.campaign.metrics import METRICS, Metric
 from noack.config import toml_file
 from noack.settings.matrices import Rows
-from noack.settings.section import ScenarioSection, Seed
+from noack.settings.section import NonNegative, ScenarioSection, Seed
 
 MOST_POINTS = 10_000
 MOST_SERIES = 12
@@ -142,6 +142,9 @@ class Metrics(ScenarioSection):
     """A run has settled when ‖x‖ stays below this share of ‖x(0)‖."""
     most_events: Annotated[int, Field(ge=1, le=10_000_000)] = 100_000
     """A run with more transmissions is stopped."""
+    count_from_s: NonNegative = 0.0
+    """With several loops: updates that were sent earlier do not count in loops_guarantee_used,
+    updates_late and delay_max_s."""
 
 
 class PairedComparison(ScenarioSection):

@@ -170,7 +170,8 @@ def _work(campaign: Campaign, scenario: Scenario) -> tuple[Work, float | None]:
         if campaign.time != "sampled":
             raise CallerError('loops: a network that several loops share needs time = "sampled"')
         judges = "loops_claims_held" in campaign.measured_metrics
-        work = SharedWork(in_virtual_time(scenario), campaign.seed, **measured, judges=judges)
+        measured |= {"judges": judges, "count_from_s": metrics.count_from_s}
+        work = SharedWork(in_virtual_time(scenario), campaign.seed, **measured)
         return work, None
     resolved = resolve(scenario)
     if campaign.time == "sampled":

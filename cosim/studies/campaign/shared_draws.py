@@ -2,9 +2,14 @@
 
 Numbers of transmissions and deliveries are those of all loops; the cost is the mean over the loops.
 Times, errors and loss bursts are those of the worst loop.
+
+A loop has used up its guarantee where the shared queue brought it to the longest burst of losses
+that the guarantee allows: M − 1 consecutive losses, at least one of them in a full queue. Its next
+update enters the full queue. An update is late if it is in the network for longer than
+``certificate.network_delay_s``, or one measurement period if that is not given.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,19 +18,33 @@ from numpy.typing import NDArray
 
 from cosim.analysis.claims.claims_by_part import RunClaims
 from cosim.analysis.summary_model import ClaimVerdict
+from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.batch.batch_interface import ROW
 from cosim.simulation.batch.batch_status import OK
 from cosim.simulation.shared_network import simulate_loops
 from cosim.studies.campaign.random_draws import seeds_of
 from cosim.studies.campaign.sampled_draws import SampledWork
+from noack.core.clock import NS_PER_S
+from noack.protocol.record_tables import NETEM_PACKET, Fate, effective
 
 SHARED_ROW = np.dtype(
-    [*ROW.descr, ("cost_worst", "<f8"), ("loops_failed", "<f8"), ("loops_claims_held", "<f8")]
-)
+    [
+        *ROW.descr,
+        *(
+            (name, "<f8")
+            for name in (
+                "cost_worst", "loops_failed", "loops_claims_held",
+                "loops_guarantee_used", "updates_late", "delay_max_s",
+            )
+        ),
+    ]
+)  # fmt: skip
 """The row of a run of several loops.
 
 cost_worst: the largest cost of a loop. loops_failed: share of the loops that diverged or exceeded
 the largest number of events. loops_claims_held: share of the loops of which every claim held.
+loops_guarantee_used: share of the loops that used up the guarantee. updates_late: share of the
+delivered updates that were late. delay_max_s: largest time of a delivered update in the network.
 """
 _OF_ALL: Mapping[str, Callable[[NDArray[Any]], Any]] = {
     "transmissions": np.sum, "deliveries": np.sum, "longest_loss_burst": np.max,
@@ -44,26 +63,64 @@ class SharedWork(SampledWork):
     judges: bool = False
     """Whether the claims of each loop are judged, which takes as long as the run."""
 
+    count_from_s: float = 0.0
+    """Updates that were sent earlier do not count in the last three columns of the row."""
+
     def run(self, draws: range) -> NDArray[np.void]:
         """Compute consecutive draws; one row of :data:`SHARED_ROW` each."""
         rows = np.zeros(len(draws), SHARED_ROW)
         for row, draw in zip(rows, draws, strict=True):
             seeds = seeds_of(self.seed, draw)
             shared = simulate_loops(self.scenario.model_copy(update={"seeds": seeds}))
-            loops = np.zeros(len(shared.loops), ROW)
-            with np.errstate(all="ignore"):  # loops may diverge
-                for own, record in zip(loops, shared.loops, strict=True):
-                    self._measure(record, own)
-                if self.judges:
-                    held = [
-                        all(one.verdict == ClaimVerdict.HELD for one in RunClaims(record).judge())
-                        for record in shared.loops
-                    ]
-            for name, of_all in _OF_ALL.items():
-                row[name] = of_all(loops[name])
-            row["diverged_at_s"] = np.nanmin(np.append(loops["diverged_at_s"], np.inf))
-            row["status"] = OK
-            row["cost_worst"] = np.max(loops["cost"])
-            row["loops_failed"] = np.mean(loops["status"] != OK)
-            row["loops_claims_held"] = np.mean(held) if self.judges else np.nan
+            self.measure_loops(shared.loops, row)
         return rows
+
+    def measure_loops(self, records: Sequence[RunRecord], row: np.void) -> None:
+        """Fill a row from the records of the loops of a run."""
+        loops = np.zeros(len(records), ROW)
+        with np.errstate(all="ignore"):  # loops may diverge
+            for own, record in zip(loops, records, strict=True):
+                self._measure(record, own)
+            if self.judges:
+                held = [
+                    all(one.verdict == ClaimVerdict.HELD for one in RunClaims(record).judge())
+                    for record in records
+                ]
+        for name, of_all in _OF_ALL.items():
+            row[name] = of_all(loops[name])
+        row["diverged_at_s"] = np.nanmin(np.append(loops["diverged_at_s"], np.inf))
+        row["status"] = OK
+        row["cost_worst"] = np.max(loops["cost"])
+        row["loops_failed"] = np.mean(loops["status"] != OK)
+        row["loops_claims_held"] = np.mean(held) if self.judges else np.nan
+        self._measure_network(records, row)
+
+    def _measure_network(self, records: Sequence[RunRecord], row: np.void) -> None:
+        scenario = records[0].scenario
+        counted = [_updates(record, self.count_from_s) for record in records]
+        burst = scenario.network.longest_burst
+        row["loops_guarantee_used"] = np.mean([used_up(one["fate"], burst) for one in counted])
+        delays_ns = np.concatenate(
+            [(one["release_ns"] - one["now_ns"])[effective(one["fate"])] for one in counted]
+        )
+        due_s = scenario.certificate.network_delay_s
+        due_ns = scenario.timing.measurement_period_ns if due_s is None else due_s * NS_PER_S
+        row["updates_late"] = np.mean(delays_ns > due_ns) if len(delays_ns) else 0.0
+        row["delay_max_s"] = delays_ns.max(initial=0) / NS_PER_S
+
+
+def _updates(record: RunRecord, from_s: float) -> Rows:
+    packets = record[NETEM_PACKET]
+    counted: Rows = packets[(packets["flow"] == 0) & (packets["now_ns"] >= from_s * NS_PER_S)]
+    return counted
+
+
+def used_up(fates: NDArray[Any], burst: int) -> bool:
+    """Whether ``burst`` ≥ 1 consecutive losses include one in a full queue."""
+    losses = overflows = 0
+    for fate, delivered in zip(fates, effective(fates), strict=True):
+        losses = 0 if delivered else losses + 1
+        overflows = 0 if delivered else overflows + (fate == Fate.OVERFLOWED)
+        if overflows and losses >= burst:
+            return True
+    return False

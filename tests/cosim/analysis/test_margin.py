@@ -106,7 +106,7 @@ def test_command_as_json_and_as_a_table() -> None:
         (["double_integrator", *DEADLINE, "--play", "--no-period"], 2, "--play: the times between"),
         (["lane_periodic", "--play", "--json"], 2, "--play"),
         (["lane_periodic", "--play", "--most", "1", "--no-period"], 2, "no destabilising pattern"),
-        (["lane_periodic", "--accuracy", "2"], 2, "--accuracy 2: expected"),
+        (["lane_periodic", "--accuracy", "2"], 2, "accuracy 2: expected"),
         (["lane_periodic", "--set", "trigger.period_s=9", "--no-period"], 1, "destabilises M = 1"),
     ],
 )
@@ -114,6 +114,11 @@ def test_mistakes_and_negative_answers(words: list[str], status: int, message: s
     done = CliRunner().invoke(app, ["margin", *words])
     assert done.exit_code == status, done.output
     assert message in done.output
+
+
+def test_no_m_to_examine() -> None:
+    with pytest.raises(noack.NoackError, match="most_m 0: expected"):
+        noack.margin("lane_periodic", most_m=0)
 
 
 def test_the_played_settings_are_the_pattern() -> None:

@@ -24,6 +24,8 @@ MISTAKES = {
     "a valid integer, unable to parse string as an integer; see `noack certify --help`",
     "certify lane_following --late 2000": "noack: certify: invalid value for '--late': should be "
     "less than or equal to 1000; see `noack certify --help`",
+    "adversary lane_following --trigger no": "noack: adversary: invalid value for '--trigger': "
+    "'no' is not one of 'sampled', 'continuous'; see `noack adversary --help`",
     "check lane_following too": "noack: check: got unexpected extra argument(s) (too); "
     "see `noack check --help`",
     "demo --set": "noack: demo: option '--set' requires an argument; see `noack demo --help`",

@@ -19,6 +19,7 @@ from cosim.analysis.loops_over_time import (
 from cosim.analysis.shared_summary import in_flight, is_complete
 from cosim.cli import app
 from cosim.output.report.loops_figures import error_map, norms_figure
+from cosim.output.viewer.opening_time import opening_time_ns
 from cosim.record.align import align_tables
 from cosim.record.run_record import load_record
 from noack.config.resolution import network_tables
@@ -115,6 +116,12 @@ def test_the_loops_over_time(run_dir: Path) -> None:
     assert found.errors.shape == found.states.shape == (LOOPS, INTERVALS)
     for number, one in enumerate(summary["loops"]):
         assert np.nanmax(found.errors[number]) == one["sup_e_c_norm"]
+    # The view opens where the worst loop has its largest error.
+    worst = worst_loop(run_dir, summary["loops"]).number
+    opened_ns = opening_time_ns(run_dir / "recording.rrd")
+    assert opened_ns is not None
+    at = np.searchsorted(found.edges_s, opened_ns * 1e-9, "right") - 1
+    assert found.errors[worst, at] == summary["loops"][worst]["sup_e_c_norm"]
     # Loop 6 alone, interval by interval; its time begins at its phase.
     phase_ns, run = round(1e9 * summary["loops"][6]["phase_s"]), align_tables(records[6])
     assert phase_ns > 0

@@ -3,13 +3,17 @@
 The policies are written again in ``event_rules``, and the loops are simulated in ``loops``.
 """
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from noack.config.resolution import policy_of
+from noack.config.resolution import policy_of, resolve
+from noack.config.scenario_file import load
 from noack.theory.certificate import NetworkConditions
+from noack.theory.run_conditions import allowed_conditions
 from noack.theory.scenario_certificates import certify
 from tests.noack.theory.broken_policies import BROKEN_POLICIES, INSTANT
 from tests.noack.theory.disturbed_loops import DisturbedLoop, signals
@@ -26,6 +30,8 @@ from tests.noack.theory.loops import (
     systems,
 )
 from tests.noack.theory.policy_loops import KINDS, exceeded_by, policy_case
+
+SCENARIO = Path(__file__).parents[3] / "scenarios" / "double_integrator.toml"
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -74,6 +80,20 @@ def test_no_bound_of_a_policy_is_exceeded_in_continuous_time(
         ):
             assert (seen <= ROUNDING * bound + slack * certificate.state(samples.t_s)).all()
         assert np.diff(run.event_s).min(initial=np.inf) >= least_s / ROUNDING - 1e-9
+
+
+@pytest.mark.parametrize(("interval_s", "decays"), [(0.02, True), (1.0, False)])
+def test_a_short_deadline_adds_decay_to_a_constant_threshold(
+    interval_s: float, *, decays: bool
+) -> None:
+    rule = '{policy="absolute", delta=0.01}'
+    late = []
+    for trigger in (rule, f'{{policy="deadline", interval_s={interval_s}, rule={rule}}}'):
+        resolved = resolve(load(SCENARIO, [f"trigger={trigger}"]))
+        found = certify(resolved, allowed_conditions(resolved))
+        late.append(found.state(np.array([1e3]))[0])
+        assert found.unit == ""  # the errors' constants are absolute
+    assert late[1] < 1e-100 if decays else late[1] == pytest.approx(late[0])
 
 
 @pytest.mark.parametrize("mistake", BROKEN_POLICIES)

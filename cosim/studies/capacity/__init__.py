@@ -1,0 +1,1 @@
+"""How many loops a link carries: with periodic and with event-triggered transmissions."""

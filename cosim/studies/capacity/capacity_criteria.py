@@ -1,0 +1,119 @@
+"""What limits the number of loops on a link, for each policy, with confidence intervals.
+
+A run reaches a limit if
+
+* guarantee: a loop has used up its guarantee, because of the full queue;
+* deadline: more than :data:`LATE` of the delivered updates are late;
+* cost: the mean cost of the loops is at least :data:`COST_FACTOR` times the mean over all draws of
+  the cost of one loop. A run of one loop reaches it only by diverging.
+
+The capacity of a draw is the largest number of loops of the study up to which no run reaches the
+limit: 0 if one loop reaches it, infinite if none does. The estimate is the median over the draws,
+with the 95 % confidence interval of order statistics.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.studies.campaign.campaign_summary import CampaignSummary, runs_at
+from cosim.studies.campaign.chunk_store import Store
+from cosim.studies.campaign.draw_statistics import quantile_interval, quartiles
+from cosim.studies.campaign.metrics import Metric
+from cosim.studies.capacity.capacity_plan import DISTURBANCE, LOOPS, OWN, POLICY
+from noack.core.linear_systems import Matrix, Vector
+
+LATE, COST_FACTOR = 0.01, 2.0
+Limit = Literal["guarantee", "deadline", "cost"]
+LIMITS: Mapping[Limit, Metric] = {
+    "guarantee": "loops_guarantee_used", "deadline": "updates_late", "cost": "cost",
+}  # fmt: skip
+"""The limits and their metrics."""
+
+
+class Capacity(NamedTuple):
+    """The largest number of loops that a draw carries: median and 95 % confidence interval."""
+
+    median: float
+    low: float
+    high: float
+
+
+class PolicyCapacity(NamedTuple):
+    """The capacity of the link for a policy."""
+
+    policy: str
+    disturbance: str
+    limits: Mapping[Limit, Capacity]
+    any_limit: Capacity
+
+    @property
+    def limited_by(self) -> str:
+        """The limits that are reached first; empty if none is."""
+        first = min(one.median for one in self.limits.values())
+        names = [name for name, one in self.limits.items() if one.median == first]
+        return ", ".join(names) if np.isfinite(first) else ""
+
+    def document(self) -> dict[str, Any]:
+        """Return the capacity for JSON."""
+        limits = {name: one._asdict() for name, one in self.limits.items()}
+        return {
+            "policy": self.policy, "disturbance": self.disturbance,
+            **self.any_limit._asdict(), "limited_by": self.limited_by, "limits": limits,
+        }  # fmt: skip
+
+
+def capacities(summary: CampaignSummary, store: Store) -> list[PolicyCapacity]:
+    """Return the capacity of the link for each policy and disturbance."""
+    groups: dict[tuple[str, str], dict[int, Mapping[Metric, Vector]]] = {}
+    for one in summary.found:
+        labels = one.point.labels
+        key = labels[POLICY], labels.get(DISTURBANCE, OWN)
+        groups.setdefault(key, {})[int(labels[LOOPS])] = runs_at(one.point, store)[0]
+    return [_capacity(policy, how, by_count) for (policy, how), by_count in groups.items()]
+
+
+def cost_limit(cost_of_one_loop: Vector) -> float:
+    """Return the limit of the cost, from the cost of one loop in each draw."""
+    finite = cost_of_one_loop[np.isfinite(cost_of_one_loop)]
+    return COST_FACTOR * float(finite.mean()) if len(finite) else 0.0
+
+
+def carried(counts: Sequence[int], reached: NDArray[np.bool_]) -> Vector:
+    """Return the capacity of each draw.
+
+    Args:
+        counts: ascending numbers of loops, (c,).
+        reached: whether a run reaches the limit, (c, draws).
+    """
+    before = np.array([0, *counts[:-1]], dtype=np.float64)
+    found = before[np.argmax(reached, axis=0)]
+    return np.where(reached.any(axis=0), found, np.inf)
+
+
+def _capacity(
+    policy: str, disturbance: str, by_count: Mapping[int, Mapping[Metric, Vector]]
+) -> PolicyCapacity:
+    counts = sorted(by_count)
+
+    def values(limit: Limit) -> Matrix:
+        return np.stack([by_count[count][LIMITS[limit]] for count in counts])
+
+    cost = values("cost")
+    reached: dict[Limit, NDArray[np.bool_]] = {
+        "guarantee": values("guarantee") > 0,
+        "deadline": values("deadline") > LATE,
+        "cost": cost >= cost_limit(cost[0]),
+    }
+    reached["cost"][0] = np.isinf(cost[0])  # one loop is the reference, however costly its draw
+    draws = {limit: carried(counts, one) for limit, one in reached.items()}
+    limits = {limit: _estimate(one) for limit, one in draws.items()}
+    worst = np.min(np.stack([*draws.values()]), axis=0)
+    return PolicyCapacity(policy, disturbance, limits, _estimate(worst))
+
+
+def _estimate(draws: Vector) -> Capacity:
+    low, high = quantile_interval(draws, 0.5)
+    return Capacity(quartiles(draws).median, max(low, 0.0), high)

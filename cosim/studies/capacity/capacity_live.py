@@ -1,0 +1,118 @@
+"""Points of a capacity study as live runs: real processes, real datagrams, the real bottleneck.
+
+A live run has the seeds of draw 0. It agrees with the simulation if its values lie within the 95 %
+prediction intervals of a further simulated draw, mean ± t s √(1 + 1/k).
+"""
+
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cosim.live.finalize import finalize
+from cosim.live.launcher import launch
+from cosim.record.run_directory import SUMMARY_FILE, read_object
+from cosim.record.run_record import RunRecord, load_record
+from cosim.record.shared_run import loop_directories
+from cosim.studies.campaign.campaign_summary import GridPointResult
+from cosim.studies.campaign.draw_statistics import Estimate
+from cosim.studies.campaign.metrics import Metric, measured
+from cosim.studies.campaign.random_draws import seeds_of
+from cosim.studies.campaign.shared_draws import SHARED_ROW, SharedWork
+from cosim.studies.capacity.capacity_criteria import LIMITS
+from cosim.studies.capacity.capacity_plan import DISTURBANCE, LOOPS, OWN, POLICY, CapacityPlan
+from noack.core.errors import CallerError
+
+
+class LivePoint(NamedTuple):
+    """A live run and its simulated counterparts."""
+
+    policy: str
+    loops: int
+    run_dir: Path
+    status: int
+    reason: str
+    unintended_losses: int
+    values: dict[Metric, float]
+    simulated: dict[Metric, tuple[float, float]]
+    """Ends of the prediction intervals of the simulation."""
+
+    @property
+    def outside(self) -> list[Metric]:
+        """The metrics that lie outside the interval of the simulation."""
+        return [
+            name for name, (low, high) in self.simulated.items()
+            if not low <= self.values[name] <= high
+        ]  # fmt: skip
+
+    def document(self) -> dict[str, Any]:
+        """Return the point for JSON."""
+        return {**self._asdict(), "run_dir": str(self.run_dir), "outside": self.outside}
+
+
+def chosen_points(text: str | None, plan: CapacityPlan) -> list[tuple[str, int]]:
+    """Return policy and number of loops of each POLICY=N of a list.
+
+    Raises:
+        CallerError: the study has no such point.
+    """
+    points = {f"{name}={count}": (name, count) for name in plan.policies for count in plan.counts}
+    texts = [one.strip() for one in text.split(",")] if text else []
+    for one in texts:
+        if one not in points:
+            raise CallerError(f"--live {one}: no such point; they are {', '.join(points)}")
+    return [points[one] for one in texts]
+
+
+def live_point(
+    chosen: tuple[str, int], found: Iterable[GridPointResult], folder: Path
+) -> LivePoint:
+    """Run a grid point live, without the common disturbance and with the seeds of draw 0.
+
+    Raises:
+        NoackError: the run could not be started or completed.
+    """
+    places = {
+        (one.point.labels[POLICY], int(one.point.labels[LOOPS])): one
+        for one in found if one.point.labels.get(DISTURBANCE, OWN) == OWN
+    }  # fmt: skip
+    return _live_point(places[chosen], folder)
+
+
+def _live_point(found: GridPointResult, folder: Path) -> LivePoint:
+    point, work = found.point, found.point.work
+    assert isinstance(work, SharedWork)
+    name = f"{point.labels[POLICY]}-{point.labels[LOOPS]}"
+    scenario = point.scenario.model_copy(update={"seeds": seeds_of(work.seed, 0), "name": name})
+    outcome = finalize(launch(scenario, folder), report=False)
+    records = _records(outcome.run_dir, scenario)
+    rows = np.zeros(1, SHARED_ROW)
+    work.measure_loops(records, rows[0])
+    columns = {column: rows[column] for column in SHARED_ROW.names or ()}
+    values = {key: float(value[0]) for key, value in measured(columns, None).items()}
+    judged: list[Metric] = ["transmissions", *LIMITS.values()]
+    return LivePoint(
+        point.labels[POLICY], int(point.labels[LOOPS]), outcome.run_dir, int(outcome.status),
+        outcome.reason, _unintended(outcome.run_dir, scenario),
+        {metric: values[metric] for metric in [*judged, "delay_max_s"]},
+        {metric: prediction_interval(found.estimates[metric]) for metric in judged},
+    )  # fmt: skip
+
+
+def prediction_interval(one: Estimate) -> tuple[float, float]:
+    """Return the 95 % prediction interval of a further draw; infinite from fewer than two draws."""
+    if one.finite < 2:
+        return -math.inf, math.inf
+    halfwidth = one.halfwidth * math.sqrt(one.finite + 1)
+    return one.mean - halfwidth, one.mean + halfwidth
+
+
+def _records(run_dir: Path, scenario: Any) -> list[RunRecord]:
+    return [load_record(one) for one in loop_directories(run_dir, scenario)]
+
+
+def _unintended(run_dir: Path, scenario: Any) -> int:
+    summaries = [read_object(one / SUMMARY_FILE) for one in loop_directories(run_dir, scenario)]
+    return sum(int(one.get("unintended_losses") or 0) for one in summaries)

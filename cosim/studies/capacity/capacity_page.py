@@ -1,0 +1,232 @@
+"""The output of a capacity study: page, figures, JSON, and a table for a terminal."""
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from markupsafe import Markup
+from matplotlib.figure import Figure
+from pydantic_core import to_json
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from cosim.output import palette
+from cosim.output.report.figure_files import inline, save_figure
+from cosim.output.report.figure_style import printed
+from cosim.output.report.report_page import templates
+from cosim.studies.campaign.campaign_figures import curve_figure
+from cosim.studies.campaign.campaign_summary import CampaignSummary
+from cosim.studies.campaign.metrics import METRICS
+from cosim.studies.capacity.capacity_criteria import (
+    COST_FACTOR,
+    LATE,
+    LIMITS,
+    Capacity,
+    Limit,
+    PolicyCapacity,
+)
+from cosim.studies.capacity.capacity_live import LivePoint
+from cosim.studies.capacity.capacity_plan import (
+    COMMON,
+    DISTURBANCE,
+    LOOPS,
+    OWN,
+    PERIODIC,
+    POLICY,
+    CapacityPlan,
+)
+from noack.core.file_access import write_whole
+from noack.core.number_format import number
+
+PAGE, RESULTS = "capacity.html", "capacity.json"
+_SENTENCES = {
+    "guarantee": "a loop used up its guarantee: M − 1 consecutive losses, one in the full queue",
+    "deadline": f"more than {100 * LATE:g} % of the updates were late",
+    "cost": f"the mean cost was at least {COST_FACTOR:g} times that of one loop",
+}
+
+
+class CapacityResult(NamedTuple):
+    """The results of a capacity study."""
+
+    plan: CapacityPlan
+    summary: CampaignSummary
+    capacities: Sequence[PolicyCapacity]
+    live: Sequence[LivePoint]
+
+    def document(self) -> dict[str, Any]:
+        """Return the results for JSON."""
+        plan = self.plan
+        return {
+            "scenario": plan.scenario.name, "rate_bps": plan.rate_bps, "period_s": plan.period_s,
+            "deadline_s": plan.deadline_s, "periodic_loops_by_rate": plan.periodic_loops,
+            "loops": list(plan.counts), "draws": plan.draws, "seed": plan.seed,
+            "capacities": [one.document() for one in self.capacities],
+            "comparisons": list(comparisons(self)),
+            "points": self.summary.document()["points"],
+            "live": [one.document() for one in self.live],
+        }  # fmt: skip
+
+
+def write(result: CapacityResult, folder: Path) -> list[Path]:
+    """Write page, JSON and figures; return their paths.
+
+    Raises:
+        MachineError: they cannot be written.
+    """
+    document = to_json(result.document(), indent=1, inf_nan_mode="null")
+    written = [
+        write_whole(folder / PAGE, page(result)),
+        write_whole(folder / RESULTS, document + b"\n"),
+    ]
+    for name, figure, _ in figures(result):
+        written.append(folder / f"{name}.svg")
+        save_figure(figure, written[-1])
+    return written
+
+
+def page(result: CapacityResult) -> str:
+    """Return the page as HTML; all text except the figures is escaped."""
+    plan = result.plan
+    return templates(Path(__file__).parent).get_template("capacity.html.jinja").render(
+        title=plan.scenario.name,
+        subtitle=f"{plan.rate_bps / 1000:g} kbit/s, {plan.draws:,} draws at each number of loops, "
+        f"seed {plan.seed}",
+        verdict=f"The rate carries {plan.periodic_loops:.4g} loops that transmit every "
+        f"{plan.period_s:g} s.",
+        comparisons=list(comparisons(result)),
+        counts=", ".join(map(str, plan.counts)),
+        deadline=f"{plan.deadline_s:g} s",
+        from_s=f"{plan.counted_from_s:g} s",
+        limits=[(name, _SENTENCES[name]) for name in LIMITS],
+        rows=list(rows(result)),
+        headings=HEADINGS,
+        figures=[
+            (name, Markup(inline(figure, name, caption)), caption)
+            for name, figure, caption in figures(result)
+        ],
+        live=[live_row(one) for one in result.live],
+    )  # fmt: skip
+
+
+HEADINGS = ("policy", "disturbance", "loops carried", "limited by", *LIMITS)
+
+
+def rows(result: CapacityResult) -> Iterator[tuple[str, ...]]:
+    """Yield the rows of the table of capacities."""
+    last = result.plan.counts[-1]
+    for one in result.capacities:
+        limits = [_shown(one.limits[limit], last) for limit in LIMITS]
+        yield (
+            one.policy, one.disturbance, _shown(one.any_limit, last), one.limited_by or "–", *limits
+        )  # fmt: skip
+
+
+def comparisons(result: CapacityResult) -> Iterator[str]:
+    """Yield for each event-triggered policy whether it carries more loops than the periodic one."""
+    found = {(one.policy, one.disturbance): one.any_limit for one in result.capacities}
+    last = result.plan.counts[-1]
+    for (policy, disturbance), own in found.items():
+        other = found[PERIODIC, disturbance]
+        if policy == PERIODIC:
+            continue
+        how = "no difference to"
+        if own.low > other.high or (own.low == math.inf > other.high):
+            how = "wins over"
+        elif own.high < other.low:
+            how = "loses to"
+        where = "with a common disturbance" if disturbance == COMMON else "loops disturbed as given"
+        yield (
+            f"{where}: {policy} {how} {PERIODIC}: {_shown(own, last)} against "
+            f"{_shown(other, last)} loops"
+        )
+
+
+def figures(result: CapacityResult) -> Iterator[tuple[str, Figure, str]]:
+    """Draw the metric of each limit over the number of loops; yield name, figure, caption."""
+    for disturbance in dict.fromkeys(one.disturbance for one in result.capacities):
+        for limit, metric in LIMITS.items():
+            yield (
+                f"{limit}-{'common' if disturbance == COMMON else 'own'}",
+                _figure(result, limit, disturbance),
+                f"{METRICS[metric].title.capitalize()} over the number of loops; disturbance: "
+                f"{disturbance}. Means with 95 % confidence intervals"
+                + ("; crosses are live runs." if _is_live(result, disturbance) else "."),
+            )
+
+
+def _figure(result: CapacityResult, limit: Limit, disturbance: str) -> Figure:
+    counts, metric = result.plan.counts, LIMITS[limit]
+    found = {
+        (one.point.labels[POLICY], int(one.point.labels[LOOPS])): one.estimates[metric]
+        for one in result.summary.found
+        if one.point.labels.get(DISTURBANCE, OWN) == disturbance
+    }
+    policies = list(result.plan.policies)
+    series = {name: [found[name, count] for count in counts] for name in policies}
+    figure = curve_figure(
+        np.array(counts, dtype=np.float64), [*map(str, counts)], series, "number of loops", metric
+    )
+    (axes,) = figure.axes
+    fitting = axes.axvline(
+        result.plan.periodic_loops, color=printed(palette.CERTIFIED), linestyle=(0, (6, 2))
+    )
+    fitting.set_zorder(0)
+    if limit != "cost":
+        axes.set_ylim(-0.02, 1.02)
+    if _is_live(result, disturbance):
+        for one in result.live:
+            colour = axes.lines[policies.index(one.policy)].get_color()
+            axes.plot(
+                [one.loops], [one.values[metric]], marker="x", markersize=9, markeredgewidth=2.2,
+                color=colour, linestyle="none", clip_on=False,
+            )  # fmt: skip
+    return figure
+
+
+def _is_live(result: CapacityResult, disturbance: str) -> bool:
+    return bool(result.live) and disturbance == OWN
+
+
+def live_row(one: LivePoint) -> tuple[str, ...]:
+    """Return the row of a live run: each metric with the interval of the simulation."""
+    cells = [
+        f"{number(one.values[metric])} [{number(low)}, {number(high)}]"
+        for metric, (low, high) in one.simulated.items()
+    ]
+    verdict = "agrees" if not one.outside else f"differs: {', '.join(one.outside)}"
+    if one.status:
+        verdict = f"failed: {one.reason}"
+    return (one.policy, str(one.loops), *cells, str(one.unintended_losses), verdict)
+
+
+def _shown(one: Capacity, last: int) -> str:
+    def text(count: float) -> str:
+        return f"≥ {last}" if math.isinf(count) else f"{count:g}"
+
+    return f"{text(one.median)} [{text(one.low)}, {text(one.high)}]"
+
+
+def print_result(console: Console, result: CapacityResult) -> None:
+    """Print the capacities, the comparisons and the live runs."""
+    plan = result.plan
+    table = Table(
+        title=f"{plan.scenario.name}: loops on {plan.rate_bps / 1000:g} kbit/s",
+        title_justify="left", box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False,
+    )  # fmt: skip
+    shown = HEADINGS[:4]  # the table must fit into 80 columns
+    for heading in shown:
+        table.add_column(heading)
+    for row in rows(result):
+        table.add_row(*row[: len(shown)])
+    console.print(table)
+    lines = [
+        f"periodic every {plan.period_s:g} s: the rate carries {plan.periodic_loops:.4g} loops",
+        *comparisons(result),
+        *(f"live: {one.policy}, {one.loops} loops: {live_row(one)[-1]}" for one in result.live),
+    ]
+    for line in lines:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)

@@ -1,0 +1,93 @@
+"""The recording of several loops: few are all shown, of many the quantiles and the worst."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cosim.analysis.loops_over_time import INTERVALS, QUANTILES, loops_over_time
+from cosim.analysis.shared_summary import in_flight
+from cosim.output.viewer import blueprint as bp
+from cosim.output.viewer.loops_view import (
+    ERROR,
+    MAP,
+    QUEUE,
+    SHARE,
+    SIZE,
+    map_pixels,
+    write_loops_view,
+)
+from cosim.record.align import align_tables
+from cosim.record.environment import write_environment
+from cosim.record.run_directory import RECORDING_FILE, write_scenario
+from cosim.record.shared_run import SharedRun, write_shared_run
+from cosim.shipped_files import find_shipped
+from cosim.simulation.shared_network import simulate_loops
+from noack.config.scenario_file import load
+from noack.protocol.record_tables import NETEM_PACKET
+from tests.cosim.output.viewer.test_viewer import Chunks, of_views, read, series
+
+MAX_BYTES = 3_000_000
+
+
+def shown(folder: Path, count: int) -> tuple[SharedRun, list[dict[str, Any]], Chunks]:
+    """Simulate loops, and read their recording; the last loop but one is the worst."""
+    settings = ["horizon_s=0.4", f'loops=[{{ name = "p", count = {count} }}]']
+    scenario = load(find_shipped("shared_bottleneck", "scenarios"), settings)
+    run = simulate_loops(write_scenario(scenario, folder))
+    write_environment(folder, "simulated")
+    write_shared_run(run, folder)
+    horizon_ns = scenario.timing.horizon_ns
+    loops: list[dict[str, Any]] = [
+        {
+            "name": record.scenario.name, "number": i, "sup_e_c_norm": float(i == count - 2),
+            "exit": {"status": 0, "reason": "horizon"},
+        }
+        for i, record in enumerate(run.loops)
+    ]  # fmt: skip
+    flying = in_flight(run.network[NETEM_PACKET], horizon_ns).model_dump()
+    write_loops_view(run.network, {"loops": loops, "network": {"in_flight": flying}}, folder, 9)
+    return run, loops, read(folder / RECORDING_FILE)
+
+
+def test_of_few_loops_each_is_recorded_in_the_time_of_the_run(tmp_path: Path) -> None:
+    run, loops, found = shown(tmp_path, 3)
+    over_time = loops_over_time(run.network, run.loops)
+    _, errors = series(found, ERROR)
+    largest = np.nanmax(over_time.errors, axis=1)
+    np.testing.assert_allclose(10 ** np.nanmax(errors, axis=0), largest, rtol=1e-9)
+    for loop, record in zip(loops, run.loops, strict=True):
+        folder = bp.loop_path(loop["name"])
+        aligned = align_tables(record)
+        t_ns, states = series(found, f"{folder}/{bp.state_path('angle')}")
+        np.testing.assert_array_equal(states[:, 0], aligned.x[:, 0])
+        assert any(one.startswith(f"{folder}/picture/") for one in found)
+        assert np.ptp(t_ns - aligned.t_ns) == 0
+    origins = of_views(read(tmp_path / RECORDING_FILE, "blueprint"), "ViewBlueprint:space_origin")
+    assert {f"loops/p-{i}/picture" for i in (1, 2, 3)} < {one.strip("/") for one in origins}
+
+
+def test_of_many_loops_quantiles_a_map_and_the_worst_are_recorded(tmp_path: Path) -> None:
+    run, _, found = shown(tmp_path, 100)
+    over_time = loops_over_time(run.network, run.loops)
+    assert {one.split("/")[1] for one in found if one.startswith("loops/")} == {"p-099"}
+    for entity, values in ((ERROR, over_time.errors), (SIZE, over_time.states)):
+        t_ns, drawn = series(found, entity)
+        assert len(t_ns) == INTERVALS
+        last = np.quantile(values[:, -1], QUANTILES)
+        np.testing.assert_allclose(10 ** drawn[-1], np.maximum(last, 1e-12), rtol=1e-9)
+    _, queue = series(found, QUEUE)
+    assert queue[:, 0].max() > 1
+    assert (queue[:, 1] <= queue[:, 0] + 1e-6).all()
+    assert series(found, SHARE)[1][-1, -1] <= 100
+    assert MAP in found
+    assert (tmp_path / RECORDING_FILE).stat().st_size < MAX_BYTES
+
+
+def test_the_map_has_the_colours_of_the_norms() -> None:
+    errors = np.array([[1.0, 1e-9, np.nan], [0.1, 0.1, 0.1]])
+    pixels = map_pixels(errors)
+    high, wide = pixels.shape[0] // 2, pixels.shape[1] // 3
+    found = pixels[::high, ::wide].tolist()
+    assert found[0] == [[253, 231, 36], [68, 1, 84], [0, 0, 0]]  # the ends of viridis
+    assert found[1][0] == found[1][2] not in found[0]
