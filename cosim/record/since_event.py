@@ -36,7 +36,7 @@ class EventFollower:
         self._scenario = scenario
         self._propagate = Propagator(loop.A + loop.B @ loop.K)
         self._x = np.full(loop.n, np.nan)
-        self._t_ns = self._event_ns = 0
+        self._event_ns = 0
         self._event = NO_SEQUENCE
 
     @np.errstate(all="ignore")  # a run may diverge
@@ -48,8 +48,8 @@ class EventFollower:
         for begin, end in pairwise([0, *events, len(rows)]):
             following = begin
             if begin < end and rows["event"][begin] != NO_SEQUENCE:
-                self._x, self._t_ns = rows["x"][begin], int(t_ns[begin])
-                self._event, self._event_ns = int(rows["event"][begin]), self._t_ns
+                self._x, self._event_ns = rows["x"][begin], int(t_ns[begin])
+                self._event = int(rows["event"][begin])
                 predicted[begin], following = self._x, begin + 1
             predicted[following:end] = self._followed(t_ns[following:end])
             newest[begin:end], begun_ns[begin:end] = self._event, self._event_ns
@@ -58,19 +58,15 @@ class EventFollower:
         return SinceEvent(age_s, predicted, np.where(shared, newest - aligned.received, UNKNOWN))
 
     def _followed(self, t_ns: NDArray[np.int64]) -> Reals:
-        """Return the prediction at the next times, (k, n)."""
-        if not len(t_ns):
-            return np.zeros((0, len(self._x)))
-        steps_ns = np.diff(t_ns, prepend=self._t_ns)
-        if (steps_ns == steps_ns[0]).all():
-            leap = self._propagate.transition(int(steps_ns[0]))
-            found = (leap @ self._x)[None]
-            while len(found) < len(t_ns):
-                found, leap = np.concatenate([found, found @ leap.T]), leap @ leap
-        else:
-            states = [self._x]
-            for step_ns in steps_ns.tolist():
-                states.append(self._propagate(states[-1], step_ns))
-            found = np.array(states[1:])
-        self._x, self._t_ns = found[len(t_ns) - 1], int(t_ns[-1])
-        return np.asarray(found[: len(t_ns)])
+        """Return the prediction at times of the measurements' grid, (k, n).
+
+        A step count is followed bit by bit, so that a value does not depend on the other times.
+        """
+        found = np.tile(self._x, (len(t_ns), 1))
+        period_ns = self._scenario.timing.measurement_period_ns
+        counts = (t_ns - self._event_ns) // period_ns
+        for bit in range(int(counts.max(initial=0)).bit_length()):
+            rows = np.flatnonzero(counts >> bit & 1)
+            leap, before = self._propagate.transition(period_ns << bit), found[rows]
+            found[rows] = sum(leap[:, i] * before[:, i, None] for i in range(len(self._x)))
+        return found
