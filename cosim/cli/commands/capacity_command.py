@@ -57,7 +57,9 @@ Seed = Annotated[int, typer.Option(help="Seed of the draws.", min=0, max=2**63 -
 Live = Annotated[
     str | None,
     typer.Option(
-        "--live", metavar="POLICY=N,...", help="Confirm these points by live runs, e.g. model=20."
+        "--confirm",
+        metavar="POLICY=N,...",
+        help="Confirm these points by live runs, e.g. model=20.",
     ),
 ]
 Out = Annotated[
@@ -67,20 +69,20 @@ Out = Annotated[
 
 @cli.command(cli.CAMPAIGNS, 30, [
     ("noack capacity shared_bottleneck --rate-bps 50000", "periodic, ZOH-ET and MB-ET"),
-    ("noack capacity shared_bottleneck --loops 5,10,20 --draws 8 --live model=10", ""),
+    ("noack capacity shared_bottleneck --loops 5,10,20 --draws 8 --confirm model=5", ""),
 ])  # fmt: skip
 def capacity(
     scenario: cli.ScenarioArgument,
     *,
     loops: Loops = None,
     rate_bps: RateBps = None,
-    period: Period = None,
-    deadline: Deadline = None,
+    update_period: Period = None,
+    late_after: Deadline = None,
     policy: PolicyOption = None,
     disturbance: Disturbance = 1.0,
     draws: Draws = 10,
     seed: Seed = 0,
-    live: Live = None,
+    confirm: Live = None,
     workers: Workers = None,
     settings: cli.SetOption = None,
     out: Out = None,
@@ -99,9 +101,10 @@ def capacity(
     start = worker_pool(workers)
     plan = _plan(
         cli.find_scenario(scenario), settings or [], policy or [], loops=loops, rate_bps=rate_bps,
-        period_s=period, deadline_s=deadline, amplitude=disturbance, draws=draws, seed=seed,
+        period_s=update_period, deadline_s=late_after, amplitude=disturbance, draws=draws,
+        seed=seed,
     )  # fmt: skip
-    chosen = capacity_live.chosen_points(live, plan)
+    chosen = capacity_live.chosen_points(confirm, plan)
     folder = out or cli.DEFAULT_RUNS / "capacity" / plan.scenario.name
     console = PatientConsole(stderr=True)
     done = execute_campaign(console, plan.campaign(), Path("noack capacity"), start, folder=folder)
@@ -144,7 +147,7 @@ def _plan(
         settings["network.impairments"] = stages
     settings["loops"] = [{"name": "loop"}]
     rate_bps = plans.bottleneck(given).rate_bps
-    for option, seconds in (("--period", period_s), ("--deadline", deadline_s)):
+    for option, seconds in (("--update-period", period_s), ("--late-after", deadline_s)):
         if seconds is not None and not 0 < seconds < given.horizon_s:
             raise CallerError(f"{option} {seconds:g}: between 0 and the horizon of the scenario")
     period_s = period_s or plans.sampling_period_s(given)

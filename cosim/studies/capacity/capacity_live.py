@@ -62,7 +62,7 @@ def chosen_points(text: str | None, plan: CapacityPlan) -> list[tuple[str, int]]
     texts = [one.strip() for one in text.split(",")] if text else []
     for one in texts:
         if one not in points:
-            raise CallerError(f"--live {one}: no such point; they are {', '.join(points)}")
+            raise CallerError(f"--confirm {one}: no such point; they are {', '.join(points)}")
     return [points[one] for one in texts]
 
 

@@ -119,7 +119,7 @@ def test_the_command_compares_the_policies_and_confirms_a_point_live(tmp_path: P
     result = capacity(
         str(FILE), "--loops", "2", "--draws", "1", "--workers", "1", "--json", *SHORT,
         "--rate-bps", "60000", "--policy", "slow={ policy = 'periodic', period_s = 0.5 }",
-        "--live", "model=2", "--out", str(tmp_path),
+        "--confirm", "model=2", "--out", str(tmp_path),
     )  # fmt: skip
     assert result.exit_code == 0, result.output
     found = json.loads(result.stdout)
@@ -138,7 +138,7 @@ def test_the_command_compares_the_policies_and_confirms_a_point_live(tmp_path: P
         (["--set", "network.impairments=[]"], "no bottleneck that the loops could share"),
         (["--loops", "0,3"], "numbers of loops are at least 1"),
         (["--loops", "few"], "--loops few: write it as"),
-        (["--period", "99"], "--period 99: between 0 and the horizon"),
+        (["--update-period", "99"], "--update-period 99: between 0 and the horizon"),
         (["--policy", "zoh={}"], "with a new name"),
         (["--set", "trigger={ policy = 'periodic', period_s = 0.2 }"], "need an event-triggered"),
     ],
@@ -152,7 +152,7 @@ def test_a_mistake_is_one_line(words: list[str], message: str, tmp_path: Path) -
 
 
 def test_a_point_that_the_study_does_not_have_is_refused_before_it_runs(tmp_path: Path) -> None:
-    result = capacity(str(FILE), "--out", str(tmp_path / "study"), *SHORT, "--live", "model=77")
+    result = capacity(str(FILE), "--out", str(tmp_path / "study"), *SHORT, "--confirm", "model=77")
     assert result.exit_code == 2
-    assert "--live model=77: no such point" in result.stderr
+    assert "--confirm model=77: no such point" in result.stderr
     assert not (tmp_path / "study").exists()
