@@ -207,8 +207,15 @@ def with_weight(
     weight: Matrix | None = None
     if which == "given":
         return resolved, None
+    if which not in ("identity", "chosen"):
+        raise CallerError(f'weight: given, identity or chosen, not "{which}"')
+    trigger = resolved.trigger
+    if not isinstance(trigger, DecayingSettings):
+        raise CallerError(
+            f'weight {which}: only for the paper\'s trigger, "decaying"; '
+            f'the policy of this scenario is "{trigger.policy}"'
+        )
     if which == "chosen":
-        trigger = resolved.decaying
         try:
             weight = choose_weight(
                 loop_of(resolved), trigger.beta, trigger.alpha_per_s,
@@ -216,11 +223,10 @@ def with_weight(
             )  # fmt: skip
         except NotDecayingError as error:
             raise CallerError(f"weight chosen: {error}") from None
-    elif which != "identity":
-        raise CallerError(f'weight: given, identity or chosen, not "{which}"')
     rows = None if weight is None else tuple(tuple(row) for row in weight.tolist())
-    trigger = resolved.decaying.model_copy(update={"weight": rows})
-    return resolved.model_copy(update={"trigger": trigger}), weight
+    return resolved.model_copy(
+        update={"trigger": trigger.model_copy(update={"weight": rows})}
+    ), weight
 
 
 def certificates_of(
