@@ -91,6 +91,7 @@ def error_map(over_time: LoopsOverTime, names: Sequence[str]) -> Figure:
         return figure
     most = float(np.nanmax(values))
     least = max(float(np.nanmin(values)), most / 10**_DECADES)
+    values[over_time.errors == 0] = least  # just after an update
     norm = LogNorm(least, most if most > least else 2 * least)
     image = axes.imshow(
         values, aspect="auto", interpolation="nearest", norm=norm, cmap=colormaps["viridis"],

@@ -55,7 +55,6 @@ _ANIMATED = 4
 """Up to so many loops have a diagram of their packets, which is most of a recording."""
 QUEUE, SHARE, ERROR, SIZE, MAP = "link/queue", "link/share", "all/error", "all/size", "all/map"
 _DECADES = 5
-_LEAST = 1e-12
 _ROW_PIXELS = 600
 """Least height of the map in pixels."""
 
@@ -183,7 +182,7 @@ Curves of more than {len(SERIES)} loops are quantiles over the loops:
     whole.send(QUEUE, queue_ns, counts.T)
     middles_ns = (over_time.middles_s * NS_PER_S).astype(np.int64)
     for entity, values in ((ERROR, over_time.errors), (SIZE, over_time.states)):
-        whole.send(entity, middles_ns, np.log10(np.maximum(_reduced(values), _LEAST)).T)
+        whole.send(entity, middles_ns, _levels(_reduced(values)).T)
     ends_s, shares = over_time.shares()
     ends_ns = ((ends_s - ends_s[0] / 2) * NS_PER_S).astype(np.int64)
     whole.send(SHARE, ends_ns, 100 * _reduced(shares).T)
@@ -203,10 +202,16 @@ def _reduced(values: Reals) -> Reals:
     return values if len(values) <= len(SERIES) else quantiles(values)
 
 
+def _levels(curves: Reals) -> Reals:
+    """Return log10 of curves, cut off some decades below the largest value: a norm may be 0."""
+    most = float(np.nanmax(curves, initial=np.finfo(float).tiny))
+    return np.asarray(np.log10(np.maximum(curves, most / 10**_DECADES)))
+
+
 def map_pixels(errors: Reals) -> NDArray[np.uint8]:
     """Return the colours of norms (L, k), with rows as high as needed; black where unknown."""
-    known = np.isfinite(errors) & (errors > 0)
-    levels = np.log10(np.where(known, errors, 1.0))
+    known = np.isfinite(errors)
+    levels = np.log10(np.where(known, np.maximum(errors, np.finfo(float).tiny), 1.0))
     most = levels[known].max(initial=-np.inf)
     share = np.clip(1 + (levels - most) / _DECADES, 0, 1) if known.any() else levels
     pixels = colormaps["viridis"](share, bytes=True)[..., :3]

@@ -75,7 +75,8 @@ def test_of_many_loops_quantiles_a_map_and_the_worst_are_recorded(tmp_path: Path
         t_ns, drawn = series(found, entity)
         assert len(t_ns) == INTERVALS
         last = np.quantile(values[:, -1], QUANTILES)
-        np.testing.assert_allclose(10 ** drawn[-1], np.maximum(last, 1e-12), rtol=1e-9)
+        least = 10 ** np.nanmax(drawn) / 1e5  # curves are cut off below
+        np.testing.assert_allclose(10 ** drawn[-1], np.maximum(last, least), rtol=1e-9)
     _, queue = series(found, QUEUE)
     assert queue[:, 0].max() > 1
     assert (queue[:, 1] <= queue[:, 0] + 1e-6).all()
@@ -85,7 +86,7 @@ def test_of_many_loops_quantiles_a_map_and_the_worst_are_recorded(tmp_path: Path
 
 
 def test_the_map_has_the_colours_of_the_norms() -> None:
-    errors = np.array([[1.0, 1e-9, np.nan], [0.1, 0.1, 0.1]])
+    errors = np.array([[1.0, 0.0, np.nan], [0.1, 0.1, 0.1]])
     pixels = map_pixels(errors)
     high, wide = pixels.shape[0] // 2, pixels.shape[1] // 3
     found = pixels[::high, ::wide].tolist()

@@ -166,7 +166,8 @@ def test_a_missing_campaign_gives_one_line() -> None:
     assert done.exit_code == 2
     assert done.stderr == (
         "noack: mb_vs_zho: no such file, nor a shipped campaign; did you mean mb_vs_zoh? "
-        "There are acknowledgements, mansd_sweep, mb_vs_zoh, paper, policies_under_loss\n"
+        "There are acknowledgements, loops_on_a_link, mansd_sweep, mb_vs_zoh, paper, "
+        "policies_under_loss\n"
     )
 
 
