@@ -53,7 +53,7 @@ def test_each_kind_of_attack_is_rejected_for_its_reasons(kind: str) -> None:
         "empty": {"length"},
         "noise": {"length", "version"},
         "forged": {"tag"},
-        "flipped": {"version", "length", "run", "flow", "tag"},
+        "flipped": {"version", "length", "run", "loop", "flow", "tag"},
         "truncated": {"length"},
         "oversized": {"length"},
         "replayed": {"source", "stale"},
