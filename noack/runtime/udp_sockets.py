@@ -61,8 +61,9 @@ def bind(port: int, key: str) -> socket.socket:
     return endpoint
 
 
-def enlarge_buffer(endpoint: socket.socket, size_bytes: int = _BUFFER_BYTES) -> int:
+def enlarge_buffer(endpoint: socket.socket, size_bytes: int | None = None) -> int:
     """Request a receive buffer, by default of 4 MiB; return the size that the kernel set."""
+    size_bytes = size_bytes or _BUFFER_BYTES
     try:
         endpoint.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, size_bytes)
     except OSError:
