@@ -151,16 +151,17 @@ def test_a_plant_step_is_compared_with_its_period_and_a_linear_plant() -> None:
 def test_an_emulator_relays_and_records_every_datagram_of_the_bursts(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    reports, totals = [], []
+    reports, buffers = [], []
     close, flush = emulator.RelayShell.close, emulator.TelemetryBuffer.flush
     monkeypatch.setattr(
         emulator.RelayShell, "close", lambda one: (reports.append(one.report()), close(one))
     )
     monkeypatch.setattr(
-        emulator.TelemetryBuffer, "flush", lambda one: (flush(one), totals.append(one.totals()))
+        emulator.TelemetryBuffer, "flush", lambda one: (flush(one), buffers.append(one))
     )
     monkeypatch.setattr(emulator, "BURSTS", 2)
     assert emulator.cpu_us(kind) > 0
     assert sum(reports[0]["received_from"].values()) == 2 * emulator.BURST
     assert 0 < reports[0]["sent"] < 2 * emulator.BURST
-    assert totals[-1]["netem_packet"] >= 2 * emulator.BURST - 256  # the rest is not yet a batch
+    published = buffers[-1].totals()["netem_packet"]
+    assert published >= 2 * emulator.BURST - 256  # the rest is not yet a batch
