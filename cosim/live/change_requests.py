@@ -56,8 +56,8 @@ class ChangeRequests:
         if settings:
             if may_be_compiled(self._scenario):
                 raise CallerError(
-                    "the settings of four or more loops cannot be changed while they run; "
-                    "schedule changes in the scenario"
+                    "the loops of this run may run as compiled code, whose settings cannot be "
+                    "changed; schedule changes in the scenario"
                 )
             if obstacle is not None:
                 raise CallerError(obstacle)
