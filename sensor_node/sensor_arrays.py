@@ -29,7 +29,7 @@ from noack.core.model_arrays import (
     advance_model,
     find_transition,
 )
-from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT
+from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT, SENSOR_SETTING
 from noack.trigger.trigger_arrays import (
     TRIGGER,
     has_array_form,
@@ -101,7 +101,8 @@ def sensor_arrays_of(resolved: Sequence[Scenario]) -> FleetParts | None:
         start_condition(
             rows[number], arrays.matrices, 0, arrays.x_s, number * n, n, arrays.z, scratch
         )
-    return FleetParts(arrays, np.full(len(loops), NEVER_NS), transitions)
+    dues_ns = np.full(len(loops), NEVER_NS)
+    return FleetParts(arrays, dues_ns, transitions, changes=SENSOR_SETTING)
 
 
 def handle(memory: FleetMemory, own: SensorArrays, loop: int, begin: int, now_ns: int) -> int:
