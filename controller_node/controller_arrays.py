@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from controller_node.loss_check import LossCheck
 from noack.config import fleet_layout as layout
 from noack.config.fleet_layout import FleetMemory, FleetParts, FleetRole, copy_reals
+from noack.config.parameter_changes import ChangeSchedule
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.controllers.linear_feedback import LinearFeedbackSettings
@@ -20,7 +21,7 @@ from noack.core.model_arrays import ModelTable, Transitions, advance_model, join
 from noack.core.ordered_arithmetic import multiply
 from noack.impairments.loss_guarantee import LongestBurst
 from noack.protocol.machine_interface import Notice
-from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP
+from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_SETTING, CONTROLLER_STEP
 
 CONTROLLER = np.dtype([(name, "<i8") for name in ("model_ns", "newest", "knows_state")])
 
@@ -72,8 +73,11 @@ def controller_arrays_of(resolved: Sequence[Scenario]) -> FleetParts | None:
         safe_input=joined((one.controller.safe_input for one in resolved), m),
         models=transitions.table,
     )
-    begun = layout.new_loops(resolved, ticks_ns)
-    return FleetParts(arrays, begun, transitions, inspect=_LossChecks(resolved))
+    begun, checks = layout.new_loops(resolved, ticks_ns), _LossChecks(resolved)
+    return FleetParts(
+        arrays, begun, transitions, inspect=checks, changes=CONTROLLER_SETTING,
+        follow=checks.follow,
+    )  # fmt: skip
 
 
 class _LossChecks:
@@ -93,20 +97,26 @@ class _LossChecks:
             for rule in one.network.guarantee.rules
         )
 
+    def follow(self, schedule: ChangeSchedule, phases_ns: Sequence[int]) -> None:
+        """Use the announced changes of the network; from now on, every row counts."""
+        self._all = True
+        for check, phase_ns in zip(self._checks, phases_ns, strict=True):
+            check.follow(schedule, phase_ns)
+
     def __call__(self, rows: NDArray[np.void]) -> Sequence[tuple[int, Notice]]:
         """Return the violations, each with its loop."""
         if not self._all:
             rows = rows[rows["dropouts"] > 0]
-        names = ("loop", "sequence", "dropouts", "t_ns", "now_ns")
-        return [
-            (loop, notice)
-            for loop, sequence, losses, t_ns, now_ns in zip(
-                *(rows[name].tolist() for name in names), strict=True
-            )
-            for notice in self._checks[loop].add(
-                sequence, sequence - losses - 1, losses, t_ns, now_ns
-            )
-        ]
+        names = ("loop", "sequence", "dropouts", "t_ns", "now_ns", "model_t_ns")
+        found: list[tuple[int, Notice]] = []
+        for loop, sequence, losses, t_ns, now_ns, model_ns in zip(
+            *(rows[name].tolist() for name in names), strict=True
+        ):
+            check = self._checks[loop]
+            check.reach(model_ns)
+            notices = check.add(sequence, sequence - losses - 1, losses, t_ns, now_ns)
+            found += [(loop, notice) for notice in notices]
+        return found
 
 
 def handle(memory: FleetMemory, own: ControllerArrays, loop: int, begin: int, now_ns: int) -> int:

@@ -12,7 +12,7 @@ from noack.config.resolution import loop_of, policy_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Vector
 from noack.core.model_arrays import ModelTable, Transitions, advance_model, joined
-from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT
+from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT, SENSOR_SETTING
 from noack.trigger.trigger_arrays import (
     TRIGGER,
     has_array_form,
@@ -84,7 +84,7 @@ def sensor_arrays_of(resolved: Sequence[Scenario]) -> FleetParts | None:
         start_condition(
             rows[number], arrays.matrices, 0, arrays.x_s, number * n, n, arrays.z, scratch
         )
-    return FleetParts(arrays, layout.new_loops(resolved), transitions)
+    return FleetParts(arrays, layout.new_loops(resolved), transitions, changes=SENSOR_SETTING)
 
 
 def handle(memory: FleetMemory, own: SensorArrays, loop: int, begin: int, now_ns: int) -> int:

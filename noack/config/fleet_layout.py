@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from noack.config.parameter_changes import ChangeSchedule
 from noack.config.scenario import Scenario
 from noack.core.model_arrays import Transitions
 from noack.protocol.machine_interface import Notice
@@ -137,6 +138,10 @@ class FleetParts(NamedTuple):
     """Returns the line for the log that a machine asked for, from its arrays and FLEET's row."""
     inspect: Callable[[NDArray[np.void]], Sequence[tuple[int, Notice]]] | None = None
     """Returns lines for the log about new rows of ``on_message``, each with its loop."""
+    changes: str = ""
+    """The table of announced changes; none can be announced to other roles."""
+    follow: Callable[[ChangeSchedule, Sequence[int]], None] | None = None
+    """Takes the announced changes of the network, in the time of the run, and the phases."""
 
 
 class FleetRole(NamedTuple):
