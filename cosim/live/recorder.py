@@ -44,8 +44,11 @@ _SHOW_S = 0.1
 _DISCOVERY_S = 5.0
 """By then a restarted recorder has received the liveliness tokens of all running processes."""
 _ACKNOWLEDGE_S = 1.0
+_POLL_FOR_S = 0.2
 _WAITING_BATCHES = 4096
 """A minute of batches; each place of the ring takes 256 bytes once it has been used."""
+_WAITING_BATCHES_OF_LOOPS = 512
+"""Some seconds of batches, each with some hundred kilobytes; a lost one is sent again."""
 _ROWS_IN_FLIGHT_S = 0.3
 _STOP_TIMEOUT_S = 8.0
 
@@ -75,7 +78,8 @@ class Recorder:
         self._blind_reported = self._monitoring_ended = False
         session, key = plane.session, plane.key
         self._batches = session.declare_subscriber(
-            key("telemetry", "*", "*"), RingChannel(_WAITING_BATCHES)
+            key("telemetry", "*", "*"),
+            RingChannel(_WAITING_BATCHES if scenario.loops is None else _WAITING_BATCHES_OF_LOOPS),
         )
         self._report_queries = session.declare_queryable(key("report", "*"), FifoChannel(64))
         self._tokens = session.liveliness().declare_subscriber(
@@ -110,10 +114,17 @@ class Recorder:
 
         self._feed = ViewFeed(self._scenario, view)
 
-    def poll(self) -> None:
-        """Handle all messages that have arrived."""
-        while (sample := self._batches.try_recv()) is not None:
-            self._take(sample)
+    def poll(self) -> bool:
+        """Handle messages that have arrived; return whether there may be more.
+
+        It returns after a while, even if batches arrive faster than they are handled: the processes
+        keep their rows until they are acknowledged.
+        """
+        until_s = time.monotonic() + _POLL_FOR_S
+        more = True
+        while more and time.monotonic() < until_s:
+            if more := (sample := self._batches.try_recv()) is not None:
+                self._take(sample)
         while (query := self._report_queries.try_recv()) is not None:
             self._take_report(query)
         while (token := self._tokens.try_recv()) is not None:
@@ -123,6 +134,7 @@ class Recorder:
                 alive.discard(instance)
             else:
                 alive.add(instance)
+        return more
 
     def end_monitoring(self) -> None:
         """Check no more assumptions: the run is stopping, and its processes end one by one."""
@@ -259,6 +271,9 @@ class Recorder:
             self._plane.refuse(query, str(error))
             return
         report: dict[str, Any] = {"generation": 0, "instance": ""} | fields | {"process": role}
+        if stored := self._store.add_stored(report):
+            text = f"{role}: {stored} rows were written to disk by itself: the recorder was slow"
+            self.note(Notice(report.get("reached_ns") or 0, "info", text))
         # Telemetry has a lower priority: batches that were sent earlier may still be in flight.
         self._await_rows(report)
         missing = self._store.missing(report)
@@ -325,7 +340,8 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
         if view is not None:
             view.close()
         return
-    recorder.poll()
+    while recorder.poll():
+        pass
     recorder.show()
     record = recorder.finish()
     try:
@@ -357,7 +373,7 @@ def _poll_to_the_end(process: RunProcess, recorder: Recorder) -> bool:
     shown_s = stop_s = None
     acknowledged_s = time.monotonic()
     while not recorder.finished:
-        recorder.poll()
+        more = recorder.poll()
         if process.stopping:
             recorder.end_monitoring()
         for change, announcement in process.updates.take():
@@ -375,7 +391,8 @@ def _poll_to_the_end(process: RunProcess, recorder: Recorder) -> bool:
             stop_s = stop_s or now_s
             if process.ended in ("SIGINT", "SIGTERM") or now_s - stop_s > _STOP_TIMEOUT_S:
                 return True
-        time.sleep(_POLL_S)
+        if not more:
+            time.sleep(_POLL_S)
     return True
 
 
