@@ -16,8 +16,7 @@ from cosim.live.progress_report import ProgressReport
 from cosim.live.telemetry_store import TelemetryStore
 from cosim.record.decimate import is_long
 from cosim.record.run_directory import active_run
-from cosim.record.run_record import Rows, RunRecord, report_of, write_reports
-from cosim.record.shared_spool import finish_run_record
+from cosim.record.run_record import Rows, RunRecord, finish_record, report_of, write_reports
 from noack.config.loops import loops_of
 from noack.config.parameter_changes import ParameterChange, change_notice
 from noack.config.resolution import resolve
@@ -174,8 +173,8 @@ class Recorder:
         for role, content in self._store.acknowledgements():
             self._plane.acknowledge_rows(role, content)
 
-    def finish(self) -> RunRecord:
-        """Write the record, of the network if the run has several loops; complete the view.
+    def finish(self) -> RunRecord | None:
+        """Write the record and complete the view; the launcher writes the records of several loops.
 
         Raises:
             MachineError: the record cannot be written; the spool is kept.
@@ -188,7 +187,7 @@ class Recorder:
             self.lost = error
         self._store.close()
         write_reports(self._run_dir, self._reports.values())
-        record = finish_run_record(self._run_dir)
+        record = finish_record(self._run_dir) if self._scenario.loops is None else None
         if self._feed is not None:
             try:
                 self._feed.advance(final=True)
@@ -349,7 +348,7 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
             view.close()
     except MachineError as error:
         print_to_stderr(f"noack recorder: {error}; the numeric record is complete")
-    if recorder.view_is_incomplete and not unseen:
+    if recorder.view_is_incomplete and not unseen and record is not None:
         from cosim.output.viewer.run_view import write_view
 
         write_view(record, run_dir, run_id)
