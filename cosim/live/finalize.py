@@ -14,11 +14,11 @@ from cosim.analysis.claims.claim_definition import Envelope
 from cosim.analysis.claims.claims_by_part import RunClaims
 from cosim.analysis.fidelity import fidelity_for_summary
 from cosim.analysis.loops_over_time import worst_loop
+from cosim.analysis.loops_summary import LoopsSummary, is_complete
 from cosim.analysis.loss_statistics import list_violations
 from cosim.analysis.model_comparison import linearisation
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import Outcome, Summary, summarise
-from cosim.analysis.shared_summary import SharedSummary, is_complete
 from cosim.analysis.summary_model import ReplayPart, RunSummary, SummaryPart
 from cosim.live.finalize_loops import exit_after_replay, finalize_loops
 from cosim.live.replay_process import ReplayProcess
@@ -95,7 +95,7 @@ def finalize(ending: RunEnding, *, report: bool = True, again: bool = False) -> 
 
 
 def _finalize_shared(
-    network: RunRecord, summary: SharedSummary, ending: RunEnding, *, report: bool
+    network: RunRecord, summary: LoopsSummary, ending: RunEnding, *, report: bool
 ) -> Outcome:
     """Write summary, report and recording of a run of several loops, which are finalised."""
     _write_summary(ending.run_dir, summary)

@@ -3,9 +3,9 @@
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
+from cosim.analysis.loops_summary import LoopsSummary, summarise_loops
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import Outcome
-from cosim.analysis.shared_summary import SharedSummary, summarise_shared
 from cosim.analysis.summary_model import ExitPart, ReplayPart
 from cosim.live.process_pool import interrupts_held, processes
 from cosim.live.progress import work_bar
@@ -25,7 +25,7 @@ start."""
 
 def finalize_loops(
     ending: RunEnding, finalize_loop: Callable[[RunEnding], Outcome], *, unfinished: bool
-) -> tuple[RunRecord, SharedSummary]:
+) -> tuple[RunRecord, LoopsSummary]:
     """Finalise each loop of a run; return the record of the network, and the summary of the run.
 
     Args:
@@ -56,7 +56,7 @@ def finalize_loops(
     if unfinished:
         remove_spool(run_dir)
     end = ExitPart(status=int(ending.status), reason=ending.reason)
-    summary = summarise_shared(network, outcomes, end, ending.startup_s)
+    summary = summarise_loops(network, outcomes, end, ending.startup_s)
     if replayed is None:
         return network, summary
     end = exit_after_replay(summary.exit, replayed)

@@ -164,7 +164,7 @@ class _Hop:
         self._read += len(rows)
         # Every receiver accepts only messages that are newer than those before.
         first = int(np.searchsorted(self._sent.sequences, self._newest))
-        self._sent = SentMessages(*(column[first:] for column in self._sent))
+        self._sent = self._sent.at(slice(first, None))
         self._survivors = {k for k in self._survivors if k >= self._newest}
 
     def result(self, *, network_is_whole: bool) -> MessagesReplay:
@@ -181,11 +181,9 @@ class _Hop:
 
     def _add(self, sent: SentMessages) -> None:
         """Add messages; of several with the same number, the last one counts."""
-        if len(self._sent.sequences):
-            sent = SentMessages(*map(np.concatenate, zip(self._sent, sent, strict=True)))
+        sent = self._sent.followed_by(sent)
         if (np.diff(sent.sequences) < 0).any():
-            order = np.argsort(sent.sequences, kind="stable")
-            sent = SentMessages(*(column[order] for column in sent))
+            sent = sent.at(np.argsort(sent.sequences, kind="stable"))
         self._sent = sent
 
     def _compare_vectors(self) -> None:

@@ -24,6 +24,20 @@ class SentMessages(NamedTuple):
     vectors: NDArray[np.float64]
     """(k, entries)"""
 
+    def at(self, places: slice | Numbers) -> "SentMessages":
+        """Return those at some places."""
+        return SentMessages(self.sequences[places], self.t_ns[places], self.vectors[places])
+
+    def followed_by(self, more: "SentMessages") -> "SentMessages":
+        """Return these and more."""
+        if not len(self.sequences):
+            return more
+        return SentMessages(
+            np.concatenate([self.sequences, more.sequences]),
+            np.concatenate([self.t_ns, more.t_ns]),
+            np.concatenate([self.vectors, more.vectors]),
+        )
+
 
 class FleetReplay:
     """The machines of a role under replay, part by part of the record.
