@@ -19,7 +19,8 @@ from cosim.analysis.claims.observed_conditions import (
     SampledSeries,
     combined,
 )
-from cosim.record.run_record import Rows, RunRecord, updates_in
+from cosim.record.packet_outcomes import updates_in
+from cosim.record.run_record import Rows, RunRecord
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.protocol.machine_interface import GENERATION
