@@ -116,6 +116,12 @@ def product(matrix: Matrix, stack: Stack) -> Stack:
     return np.asarray((matrix @ columns).reshape(len(matrix), k, r).transpose(1, 0, 2))
 
 
+def times(matrix: Matrix, values: Stack) -> Stack:
+    """Return M Y for matrices Y along the last axis, (n, r, k) → (q, r, k)."""
+    found = matrix @ values.reshape(len(values), -1)
+    return np.asarray(found.reshape(len(matrix), *values.shape[1:]))
+
+
 def frobenius_norms(stack: Stack) -> Stack:
     """Return the Frobenius norms of a stack of matrices, (k, q, r) → (k,)."""
     return np.asarray(np.sqrt(np.einsum("kij,kij->k", stack, stack)))

@@ -36,6 +36,7 @@ from noack.theory.contraction import (
     sizes,
     spectral_norm,
     spectral_norms,
+    times,
 )
 
 _ROUNDING = 1.0 + 1e-9
@@ -168,8 +169,8 @@ class ResponseBounds:
     def through_groups(self, outputs: Outputs) -> dict[str, list[KernelBounds]]:
         """Return bounds of ‖C e^{Gτ} D‖ for every output and each group of columns of D."""
         steps_s, columns, nodes = np.diff(self.edges_s), self._columns, self._nodes
-        exact = _times(outputs.stacked, nodes)
-        rounding = outputs.sizes(_times(np.abs(outputs.stacked), np.abs(nodes)), columns)
+        exact = times(outputs.stacked, nodes)
+        rounding = outputs.sizes(times(np.abs(outputs.stacked), np.abs(nodes)), columns)
         norms = np.array(
             [[largest_gains(exact[rows, group]) for group in columns] for rows in outputs.rows]
         )
@@ -199,8 +200,8 @@ class ResponseBounds:
     def areas_of_columns(self, C: Matrix) -> Stack:
         """Return bounds of Σ_i ∫‖C e^{Gτ} D_i‖ over each cell, for the columns D_i of D."""
         steps_s, nodes, columns = np.diff(self.edges_s), self._nodes, self.states.shape[2]
-        rounding = sizes(_times(np.abs(C), np.abs(nodes)))
-        norms = np.linalg.norm(_times(C, nodes), axis=0).sum(axis=0)
+        rounding = sizes(times(np.abs(C), np.abs(nodes)))
+        norms = np.linalg.norm(times(C, nodes), axis=0).sum(axis=0)
         # The sum over the columns is at most √columns times the Frobenius norm.
         norms = norms + np.sqrt(columns) * EPSILON * len(nodes) * rounding
         middle = 0.5 * (norms[:-1] + norms[1:])
@@ -233,8 +234,10 @@ class _Bends:
 
     def over(self, outputs: Outputs) -> Stack:
         """Return the bounds for output matrices C, (outputs, groups, k)."""
-        found = outputs.sizes(_times(outputs.stacked, self.terms), self.columns)
-        bound = found.reshape(len(outputs.rows), *self.rest.shape[:1], _TAYLOR_TERMS, -1).sum(axis=2)
+        found = outputs.sizes(times(outputs.stacked, self.terms), self.columns)
+        bound = found.reshape(len(outputs.rows), *self.rest.shape[:1], _TAYLOR_TERMS, -1).sum(
+            axis=2
+        )
         rest = outputs.norms[:, None, None] * self.rest
         if self.decay is None:
             return np.asarray(bound + rest)
@@ -251,9 +254,9 @@ def _bends(
     growth = np.where(
         exponents < _LARGEST_EXPONENT, np.exp(exponents.clip(max=_LARGEST_EXPONENT)), np.inf
     )
-    terms = [_times(generator, _times(generator, nodes))]
+    terms = [times(generator, times(generator, nodes))]
     for order in range(1, _TAYLOR_TERMS + 1):
-        terms.append(_times(generator, terms[-1]) * (steps_s / order))
+        terms.append(times(generator, terms[-1]) * (steps_s / order))
 
     def norms(values: Stack) -> Stack:
         return np.array([sizes(values[:, group]) for group in columns])
@@ -264,14 +267,9 @@ def _bends(
         np.concatenate(terms[:-1], axis=2),
         growth * norms(terms[-1]),
         decay,
-        none if decay is None else norms(_times(decay.factor, terms[-1])),
-        none if decay is None else norms(_times(decay.factor, terms[0])),
+        none if decay is None else norms(times(decay.factor, terms[-1])),
+        none if decay is None else norms(times(decay.factor, terms[0])),
     )
-
-
-def _times(matrix: Matrix, values: Stack) -> Stack:
-    """Return M Y for matrices Y along the last axis, (n, r, k) → (q, r, k)."""
-    return (matrix @ values.reshape(len(values), -1)).reshape(len(matrix), *values.shape[1:])
 
 
 def _slices(*ends: int) -> list[slice]:
