@@ -49,7 +49,7 @@ class Decay(NamedTuple):
 
 def decay_of(generator: Matrix) -> Decay | None:
     """Return the better of two candidates for L; None if neither passes its check numerically."""
-    return _decay_of(generator.tobytes(), len(generator))
+    return _decay_of(np.asarray(generator, dtype=np.float64).tobytes(), len(generator))
 
 
 @lru_cache(maxsize=8)
@@ -161,7 +161,7 @@ def _largest_eigenvalues(products: Stack) -> Stack:
     """Return the largest eigenvalues of Gram matrices along the last axis, (n, n, k) → (k,)."""
     n = len(products)
     if n == 1:
-        return products[0, 0]
+        return np.asarray(products[0, 0])
     if n == 2:
         (a, b), (_, d) = products
         return np.asarray(0.5 * (a + d) + np.hypot(0.5 * (a - d), b))

@@ -19,6 +19,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import accumulate, pairwise
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,13 +105,16 @@ class KernelBounds:
         return float(self.area.sum())
 
 
-class Outputs:
+Name = TypeVar("Name", bound=str)
+
+
+class Outputs(Generic[Name]):
     """Several output matrices C, (q, n) each, whose bounds are computed at once.
 
     They are ``stacked`` one below the other; ``rows`` are the rows of each, ``norms`` its ‖C‖.
     """
 
-    def __init__(self, matrices: Mapping[str, Matrix]) -> None:
+    def __init__(self, matrices: Mapping[Name, Matrix]) -> None:
         self.names = list(matrices)
         self.stacked = np.concatenate(list(matrices.values()))
         self.rows = _slices(*accumulate(map(len, matrices.values()), initial=0))
@@ -162,11 +166,11 @@ class ResponseBounds:
         """Return bounds of ‖C e^{Gτ} D‖, with C of shape (q, n)."""
         return self.through_each(Outputs({"": C}))[""]
 
-    def through_each(self, outputs: Outputs) -> dict[str, KernelBounds]:
+    def through_each(self, outputs: Outputs[Name]) -> dict[Name, KernelBounds]:
         """Return bounds of ‖C e^{Gτ} D‖ for every output."""
         return {name: found for name, (found,) in self.through_groups(outputs).items()}
 
-    def through_groups(self, outputs: Outputs) -> dict[str, list[KernelBounds]]:
+    def through_groups(self, outputs: Outputs[Name]) -> dict[Name, list[KernelBounds]]:
         """Return bounds of ‖C e^{Gτ} D‖ for every output and each group of columns of D."""
         steps_s, columns, nodes = np.diff(self.edges_s), self._columns, self._nodes
         exact = times(outputs.stacked, nodes)
@@ -232,12 +236,10 @@ class _Bends:
     least: Stack
     """(groups, k), factor of ‖C L^{−1}‖ in a bound of the whole value."""
 
-    def over(self, outputs: Outputs) -> Stack:
+    def over(self, outputs: Outputs[Name]) -> Stack:
         """Return the bounds for output matrices C, (outputs, groups, k)."""
         found = outputs.sizes(times(outputs.stacked, self.terms), self.columns)
-        bound = found.reshape(len(outputs.rows), *self.rest.shape[:1], _TAYLOR_TERMS, -1).sum(
-            axis=2
-        )
+        bound = found.reshape(*found.shape[:2], _TAYLOR_TERMS, -1).sum(axis=2)
         rest = outputs.norms[:, None, None] * self.rest
         if self.decay is None:
             return np.asarray(bound + rest)
@@ -314,7 +316,7 @@ def response(generator: Matrix, D: Matrix) -> ResponseBounds:
 
 
 def _straight(
-    everything: Outputs, generator: Matrix, state: Matrix, step_s: float, decay: Decay
+    everything: Outputs[str], generator: Matrix, state: Matrix, step_s: float, decay: Decay
 ) -> bool:
     """Return whether e^{Gτ} Y is close to its chord over a step."""
     size = float(np.linalg.norm(state))
@@ -357,7 +359,8 @@ def factors(matrix: Matrix) -> tuple[Matrix, Matrix]:
 
 def _propagate(generator: Matrix, state: Matrix, step_s: float, cells: int) -> Stack:
     """Return e^{G k s} state for k = 0 … cells, (cells + 1, n, r), block by block."""
-    powers, leap = _powers(generator.tobytes(), len(generator), step_s, min(_BLOCK, cells))
+    entries = np.asarray(generator, dtype=np.float64).tobytes()
+    powers, leap = _powers(entries, len(generator), step_s, min(_BLOCK, cells))
     size, blocks = len(powers), []
     for _ in range(-(-(cells + 1) // size)):
         blocks.append((powers.reshape(-1, len(state)) @ state).reshape(size, *state.shape))

@@ -146,12 +146,12 @@ class ErrorGains:
         }
 
     @cached_property
-    def stacked(self) -> Outputs:
+    def stacked(self) -> Outputs[Output]:
         """All outputs, whose bounds are computed at once."""
         return Outputs(self.outputs)
 
     @cached_method
-    def _stack(self, output: Output) -> Outputs:
+    def _stack(self, output: Output) -> Outputs[Output]:
         return Outputs({output: self.outputs[output]})
 
     @cached_property
@@ -211,7 +211,6 @@ class ErrorGains:
 
     def growth(self, columns: Columns, until_s: float, cells: int) -> Callable[[Output], Growth]:
         """Return the growth of every output C e_s, with what drives e_s through these columns."""
-
         driven = np.hstack([columns.mismatch, columns.input_error])
         groups = (0, columns.mismatch.shape[1])
         followed = response_until(self.scaled_H, driven, until_s, cells, groups)
@@ -300,7 +299,7 @@ class PlantGains:
         }
 
     @cached_property
-    def stacked(self) -> Outputs:
+    def stacked(self) -> Outputs[str]:
         """All outputs, whose bounds are computed at once."""
         return Outputs(self.outputs)
 

@@ -203,7 +203,7 @@ class EstimationError:
         return np.eye(self._loop.n) - self._gains @ self._model.C
 
     def _sources(self, columns: Matrix, alpha_per_s: float) -> Stack:
-        """Return the effects of the steps before each measurement on its error, (k, steps, n, r)."""
+        """Return the effects of the steps before each measurement on it, (k, steps, n, r)."""
         effects, power = [], columns
         for i in range(self._model.steps):
             effects.append(np.exp(alpha_per_s * self._period_s * (i + 1)) * power)
@@ -293,7 +293,8 @@ def _sums(matrices: Stack, effects: Stack) -> Stack:
     k, q, n = matrices.shape
     products = matrices.reshape(-1, n) @ effects.reshape(n, -1)
     values = products.reshape(k, q, *effects.shape[1:]).transpose(1, 2, 0, 3)
-    return largest_gains(values.reshape(*values.shape[:2], -1)).reshape(k, -1).sum(axis=1)
+    norms = largest_gains(values.reshape(*values.shape[:2], -1))
+    return np.asarray(norms.reshape(k, -1).sum(axis=1))
 
 
 def _powers(step: Matrix, count: int) -> Stack:
