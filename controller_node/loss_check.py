@@ -15,20 +15,30 @@ class LossCheck:
 
     Args:
         guarantee: more losses violate the assumption.
-        schedule: the announced changes of settings; None if there cannot be any.
+        schedule: the announced changes of settings; None if there are none.
         known_start: whether the controller needs no first update.
     """
 
     def __init__(
         self, guarantee: LossGuarantee, schedule: ChangeSchedule | None, *, known_start: bool
     ) -> None:
-        self._schedule = schedule
+        self._schedule, self._phase_ns, self._follows = schedule, 0, False
         self._known_start = known_start
         self._guarantee = guarantee
         self._since_ns = 0
         self._further = _further(guarantee)
         self._history = LossHistory(self._further)
         self._newest_ns = 0
+
+    def follow(self, schedule: ChangeSchedule, phase_ns: int) -> None:
+        """Use announced changes whose times are those of the run; the loop begins at its phase."""
+        self._schedule, self._phase_ns, self._follows = schedule, phase_ns, True
+
+    def reach(self, t_ns: int) -> None:
+        """Use the guarantee of the followed changes that is in force at a time of the loop."""
+        if self._schedule is not None and self._follows:
+            now = self._schedule.at(t_ns + self._phase_ns)
+            self.change(now.scenario.network.guarantee, now.since_ns - self._phase_ns)
 
     def change(self, guarantee: LossGuarantee, since_ns: int) -> None:
         """Use another guarantee for what is sent from ``since_ns`` on."""
@@ -57,7 +67,8 @@ class LossCheck:
         """Compare with the largest limit in force since the update before."""
         allowed = _cap(self._guarantee)
         if losses > allowed and self._schedule is not None:
-            scenarios = self._schedule.between(newest_ns, now_ns)
+            times_ns = newest_ns + self._phase_ns, now_ns + self._phase_ns
+            scenarios = self._schedule.between(*times_ns)
             allowed = max(_cap(one.network.guarantee) for one in scenarios)
         if losses <= allowed:
             return ""

@@ -12,6 +12,7 @@ from noack.config.parameter_changes import (
     current_parameters,
     scheduled,
 )
+from noack.config.runtime_parameters import is_of_network_alone, text_of
 from noack.config.scenario import MOST_CHANGES
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
@@ -54,10 +55,11 @@ class ChangeRequests:
         settings = parse_message(ChangeRequest, request).get("settings", {})
         from_s, now_ns = None, clock()
         if settings:
-            if may_be_compiled(self._scenario):
+            if may_be_compiled(self._scenario) and not is_of_network_alone(settings):
                 raise CallerError(
-                    "the loops of this run may run as compiled code, whose settings cannot be "
-                    "changed; schedule changes in the scenario"
+                    f"{text_of(settings)}: of this run only network.loss, network.mansd and "
+                    "network.constraints can be changed, as its loops may run as compiled code; "
+                    "schedule other changes in the scenario"
                 )
             if obstacle is not None:
                 raise CallerError(obstacle)

@@ -6,6 +6,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from cosim.analysis.claims.claim_definition import envelope_formula
 from cosim.output.all_certificates import SCHEDULE, Certificates
 from cosim.output.assumptions_table import print_assumptions
 from cosim.output.certificate_rows import constant_rows, plants_of
@@ -46,19 +47,13 @@ def _in_words(found: Certificates) -> Iterator[str]:
         if under != SCHEDULE or constants is None:
             continue
         plants = "every plant of the box" if certificate.scope == BOX else "the scenario's plant"
-        decay = f" e^(−{constants.rate_per_s:.3g}t)" if constants.rate_per_s else ""
-        late = ""
-        if (floor := certificate.floor_constants) is not None:
-            late = f"; from {certificate.floor_from_s:.4g} s on, ‖x‖ ≤ {floor.state:.4g}"
-        if (rest := certificate.persistent_constants) is not None:
-            late = f" + {rest.state:.4g}"
         apart = ""
         if (spacing_s := certificate.inter_event_s) is not None:
             apart = f" The inter-event time is at least {_limit(spacing_s)}."
         yield (
             f"In words: for {plants}, under the assumptions above and for every pattern of losses "
             f"with {certificate.conditions.guarantee.meaning}: "
-            f"‖x‖ ≤ {constants.state:.4g}{decay}{late}.{apart}"
+            f"{envelope_formula('‖x‖', certificate, 'state').format(constants.state)}.{apart}"
         )
 
 
@@ -106,6 +101,11 @@ def _print_constants(console: Console, found: Certificates) -> None:
             "[dim]The rows with + are added: they are the bounds from disturbances, noise, and the "
             "threshold's constant or floor. With noise or an observer, e_s and e_c are x_s − x̂ and "
             "x_c − x̂.[/]"
+        )
+    if any(one.other for one in certificates):
+        console.print(
+            "[dim]Two bounds hold at all times. The table has the one that tends to the smaller "
+            "value; both are in the words below.[/]"
         )
     for under, certificate in found:
         if certificate.void:

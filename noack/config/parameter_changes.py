@@ -131,6 +131,25 @@ class FixedMachine:
         raise CallerError(f"nothing can be changed here during a run: {text_of(change.settings)}")
 
 
+def announcement_outputs(
+    table: str, change: ParameterChange, number: int, now_ns: int, since_ns: int
+) -> list[Record | Notice]:
+    """Return the row of an announcement in a machine's ``table``, and a notice if it is late.
+
+    The announcement is the machine's input ``number``, at ``now_ns``; the change is in force from
+    ``since_ns`` on.
+    """
+    row = (number, change.number, change.t_ns, now_ns, since_ns, settings_bytes(change.settings))
+    outputs: list[Record | Notice] = [Record(table, row)]
+    if since_ns > change.t_ns:
+        text = (
+            f"change received too late: {text_of(change.settings)}, due at "
+            f"{change.t_ns / NS_PER_S:.3f} s, applies from {since_ns / NS_PER_S:.3f} s on"
+        )
+        outputs.append(Notice(since_ns, LATE, text))
+    return outputs
+
+
 class AppliedParameters(NamedTuple):
     """A scenario, and the machine's own time from which it is in force."""
 
@@ -179,22 +198,7 @@ class ChangeSchedule:
             every[place] = every[place]._replace(scenario=scenario, prepared=prepared)
         self._all = every
         self._update_next()
-        row = (
-            number,
-            change.number,
-            change.t_ns,
-            now_ns,
-            since_ns,
-            settings_bytes(change.settings),
-        )
-        outputs: list[Record | Notice] = [Record(table, row)]
-        if since_ns > change.t_ns:
-            text = (
-                f"change received too late: {text_of(change.settings)}, due at "
-                f"{change.t_ns / NS_PER_S:.3f} s, applies from {since_ns / NS_PER_S:.3f} s on"
-            )
-            outputs.append(Notice(since_ns, LATE, text))
-        return outputs
+        return announcement_outputs(table, change, number, now_ns, since_ns)
 
     def take(self, t_ns: int) -> AppliedParameters | None:
         """Return the next scenario that is due at a time and not yet applied, or None."""
@@ -209,6 +213,10 @@ class ChangeSchedule:
     def last(self) -> Scenario:
         """The scenario with all announced changes."""
         return self._all[-1].scenario
+
+    def at(self, t_ns: int) -> AppliedParameters:
+        """The scenario that is in force at a time."""
+        return self._all[bisect(self._all, t_ns, key=lambda one: one.since_ns) - 1]
 
     def between(self, first_ns: int, last_ns: int) -> Iterator[Scenario]:
         """Return the scenarios that are in force at any time within an interval."""

@@ -44,14 +44,14 @@ class Fleet:
         loop = message.loop
         outputs = self.machines[loop].handle(message, now_ns - self._phases_ns[loop])
         self._update(loop)
-        return [_of_loop(loop, output) for output in outputs]
+        return [of_loop(loop, output) for output in outputs]
 
     def on_timer(self, now_ns: int) -> Sequence[Output]:
         """Do the work of the one machine whose deadline is the earliest."""
         loop = self._due[0][1]
         outputs = self.machines[loop].on_timer(now_ns - self._phases_ns[loop])
         self._update(loop)
-        return [_of_loop(loop, output) for output in outputs]
+        return [of_loop(loop, output) for output in outputs]
 
     def announce(self, change: Any, now_ns: int) -> Sequence[Record | Notice]:
         """Announce a change of settings to every machine; its time is that of the run."""
@@ -61,7 +61,7 @@ class Fleet:
         ):
             own = change._replace(t_ns=max(change.t_ns - phase_ns, 0))
             announced = machine.announce(own, now_ns - phase_ns)  # type: ignore[attr-defined]
-            outputs += [_of_loop(loop, output) for output in announced]
+            outputs += [of_loop(loop, output) for output in announced]
         return outputs
 
     def _update(self, loop: int) -> None:
@@ -114,7 +114,7 @@ class FleetDecoder:
         return [one.report() for one in self.decoders]
 
 
-def _of_loop(loop: int, output: Any) -> Any:
+def of_loop(loop: int, output: Any) -> Any:
     """Return an output of a loop's machine with the number of the loop."""
     if type(output) is Record:
         return Record(output.table, (loop, *output.row))

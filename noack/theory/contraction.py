@@ -157,6 +157,11 @@ def largest_gains(values: Stack) -> Stack:
     return np.asarray(np.sqrt(np.maximum(_largest_eigenvalues(products), 0.0)))
 
 
+def largest_eigenvalues(stack: Stack) -> Stack:
+    """Return the largest eigenvalues of Gram matrices, (k, n, n) → (k,)."""
+    return _largest_eigenvalues(stack.transpose(1, 2, 0))
+
+
 def _largest_eigenvalues(products: Stack) -> Stack:
     """Return the largest eigenvalues of Gram matrices along the last axis, (n, n, k) → (k,)."""
     n = len(products)

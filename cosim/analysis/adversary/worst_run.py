@@ -209,4 +209,5 @@ def _sampled_quantity(objective: Objective, certificate: ScenarioCertificate) ->
 
 def _is_shaped(certificate: ScenarioCertificate) -> bool:
     """Return whether the bounds are not c e^{−rt}."""
-    return certificate.persistent_constants is not None or certificate.floor_constants is not None
+    parts = (certificate.persistent_constants, certificate.floor_constants, certificate.other)
+    return any(part is not None for part in parts)

@@ -11,11 +11,17 @@ import numpy as np
 
 from noack.config.fleet_layout import HEADER_WORDS, STRIDE, FleetParts, FleetRole
 from noack.config.loops import phases_ns
-from noack.config.parameter_changes import ParameterChange
+from noack.config.parameter_changes import (
+    ChangeSchedule,
+    ParameterChange,
+    announcement_outputs,
+)
 from noack.config.resolution import loop_of, tables_of
+from noack.config.runtime_parameters import is_of_network_alone, text_of
 from noack.config.scenario import Scenario
 from noack.core.clock import RunClock
 from noack.core.errors import CallerError
+from noack.protocol.fleet import of_loop
 from noack.protocol.machine_interface import Notice, Output, Record
 from noack.protocol.topology import RECEIVES, SENDS
 from noack.protocol.wire_format import Encoder, Message
@@ -63,10 +69,11 @@ class CompiledFleet:
         self._on_timer = role.on_message if timer is None else timer
         self._types = tables[self._on_timer], tables[self._on_message]
         self._encoder = Encoder(run_id, key)
+        self._phases_ns, self._schedule = phases_ns(run), ChangeSchedule(loops[0])
         one = loop_of(loops[0])
         self._sent = loops[0].message_sizes.entries(self._sends)
         wire = wire_memory(self._sends, RECEIVES[name], loops[0].message_sizes, run_id, key)
-        self._memory = driver_memory(parts, phases_ns(run), (one.n, one.m), self._types, wire)
+        self._memory = driver_memory(parts, self._phases_ns, (one.n, one.m), self._types, wire)
         rest_ns = int(loops[0].timing.plant_period_ns / _REST_SHARE / run.speed)
         self._memory.driver["rest_ns"] = min(rest_ns, _LONGEST_REST_NS)
         self._notices: list[Notice] = []
@@ -99,8 +106,32 @@ class CompiledFleet:
         return int(self._memory.heap[0]) if self._memory.driver[0]["due"] else None
 
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
-        """Raise a CallerError: arrays have no schedule."""
-        raise CallerError("the settings of many loops in compiled code cannot be changed")
+        """Record a change of the network for each loop, and check losses by it.
+
+        Raise CallerError for other settings: the arrays keep theirs.
+        """
+        if not is_of_network_alone(change.settings):
+            raise CallerError(f"compiled machines keep their settings: {text_of(change.settings)}")
+        self._schedule.announce("", change, 0, 0, -1)
+        if self._parts.follow is not None:
+            self._parts.follow(self._schedule, self._phases_ns)
+        outputs: list[Record | Notice] = []
+        loops = self._memory.fleet.loops
+        # Of the inputs so far, change.number were announcements.
+        reached_ns = np.where(loops["inputs"] > change.number, self._own[0]["model_ns"], -1)
+        for loop, (phase_ns, reached) in enumerate(
+            zip(self._phases_ns, reached_ns.tolist(), strict=True)
+        ):
+            own = change._replace(t_ns=max(change.t_ns - phase_ns, 0))
+            since_ns, number = max(own.t_ns, reached + 1), int(loops["inputs"][loop])
+            outputs += [
+                of_loop(loop, output)
+                for output in announcement_outputs(
+                    self._parts.changes, own, number, now_ns - phase_ns, since_ns
+                )
+            ]
+        loops["inputs"] += 1
+        return outputs
 
     def drive(self, until_ns: int, sink: RecordSink) -> None:
         """Work until a time, and pass on the rows of the record."""

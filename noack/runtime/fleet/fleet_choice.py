@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from noack.config.fleet_layout import FleetRole
 from noack.config.resolution import resolved_loops
+from noack.config.runtime_parameters import is_of_network_alone
 from noack.config.scenario import Scenario
 from noack.core.code_cache import while_compiling
 from noack.core.errors import CallerError
@@ -21,8 +22,8 @@ _ABOUT_S = 25.0
 
 
 def may_be_compiled(run: Scenario) -> bool:
-    """Whether the machines may be compiled; the settings of such a run cannot be changed."""
-    if run.loops is None or run.changes:
+    """Whether the machines may be compiled; of such a run only the network can be changed."""
+    if run.loops is None or not all(is_of_network_alone(one.set) for one in run.changes):
         return False
     return sum(section.count for section in run.loops) >= _FEWEST_LOOPS
 
@@ -32,8 +33,8 @@ def fleet_of(
 ) -> CompiledFleet | None:
     """Return the compiled machines of a role; None if the single machines are to be used.
 
-    They are used for few loops, for loops with something that has no compiled form, if settings
-    change during the run, and if the code is not in the cache.
+    They are used for few loops, for loops with something that has no compiled form, if more than
+    the network changes during the run, and if the code is not in the cache.
     """
     driver = kept_driver(role)
     if driver is None or not may_be_compiled(run):

@@ -177,8 +177,8 @@ def test_the_text_states_the_bounds_and_their_conditions(document: dict[str, Any
     for sentence, one in zip(sentences, scheduled, strict=True):
         assert "under the assumptions above" in sentence
         assert "at most M − 1 = 3 consecutive losses" in sentence
-        assert f"‖x‖ ≤ {one['constants']['state']:.4g} e^(−0.3t); from" in sentence
-        assert f"on, ‖x‖ ≤ {one['floor_constants']['state']:.4g}." in sentence
+        assert f"‖x‖ ≤ {one['constants']['state']:.4g} e^(−0.3t), from" in sentence
+        assert f"on ≤ {one['floor_constants']['state']:.4g}." in sentence
 
 
 def test_a_gain_of_the_opposite_sign_is_recognised() -> None:

@@ -11,12 +11,14 @@ from controller_node.controller import controller_of
 from controller_node.controller_arrays import CONTROLLER_FLEET
 from noack.config.fleet_layout import FleetRole
 from noack.config.loops import phases_ns
+from noack.config.parameter_changes import ParameterChange
 from noack.config.resolution import resolved_loops, tables_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
+from noack.core.errors import CallerError
 from noack.protocol.fleet import Fleet
-from noack.protocol.machine_interface import Machine, Output, Record
-from noack.protocol.record_tables import PLANT_ACTUATION
+from noack.protocol.machine_interface import Machine, Notice, Output, Record
+from noack.protocol.record_tables import CONTROLLER_SETTING, PLANT_ACTUATION, SENSOR_SETTING
 from noack.protocol.wire_format import Flow, Message
 from noack.runtime.fleet.compiled_driver import compiled_driver, compiled_replay
 from noack.runtime.fleet.compiled_fleet import CompiledFleet
@@ -64,6 +66,12 @@ class Pair:
         self._compiled = compiled(name, run)
         self._compiled.use(compiled_driver(role, self._compiled.arguments))
         self._rows: dict[str, list[Any]] = {}
+        self.notices: list[str] = []
+
+    def announce(self, change: ParameterChange, now_ns: int) -> None:
+        self._compare(
+            self._single.announce(change, now_ns), self._compiled.announce(change, now_ns)
+        )
 
     def due_ns(self) -> int | None:
         due_ns = self._single.next_deadline_ns()
@@ -86,6 +94,8 @@ class Pair:
         for output in single:
             if isinstance(output, Record):
                 self._rows.setdefault(output.table, []).append(output.row)
+            elif isinstance(output, Notice):
+                self.notices.append(output.text)
         return [one for one in single if isinstance(one, Message)]
 
     @property
@@ -103,19 +113,31 @@ class Pair:
         return str(output)
 
 
-def drive(run: Scenario, seed: int, *, loss: float, delay_ns: int) -> dict[str, Pair]:
+def drive(
+    run: Scenario,
+    seed: int,
+    *,
+    loss: float,
+    delay_ns: int,
+    announced: Sequence[tuple[int, ParameterChange]] = (),
+) -> dict[str, Pair]:
     """Run all loops with late timers, and with datagrams that are lost and delayed at random."""
     chance = random.Random(seed)
     pairs = {name: Pair(name, run) for name in ROLES}
     newest: dict[tuple[str, int], int] = {}
     flying: list[tuple[int, int, str, Message]] = []
     to = {Flow.MEASUREMENT: "sensor", Flow.UPDATE: "controller", Flow.ACTUATION: "plant"}
-    count = 0
+    count, waiting = 0, [*announced]
     while True:
         dues = [(due, name) for name, pair in pairs.items() if (due := pair.due_ns()) is not None]
         if not dues and not flying:
             return pairs
         flying.sort(key=lambda one: one[:2])
+        next_ns = min([due for due, _ in dues] + [one[0] for one in flying])
+        while waiting and waiting[0][0] <= next_ns:
+            now_ns, change = waiting.pop(0)
+            for name in ("sensor", "controller"):
+                pairs[name].announce(change, now_ns)
         if flying and (not dues or flying[0][0] < min(dues)[0]):
             now_ns, _, name, message = flying.pop(0)
             if message.sequence <= newest.get((name, message.loop), -1):
@@ -194,10 +216,34 @@ def test_a_replay_finds_every_row_again_and_one_changed_bit(loops: Content) -> N
             assert found.differs == (table, row)
 
 
-def test_machines_whose_settings_change_are_not_compiled(loops: Content) -> None:
+def test_changes_of_the_network_have_the_rows_and_notices_of_the_single_machines(
+    loops: Content,
+) -> None:
+    loops["network"] |= {"mansd": 8, "initial_sync": "first_packet"}
+    run = validate(loops, "here")
+    announced: list[tuple[int, ParameterChange]] = [
+        (0, ParameterChange(0, 0, {"network.loss.probability": 0.5})),
+        (300_000_000, ParameterChange(1, 500_000_000, {"network.mansd": 1})),
+        (1_210_000_000, ParameterChange(2, 1_200_000_000, {"network.mansd": 3})),  # too late
+    ]  # fmt: skip
+    pairs = drive(run, 4, loss=0.6, delay_ns=60_000_000, announced=announced)
+    for name, table in (("sensor", SENSOR_SETTING), ("controller", CONTROLLER_SETTING)):
+        assert len(pairs[name].rows[table]) == len(announced) * len(resolved_loops(run))
+        assert any("too late" in text for text in pairs[name].notices)
+    texts = " ".join(pairs["controller"].notices)
+    assert "at most 1 assumed" in texts
+    assert "at most 3 assumed" in texts
+
+
+def test_machines_whose_own_settings_change_are_not_compiled(loops: Content) -> None:
     assert may_be_compiled(validate(loops, "here"))
     loops["changes"] = [{"at_s": 0.5, "set": {"network.mansd": 1}}]
+    assert may_be_compiled(validate(loops, "here"))
+    loops["changes"] = [{"at_s": 0.5, "set": {"controller.setpoint": [0, 0]}}]
     assert not may_be_compiled(validate(loops, "here"))
+    fleet = compiled("sensor", validate(loops, "here"))
+    with pytest.raises(CallerError, match="keep their settings"):
+        fleet.announce(ParameterChange(0, 0, {"controller.setpoint": [0, 0]}), 0)
     del loops["changes"]
     loops["loops"] = loops["loops"][:1]
     assert not may_be_compiled(validate(loops, "here"))
