@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, spectral_abscissa
+from noack.core.matrix_functions import solve_lyapunov
 
 Stack = NDArray[np.float64]
 
@@ -83,13 +84,11 @@ def _checked(generator: Matrix, factor: Matrix) -> Decay | None:
 
 def _lyapunov_factor(generator: Matrix) -> Matrix | None:
     """Return the factor of P, (G+νI)ᵀP + P(G+νI) = −I, ν half of G's decay rate; smooth in G."""
-    from scipy.linalg import cholesky, solve_continuous_lyapunov
-
     n = len(generator)
     shifted = generator - 0.5 * spectral_abscissa(generator) * np.eye(n)
     try:
-        P = solve_continuous_lyapunov(shifted.T, -np.eye(n))
-        return np.asarray(cholesky(0.5 * (P + P.T)))
+        P = solve_lyapunov(shifted.T, -np.eye(n))
+        return np.asarray(np.linalg.cholesky(0.5 * (P + P.T)).T)
     except (np.linalg.LinAlgError, ValueError):
         return None
 

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, spectral_abscissa
+from noack.core.matrix_functions import exponential
 from noack.theory.contraction import (
     EPSILON,
     Decay,
@@ -374,10 +375,8 @@ def _powers(entries: bytes, n: int, step_s: float, least: int) -> tuple[Stack, M
 
     The matrix is given by its entries; several responses follow each other with the same steps.
     """
-    from scipy.linalg import expm
-
     generator = np.frombuffer(entries).reshape(n, n)
-    powers, leap = np.eye(n)[None], expm(generator * step_s)
+    powers, leap = np.eye(n)[None], exponential(generator * step_s)
     while len(powers) < least:
         powers, leap = np.concatenate([powers, product(leap, powers)]), leap @ leap
     return powers, leap
