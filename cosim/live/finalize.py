@@ -14,7 +14,7 @@ from cosim.analysis.claims.claim_definition import Envelope
 from cosim.analysis.claims.claims_by_part import RunClaims
 from cosim.analysis.fidelity import fidelity_for_summary
 from cosim.analysis.loops_over_time import worst_loop
-from cosim.analysis.loops_summary import is_complete
+from cosim.analysis.loops_summary import LoopsSummary, is_complete
 from cosim.analysis.loss_statistics import list_violations
 from cosim.analysis.model_comparison import linearisation
 from cosim.analysis.replay import replay
@@ -34,10 +34,9 @@ from cosim.record.run_directory import (
     read_object,
 )
 from cosim.record.run_ending import EndingFile, RunEnding
-from cosim.record.run_record import RunRecord, load_record
+from cosim.record.run_record import RunRecord, finish_record, load_record
 from cosim.record.shared_run import loop_directories
-from cosim.record.shared_spool import finish_run_record
-from noack.config.loops import loops_of
+from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.file_access import write_whole
 from noack.runtime.spool import SPOOL
@@ -62,13 +61,18 @@ def finalize(ending: RunEnding, *, report: bool = True, again: bool = False) -> 
     run_dir = ending.run_dir
     with _with_reason(ending), finished_run(run_dir), ExitStack() as stack:
         unfinished = (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir()
-        record = finish_run_record(run_dir) if unfinished else load_record(run_dir, network=True)
-        if record.is_network:
-            return _finalize_shared(record, ending, report=report, again=again)
+        scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
+        if scenario.loops is not None:
+            few = sum(section.count for section in scenario.loops) <= _FEW_LOOPS
+            of_loop = partial(finalize, report=report and few, again=again)
+            network, shared = finalize_loops(ending, of_loop, unfinished=unfinished)
+            return _finalize_shared(network, shared, ending, report=report)
+        record = finish_record(run_dir) if unfinished else load_record(run_dir)
         replaying = stack.enter_context(ReplayProcess(record, run_dir))
         # A stopped recorder has no time to write the recording of a long run.
         needed = unfinished or (record.kind == "live" and is_long(record.scenario))
-        if needed or (again and record.kind == "live"):
+        shown = record.number is None or (report and not unfinished)
+        if shown and (needed or (again and record.kind == "live")):
             from cosim.output.viewer.run_view import write_view
 
             # The recording of an earlier attempt may be complete.
@@ -91,11 +95,9 @@ def finalize(ending: RunEnding, *, report: bool = True, again: bool = False) -> 
 
 
 def _finalize_shared(
-    network: RunRecord, ending: RunEnding, *, report: bool, again: bool
+    network: RunRecord, summary: LoopsSummary, ending: RunEnding, *, report: bool
 ) -> Outcome:
-    """Finalise each loop of a run of several; write summary, report and recording of the run."""
-    of_each = report and len(loops_of(network.scenario)) <= _FEW_LOOPS
-    summary = finalize_loops(network, ending, partial(finalize, report=of_each, again=again))
+    """Write summary, report and recording of a run of several loops, which are finalised."""
     _write_summary(ending.run_dir, summary)
     status, reason = ExitStatus(summary.exit.status), summary.exit.reason
     if (ending.status, ending.reason) != (status, reason):

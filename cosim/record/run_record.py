@@ -263,7 +263,14 @@ def _write(
 
 
 def finish_record(run_dir: Path) -> RunRecord:
-    """Convert a run's spool to its record, and remove the spool.
+    """Convert a run's spool to its record, and remove the spool; see :func:`convert_spool`."""
+    convert_spool(run_dir)
+    remove_spool(run_dir)
+    return load_record(run_dir, network=True)
+
+
+def convert_spool(run_dir: Path) -> None:
+    """Convert a run's spool to its record.
 
     It merges all spools and removes duplicate rows. Of a run with [[loops]], it converts the part
     of the network; see :func:`cosim.record.shared_spool.finish_run_record`.
@@ -279,16 +286,31 @@ def finish_record(run_dir: Path) -> RunRecord:
     notices = [one for one in _notices(folder, spool) if one.get(LOOP) is None]
     try:
         _write(folder, tables, types, None if is_network else loop_of(scenario), notices)
+    except OSError as error:
+        raise _kept(run_dir, error) from None
+
+
+def remove_spool(run_dir: Path) -> None:
+    """Remove a run's spool, whose rows are in its record.
+
+    Raises:
+        MachineError: it cannot be removed.
+    """
+    spool = run_dir / SPOOL
+    try:
         if spool.is_dir():  # moved in one step, so that an incomplete spool is never read
             done = spool.with_name(f"{SPOOL}.done")
             shutil.rmtree(done, ignore_errors=True)  # of an earlier attempt that was interrupted
             shutil.rmtree(spool.rename(done), ignore_errors=True)
     except OSError as error:
-        raise MachineError(
-            f"{folder}: the record cannot be written: {why(error)}; what was recorded is kept "
-            f"in {spool}, and `noack summary {run_dir}` finishes it"
-        ) from None
-    return load_record(run_dir, network=True)
+        raise _kept(run_dir, error) from None
+
+
+def _kept(run_dir: Path, error: OSError) -> MachineError:
+    return MachineError(
+        f"{run_dir / RECORD}: the record cannot be written: {why(error)}; what was recorded is "
+        f"kept in {run_dir / SPOOL}, and `noack summary {run_dir}` finishes it"
+    )
 
 
 def recorded_rows(run_dir: Path, table: str, dtype: np.dtype[np.void]) -> Iterator[Rows]:

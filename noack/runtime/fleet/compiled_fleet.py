@@ -181,6 +181,11 @@ class CompiledFleet:
         """The tables of the role."""
         return tuple(dict.fromkeys((self._on_timer, self._on_message)))
 
+    @property
+    def sent_words(self) -> int:
+        """Words of number, time and vector of a message that the machines send."""
+        return 2 + self._sent
+
     def replay(self, code: Driver, tables: tuple[Any, ...], inputs: int) -> int:
         """Replay recorded inputs (:mod:`noack.runtime.fleet.replay_driver`); return the reason."""
         while True:

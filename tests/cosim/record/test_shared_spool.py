@@ -120,7 +120,7 @@ def test_an_interrupted_attempt_is_repeated_and_later_rows_are_added(
     for table, found in rows.items():
         spool(run_dir, table, found[: len(found) // 2])
     with monkeypatch.context() as patch:
-        patch.setattr("cosim.record.shared_spool.finish_record", _fail)
+        patch.setattr("cosim.record.shared_spool._spool_network", _fail)
         with pytest.raises(MachineError, match="is kept in"):
             finish_run_record(run_dir)
     finish_run_record(run_dir)
@@ -133,7 +133,7 @@ def test_an_interrupted_attempt_is_repeated_and_later_rows_are_added(
         same_rows(record, expected)
 
 
-def _fail(run_dir: Path) -> RunRecord:
+def _fail(*_: object) -> None:
     raise OSError(28, "No space left on device")
 
 
