@@ -21,8 +21,12 @@ def print_certificates(console: Console, found: Certificates) -> None:
     """Print the tables."""
     _print_constants(console, found)
     if any(found.setpoint or ()):
-        console.print("[dim]x is the distance from the set-point, x − x_r.[/]")
-    _print_limits(console, found)
+        console.print(
+            "[dim]x is the distance from the set-point, x − x_r. If the plant does not rest there, "
+            "A x_r + B u_r is a disturbance: a step at the state.[/]"
+        )
+    if any(certificate.constants for _, certificate in found):
+        _print_limits(console, found)
     if (outside := outside_box(found.scenario)) is not None:
         console.print(f"[yellow]the box certificates do not cover this plant:[/] {outside}")
     console.print("assumptions of the certificates for the schedule:")
@@ -65,7 +69,8 @@ def _stability_in_words(found: Certificates) -> Iterator[str]:
     growth = f"growth per period {known.lower:.4g} to {known.upper:.4g}"
     text = {
         "stable": f"all {patterns} are stable: {growth}",
-        "destabilised": f"the pattern {known.text}, repeated, destabilises the loop: {growth}",
+        "destabilised": f"the pattern {known.text} (D delivered, L lost), repeated, "
+        f"destabilises the loop: {growth}",
         "undecided": f"{growth} under the worst of all {patterns}",
     }[known.verdict]
     yield f"Exactly, but without lateness: {text}; noack margin finds the limits."
@@ -89,13 +94,15 @@ def _print_constants(console: Console, found: Certificates) -> None:
     for label, values, of_theorem in constant_rows(certificates, found.theorem_2, rate):
         table.add_row(label, *values, *([of_theorem] if printed else []))
     console.print(table)
-    console.print(
-        "[dim]Each bound of a norm is multiplied by e^(−rate·t). paper: no sampling, no delay, no "
-        "hold. schedule: the scenario's rates, plus the lateness that it allows. plant: the "
-        "scenario's plant. box: every plant of the uncertainty box. updates outstanding: maximum "
-        "number of updates lost or in flight. no update missing: while the controller has every "
-        "update, which sharpens the bound of x from an event on. inter-event time: minimum.[/]"
-    )
+    if any(one.constants for one in certificates):
+        console.print(
+            "[dim]Each bound of a norm is multiplied by e^(−rate·t). paper: no sampling, no delay, "
+            "no hold. schedule: the scenario's rates, plus the lateness that it allows. plant: the "
+            "scenario's plant. box: every plant of the uncertainty box. updates outstanding: "
+            "maximum number of updates lost or in flight. no update missing: while the controller "
+            "has every update, which sharpens the bound of x from an event on. inter-event time: "
+            "minimum.[/]"
+        )
     if any(one.persistent_constants for one in certificates):
         console.print(
             "[dim]The rows with + are added: they are the bounds from disturbances, noise, and the "

@@ -13,6 +13,7 @@ e_c = (0, I) e^{Fr} z' after r. The weights are improved step by step; all weigh
 import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector
+from noack.core.matrix_functions import exponential
 from noack.theory.contraction import Stack, logarithmic_norm
 from noack.theory.delivery_flow import ROUNDING, DeliveryFlow, Reach
 from noack.theory.enclosure import KernelBounds
@@ -32,27 +33,33 @@ _TAYLOR_TERMS, _CONDITION = 8, 1e-10
 
 
 def errors_after_losses(
-    reach: Reach, plain: Vector, level: float, spacing_s: float, kernel: KernelBounds
+    reach: Reach,
+    plain: Vector,
+    size: float,
+    level: float,
+    spacing_s: float,
+    kernel: KernelBounds,
 ) -> Vector:
     """Bound ‖e_c‖_W while at most 0, 1, … events have been lost since the delivery.
 
     Args:
         reach: the flow from a delivery; it is invariant.
         plain: bounds without the flow, for 0, 1, … events.
-        level: bound of ‖e_s‖_W.
+        size: bound of ‖e_s‖_W.
+        level: ‖e_s‖_W at an event, at least.
         spacing_s: the least time between events.
         kernel: of ‖e^{(H+αI)τ}‖_W.
     """
     found, since_s, bend = plain.copy(), 0.0, bend_of_error(reach, level)
     most_s = float(reach.starts.flow.edges_s[-1]) / 4  # e^{Fτ} is accurate until 4 times as late
     for lost in range(len(plain) if spacing_s < most_s else 0):
-        earlier = float(found[lost - 1]) if lost else _NOTHING * level
-        sought = (_SOUGHT * (level + earlier) - level) / earlier
+        earlier = float(found[lost - 1]) if lost else _NOTHING * size
+        sought = (_SOUGHT * (size + earlier) - size) / earlier
         r_s = _nodes_s(spacing_s, kernel, sought)
         stage = _Stage(reach, min(since_s, most_s), earlier, r_s[r_s <= 2 * most_s])
         if lost:
-            added = level + kernel.sups(stage.r_s) * earlier
-            largest = max(stage.largest_error(level, added), float(added[-1]), earlier)
+            added = size + kernel.sups(stage.r_s) * earlier
+            largest = max(stage.largest_error(size, added), float(added[-1]), earlier)
             found[lost] = min(plain[lost], largest)
             if lost > 1 and found[lost] > _WORTH * float(added[0]):
                 break  # later stages gain nothing, either
@@ -81,23 +88,21 @@ class _Stage:
     """What follows an event, a time w or more after the delivery, for times r since it."""
 
     def __init__(self, reach: Reach, window_s: float, earlier: float, r_s: Vector) -> None:
-        from scipy.linalg import expm
-
         self._flow, self.r_s, self._earlier = reach.starts.flow, r_s, earlier
         n, one = self._flow.n, np.eye(2 * self._flow.n)
-        half = expm(self._flow.generator * window_s / 2)
+        half = exponential(self._flow.generator * window_s / 2)
         rows = [one[n:] / earlier, half[n:] / earlier, (half @ half)[n:] / earlier]
         rows.append(reach.starts.shape @ one[:n] / reach.size)
         forms = np.array([row.T @ row for row in rows])
         self._forms = np.broadcast_to(forms, (len(r_s), *forms.shape))
-        self._z = expm(self._flow.generator * r_s[:, None, None]) @ half @ half
-        held = np.pad(expm(self._flow.H * r_s[:, None, None]), ((0, 0), (0, 0), (n, 0)))
+        self._z = _exponentials(self._flow.generator, r_s) @ half @ half
+        held = np.pad(_exponentials(self._flow.H, r_s), ((0, 0), (0, 0), (n, 0)))
         self._e_s = self._z[:, n:] - held @ half @ half
 
-    def largest_error(self, level: float, added: Vector) -> float:
+    def largest_error(self, size: float, added: Vector) -> float:
         """Bound ‖e_c‖_W up to the last r, given bounds without the flow for the nodes."""
         n = self._flow.n
-        events = (self._e_s.swapaxes(1, 2) @ self._e_s)[:-1, None] / level**2
+        events = (self._e_s.swapaxes(1, 2) @ self._e_s)[:-1, None] / size**2
         forms = np.concatenate([self._forms[:-1], events], axis=1)
         ends, weights = _largest(forms, self._z[1:, n:], float(added[-1]))
         cells = np.maximum(ends, np.append(self._earlier, ends[:-1])) + self._sags(forms, weights)
@@ -126,12 +131,14 @@ class _Stage:
         return float(self.r_s[np.append(reached, True).argmax()])
 
 
+def _exponentials(generator: Matrix, times_s: Vector) -> Stack:
+    return np.array([exponential(generator * float(time_s)) for time_s in times_s])
+
+
 def error_after(flow: DeliveryFlow, time_s: float) -> Matrix:
     """Return C_r: e_s a time after an event is C_r z."""
-    from scipy.linalg import expm
-
-    found = np.asarray(expm(flow.generator * time_s)[flow.n :])
-    found[:, flow.n :] -= expm(flow.H * time_s)
+    found = np.asarray(exponential(flow.generator * time_s)[flow.n :])
+    found[:, flow.n :] -= exponential(flow.H * time_s)
     return found
 
 

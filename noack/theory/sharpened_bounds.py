@@ -21,6 +21,7 @@ import numpy as np
 
 from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
+from noack.core.matrix_functions import solve_lyapunov
 from noack.theory.contraction import Stack
 from noack.theory.delivery_flow import ROUNDING, DeliveryFlow, Reach, Starts
 from noack.theory.gains import Output, PlantGains
@@ -92,7 +93,7 @@ class InvariantEllipsoids:
         at_event = max(float(errors_at_events(errors)[-1]), _LEAST_SHARE * limit)
         next_s = _next_event_s(reach, replace(reach, limit=at_event), level, known.inter_event_s)
         kernel = self.plant.error.kernels[Output.WEIGHTED]
-        errors = errors_after_losses(reach, errors, size, next_s, kernel)
+        errors = errors_after_losses(reach, errors, size, level, next_s, kernel)
         return found._replace(inter_event_s=next_s), errors
 
     def within(self, limit: float) -> Reach | None:
@@ -154,8 +155,6 @@ class InvariantEllipsoids:
     @cached_method
     def _grown(self, logit: float) -> list[Matrix]:
         """Return X for each of the three parts of Q, for ν that follows from ``logit``."""
-        from scipy.linalg import solve_continuous_lyapunov
-
         flow, n = self.flow, self.flow.n
         share = 0.1 + 0.85 / (1 + math.exp(-logit))
         rate = share * -spectral_abscissa(flow.closed_loop)
@@ -165,7 +164,7 @@ class InvariantEllipsoids:
             Q = columns @ columns.T / max(float((columns**2).sum()), 1e-300)
             if not np.isfinite(Q).all():
                 raise np.linalg.LinAlgError("the squares of the entries overflow")
-            X = solve_continuous_lyapunov(moved, -Q)
+            X = solve_lyapunov(moved, -Q)
             found.append(np.asarray(0.5 * (X + X.T)))
         return found
 

@@ -8,6 +8,7 @@ from urllib.parse import quote
 import numpy as np
 
 from cosim.analysis.loops_over_time import LoopsOverTime, loops_over_time, worst_loop
+from cosim.output.loops_tables import CAPTION, HEADINGS, badness, loop_row, network_rows
 from cosim.output.report.loops_figures import (
     NAMED,
     QueueLength,
@@ -17,7 +18,7 @@ from cosim.output.report.loops_figures import (
 )
 from cosim.output.report.report_page import environment_rows, templates
 from cosim.output.report.run_figures import Envelope, RunFigure, pictures
-from cosim.output.shared_tables import CAPTION, HEADINGS, badness, loop_row, network_rows
+from cosim.record.loops_run import loop_directories
 from cosim.record.run_directory import (
     ENVIRONMENT_FILE,
     LOOPS,
@@ -26,7 +27,6 @@ from cosim.record.run_directory import (
     read_object,
 )
 from cosim.record.run_record import RunRecord, load_record
-from cosim.record.shared_run import loop_directories
 from noack.core.errors import ExitStatus
 from noack.core.file_access import write_whole
 from noack.core.number_format import number

@@ -298,3 +298,12 @@ def test_a_time_triggered_loop_shows_whether_all_patterns_are_stable() -> None:
 def test_a_policy_without_a_certificate_says_why(trigger: str, why: str) -> None:
     found = certificates_of(load(ROOT / "scenarios/lane_following.toml", [f"trigger={trigger}"]))
     assert why in (found.paper.void or "")
+
+
+def test_a_loop_without_any_certificate_has_the_reasons_and_no_empty_tables() -> None:
+    result = CliRunner().invoke(app, ["certify", "reactor_petc"])
+    assert result.exit_code == 1
+    assert "loop gain of the errors" in result.stdout
+    table, _, rest = result.stdout.partition("└")
+    assert table.count("void") == 2  # paper, schedule
+    assert "largest certified value" not in rest

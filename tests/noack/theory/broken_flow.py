@@ -49,7 +49,7 @@ def half_of_the_threshold() -> AbstractContextManager[Any]:
     return patch.object(
         lost_events._Stage,
         "largest_error",
-        lambda self, level, added: exact(self, 0.5 * level, added),
+        lambda self, size, added: exact(self, 0.5 * size, added),
     )
 
 
