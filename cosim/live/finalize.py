@@ -23,6 +23,7 @@ from cosim.analysis.summary_model import ReplayPart, RunSummary, SummaryPart
 from cosim.live.finalize_loops import exit_after_replay, finalize_loops
 from cosim.live.replay_process import ReplayProcess
 from cosim.record.decimate import is_long
+from cosim.record.loops_run import loop_directories
 from cosim.record.run_directory import (
     ENDING_FILE,
     RECORD,
@@ -34,8 +35,8 @@ from cosim.record.run_directory import (
     read_object,
 )
 from cosim.record.run_ending import EndingFile, RunEnding
-from cosim.record.run_record import RunRecord, finish_record, load_record
-from cosim.record.shared_run import loop_directories
+from cosim.record.run_record import RunRecord, load_record
+from cosim.record.spool_conversion import finish_record
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.file_access import write_whole
@@ -70,7 +71,7 @@ def finalize(
             few = report and count <= _FEW_LOOPS
             of_loop = partial(finalize, report=few, again=again, loops=count)
             network, shared = finalize_loops(ending, of_loop, unfinished=unfinished)
-            return _finalize_shared(network, shared, ending, report=report)
+            return _finalize_loops(network, shared, ending, report=report)
         record = finish_record(run_dir) if unfinished else load_record(run_dir)
         replaying = stack.enter_context(ReplayProcess(record, run_dir))
         # A stopped recorder has no time to write the recording of a long run.
@@ -98,7 +99,7 @@ def finalize(
     return Outcome(run_dir, status, reason, content)
 
 
-def _finalize_shared(
+def _finalize_loops(
     network: RunRecord, summary: LoopsSummary, ending: RunEnding, *, report: bool
 ) -> Outcome:
     """Write summary, report and recording of a run of several loops, which are finalised."""

@@ -19,8 +19,9 @@ from cosim.record.align import (
 )
 from cosim.record.decimate import decimate_all
 from cosim.record.estimation_error import true_states
+from cosim.record.packet_outcomes import updates_in
 from cosim.record.recorded_changes import claimed_until_s, model_flow
-from cosim.record.run_record import Rows, updates_in
+from cosim.record.run_record import Rows
 from cosim.record.since_event import EventFollower
 from noack.config.resolution import loop_of, policy_of, tables_of
 from noack.config.scenario import Scenario

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from cosim.record.loop_rows import network_rows_by_loop
+from cosim.record.loops_run import loop_directories
 from cosim.record.record_source import Rows
 from cosim.record.run_directory import (
     ENVIRONMENT_FILE,
@@ -25,8 +26,8 @@ from cosim.record.run_directory import (
     read_object,
     write_scenario,
 )
-from cosim.record.run_record import RunRecord, finish_record, recorded_rows
-from cosim.record.shared_run import loop_directories
+from cosim.record.run_record import RunRecord
+from cosim.record.spool_conversion import finish_record, recorded_rows
 from noack.config.loops import phases_ns
 from noack.config.resolution import network_tables, resolved_loops, tables_of
 from noack.config.scenario import Scenario
