@@ -14,7 +14,7 @@ from cosim.analysis.adversary.pattern_flow import Flags, Segments
 from cosim.simulation.sampled.loop_steps import Numbers, Runs, Scales
 from cosim.simulation.sampled.sampled_loop import SampledLoop
 from noack.core.linear_systems import Matrix, Vector
-from noack.theory.scenario_certificates import ScenarioCertificate
+from noack.theory.certified_bounds import ScenarioCertificate
 
 _TINY = float(np.finfo(np.float64).tiny)
 

@@ -33,8 +33,9 @@ from cosim.simulation.sampled.sampled_loop import SampledLoop
 from noack.config.scenario import Scenario
 from noack.core.random_streams import stream
 from noack.theory.certificate import NetworkConditions
+from noack.theory.certified_bounds import ScenarioCertificate
 from noack.theory.run_conditions import ideal_conditions, nominal_conditions
-from noack.theory.scenario_certificates import ScenarioCertificate, certify
+from noack.theory.scenario_certificates import certify
 
 NODES = 500_000
 BEAM = 512

@@ -30,11 +30,12 @@ from noack.config.scenario import Scenario
 from noack.protocol.record_tables import NO_SEQUENCE
 from noack.protocol.topology import LOOP_ROLES
 from noack.theory.certificate import NetworkConditions
+from noack.theory.certified_bounds import ScenarioCertificate
 from noack.theory.error_bounds import ErrorMonitor
 from noack.theory.known_state import KnownStateBounds, known_state_bounds
 from noack.theory.paper_bounds import Theorem2, theorem_2
 from noack.theory.run_conditions import allowed_conditions, ideal_conditions, nominal_conditions
-from noack.theory.scenario_certificates import ScenarioCertificate, certify, certify_box
+from noack.theory.scenario_certificates import certify, certify_box
 
 _LONG_S = 1e300  # finite: the delay of an input that never arrived is infinite
 _ANY = NetworkConditions(sys.maxsize, _LONG_S, _LONG_S, _LONG_S, _LONG_S, _LONG_S)
