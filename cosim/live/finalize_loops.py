@@ -40,7 +40,8 @@ def finalize_loops(
     """
     run_dir = ending.run_dir
     if unfinished:
-        distribute_rows(run_dir)
+        with work_bar("rows of the loops") as show:
+            distribute_rows(run_dir, show)
         convert_spool(run_dir)
     network = load_record(run_dir, network=True)
     endings = [

@@ -7,7 +7,7 @@ finished as that of a run of one loop.
 
 import json
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -59,10 +59,13 @@ def finish_run_record(run_dir: Path) -> RunRecord:
     return finish_record(run_dir)
 
 
-def distribute_rows(run_dir: Path) -> Sequence[Path]:
+def distribute_rows(
+    run_dir: Path, show: Callable[[float], None] = lambda share: None
+) -> Sequence[Path]:
     """Distribute the rows of a run's spool to spools of its loops; return their directories.
 
     Each of them then has all but the record of a run of one loop. There is none without [[loops]].
+    ``show`` is called with the completed share.
 
     Raises:
         MachineError: they cannot be written.
@@ -75,7 +78,7 @@ def distribute_rows(run_dir: Path) -> Sequence[Path]:
         for number, loop in enumerate(resolved_loops(scenario)):
             place = {"number": number, "phase_ns": phases[number]}
             _make_directory(run_dir, folders[number], loop, place)
-        _distribute(run_dir / SPOOL, scenario, folders)
+        _distribute(run_dir / SPOOL, scenario, folders, show)
         rows = {
             table: np.concatenate([np.zeros(0, dtype), *recorded_rows(run_dir, table, dtype)])
             for table, dtype in network_tables().items()
@@ -107,8 +110,11 @@ def _make_directory(run_dir: Path, folder: Path, loop: Scenario, place: Mapping[
     write_whole(folder / LOOP_FILE, json.dumps(place, indent=2))
 
 
-def _distribute(spool: Path, scenario: Scenario, folders: Sequence[Path]) -> None:
+def _distribute(
+    spool: Path, scenario: Scenario, folders: Sequence[Path], show: Callable[[float], None]
+) -> None:
     """Copy the rows and log lines of a spool to the spools of the loops."""
+    done_bytes, all_bytes = 0, sum(file.stat().st_size for file in spool.glob("*"))
     for table, dtype in tables_of(scenario).items():
         if OWNER[table] == "netem":
             continue
@@ -116,6 +122,8 @@ def _distribute(spool: Path, scenario: Scenario, folders: Sequence[Path]) -> Non
         names = [name for name in dtype.names or () if name != LOOP]
         own = np.dtype([(name, dtype[name]) for name in names])
         for rows in _parts(spool, table, dtype):
+            done_bytes += rows.nbytes
+            show(done_bytes / all_bytes)
             rows = rows[rows[LOOP] < len(folders)]  # the others are damaged
             rows = rows[np.argsort(rows[LOOP], kind="stable")]
             stripped = np.empty(len(rows), own)

@@ -38,10 +38,11 @@ from noack.protocol.record_tables import (
     Fate,
     effective,
 )
+from noack.theory.certified_bounds import ScenarioCertificate
 from noack.theory.error_bounds import ErrorMonitor
 from noack.theory.known_state import KnownStateBounds, known_state_bounds
 from noack.theory.run_conditions import allowed_conditions
-from noack.theory.scenario_certificates import ScenarioCertificate, certify
+from noack.theory.scenario_certificates import certify
 
 _LAG_S = 0.2
 """Wall time by which the view lags, so that the batches of all processes have arrived."""
