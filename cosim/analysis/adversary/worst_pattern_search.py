@@ -12,6 +12,8 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
+
 from cosim.analysis.adversary.beam_search import search_beam
 from cosim.analysis.adversary.cost_bound import cost_ceiling
 from cosim.analysis.adversary.loss_patterns import guess, improve
@@ -74,7 +76,8 @@ def find_worst(
     if certificate is None:
         certificate = certify(resolved, conditions_of(resolved, continuous=continuous))
     find = _find_continuous if continuous else _find_sampled
-    return find(resolved, objective, certificate, beam, most_nodes, report)
+    with np.errstate(all="ignore"):  # a loop that diverges overflows
+        return find(resolved, objective, certificate, beam, most_nodes, report)
 
 
 def conditions_of(resolved: Scenario, *, continuous: bool) -> NetworkConditions:

@@ -150,7 +150,7 @@ class RunEvidence:
             longest_ns = int(np.diff(ends_ns).max(initial=found.longest_update_ns))
             fresh_ns = ends_ns[-1] if len(ends_ns) else None
             newest, last_ns = int(joined.received[-1]), int(joined.t_ns[-1])
-            largest = float(np.abs(both).max(initial=found.largest_state))
+            largest = float(np.abs(both[np.isfinite(both)]).max(initial=found.largest_state))
             found = found._replace(
                 any_in_common=bool(started[-1]),
                 largest_state=largest,
@@ -300,7 +300,8 @@ class RunEvidence:
 
 def _common(scenario: Scenario, joined: AlignedRun) -> NDArray[np.bool_]:
     """Return where sensor and controller share an update, and ‖e_c‖ is finite, (k,)."""
-    return np.asarray(np.isfinite(joined.e_c_norm) & in_common(scenario, joined))
+    finite = np.isfinite(joined.e_c_norm) & np.isfinite(joined.x_s).all(axis=1)
+    return np.asarray(finite & in_common(scenario, joined))
 
 
 def scheduled_certificates(
