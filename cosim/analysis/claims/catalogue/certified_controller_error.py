@@ -5,9 +5,9 @@ from cosim.analysis.claims.claim_definition import (
     CertifiedClaim,
     Envelope,
     controller_error_bound,
-    envelope_formula,
 )
 from cosim.analysis.claims.run_evidence import RunEvidence, Samples
+from noack.theory.envelope_formula import envelope_formula
 from noack.theory.scenario_certificates import ScenarioCertificate
 
 

@@ -4,11 +4,11 @@ from cosim.analysis.claims.claim_definition import (
     Bound,
     CertifiedClaim,
     Envelope,
-    envelope_formula,
     upper_shares,
 )
 from cosim.analysis.claims.run_evidence import RunEvidence, Samples
 from noack.core.linear_systems import row_norms
+from noack.theory.envelope_formula import envelope_formula
 from noack.theory.scenario_certificates import ScenarioCertificate
 
 
