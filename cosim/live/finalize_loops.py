@@ -9,10 +9,11 @@ from cosim.analysis.run_summary import Outcome
 from cosim.analysis.summary_model import ExitPart, ReplayPart
 from cosim.live.process_pool import interrupts_held, processes
 from cosim.live.progress import work_bar
+from cosim.record.loops_run import loop_directories
+from cosim.record.loops_spool import distribute_rows
 from cosim.record.run_ending import RunEnding
-from cosim.record.run_record import RunRecord, convert_spool, load_record, remove_spool
-from cosim.record.shared_run import loop_directories
-from cosim.record.shared_spool import distribute_rows
+from cosim.record.run_record import RunRecord, load_record
+from cosim.record.spool_conversion import convert_spool, remove_spool
 from noack.config.loops import loops_of
 from noack.config.scenario import Scenario
 from noack.core.errors import ExitStatus
@@ -39,7 +40,8 @@ def finalize_loops(
     """
     run_dir = ending.run_dir
     if unfinished:
-        distribute_rows(run_dir)
+        with work_bar("rows of the loops") as show:
+            distribute_rows(run_dir, show)
         convert_spool(run_dir)
     network = load_record(run_dir, network=True)
     endings = [

@@ -15,8 +15,10 @@ from cosim.analysis.claims.observed_conditions import AssumptionViolation
 from cosim.live.progress_report import ProgressReport
 from cosim.live.telemetry_store import TelemetryStore
 from cosim.record.decimate import is_long
+from cosim.record.process_reports import report_of, write_reports
 from cosim.record.run_directory import active_run
-from cosim.record.run_record import Rows, RunRecord, finish_record, report_of, write_reports
+from cosim.record.run_record import Rows, RunRecord
+from cosim.record.spool_conversion import finish_record
 from noack.config.loops import loops_of
 from noack.config.parameter_changes import ParameterChange, change_notice
 from noack.config.resolution import resolve

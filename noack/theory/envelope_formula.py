@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from noack.theory.scenario_certificates import ScenarioCertificate
+from noack.theory.certified_bounds import ScenarioCertificate
 
 
 def envelope_formula(

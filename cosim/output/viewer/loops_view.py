@@ -42,9 +42,9 @@ from cosim.output.viewer.recording_file import RecordingFile
 from cosim.output.viewer.run_view import about, feed_record, require_space
 from cosim.output.viewer.table_feed import ViewFeed
 from cosim.record.decimate import Reals, is_long
+from cosim.record.loops_run import loop_directories
 from cosim.record.run_directory import RECORDING_FILE
 from cosim.record.run_record import RunRecord, load_record
-from cosim.record.shared_run import loop_directories
 from noack.config.loops import phases_ns
 from noack.config.resolution import loop_of
 from noack.core.clock import NS_PER_S

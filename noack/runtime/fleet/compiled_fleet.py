@@ -147,6 +147,10 @@ class CompiledFleet:
         self._memory.driver["from_peer"] = 1
         return outputs.rows
 
+    def encode(self, message: Message) -> bytes:
+        """Return the datagram of a message."""
+        return self._encoder.encode(message)
+
     def handle(self, message: Message, now_ns: int) -> Sequence[Output]:
         """Process a message; return the outputs, without sockets."""
         self._put(self._encoder.encode(message), from_peer=True)

@@ -7,7 +7,7 @@ finished as that of a run of one loop.
 
 import json
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from cosim.record.loop_rows import network_rows_by_loop
+from cosim.record.loops_run import loop_directories
 from cosim.record.record_source import Rows
 from cosim.record.run_directory import (
     ENVIRONMENT_FILE,
@@ -25,8 +26,8 @@ from cosim.record.run_directory import (
     read_object,
     write_scenario,
 )
-from cosim.record.run_record import RunRecord, finish_record, recorded_rows
-from cosim.record.shared_run import loop_directories
+from cosim.record.run_record import RunRecord
+from cosim.record.spool_conversion import finish_record, recorded_rows
 from noack.config.loops import phases_ns
 from noack.config.resolution import network_tables, resolved_loops, tables_of
 from noack.config.scenario import Scenario
@@ -58,10 +59,13 @@ def finish_run_record(run_dir: Path) -> RunRecord:
     return finish_record(run_dir)
 
 
-def distribute_rows(run_dir: Path) -> Sequence[Path]:
+def distribute_rows(
+    run_dir: Path, show: Callable[[float], None] = lambda share: None
+) -> Sequence[Path]:
     """Distribute the rows of a run's spool to spools of its loops; return their directories.
 
     Each of them then has all but the record of a run of one loop. There is none without [[loops]].
+    ``show`` is called with the completed share.
 
     Raises:
         MachineError: they cannot be written.
@@ -74,7 +78,7 @@ def distribute_rows(run_dir: Path) -> Sequence[Path]:
         for number, loop in enumerate(resolved_loops(scenario)):
             place = {"number": number, "phase_ns": phases[number]}
             _make_directory(run_dir, folders[number], loop, place)
-        _distribute(run_dir / SPOOL, scenario, folders)
+        _distribute(run_dir / SPOOL, scenario, folders, show)
         rows = {
             table: np.concatenate([np.zeros(0, dtype), *recorded_rows(run_dir, table, dtype)])
             for table, dtype in network_tables().items()
@@ -106,8 +110,11 @@ def _make_directory(run_dir: Path, folder: Path, loop: Scenario, place: Mapping[
     write_whole(folder / LOOP_FILE, json.dumps(place, indent=2))
 
 
-def _distribute(spool: Path, scenario: Scenario, folders: Sequence[Path]) -> None:
+def _distribute(
+    spool: Path, scenario: Scenario, folders: Sequence[Path], show: Callable[[float], None]
+) -> None:
     """Copy the rows and log lines of a spool to the spools of the loops."""
+    done_bytes, all_bytes = 0, sum(file.stat().st_size for file in spool.glob("*"))
     for table, dtype in tables_of(scenario).items():
         if OWNER[table] == "netem":
             continue
@@ -115,6 +122,8 @@ def _distribute(spool: Path, scenario: Scenario, folders: Sequence[Path]) -> Non
         names = [name for name in dtype.names or () if name != LOOP]
         own = np.dtype([(name, dtype[name]) for name in names])
         for rows in _parts(spool, table, dtype):
+            done_bytes += rows.nbytes
+            show(done_bytes / all_bytes)
             rows = rows[rows[LOOP] < len(folders)]  # the others are damaged
             rows = rows[np.argsort(rows[LOOP], kind="stable")]
             stripped = np.empty(len(rows), own)
