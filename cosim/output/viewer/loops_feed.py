@@ -2,11 +2,12 @@
 
 The loops that are shown in detail have a feed each, and share a part of the recorder's time. All
 loops together are shown as in the finished recording: largest values in intervals of the run. What
-the viewer does not get is in the record all the same.
+the viewer does not get is in the record all the same. Certified bounds, which take long to compute,
+are in the finished recording only.
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,10 +19,10 @@ from cosim.output.viewer.table_feed import LAG_S, SHOWN, ViewFeed, log_level
 from cosim.record.loop_rows import rows_by_loop
 from cosim.record.run_record import Rows
 from noack.config.loops import phases_ns
-from noack.config.resolution import resolved_loops, tables_of
+from noack.config.resolution import loop_of, resolved_loops
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
-from noack.core.linear_systems import row_norms
+from noack.core.linear_systems import Propagator, row_norms
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
@@ -32,10 +33,12 @@ from noack.protocol.record_tables import (
 
 _TURN_S, _SHARE = 0.03, 0.3
 """CPU time of a turn; share of a core."""
-_NAMED_S, _PATIENCE_S = 2.0, 10.0
+_NAMED_S, _PATIENCE_S = 3.0, 10.0
 """Wall time by which the loops in detail may lag before it is said, and before they are dropped."""
 _MAP_EVERY_S = 2.0
 _NEVER_NS = 2**63 - 1
+_LONGEST_NS = 2**50
+"""Longer than any run; 2**13 loops have keys of 63 bits."""
 
 
 class LoopsFeed:
@@ -54,8 +57,11 @@ class LoopsFeed:
         self._view, self._warn = view, warn
         self._wall_ns = NS_PER_S * scenario.speed
         self._phases_ns = phases_ns(scenario)
-        self._together = _AllLoops(scenario, view, loops[0].network.initial_sync == "known_state")
-        self._feeds = {number: ViewFeed(loops[number], one) for number, one in view.views.items()}
+        self._together = _AllLoops(scenario, loops, view)
+        self._feeds = {
+            number: ViewFeed(loops[number], one, certified=False)
+            for number, one in view.views.items()
+        }
         self._waiting: dict[str, list[Rows]] = {}
         self._due: list[int] = []
         self._handed_ns = self._shown_ns = 0
@@ -78,8 +84,10 @@ class LoopsFeed:
 
     def advance(self, *, final: bool = False) -> None:
         """Pass on what is complete, as far as there is time; at the end, everything."""
-        if not final and time.monotonic() < self._next_s:
-            return
+        if not final:
+            self._watch_lag()
+            if time.monotonic() < self._next_s:
+                return
         began_s = time.thread_time()
         self._together.advance(final=final)
         if final:
@@ -96,8 +104,6 @@ class LoopsFeed:
                 break
         self._view.flush()
         self._next_s = time.monotonic() + (time.thread_time() - began_s) * (1 / _SHARE - 1)
-        if not final:
-            self._watch_lag()
 
     def _hand_out(self) -> None:
         """Begin a round: give each loop its rows."""
@@ -127,15 +133,23 @@ class LoopsFeed:
 class _AllLoops:
     """Shows the norms and shares of all loops, and the network, interval by interval."""
 
-    def __init__(self, scenario: Scenario, view: LoopsRecording, knows_state: bool) -> None:
+    def __init__(self, scenario: Scenario, loops: Sequence[Scenario], view: LoopsRecording) -> None:
         self._view, self._horizon_ns = view, scenario.timing.horizon_ns
+        self._period_ns = loops[0].timing.controller_period_ns
+        self._loops = [loop_of(one) for one in loops]
+        self._rest = np.stack(
+            [np.zeros(one.n) if one.setpoint is None else one.setpoint for one in self._loops]
+        )
+        self._transitions: dict[int, Any] = {}
         self._lag_ns = int(LAG_S * NS_PER_S * scenario.speed)
         self._phases_ns = np.array(phases_ns(scenario))
-        types = tables_of(scenario)
-        tables = SENSOR_MEASUREMENT, CONTROLLER_STEP, CONTROLLER_DELIVERY
-        self._pending: dict[str, list[Rows]] = {one: [np.zeros(0, types[one])] for one in tables}
-        count = len(self._phases_ns)
-        self._first_ns = np.full(count, -1 if knows_state else _NEVER_NS)
+        numbers = [(name, "<i8") for name in (LOOP, "input", "t_ns")]
+        self._none = self._newest = np.zeros(0, [*numbers, ("x", "<f8", (self._loops[0].n,))])
+        """Of each loop, the newest row of the controller that was used."""
+        self._measured: list[Rows] = []
+        self._models: list[Rows] = []
+        knows_state = loops[0].network.initial_sync == "known_state"
+        self._first_ns = np.full(len(loops), -1 if knows_state else _NEVER_NS)
         """When each loop's controller began to know the state."""
         self._over_time = empty_over_time(scenario)
         self._inside = np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -151,10 +165,15 @@ class _AllLoops:
                 np.concatenate, zip(self._inside, times_inside(rows), strict=True)
             )
             self._inside = begin_ns, end_ns
-        elif table in self._pending:
-            self._pending[table].append(rows)
-            if table == SENSOR_MEASUREMENT:
-                self.newest_ns = max(self.newest_ns, int(self._of_run_ns(rows).max()))
+        elif table == SENSOR_MEASUREMENT:
+            self._measured.append(self._reduced(rows, "t_ns", "x"))
+            of_run_ns = rows["t_ns"] + self._phases_ns[rows[LOOP]]
+            self.newest_ns = max(self.newest_ns, int(of_run_ns.max()))
+        elif table in (CONTROLLER_STEP, CONTROLLER_DELIVERY):
+            self._models.append(self._reduced(rows, "model_t_ns", "x_c"))
+            if table == CONTROLLER_DELIVERY:
+                of_run_ns = rows["model_t_ns"] + self._phases_ns[rows[LOOP]]
+                np.minimum.at(self._first_ns, rows[LOOP], of_run_ns)
 
     @np.errstate(all="ignore")  # a loop may diverge
     def advance(self, *, final: bool) -> None:
@@ -179,44 +198,59 @@ class _AllLoops:
             fresh, self._shares_sent = slice(self._shares_sent, known), known
             t_ns = ((ends_s - ends_s[0] / 2) * NS_PER_S).astype(np.int64)
             self._view.share(t_ns[fresh], shares[:, fresh])
-        if final or time.monotonic() - self._map_s > _MAP_EVERY_S:
+        if not self._view.views and (final or time.monotonic() - self._map_s > _MAP_EVERY_S):
             self._view.map(self._over_time.errors, int(middles_ns[-1]))
             self._map_s = time.monotonic()
 
     def _add_norms(self, until_ns: int) -> None:
-        """Add the norms of the rows up to a time of the run."""
-        measured, at_ns = self._take(SENSOR_MEASUREMENT, until_ns)
+        """Add the norms of the measurements up to a time of the run."""
+        measured, at_ns = self._take(self._measured, until_ns)
         self._largest(self._over_time.states, measured[LOOP], at_ns, row_norms(measured["x"]))
-        received, model_ns = self._take(CONTROLLER_DELIVERY, until_ns)
-        loops, errors = received[LOOP], row_norms(received["x_c_before"] - received["x_c"])
-        np.minimum.at(self._first_ns, loops, model_ns)
-        later = model_ns > self._first_ns[loops]
-        self._largest(self._over_time.errors, loops[later], model_ns[later], errors[later])
-        # e_c at the ticks that are at the times of measurements.
-        ticks, tick_ns = self._take(CONTROLLER_STEP, until_ns)
-        count = len(self._phases_ns)
-        keys, known = tick_ns * count + ticks[LOOP], at_ns * count + measured[LOOP]
-        order = np.argsort(known)
-        place = np.minimum(np.searchsorted(known[order], keys), max(len(known) - 1, 0))
-        if not len(known) or not len(keys):
-            return
-        same = (known[order][place] == keys) & (tick_ns > self._first_ns[ticks[LOOP]])
-        same &= ticks["model_t_ns"] == ticks["t_ns"]
-        x = measured["x"][order][place[same]]
-        errors = row_norms(ticks["x_c"][same] - x)
-        self._largest(self._over_time.errors, ticks[LOOP][same], tick_ns[same], errors)
+        # x_c at each measurement follows from the newest row of the controller before it.
+        models = np.append(self._newest, self._take(self._models, until_ns)[0])
+        models = models[np.lexsort((models["input"], models["t_ns"], models[LOOP]))]
+        _, from_end = np.unique(models[LOOP][::-1], return_index=True)
+        self._newest = models[len(models) - 1 - from_end]
+        keys, wanted = _keys(models), _keys(measured)
+        place = np.searchsorted(keys, wanted, "right") - 1
+        age_ns = wanted - keys[place] if len(keys) else wanted
+        known = (place >= 0) & (age_ns >= 0) & (age_ns <= self._period_ns)
+        known &= at_ns >= self._first_ns[measured[LOOP]]
+        measured, age_ns, x_c = measured[known], age_ns[known], models["x"][place[known]]
+        for dt_ns in np.unique(age_ns).tolist():
+            of = age_ns == dt_ns
+            x_c[of] = self._flow(dt_ns, measured[LOOP][of], x_c[of])
+        errors = row_norms(x_c - measured["x"])
+        self._largest(self._over_time.errors, measured[LOOP], at_ns[known], errors)
+
+    def _flow(self, dt_ns: int, loops: Any, x_c: Any) -> Any:
+        """Return models of controllers, (k, n), a time later, with the set-points of the start."""
+        if dt_ns not in self._transitions:
+            self._transitions[dt_ns] = np.stack(
+                [Propagator(one.H).transition(dt_ns) for one in self._loops]
+            )
+        rest = self._rest[loops]
+        return rest + np.einsum("kij,kj->ki", self._transitions[dt_ns][loops], x_c - rest)
 
     def _largest(self, values: Any, loops: Any, t_ns: Any, norms: Any) -> None:
         np.fmax.at(values, (loops, places(t_ns, self._horizon_ns)), norms)
 
-    def _take(self, table: str, until_ns: int) -> tuple[Rows, Any]:
-        """Return the pending rows up to a time of the run, and their times of the run."""
-        rows = np.concatenate(self._pending[table])
-        of_run_ns = self._of_run_ns(rows)
+    def _take(self, waiting: list[Rows], until_ns: int) -> tuple[Rows, Any]:
+        """Return the waiting rows up to a time of the run, and their times of the run."""
+        rows = np.concatenate([self._none, *waiting])
+        of_run_ns = rows["t_ns"] + self._phases_ns[rows[LOOP]]
         ready = of_run_ns <= until_ns
-        self._pending[table] = [rows[~ready]]
+        waiting[:] = [rows[~ready]]
         return rows[ready], of_run_ns[ready]
 
-    def _of_run_ns(self, rows: Rows) -> Any:
-        name = "model_t_ns" if "x_c_before" in (rows.dtype.names or ()) else "t_ns"
-        return rows[name] + self._phases_ns[rows[LOOP]]
+    def _reduced(self, rows: Rows, time_name: str, vector_name: str) -> Rows:
+        """Return the needed columns of rows."""
+        found = np.empty(len(rows), self._none.dtype)
+        found[LOOP], found["input"] = rows[LOOP], rows["input"]
+        found["t_ns"], found["x"] = rows[time_name], rows[vector_name]
+        return found
+
+
+def _keys(rows: Rows) -> Any:
+    """Return keys that order rows by their loops, then by their times."""
+    return rows[LOOP] * _LONGEST_NS + rows["t_ns"]

@@ -16,6 +16,7 @@ Up to ``PICTURED`` loops are all shown; of more, the worst one only, in the reco
 has ended.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
@@ -150,7 +151,7 @@ Curves of more than {len(SERIES)} loops are quantiles over the loops:
     def map(self, errors: Reals, t_ns: int | None = None) -> None:
         """Show ‖e_c‖ of each loop, (L, k), from a time on; None: at all times."""
         image = BytesIO()
-        imsave(image, map_pixels(errors), format="png")
+        imsave(image, map_pixels(errors), format="png", pil_kwargs={"compress_level": 1})
         png, kind = image.getvalue(), "image/png"
         if t_ns is None:
             self.add_static({MAP: rr.EncodedImage(contents=png, media_type=kind)})
@@ -215,7 +216,9 @@ def _layout(pages: Sequence[_LoopPage], count: int, worst: WorstLoop | None) -> 
     of_map = rrb.Spatial2DView(origin=MAP, name="log10 ‖e_c‖ of each loop, a row, over time")
     left: rrb.Container
     if count <= PICTURED:
-        left = rrb.Grid(*(page.pictured() for page in pages))
+        left = rrb.Grid(
+            *(page.pictured() for page in pages), grid_columns=math.ceil(math.sqrt(count))
+        )
     else:
         left = rrb.Vertical(of_map, bp.plot(f"log10 ‖x‖{kind}", SIZE), row_shares=[2, 1])
     text = rrb.TextDocumentView(origin=bp.ABOUT, name="About this run")

@@ -249,8 +249,7 @@ class LoopView(RunView):
         self._whole.send_columns(f"{self._folder}/{entity}", times_ns, columns)
 
     def flush(self) -> None:
-        """Pass buffered data to the operating system."""
-        self._whole.flush()
+        """Nothing: the recording of all loops is flushed as a whole."""
 
     def close(self) -> None:
         """Write the waiting data; the recording stays open."""

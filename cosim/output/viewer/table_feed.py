@@ -71,10 +71,18 @@ class ViewFeed:
         scenario: the resolved scenario.
         view: receives the aligned batches.
         columns: reduce each batch to the extremes in so many columns; None keeps all rows.
+        certified: show the certified bounds, which take up to some seconds to compute.
     """
 
-    def __init__(self, scenario: Scenario, view: RunView, columns: int | None = None) -> None:
-        self._columns = columns
+    def __init__(
+        self,
+        scenario: Scenario,
+        view: RunView,
+        columns: int | None = None,
+        *,
+        certified: bool = True,
+    ) -> None:
+        self._columns, self._is_certified = columns, certified and scenario.coverage.is_certifiable
         self._scenario = scenario
         self._loop = loop_of(scenario)
         self._view = view
@@ -187,7 +195,7 @@ class ViewFeed:
     @cached_property
     def _certificate(self) -> ScenarioCertificate | None:
         """The run's certificate; None if there is none. Computed at first use, since it is slow."""
-        if not self._scenario.coverage.is_certifiable or self._loop.setpoint is not None:
+        if not self._is_certified or self._loop.setpoint is not None:
             return None  # with a set-point, it bounds the deviations from it
         certificate = certify(self._scenario, allowed_conditions(self._scenario))
         if certificate.inter_event_s is not None:

@@ -38,15 +38,13 @@ def content(content: Content) -> Content:
 def live_rows(run: SharedRun) -> Iterator[tuple[str, Rows]]:
     """Yield the rows as the processes send them: those of all loops mixed, batch by batch."""
     network = run.network
-    types = tables_of(network.scenario)
+    every = {NETEM_PACKET: network[NETEM_PACKET]}
+    for table, dtype in tables_of(network.scenario).items():
+        if OWNER[table] != "netem":
+            of_loops = [numbered(one, i, table, dtype) for i, one in enumerate(run.loops)]
+            every[table] = np.concatenate(of_loops)
     for begin_ns in range(0, 2 * network.scenario.timing.horizon_ns, BATCH_NS):
-        for table, dtype in types.items():
-            if OWNER[table] == "netem":
-                rows = network[table] if table in (NETEM_PACKET,) else np.zeros(0, dtype)
-            else:
-                rows = np.concatenate(
-                    [numbered(one, i, table, dtype) for i, one in enumerate(run.loops)]
-                )
+        for table, rows in every.items():
             now_ns = rows["now_ns"]
             chosen = rows[(now_ns >= begin_ns) & (now_ns < begin_ns + BATCH_NS)]
             if len(chosen):
