@@ -10,12 +10,15 @@ with quiet_interrupt():
     from controller_node.controller_arrays import CONTROLLER_FLEET
     from noack.core.errors import ExitStatus
     from noack.runtime import process_entry
+    from noack.runtime.loop_machines import run_machines
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the controller in the run that a recorder or launcher has opened."""
     return process_entry.main(
-        "controller", lambda member: member.run_messages(controller_of, CONTROLLER_FLEET), arguments
+        "controller",
+        lambda process: run_machines(process, controller_of, CONTROLLER_FLEET),
+        arguments,
     )
 
 

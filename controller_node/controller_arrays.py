@@ -10,40 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller_node.loss_check import LossCheck
-from noack.config.fleet_layout import (
-    HEADER_WORDS,
-    NEEDS_MATRIX,
-    NEVER_NS,
-    SENDS,
-    FleetMemory,
-    FleetParts,
-    FleetRole,
-    begin_message,
-    begin_row,
-    copy_reals,
-)
+from noack.config import fleet_layout as layout
+from noack.config.fleet_layout import FleetMemory, FleetParts, FleetRole, copy_reals
 from noack.config.parameter_changes import ChangeSchedule
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.controllers.linear_feedback import LinearFeedbackSettings
 from noack.core.linear_systems import Vector
-from noack.core.model_arrays import (
-    MISSING,
-    ModelTable,
-    Transitions,
-    advance_model,
-    find_transition,
-)
+from noack.core.model_arrays import ModelTable, Transitions, advance_model, joined
 from noack.core.ordered_arithmetic import multiply
 from noack.impairments.loss_guarantee import LongestBurst
 from noack.protocol.machine_interface import Notice
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_SETTING, CONTROLLER_STEP
 
-CONTROLLER = np.dtype(
-    [(name, "<i8") for name in (
-        "period_ns", "first_ns", "horizon_ns", "step", "model_ns", "newest", "knows_state",
-    )]
-)  # fmt: skip
+CONTROLLER = np.dtype([(name, "<i8") for name in ("model_ns", "newest", "knows_state")])
 
 
 class ControllerArrays(NamedTuple):
@@ -74,41 +54,28 @@ def controller_arrays_of(resolved: Sequence[Scenario]) -> FleetParts | None:
         return None
     loops = [loop_of(one) for one in resolved]
     n, m = loops[0].n, loops[0].m
-    steps_ns = set[int]()
+    ticks_ns = [
+        (one.timing.controller_phase_ns, one.timing.controller_period_ns) for one in resolved
+    ]
     controllers = np.zeros(len(loops), CONTROLLER)
-    for place, one in enumerate(resolved):
-        row = controllers[place]
-        period_ns, first_ns = one.timing.controller_period_ns, one.timing.controller_phase_ns
-        steps_ns |= {period_ns, first_ns, period_ns - first_ns}
-        row["period_ns"], row["first_ns"] = period_ns, first_ns
-        row["horizon_ns"], row["newest"] = one.timing.horizon_ns, -1
-        row["knows_state"] = one.network.initial_sync == "known_state"
+    known = [one.network.initial_sync == "known_state" for one in resolved]
+    controllers["newest"], controllers["knows_state"] = -1, known
     transitions = Transitions(
-        [loop.H for loop in loops], [loop.setpoint for loop in loops], sorted(steps_ns)
+        [loop.H for loop in loops],
+        [loop.setpoint for loop in loops],
+        {step for first, period in ticks_ns for step in (first, period, period - first)},
     )
-    known = controllers["knows_state"]
     arrays = ControllerArrays(
         controllers=controllers,
-        x_c=np.concatenate(
-            [loop.x0 if knows else np.zeros(n) for loop, knows in zip(loops, known, strict=True)]
-        ),
-        K=np.concatenate([loop.K.ravel() for loop in loops]),
-        u_r=np.concatenate(
-            [np.zeros(m) if (u_r := loop.setpoint_input) is None else u_r for loop in loops]
-        ),
-        safe_input=np.concatenate(
-            [
-                np.zeros(m) if (given := one.controller.safe_input) is None else np.array(given)
-                for one in resolved
-            ]
-        ),
+        x_c=joined((loops[k].x0 if knows else None for k, knows in enumerate(known)), n),
+        K=joined((loop.K for loop in loops), m * n),
+        u_r=joined((loop.setpoint_input for loop in loops), m),
+        safe_input=joined((one.controller.safe_input for one in resolved), m),
         models=transitions.table,
     )
-    firsts_ns = controllers["first_ns"]
-    due_ns = np.where(firsts_ns <= controllers["horizon_ns"], firsts_ns, NEVER_NS)
-    checks = _LossChecks(resolved)
+    begun, checks = layout.new_loops(resolved, ticks_ns), _LossChecks(resolved)
     return FleetParts(
-        arrays, due_ns, transitions, inspect=checks, changes=CONTROLLER_SETTING,
+        arrays, begun, transitions, inspect=checks, changes=CONTROLLER_SETTING,
         follow=checks.follow,
     )  # fmt: skip
 
@@ -157,18 +124,15 @@ def handle(memory: FleetMemory, own: ControllerArrays, loop: int, begin: int, no
     one, n, row = own.controllers[loop], memory.fleet[0].n, memory.row_reals
     sequence, event_ns = memory.arrived[begin + 2], memory.arrived[begin + 3]
     model_ns = max(one.model_ns, event_ns)
-    before = find_transition(own.models, loop, model_ns - one.model_ns)
-    if before == MISSING:
-        return NEEDS_MATRIX
-    after = find_transition(own.models, loop, model_ns - event_ns)
-    if after == MISSING:
-        return NEEDS_MATRIX
-    begin_row(memory, loop, sequence, event_ns, now_ns)
+    copy_reals(memory.arrived_reals, begin + layout.HEADER_WORDS, row, 5, n)
+    before, after, models = 5 + n, 5 + 2 * n, own.models
+    if not advance_model(
+        models, loop, n, model_ns - one.model_ns, own.x_c, loop * n, row, before
+    ) or not advance_model(models, loop, n, model_ns - event_ns, row, 5, row, after):
+        return layout.NEEDS_MATRIX
+    layout.begin_row(memory, loop, sequence, event_ns, now_ns)
     memory.row[4] = model_ns
-    copy_reals(memory.arrived_reals, begin + HEADER_WORDS, row, 5, n)
-    advance_model(own.models, loop, n, before, own.x_c, loop * n, row, 5 + n)
-    advance_model(own.models, loop, n, after, row, 5, own.x_c, loop * n)
-    copy_reals(own.x_c, loop * n, row, 5 + 2 * n, n)
+    copy_reals(row, after, own.x_c, loop * n, n)
     memory.row[5 + 3 * n] = sequence - one.newest - 1
     one.model_ns = model_ns
     one.newest = sequence
@@ -178,16 +142,15 @@ def handle(memory: FleetMemory, own: ControllerArrays, loop: int, begin: int, no
 
 def on_timer(memory: FleetMemory, own: ControllerArrays, loop: int, now_ns: int) -> int:
     """Advance x_c to the tick and write the control input."""
-    one, fleet, row = own.controllers[loop], memory.fleet[0], memory.row_reals
-    n, m, t_ns = fleet.n, fleet.m, one.first_ns + one.step * one.period_ns
+    one, tick, row = own.controllers[loop], memory.loops[loop], memory.row_reals
+    n, m, t_ns, step = memory.fleet[0].n, memory.fleet[0].m, tick.due_ns, tick.step
     if t_ns > one.model_ns:
-        found = find_transition(own.models, loop, t_ns - one.model_ns)
-        if found == MISSING:
-            return NEEDS_MATRIX
-        advance_model(own.models, loop, n, found, own.x_c, loop * n, memory.scratch, 0)
+        dt_ns = t_ns - one.model_ns
+        if not advance_model(own.models, loop, n, dt_ns, own.x_c, loop * n, memory.scratch, 0):
+            return layout.NEEDS_MATRIX
         copy_reals(memory.scratch, 0, own.x_c, loop * n, n)
         one.model_ns = t_ns
-    begin_row(memory, loop, one.step, t_ns, now_ns)
+    layout.begin_row(memory, loop, step, t_ns, now_ns)
     memory.row[4] = one.model_ns
     copy_reals(own.x_c, loop * n, row, 5, n)
     u, shifts = 5 + n, own.models.has_setpoint[loop] != 0
@@ -202,11 +165,9 @@ def on_timer(memory: FleetMemory, own: ControllerArrays, loop: int, now_ns: int)
         if shifts:
             for k in range(m):
                 row[u + k] += own.u_r[loop * m + k]
-    copy_reals(row, u, memory.out_reals, begin_message(memory, one.step, one.model_ns), m)
-    one.step += 1
-    due_ns = t_ns + one.period_ns
-    memory.loops[loop].due_ns = due_ns if due_ns <= one.horizon_ns else NEVER_NS
-    return SENDS
+    layout.write_message(memory, step, one.model_ns, row, u, m)
+    layout.next_tick(memory, loop)
+    return layout.SENDS
 
 
 CONTROLLER_FLEET = FleetRole(__name__, CONTROLLER_DELIVERY, CONTROLLER_STEP, controller_arrays_of)

@@ -14,7 +14,7 @@ KINDS = ("scenarios", "campaigns")
 _SCHEMA = "#:schema"
 """Begins the line that names the schema for editors; a copy does not have it."""
 
-_FILE = re.compile(r'^file = "([\w./]+)"', re.MULTILINE)
+_FILE = re.compile(r'^file = "([\w/]+\.\w+)"', re.MULTILINE)
 """A file beside a scenario, which a copy of the scenario names by its absolute path."""
 
 

@@ -8,6 +8,7 @@ from noack.runtime.signals import quiet_interrupt
 with quiet_interrupt():
     from noack.core.errors import ExitStatus
     from noack.runtime import process_entry
+    from noack.runtime.loop_machines import run_machines
     from plant_server.plant import plant_of
     from plant_server.plant_arrays import PLANT_FLEET
 
@@ -16,7 +17,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the plant in the run that a recorder or launcher has opened."""
     return process_entry.main(
         "plant",
-        lambda member: member.run_messages(lambda loop, _: plant_of(loop), PLANT_FLEET),
+        lambda process: run_machines(process, lambda loop, _: plant_of(loop), PLANT_FLEET),
         arguments,
     )
 

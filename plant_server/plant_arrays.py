@@ -9,21 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.config.fleet_layout import (
-    HEADER_WORDS,
-    NEVER_NS,
-    NOTES,
-    SENDS,
-    FleetMemory,
-    FleetParts,
-    FleetRole,
-    begin_message,
-    begin_row,
-    copy_reals,
-)
+from noack.config import fleet_layout as layout
+from noack.config.fleet_layout import FleetMemory, FleetParts, FleetRole, copy_reals
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Vector, discretise
+from noack.core.model_arrays import joined
 from noack.core.ordered_arithmetic import multiply
 from noack.plants.linear import LinearSettings
 from noack.protocol.machine_interface import Notice
@@ -36,8 +27,8 @@ _ZERO = 1
 
 PLANT = np.dtype(
     [(name, "<i8") for name in (
-        "period_ns", "horizon_ns", "measure_every", "step", "measurements",
-        "newest_ns", "newest_sequence", "timeout_ns", "notice_ns", "policy",
+        "measure_every", "measurements", "newest_ns", "newest_sequence", "timeout_ns",
+        "notice_ns", "policy",
         "noticed_ns",  # since when actuations have been reported missing; _IN_TIME: they are not
     )]
 )  # fmt: skip
@@ -75,7 +66,6 @@ def plant_arrays_of(resolved: Sequence[Scenario]) -> FleetParts | None:
     loops = [loop_of(one) for one in resolved]
     plants = np.zeros(len(loops), PLANT)
     for row, one in zip(plants, resolved, strict=True):
-        row["period_ns"], row["horizon_ns"] = one.timing.plant_period_ns, one.timing.horizon_ns
         row["measure_every"] = one.plant.measure_every
         row["timeout_ns"] = one.timing.actuation_timeout_ns
         row["notice_ns"] = max(one.timing.missing_actuation_ns, one.timing.actuation_timeout_ns)
@@ -85,16 +75,17 @@ def plant_arrays_of(resolved: Sequence[Scenario]) -> FleetParts | None:
         discretise(loop.A, loop.B, one.timing.plant_period_ns)
         for loop, one in zip(loops, resolved, strict=True)
     ]
-    inputs = len(loops) * loops[0].m
+    n, m = loops[0].n, loops[0].m
     arrays = PlantArrays(
         plants=plants,
-        x=np.concatenate([np.array(one.plant.initial_state, np.float64) for one in resolved]),
-        u=np.zeros(inputs),
-        newest_u=np.zeros(inputs),
-        Ad=np.concatenate([Ad.ravel() for Ad, _ in discrete]),
-        Bd=np.concatenate([Bd.ravel() for _, Bd in discrete]),
+        x=joined((one.plant.initial_state for one in resolved), n),
+        u=np.zeros(len(loops) * m),
+        newest_u=np.zeros(len(loops) * m),
+        Ad=joined((Ad for Ad, _ in discrete), n * n),
+        Bd=joined((Bd for _, Bd in discrete), n * m),
     )
-    return FleetParts(arrays, np.zeros(len(loops), np.int64), notice=_notice)
+    ticks_ns = [(0, one.timing.plant_period_ns) for one in resolved]
+    return FleetParts(arrays, layout.new_loops(resolved, ticks_ns), notice=_notice)
 
 
 def _notice(own: PlantArrays, fleet: Any) -> Notice:
@@ -113,35 +104,31 @@ def handle(memory: FleetMemory, own: PlantArrays, loop: int, begin: int, now_ns:
     """Receive the actuation whose datagram begins at ``begin``."""
     plant, m = own.plants[loop], memory.fleet[0].m
     plant.newest_sequence, plant.newest_ns = memory.arrived[begin + 2], memory.arrived[begin + 3]
-    copy_reals(memory.arrived_reals, begin + HEADER_WORDS, own.newest_u, loop * m, m)
-    begin_row(memory, loop, plant.newest_sequence, plant.newest_ns, now_ns)
+    copy_reals(memory.arrived_reals, begin + layout.HEADER_WORDS, own.newest_u, loop * m, m)
+    layout.begin_row(memory, loop, plant.newest_sequence, plant.newest_ns, now_ns)
     copy_reals(own.newest_u, loop * m, memory.row_reals, 4, m)
     return 0
 
 
 def on_timer(memory: FleetMemory, own: PlantArrays, loop: int, now_ns: int) -> int:
     """Make one step under the held input; measure; choose the input from now on."""
-    plant, fleet = own.plants[loop], memory.fleet[0]
-    n, m, step = fleet.n, fleet.m, plant.step
-    t_ns = step * plant.period_ns
+    plant, fleet, tick = own.plants[loop], memory.fleet[0], memory.loops[loop]
+    n, m, step, t_ns = fleet.n, fleet.m, tick.step, tick.due_ns
     if step > 0:
         multiply(own.Ad, loop * n * n, own.x, loop * n, memory.scratch, 0, (n, n))
         multiply(own.Bd, loop * n * m, own.u, loop * m, memory.scratch, n, (n, m))
         for k in range(n):
             own.x[loop * n + k] = memory.scratch[k] + memory.scratch[n + k]
     outputs = _choose_input(memory, own, loop, t_ns)
-    begin_row(memory, loop, step, t_ns, now_ns)
+    layout.begin_row(memory, loop, step, t_ns, now_ns)
     copy_reals(own.x, loop * n, memory.row_reals, 4, n)
     copy_reals(own.u, loop * m, memory.row_reals, 4 + n, m)
     memory.row[4 + n + m] = plant.newest_sequence
-    plant.step += 1
-    due_ns = t_ns + plant.period_ns
-    memory.loops[loop].due_ns = due_ns if due_ns <= plant.horizon_ns else NEVER_NS
+    layout.next_tick(memory, loop)
     if step % plant.measure_every == 0:
-        into = begin_message(memory, plant.measurements, t_ns)
-        copy_reals(own.x, loop * n, memory.out_reals, into, n)
+        layout.write_message(memory, plant.measurements, t_ns, own.x, loop * n, n)
         plant.measurements += 1
-        outputs += SENDS
+        outputs += layout.SENDS
     return int(outputs)
 
 
@@ -156,7 +143,7 @@ def _choose_input(memory: FleetMemory, own: PlantArrays, loop: int, t_ns: int) -
         return 0
     fleet.note_loop, fleet.note_ns, fleet.note_since_ns = loop, t_ns, plant.noticed_ns
     plant.noticed_ns = t_ns if is_missing else _IN_TIME
-    return NOTES
+    return layout.NOTES
 
 
 PLANT_FLEET = FleetRole(__name__, PLANT_ACTUATION, PLANT_STEP, plant_arrays_of)

@@ -8,6 +8,7 @@ from noack.runtime.signals import quiet_interrupt
 with quiet_interrupt():
     from noack.core.errors import ExitStatus
     from noack.runtime import process_entry
+    from noack.runtime.loop_machines import run_machines
     from sensor_node.sensor import sensor_of
     from sensor_node.sensor_arrays import SENSOR_FLEET
 
@@ -15,7 +16,7 @@ with quiet_interrupt():
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the sensor in the run that a recorder or launcher has opened."""
     return process_entry.main(
-        "sensor", lambda member: member.run_messages(sensor_of, SENSOR_FLEET), arguments
+        "sensor", lambda process: run_machines(process, sensor_of, SENSOR_FLEET), arguments
     )
 
 

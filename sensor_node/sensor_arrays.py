@@ -6,29 +6,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.config.fleet_layout import (
-    HEADER_WORDS,
-    NEEDS_MATRIX,
-    NEVER_NS,
-    SCRATCH,
-    SENDS,
-    FleetMemory,
-    FleetParts,
-    FleetRole,
-    begin_message,
-    begin_row,
-    copy_reals,
-)
+from noack.config import fleet_layout as layout
+from noack.config.fleet_layout import FleetMemory, FleetParts, FleetRole, copy_reals
 from noack.config.resolution import loop_of, policy_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Vector
-from noack.core.model_arrays import (
-    MISSING,
-    ModelTable,
-    Transitions,
-    advance_model,
-    find_transition,
-)
+from noack.core.model_arrays import ModelTable, Transitions, advance_model, joined
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT, SENSOR_SETTING
 from noack.trigger.trigger_arrays import (
     TRIGGER,
@@ -81,14 +64,14 @@ def sensor_arrays_of(resolved: Sequence[Scenario]) -> FleetParts | None:
     transitions = Transitions(
         [loop.H for loop in loops],
         [loop.setpoint for loop in loops],
-        sorted({one.timing.measurement_period_ns for one in resolved}),
+        {one.timing.measurement_period_ns for one in resolved},
     )
     known = [one.network.initial_sync == "known_state" for one in resolved]
     sensors = np.zeros(len(loops), SENSOR)
     sensors["knows_state"] = known
     arrays = SensorArrays(
         sensors=sensors,
-        x_s=np.concatenate([loop.x0 for loop in loops]),
+        x_s=joined((loop.x0 for loop in loops), n),
         triggers=triggers,
         matrices=np.array([*matrices, 0.0]),
         z=np.zeros(2 * n),
@@ -96,36 +79,31 @@ def sensor_arrays_of(resolved: Sequence[Scenario]) -> FleetParts | None:
         sides=np.zeros(2),
         models=transitions.table,
     )
-    scratch, rows = np.zeros(SCRATCH), triggers.view(np.recarray)
+    scratch, rows = np.zeros(layout.SCRATCH), triggers.view(np.recarray)
     for number in np.flatnonzero(known).tolist():
         start_condition(
             rows[number], arrays.matrices, 0, arrays.x_s, number * n, n, arrays.z, scratch
         )
-    dues_ns = np.full(len(loops), NEVER_NS)
-    return FleetParts(arrays, dues_ns, transitions, changes=SENSOR_SETTING)
+    return FleetParts(arrays, layout.new_loops(resolved), transitions, changes=SENSOR_SETTING)
 
 
 def handle(memory: FleetMemory, own: SensorArrays, loop: int, begin: int, now_ns: int) -> int:
     """Process the measurement whose datagram begins at ``begin``."""
     sensor, trigger, n = own.sensors[loop], own.triggers[loop], memory.fleet[0].n
     sequence, t_ns = memory.arrived[begin + 2], memory.arrived[begin + 3]
-    measured, x_s, at, z = memory.arrived_reals, own.model, begin + HEADER_WORDS, own.z
+    measured, x_s, at, z = memory.arrived_reals, own.model, begin + layout.HEADER_WORDS, own.z
     first = sensor.knows_state == 0
     if first:
         copy_reals(measured, at, x_s, 0, n)
-    else:
-        found = find_transition(own.models, loop, t_ns - sensor.model_ns)
-        if found == MISSING:
-            return NEEDS_MATRIX
-        advance_model(own.models, loop, n, found, own.x_s, loop * n, x_s, 0)
-    if first:
         start_condition(trigger, own.matrices, t_ns, measured, at, n, z, memory.scratch)
+    elif not advance_model(own.models, loop, n, t_ns - sensor.model_ns, own.x_s, loop * n, x_s, 0):
+        return layout.NEEDS_MATRIX
     for k in range(n):
         z[k] = measured[at + k]
         z[n + k] = x_s[k] - measured[at + k]
     event = is_event(trigger, own.matrices, t_ns, n, z, own.sides, memory.scratch)
     event = event or first
-    begin_row(memory, loop, sequence, t_ns, now_ns)
+    layout.begin_row(memory, loop, sequence, t_ns, now_ns)
     copy_reals(measured, at, memory.row_reals, 4, n)
     copy_reals(x_s, 0, memory.row_reals, 4 + n, n)
     place = 4 + 2 * n
@@ -140,9 +118,9 @@ def handle(memory: FleetMemory, own: SensorArrays, loop: int, begin: int, now_ns
         return 0
     start_condition(trigger, own.matrices, t_ns, measured, at, n, z, memory.scratch)
     copy_reals(measured, at, own.x_s, loop * n, n)
-    copy_reals(measured, at, memory.out_reals, begin_message(memory, sensor.events, t_ns), n)
+    layout.write_message(memory, sensor.events, t_ns, measured, at, n)
     sensor.events += 1
-    return SENDS
+    return layout.SENDS
 
 
 def on_timer(memory: FleetMemory, own: SensorArrays, loop: int, now_ns: int) -> int:

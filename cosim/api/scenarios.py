@@ -121,7 +121,7 @@ def from_system(
     if plant is not None:
         true = matrices_of(plant)
         content["plant"] |= {"draw": "given", "A": true["A"].tolist(), "B": true["B"].tolist()}
-    return _completed(content, settings, Path(name))
+    return _completed(content, settings, Path("from_system"))
 
 
 def _completed(content: dict[str, Any], settings: Mapping[str, Any] | None, path: Path) -> Scenario:

@@ -14,11 +14,11 @@ from cosim.analysis.claims.claim_definition import Envelope
 from cosim.analysis.claims.claims_by_part import RunClaims
 from cosim.analysis.fidelity import fidelity_for_summary
 from cosim.analysis.loops_over_time import worst_loop
+from cosim.analysis.loops_summary import is_complete
 from cosim.analysis.loss_statistics import list_violations
 from cosim.analysis.model_comparison import linearisation
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import Outcome, Summary, summarise
-from cosim.analysis.shared_summary import is_complete
 from cosim.analysis.summary_model import ReplayPart, RunSummary, SummaryPart
 from cosim.live.finalize_loops import exit_after_replay, finalize_loops
 from cosim.live.replay_process import ReplayProcess

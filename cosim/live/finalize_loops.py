@@ -3,9 +3,9 @@
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
+from cosim.analysis.loops_summary import LoopsSummary, summarise_loops
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import Outcome
-from cosim.analysis.shared_summary import SharedSummary, summarise_shared
 from cosim.analysis.summary_model import ExitPart, ReplayPart
 from cosim.live.process_pool import interrupts_held, processes
 from cosim.record.run_ending import RunEnding
@@ -23,7 +23,7 @@ start."""
 
 def finalize_loops(
     network: RunRecord, ending: RunEnding, finalize_loop: Callable[[RunEnding], Outcome]
-) -> SharedSummary:
+) -> LoopsSummary:
     """Finalise each loop of a run; return the summary of the run.
 
     Args:
@@ -38,7 +38,7 @@ def finalize_loops(
     with _each(finalize_loop, endings, network.scenario) as outcomes:
         replayed = _replay(network) if network.kind == "live" else None
         end = ExitPart(status=int(ending.status), reason=ending.reason)
-        summary = summarise_shared(network, [*outcomes], end, ending.startup_s)
+        summary = summarise_loops(network, [*outcomes], end, ending.startup_s)
     if replayed is None:
         return summary
     end = exit_after_replay(summary.exit, replayed)

@@ -6,6 +6,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from cosim.analysis.claims.claim_definition import envelope_formula
 from cosim.output.all_certificates import SCHEDULE, Certificates
 from cosim.output.assumptions_table import print_assumptions
 from cosim.output.certificate_rows import constant_rows, plants_of
@@ -20,8 +21,12 @@ def print_certificates(console: Console, found: Certificates) -> None:
     """Print the tables."""
     _print_constants(console, found)
     if any(found.setpoint or ()):
-        console.print("[dim]x is the distance from the set-point, x − x_r.[/]")
-    _print_limits(console, found)
+        console.print(
+            "[dim]x is the distance from the set-point, x − x_r. If the plant does not rest there, "
+            "A x_r + B u_r is a disturbance: a step at the state.[/]"
+        )
+    if any(certificate.constants for _, certificate in found):
+        _print_limits(console, found)
     if (outside := outside_box(found.scenario)) is not None:
         console.print(f"[yellow]the box certificates do not cover this plant:[/] {outside}")
     console.print("assumptions of the certificates for the schedule:")
@@ -46,19 +51,13 @@ def _in_words(found: Certificates) -> Iterator[str]:
         if under != SCHEDULE or constants is None:
             continue
         plants = "every plant of the box" if certificate.scope == BOX else "the scenario's plant"
-        decay = f" e^(−{constants.rate_per_s:.3g}t)" if constants.rate_per_s else ""
-        late = ""
-        if (floor := certificate.floor_constants) is not None:
-            late = f"; from {certificate.floor_from_s:.4g} s on, ‖x‖ ≤ {floor.state:.4g}"
-        if (rest := certificate.persistent_constants) is not None:
-            late = f" + {rest.state:.4g}"
         apart = ""
         if (spacing_s := certificate.inter_event_s) is not None:
             apart = f" The inter-event time is at least {_limit(spacing_s)}."
         yield (
             f"In words: for {plants}, under the assumptions above and for every pattern of losses "
             f"with {certificate.conditions.guarantee.meaning}: "
-            f"‖x‖ ≤ {constants.state:.4g}{decay}{late}.{apart}"
+            f"{envelope_formula('‖x‖', certificate, 'state').format(constants.state)}.{apart}"
         )
 
 
@@ -70,7 +69,8 @@ def _stability_in_words(found: Certificates) -> Iterator[str]:
     growth = f"growth per period {known.lower:.4g} to {known.upper:.4g}"
     text = {
         "stable": f"all {patterns} are stable: {growth}",
-        "destabilised": f"the pattern {known.text}, repeated, destabilises the loop: {growth}",
+        "destabilised": f"the pattern {known.text} (D delivered, L lost), repeated, "
+        f"destabilises the loop: {growth}",
         "undecided": f"{growth} under the worst of all {patterns}",
     }[known.verdict]
     yield f"Exactly, but without lateness: {text}; noack margin finds the limits."
@@ -94,18 +94,25 @@ def _print_constants(console: Console, found: Certificates) -> None:
     for label, values, of_theorem in constant_rows(certificates, found.theorem_2, rate):
         table.add_row(label, *values, *([of_theorem] if printed else []))
     console.print(table)
-    console.print(
-        "[dim]Each bound of a norm is multiplied by e^(−rate·t). paper: no sampling, no delay, no "
-        "hold. schedule: the scenario's rates, plus the lateness that it allows. plant: the "
-        "scenario's plant. box: every plant of the uncertainty box. updates outstanding: maximum "
-        "number of updates lost or in flight. no update missing: while the controller has every "
-        "update, which sharpens the bound of x from an event on. inter-event time: minimum.[/]"
-    )
+    if any(one.constants for one in certificates):
+        console.print(
+            "[dim]Each bound of a norm is multiplied by e^(−rate·t). paper: no sampling, no delay, "
+            "no hold. schedule: the scenario's rates, plus the lateness that it allows. plant: the "
+            "scenario's plant. box: every plant of the uncertainty box. updates outstanding: "
+            "maximum number of updates lost or in flight. no update missing: while the controller "
+            "has every update, which sharpens the bound of x from an event on. inter-event time: "
+            "minimum.[/]"
+        )
     if any(one.persistent_constants for one in certificates):
         console.print(
             "[dim]The rows with + are added: they are the bounds from disturbances, noise, and the "
             "threshold's constant or floor. With noise or an observer, e_s and e_c are x_s − x̂ and "
             "x_c − x̂.[/]"
+        )
+    if any(one.other for one in certificates):
+        console.print(
+            "[dim]Two bounds hold at all times. The table has the one that tends to the smaller "
+            "value; both are in the words below.[/]"
         )
     for under, certificate in found:
         if certificate.void:

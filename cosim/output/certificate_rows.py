@@ -37,6 +37,9 @@ def constant_rows(
         delta_2 = "(same)"
         state_2 = number(theorem.state_start + theorem.state_forced, 4)
         spacing_2 = number(theorem.inter_event_s, 4)
+    if not any(c.constants for c in certificates):
+        yield "certificate", ["void"] * len(certificates), NONE
+        return
     yield "decay rate, 1/s", constant("rate_per_s"), number(theorem_rate, 4)
     yield "updates outstanding", constant("missing_events"), NONE
     unit = next((f"/{one.unit}" for one in certificates if one.unit), "")

@@ -11,11 +11,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.text import Text
 
+from cosim.analysis.loops_summary import has_loops
 from cosim.analysis.run_summary import Outcome, Summary
-from cosim.analysis.shared_summary import is_shared
+from cosim.output.loops_tables import print_loops
 from cosim.output.remarks import remarks
 from cosim.output.run_tables import number_table, print_details, short_numbers
-from cosim.output.shared_tables import print_shared
 from cosim.record.run_directory import RECORDING_FILE, REPORT_FILE
 from noack.core.errors import ExitStatus
 from noack.runtime.life_cycle import HORIZON
@@ -85,8 +85,8 @@ def print_outcome(console: Console, outcome: Outcome, *, verbose: bool = False) 
         verbose: print all tables instead of the key numbers.
     """
     summary = outcome.summary
-    if is_shared(summary):
-        print_shared(console, summary, verbose=verbose)
+    if has_loops(summary):
+        print_loops(console, summary, verbose=verbose)
         if (report := outcome.run_dir / REPORT_FILE).is_file():
             console.print(f"report         {report}", highlight=False, soft_wrap=True)
         console.print(f"run directory  {outcome.run_dir}", highlight=False, soft_wrap=True)

@@ -6,7 +6,7 @@ to ``row``, and a message to the next place of ``out``. They return a sum of :da
 :data:`NOTES`, or :data:`NEEDS_MATRIX`; then they have changed nothing and are called again.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,7 +35,10 @@ LOOP = np.dtype(
         (name, "<i8")
         for name in (
             "phase_ns",  # when the loop begins; all other times are its own
-            "due_ns",  # the next deadline; NEVER_NS: none
+            "due_ns",  # the nominal time of the next tick; NEVER_NS: none
+            "step",  # its number
+            "period_ns",  # from one tick to the next
+            "horizon_ns",  # no tick is later
             "newest",  # sequence number of the newest message accepted; -1: none
             "accepted",  # messages
             "inputs",  # number of the machine's next input
@@ -74,6 +77,28 @@ class FleetMemory(NamedTuple):
     scratch: NDArray[np.float64]
 
 
+def new_loops(
+    resolved: Sequence[Scenario], ticks_ns: Iterable[tuple[int, int]] | None = None
+) -> NDArray[Any]:
+    """Return the loops before their start, (L,); ``ticks_ns``: the first tick and the period."""
+    loops = np.zeros(len(resolved), LOOP)
+    loops["newest"], loops["due_ns"] = -1, NEVER_NS
+    loops["horizon_ns"] = [one.timing.horizon_ns for one in resolved]
+    if ticks_ns is not None:
+        for one, (first_ns, period_ns) in zip(loops, ticks_ns, strict=True):
+            one["period_ns"] = period_ns
+            one["due_ns"] = first_ns if first_ns <= one["horizon_ns"] else NEVER_NS
+    return loops
+
+
+def next_tick(memory: FleetMemory, loop: int) -> None:
+    """Set the loop's deadline to its next tick."""
+    one = memory.loops[loop]
+    due_ns = one.due_ns + one.period_ns
+    one.step += 1
+    one.due_ns = due_ns if due_ns <= one.horizon_ns else NEVER_NS
+
+
 def begin_row(memory: FleetMemory, loop: int, sequence: int, t_ns: int, now_ns: int) -> None:
     """Write the columns that all tables have."""
     one = memory.loops[loop]
@@ -84,12 +109,14 @@ def begin_row(memory: FleetMemory, loop: int, sequence: int, t_ns: int, now_ns: 
     one.inputs += 1
 
 
-def begin_message(memory: FleetMemory, sequence: int, t_ns: int) -> int:
-    """Write number and time of the next message; return where its vector begins."""
-    begin = memory.fleet[0].out * STRIDE
-    memory.out[begin + 2] = sequence
-    memory.out[begin + 3] = t_ns
-    return int(begin + HEADER_WORDS)
+def write_message(
+    memory: FleetMemory, sequence: int, t_ns: int, source: Any, begin: int, count: int
+) -> None:
+    """Write number, time and vector of the next message; its vector begins in ``source``."""
+    place = memory.fleet[0].out * STRIDE
+    memory.out[place + 2] = sequence
+    memory.out[place + 3] = t_ns
+    copy_reals(source, begin, memory.out_reals, place + HEADER_WORDS, count)
 
 
 def copy_reals(source: Any, begin: int, result: Any, into: int, count: int) -> None:
@@ -103,8 +130,8 @@ class FleetParts(NamedTuple):
 
     arrays: Any
     """The arrays of the role, a NamedTuple."""
-    due_ns: NDArray[np.int64]
-    """(L,) The first deadline of each loop, in its time."""
+    loops: NDArray[Any]
+    """(L,) :data:`LOOP`, see :func:`new_loops`."""
     transitions: Transitions | None = None
     """Of a role with models, the field ``models`` of its arrays."""
     notice: Callable[[Any, Any], Notice] | None = None

@@ -28,7 +28,7 @@ def input_at(A: Matrix, B: Matrix, x_r: Vector) -> Vector:
     if not states.shape[1]:
         raise ValueError("no equilibrium of the model, which has none but 0: Âx + B̂u = 0")
     nearest = states @ (states.T @ x_r)
-    shown = ", ".join(f"{value:.6g}" for value in np.where(np.abs(nearest) < 1e-12, 0.0, nearest))
+    shown = ", ".join(f"{value:.12g}" for value in np.where(np.abs(nearest) < 1e-12, 0.0, nearest))
     raise ValueError(
         f"no equilibrium of the model (Âx + B̂u = 0); those are a space of dimension "
         f"{states.shape[1]}, and the nearest one is [{shown}]"

@@ -114,7 +114,7 @@ class TheoryCoverage:
         """Raise CallerError if the settings change, or the set point is not 0."""
         self.require_constant()
         if any(self.scenario.controller.setpoint or ()):
-            raise CallerError("controller.setpoint: needs the set point 0")
+            raise CallerError("controller.setpoint: this needs the set point 0")
 
     def require_direct_inputs(self) -> None:
         """Raise CallerError unless every actuation reaches the plant and carries one input."""

@@ -4,7 +4,7 @@ The matrices e^{H dt} are in a table with the model's number and dt as keys. Wha
 is computed by :class:`Transitions`, outside compiled code.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -69,17 +69,23 @@ def first_place(model: int, dt_ns: int, last: int) -> int:
 
 
 def advance_model(
-    table: Any, loop: int, n: int, found: int, x: Any, begin: int, result: Any, into: int
-) -> None:
-    """Compute the model's state after the time of ``found``; the arrays must not overlap."""
+    table: Any, loop: int, n: int, dt_ns: int, x: Any, begin: int, result: Any, into: int
+) -> bool:
+    """Compute a model's state after a time; return False if its matrix is not in the table.
+
+    The arrays must not overlap.
+    """
+    found = find_transition(table, loop, dt_ns)
+    if found == MISSING:
+        return False
     shifts = table.has_setpoint[loop] != 0
     if found == STILL or (found == STATIC and not shifts):
         for k in range(n):
             result[into + k] = x[begin + k]
-        return
+        return True
     if not shifts:
         multiply(table.values, found, x, begin, result, into, (n, n))
-        return
+        return True
     for k in range(n):
         table.moved[k] = x[begin + k] - table.setpoint[loop * n + k]
         result[into + k] = table.moved[k]
@@ -87,6 +93,14 @@ def advance_model(
         multiply(table.values, found, table.moved, 0, result, into, (n, n))
     for k in range(n):
         result[into + k] = table.setpoint[loop * n + k] + result[into + k]
+    return True
+
+
+def joined(parts: Iterable[Any], size: int) -> Vector:
+    """Return the entries of the arrays of all loops, of ``size`` each; None is 0."""
+    return np.concatenate(
+        [np.zeros(size) if part is None else np.ravel(part).astype(np.float64) for part in parts]
+    )
 
 
 class Transitions:
@@ -102,7 +116,7 @@ class Transitions:
         self,
         generators: Sequence[Matrix],
         setpoints: Sequence[Vector | None],
-        steps_ns: Sequence[int],
+        steps_ns: Iterable[int],
     ) -> None:
         numbers: dict[bytes, int] = {}
         model = [numbers.setdefault(H.tobytes(), len(numbers)) for H in generators]
@@ -116,7 +130,7 @@ class Transitions:
             keys=np.zeros(2 * _PLACES, np.int64),
             places=np.full(_PLACES, MISSING, np.int64),
             values=np.zeros(_PLACES // 2 * n * n),
-            setpoint=np.concatenate([np.zeros(n) if x_r is None else x_r for x_r in setpoints]),
+            setpoint=joined(setpoints, n),
             has_setpoint=np.array([x_r is not None for x_r in setpoints], np.int64),
             wanted=np.zeros(2, np.int64),
             moved=np.zeros(n),

@@ -18,6 +18,11 @@ Indices = NDArray[np.int64]
 _FORBIDDEN, _UNKNOWN = -1, -2
 
 
+def outcome_letters(delivered: Iterable[bool]) -> str:
+    """Return the outcomes of successive packets as text: ``D`` delivered, ``L`` lost."""
+    return "".join("D" if one else "L" for one in delivered)
+
+
 class LossRule(Protocol):
     """One rule of a guarantee, as a counter; states and values are integers."""
 

@@ -10,49 +10,37 @@ import signal
 import socket
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, closing
-from functools import cached_property, partial
+from contextlib import closing
 from itertools import chain, repeat
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, cast
 
-from noack.config.fleet_layout import FleetRole
 from noack.config.loops import loops_of, phases_ns
 from noack.config.parameter_changes import ReconfigurableMachine
-from noack.config.resolution import resolved_loops, tables_of
-from noack.config.scenario import Scenario
+from noack.config.resolution import tables_of
 from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import CallerError, NoackError, PeerError, one_line
-from noack.protocol.fleet import Fleet, FleetDecoder
 from noack.protocol.machine_interface import BEGINNING, RESTART, Machine, Notice, Record, Start
 from noack.protocol.record_tables import OWNER
 from noack.protocol.topology import (
     CHANGEABLE,
-    ENDS,
     LOOP_ROLES,
-    RECEIVES,
     RECORDER,
-    SENDS,
-    receiver_of,
-    sender_to,
 )
-from noack.protocol.wire_format import Decoder, Encoder, Flow, Message
 from noack.runtime.address import Address
 from noack.runtime.command_line import print_to_stderr
 from noack.runtime.control_messages import Admission, ControlMessage, RunStart, parse_message
 from noack.runtime.control_plane import ControlPlane, ParameterUpdates
-from noack.runtime.fleet.compiled_fleet import CompiledFleet
-from noack.runtime.fleet.fleet_choice import fleet_of
-from noack.runtime.fleet.fleet_socket import FLEET_BUFFER_BYTES, FleetSocket
+from noack.runtime.fleet.fleet_socket import FLEET_BUFFER_BYTES
 from noack.runtime.join_ticket import Ticket
 from noack.runtime.life_cycle import HORIZON, LAUNCHER_GONE, Event, LifeCycle, Side, State
 from noack.runtime.real_time_loop import Channel, run_loop
 from noack.runtime.real_time_settings import realtime
 from noack.runtime.record_handover import deliver_report, persisted_rows, spool_rows
-from noack.runtime.rehearsal import Rehearsal, can_rehearse
+from noack.runtime.rehearsal import Rehearsal
 from noack.runtime.signals import Signals
 from noack.runtime.telemetry import TelemetryBuffer
-from noack.runtime.udp_sockets import MessageSocket, bind, enlarge_buffer
+from noack.runtime.udp_sockets import bind, enlarge_buffer
 
 T = TypeVar("T")
 
@@ -80,9 +68,6 @@ class ReportingChannel(Channel[T], Protocol[T]):
         ...
 
 
-NewMachine = Callable[[Scenario, Start], Machine[Message]]
-"""Makes the machine of a loop, from its resolved scenario and its beginning in the loop's time."""
-
 OpenChannel = Callable[[socket.socket, Mapping[str, Address]], ReportingChannel[T]]
 
 
@@ -93,19 +78,20 @@ class RunProcess:
         self.role = role
         self.ticket = ticket
         self.scenario = ticket.scenario
-        self._phases_ns = phases_ns(ticket.scenario)
+        self.phases_ns = phases_ns(ticket.scenario)
+        """When each loop begins."""
         self.plane = plane
         self.life = LifeCycle(role, Side.PROCESS)
         self.updates = ParameterUpdates(plane)
         self._signals = signals
-        self._admitted_ns = 0
+        self.admitted_ns = 0
         self._address: Address | None = None
         self.start: Start = BEGINNING
         """Where in the run its work begins."""
         self.replaces: str | None = None
         """Of a restarted process: how the one before it ended."""
         self.report: dict[str, Any] = {}
-        self._rehearsal: Rehearsal | None = None
+        self.rehearsal: Rehearsal | None = None
 
     def request_admission(self) -> None:
         """Ask the coordinator for admission to the run.
@@ -117,7 +103,7 @@ class RunProcess:
         self.start = Start(admission["generation"], admission["from_ns"])
         if self.start.is_restart:
             self._address, self.replaces = admission["address"], admission["replaces"]
-            self._admitted_ns = admission["admitted_ns"]
+            self.admitted_ns = admission["admitted_ns"]
 
     def join(self, address: Address | None) -> Mapping[str, Address]:
         """Wait at the start barrier; return all addresses. Sets the common epoch.
@@ -152,105 +138,10 @@ class RunProcess:
             raise PeerError(self.life.reason) if self.life.reason else error from None
         return parse_message(answer, message)
 
-    @cached_property
-    def loops(self) -> tuple[Scenario, ...]:
-        """The resolved scenario of each loop; that of the run, if it has no [[loops]]."""
-        return (self.scenario,) if self.scenario.loops is None else resolved_loops(self.scenario)
-
     @property
     def loop_count(self) -> int | None:
         """Number of loops whose datagrams carry their number; None in a run without [[loops]]."""
-        return None if self.scenario.loops is None else len(self._phases_ns)
-
-    def run_messages(self, new_machine: NewMachine, compiled: FleetRole) -> None:
-        """Run the machines of all loops, with the process's route in the topology.
-
-        Args:
-            new_machine: makes a machine; another of the first loop is made for rehearsals.
-            compiled: the machines of many loops as compiled code.
-        """
-        fleet = None
-        if not self.start.is_restart:
-            fleet = fleet_of(
-                compiled, self.role, self.scenario, self.ticket.run_id, self.ticket.key
-            )
-        if fleet is not None:
-            self.run(fleet, partial(self._fleet_socket, fleet=fleet))
-            return
-        role, network = self.role, self.scenario.network.flows
-        receives, sends, answer = RECEIVES[role], SENDS[role], Flow.ACKNOWLEDGEMENT
-        answers = answer in network and role in ENDS[answer]
-        is_answered = answers and role == ENDS[answer].receiver
-
-        def channel(endpoint: socket.socket, addresses: Mapping[str, Address]) -> MessageSocket:
-            by = addresses["netem"]
-            return MessageSocket(
-                endpoint,
-                self._decoder(receives, not_before_ns=self._admitted_ns),
-                self._encoder(),
-                sends,
-                source=addresses[sender_to(role, receives, network)],
-                destination=addresses[receiver_of(role, sends, network)],
-                acknowledgements=(self._decoder(answer), by) if is_answered else None,
-                acknowledges_to=by if answers and not is_answered else None,
-            )
-
-        with ExitStack() as stack:
-            if can_rehearse(self.role, self.loops[0]):
-                endpoint = stack.enter_context(closing(bind(0, "realtime.rehearse")))
-                own: Address = endpoint.getsockname()
-                copy = MessageSocket(
-                    endpoint, self._decoder(receives, 1), self._encoder(), sends,
-                    source=own, destination=own,
-                )  # fmt: skip
-                entries = self.loops[0].message_sizes.entries(receives)
-                machine = self._machine(new_machine, 1)
-                rehearsal = Rehearsal(machine, copy, self._encoder(), receives, entries)
-                self._rehearsal = stack.enter_context(closing(rehearsal))
-            self.run(self._machine(new_machine), channel)
-
-    def _fleet_socket(
-        self, endpoint: socket.socket, addresses: Mapping[str, Address], fleet: CompiledFleet
-    ) -> FleetSocket:
-        role, network = self.role, self.scenario.network.flows
-        receives, sends = RECEIVES[role], SENDS[role]
-        return FleetSocket(
-            endpoint, fleet, sends, clock=self.clock,
-            source=addresses[sender_to(role, receives, network)],
-            destination=addresses[receiver_of(role, sends, network)],
-        )  # fmt: skip
-
-    def _machine(self, new_machine: NewMachine, most: int | None = None) -> Machine[Message]:
-        """Return the machine of all loops, or of the first ones."""
-        if self.scenario.loops is None:
-            return new_machine(self.scenario, self.start)
-        machines = [
-            new_machine(loop, self.start._replace(from_ns=self.start.from_ns - phase_ns))
-            for loop, phase_ns in zip(self.loops[:most], self._phases_ns, strict=False)
-        ]
-        return Fleet(machines, self._phases_ns[:most])
-
-    def _encoder(self) -> Encoder:
-        return Encoder(self.ticket.run_id, self.ticket.key)
-
-    def _decoder(
-        self, flow: Flow, most: int | None = None, *, not_before_ns: int = 0
-    ) -> Decoder | FleetDecoder:
-        """Return the decoder of a flow of all loops, or of the first ones."""
-        decoders = [
-            Decoder(
-                flow,
-                0 if flow == Flow.ACKNOWLEDGEMENT else loop.message_sizes.entries(flow),
-                self.ticket.run_id,
-                self.ticket.key,
-                not_before_ns=not_before_ns - phase_ns,
-                loop=number,
-            )
-            for number, (loop, phase_ns) in enumerate(
-                zip(self.loops[:most], self._phases_ns, strict=False)
-            )
-        ]
-        return decoders[0] if self.scenario.loops is None else FleetDecoder(decoders)
+        return None if self.scenario.loops is None else len(self.phases_ns)
 
     def run(self, machine: Machine[T], open_channel: OpenChannel[T]) -> None:
         """Join, drive the machine to the horizon, hand over the remaining rows, and report.
@@ -284,7 +175,7 @@ class RunProcess:
                     "pid": os.getpid(),
                     "ended": self.ended,
                     "realtime": applied,
-                    "rehearsal": self._rehearsal.report() if self._rehearsal else {},
+                    "rehearsal": self.rehearsal.report() if self.rehearsal else {},
                     "channel": channel.report(),
                     "rows": telemetry.totals(),
                     **(
@@ -321,7 +212,7 @@ class RunProcess:
             stop=lambda: self.stopping,
             spin_us=self.scenario.realtime.spin_us,
             gather_ns=self._gather_ns,
-            rehearsal=self._rehearsal,
+            rehearsal=self.rehearsal,
             news=lambda now_ns: self._announce(changeable, now_ns, next(limits)),
         )
         reached_ns = self.clock.now_ns() - late_ns
@@ -338,7 +229,7 @@ class RunProcess:
 
         The emulator's deadlines are delays, which stay exact.
         """
-        if self.role == "netem" or len(self._phases_ns) <= _FEW_LOOPS:
+        if self.role == "netem" or len(self.phases_ns) <= _FEW_LOOPS:
             return 0
         timing = loops_of(self.scenario)[0].timing
         return min(timing.plant_period_ns, timing.controller_period_ns) // _GATHER_PARTS
@@ -347,7 +238,7 @@ class RunProcess:
     def _end_ns(self) -> int:
         """When the loop ends: the last horizon of all loops, and time for packets in flight."""
         grace_ns = int(_GRACE_S * NS_PER_S * self.scenario.speed)
-        return loops_of(self.scenario)[0].timing.horizon_ns + max(self._phases_ns) + grace_ns
+        return loops_of(self.scenario)[0].timing.horizon_ns + max(self.phases_ns) + grace_ns
 
     def fail(self, error: BaseException) -> None:
         """Stop with an error as the reason."""

@@ -70,7 +70,7 @@ def assumptions(resolved: Scenario) -> list[Assumption]:
     if resolved.plant.disturbances:
         kinds = ", ".join(f"{one.kind} at the {one.at}" for one in resolved.plant.disturbances)
         found.append(
-            _violated("nothing disturbs the plant", "eq:plant", f"{kinds}: {_NOT_BY_THEOREMS}")
+            _violated("the plant is not disturbed", "eq:plant", f"{kinds}: {_NOT_BY_THEOREMS}")
         )
     return found + _estimated(loop, resolved)
 

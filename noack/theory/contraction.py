@@ -123,10 +123,10 @@ def spectral_norms(stack: Stack) -> Stack:
     products = np.einsum("kij,klj->kil" if wide else "kij,kil->kjl", stack, stack)
     if not np.isfinite(products).all():  # the norm may be finite
         return np.asarray(np.linalg.norm(stack, 2, axis=(1, 2)))
-    return np.asarray(np.sqrt(np.maximum(_largest_eigenvalues(products), 0.0)))
+    return np.asarray(np.sqrt(np.maximum(largest_eigenvalues(products), 0.0)))
 
 
-def _largest_eigenvalues(stack: Stack) -> Stack:
+def largest_eigenvalues(stack: Stack) -> Stack:
     """Return the largest eigenvalues of Gram matrices, (k, n, n) → (k,)."""
     n = stack.shape[1]
     if n == 1:

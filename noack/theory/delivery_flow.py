@@ -25,17 +25,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
-from noack.theory.contraction import Stack, logarithmic_norm
-from noack.theory.enclosure import response
-from noack.theory.gains import PlantGains
+from noack.theory.contraction import (
+    Stack,
+    largest_eigenvalues,
+    logarithmic_norm,
+    product,
+    spectral_norms,
+)
+from noack.theory.gains import Output, PlantGains
 
 _CELLS_PER_STEP, _FIRST_STEP, _MOST_STEP = 32, 0.005, 0.02
 _MOST_GROWTH, _SETTLED, _MOST_CELLS = 1e6, 0.03, 3000
-_LOGITS = np.append(np.arange(-12.0, 13.0), 40.0)
+_LOGITS = np.append(np.arange(-12.0, 13.0, 2.0), 40.0)
 _ALONE = 40.0
 """λ = 1, to rounding: only ‖Λξ‖ ≤ 1 is used."""
-_NEIGHBOURS, _WIDTHS = np.array([-1.0, 0.0, 1.0]), (1.0, 0.5, 0.25, 0.12, 0.06)
-_AT_ONCE = 32
+_NEIGHBOURS, _WIDTHS = np.array([-1.0, 0.0, 1.0]), np.array([1.5, 0.75, 0.37, 0.18, 0.09])
+_AT_ONCE = 16
+_SHARES = np.array([
+    (first, (1 - first) * (1 - last), (1 - first) * last)
+    for first in (0.01, 0.03, 0.1, 0.3) for last in (0.1, 0.3, 0.5, 0.7, 0.9)
+])  # fmt: skip
+"""Of the three conditions that hold after the last node."""
 _TAYLOR_TERMS = 4
 ROUNDING = 1 + 1e-5
 """Covers the error of e^{Fτ}, about 1e-13 of its norm, which is at most about 1e6."""
@@ -56,6 +66,7 @@ class DeliveryFlow:
         self.mismatch = E = self.closed_loop - self.H
         self.generator = np.block([[self.closed_loop, self.BK], [-E, self.H - self.BK]])
         self.start = self.weight @ plant.start
+        self.stretch = error.kernels[Output.WEIGHTED].sup()
         fastest = max(float(np.abs(np.linalg.eigvals(self.generator)).max()), 1e-9)
         slowest, unstable = -spectral_abscissa(self.H), spectral_abscissa(self.generator)
         step_s, state = _FIRST_STEP / fastest, np.eye(2 * self.n)[:, : self.n]
@@ -77,154 +88,177 @@ class DeliveryFlow:
 
 
 @dataclass(frozen=True)
-class Reach:
-    """What z can be at some time after a delivery."""
+class Starts:
+    """The states ξ at a delivery with ‖Λ W ξ‖ ≤ 1."""
 
     flow: DeliveryFlow
     shape: Matrix
-    """Λ, (n, n), invertible: ‖Λ W x‖ ≤ 1 at the delivery."""
+    """Λ, (n, n), invertible."""
+
+    @cached_property
+    def inverse(self) -> Matrix:
+        """Λ⁻¹."""
+        return np.asarray(np.linalg.inv(self.shape))
+
+    @cached_property
+    def axes(self) -> tuple[Vector, Stack]:
+        """The singular values of N Λ⁻¹ at the left nodes, and Λ⁻¹ V."""
+        _, singular, Vt = np.linalg.svd(self.flow.states[:-1, self.flow.n :] @ self.inverse)
+        return singular, self.inverse @ Vt.transpose(0, 2, 1)
+
+    @cached_property
+    def followed(self) -> tuple[Matrix, Matrix, Vector]:
+        """What bounds of z over the cells need, on the axes of their ellipsoids.
+
+        e^{Fτ} at both nodes of each cell, Taylor's terms of F² e^{Fτ}, both as columns; and bounds
+        of the terms' remainder.
+        """
+        flow, axes = self.flow, self.axes[1]
+        F, steps_s = flow.generator, np.diff(flow.edges_s)
+        ends = [flow.states[:-1] @ axes, flow.states[1:] @ axes]
+        terms = [product(F @ F, ends[0])]
+        for order in range(1, _TAYLOR_TERMS + 1):
+            terms.append(product(F, terms[-1]) * (steps_s / order)[:, None, None])
+        with np.errstate(over="ignore"):
+            growth = np.exp(max(logarithmic_norm(F), 0.0) * steps_s)
+        rest = growth[:, None] * np.linalg.norm(terms[-1], axis=1)
+        return _columns(ends), _columns(terms[:-1]), rest
+
+    @cached_property
+    def itself(self) -> "_CellBounds":
+        """Bounds of Λx."""
+        return _CellBounds(self, np.hstack([self.shape, np.zeros_like(self.shape)]))
+
+    @cached_property
+    def first(self) -> int:
+        """The first cell in which ‖Λx‖ might grow.
+
+        ‖Λx‖ ≤ 1 cannot be left while ‖ΛBK e_c‖ is below the rate at which it contracts.
+        """
+        flow = self.flow
+        rate = -logarithmic_norm(self.shape @ flow.closed_loop @ self.inverse)
+        C = np.hstack([np.zeros_like(flow.BK), self.shape @ flow.BK])
+        driven = _CellBounds(self, C).loose(1.0, np.array([_ALONE]))[:, 0]
+        return int(np.argmax(np.append(driven, np.inf) * ROUNDING >= rate))
+
+    @cached_property
+    def late(self) -> tuple[Matrix, float]:
+        """e^{FT'} for some T' before the last node, and a bound of ‖x + e_c‖ from then on."""
+        from scipy.linalg import expm
+
+        flow, n = self.flow, self.flow.n
+        node = int(flow.edges_s.searchsorted(5 / 6 * flow.edges_s[-1])) - 1
+        since_s = float(flow.edges_s[-1] - flow.edges_s[node])
+        x_c = flow.states[node, :n] + flow.states[node, n:]
+        return np.asarray(expm(flow.generator * since_s)), flow.stretch * float(
+            np.linalg.norm(x_c @ self.inverse, 2)
+        )
+
+
+@dataclass(frozen=True)
+class Reach:
+    """What z can be at some time after a delivery: ‖ΛWξ‖ ≤ c at the delivery, ‖e_c‖_W ≤ D since."""
+
+    starts: Starts
+    size: float
+    """c."""
     limit: float
-    """D, ‖e_c‖_W since then."""
+    """D."""
 
     def sup(self, C: Matrix) -> float:
         """Bound ‖C z‖ at all times, for C of shape (q, 2n)."""
-        return max(self._over_cells(C, 0), self._afterwards(C))
+        return self._sup(C, _CellBounds(self.starts, C), 0)
 
     def is_invariant(self) -> bool:
-        """Return whether ‖Λx‖ ≤ 1 at a delivery implies the same at all times until the next."""
-        flow, n = self.flow, self.flow.n
-        x, e_c = np.split(np.eye(2 * n), 2)
-        # ‖Λx‖ ≤ 1 cannot be left while ‖ΛBK e_c‖ is below the rate at which it contracts.
-        rate = -logarithmic_norm(self.shape @ flow.closed_loop @ np.linalg.inv(self.shape))
-        driven = _CellBounds(self, self.shape @ flow.BK @ e_c).loose(np.array([_ALONE]))[:, 0]
-        first = int(np.argmax(np.append(driven, np.inf) * ROUNDING >= rate))
-        return max(self._over_cells(self.shape @ x, first), self._afterwards(self.shape @ x)) <= 1
+        """Return whether ‖Λx‖ ≤ c at a delivery implies the same at all times until the next."""
+        itself = self.starts.itself
+        return self._sup(itself.C, itself, self.starts.first) <= self.size
 
-    def _over_cells(self, C: Matrix, first: int) -> float:
-        """Bound ‖C z‖ over the cells from the given one on."""
-        bounds = _CellBounds(self, C)
-        loose = bounds.loose(_LOGITS)
+    def _sup(self, C: Matrix, bounds: "_CellBounds", first: int) -> float:
+        # All is in proportion to c, for D/c.
+        limit = self.limit / self.size
+        return self.size * max(bounds.sup(limit, first), self._afterwards(C, limit))
+
+    def _afterwards(self, C: Matrix, limit: float) -> float:
+        """Bound ‖C z‖ after the last node, for c = 1.
+
+        It follows from ‖x + e_c‖ ≤ h and ‖e_c‖ ≤ D, T' before, and ‖e_c‖ ≤ D now.
+        """
+        n = len(self.starts.shape)
+        moved, h = self.starts.late
+        one, none = np.eye(n), np.zeros((n, n))
+        moved = moved @ np.block([[one, -one], [none, one]])
+        rows = [np.hstack([one, none]) / h, np.hstack([none, one]) / limit, moved[n:] / limit]
+        values, V = np.linalg.eigh(np.tensordot(_SHARES, [row.T @ row for row in rows], axes=1))
+        sizes = spectral_norms(C @ moved @ V / np.sqrt(values)[:, None])
+        found = float(sizes.min()) * ROUNDING
+        return found if math.isfinite(found) else math.inf
+
+
+class _CellBounds:
+    """Bounds of ‖C z‖ over each cell, for ‖Λξ‖ ≤ 1."""
+
+    def __init__(self, starts: Starts, C: Matrix) -> None:
+        self.C, self._singular = C, starts.axes[0]
+        cells, n = self._singular.shape
+        ends, terms, rest = starts.followed
+        self._ends = (C @ ends).reshape(len(C), 2, cells, n)
+        followed = (C @ terms).reshape(len(C), _TAYLOR_TERMS, cells, n)
+        self._squares = np.concatenate(
+            [
+                np.einsum("qokj->kjo", self._ends**2),
+                np.einsum("qokj->kjo", followed**2),
+                (np.linalg.norm(C, 2) * rest)[..., None] ** 2,
+            ],
+            axis=2,
+        )
+        """(k, n, 7): of both ends, and of the terms that bound ‖C F² e^{Fτ}‖, for each axis."""
+        self._sags_s2 = np.diff(starts.flow.edges_s) ** 2 / 8
+
+    def sup(self, limit: float, first: int) -> float:
+        """Bound ‖C z‖ over the cells from the given one on, for this D."""
+        loose = self.loose(limit, _LOGITS)
         if not np.isfinite(loose).all():
             return math.inf
         highest, logits = loose.min(axis=1), _LOGITS[loose.argmin(axis=1)]
         highest[:first] = 0.0
-        found, order = 0.0, np.argsort(highest)[::-1]
-        for cells in np.array_split(order, max(len(order) // _AT_ONCE, 1)):
-            if highest[cells[0]] <= found:
-                break  # the others are below it, too
-            found = max(found, float(bounds.tight(cells.astype(np.int64), logits[cells]).max()))
-        return found * ROUNDING
-
-    @cached_property
-    def _split(self) -> tuple[Vector, Stack]:
-        """The singular values of N Λ⁻¹ at the left nodes, and Λ⁻¹ V."""
-        inverse, n = np.linalg.inv(self.shape), self.flow.n
-        _, singular, Vt = np.linalg.svd(self.flow.states[:-1, n:] @ inverse)
-        return singular, inverse @ Vt.transpose(0, 2, 1)
-
-    @cached_property
-    def ends(self) -> tuple[Stack, Stack]:
-        """e^{Fτ} at both nodes of each cell, on the axes of its ellipsoids."""
-        states, axes = self.flow.states, self._split[1]
-        return states[:-1] @ axes, states[1:] @ axes
-
-    def semi_axes(self, cells: NDArray[np.int64] | slice, logits: Vector) -> Stack:
-        """Return those of the ellipsoids of cells with λ = 1/(1 + e^{−logit}), (…, n)."""
-        share = 1 / (1 + np.exp(-logits))[..., None]
-        others = (self._split[0][cells, None] / self.limit) ** 2 / (1 + np.exp(logits))[..., None]
-        return np.asarray(1 / np.sqrt(share + others))
-
-    @cached_property
-    def terms(self) -> tuple[list[Stack], Vector]:
-        """Taylor's terms of F² e^{Fτ} over each cell, and the growth of the remainder."""
-        F, steps_s = self.flow.generator, np.diff(self.flow.edges_s)
-        terms = [F @ F @ self.ends[0]]
-        for order in range(1, _TAYLOR_TERMS + 1):
-            terms.append(F @ terms[-1] * (steps_s / order)[:, None, None])
-        exponents = max(logarithmic_norm(F), 0.0) * steps_s
-        with np.errstate(over="ignore"):
-            return terms, np.exp(exponents)
-
-    def _afterwards(self, C: Matrix) -> float:
-        """Bound ‖C z‖ after the last node."""
-        found = float(_largest(_gram(C @ self._last)).min()) * ROUNDING
-        return found if math.isfinite(found) else math.inf
-
-    @cached_property
-    def _last(self) -> Stack:
-        """e^{FT'} on ellipsoids that contain z, T' before each time after the last node.
-
-        They follow from ‖x + e_c‖ ≤ h and ‖e_c‖ ≤ D at that time, and ‖e_c‖ ≤ D now.
-        """
-        from scipy.linalg import expm
-
-        flow, n = self.flow, self.flow.n
-        end_s = float(flow.edges_s[-1])
-        ago_s = end_s / 6
-        kernel = response(flow.H, np.asarray(np.linalg.inv(self.shape))).through(np.eye(n))
-        h = kernel.sup(end_s - ago_s)
-        one, none = np.eye(n), np.zeros((n, n))
-        moved = expm(flow.generator * ago_s) @ np.block([[one, -one], [none, one]])
-        rows = [np.hstack([one, none]) / h, np.hstack([none, one]) / self.limit]
-        rows.append(moved[n:] / self.limit)
-        grams = [row.T @ row for row in rows]
-        found = []
-        for first in (0.01, 0.03, 0.1, 0.3):
-            for last in (0.1, 0.3, 0.5, 0.7, 0.9):
-                shares = (first, (1 - first) * (1 - last), (1 - first) * last)
-                values, V = np.linalg.eigh(
-                    sum(s * gram for s, gram in zip(shares, grams, strict=True))
-                )
-                found.append(moved @ V / np.sqrt(values))
-        return np.array(found)
-
-
-class _CellBounds:
-    """Bounds of ‖C z‖ over each cell."""
-
-    def __init__(self, reach: Reach, C: Matrix) -> None:
-        self._reach = reach
-        self._grams = [_gram(C @ ends) for ends in reach.ends]
-        terms, growth = reach.terms
-        rest = np.linalg.norm(C, 2) * growth[:, None]
-        found = [np.einsum("kij,kij->kj", Y, Y) for Y in (C @ term for term in terms[:-1])]
-        found.append(rest**2 * np.einsum("kij,kij->kj", terms[-1], terms[-1]))
-        self._bends = np.array(found)
-        """Squares of the terms that bound ‖C F² e^{Fτ}‖, for each axis, (terms, k, n)."""
-        self._sags_s2 = np.diff(reach.flow.edges_s) ** 2 / 8
-
-    def loose(self, logits: Vector) -> Stack:
-        """Return bounds in the Frobenius norm, for every λ, (k, j)."""
-        squares = self._reach.semi_axes(slice(None), logits) ** 2
-        sizes = [np.sqrt(np.einsum("kii,kji->kj", gram, squares)) for gram in self._grams]
-        bends = np.sqrt(np.einsum("oki,kji->okj", self._bends, squares)).sum(axis=0)
-        return np.asarray(np.maximum(*sizes) + self._sags_s2[:, None] * bends)
-
-    def tight(self, cells: NDArray[np.int64], logits: Vector) -> Vector:
-        """Return bounds for some cells, with better λ near the given ones, (k,)."""
-
-        def bounds(tried: Vector) -> Vector:
-            d = self._reach.semi_axes(cells, tried)
-            sizes = [
-                _largest(gram[cells, None] * d[..., None] * d[..., None, :]) for gram in self._grams
-            ]
-            bends = np.sqrt(np.einsum("oki,kji->okj", self._bends[:, cells], d**2)).sum(axis=0)
-            return np.asarray(np.maximum(*sizes) + self._sags_s2[cells, None] * bends)
-
-        rows, best = np.arange(len(cells)), logits
-        found = np.full(len(cells), np.inf)
-        for width in _WIDTHS:
-            tried = best[:, None] + width * _NEIGHBOURS
-            values = bounds(tried)
+        rounds = np.zeros(len(highest), dtype=np.int64)
+        while True:  # the highest bounds become better, until that of the highest is settled
+            cells = np.argsort(highest)[-_AT_ONCE:]
+            if rounds[cells[-1]] == len(_WIDTHS):
+                return float(highest[cells[-1]]) * ROUNDING
+            cells = cells[rounds[cells] < len(_WIDTHS)]
+            tried = logits[cells, None] + _WIDTHS[rounds[cells], None] * _NEIGHBOURS
+            values = self._tight(limit, cells, tried)
             index = values.argmin(axis=1)
-            best, found = tried[rows, index], np.minimum(found, values[rows, index])
-        return found
+            logits[cells] = tried[np.arange(len(cells)), index]
+            highest[cells] = np.minimum(highest[cells], values.min(axis=1))
+            rounds[cells] += 1
+
+    def loose(self, limit: float, logits: Vector) -> Stack:
+        """Return bounds in the Frobenius norm, for every λ, (k, j)."""
+        sizes = np.sqrt(_semi_axes(self._singular / limit, logits) ** 2 @ self._squares)
+        return np.asarray(
+            sizes[..., :2].max(axis=2) + self._sags_s2[:, None] * sizes[..., 2:].sum(axis=2)
+        )
+
+    def _tight(self, limit: float, cells: NDArray[np.int64], logits: Stack) -> Stack:
+        """Return bounds in the spectral norm for some cells, each with its own λ, (k, j)."""
+        ends, d = self._ends[:, :, cells], _semi_axes(self._singular[cells] / limit, logits)
+        grams = np.einsum("qoki,qokj->koij", ends, ends)[:, None]
+        scaled = grams * d[:, :, None, :, None] * d[:, :, None, None, :]
+        sizes = largest_eigenvalues(scaled.reshape(-1, *scaled.shape[-2:])).clip(min=0.0)
+        bends = np.sqrt(d**2 @ self._squares[cells, :, 2:]).sum(axis=2)
+        ends = np.sqrt(sizes.reshape(scaled.shape[:-2])).max(axis=2)
+        return np.asarray(ends + self._sags_s2[cells, None] * bends)
 
 
-def _gram(values: Stack) -> Stack:
-    return np.asarray(values.transpose(0, 2, 1) @ values)
+def _semi_axes(singular: Vector, logits: Vector) -> Stack:
+    """Return those of the ellipsoids of cells with λ = 1/(1 + e^{−logit}), (k, j, n)."""
+    share = 1 / (1 + np.exp(-logits))[..., None]
+    return np.asarray(1 / np.sqrt(share + (1 - share) * singular[:, None] ** 2))
 
 
-def _largest(grams: Stack) -> Vector:
-    """Return the square roots of the largest eigenvalues, (k,)."""
-    return np.asarray(np.sqrt(np.linalg.eigvalsh(grams)[..., -1].clip(min=0.0)))
+def _columns(stacks: list[Stack]) -> Matrix:
+    """Return stacks of the same shape (k, 2n, n) side by side."""
+    return np.asarray(np.concatenate(stacks).transpose(1, 0, 2).reshape(stacks[0].shape[1], -1))

@@ -26,6 +26,8 @@ from noack.theory.trigger_bounds import TriggerBounds
 
 PlantAt = Callable[[ErrorGains, Matrix, float], PlantGains]
 """Returns the plant's gains from the gains of the models, the start of x, and α."""
+Added = tuple[Constants, Constants | None]
+"""Constants whose bounds are added."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +43,10 @@ class DisturbedCertificate:
 
     def constants(
         self, conditions: NetworkConditions, *, decays: bool, longest: bool = True
-    ) -> tuple[Constants, Constants | None]:
+    ) -> list[Added]:
         """Return the constants that decay and those to be added; without decay only one.
+
+        Where there are several such sums, each bounds the run.
 
         ``decays``: α is below the decay rates of the models and of the plant. ``longest``: search
         for the tightest bounds and the longest δ; otherwise any suffice.
@@ -59,10 +63,10 @@ class DisturbedCertificate:
         structured = self.start_error == 0.0
         if decays and self.resolved.coverage.is_decaying:
             try:
-                return solve_divided(
+                return [solve_divided(
                     self._decaying, self._persistent, conditions, self.start_error,
                     structured=structured, shares=SHARES if longest else (),
-                )  # fmt: skip
+                )]  # fmt: skip
             except NotDecayingError:
                 pass
         level, floor = max(self.trigger.beta, self.trigger.floor), self.trigger.floor
@@ -73,44 +77,40 @@ class DisturbedCertificate:
         )
         # The mean of an integral bounds e_s over a time that suits only one of several parts.
         is_divided = not self.trigger.beta and not self.trigger.area and not self.start_error
+        divided: list[Added] = []
         if decays and is_divided and longest:
-            with contextlib.suppress(VoidError, NotDecayingError):
-                return self._of_constant_threshold(conditions, found.inter_event_s or 0.0)
-        return found, None
+            divided = self._of_constant_threshold(conditions, found.inter_event_s or 0.0)
+        return divided or [(found, None)]
 
-    def _of_constant_threshold(
-        self, conditions: NetworkConditions, apart_s: float
-    ) -> tuple[Constants, Constants | None]:
+    def _of_constant_threshold(self, conditions: NetworkConditions, apart_s: float) -> list[Added]:
         """Return the constants of what the start causes, and of what persists, if anything does.
 
-        The threshold has no rate; that of :func:`soonest` is taken. ``apart_s`` is a lower bound of
-        the inter-event time, certified without dividing the causes.
-
-        Raises:
-            VoidError: the loop gain is not below 1, at any rate.
-            NotDecayingError: a mode of the loop or of the observer does not decay.
+        There is one pair for each bound of e_s that suffices, that with the smallest ultimate bound
+        first. The threshold has no rate; that of :func:`soonest` is taken. ``apart_s`` is a lower
+        bound of the inter-event time, certified without dividing the causes.
         """
-        found: list[tuple[float, TriggerBound, Part]] = []
+        found: list[Added] = []
         for of_start, of_rest in self.trigger.divided(conditions, apart_s):
-            rest = self._persistent._replace(bound=of_rest)
-            with contextlib.suppress(VoidError):
-                found.append((solve_sum([rest], conditions)[0].state, of_start, rest))
-        if not found:
-            raise VoidError("no bound of e_s alone has a certificate")
-        _, of_start, rest = min(found, key=lambda one: one[0])
+            with contextlib.suppress(VoidError, NotDecayingError):
+                found.append(self._divided(of_start, of_rest, conditions))
+        return sorted(found, key=lambda one: 0.0 if one[1] is None else one[1].state)
 
-        if not rest.bound.beta and rest.plant.forcing is None and not rest.estimation.fixed:
-            return soonest(
-                lambda rate_per_s: solve_sum([self._at_rate(rate_per_s, of_start)], conditions),
-                self.slowest_per_s, loop_of(self.resolved).x0,
-            )[0], None  # fmt: skip
+    def _divided(
+        self, of_start: TriggerBound, of_rest: TriggerBound, conditions: NetworkConditions
+    ) -> Added:
+        """Return the constants that one bound of e_s gives.
 
-        def solved(rate_per_s: float) -> tuple[Constants, Constants]:
-            start = self._at_rate(rate_per_s, of_start)
-            first, second = solve_sum([start, rest], conditions)
-            return first, second
+        Raises: as :func:`soonest`.
+        """
+        rest = self._persistent._replace(bound=of_rest)
+        persists = of_rest.beta or rest.plant.forcing is not None or rest.estimation.fixed
+        others = [rest] if persists else []
 
-        return soonest(solved, self.slowest_per_s, loop_of(self.resolved).x0)
+        def solved(rate_per_s: float) -> list[Constants]:
+            return solve_sum([self._at_rate(rate_per_s, of_start), *others], conditions)
+
+        first, *added = soonest(solved, self.slowest_per_s, loop_of(self.resolved).x0)
+        return first, added[0] if added else None
 
     @cached_property
     def _decaying(self) -> Part:

@@ -114,6 +114,8 @@ class KnownStateBounds:
     delay_s: float
     disturbances: Matrix
     """Columns D_i of disturbances, with the largest value of each, (n, k)."""
+    other: "KnownStateBounds | None" = None
+    """Those of a second certificate, which hold, too."""
 
     def state_deviation(self, t_s: Vector, age_s: Vector, missing: Counts) -> Vector:
         """Bound ‖x(t) − e^{M(t−t_k)} x(t_k)‖ at times t, (k,).
@@ -126,11 +128,17 @@ class KnownStateBounds:
         each = [
             part.level(t_s) * part.deviation(age_s, missing, self.delay_s) for part in self.parts
         ]
-        return np.asarray(sum(each) + self._disturbed(age_s))
+        found = np.asarray(sum(each) + self._disturbed(age_s))
+        if self.other is None:
+            return found
+        return np.asarray(np.minimum(found, self.other.state_deviation(t_s, age_s, missing)))
 
     def controller_error(self, t_s: Vector, missing: Counts) -> Vector:
         """Bound ‖e_c‖_W at times t, (k,), given the numbers of missing events."""
-        return np.asarray(sum(p.level(t_s) * p.controller_error(missing) for p in self.parts))
+        found = np.asarray(sum(p.level(t_s) * p.controller_error(missing) for p in self.parts))
+        if self.other is None:
+            return found
+        return np.asarray(np.minimum(found, self.other.controller_error(t_s, missing)))
 
     def _disturbed(self, age_s: Vector) -> Vector:
         if not self.disturbances.size:
@@ -183,4 +191,7 @@ def known_state_bounds(
     parts += [] if rest is None else [part(rest, 1.0)]
     forcing = forcing_of(resolved, loop.B)
     pushes = np.zeros((loop.n, 0)) if forcing is None else forcing.limited
-    return KnownStateBounds(tuple(parts), certificate.conditions.delay_s, pushes)
+    return KnownStateBounds(
+        tuple(parts), certificate.conditions.delay_s, pushes,
+        None if certificate.other is None else known_state_bounds(resolved, certificate.other),
+    )  # fmt: skip

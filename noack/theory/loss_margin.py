@@ -15,7 +15,7 @@ from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.impairments.kinds.delay import Delay
-from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
+from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, outcome_letters
 from noack.impairments.loss_process import LossProcess
 from noack.impairments.markov_chain import NotPredictableError
 from noack.theory.delivery_graph import EVERY_STEP, Burst, EventTimes, bursts_of
@@ -71,13 +71,13 @@ class Stability(NamedTuple):
 
         If they differ, the times to the next update stand between.
         """
-        letters = ["D" if delivered else "L" for delivered in self.pattern]
-        if not self.is_periodic:
-            letters = [
-                f"{letter} ({interval_s:g} s)"
-                for letter, interval_s in zip(letters, self.intervals_s, strict=True)
-            ]
-        return " ".join(letters)
+        letters = outcome_letters(self.pattern)
+        if self.is_periodic:
+            return letters
+        return " ".join(
+            f"{letter} ({interval_s:g} s)"
+            for letter, interval_s in zip(letters, self.intervals_s, strict=True)
+        )
 
 
 def capped(guarantee: LossGuarantee, losses: int) -> LossGuarantee:
@@ -207,7 +207,7 @@ def require_covered(resolved: Scenario) -> None:
     """Raise CallerError unless the loop is linear, transmits in time, and the watchdog is idle."""
     resolved.coverage.require_direct_inputs()
     resolved.coverage.require_exact()
-    resolved.coverage.require_unchanging()
+    resolved.coverage.require_constant()
     timing = resolved.timing
     if timing.plant_period_ns + timing.controller_period_ns > timing.actuation_timeout_ns:
         raise CallerError(

@@ -2,7 +2,7 @@
 
 import contextlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -60,6 +60,8 @@ class ScenarioCertificate:
     persistent_constants: Constants | None = None
     """The constants, in units of 1 and without decay, whose bounds are added to those of
     ``constants`` under disturbances, noise, an observer or a constant threshold."""
+    other: "ScenarioCertificate | None" = None
+    """A second certificate of the same plants under the same conditions: both bounds hold."""
 
     @property
     def source(self) -> str:
@@ -119,6 +121,7 @@ class ScenarioCertificate:
             "constants": None if constants is None else constants._asdict(),
             "floor_constants": None if late is None else late._asdict(),
             "persistent_constants": None if rest is None else rest._asdict(),
+            "other": None if self.other is None else self.other.to_json(),
             "inter_event_s": self.inter_event_s,
             "floor_from_s": None if self.floor == 0 else self.floor_from_s,
         }
@@ -133,6 +136,8 @@ class ScenarioCertificate:
             bound = np.where(t_s < self.floor_from_s, bound, late)
         if self.persistent_constants is not None:
             bound = bound + scale(self.persistent_constants, 1.0)
+        if self.other is not None:
+            bound = np.minimum(bound, self.other._envelope(t_s, scale))
         return np.asarray(bound)
 
 
@@ -216,6 +221,10 @@ def _halfwidth(rows: Rows | None, matrix: Matrix) -> Matrix:
     return np.zeros_like(matrix) if rows is None else np.array(rows)
 
 
+Phases = tuple[Constants, Constants | None, Constants | None]
+"""The constants, those from the floor on, and those under persistent causes."""
+
+
 class CertificateScope:
     """Plants for which certificates are computed; values without conditions are computed once.
 
@@ -253,15 +262,24 @@ class CertificateScope:
     def certificate(self, conditions: NetworkConditions) -> ScenarioCertificate:
         """Return the certificate under some conditions; a void certificate has the reason."""
         trigger, void = self._trigger, None
-        first, late, rest = None, None, None
+        phases: Sequence[tuple[Constants | None, ...]] = [(None, None, None)]
         try:
-            first, late, rest = self._constants(conditions)
+            phases = self._constants(conditions)
         except (NotDecayingError, VoidError) as error:
             void = str(error)
-        found = ScenarioCertificate(
-            self.name, trigger.beta, trigger.alpha_per_s, trigger.floor,
-            self._loop.weight is not None, conditions, (), first, late, void, rest,
-        )  # fmt: skip
+
+        def certificate(
+            phase: tuple[Constants | None, ...], *others: tuple[Constants | None, ...]
+        ) -> ScenarioCertificate:
+            first, late, rest = phase
+            return ScenarioCertificate(
+                self.name, trigger.beta, trigger.alpha_per_s, trigger.floor,
+                self._loop.weight is not None, conditions, (), first, late, void, rest,
+                certificate(*others) if others else None,
+            )  # fmt: skip
+
+        found = certificate(*phases)
+        first, rest = found.constants, found.persistent_constants
         kept = None
         if not self._resolved.network.enforce_mansd:
             kept = kept_probability(self._resolved, conditions.guarantee, found.inter_event_s)
@@ -281,12 +299,10 @@ class CertificateScope:
             return max(error.loop_gain, 1.0)
         except NotDecayingError:
             return math.inf
-        return max(one.loop_gain for one in constants if one is not None)
+        return max(one.loop_gain for one in constants[0] if one is not None)
 
-    def _constants(
-        self, conditions: NetworkConditions, *, longest: bool = True
-    ) -> tuple[Constants, Constants | None, Constants | None]:
-        """Return the constants, those from the floor on, and those under persistent causes.
+    def _constants(self, conditions: NetworkConditions, *, longest: bool = True) -> list[Phases]:
+        """Return the constants of each bound of the run; all of them hold.
 
         ``longest``: search for the tightest bounds and the longest δ; otherwise any suffice.
 
@@ -297,9 +313,9 @@ class CertificateScope:
         try:
             with np.errstate(all="ignore"):
                 if self._resolved.coverage.is_undisturbed and not self._trigger.is_constant:
-                    return *self._phases(conditions, longest=longest), None
-                first, rest = self._disturbed_phases(conditions, longest=longest)
-                return first, None, rest
+                    return [(*self._phases(conditions, longest=longest), None)]
+                found = self._disturbed_phases(conditions, longest=longest)
+                return [(first, None, rest) for first, rest in found]
         except (OverflowError, np.linalg.LinAlgError):
             raise VoidError(_TOO_LARGE) from None
 
@@ -316,12 +332,12 @@ class CertificateScope:
 
     def _disturbed_phases(
         self, conditions: NetworkConditions, *, longest: bool
-    ) -> tuple[Constants, Constants | None]:
+    ) -> list[tuple[Constants, Constants | None]]:
         """Return the constants, and those that are added to them under persistent causes."""
         alpha = self._trigger.alpha_per_s
         decays = not self._held and below(alpha, min(self._decay.values()))
         found = self._disturbed.constants(conditions, decays=decays, longest=longest)
-        return self._checked(*found)
+        return [self._checked(*one) for one in found]
 
     @cached_property
     def _disturbed(self) -> DisturbedCertificate:

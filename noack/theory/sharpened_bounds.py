@@ -11,27 +11,31 @@ and D is smaller with this longer time. Every step uses bounds that hold already
 is checked with all enclosures.
 """
 
+import contextlib
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
+from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
-from noack.theory.delivery_flow import ROUNDING, DeliveryFlow, Reach
-from noack.theory.error_growth import COARSE_CELLS
+from noack.theory.contraction import Stack
+from noack.theory.delivery_flow import ROUNDING, DeliveryFlow, Reach, Starts
 from noack.theory.gains import PlantGains
 
-_MARGINS = (1.0, 1.02, 1.05, 1.08, 1.12, 1.2, 1.35)
+_MARGINS = (1.0, 1.01, 1.02, 1.05, 1.08, 1.12, 1.2, 1.35)
 """Factors of the ellipsoid's computed size that are tried."""
 _STARTS = [(-1.5, -2.0, -7.0), (0.0, -7.0, -7.0), (-1.5, 0.0, -1.0), (-1.5, -7.0, -1.0)]
 """Parameters of the ellipsoid that are tried first."""
-_REACH, _EVALUATIONS = 1.5, 50
-_COARSE, _FINE = np.exp(np.arange(-10.0, 17.0, 2.0)), np.exp(np.linspace(-1.5, 1.5, 9))
+_DIRECTIONS = np.vstack([np.eye(3), -np.eye(3)])
+_WIDTHS = (1.5, 1.5, 1.5, 0.8, 0.8, 0.4, 0.4, 0.2)
+"""Changes of one parameter in each round of the search."""
+_COARSE, _FINE = np.exp(np.arange(-9.0, 13.0, 3.0)), np.exp(np.linspace(-2.0, 2.0, 9))
 """Multipliers μ: all of them, and around the best one."""
-_NODES, _CRITICAL = 32, 6
-_SETTLED = 0.01
+_NODES, _CRITICAL = 16, 4
+_SETTLED, _MOST_STEPS = 0.005, 16
 _ILL_CONDITIONED = 1e8
 _LEAST_SHARE = 1e-6
 
@@ -68,7 +72,7 @@ class InvariantEllipsoids:
         reach = self.within(limit)
         if reach is None:
             return known
-        flow, inverse = self.flow, np.linalg.inv(reach.shape)
+        flow, inverse = self.flow, reach.size * reach.starts.inverse
         gain = self.plant.error.split_K[1] @ flow.inverse
 
         def of_state(C: Matrix) -> float:
@@ -83,16 +87,19 @@ class InvariantEllipsoids:
         )
         if level is None or known.inter_event_s is None:
             return found
-        at_events = Reach(flow, reach.shape, max(min(lost, limit), _LEAST_SHARE * limit))
-        return found._replace(inter_event_s=self._next_event_s(at_events, found, level))
+        at_events = replace(reach, limit=max(min(lost, limit), _LEAST_SHARE * limit))
+        next_s = _next_event_s(reach, at_events, level, known.inter_event_s)
+        return found._replace(inter_event_s=next_s)
 
     def within(self, limit: float) -> Reach | None:
         """Return the flow from an ellipsoid for these bounds; None if none is found."""
-        size = self._size(self._chosen, limit)
-        if not math.isfinite(size) or np.linalg.cond(self._chosen) > _ILL_CONDITIONED:
+        starts = self._starts
+        if starts is None or np.linalg.cond(starts.shape) > _ILL_CONDITIONED:
             return None
-        shape = self._chosen / size
-        reaches = (Reach(self.flow, shape / margin, limit) for margin in _MARGINS)
+        (size,) = self._sizes(starts.inverse[None], limit)
+        if not math.isfinite(size):
+            return None
+        reaches = (Reach(starts, size * margin, limit) for margin in _MARGINS)
         return next((one for one in reaches if one.is_invariant()), None)
 
     @cached_property
@@ -101,105 +108,134 @@ class InvariantEllipsoids:
         return DeliveryFlow(self.plant)
 
     @cached_property
-    def _chosen(self) -> Matrix:
-        """Λ for a small bound of ‖x‖."""
-        from scipy.optimize import minimize
+    def _starts(self) -> Starts | None:
+        """Λ for a small bound of ‖x‖: a pattern search over its three parameters."""
+        with np.errstate(all="ignore"):
+            tried = np.array(_STARTS)
+            merits = self._merits(tried)
+            best, merit = tried[merits.argmin()], merits.min()
+            for width in _WIDTHS:
+                tried = best + width * _DIRECTIONS
+                merits = self._merits(tried)
+                if merits.min() < merit:
+                    best, merit = tried[merits.argmin()], merits.min()
+            (factor,) = self._factors(best[None])
+        return Starts(self.flow, np.linalg.inv(factor)) if math.isfinite(merit) else None
 
-        def merit(parameters: Vector) -> float:
-            try:
-                shape = self._shape(parameters)
-                state = float(np.linalg.norm(self.flow.inverse @ np.linalg.inv(shape), 2))
-                return state * self._size(shape, self.largest)
-            except np.linalg.LinAlgError:
-                return math.inf
+    def _merits(self, parameters: Matrix) -> Vector:
+        """Return the bounds of ‖x‖ that some parameters give, (c,)."""
+        factors = self._factors(parameters)
+        usable = np.isfinite(factors).all(axis=(1, 2))
+        found = np.full(len(parameters), np.inf)
+        if usable.any():
+            factors = factors[usable]
+            sizes = self._sizes(factors, self.largest)
+            found[usable] = sizes * np.linalg.norm(self.flow.inverse @ factors, 2, axis=(1, 2))
+        return found
 
-        first = min(_STARTS, key=lambda start: merit(np.array(start)))
-        simplex = np.vstack([first, np.array(first) + _REACH * np.eye(len(first))])
-        found = minimize(
-            merit, simplex[0], method="Nelder-Mead",
-            options={"maxfev": _EVALUATIONS, "initial_simplex": simplex},
-        )  # fmt: skip
-        return self._shape(np.asarray(found.x))
+    def _factors(self, parameters: Matrix) -> Stack:
+        """Return Λ⁻¹ with Λ⁻¹Λ⁻ᵀ = X, (M + νI)X + X(M + νI)ᵀ = −Q, (c, n, n); not finite if none.
 
-    def _shape(self, parameters: Vector) -> Matrix:
-        """Return Λ with (ΛᵀΛ)⁻¹ = X, (M + νI)X + X(M + νI)ᵀ = −Q; its scale is arbitrary.
-
-        M = A + BK, and Q is BK Kᵀ Bᵀ with shares of the identity and of x(0) x(0)ᵀ.
+        M = A + BK, and Q is BK Kᵀ Bᵀ with shares of the identity and of x(0) x(0)ᵀ. Its scale is
+        arbitrary.
         """
+        found = np.full((len(parameters), self.flow.n, self.flow.n), np.nan)
+        for index, (logit, all_x, x0) in enumerate(parameters.clip(-15.0, 15.0)):
+            by_input, by_all, by_start = self._grown(float(logit))
+            X = by_input + math.exp(all_x) * by_all + math.exp(x0) * by_start
+            with contextlib.suppress(np.linalg.LinAlgError):
+                found[index] = np.linalg.cholesky(X)
+        return found
+
+    @cached_method
+    def _grown(self, logit: float) -> list[Matrix]:
+        """Return X for each of the three parts of Q, for ν that follows from ``logit``."""
         from scipy.linalg import solve_continuous_lyapunov
 
         flow, n = self.flow, self.flow.n
-        logit, all_x, x0 = parameters.clip(-15.0, 15.0)
         share = 0.1 + 0.85 / (1 + math.exp(-logit))
         rate = share * -spectral_abscissa(flow.closed_loop)
-        Q = math.exp(all_x) / n * np.eye(n)
-        for weight, column in ((1.0, flow.BK), (math.exp(x0), flow.start)):
-            Q += weight * column @ column.T / max(float((column**2).sum()), 1e-300)
-        if not np.isfinite(Q).all():
-            raise np.linalg.LinAlgError("the squares of the entries overflow")
-        X = solve_continuous_lyapunov(flow.closed_loop + rate * np.eye(n), -Q)
-        return np.asarray(np.linalg.inv(np.linalg.cholesky(0.5 * (X + X.T))))
+        moved = flow.closed_loop + rate * np.eye(n)
+        found = []
+        for columns in (flow.BK, np.eye(n), flow.start):
+            Q = columns @ columns.T / max(float((columns**2).sum()), 1e-300)
+            if not np.isfinite(Q).all():
+                raise np.linalg.LinAlgError("the squares of the entries overflow")
+            X = solve_continuous_lyapunov(moved, -Q)
+            found.append(np.asarray(0.5 * (X + X.T)))
+        return found
 
-    def _size(self, shape: Matrix, limit: float) -> float:
-        """Return about the smallest c for which ‖Λx‖ ≤ c is invariant and contains x(0).
+    @cached_property
+    def _nodes(self) -> Stack:
+        """The flow at some nodes."""
+        edges_s, states = self.flow.edges_s, self.flow.states
+        count = len(edges_s) - 1
+        late = edges_s.searchsorted(np.geomspace(float(edges_s[1]), float(edges_s[-1]), _NODES))
+        even = np.linspace(1, count, _NODES).astype(int)
+        return np.asarray(states[np.unique([*late.clip(1, count), *even])])
+
+    def _sizes(self, factors: Stack, limit: float) -> Vector:
+        """Return about the smallest c for which ‖Λx‖ ≤ c is invariant and contains x(0), (c,).
 
         At a node it does not exceed c if c² ≥ μ/(1 − λ) for some μ, λ the largest eigenvalue of
         ‖ΛΦξ‖² − μ‖Nξ‖²/D² on ‖Λξ‖ = 1, (Φ, N) ξ = e^{Fτ} (ξ, 0).
         """
-        flow, n, inverse = self.flow, self.flow.n, np.linalg.inv(shape)
-        count = len(flow.edges_s) - 1
-        times_s = np.geomspace(float(flow.edges_s[1]), float(flow.edges_s[-1]), _NODES)
-        late = flow.edges_s.searchsorted(times_s)
-        even = np.linspace(1, count, _NODES // 2).astype(int)
-        nodes = flow.states[np.unique([*late.clip(1, count), *even])]
-        grams = [
-            Y.transpose(0, 2, 1) @ Y
-            for Y in (shape @ nodes[:, :n] @ inverse, nodes[:, n:] @ inverse / limit)
-        ]
-        grows = np.linalg.eigvalsh(grams[0])[:, -1] >= 1
-        sizes = np.zeros(1)
-        if grows.any():
-            image, error = (gram[grows] for gram in grams)
-            sizes, best = _sizes(image, error, np.tile(_COARSE, (len(image), 1)))
-            last = np.argsort(sizes)[-_CRITICAL:]
-            sizes, _ = _sizes(image[last], error[last], best[last, None] * _FINE)
-        start = float(np.linalg.norm(shape @ flow.start, 2)) * ROUNDING
-        return max(math.sqrt(sizes.max()), start)
-
-    def _next_event_s(self, reach: Reach, known: SharpenedBounds, level: float) -> float:
-        """Return a time before which ‖e_s‖_W cannot reach ``level`` after an event.
-
-        It is at least the known one. From each time at which the flow bounds ‖e_s‖_W, it grows as
-        between two tests.
-        """
-        plant, found_s = self.plant, known.inter_event_s or 0.0
-        speed = known.mismatch + known.input_error * float(
-            np.linalg.norm(plant.error.weight @ plant.input_matrix, 2)
+        n, shapes = self.flow.n, np.linalg.inv(factors)
+        image, error = (
+            np.asarray(Y.swapaxes(-1, -2) @ Y)
+            for Y in (
+                shapes[:, None] @ self._nodes[:, :n] @ factors[:, None],
+                self._nodes[:, n:] @ factors[:, None] / limit,
+            )
         )
-        if not speed > 0 or not math.isfinite(found_s):
+        found = np.linalg.norm(shapes @ self.flow.start, 2, axis=(1, 2)) ** 2 * ROUNDING
+        which, nodes = np.nonzero(np.linalg.eigvalsh(image)[..., -1] >= 1)
+        if len(which):
+            image, error = image[which, nodes], error[which, nodes]
+            squares, best = _squares(image, error, np.tile(_COARSE, (len(which), 1)))
+            order = np.lexsort((-squares, which))  # the largest of each candidate first
+            rank = np.arange(len(which)) - np.searchsorted(which[order], which[order])
+            last = order[rank < _CRITICAL]
+            squares, _ = _squares(image[last], error[last], best[last, None] * _FINE)
+            np.maximum.at(found, which[last], squares)
+        return np.asarray(np.sqrt(found))
+
+
+def _next_event_s(reach: Reach, at_events: Reach, level: float, known_s: float) -> float:
+    """Return a time before which ‖e_s‖_W cannot reach ``level`` after an event.
+
+    It is at least the known one. Over a step s, e_s differs from its chord by at most s²/8 times a
+    bound of its second derivative, which holds as long as ‖e_s‖_W is below the level.
+    """
+    flow, found_s = reach.starts.flow, known_s
+    n, F, H = flow.n, flow.generator, flow.H
+    bend = reach.sup((F @ F)[n:] - np.hstack([np.zeros((n, n)), H @ H]))
+    bend += float(np.linalg.norm(H @ H, 2)) * level
+    if not (0 < known_s < math.inf and 0 < bend < math.inf):
+        return known_s
+    size, tries = at_events.sup(_error_after(flow, found_s)), 0
+    slope = size / found_s
+    while size < level:
+        step_s = min(math.sqrt(4 * (level - size) / bend), found_s)
+        if slope * step_s > 0.99 * (level - size):
+            step_s = 0.99 * (level - size) / slope
+        while tries < _MOST_STEPS and step_s > _SETTLED * found_s:
+            later, tries = at_events.sup(_error_after(flow, found_s + step_s)), tries + 1
+            if max(size, later) + step_s**2 / 8 * bend < level:
+                break
+            step_s *= 0.6
+        else:
             return found_s
-        while True:
-            size = reach.sup(_error_after(reach.flow, found_s))
-            step_s = (level - size) / speed
-            while step_s > _SETTLED * found_s:
-                growth = plant.growth(step_s, COARSE_CELLS)
-                grown = plant.error.stretch(step_s) * size
-                grown += growth.mismatch.integral_on_grid() * known.mismatch
-                grown += growth.input_error.integral_on_grid() * known.input_error
-                if grown < level:
-                    break
-                step_s *= 0.8
-            else:
-                return found_s
-            found_s += step_s
+        slope = (later - size) / step_s
+        found_s, size = found_s + step_s, later
+    return found_s
 
 
-def _sizes(image: Matrix, error: Matrix, multipliers: Matrix) -> tuple[Vector, Vector]:
+def _squares(image: Stack, error: Stack, multipliers: Matrix) -> tuple[Vector, Vector]:
     """Return the smallest c² over the multipliers, (k, j), and its multiplier, for k nodes."""
     forms = image[:, None] - multipliers[..., None, None] * error[:, None]
     left = np.linalg.eigvalsh(forms)[..., -1]
-    with np.errstate(divide="ignore"):
-        found = np.where(left < 1, multipliers / (1 - left.clip(min=0.0)), np.inf)
+    found = np.where(left < 1, multipliers / (1 - left.clip(min=0.0)), np.inf)
     best = found.argmin(axis=1)
     rows = np.arange(len(found))
     return found[rows, best], multipliers[rows, best]

@@ -4,6 +4,7 @@ from pathlib import Path
 
 from noack.core.errors import CallerError, shortened
 
+_FOLDER = Path(__file__).parent / "shipped"
 _LONGEST = 100
 
 
@@ -21,17 +22,10 @@ def find_trace(name: str, folder: Path = Path(), named: str = "") -> Path:
     path = folder / name
     if len(Path(name).parts) != 1 or Path(name).suffix or len(name) > _LONGEST or path.exists():
         return path
-    shipped = {one.stem: one for one in _folder().glob("*/*.csv")}
+    shipped = {one.stem: one for one in _FOLDER.glob("*/*.csv")}
     if name in shipped:
         return shipped[name]
     raise CallerError(
         f"{named or shortened(name)}: no such file, nor a shipped trace; "
         f"there are {', '.join(sorted(shipped))}"
     )
-
-
-def _folder() -> Path:
-    """Return their folder: in the installed package, or in the repository."""
-    root = Path(__file__).parents[2]
-    installed = root / "cosim" / "scenarios" / "traces"
-    return installed if installed.is_dir() else root / "scenarios" / "traces"

@@ -14,6 +14,7 @@ from cosim.analysis.adversary.pattern_evaluation import Valued
 from cosim.analysis.adversary.search_nodes import Pattern
 from noack.config.scenario import Scenario
 from noack.core.number_format import number
+from noack.impairments.loss_guarantee import outcome_letters
 from noack.theory.certificate import Constants
 from noack.theory.scenario_certificates import ScenarioCertificate
 
@@ -74,8 +75,8 @@ class Worst:
 
     @property
     def text(self) -> str:
-        """The pattern, one letter per event: ``D`` delivered, ``·`` lost."""
-        return "".join("D" if delivered else "·" for delivered in self.pattern)
+        """The pattern, one letter per event: ``D`` delivered, ``L`` lost."""
+        return outcome_letters(self.pattern)
 
     def to_json(self) -> dict[str, Any]:
         """Return all fields for JSON; an infinite value becomes null."""
@@ -174,7 +175,7 @@ def print_worst(
         console.print(f"[dim]Nothing is certified: {certificate.void}[/]")
     elif trigger == "sampled":
         console.print("[dim]certified: for the scenario's schedule, without lateness[/]")
-    console.print("[dim]One letter per event: D delivered, · lost. --json prints their times[/]")
+    console.print("[dim]One letter per event: D delivered, L lost. --json prints their times[/]")
 
 
 def _quantity(objective: Objective, certificate: ScenarioCertificate, trigger: str) -> str:
@@ -209,4 +210,5 @@ def _sampled_quantity(objective: Objective, certificate: ScenarioCertificate) ->
 
 def _is_shaped(certificate: ScenarioCertificate) -> bool:
     """Return whether the bounds are not c e^{−rt}."""
-    return certificate.persistent_constants is not None or certificate.floor_constants is not None
+    parts = (certificate.persistent_constants, certificate.floor_constants, certificate.other)
+    return any(part is not None for part in parts)

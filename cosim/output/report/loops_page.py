@@ -8,6 +8,7 @@ from urllib.parse import quote
 import numpy as np
 
 from cosim.analysis.loops_over_time import LoopsOverTime, loops_over_time, worst_loop
+from cosim.output.loops_tables import CAPTION, HEADINGS, badness, loop_row, network_rows
 from cosim.output.report.loops_figures import (
     NAMED,
     QueueLength,
@@ -17,7 +18,6 @@ from cosim.output.report.loops_figures import (
 )
 from cosim.output.report.report_page import environment_rows, templates
 from cosim.output.report.run_figures import Envelope, RunFigure, pictures
-from cosim.output.shared_tables import CAPTION, HEADINGS, badness, loop_row, network_rows
 from cosim.record.run_directory import (
     ENVIRONMENT_FILE,
     LOOPS,

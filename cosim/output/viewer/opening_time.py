@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from cosim.analysis.loops_over_time import worst_loop
-from cosim.analysis.shared_summary import is_shared
+from cosim.analysis.loops_summary import has_loops
 from cosim.output.viewer.pictures.picture import TIMELINE
 from cosim.output.viewer.rerun_program import logged_port
 from cosim.record.run_directory import LOOPS, SUMMARY_FILE
@@ -43,7 +43,7 @@ def opening_time_ns(recording: Path) -> int | None:
     run_dir, begin_s = recording.parent, 0.0
     try:
         summary = _summary(run_dir)
-        if is_shared(summary):
+        if has_loops(summary):
             worst = summary["loops"][worst_loop(run_dir, summary["loops"]).number]
             summary, begin_s = _summary(run_dir / LOOPS / worst["name"]), worst["phase_s"]
         at_s: float = summary["sup_e_c_at_s"]

@@ -113,7 +113,10 @@ class ContinuousLoop:
             CallerError: the policy is another one.
         """
         if not isinstance(self.trigger, DecayingTrigger):
-            raise CallerError('trigger.policy: needs the paper\'s trigger, "decaying"')
+            raise CallerError(
+                "trigger.policy: with a continuous trigger (--trigger continuous) only "
+                '"decaying" is searched'
+            )
         return self.trigger
 
     def threshold(self, t_s: float) -> float:
@@ -339,6 +342,9 @@ def continuous_loop_of(resolved: Scenario) -> ContinuousLoop:
     Raises:
         CallerError: exact simulation does not support the scenario.
     """
-    resolved.coverage.require_unchanging()
-    resolved.coverage.require_exact()
+    try:
+        resolved.coverage.require_unchanging()
+        resolved.coverage.require_exact()
+    except CallerError as error:
+        raise CallerError(f"with a continuous trigger (--trigger continuous): {error}") from None
     return ContinuousLoop(loop_of(resolved), policy_of(resolved))

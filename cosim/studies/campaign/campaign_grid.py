@@ -16,10 +16,10 @@ from cosim.simulation.batch.batch_interface import ROW, Setting, run_batch, sett
 from cosim.simulation.continuous.network_fates import timeless
 from cosim.studies.campaign.campaign_file import Campaign, Value
 from cosim.studies.campaign.campaign_workers import Work
+from cosim.studies.campaign.loops_draws import LOOPS_ROW, LoopsWork
 from cosim.studies.campaign.metrics import certified_error
 from cosim.studies.campaign.random_draws import Box, box_of
 from cosim.studies.campaign.sampled_draws import SampledWork, in_virtual_time
-from cosim.studies.campaign.shared_draws import SHARED_ROW, SharedWork
 from noack.config import toml_file
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
@@ -122,7 +122,7 @@ def grid(campaign: Campaign, path: Path) -> list[Point]:
 def row_type(points: Sequence[Point]) -> np.dtype[np.void]:
     """Return the type of the rows of runs."""
     shared = any(point.scenario.loops is not None for point in points)
-    return SHARED_ROW if shared else ROW
+    return LOOPS_ROW if shared else ROW
 
 
 def _put_loops(content: dict[str, Any], count: Any, source: str) -> None:
@@ -171,7 +171,7 @@ def _work(campaign: Campaign, scenario: Scenario) -> tuple[Work, float | None]:
             raise CallerError('loops: a network that several loops share needs time = "sampled"')
         judges = "loops_claims_held" in campaign.measured_metrics
         measured |= {"judges": judges, "count_from_s": metrics.count_from_s}
-        work = SharedWork(in_virtual_time(scenario), campaign.seed, **measured)
+        work = LoopsWork(in_virtual_time(scenario), campaign.seed, **measured)
         return work, None
     resolved = resolve(scenario)
     if campaign.time == "sampled":

@@ -18,9 +18,9 @@ from cosim.record.run_record import RunRecord, load_record
 from cosim.record.shared_run import loop_directories
 from cosim.studies.campaign.campaign_summary import GridPointResult
 from cosim.studies.campaign.draw_statistics import Estimate
+from cosim.studies.campaign.loops_draws import LOOPS_ROW, LoopsWork
 from cosim.studies.campaign.metrics import Metric, measured
 from cosim.studies.campaign.random_draws import seeds_of
-from cosim.studies.campaign.shared_draws import SHARED_ROW, SharedWork
 from cosim.studies.capacity.capacity_criteria import LIMITS
 from cosim.studies.capacity.capacity_plan import DISTURBANCE, LOOPS, OWN, POLICY, CapacityPlan
 from noack.core.errors import CallerError
@@ -83,14 +83,14 @@ def live_point(
 
 def _live_point(found: GridPointResult, folder: Path) -> LivePoint:
     point, work = found.point, found.point.work
-    assert isinstance(work, SharedWork)
+    assert isinstance(work, LoopsWork)
     name = f"{point.labels[POLICY]}-{point.labels[LOOPS]}"
     scenario = point.scenario.model_copy(update={"seeds": seeds_of(work.seed, 0), "name": name})
     outcome = finalize(launch(scenario, folder), report=False)
     records = _records(outcome.run_dir, scenario)
-    rows = np.zeros(1, SHARED_ROW)
+    rows = np.zeros(1, LOOPS_ROW)
     work.measure_loops(records, rows[0])
-    columns = {column: rows[column] for column in SHARED_ROW.names or ()}
+    columns = {column: rows[column] for column in LOOPS_ROW.names or ()}
     values = {key: float(value[0]) for key, value in measured(columns, None).items()}
     judged: list[Metric] = ["transmissions", *LIMITS.values()]
     return LivePoint(

@@ -6,7 +6,6 @@ import numpy as np
 
 from noack.config.fleet_layout import (
     FLEET,
-    LOOP,
     NEVER_NS,
     SCRATCH,
     STRIDE,
@@ -36,8 +35,8 @@ def driver_memory(
     fleet, driver = np.zeros(1, FLEET), np.zeros(1, DRIVER)
     fleet["n"], fleet["m"] = dimensions
     fleet["loops"] = count
-    loops = np.zeros(count, LOOP)
-    loops["phase_ns"], loops["due_ns"], loops["newest"] = phases_ns, parts.due_ns, -1
+    loops = parts.loops
+    loops["phase_ns"] = phases_ns
     due = sorted(
         (int(one["due_ns"] + one["phase_ns"]), number)
         for number, one in enumerate(loops)

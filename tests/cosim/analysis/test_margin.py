@@ -131,3 +131,11 @@ def test_the_played_settings_are_the_pattern() -> None:
     pattern = found.found.pattern
     expected = [pattern[i % len(pattern)] for i in range(len(received))]
     assert received[:-1] == expected[:-1]
+
+
+def test_growth_does_not_depend_on_the_set_point() -> None:
+    at_0, at_2 = (
+        noack.margin(held_integrator(**{"controller.setpoint": point}), most_m=2, period=False)
+        for point in ([0.0, 0.0], [2.0, 0.0])
+    )
+    assert at_0.caps == at_2.caps

@@ -16,7 +16,7 @@ from cosim.analysis.loops_over_time import (
     quantiles,
     worst_loop,
 )
-from cosim.analysis.shared_summary import in_flight, is_complete
+from cosim.analysis.loops_summary import in_flight, is_complete
 from cosim.cli import app
 from cosim.output.report.loops_figures import error_map, norms_figure
 from cosim.output.viewer.opening_time import opening_time_ns

@@ -14,7 +14,7 @@ from noack.traces.packet_trace import packet_trace
 from noack.traces.trace_formats import read_trace
 
 MS = 1_000_000
-TRACES = Path(__file__).parents[3] / "scenarios" / "traces" / "cicv5g"
+TRACES = Path(__file__).parents[3] / "noack/traces/shipped/cicv5g"
 
 
 def lane(**network: object) -> Scenario:

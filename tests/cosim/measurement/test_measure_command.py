@@ -23,7 +23,7 @@ from noack.traces.packet_trace import packet_trace
 from noack.traces.trace_formats import read_trace
 from tests.cosim.measurement.chains import chain_losses, trace_of
 
-RURAL = Path(__file__).parents[3] / "scenarios" / "traces" / "cicv5g" / "rural_n8_10kmh.csv"
+RURAL = Path(__file__).parents[3] / "noack/traces/shipped/cicv5g" / "rural_n8_10kmh.csv"
 
 
 ANY_RECORD = st.tuples(st.integers(0, 10**9), st.none() | st.integers(0, 10**12))

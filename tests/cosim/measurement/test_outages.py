@@ -15,7 +15,7 @@ from cosim.measurement.outage_rule import find_outages
 from noack.traces.trace_formats import read_trace
 from tests.cosim.measurement.chains import chain_losses
 
-TRACES = Path(__file__).parents[3] / "scenarios" / "traces" / "cicv5g"
+TRACES = Path(__file__).parents[3] / "noack/traces/shipped/cicv5g"
 GILBERT = ChainRates(0.03, 0.25, 0.0, 1.0)
 ELLIOTT = ChainRates(0.01, 0.05, 0.02, 0.7)
 

@@ -177,8 +177,8 @@ def test_the_text_states_the_bounds_and_their_conditions(document: dict[str, Any
     for sentence, one in zip(sentences, scheduled, strict=True):
         assert "under the assumptions above" in sentence
         assert "at most M − 1 = 3 consecutive losses" in sentence
-        assert f"‖x‖ ≤ {one['constants']['state']:.4g} e^(−0.3t); from" in sentence
-        assert f"on, ‖x‖ ≤ {one['floor_constants']['state']:.4g}." in sentence
+        assert f"‖x‖ ≤ {one['constants']['state']:.4g} e^(−0.3t), from" in sentence
+        assert f"on ≤ {one['floor_constants']['state']:.4g}." in sentence
 
 
 def test_a_gain_of_the_opposite_sign_is_recognised() -> None:
@@ -298,3 +298,12 @@ def test_a_time_triggered_loop_shows_whether_all_patterns_are_stable() -> None:
 def test_a_policy_without_a_certificate_says_why(trigger: str, why: str) -> None:
     found = certificates_of(load(ROOT / "scenarios/lane_following.toml", [f"trigger={trigger}"]))
     assert why in (found.paper.void or "")
+
+
+def test_a_loop_without_any_certificate_has_the_reasons_and_no_empty_tables() -> None:
+    result = CliRunner().invoke(app, ["certify", "reactor_petc"])
+    assert result.exit_code == 1
+    assert "loop gain of the errors" in result.stdout
+    table, _, rest = result.stdout.partition("└")
+    assert table.count("void") == 2  # paper, schedule
+    assert "largest certified value" not in rest

@@ -17,7 +17,7 @@ from noack.impairments.kinds.replay import Replay
 from noack.impairments.link_settings import LinkSettings, read_files
 from noack.traces.trace_formats import read_trace
 
-CICV5G = Path(__file__).parents[3] / "scenarios/traces/cicv5g"
+CICV5G = Path(__file__).parents[3] / "noack/traces/shipped/cicv5g"
 MS = 10**6
 records = st.lists(
     st.tuples(st.integers(0, 40 * MS), st.just(-1) | st.integers(0, 90 * MS)),

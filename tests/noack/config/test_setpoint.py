@@ -1,5 +1,6 @@
 """Set-points: the equilibria of a model, by hand and against a solver."""
 
+import json
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,14 @@ def test_the_equilibrium_input_balances_the_spring(stiffness: float, force: floa
 def test_a_set_point_that_moves_is_refused_with_the_nearest_equilibrium() -> None:
     with pytest.raises(ValueError, match=r"dimension 1, and the nearest one is \[2, 0\]"):
         input_at(A_DOUBLE, B_DOUBLE, np.array([2.0, 1.0]))
+
+
+def test_the_equilibrium_that_a_refusal_names_is_taken() -> None:
+    A, B = np.array([[0.0, 1.0, 0.0], [0.0, -3.0, 0.7], [0.0, 0.0, 0.0]]), np.eye(3)[:, 2:]
+    with pytest.raises(ValueError, match="nearest one is") as refused:
+        input_at(A, B, np.array([0.1, 0.2, 0.3]))
+    named = str(refused.value).partition("nearest one is ")[2]
+    input_at(A, B, np.array(json.loads(named)))
 
 
 def test_a_model_may_have_the_origin_as_its_only_equilibrium() -> None:

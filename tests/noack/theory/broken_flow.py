@@ -16,12 +16,14 @@ from noack.theory.sharpened_bounds import InvariantEllipsoids
 
 def only_the_start() -> AbstractContextManager[Any]:
     """The ellipsoid need not contain what errors drive x to."""
-    return patch.multiple(
-        InvariantEllipsoids,
-        within=lambda self, limit: Reach(
-            self.flow, self._chosen / np.linalg.norm(self._chosen @ self.flow.start), limit
-        ),
-    )
+
+    def within(ellipsoids: InvariantEllipsoids, limit: float) -> Reach | None:
+        starts = ellipsoids._starts
+        if starts is None:
+            return None
+        return Reach(starts, float(np.linalg.norm(starts.shape @ ellipsoids.flow.start)), limit)
+
+    return patch.object(InvariantEllipsoids, "within", within)
 
 
 def no_lost_updates() -> AbstractContextManager[Any]:

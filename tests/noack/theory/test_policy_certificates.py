@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from noack.config.resolution import policy_of, resolve
 from noack.config.scenario_file import load
 from noack.theory.certificate import NetworkConditions
+from noack.theory.known_state import known_state_bounds
 from noack.theory.run_conditions import allowed_conditions
 from noack.theory.scenario_certificates import certify
 from tests.noack.theory.broken_policies import BROKEN_POLICIES, INSTANT
@@ -87,13 +88,20 @@ def test_a_short_deadline_adds_decay_to_a_constant_threshold(
     interval_s: float, *, decays: bool
 ) -> None:
     rule = '{policy="absolute", delta=0.01}'
-    late = []
+    found = []
     for trigger in (rule, f'{{policy="deadline", interval_s={interval_s}, rule={rule}}}'):
         resolved = resolve(load(SCENARIO, [f"trigger={trigger}"]))
-        found = certify(resolved, allowed_conditions(resolved))
-        late.append(found.state(np.array([1e3]))[0])
-        assert found.unit == ""  # the errors' constants are absolute
-    assert late[1] < 1e-100 if decays else late[1] == pytest.approx(late[0])
+        found.append(certify(resolved, allowed_conditions(resolved)))
+        assert found[-1].unit == ""  # the errors' constants are absolute
+    t_s = np.array([0.0, 1.0, 3.0, 10.0, 1e3])
+    alone, short = (one.state(t_s) for one in found)
+    assert (short <= alone * ROUNDING).all()
+    assert short[-1] < 1e-100 if decays else short[-1] == pytest.approx(alone[-1])
+    known = known_state_bounds(resolved, found[-1])
+    assert known is not None
+    missing = np.zeros(len(t_s), np.int64)
+    for bound in (known.state_deviation(t_s, t_s, missing), known.controller_error(t_s, missing)):
+        assert bound[-1] < 1e-100 if decays else bound[-1] > 0.0
 
 
 @pytest.mark.parametrize("mistake", BROKEN_POLICIES)

@@ -92,9 +92,9 @@ def followed(reach: Reach) -> Iterator[Matrix]:
 
     They are scaled until one condition holds with equality; τ goes beyond the grid.
     """
-    flow, angles = reach.flow, np.linspace(0.0, np.pi, 181)
+    flow, angles = reach.starts.flow, np.linspace(0.0, np.pi, 181)
     xi = np.vstack([np.cos(angles), np.sin(angles)])
-    xi /= np.linalg.norm(reach.shape @ xi, axis=0)
+    xi *= reach.size / np.linalg.norm(reach.starts.shape @ xi, axis=0)
     step_s = float(flow.edges_s[-1]) / 400
     leap, z = expm(flow.generator * step_s), np.vstack([xi, 0 * xi])
     largest = np.full(len(angles), 1e-300)
@@ -117,11 +117,12 @@ def test_what_follows_a_delivery_is_bounded(system: System, seed: int) -> None:
     bound, sampled, sizes = reach.sup(C), 0.0, 0.0
     for z in followed(reach):
         sampled = max(sampled, float(np.linalg.norm(C @ z, axis=0).max()))
-        sizes = max(sizes, float(np.linalg.norm(reach.shape @ z[:2], axis=0).max()))
+        sizes = max(sizes, float(np.linalg.norm(reach.starts.shape @ z[:2], axis=0).max()))
     assert sampled <= bound * ROUNDING
     assert bound <= 2.5 * sampled
-    assert sizes <= ROUNDING  # no x leaves the ellipsoid
-    smaller = Reach(reach.flow, 4 * reach.shape, limit)
+    assert sizes <= reach.size * ROUNDING  # no x leaves the ellipsoid
+    smaller = Reach(reach.starts, reach.size / 4, limit)
     if smaller.is_invariant():  # only if it is
         for z in followed(smaller):
-            assert float(np.linalg.norm(smaller.shape @ z[:2], axis=0).max()) <= ROUNDING
+            size = float(np.linalg.norm(smaller.starts.shape @ z[:2], axis=0).max())
+            assert size <= smaller.size * ROUNDING

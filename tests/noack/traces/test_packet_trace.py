@@ -15,7 +15,7 @@ from noack.impairments.kinds.replay import Replay
 from noack.traces.packet_trace import TraceRecordError, packet_trace
 from noack.traces.trace_formats import read_trace
 
-CICV5G = Path(__file__).parents[3] / "scenarios/traces/cicv5g"
+CICV5G = Path(__file__).parents[3] / "noack/traces/shipped/cicv5g"
 
 
 @pytest.mark.parametrize("path", sorted(CICV5G.glob("*.csv")), ids=lambda path: path.stem)

@@ -5,6 +5,7 @@ from cosim.analysis.claims.claim_definition import (
     CertifiedClaim,
     Envelope,
     controller_error_bound,
+    envelope_formula,
 )
 from cosim.analysis.claims.run_evidence import RunEvidence, Samples
 from noack.theory.scenario_certificates import ScenarioCertificate
@@ -13,11 +14,7 @@ from noack.theory.scenario_certificates import ScenarioCertificate
 def _bound(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> Bound | None:
     if certificate.constants is None:
         return None
-    formula = f"‖e_c‖ ≤ {{:.4g}} {certificate.level}"
-    if (late := certificate.floor_constants) is not None:
-        formula += f", from {certificate.floor_from_s:.4g} s on {late.delta:.4g} ε"
-    if (rest := certificate.persistent_constants) is not None:
-        formula += f" + {rest.delta:.4g}"
+    formula = envelope_formula("‖e_c‖", certificate, "delta")
     values, void = certificate.controller_error(samples.t_s), run.violation_of(certificate)
     return controller_error_bound(run, samples, formula, values, certificate.constants.delta, void)
 

@@ -2,7 +2,12 @@
 
 import numpy as np
 
-from cosim.analysis.claims.claim_definition import Bound, CertifiedClaim, upper_shares
+from cosim.analysis.claims.claim_definition import (
+    Bound,
+    CertifiedClaim,
+    envelope_formula,
+    upper_shares,
+)
 from cosim.analysis.claims.run_evidence import RunEvidence, Samples
 from noack.core.linear_systems import row_norms
 from noack.theory.scenario_certificates import ScenarioCertificate
@@ -16,11 +21,11 @@ def _bound(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate)
     here = samples.with_x
     t_s = samples.t_s[here]
     errors = row_norms((samples.joined.x[here] - samples.true_x[here]) @ weight.T)
-    first, rest = certificate.constants, certificate.persistent_constants
-    formula = f"‖x̂ − x‖ ≤ {{:.4g}} e^(−{first.rate_per_s:.3g}t)"
-    formula += "" if rest is None else f" + {rest.estimation_error:.4g}"
+    formula = envelope_formula("‖x̂ − x‖", certificate, "estimation_error")
     shares = upper_shares(errors, certificate.estimation_error(t_s))
-    return Bound(formula, t_s, shares, run.violation_of(certificate), first.estimation_error)
+    return Bound(
+        formula, t_s, shares, run.violation_of(certificate), certificate.constants.estimation_error
+    )
 
 
 CLAIM = CertifiedClaim("the estimation error is bounded", _bound)

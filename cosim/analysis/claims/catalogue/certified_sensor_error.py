@@ -4,6 +4,7 @@ from cosim.analysis.claims.claim_definition import (
     ROUNDING,
     Bound,
     CertifiedClaim,
+    envelope_formula,
     upper_shares,
 )
 from cosim.analysis.claims.run_evidence import RunEvidence, Samples
@@ -14,11 +15,7 @@ from noack.theory.scenario_certificates import ScenarioCertificate
 def _bound(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> Bound | None:
     if certificate.constants is None:
         return None
-    formula = f"‖e_s‖ ≤ {{:.4g}} {certificate.level}"
-    if (late := certificate.floor_constants) is not None:
-        formula += f", from {certificate.floor_from_s:.4g} s on {late.overshoot:.4g} ε"
-    if (rest := certificate.persistent_constants) is not None:
-        formula += f" + {rest.overshoot:.4g}"
+    formula = envelope_formula("‖e_s‖", certificate, "overshoot")
     slack = ROUNDING * row_norms(samples.joined.x)
     shares = upper_shares(samples.joined.e_s_norm, certificate.sensor_error(samples.t_s) + slack)
     void, overshoot = run.violation_of(certificate), certificate.constants.overshoot

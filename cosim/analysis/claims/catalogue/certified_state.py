@@ -1,6 +1,12 @@
 """A certificate's bound of ‖x‖: X e^{−rt}, and a constant from the time of the floor on."""
 
-from cosim.analysis.claims.claim_definition import Bound, CertifiedClaim, Envelope, upper_shares
+from cosim.analysis.claims.claim_definition import (
+    Bound,
+    CertifiedClaim,
+    Envelope,
+    envelope_formula,
+    upper_shares,
+)
 from cosim.analysis.claims.run_evidence import RunEvidence, Samples
 from noack.core.linear_systems import row_norms
 from noack.theory.scenario_certificates import ScenarioCertificate
@@ -9,13 +15,7 @@ from noack.theory.scenario_certificates import ScenarioCertificate
 def _bound(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> Bound | None:
     if (constants := certificate.constants) is None:
         return None
-    formula = "‖x‖ ≤ {:.4g}"
-    if constants.rate_per_s:
-        formula += f" e^(−{constants.rate_per_s:.3g}t)"
-    if (late := certificate.floor_constants) is not None:
-        formula += f", from {certificate.floor_from_s:.4g} s on {late.state:.4g}"
-    if (rest := certificate.persistent_constants) is not None:
-        formula += f" + {rest.state:.4g}"
+    formula = envelope_formula("‖x‖", certificate, "state")
     here = samples.with_x
     t_s, void = samples.t_s[here], run.violation_of(certificate)
     shares = upper_shares(row_norms(samples.true_x[here]), certificate.state(t_s))

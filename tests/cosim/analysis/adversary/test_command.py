@@ -38,7 +38,7 @@ def test_the_text_output_shows_the_patterns_of_one_objective() -> None:
     status, stdout, _ = run("--objective", "error", "--nodes", "0", "--beam", "8")
     assert status == ExitStatus.OK
     assert "not all patterns searched" in stdout
-    assert "D····" in stdout
+    assert "DLLLL" in stdout
     assert "cost" not in stdout
 
 
@@ -72,3 +72,10 @@ def test_an_error_in_the_arguments_gives_one_line() -> None:
     assert stderr.startswith("noack: ")
     assert "horizon_s" in stderr
     assert len(stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize("scenario", ["lane_periodic", "lane_crosswind"])
+def test_a_refusal_names_the_option_that_needs_more(scenario: str) -> None:
+    done = CliRunner().invoke(app, ["adversary", scenario, "--trigger", "continuous"])
+    assert done.exit_code == ExitStatus.CALLER
+    assert "--trigger continuous" in done.stderr

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from cosim.analysis.loops_over_time import INTERVALS, QUANTILES, loops_over_time
-from cosim.analysis.shared_summary import in_flight
+from cosim.analysis.loops_summary import in_flight
 from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.loops_recording import (
     ERROR,

@@ -27,7 +27,7 @@ from cosim.studies.campaign.sampled_draws import SampledWork
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import NETEM_PACKET, Fate, effective
 
-SHARED_ROW = np.dtype(
+LOOPS_ROW = np.dtype(
     [
         *ROW.descr,
         *(
@@ -54,7 +54,7 @@ _OF_ALL: Mapping[str, Callable[[NDArray[Any]], Any]] = {
 
 
 @dataclass(frozen=True)
-class SharedWork(SampledWork):
+class LoopsWork(SampledWork):
     """Computes draws of a grid point with several loops; the scenario has [[loops]].
 
     Loop k of draw i has the same plant, initial state and phase for any number of loops.
@@ -67,8 +67,8 @@ class SharedWork(SampledWork):
     """Updates that were sent earlier do not count in the last three columns of the row."""
 
     def run(self, draws: range) -> NDArray[np.void]:
-        """Compute consecutive draws; one row of :data:`SHARED_ROW` each."""
-        rows = np.zeros(len(draws), SHARED_ROW)
+        """Compute consecutive draws; one row of :data:`LOOPS_ROW` each."""
+        rows = np.zeros(len(draws), LOOPS_ROW)
         for row, draw in zip(rows, draws, strict=True):
             seeds = seeds_of(self.seed, draw)
             shared = simulate_loops(self.scenario.model_copy(update={"seeds": seeds}))

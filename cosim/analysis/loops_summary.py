@@ -83,7 +83,7 @@ class NetworkPart(SummaryPart):
     in_flight: InFlightPart
 
 
-class SharedSummary(SummaryPart):
+class LoopsSummary(SummaryPart):
     """The content of ``summary.json`` of a run of several loops."""
 
     kind: Literal["live", "simulated"]
@@ -107,25 +107,25 @@ class SharedSummary(SummaryPart):
         return self
 
 
-def is_shared(summary: Mapping[str, Any]) -> bool:
+def has_loops(summary: Mapping[str, Any]) -> bool:
     """Return whether a summary is that of a run of several loops."""
     return "loops" in summary
 
 
 def is_complete(summary: Mapping[str, Any]) -> bool:
     """Return whether a file contains a complete summary of this version, of any kind of run."""
-    if not is_shared(summary):
+    if not has_loops(summary):
         return can_be_shown(summary)
     try:
-        SharedSummary.model_validate(summary)
+        LoopsSummary.model_validate(summary)
     except ValidationError:
         return False
     return True
 
 
-def summarise_shared(
+def summarise_loops(
     network: RunRecord, loops: Sequence[Outcome], end: ExitPart, startup_s: float | None = None
-) -> SharedSummary:
+) -> LoopsSummary:
     """Return the summary of a run, from the record of its network and the outcomes of its loops.
 
     ``end`` is how the run ended; a run that completed has failed if one of its loops failed.
@@ -144,7 +144,7 @@ def summarise_shared(
         )
         for number, one in enumerate(loops)
     ]  # fmt: skip
-    return SharedSummary(
+    return LoopsSummary(
         kind=network.kind,
         startup_s=startup_s,
         scenario=scenario.name,

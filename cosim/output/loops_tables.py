@@ -20,7 +20,7 @@ CAPTION = (
 )
 
 
-def print_shared(console: Console, summary: Summary, *, verbose: bool = False) -> None:
+def print_loops(console: Console, summary: Summary, *, verbose: bool = False) -> None:
     """Print how the run ended, the network, and the loops; without ``verbose`` the worst only."""
     end, reached = summary["exit"], f"{summary['reached_s']:g} s"
     if end["status"] == ExitStatus.OK:
