@@ -344,16 +344,14 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
 
 
 def _open_view(process: RunProcess, live_view: "LiveView | None") -> "RunView | LoopsRecording":
-    ticket = process.ticket
-    if ticket.scenario.loops is not None:
+    scenario, run_id, run_dir = process.scenario, process.ticket.run_id, process.ticket.run_dir
+    if scenario.loops is not None:
         from cosim.output.viewer.loops_recording import open_loops_view
 
-        return open_loops_view(
-            ticket.scenario, process.loops, Path(ticket.run_dir), ticket.run_id, live_view
-        )
+        return open_loops_view(scenario, Path(run_dir), run_id, live_view)
     from cosim.output.viewer.run_view import open_view
 
-    return open_view(ticket.scenario, Path(ticket.run_dir), ticket.run_id, live_view)
+    return open_view(scenario, Path(run_dir), run_id, live_view)
 
 
 def _poll_to_the_end(process: RunProcess, recorder: Recorder) -> bool:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from cosim.analysis.loops_over_time import INTERVALS, add_link_bytes, empty_over_time, places
-from cosim.analysis.shared_summary import counts_inside, times_inside
+from cosim.analysis.loops_summary import counts_inside, times_inside
 from cosim.output.viewer.loops_recording import ERROR, SIZE, LoopsRecording
 from cosim.output.viewer.table_feed import LAG_S, SHOWN, ViewFeed, log_level
 from cosim.record.loop_rows import rows_by_loop

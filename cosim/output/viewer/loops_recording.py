@@ -43,7 +43,7 @@ from cosim.record.decimate import Reals, is_long
 from cosim.record.environment import Kind
 from cosim.record.run_directory import RECORDING_FILE
 from noack.config.loops import loops_of, phases_ns
-from noack.config.resolution import loop_of
+from noack.config.resolution import loop_of, resolved_loops
 from noack.config.scenario import Scenario
 
 PICTURED = 12
@@ -172,9 +172,10 @@ Curves of more than {len(SERIES)} loops are quantiles over the loops:
 
 
 def open_loops_view(
-    run: Scenario, loops: Sequence[Scenario], run_dir: Path, run_id: int, live: LiveView | None
+    run: Scenario, run_dir: Path, run_id: int, live: LiveView | None
 ) -> LoopsRecording:
     """Create the recording of a live run, which is written during the run."""
+    loops = resolved_loops(run)
     shown = dict(enumerate(loops)) if len(loops) <= PICTURED else {}
     return LoopsRecording(run, run_dir, run_id, shown, worst=None, kind="live", live=live)
 

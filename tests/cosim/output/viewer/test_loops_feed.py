@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cosim.analysis.loops_over_time import INTERVALS, loops_over_time, quantiles
-from cosim.analysis.shared_summary import counts_inside, times_inside
+from cosim.analysis.loops_summary import counts_inside, times_inside
 from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.loops_feed import LoopsFeed
 from cosim.output.viewer.loops_recording import ERROR, MAP, QUEUE, SHARE, SIZE, open_loops_view
@@ -15,7 +15,6 @@ from cosim.record.run_directory import RECORDING_FILE
 from cosim.record.shared_run import SharedRun
 from cosim.shipped_files import find_shipped
 from cosim.simulation.shared_network import simulate_loops
-from noack.config.resolution import resolved_loops
 from noack.config.scenario_file import load
 from noack.protocol.machine_interface import Notice
 from noack.protocol.record_tables import NETEM_PACKET
@@ -28,7 +27,7 @@ def shown(folder: Path, count: int, *settings: str) -> tuple[SharedRun, Chunks, 
     given = ["horizon_s=2.0", f'loops=[{{ name = "p", count = {count} }}]', *settings]
     run = simulate_loops(load(find_shipped("shared_bottleneck", "scenarios"), given))
     scenario, said = run.network.scenario, list[str]()
-    with open_loops_view(scenario, resolved_loops(scenario), folder, 9, None) as view:
+    with open_loops_view(scenario, folder, 9, None) as view:
         feed = LoopsFeed(scenario, view, said.append)
         for table, rows in live_rows(run):
             feed.add(table, rows)
