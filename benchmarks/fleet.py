@@ -1,7 +1,8 @@
-"""Many loops through one bottleneck, live: losses, lateness, memory and CPU time.
+"""Many loops through one bottleneck, live: losses, lateness, memory, replay, CPU time.
 
-Each loop samples, computes and applies its input at the same rate. The record is examined where the
-processes have left it, in the spool.
+Each loop samples, computes and applies its input at the same rate. A step is one of the plant of
+one loop: with it come a measurement, a tick of the controller and an actuation. The CPU time is
+that of plant, sensor, emulator and controller while the loops run.
 """
 
 import argparse
@@ -11,29 +12,17 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-import psutil
-from numpy.typing import NDArray
-
-from benchmarks._report import Benchmark, Goal, MeasurementError, Row, say
-from noack.config.resolution import tables_of
-from noack.config.scenario import Scenario
+from benchmarks._report import Benchmark, Goal, MeasurementError, Peer, Row, say
+from benchmarks.soak.watch import Processes
+from cosim.record.run_directory import LATEST, LOOPS, SUMMARY_FILE, read_object
+from cosim.simulation.shared_network import simulate_loops
 from noack.config.scenario_file import load
-from noack.protocol.record_tables import (
-    CONTROLLER_DELIVERY,
-    CONTROLLER_STEP,
-    LOOP,
-    NETEM_PACKET,
-    PLANT_STEP,
-    SENSOR_MEASUREMENT,
-)
 from noack.protocol.topology import LOOP_ROLES
-from noack.runtime.spool import SPOOL, read_chunks
 
 CAP = 2
 _SCENARIO = """
@@ -69,6 +58,11 @@ name = "loop"
 count = {loops}
 """
 _KIBI = 1024
+_POLL_S = 0.5
+_SINGLE_S = 60.0
+_FLAT_MIB = 32.0
+_BATCH = 50, 10.0
+"""Loops, and seconds, of a run in virtual time."""
 
 
 class Load(NamedTuple):
@@ -78,10 +72,9 @@ class Load(NamedTuple):
     rate_hz: float
     horizon_s: float
 
-    @property
-    def samples(self) -> int:
-        """Number of measurements of all loops."""
-        return self.loops * (round(self.horizon_s * self.rate_hz) + 1)
+    def step_us(self, measured: "Measured") -> float:
+        """CPU time of the processes per loop and step."""
+        return sum(measured.cpu_s.values()) / (self.loops * self.horizon_s * self.rate_hz) * 1e6
 
 
 def scenario_of(load_: Load) -> str:
@@ -93,129 +86,137 @@ def scenario_of(load_: Load) -> str:
 
 
 class Measured(NamedTuple):
-    """A run whose processes have reported."""
+    """A finished run."""
 
-    run_dir: Path
+    network: dict[str, Any]
+    """The summary of the run."""
+    loops: list[dict[str, Any]]
+    """The summary of each loop."""
     memory_mib: Mapping[str, list[float]]
-    """Resident memory over time, by process."""
+    """Private memory over time, by process."""
     cpu_s: Mapping[str, float]
+    """By process, while the loops ran."""
+    end_s: float
+    """Wall time from the end of the loops to the end of the command."""
 
 
-@contextmanager
-def run(load_: Load, folder: Path) -> Iterator[Measured]:
-    """Run it until all processes have reported; the recorder then waits, and the spool is kept.
+def run(load_: Load, folder: Path) -> Measured:
+    """Run the loops as a user does.
 
     Raises:
-        MeasurementError: it did not reach its horizon.
+        MeasurementError: the run failed.
     """
     path = folder / "fleet.toml"
     path.write_text(scenario_of(load_))
-    memory, cpu_s = defaultdict[str, list[float]](list), dict[str, float]()
-    command = [sys.executable, "-m", "benchmarks._fleet_run", str(path), str(folder)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        recorder: psutil.Process | None = None
-        while process.poll() is None:
-            for child in psutil.Process(process.pid).children(recursive=True):
-                with suppress(psutil.Error):
-                    name = " ".join(child.cmdline())
-                    if name.startswith("noack "):
-                        memory[name].append(child.memory_info().rss / _KIBI**2)
-                        cpu_s[name] = sum(child.cpu_times()[:2])
-                        recorder = child if name == "noack recorder" else recorder
-            found = [*folder.glob("*/reports.json")]
-            if found and len(json.loads(found[0].read_text() or "{}")) == len(LOOP_ROLES):
-                break
-            time.sleep(0.5)
-        else:
-            assert process.stdout is not None
-            raise MeasurementError(f"the run failed: {process.stdout.read()}")
-        if recorder is not None:
-            recorder.suspend()
-        try:
-            yield Measured(found[0].parent, memory, cpu_s)
-        finally:
-            with suppress(psutil.Error):
-                if recorder is not None:
-                    recorder.kill()
-            process.terminate()
+    command = [sys.executable, "-m", "cosim.cli", "run", str(path), "--json", "--no-report",
+               "--runs", str(folder)]  # fmt: skip
+    with (folder / "output").open("w+") as output:
+        with subprocess.Popen(command, stdout=output, stderr=subprocess.DEVNULL) as process:
+            memory, cpu_s, end_s = _follow(process, folder / LATEST)
+        output.seek(0)
+        network = json.loads(output.read() or "{}")
+    if process.returncode != 0:
+        found = network.get("exit", {}).get("reason", network.get("error"))
+        raise MeasurementError(f"{load_.loops} loops at {load_.rate_hz:g} Hz: {found}")
+    directories = sorted((folder / LATEST / LOOPS).iterdir())
+    loops = [read_object(directory / SUMMARY_FILE) for directory in directories]
+    return Measured(network, loops, memory, cpu_s, end_s)
 
 
-def rows_of(run_dir: Path, scenario: Scenario, table: str) -> NDArray[np.void]:
-    """Return the rows of a table in the spool."""
-    dtype = tables_of(scenario)[table]
-    chunks = dict(read_chunks(run_dir / SPOOL, table))  # a batch may have been sent twice
-    return np.concatenate(
-        [np.zeros(0, dtype), *(np.frombuffer(chunks[first], dtype) for first in sorted(chunks))]
-    )
+def _follow(
+    process: subprocess.Popen[bytes], started: Path
+) -> tuple[dict[str, list[float]], dict[str, float], float]:
+    """Return memory and CPU time of a run's processes from its start, when a path exists."""
+    processes = Processes(process.pid)
+    memory = defaultdict[str, list[float]](list)
+    first, last = dict[str, float](), dict[str, float]()
+    ended_s = time.monotonic()
+    while process.poll() is None:
+        if started.exists():
+            for role, one in processes.sample().items():
+                memory[role].append(one.uss_kib / _KIBI)
+                if role in LOOP_ROLES:
+                    first.setdefault(role, one.cpu_s)
+                    last[role] = one.cpu_s
+                    ended_s = time.monotonic()
+        time.sleep(_POLL_S)
+    cpu_s = {role: last[role] - first[role] for role in last}
+    return memory, cpu_s, time.monotonic() - ended_s
 
 
-def figures(load_: Load, folder: Path) -> list[Row]:
-    """Return the figures of a run."""
-    name = f"{load_.loops:,} loops at {load_.rate_hz:g} Hz, {load_.horizon_s:g} s"
-    say(name)
-    with run(load_, folder) as measured_run:
-        return [row_named(row, f"{name}: {row.name}") for row in _rows(load_, *measured_run)]
-
-
-def _rows(
-    load_: Load, run_dir: Path, memory: Mapping[str, list[float]], cpu_s: Mapping[str, float]
-) -> list[Row]:
-    scenario = load(run_dir / "scenario.toml")
-    reports: dict[str, Any] = json.loads((run_dir / "reports.json").read_text())
-    lost = sum(one["channel"]["lost_in_kernel"] or 0 for one in reports.values())
-    rejected = sum(sum(one["channel"]["rejected"].values()) for one in reports.values())
-    steps, ticks = (rows_of(run_dir, scenario, table) for table in (PLANT_STEP, CONTROLLER_STEP))
-    late_ms = [(one["now_ns"] - one["t_ns"]) * 1e-6 for one in (steps, ticks)]
-    measured = rows_of(run_dir, scenario, SENSOR_MEASUREMENT)
-    deliveries = rows_of(run_dir, scenario, CONTROLLER_DELIVERY)
-    packets = rows_of(run_dir, scenario, NETEM_PACKET)
-    burst = int(deliveries["dropouts"].max(initial=0))
-    growth = max(max(one[len(one) // 2 :]) - one[len(one) // 2] for one in memory.values())
-    total_s = sum(cpu_s.values())
-    period_ms = 1e3 / load_.rate_hz
-    return [
-        Row("samples", len(steps), "", note=f"{len(np.unique(steps[LOOP]))} loops"),
-        Row("missing samples", load_.samples - len(measured), "", goal=Goal("==", 0)),
-        Row("missing ticks", load_.samples - load_.loops - len(ticks), "", goal=Goal("==", 0)),
-        Row("unintended losses", lost + rejected, "", goal=Goal("==", 0)),
-        Row("longest loss burst", burst, "", goal=Goal("<=", CAP)),
-        Row("updates", len(packets), "", note=f"{len(packets) / load_.horizon_s:.0f} /s"),
-        Row("plant lateness, p99", float(np.percentile(late_ms[0], 99)), "ms",
-            goal=Goal("<", period_ms), note=f"max {late_ms[0].max():.1f} ms"),
-        Row("controller lateness, p99", float(np.percentile(late_ms[1], 99)), "ms",
-            goal=Goal("<", period_ms), note=f"max {late_ms[1].max():.1f} ms"),
-        Row("CPU time of all processes", total_s / load_.horizon_s, "s/s",
-            note=", ".join(f"{k.removeprefix('noack ')} {v:.1f} s" for k, v in cpu_s.items())),
-        Row("CPU time per loop and step", total_s / load_.samples * 1e6, "µs"),
-        Row("growth of memory in the second half", growth, "MiB",
+def figures(load_: Load, found: Measured, single_us: float) -> list[Row]:
+    """Return the figures of a run; ``single_us`` is the CPU time of a step of one loop alone."""
+    loops, network = found.loops, found.network
+    nothing, period_ms = Goal("==", 0), 1e3 / load_.rate_hz
+    unequal = [one["replay"]["bit_exact"] for one in (network, *loops)].count(True)
+    late = {
+        role: max(one["lateness_us"][role]["p99"] for one in loops) * 1e-3
+        for role in ("plant", "controller")
+    }
+    loop_memory = {role: mib for role, mib in found.memory_mib.items() if role in LOOP_ROLES}
+    growth = max(mib[-1] - mib[len(mib) // 2] for mib in loop_memory.values())
+    datagrams = network["network"]["datagrams"]
+    rows = [
+        Row("missing samples", sum(one["missing_samples"] for one in loops), "", goal=nothing),
+        Row("unintended losses", sum(one["unintended_losses"] for one in loops), "", goal=nothing),
+        Row("longest loss burst", max(one["longest_loss_burst"] for one in loops), "",
+            goal=Goal("<=", CAP)),
+        Row("updates", datagrams / load_.horizon_s, "/s"),
+        *(
+            Row(f"{role} lateness p99, worst loop", late_ms, "ms", goal=Goal("<", period_ms))
+            for role, late_ms in late.items()
+        ),
+        Row("loops and network not replayed bit for bit", 1 + len(loops) - unequal, "",
+            goal=nothing),
+        Row("CPU time per loop and step", load_.step_us(found), "µs", Peer("one loop", single_us),
+            note=", ".join(f"{role} {used_s:.1f} s" for role, used_s in found.cpu_s.items())),
+        Row("growth of memory in the second half, worst process", growth, "MiB",
+            goal=Goal("<", _FLAT_MIB),
             note=", ".join(
-                f"{k.removeprefix('noack ')} {v[len(v) // 2]:.0f}–{v[-1]:.0f}"
-                for k, v in memory.items()
+                f"{role} {mib[len(mib) // 2]:.0f}–{mib[-1]:.0f}"
+                for role, mib in found.memory_mib.items()
             )),
+        Row("end of the run", found.end_s, "s", goal=Goal("<", load_.horizon_s)),
     ]  # fmt: skip
+    name = f"{load_.loops:,} loops at {load_.rate_hz:g} Hz, {load_.horizon_s:g} s"
+    return [replace(row, name=f"{name}: {row.name}") for row in rows]
 
 
-def row_named(row: Row, name: str) -> Row:
-    """Return a row with another name."""
-    return Row(name, row.value, row.unit, row.peer, row.goal, row.note)
+def batch() -> Row:
+    """Return how many runs of a loop in virtual time are computed a second."""
+    loops, horizon_s = _BATCH
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "fleet.toml"
+        path.write_text(scenario_of(Load(loops, 50.0, horizon_s)))
+        scenario = load(path)
+    begun_s = time.process_time()
+    simulate_loops(scenario)
+    name = f"virtual time, runs of {horizon_s:g} s of {loops} loops at 50 Hz: loops × runs"
+    return Row(name, loops / (time.process_time() - begun_s), "/s of CPU")
 
 
 def options(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
     parser.add_argument("--fleet-s", type=float, default=60.0, help="length of the runs, seconds")
     parser.add_argument("--fleet-loops", type=int, default=1000, help="loops at 50 Hz")
+    parser.add_argument("--fleet-dir", type=Path, help="where the runs are kept meanwhile")
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
-    """Measure both loads."""
-    found = []
+    """Measure both loads, and one loop at the rates of both."""
+    rows = [batch()]
     for load_ in (
         Load(options.fleet_loops, 50.0, options.fleet_s),
         Load(20, 500.0, options.fleet_s),
     ):
-        with tempfile.TemporaryDirectory() as folder:
-            found += figures(load_, Path(folder))
-    return found
+        single = load_._replace(loops=1, horizon_s=min(load_.horizon_s, _SINGLE_S))
+        measured = []
+        for one in (single, load_):
+            say(f"{one.loops:,} loops at {one.rate_hz:g} Hz, {one.horizon_s:g} s")
+            with tempfile.TemporaryDirectory(dir=options.fleet_dir) as folder:
+                measured.append(run(one, Path(folder)))
+        rows += figures(load_, measured[1], single.step_us(measured[0]))
+    return rows
 
 
 BENCHMARK = Benchmark("fleet", "Many loops on one network", measure, options)

@@ -101,13 +101,13 @@ def handle(memory: FleetMemory, own: SensorArrays, loop: int, begin: int, now_ns
     for k in range(n):
         z[k] = measured[at + k]
         z[n + k] = x_s[k] - measured[at + k]
-    event = is_event(trigger, own.matrices, t_ns, n, z, own.sides, memory.scratch)
+    event = is_event(trigger, own.matrices, t_ns, n, z, 0.0, own.sides, memory.scratch)
     event = event or first
     layout.begin_row(memory, loop, sequence, t_ns, now_ns)
     copy_reals(measured, at, memory.row_reals, 4, n)
     copy_reals(x_s, 0, memory.row_reals, 4 + n, n)
     place = 4 + 2 * n
-    memory.row_reals[place] = weighted_norm(trigger, own.matrices, n, z, memory.scratch)
+    memory.row_reals[place] = weighted_norm(trigger, own.matrices, z, n, n, memory.scratch)
     memory.row_reals[place + 1] = own.sides[0]
     memory.row_reals[place + 2] = own.sides[1]
     memory.row[place + 3] = sensor.events if event else NO_SEQUENCE

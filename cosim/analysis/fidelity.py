@@ -154,9 +154,12 @@ class Fidelity:
         )
 
 
-def fidelity_for_summary(record: RunRecord) -> FidelityPart | NoFidelityPart:
-    """The comparison for a run's summary, or the reason why there is none."""
-    if record.count(PLANT_STEP) > _STEPS_AT_THE_END:
+def fidelity_for_summary(record: RunRecord, loops: int = 1) -> FidelityPart | NoFidelityPart:
+    """The comparison for a run's summary, or the reason why there is none.
+
+    ``loops`` is the number of loops of the run.
+    """
+    if loops * record.count(PLANT_STEP) > _STEPS_AT_THE_END:
         return NoFidelityPart(reason="the run is long; `noack fidelity` compares it")
     try:
         return compute_fidelity(record, _EVENTS_AT_THE_END).summary()

@@ -8,9 +8,12 @@ from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import Outcome
 from cosim.analysis.summary_model import ExitPart, ReplayPart
 from cosim.live.process_pool import interrupts_held, processes
+from cosim.live.progress import work_bar
+from cosim.record.loops_run import loop_directories
+from cosim.record.loops_spool import distribute_rows
 from cosim.record.run_ending import RunEnding
-from cosim.record.run_record import RunRecord
-from cosim.record.shared_run import loop_directories
+from cosim.record.run_record import RunRecord, load_record
+from cosim.record.spool_conversion import convert_spool, remove_spool
 from noack.config.loops import loops_of
 from noack.config.scenario import Scenario
 from noack.core.errors import ExitStatus
@@ -22,27 +25,44 @@ start."""
 
 
 def finalize_loops(
-    network: RunRecord, ending: RunEnding, finalize_loop: Callable[[RunEnding], Outcome]
-) -> LoopsSummary:
-    """Finalise each loop of a run; return the summary of the run.
+    ending: RunEnding, finalize_loop: Callable[[RunEnding], Outcome], *, unfinished: bool
+) -> tuple[RunRecord, LoopsSummary]:
+    """Finalise each loop of a run; return the record of the network, and the summary of the run.
 
     Args:
-        network: the record of the network that the loops share.
         ending: how the run ended.
-        finalize_loop: writes the summary of a loop, from how its run ended; it can be pickled.
+        finalize_loop: completes record and summary of a loop, from how its run ended; it can be
+            pickled.
+        unfinished: whether the run has a spool, which is removed when all loops are finalised.
+
+    Raises:
+        MachineError: a record or a summary cannot be written; the spool is kept.
     """
+    run_dir = ending.run_dir
+    if unfinished:
+        with work_bar("rows of the loops") as show:
+            distribute_rows(run_dir, show)
+        convert_spool(run_dir)
+    network = load_record(run_dir, network=True)
     endings = [
         RunEnding(one, 0, ending.status, ending.reason, ending.startup_s)
-        for one in loop_directories(ending.run_dir, network.scenario)
+        for one in loop_directories(run_dir, network.scenario)
     ]
-    with _each(finalize_loop, endings, network.scenario) as outcomes:
+    what = f"record and claims of {len(endings)} loops"
+    with _each(finalize_loop, endings, network.scenario) as each, work_bar(what) as show:
         replayed = _replay(network) if network.kind == "live" else None
-        end = ExitPart(status=int(ending.status), reason=ending.reason)
-        summary = summarise_loops(network, [*outcomes], end, ending.startup_s)
+        outcomes = []
+        for outcome in each:
+            outcomes.append(outcome)
+            show(len(outcomes) / len(endings))
+    if unfinished:
+        remove_spool(run_dir)
+    end = ExitPart(status=int(ending.status), reason=ending.reason)
+    summary = summarise_loops(network, outcomes, end, ending.startup_s)
     if replayed is None:
-        return summary
+        return network, summary
     end = exit_after_replay(summary.exit, replayed)
-    return summary.model_copy(update={"replay": replayed, "exit": end})
+    return network, summary.model_copy(update={"replay": replayed, "exit": end})
 
 
 def exit_after_replay(end: ExitPart, replayed: ReplayPart) -> ExitPart:

@@ -25,7 +25,6 @@ from cosim.live.start_limit import DEFAULT_S, StartLimit
 from cosim.record.environment import write_environment
 from cosim.record.run_directory import active_run, new_run_dir, point_to_latest, write_scenario
 from cosim.record.run_ending import EndingFile, RunEnding
-from noack.config.loops import phases_ns
 from noack.config.resolution import resolved_loops
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError, ExitStatus, NeverStartedError
@@ -46,8 +45,8 @@ _STOPPED: Mapping[int, str] = {
 }
 _POLL_S = 0.01
 _STOP_TIMEOUT_S = 15.0
-_OVERTIME_S, _OVERTIME_SHARE, _OVERTIME_PER_LOOP_S = 20.0, 0.2, 1.0
-"""After the horizon: the recorder sorts the rows by loop, and a long run has many."""
+_OVERTIME_S, _OVERTIME_SHARE = 20.0, 0.2
+"""After the horizon: the recorder writes the record, and a long run has many rows."""
 
 
 _FLEETS = (
@@ -196,9 +195,7 @@ class _Run:
                 started = True
                 point_to_latest(self._run_dir)
                 self._notify("started", self._run_dir)
-                deadline_s = now_s + longest_s(
-                    self._scenario.horizon_s / self._scenario.speed, len(phases_ns(self._scenario))
-                )
+                deadline_s = now_s + longest_s(self._scenario.horizon_s / self._scenario.speed)
             self._notify_progress()
             if result is None:
                 result = _signalled(signals) or self._policy.check()
@@ -265,6 +262,6 @@ def _signalled(signals: Signals) -> Failure | None:
     return signals.status, f"{_STOPPED[signals.received]} ({signal_name(signals.received)})"
 
 
-def longest_s(run_s: float, loops: int = 1) -> float:
+def longest_s(run_s: float) -> float:
     """How long a run of ``run_s`` of wall time may take until all its processes have ended."""
-    return run_s * (1 + _OVERTIME_SHARE) + _OVERTIME_S + (loops - 1) * _OVERTIME_PER_LOOP_S
+    return run_s * (1 + _OVERTIME_SHARE) + _OVERTIME_S

@@ -14,9 +14,10 @@ from cosim.live.loops_monitor import Finding, LoopsMonitor
 from cosim.live.progress_report import ProgressReport
 from cosim.live.telemetry_store import TelemetryStore
 from cosim.record.decimate import is_long
+from cosim.record.process_reports import report_of, write_reports
 from cosim.record.run_directory import active_run
-from cosim.record.run_record import Rows, RunRecord, report_of, write_reports
-from cosim.record.shared_spool import finish_run_record
+from cosim.record.run_record import Rows, RunRecord
+from cosim.record.spool_conversion import finish_record
 from noack.config.parameter_changes import ParameterChange, change_notice
 from noack.config.runtime_parameters import is_of_loss_alone
 from noack.config.scenario import Scenario
@@ -43,8 +44,11 @@ _SHOW_S = 0.1
 _DISCOVERY_S = 5.0
 """By then a restarted recorder has received the liveliness tokens of all running processes."""
 _ACKNOWLEDGE_S = 1.0
+_POLL_FOR_S = 0.2
 _WAITING_BATCHES = 4096
 """A minute of batches; each place of the ring takes 256 bytes once it has been used."""
+_WAITING_BATCHES_OF_LOOPS = 512
+"""Some seconds of batches, each with some hundred kilobytes; a lost one is sent again."""
 _ROWS_IN_FLIGHT_S = 0.3
 _STOP_TIMEOUT_S = 8.0
 
@@ -72,7 +76,8 @@ class Recorder:
         self._blind_reported = self._monitoring_ended = False
         session, key = plane.session, plane.key
         self._batches = session.declare_subscriber(
-            key("telemetry", "*", "*"), RingChannel(_WAITING_BATCHES)
+            key("telemetry", "*", "*"),
+            RingChannel(_WAITING_BATCHES if scenario.loops is None else _WAITING_BATCHES_OF_LOOPS),
         )
         self._report_queries = session.declare_queryable(key("report", "*"), FifoChannel(64))
         self._tokens = session.liveliness().declare_subscriber(
@@ -114,10 +119,17 @@ class Recorder:
 
             self._feed = LoopsFeed(self._scenario, view, self._progress.add_warning)
 
-    def poll(self) -> None:
-        """Handle all messages that have arrived."""
-        while (sample := self._batches.try_recv()) is not None:
-            self._take(sample)
+    def poll(self) -> bool:
+        """Handle messages that have arrived; return whether there may be more.
+
+        It returns after a while, even if batches arrive faster than they are handled: the processes
+        keep their rows until they are acknowledged.
+        """
+        until_s = time.monotonic() + _POLL_FOR_S
+        more = True
+        while more and time.monotonic() < until_s:
+            if more := (sample := self._batches.try_recv()) is not None:
+                self._take(sample)
         while (query := self._report_queries.try_recv()) is not None:
             self._take_report(query)
         while (token := self._tokens.try_recv()) is not None:
@@ -127,6 +139,7 @@ class Recorder:
                 alive.discard(instance)
             else:
                 alive.add(instance)
+        return more
 
     def end_monitoring(self) -> None:
         """Check no more assumptions: the run is stopping, and its processes end one by one."""
@@ -166,8 +179,8 @@ class Recorder:
         for role, content in self._store.acknowledgements():
             self._plane.acknowledge_rows(role, content)
 
-    def finish(self) -> RunRecord:
-        """Write the record, of the network if the run has several loops; complete the view.
+    def finish(self) -> RunRecord | None:
+        """Write the record and complete the view; the launcher writes the records of several loops.
 
         Raises:
             MachineError: the record cannot be written; the spool is kept.
@@ -180,7 +193,7 @@ class Recorder:
             self.lost = error
         self._store.close()
         write_reports(self._run_dir, self._reports.values())
-        record = finish_run_record(self._run_dir)
+        record = finish_record(self._run_dir) if self._scenario.loops is None else None
         if self._feed is not None:
             try:
                 self._feed.advance(final=True)
@@ -261,6 +274,9 @@ class Recorder:
             self._plane.refuse(query, str(error))
             return
         report: dict[str, Any] = {"generation": 0, "instance": ""} | fields | {"process": role}
+        if stored := self._store.add_stored(report):
+            text = f"{role}: {stored} rows were written to disk by itself: the recorder was slow"
+            self.note(Notice(report.get("reached_ns") or 0, "info", text))
         # Telemetry has a lower priority: batches that were sent earlier may still be in flight.
         self._await_rows(report)
         missing = self._store.missing(report)
@@ -327,7 +343,8 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
         if view is not None:
             view.close()
         return
-    recorder.poll()
+    while recorder.poll():
+        pass
     recorder.show()
     record = recorder.finish()
     try:
@@ -335,7 +352,7 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
             view.close()
     except MachineError as error:
         print_to_stderr(f"noack recorder: {error}; the numeric record is complete")
-    if recorder.view_is_incomplete and not unseen:
+    if recorder.view_is_incomplete and not unseen and record is not None:
         from cosim.output.viewer.run_view import write_view
 
         write_view(record, run_dir, run_id)
@@ -363,7 +380,7 @@ def _poll_to_the_end(process: RunProcess, recorder: Recorder) -> bool:
     shown_s = stop_s = None
     acknowledged_s = time.monotonic()
     while not recorder.finished:
-        recorder.poll()
+        more = recorder.poll()
         if process.stopping:
             recorder.end_monitoring()
         for change, announcement in process.updates.take():
@@ -381,7 +398,8 @@ def _poll_to_the_end(process: RunProcess, recorder: Recorder) -> bool:
             stop_s = stop_s or now_s
             if process.ended in ("SIGINT", "SIGTERM") or now_s - stop_s > _STOP_TIMEOUT_S:
                 return True
-        time.sleep(_POLL_S)
+        if not more:
+            time.sleep(_POLL_S)
     return True
 
 

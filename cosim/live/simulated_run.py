@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from cosim.record.environment import write_environment
+from cosim.record.loops_run import write_loops
 from cosim.record.run_directory import (
     REPORTS_FILE,
     active_run,
@@ -16,7 +17,6 @@ from cosim.record.run_directory import (
 )
 from cosim.record.run_ending import EndingFile, RunEnding
 from cosim.record.run_record import RunRecord, write_record
-from cosim.record.shared_run import write_shared_run
 from cosim.simulation.shared_network import simulate_loops
 from cosim.simulation.virtual_time import Progress, simulate
 from noack.config.resolution import resolve
@@ -70,7 +70,7 @@ def simulate_run(
 
 def _write_loops(scenario: Scenario, run_dir: Path, progress: Progress | None) -> None:
     """Simulate several loops; write their records and that of their network."""
-    write_shared_run(simulate_loops(write_scenario(scenario, run_dir), progress), run_dir)
+    write_loops(simulate_loops(write_scenario(scenario, run_dir), progress), run_dir)
 
 
 def _into_new_run(scenario: Scenario, runs: Path, write: Callable[[Path, int], None]) -> RunEnding:

@@ -77,6 +77,17 @@ class TelemetryStore:
         received.add(first, first + len(rows))
         return rows, follows
 
+    def add_stored(self, report: Mapping[str, Any]) -> int:
+        """Count the rows that a process has stored itself; return the number of new ones."""
+        role, generation, count = report["process"], report["generation"], 0
+        for table, ranges in report.get("stored", {}).items():
+            received = self._received[role, table, generation]
+            before = received.count
+            for first, end in ranges:
+                received.add(first, end)
+            count += received.count - before
+        return count
+
     def add_own_notice(self, notice: Notice) -> None:
         """Store a line of the recorder's own for the log."""
         payload = json.dumps(notice.line()).encode()

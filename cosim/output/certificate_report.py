@@ -13,8 +13,9 @@ from cosim.output.certificate_rows import constant_rows, plants_of
 from cosim.output.unlimited_losses_report import print_unlimited
 from noack.core.number_format import duration
 from noack.theory.assumptions import assumptions
+from noack.theory.certified_bounds import BOX
 from noack.theory.network_limits import MOST_S
-from noack.theory.scenario_certificates import BOX, outside_box
+from noack.theory.scenario_certificates import outside_box
 
 
 def print_certificates(console: Console, found: Certificates) -> None:

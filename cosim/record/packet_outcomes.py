@@ -5,9 +5,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.record.run_record import Rows, RunRecord, updates_in
-from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, direction_of, effective
-from noack.protocol.wire_format import Flow
+from cosim.record.run_record import Rows, RunRecord
+from noack.protocol.record_tables import (
+    NETEM_PACKET,
+    NETEM_RELEASE,
+    PACKET_HEAD_BYTES,
+    direction_of,
+    effective,
+)
+from noack.protocol.wire_format import FLOW_OFFSET, VERSION, Flow, read_header
 
 
 class PacketOutcome(NamedTuple):
@@ -76,3 +82,32 @@ def _outcomes(
     in_flight = effectively & delayed & ~np.isin(numbers, forwarded)
     fate, lost = rows["fate"].astype(np.int8), ~effectively | stale
     return PacketOutcome(sequence, event_ns, rows["now_ns"].copy(), fate, lost, in_flight)
+
+
+def updates_in(
+    packets: Rows, flow: Flow = Flow.UPDATE
+) -> tuple[Rows, NDArray[np.int64], NDArray[np.int64]]:
+    """Select the loop's messages of a flow from the packets that reached the network emulator.
+
+    The emulator reads no payload, so the packets' headers are read here.
+
+    Returns:
+        Their rows of ``netem_packet``, sequence numbers and event times.
+    """
+    indices, sequences, events_ns = [], [], []
+    heads = packets["head"]
+    octets = np.ascontiguousarray(heads).view(np.uint8).reshape(len(heads), PACKET_HEAD_BYTES)
+    marks = octets[:, FLOW_OFFSET]
+    for i in np.flatnonzero(marks == flow).tolist():
+        header = read_header(heads[i].tobytes())
+        if header is None or (header.version, header.flow) != (VERSION, flow):
+            continue
+        if header.sequence < 2**63 and header.t_ns >= 0:  # others do not fit the record's columns
+            indices.append(i)
+            sequences.append(header.sequence)
+            events_ns.append(header.t_ns)
+    return (
+        packets[indices],
+        np.array(sequences, dtype=np.int64),
+        np.array(events_ns, dtype=np.int64),
+    )

@@ -1,11 +1,9 @@
-"""The numeric record of a run: spool in, Parquet out, rows back, all batch by batch.
+"""The numeric record of a run: written as Parquet, read back batch by batch.
 
 ``RUN/record/TABLE.parquet`` is the authoritative record; ``docs/record.md`` documents the columns.
 """
 
-import contextlib
 import json
-import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -16,6 +14,7 @@ from numpy.typing import NDArray
 
 from cosim.record.environment import Kind, kind_of
 from cosim.record.process_lives import Life, LifeNumbers, generations, lives_of
+from cosim.record.process_reports import read_reports
 from cosim.record.record_source import (
     BATCH_ROWS,
     DerivedRows,
@@ -26,37 +25,18 @@ from cosim.record.record_source import (
     with_columns,
 )
 from cosim.record.record_source import Rows as Rows
-from cosim.record.run_directory import (
-    LOOP_FILE,
-    LOOPS,
-    RECORD,
-    REPORTS_FILE,
-    SCENARIO_FILE,
-    read_object,
-)
-from cosim.record.spool_merge import merged, spool_segments
+from cosim.record.run_directory import LOOP_FILE, LOOPS, RECORD, SCENARIO_FILE, read_object
 from noack.config.resolution import LoopMatrices, loop_of, network_tables, tables_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
-from noack.core.errors import CallerError, MachineError, PeerError, why
-from noack.core.file_access import write_whole
+from noack.core.errors import CallerError, PeerError
 from noack.protocol.machine_interface import RESTART
-from noack.protocol.record_tables import (
-    LOOP,
-    NO_SEQUENCE,
-    OWNER,
-    PACKET_HEAD_BYTES,
-    PLANT_STEP,
-    SENSOR_MEASUREMENT,
-)
-from noack.protocol.topology import LOOP_ROLES, RECORDER
-from noack.protocol.wire_format import FLOW_OFFSET, MAX_LOOPS, VERSION, Flow, read_header
-from noack.runtime.control_messages import LogLine, ProcessReport, parse_message
-from noack.runtime.spool import SPOOL, read_chunks
-from noack.runtime.telemetry import notices_of
+from noack.protocol.record_tables import NO_SEQUENCE, OWNER, PLANT_STEP, SENSOR_MEASUREMENT
+from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.wire_format import MAX_LOOPS
+from noack.runtime.control_messages import LogLine, parse_message
 
 _NOTICES_FILE = "notices.jsonl"
-_EARLIER = "earlier"
 _COLUMNS = 6_000
 """Columns of a whole run: short runs are not reduced, and figures have far fewer columns."""
 
@@ -226,10 +206,10 @@ def load_record(run_dir: Path, *, network: bool = False) -> RunRecord:
         raise CallerError(f"{run_dir}: a run of several loops; name one of them, e.g. {one}")
     tables = tables_of(scenario) if scenario.loops is None else network_tables()
     rows = StoredTables(folder, tables)
-    reports, earlier = _reports(run_dir, rows)
+    reports, earlier = read_reports(run_dir, rows)
     number = read_object(run_dir / LOOP_FILE).get("number")
     number = number if isinstance(number, int) and 0 <= number < MAX_LOOPS else None
-    notices = _read_notices(folder)
+    notices = read_notices(folder)
     return RunRecord(scenario, rows, notices, reports, kind_of(run_dir), earlier, number)
 
 
@@ -241,16 +221,17 @@ def write_record(record: RunRecord, run_dir: Path) -> None:
     """
     tables = {table: record.source.batches(table) for table in record.tables}
     loop = None if record.is_network else record.loop
-    _write(run_dir / RECORD, tables, record.tables, loop, record.notices)
+    write_tables(run_dir / RECORD, tables, record.tables, loop, record.notices)
 
 
-def _write(
+def write_tables(
     folder: Path,
     tables: Mapping[str, Iterable[Rows]],
     types: Mapping[str, np.dtype[np.void]],
     loop: LoopMatrices | None,
     notices: Iterable[Mapping[str, Any]],
 ) -> None:
+    """Write tables, with the names of the loop's states and inputs, and the run's log."""
     from cosim.record.table_files import write_table
 
     folder.mkdir(exist_ok=True)
@@ -262,144 +243,11 @@ def _write(
     scratch.replace(folder / _NOTICES_FILE)
 
 
-def finish_record(run_dir: Path) -> RunRecord:
-    """Convert a run's spool to its record, and remove the spool.
-
-    It merges all spools and removes duplicate rows. Of a run with [[loops]], it converts the part
-    of the network; see :func:`cosim.record.shared_spool.finish_run_record`.
-
-    Raises:
-        MachineError: the record cannot be written; the spool is kept.
-    """
-    scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
-    is_network = scenario.loops is not None
-    types = network_tables() if is_network else tables_of(scenario)
-    spool, folder = run_dir / SPOOL, run_dir / RECORD
-    tables = {table: recorded_rows(run_dir, table, dtype) for table, dtype in types.items()}
-    notices = [one for one in _notices(folder, spool) if one.get(LOOP) is None]
-    try:
-        _write(folder, tables, types, None if is_network else loop_of(scenario), notices)
-        if spool.is_dir():  # moved in one step, so that an incomplete spool is never read
-            done = spool.with_name(f"{SPOOL}.done")
-            shutil.rmtree(done, ignore_errors=True)  # of an earlier attempt that was interrupted
-            shutil.rmtree(spool.rename(done), ignore_errors=True)
-    except OSError as error:
-        raise MachineError(
-            f"{folder}: the record cannot be written: {why(error)}; what was recorded is kept "
-            f"in {spool}, and `noack summary {run_dir}` finishes it"
-        ) from None
-    return load_record(run_dir, network=True)
-
-
-def recorded_rows(run_dir: Path, table: str, dtype: np.dtype[np.void]) -> Iterator[Rows]:
-    """Yield the rows of a table from an earlier record and from the spool."""
-    from cosim.record.table_files import group_segments
-
-    path = run_dir / RECORD / f"{table}.parquet"
-    recorded = group_segments(path, dtype) if path.is_file() else ()
-    yield from merged([*recorded, *spool_segments(run_dir / SPOOL, table, dtype)], dtype)
-
-
-def updates_in(
-    packets: Rows, flow: Flow = Flow.UPDATE
-) -> tuple[Rows, NDArray[np.int64], NDArray[np.int64]]:
-    """Select the loop's messages of a flow from the packets that reached the network emulator.
-
-    The emulator reads no payload, so the packets' headers are read here.
-
-    Returns:
-        Their rows of ``netem_packet``, sequence numbers and event times.
-    """
-    indices, sequences, events_ns = [], [], []
-    heads = packets["head"]
-    octets = np.ascontiguousarray(heads).view(np.uint8).reshape(len(heads), PACKET_HEAD_BYTES)
-    marks = octets[:, FLOW_OFFSET]
-    for i in np.flatnonzero(marks == flow).tolist():
-        header = read_header(heads[i].tobytes())
-        if header is None or (header.version, header.flow) != (VERSION, flow):
-            continue
-        if header.sequence < 2**63 and header.t_ns >= 0:  # others do not fit the record's columns
-            indices.append(i)
-            sequences.append(header.sequence)
-            events_ns.append(header.t_ns)
-    return (
-        packets[indices],
-        np.array(sequences, dtype=np.int64),
-        np.array(events_ns, dtype=np.int64),
-    )
-
-
-def _notices(folder: Path, spool: Path) -> list[dict[str, Any]]:
-    notices = _read_notices(folder)
-    known = {json.dumps(notice, sort_keys=True) for notice in notices}
-    for role in (*LOOP_ROLES, RECORDER):
-        for _, data in read_chunks(spool, notices_of(role)):
-            try:
-                notice = parse_message(LogLine, data) | {"process": role}
-            except PeerError:  # damaged
-                continue
-            if (text := json.dumps(notice, sort_keys=True)) not in known:
-                known.add(text)
-                notices.append(notice)
-    return sorted(notices, key=lambda notice: int(notice["t_ns"]))
-
-
-def _read_notices(folder: Path) -> list[dict[str, Any]]:
+def read_notices(folder: Path) -> list[dict[str, Any]]:
+    """Read the run's log from the folder of its record."""
     path = folder / _NOTICES_FILE
     try:
         lines = path.read_bytes().splitlines() if path.is_file() else []
         return [parse_message(_Notice, line) for line in lines]
     except (OSError, PeerError) as error:
         raise CallerError(f"{path}: cannot be read: {error}") from None
-
-
-def report_of(role: str, text: bytes | str, tables: Iterable[str]) -> dict[str, Any]:
-    """Return a process's final report from its JSON.
-
-    Raises:
-        PeerError: the text is no report, or has no entry for a table of the process.
-    """
-    report = parse_message(ProcessReport, text)
-    if not report["rows"].keys() >= {table for table in tables if OWNER[table] == role}:
-        raise PeerError("the report lacks the number of rows of a table")
-    return report
-
-
-def write_reports(run_dir: Path, reports: Iterable[Mapping[str, Any]]) -> None:
-    """Write the final reports of all processes; each has the key ``process``.
-
-    Raises:
-        MachineError: they cannot be written.
-    """
-    in_order = sorted(reports, key=lambda report: int(report["generation"]))
-    newest = {report["process"]: report for report in in_order}
-    earlier = [report for report in in_order if report is not newest[report["process"]]]
-    content = newest | ({_EARLIER: earlier} if earlier else {})
-    # A run directory that was deleted meanwhile is not created again.
-    write_whole(run_dir / REPORTS_FILE, json.dumps(content, indent=2), make_folder=False)
-
-
-def _reports(
-    run_dir: Path, source: RecordSource
-) -> tuple[dict[str, dict[str, Any]], list[dict[str, Any]]]:
-    """Return the reports of the last process of each role, and those of earlier processes."""
-    try:
-        content = read_object(run_dir / REPORTS_FILE)
-        entries = [(role, content[role]) for role in LOOP_ROLES if role in content]
-        entries += [(one["process"], one) for one in content.get(_EARLIER, ())]
-    # A killed recorder wrote no report or an incomplete one.
-    except (LookupError, TypeError):
-        return {}, []
-    reports: dict[str, dict[str, Any]] = {}
-    earlier: list[dict[str, Any]] = []
-    for role, entry in entries:
-        with contextlib.suppress(PeerError, TypeError):  # an invalid report counts as missing
-            if role not in LOOP_ROLES:
-                continue
-            report = report_of(role, json.dumps(entry), source.types)
-            owned = [table for table in source.types if OWNER[table] == role]
-            if report.get("generation", 0) < generations(source, owned)[-1] or role in reports:
-                earlier.append(report | {"process": role})
-            else:
-                reports[role] = report
-    return reports, earlier

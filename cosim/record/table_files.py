@@ -50,7 +50,8 @@ class StoredTables(RecordSource):
     def whole(self, table: str) -> Rows:
         """Read all rows of a table."""
         if table not in self._whole:
-            batches = [np.zeros(0, self.types[table]), *self.batches(table)]
+            dtype = self.types[table]
+            batches = [np.zeros(0, dtype), *read_batches(self.path(table), dtype)]
             self._whole[table] = np.concatenate(batches)
         return self._whole[table]
 
@@ -59,8 +60,9 @@ class StoredTables(RecordSource):
         return self._counts[table]
 
     def batches(self, table: str, columns: Sequence[str] = ()) -> Iterator[Rows]:
-        """Read the rows of a table in order."""
-        if table in self._whole:
+        """Read the rows of a table in order; a short one is kept."""
+        if table in self._whole or self._counts[table] <= BATCH_ROWS:
+            self.whole(table)
             yield from RowsInMemory(self._whole).batches(table, columns)
         else:
             yield from read_batches(self.path(table), with_columns(self.types[table], columns))

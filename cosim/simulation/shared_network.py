@@ -8,8 +8,8 @@ from typing import Any
 
 from controller_node.controller import controller_of
 from cosim.record.loop_rows import network_rows_by_loop
+from cosim.record.loops_run import LoopsRun
 from cosim.record.run_record import RunRecord
-from cosim.record.shared_run import SharedRun
 from cosim.simulation.virtual_time import Gathered, Progress, Shuttle, drive, reports_of
 from netem.duplex_link import network_of
 from noack.config.loops import loops_of, phases_ns
@@ -53,7 +53,7 @@ class _GatheredByLoop:
             self.loops[number].take(role, Record(output.table, tuple(row)))
 
 
-def simulate_loops(scenario: Scenario, progress: Progress | None = None) -> SharedRun:
+def simulate_loops(scenario: Scenario, progress: Progress | None = None) -> LoopsRun:
     """Run a scenario with [[loops]] in virtual time; see :func:`simulate`.
 
     Args:
@@ -85,4 +85,4 @@ def simulate_loops(scenario: Scenario, progress: Progress | None = None) -> Shar
         scenario, network_rows, gathered.network.sorted_notices(),
         {"netem": reports["netem"]}, "simulated",
     )  # fmt: skip
-    return SharedRun(network, records)
+    return LoopsRun(network, records)

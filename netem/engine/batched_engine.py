@@ -159,7 +159,7 @@ class BatchedRelay(Relay):
         both["listen"] = np.frombuffer(packed_name(link.name)[0], np.uint8)
         sends = pump_layout.OWN_SOCKET
         if link.path is not None:
-            sends = pump_layout.SERVER_NAME
+            sends = pump_layout.DESTINATION_NAME
             with suppress(OSError):  # there is no route now; perhaps later
                 # For a connected socket, the kernel looks up the route once, not per datagram.
                 link.path.connect(link.server)

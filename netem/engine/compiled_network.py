@@ -123,7 +123,7 @@ class CompiledNetwork:
         with np.errstate(over="ignore"):
             row = memory.clients.view(np.recarray)
             insert(memory.table, row, 0, np.frombuffer(self._sensor, np.int64))
-        memory.directions["sends"] = pump_layout.SERVER_NAME
+        memory.directions["sends"] = pump_layout.DESTINATION_NAME
         for direction, destination in zip(memory.directions, destinations, strict=False):
             name, direction["name_bytes"] = packed_name(destination)
             direction["name"] = np.frombuffer(name, np.uint8)

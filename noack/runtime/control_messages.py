@@ -147,6 +147,8 @@ class ProcessReport(ControlMessage):
     ended: str  # the reason
     channel: ChannelCounters
     rows: dict[str, Count]  # number of recorded rows, by table
+    stored: dict[str, Ranges] = {}
+    """Those of them that the process has written to disk itself, by table."""
     generation: Count = 0
     instance: str = ""
     realtime: dict[str, str] = Field({})  # whether each real-time setting was applied

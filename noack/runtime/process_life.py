@@ -11,6 +11,7 @@ import socket
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
+from functools import cached_property
 from itertools import chain, repeat
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, cast
@@ -36,7 +37,7 @@ from noack.runtime.join_ticket import Ticket
 from noack.runtime.life_cycle import HORIZON, LAUNCHER_GONE, Event, LifeCycle, Side, State
 from noack.runtime.real_time_loop import Channel, run_loop
 from noack.runtime.real_time_settings import realtime
-from noack.runtime.record_handover import deliver_report, persisted_rows, spool_rows
+from noack.runtime.record_handover import OwnSpool, deliver_report, persisted_rows
 from noack.runtime.rehearsal import Rehearsal
 from noack.runtime.signals import Signals
 from noack.runtime.telemetry import TelemetryBuffer
@@ -178,6 +179,7 @@ class RunProcess:
                     "rehearsal": self.rehearsal.report() if self.rehearsal else {},
                     "channel": channel.report(),
                     "rows": telemetry.totals(),
+                    "stored": telemetry.stored(),
                     **(
                         {"rows_by_loop": by_loop} if (by_loop := telemetry.totals_by_loop()) else {}
                     ),
@@ -188,6 +190,10 @@ class RunProcess:
                 channel.close()
                 self._hand_over(telemetry)
 
+    @cached_property
+    def _spool(self) -> OwnSpool:
+        return OwnSpool(Path(self.ticket.run_dir), self.role, self.plane.instance)
+
     def _telemetry(self) -> TelemetryBuffer:
         tables = tables_of(self.scenario)
         owned = {table: dtype for table, dtype in tables.items() if OWNER[table] == self.role}
@@ -197,6 +203,7 @@ class RunProcess:
             self.plane.publish_telemetry,
             generation,
             lambda: persisted_rows(self.plane, generation),
+            self._spool.append,
         )
 
     def _drive(self, machine: Machine[T], channel: Channel[T], telemetry: TelemetryBuffer) -> int:
@@ -290,7 +297,7 @@ class RunProcess:
         # All messages to the recorder pass the coordinator.
         reachable = reachable and not self.plane.coordinator_gone()
         if not (reachable and deliver_report(self.plane, self.report, telemetry)):
-            spool_rows(Path(self.ticket.run_dir), self.role, self.plane.instance, telemetry)
+            self._spool.write_rest(telemetry)
 
 
 def lifeline_cut() -> bool:

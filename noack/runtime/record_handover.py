@@ -1,6 +1,7 @@
 """Handing a process's rows over to the recorder, or else to the run directory's spool."""
 
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 
 from noack.core.errors import PeerError
@@ -45,15 +46,31 @@ def deliver_report(
     return False
 
 
-def spool_rows(run_dir: Path, role: str, writer: str, telemetry: TelemetryBuffer) -> None:
-    """Write all rows that the buffer still holds to the spool; ``writer`` names its files."""
-    spool = SpoolWriter(run_dir / SPOOL, writer)
+class OwnSpool:
+    """The rows that a process writes to the run's spool itself.
 
-    def append(table: str, header: bytes, payload: bytes) -> None:
+    Args:
+        run_dir: the run's directory.
+        role: the process.
+        writer: names its files.
+    """
+
+    def __init__(self, run_dir: Path, role: str, writer: str) -> None:
+        self._folder, self._role, self._writer = run_dir / SPOOL, role, writer
+
+    @cached_property
+    def _files(self) -> SpoolWriter:
+        return SpoolWriter(self._folder, self._writer)
+
+    def append(self, table: str, header: bytes, payload: bytes) -> None:
+        """Write a batch; raise MachineError if it cannot be written."""
         generation, first = first_row(header)
         if table == NOTICES:
-            table, first = notices_of(role), notice_number(generation, first)
-        spool.append(table, first, payload)
+            table, first = notices_of(self._role), notice_number(generation, first)
+        self._files.append(table, first, payload)
 
-    telemetry.resend({table: [(0, n)] for table, n in telemetry.totals().items()}, append)
-    spool.close()
+    def write_rest(self, telemetry: TelemetryBuffer) -> None:
+        """Write all rows that the buffer still holds, and close the files."""
+        totals = telemetry.totals()
+        telemetry.resend({table: [(0, n)] for table, n in totals.items()}, self.append)
+        self._files.close()

@@ -1,8 +1,8 @@
 """The telemetry buffer: rows of the record, collected in the loop and published in batches.
 
 Adding a row costs well under a microsecond (one assignment into a preallocated array). Publishing
-a batch does not block. The buffer holds a batch until the recorder confirms that it is on disk, up
-to a limit of memory.
+a batch does not block. The buffer holds a batch until the recorder confirms that it is on disk. At
+a limit of memory, it writes the oldest batch to disk itself: a slow recorder costs no rows.
 """
 
 import json
@@ -19,7 +19,7 @@ from noack.protocol.record_tables import LOOP
 from noack.runtime.control_messages import BatchHeader, parse_message
 
 _BATCH_ROWS = 256
-_HELD_BYTES = 256 * 1024 * 1024
+_HELD_BYTES = 64 * 1024 * 1024
 _RESENT_AT_ONCE = 8  # batches that are sent again at a time: the loop waits for it
 
 _Batch = tuple[str, int, int, bytes]
@@ -44,6 +44,11 @@ class ReceivedRows:
         """The highest number plus one."""
         return self.ranges[-1][1] if self.ranges else 0
 
+    @property
+    def count(self) -> int:
+        """How many have arrived."""
+        return sum(end - first for first, end in self.ranges)
+
     def add(self, first: int, end: int) -> None:
         """Add the numbers from ``first`` to before ``end``."""
         low = bisect_left(self.ranges, first, key=lambda known: known[1])
@@ -64,6 +69,7 @@ class TelemetryBuffer:
     """Collects rows by table and passes them to ``publish``, which does not block.
 
     ``persisted`` returns ranges of rows that are newly confirmed to be on disk, by table.
+    ``store`` writes a batch to disk, or raises MachineError.
     """
 
     def __init__(
@@ -72,8 +78,10 @@ class TelemetryBuffer:
         publish: Publish,
         generation: int = 0,
         persisted: Callable[[], Mapping[str, Ranges]] = dict,
+        store: Publish = lambda table, header, rows: None,
     ) -> None:
-        self._publish = publish
+        self._publish, self._store = publish, store
+        self._stored: dict[str, ReceivedRows] = {}
         self._generation = generation
         self._persisted = persisted
         self._rows = {table: np.zeros(_BATCH_ROWS, dtype) for table, dtype in tables.items()}
@@ -133,6 +141,10 @@ class TelemetryBuffer:
         """Rows published so far of each loop, up to the last with rows; empty without [[loops]]."""
         return {table: counts.tolist() for table, counts in self._by_loop.items()}
 
+    def stored(self) -> dict[str, Ranges]:
+        """Ranges of the rows that were stored at the limit of memory, by table."""
+        return {table: found.ranges for table, found in self._stored.items()}
+
     def resend(self, missing: Mapping[str, list[tuple[int, int]]], publish: Publish) -> int:
         """Publish the held batches again that overlap missing row ranges; return their number."""
         sent = 0
@@ -155,9 +167,15 @@ class TelemetryBuffer:
         self._held.append((table, first, rows, payload))
         self._held_bytes += len(payload)
         while self._held_bytes > _HELD_BYTES:
-            self._held_bytes -= len(self._held.popleft()[3])
-            self._old = max(self._old - 1, 0)
+            self._store_oldest()
         self._publish(table, self._header(first, rows), payload)
+
+    def _store_oldest(self) -> None:
+        table, first, rows, payload = self._held.popleft()
+        self._held_bytes -= len(payload)
+        self._old = max(self._old - 1, 0)
+        self._store(table, self._header(first, rows), payload)
+        self._stored.setdefault(table, ReceivedRows()).add(first, first + rows)
 
     def _forget(self, rows: Mapping[str, Ranges]) -> None:
         """Drop batches that are on disk; plan to send older ones again that are not."""

@@ -247,9 +247,12 @@ def solve_sum(
     least_s = max(conditions.spacing_s, apart_s)
     if any(all(one.reached is None for one in part.bound.every) for part in parts):
         return constants(least_s, apart_s or None)
+    void = None
     if not longest:
-        with contextlib.suppress(VoidError):
+        try:
             return constants(least_s, least_s or None)
+        except VoidError as error:
+            void = error
     spacing_s = LONGEST_S
     for _ in range(_ATTEMPTS):
         if spacing_s <= least_s:
@@ -266,6 +269,8 @@ def solve_sum(
             return constants(spacing_s, spacing_s)
         # Iterate from above to the largest spacing that is consistent with itself.
         spacing_s = found_s if found_s < (1 - _SETTLED) * spacing_s else (1 - _SETTLED) * found_s
+    if void is not None:
+        raise void
     return constants(least_s, least_s or None)
 
 

@@ -5,12 +5,14 @@ Lyapunov function. ν is computed from the final L, so rounding in the computati
 """
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, spectral_abscissa
+from noack.core.matrix_functions import solve_lyapunov
 
 Stack = NDArray[np.float64]
 
@@ -48,6 +50,12 @@ class Decay(NamedTuple):
 
 def decay_of(generator: Matrix) -> Decay | None:
     """Return the better of two candidates for L; None if neither passes its check numerically."""
+    return _decay_of(np.asarray(generator, dtype=np.float64).tobytes(), len(generator))
+
+
+@lru_cache(maxsize=8)
+def _decay_of(entries: bytes, n: int) -> Decay | None:
+    generator = np.frombuffer(entries).reshape(n, n)
     rounding = EPSILON * len(generator) * float(np.linalg.norm(generator))
     if not spectral_abscissa(generator) < -rounding:
         return None
@@ -76,13 +84,11 @@ def _checked(generator: Matrix, factor: Matrix) -> Decay | None:
 
 def _lyapunov_factor(generator: Matrix) -> Matrix | None:
     """Return the factor of P, (G+νI)ᵀP + P(G+νI) = −I, ν half of G's decay rate; smooth in G."""
-    from scipy.linalg import cholesky, solve_continuous_lyapunov
-
     n = len(generator)
     shifted = generator - 0.5 * spectral_abscissa(generator) * np.eye(n)
     try:
-        P = solve_continuous_lyapunov(shifted.T, -np.eye(n))
-        return np.asarray(cholesky(0.5 * (P + P.T)))
+        P = solve_lyapunov(shifted.T, -np.eye(n))
+        return np.asarray(np.linalg.cholesky(0.5 * (P + P.T)).T)
     except (np.linalg.LinAlgError, ValueError):
         return None
 
@@ -109,35 +115,64 @@ def product(matrix: Matrix, stack: Stack) -> Stack:
     return np.asarray((matrix @ columns).reshape(len(matrix), k, r).transpose(1, 0, 2))
 
 
+def times(matrix: Matrix, values: Stack) -> Stack:
+    """Return M Y for matrices Y along the last axis, (n, r, k) → (q, r, k)."""
+    found = matrix @ values.reshape(len(values), -1)
+    return np.asarray(found.reshape(len(matrix), *values.shape[1:]))
+
+
 def frobenius_norms(stack: Stack) -> Stack:
     """Return the Frobenius norms of a stack of matrices, (k, q, r) → (k,)."""
     return np.asarray(np.sqrt(np.einsum("kij,kij->k", stack, stack)))
 
 
+def spectral_norm(matrix: Matrix) -> float:
+    """Return the spectral norm of a matrix."""
+    return float(np.linalg.svd(matrix, compute_uv=False)[0])
+
+
 def spectral_norms(stack: Stack) -> Stack:
-    """Return the spectral norms of a stack of matrices, (k, q, r) → (k,).
+    """Return the spectral norms of a stack of matrices, (k, q, r) → (k,)."""
+    return largest_gains(np.ascontiguousarray(stack.transpose(1, 2, 0)))
+
+
+def sizes(values: Stack) -> Stack:
+    """Return the Frobenius norms of matrices along the last axis, (q, r, k) → (k,)."""
+    return np.asarray(np.sqrt(np.einsum("ijk,ijk->k", values, values)))
+
+
+def largest_gains(values: Stack) -> Stack:
+    """Return the spectral norms of matrices along the last axis, (q, r, k) → (k,).
 
     They are roots of eigenvalues of Y Yᵀ, whose largest one has a small relative rounding error.
     """
-    wide = stack.shape[1] < stack.shape[2]
-    products = np.einsum("kij,klj->kil" if wide else "kij,kil->kjl", stack, stack)
+    q, r, _ = values.shape
+    if min(q, r) == 1:
+        products = np.einsum("ijk,ijk->k", values, values)[None, None]
+    else:
+        products = np.einsum("ijk,ljk->ilk" if q < r else "jik,jlk->ilk", values, values)
     if not np.isfinite(products).all():  # the norm may be finite
-        return np.asarray(np.linalg.norm(stack, 2, axis=(1, 2)))
-    return np.asarray(np.sqrt(np.maximum(largest_eigenvalues(products), 0.0)))
+        return np.asarray(np.linalg.norm(values, 2, axis=(0, 1)))
+    return np.asarray(np.sqrt(np.maximum(_largest_eigenvalues(products), 0.0)))
 
 
 def largest_eigenvalues(stack: Stack) -> Stack:
     """Return the largest eigenvalues of Gram matrices, (k, n, n) → (k,)."""
-    n = stack.shape[1]
+    return _largest_eigenvalues(stack.transpose(1, 2, 0))
+
+
+def _largest_eigenvalues(products: Stack) -> Stack:
+    """Return the largest eigenvalues of Gram matrices along the last axis, (n, n, k) → (k,)."""
+    n = len(products)
     if n == 1:
-        return stack[:, 0, 0]
+        return np.asarray(products[0, 0])
     if n == 2:
-        (a, b), (_, d) = stack.transpose(1, 2, 0)
+        (a, b), (_, d) = products
         return np.asarray(0.5 * (a + d) + np.hypot(0.5 * (a - d), b))
     if n > 3:
-        return np.asarray(np.linalg.eigvalsh(stack)[:, -1])
+        return np.asarray(np.linalg.eigvalsh(products.transpose(2, 0, 1))[:, -1])
     # The largest root of the characteristic polynomial, of the matrix with the trace 3.
-    (a, b, c), (_, d, e), (_, _, f) = stack.transpose(1, 2, 0)
+    (a, b, c), (_, d, e), (_, _, f) = products
     scale = (a + d + f) / 3
     a, b, c, d, e, f = np.array([a, b, c, d, e, f]) / np.where(scale > 0, scale, 1.0)
     a, d, f = a - 1, d - 1, f - 1

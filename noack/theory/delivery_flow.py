@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
+from noack.core.matrix_functions import exponential
 from noack.theory.contraction import (
     Stack,
     largest_eigenvalues,
@@ -55,8 +56,6 @@ class DeliveryFlow:
     """e^{Fτ} (ξ, 0) at the nodes of a grid, for a known plant; W is the identity."""
 
     def __init__(self, plant: PlantGains) -> None:
-        from scipy.linalg import expm
-
         error = plant.error
         self.weight, self.inverse = error.weight, error.inverse_weight
         self.n = len(error.H)
@@ -70,7 +69,7 @@ class DeliveryFlow:
         fastest = max(float(np.abs(np.linalg.eigvals(self.generator)).max()), 1e-9)
         slowest, unstable = -spectral_abscissa(self.H), spectral_abscissa(self.generator)
         step_s, state = _FIRST_STEP / fastest, np.eye(2 * self.n)[:, : self.n]
-        leap, t_s = expm(self.generator * step_s), 0.0
+        leap, t_s = exponential(self.generator * step_s), 0.0
         edges, states = [0.0], [state]
         for cell in range(1, _MOST_CELLS):
             t_s, state = t_s + step_s, leap @ state
@@ -144,13 +143,11 @@ class Starts:
     @cached_property
     def late(self) -> tuple[Matrix, float]:
         """e^{FT'} for some T' before the last node, and a bound of ‖x + e_c‖ from then on."""
-        from scipy.linalg import expm
-
         flow, n = self.flow, self.flow.n
         node = int(flow.edges_s.searchsorted(5 / 6 * flow.edges_s[-1])) - 1
         since_s = float(flow.edges_s[-1] - flow.edges_s[node])
         x_c = flow.states[node, :n] + flow.states[node, n:]
-        return np.asarray(expm(flow.generator * since_s)), flow.stretch * float(
+        return np.asarray(exponential(flow.generator * since_s)), flow.stretch * float(
             np.linalg.norm(x_c @ self.inverse, 2)
         )
 

@@ -15,23 +15,30 @@ inflation of 1e-9.
 """
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import NamedTuple
+from functools import cached_property, lru_cache
+from itertools import accumulate, pairwise
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, spectral_abscissa
+from noack.core.matrix_functions import exponential
 from noack.theory.contraction import (
     EPSILON,
     Decay,
     Stack,
     decay_of,
     frobenius_norms,
+    largest_gains,
     logarithmic_norm,
     product,
+    sizes,
+    spectral_norm,
     spectral_norms,
+    times,
 )
 
 _ROUNDING = 1.0 + 1e-9
@@ -54,7 +61,8 @@ class NotDecayingError(ArithmeticError):
     """The generator is not Hurwitz: bounds over all times would be infinite."""
 
 
-class KernelBounds(NamedTuple):
+@dataclass(frozen=True)
+class KernelBounds:
     """Upper bounds of k(τ) = ‖C e^{Gτ} D‖ (spectral norm) on a grid of cells, and beyond it."""
 
     edges_s: NDArray[np.float64]
@@ -76,10 +84,14 @@ class KernelBounds(NamedTuple):
 
     def sups(self, after_s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Sup of k(τ) over τ ≥ a for each a, (j,)."""
-        from_cell = np.maximum.accumulate(np.append(self.highest, self.tail_highest)[::-1])[::-1]
         first = np.searchsorted(self.edges_s, after_s, side="right") - 1
         beyond_s = np.maximum(after_s - self.edges_s[-1], 0.0)
-        return np.asarray(from_cell[first] * np.exp(-self.tail_rate_per_s * beyond_s))
+        return np.asarray(self._from_cell[first] * np.exp(-self.tail_rate_per_s * beyond_s))
+
+    @cached_property
+    def _from_cell(self) -> NDArray[np.float64]:
+        """Sup of k from the begin of each cell on."""
+        return np.maximum.accumulate(np.append(self.highest, self.tail_highest)[::-1])[::-1]
 
     def integral(self) -> float:
         """∫k over all times."""
@@ -92,6 +104,31 @@ class KernelBounds(NamedTuple):
     def integral_on_grid(self) -> float:
         """∫k over the grid only."""
         return float(self.area.sum())
+
+
+Name = TypeVar("Name", bound=str)
+
+
+class Outputs(Generic[Name]):
+    """Several output matrices C, (q, n) each, whose bounds are computed at once.
+
+    They are ``stacked`` one below the other; ``rows`` are the rows of each, ``norms`` its ‖C‖.
+    """
+
+    def __init__(self, matrices: Mapping[Name, Matrix]) -> None:
+        self.names = list(matrices)
+        self.stacked = np.concatenate(list(matrices.values()))
+        self.rows = _slices(*accumulate(map(len, matrices.values()), initial=0))
+        self.norms = self.norms_with(None)
+
+    def norms_with(self, M: Matrix | None) -> NDArray[np.float64]:
+        """Return ‖C M‖ of each C."""
+        product = self.stacked if M is None else self.stacked @ M
+        return np.array([spectral_norm(product[rows]) for rows in self.rows])
+
+    def sizes(self, values: Stack, columns: Sequence[slice]) -> Stack:
+        """Return the Frobenius norms of C Y, (rows, r, k) → (outputs, groups of columns, k)."""
+        return np.array([[sizes(values[rows, group]) for group in columns] for rows in self.rows])
 
 
 @dataclass(frozen=True)
@@ -107,41 +144,73 @@ class ResponseBounds:
     decay: Decay | None
     """L and ν; None if they are not needed, or if G does not decay."""
     endless: bool
-    """Whether bounds beyond the grid are requested."""
+    """Whether bounds beyond the grid are requested, for one group of columns."""
+    groups: tuple[int, ...] = (0,)
+    """The first column of each group of D's columns that is bounded apart."""
 
     @cached_property
     def _bends(self) -> "_Bends":
-        return _bends(self.generator, self.states[:-1], np.diff(self.edges_s), self.decay)
+        nodes = self._nodes[:, :, :-1]
+        return _bends(self.generator, nodes, np.diff(self.edges_s), self.decay, self._columns)
+
+    @cached_property
+    def _nodes(self) -> Stack:
+        """The states with time last, (n, r, cells + 1)."""
+        return np.ascontiguousarray(self.states.transpose(1, 2, 0))
+
+    @property
+    def _columns(self) -> list[slice]:
+        """The columns of each group."""
+        return _slices(*self.groups, self.states.shape[2])
 
     def through(self, C: Matrix) -> KernelBounds:
         """Return bounds of ‖C e^{Gτ} D‖, with C of shape (q, n)."""
-        steps_s = np.diff(self.edges_s)
-        norms = norm_bounds(C, self.states)
-        bend = self._bends.over(C)
-        ends = np.maximum(norms[:-1], norms[1:])
-        middle = 0.5 * (norms[:-1] + norms[1:])
-        rate, beyond = 0.0, math.inf
+        return self.through_each(Outputs({"": C}))[""]
+
+    def through_each(self, outputs: Outputs[Name]) -> dict[Name, KernelBounds]:
+        """Return bounds of ‖C e^{Gτ} D‖ for every output."""
+        return {name: found for name, (found,) in self.through_groups(outputs).items()}
+
+    def through_groups(self, outputs: Outputs[Name]) -> dict[Name, list[KernelBounds]]:
+        """Return bounds of ‖C e^{Gτ} D‖ for every output and each group of columns of D."""
+        steps_s, columns, nodes = np.diff(self.edges_s), self._columns, self._nodes
+        exact = times(outputs.stacked, nodes)
+        rounding = outputs.sizes(times(np.abs(outputs.stacked), np.abs(nodes)), columns)
+        norms = np.array(
+            [[largest_gains(exact[rows, group]) for group in columns] for rows in outputs.rows]
+        )
+        norms += EPSILON * len(nodes) * rounding
+        bends = self._bends.over(outputs)
+        middle = 0.5 * (norms[..., :-1] + norms[..., 1:])
+        highest = np.maximum(norms[..., :-1], norms[..., 1:]) + steps_s**2 / 8 * bends
+        areas = (steps_s * middle + steps_s**3 / 12 * bends) * _ROUNDING
+        highest *= _ROUNDING
+        rate, beyond = 0.0, np.full(norms.shape[:2], math.inf)
         if self.endless and self.decay is not None:
             rate = self.decay.rate_per_s
-            beyond = float(self.decay.bounds(C, self.states[-1:])[0]) * _ROUNDING
-        return KernelBounds(
-            self.edges_s,
-            (ends + steps_s**2 / 8 * bend) * _ROUNDING,
-            (steps_s * middle + steps_s**3 / 12 * bend) * _ROUNDING,
-            beyond,
-            beyond / rate if rate > 0 else math.inf,
-            rate,
-        )
+            last = self.decay.sizes(self.states[-1:])
+            beyond = outputs.norms_with(self.decay.inverse)[:, None] * last * _ROUNDING
+        tails = beyond.tolist()
+        return {
+            name: [
+                KernelBounds(
+                    self.edges_s, highest[i, j], areas[i, j], tail,
+                    tail / rate if rate > 0 else math.inf, rate,
+                )
+                for j, tail in enumerate(tails[i])
+            ]
+            for i, name in enumerate(outputs.names)
+        }  # fmt: skip
 
     def areas_of_columns(self, C: Matrix) -> Stack:
         """Return bounds of Σ_i ∫‖C e^{Gτ} D_i‖ over each cell, for the columns D_i of D."""
-        steps_s, n, columns = np.diff(self.edges_s), len(C.T), self.states.shape[2]
-        rounding = frobenius_norms(product(np.abs(C), np.abs(self.states)))
-        norms = np.linalg.norm(product(C, self.states), axis=1).sum(axis=1)
+        steps_s, nodes, columns = np.diff(self.edges_s), self._nodes, self.states.shape[2]
+        rounding = sizes(times(np.abs(C), np.abs(nodes)))
+        norms = np.linalg.norm(times(C, nodes), axis=0).sum(axis=0)
         # The sum over the columns is at most √columns times the Frobenius norm.
-        norms = norms + np.sqrt(columns) * EPSILON * n * rounding
+        norms = norms + np.sqrt(columns) * EPSILON * len(nodes) * rounding
         middle = 0.5 * (norms[:-1] + norms[1:])
-        bend = np.sqrt(columns) * self._bends.over(C)
+        bend = np.sqrt(columns) * self._bends.over(Outputs({"": C}))[0, 0]
         return np.asarray((steps_s * middle + steps_s**3 / 12 * bend) * _ROUNDING)
 
 
@@ -156,44 +225,58 @@ def norm_bounds(C: Matrix, states: Stack) -> Stack:
 class _Bends:
     """The factors, apart from C, of the bounds of ‖C G² e^{Gτ} D‖ over k cells."""
 
+    columns: Sequence[slice]
+    """Groups of D's columns."""
     terms: Stack
-    """(4k, n, r), Taylor's terms G^j e^{Gτ} D s^{j−2}/(j−2)! at the left nodes, by order."""
+    """(n, r, 4k), Taylor's terms G^j e^{Gτ} D s^{j−2}/(j−2)! at the left nodes, by order."""
     rest: Stack
-    """(k,), factor of ‖C‖ in a bound of the remainder."""
+    """(groups, k), factor of ‖C‖ in a bound of the remainder."""
     decay: Decay | None
     rest_decaying: Stack
-    """(k,), factor of ‖C L^{−1}‖ in a bound of the remainder from the decay."""
+    """(groups, k), factor of ‖C L^{−1}‖ in a bound of the remainder from the decay."""
     least: Stack
-    """(k,), factor of ‖C L^{−1}‖ in a bound of the whole value."""
+    """(groups, k), factor of ‖C L^{−1}‖ in a bound of the whole value."""
 
-    def over(self, C: Matrix) -> Stack:
-        """Return the bounds for an output matrix C, (k,)."""
-        bound = frobenius_norms(product(C, self.terms)).reshape(_TAYLOR_TERMS, -1).sum(axis=0)
-        rest = float(np.linalg.norm(C, 2)) * self.rest
+    def over(self, outputs: Outputs[Name]) -> Stack:
+        """Return the bounds for output matrices C, (outputs, groups, k)."""
+        found = outputs.sizes(times(outputs.stacked, self.terms), self.columns)
+        bound = found.reshape(*found.shape[:2], _TAYLOR_TERMS, -1).sum(axis=2)
+        rest = outputs.norms[:, None, None] * self.rest
         if self.decay is None:
             return np.asarray(bound + rest)
-        seen = self.decay.seen(C)
+        seen = outputs.norms_with(self.decay.inverse)[:, None, None]
         bound += np.minimum(rest, seen * self.rest_decaying)
         return np.asarray(np.minimum(seen * self.least, bound))
 
 
-def _bends(generator: Matrix, nodes: Stack, steps_s: Stack, decay: Decay | None) -> _Bends:
-    """Return the factors for the cells that start at the nodes, (k, n, r), by Taylor's formula."""
+def _bends(
+    generator: Matrix, nodes: Stack, steps_s: Stack, decay: Decay | None, columns: Sequence[slice]
+) -> _Bends:
+    """Return the factors for the cells that start at the nodes, (n, r, k), by Taylor's formula."""
     exponents = max(logarithmic_norm(generator), 0.0) * steps_s
     growth = np.where(
         exponents < _LARGEST_EXPONENT, np.exp(exponents.clip(max=_LARGEST_EXPONENT)), np.inf
     )
-    terms = [product(generator, product(generator, nodes))]
+    terms = [times(generator, times(generator, nodes))]
     for order in range(1, _TAYLOR_TERMS + 1):
-        terms.append(product(generator, terms[-1]) * (steps_s / order)[:, None, None])
+        terms.append(times(generator, terms[-1]) * (steps_s / order))
+
+    def norms(values: Stack) -> Stack:
+        return np.array([sizes(values[:, group]) for group in columns])
+
     none = np.zeros(0)
     return _Bends(
-        np.concatenate(terms[:-1]),
-        growth * frobenius_norms(terms[-1]),
+        columns,
+        np.concatenate(terms[:-1], axis=2),
+        growth * norms(terms[-1]),
         decay,
-        none if decay is None else decay.sizes(terms[-1]),
-        none if decay is None else decay.sizes(terms[0]),
+        none if decay is None else norms(times(decay.factor, terms[-1])),
+        none if decay is None else norms(times(decay.factor, terms[0])),
     )
+
+
+def _slices(*ends: int) -> list[slice]:
+    return [slice(*pair) for pair in pairwise(ends)]
 
 
 def response(generator: Matrix, D: Matrix) -> ResponseBounds:
@@ -208,7 +291,7 @@ def response(generator: Matrix, D: Matrix) -> ResponseBounds:
     decay = decay_of(generator)
     if decay is None:
         raise NotDecayingError("no Lyapunov function of it was found to working precision")
-    everything = np.eye(len(generator))
+    everything = Outputs({"": np.eye(len(generator))})
     parts: list[Stack] = []
     edges: list[Stack] = [np.zeros(1)]
     area, t_s, state, cells = 0.0, 0.0, D, 0
@@ -222,26 +305,29 @@ def response(generator: Matrix, D: Matrix) -> ResponseBounds:
         t_s, state = float(edges[-1][-1]), states[-1]
         area += step_s * float(frobenius_norms(states[:-1]).sum())
         cells += _CELLS_PER_BLOCK
-        rest = float(decay.bounds(everything, state[None])[0]) / decay.rate_per_s
+        rest = float(decay.bounds(everything.stacked, state[None])[0]) / decay.rate_per_s
         if rest <= _TAIL_SHARE * area or cells >= most_cells:
             break
-        while step_s > usual_s and not _straight(generator, state, step_s, decay):
+        while step_s > usual_s and not _straight(everything, generator, state, step_s, decay):
             step_s /= 2
-        if 2 * step_s <= usual_s or _straight(generator, state, 2 * step_s, decay):
+        if 2 * step_s <= usual_s or _straight(everything, generator, state, 2 * step_s, decay):
             step_s *= 2
     states = np.concatenate([*parts, state[None]])
     return ResponseBounds(generator, np.concatenate(edges), states, decay, endless=True)
 
 
-def _straight(generator: Matrix, state: Matrix, step_s: float, decay: Decay) -> bool:
+def _straight(
+    everything: Outputs[str], generator: Matrix, state: Matrix, step_s: float, decay: Decay
+) -> bool:
     """Return whether e^{Gτ} Y is close to its chord over a step."""
     size = float(np.linalg.norm(state))
-    everything, steps_s = np.eye(len(generator)), np.array([step_s])
-    bend = _bends(generator, state[None], steps_s, decay).over(everything)
-    return bool(step_s**2 / 8 * bend[0] <= _SAG * size)
+    bends = _bends(generator, state[:, :, None], np.array([step_s]), decay, [slice(None)])
+    return bool(step_s**2 / 8 * bends.over(everything).item() <= _SAG * size)
 
 
-def response_until(generator: Matrix, D: Matrix, until_s: float, cells: int = 64) -> ResponseBounds:
+def response_until(
+    generator: Matrix, D: Matrix, until_s: float, cells: int = 64, groups: tuple[int, ...] = (0,)
+) -> ResponseBounds:
     """Compute e^{Gτ} D over 0 ≤ τ ≤ ``until_s`` on a grid of ``cells`` equal cells."""
     step_s = until_s / cells
     return ResponseBounds(
@@ -250,6 +336,7 @@ def response_until(generator: Matrix, D: Matrix, until_s: float, cells: int = 64
         _propagate(generator, D, step_s, cells),
         decay_of(generator) if step_s * np.linalg.norm(generator) > 1 else None,
         endless=False,
+        groups=groups,
     )
 
 
@@ -273,18 +360,26 @@ def factors(matrix: Matrix) -> tuple[Matrix, Matrix]:
 
 def _propagate(generator: Matrix, state: Matrix, step_s: float, cells: int) -> Stack:
     """Return e^{G k s} state for k = 0 … cells, (cells + 1, n, r), block by block."""
-    from scipy.linalg import expm
-
-    powers, size = np.eye(len(generator))[None], min(_BLOCK, cells)
-    leap = expm(generator * step_s)
-    while len(powers) < size:
-        powers, leap = np.concatenate([powers, product(leap, powers)]), leap @ leap
-    size = len(powers)
-    blocks = []
+    entries = np.asarray(generator, dtype=np.float64).tobytes()
+    powers, leap = _powers(entries, len(generator), step_s, min(_BLOCK, cells))
+    size, blocks = len(powers), []
     for _ in range(-(-(cells + 1) // size)):
         blocks.append((powers.reshape(-1, len(state)) @ state).reshape(size, *state.shape))
         state = leap @ state
     return np.concatenate(blocks)[: cells + 1]
+
+
+@lru_cache(maxsize=8)
+def _powers(entries: bytes, n: int, step_s: float, least: int) -> tuple[Stack, Matrix]:
+    """Return e^{G k s} for k < 2^j, at least so many, and e^{G 2^j s}.
+
+    The matrix is given by its entries; several responses follow each other with the same steps.
+    """
+    generator = np.frombuffer(entries).reshape(n, n)
+    powers, leap = np.eye(n)[None], exponential(generator * step_s)
+    while len(powers) < least:
+        powers, leap = np.concatenate([powers, product(leap, powers)]), leap @ leap
+    return powers, leap
 
 
 def _fastest(generator: Matrix) -> float:

@@ -10,7 +10,7 @@ interest are the weighted norm W, the state itself, E x, and K H x (the error ra
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
 from typing import ClassVar, NamedTuple
@@ -23,6 +23,7 @@ from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, Vector, discretise, spectral_abscissa
 from noack.theory.enclosure import (
     KernelBounds,
+    Outputs,
     ResponseBounds,
     constant_kernel,
     factors,
@@ -30,6 +31,7 @@ from noack.theory.enclosure import (
     response,
     response_until,
 )
+from noack.theory.forcing import Forcing
 
 
 class Output(StrEnum):
@@ -48,37 +50,6 @@ class Coefficients(NamedTuple):
 
     free: float
     gain: float
-
-
-class NormalForcing(NamedTuple):
-    """Disturbances D ξ, ξ of k independent standard normal values, constant over each period."""
-
-    columns: Matrix
-    """D, (n, k)."""
-    period_s: float
-    limit: float
-    """Assumed bound of every single value of ξ."""
-    radius: float
-    """Assumed bound of ‖v‖ for n independent standard normal values v, at every period's end."""
-
-
-class Forcing(NamedTuple):
-    """Disturbances: ẋ = Ax + Bu + Σ_i D_i s_i, |s_i| ≤ 1 at every time, and normal ones."""
-
-    columns: Matrix
-    """D_i, (n, k)."""
-    durations_s: Vector
-    """The time for which s_i is not 0, (k,); infinite if it never ends."""
-    at_input: Vector
-    """Bound of what is added to u, included in the columns, (m,)."""
-    normal: NormalForcing | None = None
-
-    @property
-    def limited(self) -> Matrix:
-        """Columns with the bounds of all values, normal ones included, (n, k')."""
-        if self.normal is None:
-            return self.columns
-        return np.hstack([self.columns, self.normal.limit * self.normal.columns])
 
 
 class Columns(NamedTuple):
@@ -145,6 +116,15 @@ class ErrorGains:
         }
 
     @cached_property
+    def stacked(self) -> Outputs[Output]:
+        """All outputs, whose bounds are computed at once."""
+        return Outputs(self.outputs)
+
+    @cached_method
+    def _stack(self, output: Output) -> Outputs[Output]:
+        return Outputs({output: self.outputs[output]})
+
+    @cached_property
     def kernels(self) -> Mapping[Output, KernelBounds]:
         """‖C e^{(H+αI)τ} W^{−1}‖ for every output.
 
@@ -154,10 +134,10 @@ class ErrorGains:
         if not self.scaled_H.any():  # a hold: a missed update's contribution does not decay
             return {output: constant_kernel(self.now(output)) for output in self.outputs}
         followed = response(self.scaled_H, self.inverse_weight)
-        found = {output: followed.through(C) for output, C in self.outputs.items()}
+        found = followed.through_each(self.stacked)
         if self.contracts:  # ‖·‖_W is a Lyapunov function: no sum of missing events exceeds M
             norm = found[Output.WEIGHTED]
-            found[Output.WEIGHTED] = norm._replace(highest=np.minimum(norm.highest, 1.0))
+            found[Output.WEIGHTED] = replace(norm, highest=np.minimum(norm.highest, 1.0))
         return found
 
     @cached_property
@@ -167,6 +147,7 @@ class ErrorGains:
         size = float(np.linalg.norm(turned, 2))
         return float(np.linalg.eigvalsh(turned + turned.T).max()) <= 1e-12 * size
 
+    @cached_method
     def now(self, output: Output) -> float:
         """Return ‖C W^{−1}‖, the gain of the present e_s."""
         if output is Output.WEIGHTED:
@@ -189,8 +170,8 @@ class ErrorGains:
         for number in range(events):
             until_s = (number + 1) * due_s
             followed = response_until(self.scaled_H, self.inverse_weight, until_s)
-            for output, C in self.outputs.items():
-                totals[output] += followed.through(C).sup_on_grid()
+            for output, kernel in followed.through_each(self.stacked).items():
+                totals[output] += kernel.sup_on_grid()
         return totals
 
     @property
@@ -200,18 +181,19 @@ class ErrorGains:
 
     def growth(self, columns: Columns, until_s: float, cells: int) -> Callable[[Output], Growth]:
         """Return the growth of every output C e_s, with what drives e_s through these columns."""
-
-        def followed(D: Matrix) -> ResponseBounds:
-            return response_until(self.scaled_H, D, until_s, cells)
-
-        mismatch, forced = followed(columns.mismatch), followed(columns.input_error)
-        disturbed = followed(columns.disturbed) if columns.disturbed.size else None
+        driven = np.hstack([columns.mismatch, columns.input_error])
+        groups = (0, columns.mismatch.shape[1])
+        followed = response_until(self.scaled_H, driven, until_s, cells, groups)
+        disturbed = None
+        if columns.disturbed.size:
+            disturbed = response_until(self.scaled_H, columns.disturbed, until_s, cells)
 
         def of(output: Output) -> Growth:
-            C, areas = self.outputs[output], np.zeros(cells)
+            areas = np.zeros(cells)
             if disturbed is not None:
-                areas = disturbed.areas_of_columns(C)
-            return Growth(mismatch.through(C), forced.through(C), areas)
+                areas = disturbed.areas_of_columns(self.outputs[output])
+            mismatch, forced = followed.through_groups(self._stack(output))[output]
+            return Growth(mismatch, forced, areas)
 
         return of
 
@@ -287,16 +269,21 @@ class PlantGains:
         }
 
     @cached_property
+    def stacked(self) -> Outputs[str]:
+        """All outputs, whose bounds are computed at once."""
+        return Outputs(self.outputs)
+
+    @cached_property
     def states(self) -> Mapping[str, Coefficients]:
         """sup‖C x‖ from x(0), the disturbances and the input error.
 
         Raises:
             NotDecayingError: α is not below the decay rate of e^{(A+BK)τ}.
         """
-        start = response(self.closed_loop, self.start)
+        start = response(self.closed_loop, self.start).through_each(self.stacked)
         return {
             output: Coefficients(
-                start.through(C).sup() + self.disturbed(C), self.forced[output].integral()
+                start[output].sup() + self.disturbed(C), self.forced[output].integral()
             )
             for output, C in self.outputs.items()
         }
@@ -351,7 +338,7 @@ class PlantGains:
     @cached_property
     def forced(self) -> Mapping[str, KernelBounds]:
         """‖C e^{(A+BK+αI)τ} B U‖ for every output."""
-        return {output: self._forced.through(C) for output, C in self.outputs.items()}
+        return self._forced.through_each(self.stacked)
 
     @cached_property
     def _forced(self) -> ResponseBounds:
@@ -368,7 +355,7 @@ class PlantGains:
         error = self.error
         lost = response_until(error.scaled_H, error.inverse_weight, until_s, cells)
         forced = response_until(self.closed_loop, self.input_matrix, until_s, cells)
-        areas = {output: forced.through(C).area for output, C in self.outputs.items()}
+        areas = {output: one.area for output, one in forced.through_each(self.stacked).items()}
         return lost.through(error.outputs[Output.GAIN]).highest, areas
 
     @cached_method

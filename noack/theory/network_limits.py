@@ -1,7 +1,7 @@
 """The largest sampling period, delay and age of inputs for which a certificate exists."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from noack.theory.certificate import NetworkConditions
@@ -11,7 +11,12 @@ MOST_S = 10.0
 """No larger times are tried."""
 _LEAST_S, _USUAL_S = 1e-6, 1e-3
 _RESOLUTION = 1e-3
-_WIDER = 4.0
+_WIDER, _NEXT = 4.0, 1.2
+_STEPS = 6
+"""After so many steps the middle is tried, if interpolation has not found the limit."""
+
+Points = Sequence[tuple[float, float]]
+"""Logarithms of loop gains, and of their times."""
 
 
 class NetworkLimits(NamedTuple):
@@ -38,43 +43,47 @@ def network_limits(scope: CertificateScope, scheduled: NetworkConditions) -> Net
 def largest(loop_gain: Callable[[float], float], usual_s: float) -> float:
     """Return the largest time with a loop gain below 1, to 0.1 %, or 0 below 1 µs.
 
-    The gain grows with the time; it is infinite where it is not known. It is 1 near the time that
-    interpolation gives, so what is tried is that time, then one next to it on the other side, and
-    then the middle.
+    The gain grows with the time; it is infinite where it is not known.
 
     Args:
         loop_gain: of a time in s.
         usual_s: a time in s for which the gain is probably below 1.
     """
-    if loop_gain(MOST_S) < 1:
-        return MOST_S
-    low, high = (0.0, math.nan), (MOST_S, math.inf)
-    tried_s, step = min(usual_s or _USUAL_S, MOST_S / _WIDER), 0
-    while high[0] > _LEAST_S and high[0] - low[0] > _RESOLUTION * high[0]:
+    low_s, high_s, known = 0.0, math.inf, list[tuple[float, float]]()
+    tried_s, step = min(usual_s or _USUAL_S, MOST_S), 0
+    while high_s > _LEAST_S and (math.isinf(high_s) or high_s - low_s > _RESOLUTION * high_s):
         gain = loop_gain(tried_s)
-        step += 1
-        low, high = ((tried_s, gain), high) if gain < 1 else (low, (tried_s, gain))
-        if low[0] == 0:
-            tried_s = high[0] / _WIDER
-        elif math.isinf(high[1]):
-            tried_s = min(_WIDER * low[0], math.sqrt(low[0] * high[0]))
-        elif step % 3 == 0:
-            tried_s = math.sqrt(low[0] * high[0])
-        elif step % 3 == 1:
-            tried_s = _interpolated(low, high)
-        else:  # beyond the time that was interpolated
-            near = 0.9 * _RESOLUTION
-            tried_s *= 1 + near if gain < 1 else 1 - near
-            if not low[0] < tried_s < high[0]:
-                tried_s = math.sqrt(low[0] * high[0])
-    return low[0]
+        if 0 < gain < math.inf:
+            known.append((math.log(gain), math.log(tried_s)))
+        low_s, high_s = (tried_s, high_s) if gain < 1 else (low_s, tried_s)
+        if low_s == MOST_S:
+            break
+        step += low_s > 0 and math.isfinite(high_s)
+        tried_s = _next_s(low_s, high_s, known, middle=step % _STEPS == 0)
+    return low_s
 
 
-def _interpolated(low: tuple[float, float], high: tuple[float, float]) -> float:
-    """Return the time at which the gain is 1, between two times, in logarithms."""
-    (low_s, below), (high_s, above) = low, high
-    if not below > 0:
+def _next_s(low_s: float, high_s: float, known: Points, *, middle: bool) -> float:
+    """Return the time to try next, between those with gains below and above 1."""
+    guess_s = _interpolated_s(known)
+    if low_s == 0:
+        return high_s / _WIDER
+    if math.isinf(high_s):
+        is_found = len(known) > 1 and guess_s > low_s
+        guess_s = max(guess_s, _NEXT * low_s) if is_found else _WIDER * low_s
+        return min(guess_s, _WIDER**2 * low_s, MOST_S)
+    if middle or not low_s < guess_s < high_s:
         return math.sqrt(low_s * high_s)
-    share = math.log(1 / below) / math.log(above / below)
-    share = min(max(share, 0.01), 0.99)
-    return low_s * math.exp(share * math.log(high_s / low_s))
+    # Next to a time that is close to the guess, the next one is on the other side of it.
+    near = 0.9 * _RESOLUTION
+    return min(max(guess_s, low_s * (1 + near)), high_s * (1 - near))
+
+
+def _interpolated_s(known: Points) -> float:
+    """Return the time at which the gain is 1, from the gains nearest to it, in logarithms."""
+    nearest = sorted(known, key=lambda point: abs(point[0]))[:3]
+    found = 0.0
+    for gain, time in nearest:
+        others = [other for other, _ in nearest if other != gain]
+        found += time * math.prod(other / (other - gain) for other in others)
+    return math.exp(min(found, math.log(MOST_S)))

@@ -12,7 +12,6 @@ sum over all past sources of ‖W Φ(k, j) S‖ is largest at some k; beyond the
 bounded in a norm in which (I − L C) Âˢ contracts. Without an observer x̂ = y and e = v.
 """
 
-from collections.abc import Sequence
 from functools import cached_property
 from itertools import islice
 
@@ -25,9 +24,9 @@ from noack.config.state_estimation import assumed_model
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, discretise
 from noack.theory.certificate import EstimationBound
-from noack.theory.contraction import spectral_norms
+from noack.theory.contraction import largest_gains, spectral_norm, times
 from noack.theory.enclosure import NotDecayingError, factors
-from noack.theory.gains import Forcing
+from noack.theory.forcing import Forcing
 from noack.theory.persistent_causes import noise_bound, noise_deviations, normal_bounds
 
 Stack = NDArray[np.float64]
@@ -39,7 +38,7 @@ _MOST_GAINS = 1500
 _SETTLED = 1e-9
 _MOST_STEPS = 100_000
 _TAIL_SHARE = 1e-4
-_ENTRIES = 20_000
+_ENTRIES = 100_000
 """Of the effects that are computed together."""
 _ROUNDING = 1 + 1e-6
 
@@ -86,11 +85,11 @@ class EstimationError:
         first = loop.x0 if known else np.zeros(loop.n)
         if observer.initial_estimate is not None:
             first = np.array(observer.initial_estimate)
-        start = (self._rest(0) @ (first - loop.x0))[None, :, None]
-        nothing = np.zeros((0, loop.n, 1))
-        fixed = self._peak([nothing] * len(self._gains), alpha_per_s, start)
-        for sources in self._persistent_sources:
-            fixed += self._excess(sources, alpha_per_s)
+        start = (self._rest[0] @ (first - loop.x0))[None, :, None]
+        nothing = np.zeros((len(self._gains), 0, loop.n, 1))
+        fixed = self._peak(nothing, alpha_per_s, start)
+        for sources, peak in zip(self._persistent_sources, self._settled_peaks, strict=True):
+            fixed += self._excess(sources, peak, alpha_per_s)
         if self._radius:
             fixed += self._radius * self._excess_deviation(alpha_per_s)
         return self._with_model_error(fixed, alpha_per_s)
@@ -106,7 +105,7 @@ class EstimationError:
             spread = float(np.linalg.norm(W * self._noise_deviations, 2))
             fixed = float(np.linalg.norm(np.abs(W) @ self._noise)) + self._radius * spread
             return EstimationBound(fixed)
-        fixed = sum(self._peak(sources[-2:], 0.0) for sources in self._persistent_sources)
+        fixed = sum(self._settled_peaks)
         spread = float(np.linalg.norm(W @ self._settled_covariance @ W.T, 2))
         fixed += self._radius * np.sqrt(spread) * _ROUNDING
         return self._with_model_error(fixed, 0.0)
@@ -118,12 +117,17 @@ class EstimationError:
         return 0.0 if bounds is None else bounds.radius(self._loop.n)
 
     @cached_property
-    def _persistent_sources(self) -> list[list[Stack]]:
+    def _persistent_sources(self) -> list[Stack]:
         """The effects of bounded noise and of each bounded disturbance on the measurements."""
         found = [self._sources(column[:, None], 0.0) for column in self._pushes.T]
         if self._noise.any():
-            found.append([(L * self._noise).T[:, :, None] for L in self._gains])
+            found.append((self._gains * self._noise).transpose(0, 2, 1)[..., None])
         return found
+
+    @cached_property
+    def _settled_peaks(self) -> list[float]:
+        """The largest sum of these effects when the gains have settled."""
+        return [self._peak(sources[-2:], 0.0) for sources in self._persistent_sources]
 
     @cached_property
     def _covariances(self) -> list[tuple[Matrix, Matrix]]:
@@ -131,7 +135,7 @@ class EstimationError:
         sources, found = self._sources(self._normal_pushes, 0.0), []
         for k, L in enumerate(self._gains):
             pushed, noise = np.hstack([*sources[k]]), L * self._noise_deviations
-            found.append((self._rest(k) @ self._between, pushed @ pushed.T + noise @ noise.T))
+            found.append((self._rest[k] @ self._between, pushed @ pushed.T + noise @ noise.T))
         return found
 
     @cached_property
@@ -169,8 +173,8 @@ class EstimationError:
         return EstimationBound(fixed, {MISMATCH: gains[0]}, gains[1])
 
     @cached_property
-    def _gains(self) -> list[Matrix]:
-        """L_k until it has settled.
+    def _gains(self) -> Stack:
+        """L_k until it has settled, (k, n, p).
 
         Raises:
             NotDecayingError: it does not settle in so many measurements.
@@ -178,10 +182,10 @@ class EstimationError:
         assert self._resolved.observer is not None
         found: list[Matrix] = []
         for L in islice(self._resolved.observer.gains(self._model), _MOST_GAINS):
-            if found and np.abs(L - found[-1]).max() <= _SETTLED * np.abs(L).max() * (
-                1 - self._spectral_radius(L)
-            ):
-                return [*found, L]
+            if found:
+                changed, least = np.abs(L - found[-1]).max(), _SETTLED * np.abs(L).max()
+                if changed <= least and changed <= least * (1 - self._spectral_radius(L)):
+                    return np.array([*found, L])
             found.append(L)
         raise NotDecayingError(f"the observer's gain changes for {_MOST_GAINS} measurements")
 
@@ -193,73 +197,104 @@ class EstimationError:
     def _between(self) -> Matrix:
         return np.linalg.matrix_power(self._model.Ad, self._model.steps)
 
-    def _rest(self, k: int) -> Matrix:
-        """I − L_k C."""
-        return np.eye(self._loop.n) - self._gains[k] @ self._model.C
+    @cached_property
+    def _rest(self) -> Stack:
+        """I − L_k C, (k, n, n)."""
+        return np.eye(self._loop.n) - self._gains @ self._model.C
 
-    def _sources(self, columns: Matrix, alpha_per_s: float) -> list[Stack]:
-        """Return the effects of the steps before each measurement on its error."""
+    def _sources(self, columns: Matrix, alpha_per_s: float) -> Stack:
+        """Return the effects of the steps before each measurement on it, (k, steps, n, r)."""
         effects, power = [], columns
         for i in range(self._model.steps):
             effects.append(np.exp(alpha_per_s * self._period_s * (i + 1)) * power)
             power = self._model.Ad @ power
-        stack = np.array(effects)
-        return [self._rest(k) @ stack for k in range(len(self._gains))]
+        return np.asarray(self._rest[:, None] @ np.array(effects))
 
-    def _steps(self, alpha_per_s: float) -> list[Matrix]:
-        growth = self._growth(alpha_per_s)
-        return [growth * self._rest(k) @ self._between for k in range(len(self._gains))]
+    def _steps(self, alpha_per_s: float) -> Stack:
+        return np.asarray(self._growth(alpha_per_s) * self._rest @ self._between)
 
-    def _peak(
-        self, sources: Sequence[Stack], alpha_per_s: float, start: Stack | None = None
-    ) -> float:
+    def _peak(self, sources: Stack, alpha_per_s: float, start: Stack | None = None) -> float:
         """Return sup_k Σ_j ‖W Φ(k, j) S_j‖, scaled; the last gain and source apply from then on."""
-        steps = self._steps(alpha_per_s)[-len(sources) :]
+        steps, W = self._steps(alpha_per_s)[-len(sources) :], self._weight
         old = sources[0] if start is None else np.concatenate([start, sources[0]])
-        largest = _sizes(self._weight, old)
-        for step, new in zip(steps[1:-1], sources[1:-1], strict=True):
-            old = np.concatenate([step @ old, new])
-            largest = max(largest, _sizes(self._weight, old))
+        sums, old = _accumulated(W, _last_axis(old), steps[1:-1], sources[1:-1])
         factor, rate = _contraction(steps[-1])
-        seen = float(np.linalg.norm(self._weight @ np.linalg.inv(factor), 2))
-        last, total, W = sources[-1], 0.0, self._weight
+        seen = spectral_norm(W @ np.linalg.inv(factor))
+        last, total, largest = _last_axis(sources[-1]), 0.0, sums.max()
         powers = _powers(steps[-1], min(_ENTRIES // max(old.size, last.size) + 1, 256))
-        for _ in range(_MOST_STEPS // (len(powers) - 1)):
+        turned = factor @ powers[1:]
+
+        def rests(which: slice) -> Stack:
+            sums = _sums(turned[which], last) / (1 - rate) + _sums(turned[which], old)
+            return np.asarray(seen * sums)
+
+        for _ in range(_MOST_STEPS // len(turned)):
             # The same for every number of further measurements, (powers,).
-            olds, lasts = powers[1:, None] @ old, powers[:, None] @ last
-            totals = total + np.cumsum(_sizes(W, lasts[:-1]))
-            largests = np.maximum.accumulate(np.maximum(_sizes(W, olds) + totals, largest))
-            rests = seen * (_sizes(factor, lasts[1:]) / (1 - rate) + _sizes(factor, olds))
-            enough = np.flatnonzero(rests <= _TAIL_SHARE * largests)
-            number = enough[0] if len(enough) else -1
-            largest, rest, total = largests[number], rests[number], totals[-1]
-            if len(enough):
-                break
-            old, last = olds[-1], lasts[-1]
+            totals = total + np.cumsum(_sums(W @ powers[:-1], last))
+            sums = _sums(W @ powers[1:], old) + totals
+            largests = np.maximum.accumulate(np.maximum(sums, largest))
+            rest = rests(slice(-1, None))[0]
+            if rest <= _TAIL_SHARE * largests[-1]:  # the rests fall
+                every = rests(slice(None))
+                number = np.argmax(every <= _TAIL_SHARE * largests)
+                return float((largests[number] + every[number]) * _ROUNDING)
+            total, largest = totals[-1], largests[-1]
+            old, last = times(powers[-1], old), times(powers[-1], last)
         return float((largest + rest) * _ROUNDING)
 
-    def _excess(self, sources: Sequence[Stack], alpha_per_s: float) -> float:
-        """Return sup_k of Σ_j ‖W Φ(k, j) S_j‖ minus its value for settled gains, scaled."""
+    def _excess(self, sources: Stack, total: float, alpha_per_s: float) -> float:
+        """Return sup_k of Σ_j ‖W Φ(k, j) S_j‖ minus the total for settled gains, scaled."""
         if len(sources) == 2:  # settled from the start on
             return 0.0
-        total, W = self._peak(sources[-2:], 0.0), self._weight
-        growth, scale, steps = self._growth(alpha_per_s), 1.0, self._steps(0.0)
-        old, settled = sources[0], sources[-1]
-        largest = float(_sizes(W, old)) - total
-        for step, new in zip(steps[1:-1], sources[1:-1], strict=True):
-            old, scale = np.concatenate([step @ old, new]), scale * growth
-            settled = np.concatenate([steps[-1] @ settled, sources[-1]])
-            largest = max(largest, scale * (float(_sizes(W, old)) - total))
+        growth, steps, W = self._growth(alpha_per_s), self._steps(0.0), self._weight
+        sums, old = _accumulated(W, _last_axis(sources[0]), steps[1:-1], sources[1:-1])
+        powers, new = _powers(steps[-1], len(sources) - 2), _last_axis(sources[-1])
+        settled = np.concatenate([times(power, new) for power in powers[::-1]], axis=2)
+        scales = growth ** np.arange(len(sums))
         # From then on the effects of these sources, and those with settled gains, follow F.
         factor, _ = _contraction(growth * steps[-1])
-        seen = float(np.linalg.norm(W @ np.linalg.inv(factor), 2))
-        return max(largest, scale * seen * float(_sizes(factor, old - settled)), 0.0) * _ROUNDING
+        seen = spectral_norm(W @ np.linalg.inv(factor))
+        rest = scales[-1] * seen * largest_gains(times(factor, old - settled)).sum()
+        return float(max((scales * (sums - total)).max(), rest, 0.0) * _ROUNDING)
 
 
-def _sizes(C: Matrix, stacks: Stack) -> Stack:
-    """Return Σ‖C S‖ over stacks of S, (..., k, n, r) → (...)."""
-    flat = (C @ stacks).reshape(-1, len(C), stacks.shape[-1])
-    return np.asarray(spectral_norms(flat).reshape(stacks.shape[:-2]).sum(axis=-1))
+def _last_axis(sources: Stack) -> Stack:
+    """Return matrices along the last axis instead of the first, (k, n, r) → (n, r, k)."""
+    return np.ascontiguousarray(sources.transpose(1, 2, 0))
+
+
+def _accumulated(C: Matrix, old: Stack, steps: Stack, sources: Stack) -> tuple[Stack, Stack]:
+    """Follow effects S, (n, r, j), through steps, each of which adds further sources.
+
+    Returns:
+        Σ‖C S‖ before and after each step, (steps + 1,), and all effects at the end.
+    """
+    waiting, sums = [old], []
+    for step, new in zip(steps, sources, strict=True):
+        old = np.concatenate([times(step, old), _last_axis(new)], axis=2)
+        waiting.append(old)
+        if len(waiting) * old.size > _ENTRIES:
+            sums.append(_sums_of(C, waiting))
+            waiting = []
+    return np.concatenate([*sums, _sums_of(C, waiting)]), old
+
+
+def _sums_of(C: Matrix, effects: list[Stack]) -> Stack:
+    """Return Σ‖C S‖ over each of several numbers of S, (n, r, j) each."""
+    if not effects:
+        return np.zeros(0)
+    counts = np.cumsum([0, *(one.shape[2] for one in effects[:-1])])
+    norms = largest_gains(times(C, np.concatenate(effects, axis=2)))
+    return np.asarray(np.add.reduceat(norms, counts))
+
+
+def _sums(matrices: Stack, effects: Stack) -> Stack:
+    """Return Σ‖C S‖ over S, (n, r, j), for each C, (k, q, n) → (k,)."""
+    k, q, n = matrices.shape
+    products = matrices.reshape(-1, n) @ effects.reshape(n, -1)
+    values = products.reshape(k, q, *effects.shape[1:]).transpose(1, 2, 0, 3)
+    norms = largest_gains(values.reshape(*values.shape[:2], -1))
+    return np.asarray(norms.reshape(k, -1).sum(axis=1))
 
 
 def _powers(step: Matrix, count: int) -> Stack:

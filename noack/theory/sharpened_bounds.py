@@ -21,6 +21,7 @@ import numpy as np
 
 from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
+from noack.core.matrix_functions import exponential, solve_lyapunov
 from noack.theory.contraction import Stack
 from noack.theory.delivery_flow import ROUNDING, DeliveryFlow, Reach, Starts
 from noack.theory.gains import PlantGains
@@ -150,8 +151,6 @@ class InvariantEllipsoids:
     @cached_method
     def _grown(self, logit: float) -> list[Matrix]:
         """Return X for each of the three parts of Q, for ν that follows from ``logit``."""
-        from scipy.linalg import solve_continuous_lyapunov
-
         flow, n = self.flow, self.flow.n
         share = 0.1 + 0.85 / (1 + math.exp(-logit))
         rate = share * -spectral_abscissa(flow.closed_loop)
@@ -161,7 +160,7 @@ class InvariantEllipsoids:
             Q = columns @ columns.T / max(float((columns**2).sum()), 1e-300)
             if not np.isfinite(Q).all():
                 raise np.linalg.LinAlgError("the squares of the entries overflow")
-            X = solve_continuous_lyapunov(moved, -Q)
+            X = solve_lyapunov(moved, -Q)
             found.append(np.asarray(0.5 * (X + X.T)))
         return found
 
@@ -243,8 +242,6 @@ def _squares(image: Stack, error: Stack, multipliers: Matrix) -> tuple[Vector, V
 
 def _error_after(flow: DeliveryFlow, time_s: float) -> Matrix:
     """Return C_r: e_s a time after an event is C_r z."""
-    from scipy.linalg import expm
-
-    found = np.asarray(expm(flow.generator * time_s)[flow.n :])
-    found[:, flow.n :] -= expm(flow.H * time_s)
+    found = np.asarray(exponential(flow.generator * time_s)[flow.n :])
+    found[:, flow.n :] -= exponential(flow.H * time_s)
     return found

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from cosim.analysis.replay import replay
-from cosim.record.run_record import RunRecord, load_record, updates_in
+from cosim.record.packet_outcomes import updates_in
+from cosim.record.run_record import RunRecord, load_record
 from noack.config.loops import phases_ns
 from noack.protocol.record_tables import NETEM_PACKET, PLANT_STEP, Fate
 from tests.integration import conftest as live

@@ -8,18 +8,26 @@ late.
 
 from collections import deque
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cosim.analysis.claims.input_origins import (
+    NEVER,
+    NO_TIMES,
+    Batches,
+    Inputs,
+    Ticks,
+    Times,
+    columns,
+)
 from cosim.analysis.claims.observed_conditions import (
     ObservedConditions,
     PacketLosses,
     SampledSeries,
     combined,
 )
-from cosim.record.run_record import Rows, RunRecord, updates_in
+from cosim.record.packet_outcomes import updates_in
+from cosim.record.run_record import Rows, RunRecord
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.protocol.machine_interface import GENERATION
@@ -33,21 +41,12 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
     effective,
 )
-from plant_server.watchdog import too_old
 
-Times = NDArray[np.int64]
-_Batches = list[tuple[NDArray[Any], ...]]
-"""Columns of the waiting rows, batch by batch."""
-
-_KEPT_TICKS = 512
-"""A process sends its tables one after the other, up to 256 rows of each."""
-_NEVER = 2**63 - 1
 READ = (
     SENSOR_MEASUREMENT, PLANT_STEP, PLANT_ACTUATION, CONTROLLER_STEP, CONTROLLER_DELIVERY,
     NETEM_PACKET,
 )  # fmt: skip
 """The tables that the conditions depend on."""
-_NO_TIMES: Times = np.zeros(0, np.int64)
 
 
 def read_conditions(record: RunRecord) -> ObservedConditions:
@@ -68,8 +67,8 @@ class ConditionReader:
     def __init__(self, scenario: Scenario) -> None:
         self._timeout_s = scenario.timing.actuation_timeout_ns / NS_PER_S
         self._measurements = _Measurements()
-        self._ticks = _Ticks()
-        self._inputs = _Inputs(scenario)
+        self._ticks = Ticks()
+        self._inputs = Inputs(scenario)
         self._updates = _Updates()
         self._takes: Mapping[str, Callable[[Rows], None]] = {
             SENSOR_MEASUREMENT: self._measured,
@@ -109,7 +108,7 @@ class ConditionReader:
 
     def _observed(self, end_ns: int | None) -> ObservedConditions:
         ended = end_ns is not None
-        newest = _NEVER if ended else self._ticks.newest
+        newest = NEVER if ended else self._ticks.newest
         self._inputs.add_receipts(self._ticks.receipts(ended=ended), newest)
         hold, watchdog, safe_input = self._inputs.classified(ended=ended)
         self._updates.add_applied(self._inputs.applied(ended=ended))
@@ -128,7 +127,7 @@ class _Measurements:
 
     def __init__(self) -> None:
         self._times: list[Times] = []
-        self._restarts: _Batches = []
+        self._restarts: Batches = []
         self._generation = 0
         self.newest_ns = 0
 
@@ -144,180 +143,15 @@ class _Measurements:
         times, self._times = self._times, []
         if end_ns is not None:
             times.append(np.array([self.newest_ns, end_ns]))
-        since_ns = np.concatenate([_NO_TIMES, *(t_ns[:-1] for t_ns in times)])
-        gaps_ns = np.concatenate([_NO_TIMES, *map(np.diff, times)])
+        since_ns = np.concatenate([NO_TIMES, *(t_ns[:-1] for t_ns in times)])
+        gaps_ns = np.concatenate([NO_TIMES, *map(np.diff, times)])
         longer = gaps_ns > 0
         return SampledSeries(since_ns[longer] * 1e-9, gaps_ns[longer] * 1e-9)
 
     def restarts(self) -> SampledSeries:
-        t_ns, of = _columns(self._restarts, 2)
+        t_ns, of = columns(self._restarts, 2)
         self._restarts = []
         return SampledSeries(t_ns * 1e-9, of * 1.0)
-
-
-class _Receipts(NamedTuple):
-    """Updates that the controller received, with the first tick computed with each."""
-
-    sequence: Times
-    model_ns: Times
-    """Model time of the reset."""
-    tick: Times
-
-
-class _Ticks:
-    """Finds the first tick computed with each update."""
-
-    def __init__(self) -> None:
-        self._ticks: _Batches = []
-        self._deliveries: _Batches = []
-        self.newest = NO_SEQUENCE
-
-    def ticks(self, rows: Rows) -> None:
-        self._ticks.append((rows["input"], rows["sequence"]))
-        self.newest = int(rows["sequence"][-1])
-
-    def deliveries(self, rows: Rows) -> None:
-        self._deliveries.append((rows["input"], rows["sequence"], rows["model_t_ns"]))
-
-    @property
-    def waiting(self) -> int:
-        return sum(len(inputs) for inputs, *_ in self._deliveries)
-
-    def receipts(self, *, ended: bool) -> _Receipts:
-        """Return the updates whose tick was determined; at the end, also those without a tick."""
-        inputs, ticks = _columns(self._ticks, 2)
-        received, sequence, model_ns = _columns(self._deliveries, 3)
-        first = np.searchsorted(inputs, received, "right")
-        known = len(received) if ended else int((first < len(inputs)).sum())
-        self._deliveries = [(received[known:], sequence[known:], model_ns[known:])]
-        self._ticks = [(inputs[-_KEPT_TICKS:], ticks[-_KEPT_TICKS:])]
-        tick = np.append(ticks, _NEVER)[first[:known]]
-        # If the controller died before its next tick, the restarted one does not have the update.
-        of = received[:known] // GENERATION
-        same = (tick == _NEVER) | (tick // GENERATION == of)
-        return _Receipts(sequence[:known][same], model_ns[:known][same], tick[same])
-
-
-class _Inputs:
-    """The origin of the plant's inputs, step by step."""
-
-    def __init__(self, scenario: Scenario) -> None:
-        self._period_ns = scenario.timing.plant_period_ns
-        self._tick_ns = scenario.timing.controller_period_ns
-        self._timeout_ns = scenario.timing.actuation_timeout_ns
-        self._replaces = scenario.plant.watchdog.policy != "hold"
-        known = scenario.network.initial_sync == "known_state"
-        self._first_state: dict[int, int] = {0: 0} if known else {}
-        """By generation of the controller: its first tick with a state."""
-        self._ticked = NO_SEQUENCE
-        self._steps: _Batches = []
-        self._actuations: _Batches = []
-        self._received = NO_SEQUENCE
-        self._latched = NO_SEQUENCE
-        self._latches: _Batches = []
-        self._receipts: _Batches = []
-        self.newest_ns = 0
-        self.classified_ns = 0
-        self.start_ns = 0
-        self.started = False
-
-    def steps(self, rows: Rows) -> None:
-        with np.errstate(invalid="ignore"):
-            sizes = np.abs(rows["u"]).max(axis=1)
-        # The age of an input that was predicted counts from the time that it is for.
-        ahead_ns = np.zeros(len(rows), np.int64)
-        if "entry" in (rows.dtype.names or ()):
-            ahead_ns = np.maximum(rows["entry"], 0) * self._tick_ns
-        self._steps.append((rows["t_ns"], rows["actuation"], sizes, ahead_ns))
-        self.newest_ns = int(rows["t_ns"][-1])
-
-    def actuations(self, rows: Rows) -> None:
-        self._actuations.append((rows["sequence"], rows["t_ns"]))
-        self._received = int(rows["sequence"][-1])
-
-    @property
-    def waiting(self) -> int:
-        stored = (self._steps, self._latches, self._receipts)
-        return sum(len(batch[0]) for batches in stored for batch in batches)
-
-    def add_receipts(self, receipts: _Receipts, ticked: int) -> None:
-        """Add updates that the controller received, and the number of its newest tick."""
-        ticks = receipts.tick
-        for tick in ticks[np.diff(ticks // GENERATION, prepend=-1) > 0].tolist():
-            self._first_state.setdefault(tick // GENERATION, tick)
-        self._receipts.append(receipts)
-        self._ticked = ticked
-
-    def classified(self, *, ended: bool) -> tuple[SampledSeries, SampledSeries, SampledSeries]:
-        """Classify the steps with a known input.
-
-        Returns:
-            Ages of inputs; ages of actuations that the watchdog replaced; sizes of safe inputs.
-        """
-        t_ns, newest, sizes, ahead_ns = _columns(self._steps, 4)
-        ready = newest <= (_NEVER if ended else self._received)
-        ready &= (newest <= self._ticked) | (self._first_with_state(newest) < _NEVER)
-        count = int(np.minimum.accumulate(ready).sum())
-        self._steps = [(t_ns[count:], newest[count:], sizes[count:], ahead_ns[count:])]
-        t_ns, newest, sizes = t_ns[:count], newest[:count], sizes[:count]
-        sent_ns = self._model_ns(newest)
-        model_ns = sent_ns + ahead_ns[:count]
-        highest = np.maximum.accumulate(np.append(self._latched, newest))
-        there = newest != NO_SEQUENCE
-        controlled = there & (highest[1:] >= self._first_with_state(highest[1:]))
-        began = np.logical_or.accumulate(np.append(self.started, controlled))[:-1]
-        if count:
-            self.classified_ns = int(t_ns[-1])
-            rises = np.diff(highest) > 0
-            self._latches.append((highest[1:][rises], t_ns[rises]))
-            self._latched = int(highest[-1])
-        if not self.started and controlled.any():
-            self.started, self.start_ns = True, int(t_ns[np.argmax(controlled)])
-        # A late plant step may apply an input with a model time after the step's nominal time.
-        age_ns = np.maximum(t_ns + self._period_ns - model_ns, model_ns - t_ns)
-        replaced = controlled & self._replaces & too_old(t_ns, sent_ns, self._timeout_ns)
-        # Until the first input with a state, the certificates assume that the input is 0.
-        safe = there & ~controlled & (began | ~(sizes == 0))
-        step_s, held = t_ns * 1e-9, controlled & ~replaced
-        return (
-            SampledSeries(step_s[held], age_ns[held] * 1e-9),
-            SampledSeries(step_s[replaced], (t_ns - sent_ns)[replaced] * 1e-9),
-            SampledSeries(step_s[safe], sizes[safe]),
-        )
-
-    def _first_with_state(self, ticks: Times) -> Times:
-        """The first tick with a state, of the same generation of the controller."""
-        of, which = np.unique(ticks // GENERATION, return_inverse=True)
-        first = [self._first_state.get(number, _NEVER) for number in of.tolist()]
-        return np.array(first, dtype=np.int64)[which]
-
-    def _model_ns(self, newest: Times) -> Times:
-        """Return the model time of each actuation; 0 if the actuation is not recorded."""
-        sequence, t_ns = _columns(self._actuations, 2)
-        found = np.searchsorted(sequence, newest)
-        there = np.append(sequence, NO_SEQUENCE)[found] == newest
-        model_ns = np.where(there & (newest != NO_SEQUENCE), np.append(t_ns, 0)[found], 0)
-        # A later step has the newest of these actuations, or a later one.
-        used = int(np.searchsorted(sequence, newest[-1])) if len(newest) else 0
-        self._actuations = [(sequence[used:], t_ns[used:])]
-        return model_ns
-
-    def applied(self, *, ended: bool) -> list[tuple[int, int, int | None]]:
-        """Updates that took effect on the plant since the last call, in order.
-
-        Returns:
-            Sequence number; model time of the reset, ns; time of the first step with an input
-            computed with the update, ns, None if there was none.
-        """
-        sequence, model_ns, tick = _columns(self._receipts, 3)
-        latched, t_ns = _columns(self._latches, 2)
-        first = np.searchsorted(latched, tick)
-        known = len(tick) if ended else int((first < len(latched)).sum())
-        applied_ns = [int(t_ns[i]) if i < len(latched) else None for i in first[:known]]
-        self._receipts = [(sequence[known:], model_ns[known:], tick[known:])]
-        needed = latched > self._ticked  # steps with a later actuation than these ticks
-        self._latches = [(latched[needed], t_ns[needed])]
-        return [*zip(sequence[:known].tolist(), model_ns[:known].tolist(), applied_ns, strict=True)]
 
 
 class _Updates:
@@ -394,12 +228,3 @@ class _Updates:
             return np.inf, None
         # It was delivered out of order: a newer update replaced it.
         return None if applied_ns is None else ((applied_ns - event_ns) * 1e-9, None)
-
-
-def _columns(batches: _Batches, count: int) -> tuple[NDArray[Any], ...]:
-    """Concatenate batches of columns."""
-    if not batches:
-        return (_NO_TIMES,) * count
-    if len(batches) == 1:
-        return batches[0]
-    return tuple(np.concatenate(column) for column in zip(*batches, strict=True))

@@ -5,9 +5,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from controller_node.controller import controller_of
+from cosim.analysis.replay.compiled_replay import compiled_machine
 from cosim.analysis.replay.replay_result import ProcessReplay, difference, rows_differ
 from cosim.analysis.summary_model import ReplayDifference
 from cosim.record.process_lives import Life
@@ -32,8 +32,9 @@ from noack.protocol.record_tables import (
     SETTINGS,
     entry_names,
 )
-from noack.protocol.topology import RECEIVES
+from noack.protocol.topology import RECEIVES, SENDS
 from noack.protocol.wire_format import Flow, Message
+from noack.runtime.fleet.fleet_replay import FleetReplay, Numbers, SentMessages
 from plant_server.plant import plant_of
 from sensor_node.sensor import sensor_of
 
@@ -53,7 +54,18 @@ _ANSWER_RANK, _LAST_RANK = 2, 3  # of several differences at one input, the firs
 _DAMAGE = (ArithmeticError, LookupError, ValueError, CallerError)
 """Errors of a machine that gets an input from a damaged record, which no run can have."""
 
-Numbers = NDArray[np.int64]
+
+class UnequalError(Exception):
+    """A compiled machine did not emit the recorded rows; the single machines show where."""
+
+
+def sent_messages(messages: Sequence[Message]) -> SentMessages:
+    """Return messages of one flow as arrays."""
+    return SentMessages(
+        np.array([message.sequence for message in messages], np.int64),
+        np.array([message.t_ns for message in messages], np.int64),
+        np.array([message.vector for message in messages], np.float64),
+    )
 
 
 def received_vectors(table: str, rows: Rows) -> tuple[Matrix, list[str]]:
@@ -77,21 +89,36 @@ class MachineReplay:
     Each machine gets its recorded inputs, up to the first gap, and its rows are compared.
     """
 
-    def __init__(self, role: str, record: RunRecord) -> None:
+    def __init__(self, role: str, record: RunRecord, *, compiled: bool = False) -> None:
         self._tables = record.owned_by(role)
         self._numbers = record.life_numbers(role)
-        self._lives = [_LifeReplay(role, record.scenario, life) for life in record.lives(role)]
+        self._lives = [
+            _LifeReplay(role, record.scenario, life, compiled=compiled)
+            for life in record.lives(role)
+        ]
         self.sent: list[Any] = []
-        """Messages that the machines emitted in the newest part."""
+        """Messages that the single machines emitted in the newest part."""
+        self._sent: list[SentMessages] = []
+        self._flow = SENDS.get(role)
 
     def take(self, part: Slice) -> None:
         """Replay the next part of the record."""
-        self.sent = []
+        self.sent, self._sent = [], []
         places = {table: self._numbers.places(part[table]) for table in self._tables}
         for i, life in enumerate(self._lives):
             owned = {table: part[table][places[table] == i] for table in self._tables}
             if any(map(len, owned.values())):
-                self.sent += life.take(owned)
+                sent = life.take(owned)
+                if isinstance(sent, SentMessages):
+                    self._sent.append(sent)
+                else:
+                    self.sent += sent
+
+    def sent_in(self, flow: Flow) -> list[SentMessages]:
+        """Return the messages of a flow that the machines emitted in the newest part."""
+        found = [message for message in self.sent if message.flow is flow]
+        single = [sent_messages(found)] if found else []
+        return single + (self._sent if flow is self._flow else [])
 
     @property
     def results(self) -> tuple[ProcessReplay, ...]:
@@ -107,9 +134,13 @@ class MachineReplay:
 class _LifeReplay:
     """The replay of one generation."""
 
-    def __init__(self, role: str, scenario: Scenario, life: Life) -> None:
+    def __init__(self, role: str, scenario: Scenario, life: Life, *, compiled: bool) -> None:
         self._role, self._scenario, self._life = role, scenario, life
         self._run: _Run | None = None
+        self._compiled = None
+        if compiled and not life.generation:
+            self._compiled = compiled_machine(role, scenario)
+        self._now_ns: int | None = None
         self._count = sum(life.rows.values())
         report = life.report
         self._written = None if report is None else sum(report["rows"][one] for one in life.rows)
@@ -121,20 +152,40 @@ class _LifeReplay:
         """Rows in the parts before, by table."""
         self._stopped = False
 
-    def take(self, owned: Slice) -> list[Any]:
-        """Replay the next rows; return the messages that the machine emitted."""
+    def take(self, owned: Slice) -> list[Any] | SentMessages:
+        """Replay the next rows; return the messages that the machine emitted.
+
+        Raises:
+            UnequalError: the compiled machine did not emit these rows.
+        """
         if self._stopped:
             return []
-        if self._run is None:
-            start = _start(self._life.generation, owned)
-            self._run = _Run(_MACHINES[self._role](self._scenario, start))
         order = self._in_order(owned)
-        taken = self._run.replay(owned, order, self._before)
+        sent: list[Any] | SentMessages
+        if self._compiled is not None:
+            taken, sent = len(order), self._take_compiled(self._compiled, owned, order)
+        else:
+            if self._run is None:
+                start = _start(self._life.generation, owned)
+                self._run = _Run(_MACHINES[self._role](self._scenario, start))
+            taken = self._run.replay(owned, order, self._before)
+            sent = self._run.sent
         self._stopped |= taken < len(order)
         self._compared += taken
         for table, rows in owned.items():
             self._before[table] += len(rows)
-        return self._run.sent
+        return sent
+
+    def _take_compiled(self, machine: FleetReplay, owned: Slice, order: Numbers) -> SentMessages:
+        times = np.concatenate([rows["now_ns"] for rows in owned.values()])[order]
+        before = times[:1] if self._now_ns is None else [self._now_ns]
+        sent = None
+        if (np.diff(times, prepend=before) >= 0).all():
+            sent = machine.take(owned, order)
+        if sent is None:
+            raise UnequalError
+        self._now_ns = int(times[-1]) if len(times) else self._now_ns
+        return sent
 
     def result(self) -> ProcessReplay:
         generation, differs = (

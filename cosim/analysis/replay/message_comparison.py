@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.analysis.replay.machine_replay import MachineReplay, received_vectors
+from cosim.analysis.replay.machine_replay import MachineReplay, received_vectors, sent_messages
 from cosim.analysis.replay.replay_result import MessagesReplay, difference, first_entry
 from cosim.record.record_source import Slice
 from cosim.record.run_record import RunRecord
@@ -26,6 +26,7 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import ENDS
 from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Header, Message, read_header
+from noack.runtime.fleet.fleet_replay import SentMessages
 
 _RECEIVED = {
     Flow.MEASUREMENT: SENSOR_MEASUREMENT,
@@ -126,10 +127,8 @@ class _Hop:
         self._direction = direction_of(flow)
         self._selects = table == NETEM_PACKET and len(network) > 1
         self._was_forwarded = table != NETEM_PACKET and flow in network
-        self._sent: list[Message] = []
+        self._sent = sent_messages([])
         """Messages that may still be received, in order of their numbers."""
-        self._numbers = np.zeros(0, np.int64)
-        """Their numbers."""
         self._survivors: set[int] = set()
         self._newest = -1
         self._received = self._read = 0
@@ -146,8 +145,8 @@ class _Hop:
         if self._selects:
             self._at = np.flatnonzero(rows["flow"] == self._direction)
             self._rows = rows[self._at]
-        mine = [message for message in self._sender.sent if message.flow is self._flow]
-        self._add(mine)
+        for messages in self._sender.sent_in(self._flow):
+            self._add(messages)
         if self._table == NETEM_PACKET:
             self._compare_heads()
             if not self._selects:
@@ -164,8 +163,8 @@ class _Hop:
         self._received += len(self._rows)
         self._read += len(rows)
         # Every receiver accepts only messages that are newer than those before.
-        first = int(np.searchsorted(self._numbers, self._newest))
-        self._sent, self._numbers = self._sent[first:], self._numbers[first:]
+        first = int(np.searchsorted(self._sent.sequences, self._newest))
+        self._sent = self._sent.at(slice(first, None))
         self._survivors = {k for k in self._survivors if k >= self._newest}
 
     def result(self, *, network_is_whole: bool) -> MessagesReplay:
@@ -180,15 +179,12 @@ class _Hop:
             leg=self._leg, received=self._received, compared=self._compared, difference=found
         )
 
-    def _add(self, sent: list[Message]) -> None:
+    def _add(self, sent: SentMessages) -> None:
         """Add messages; of several with the same number, the last one counts."""
-        numbers = np.array([message.sequence for message in sent], np.int64)
-        self._sent += sent
-        self._numbers = np.append(self._numbers, numbers)
-        if (np.diff(self._numbers) < 0).any():
-            order = np.argsort(self._numbers, kind="stable")
-            self._numbers = self._numbers[order]
-            self._sent = [self._sent[i] for i in order.tolist()]
+        sent = self._sent.followed_by(sent)
+        if (np.diff(sent.sequences) < 0).any():
+            sent = sent.at(np.argsort(sent.sequences, kind="stable"))
+        self._sent = sent
 
     def _compare_vectors(self) -> None:
         """Compare sequence number, time and vector of the received messages."""
@@ -196,16 +192,16 @@ class _Hop:
         vectors, entries = received_vectors(self._table, rows)
         numbers = rows["sequence"]
         newest = np.maximum.accumulate(np.append(self._newest, numbers))
-        places = np.searchsorted(self._numbers, numbers, "right") - 1
-        known = np.flatnonzero((places >= 0) & (np.append(self._numbers, 0)[places] == numbers))
+        sent = self._sent
+        places = np.searchsorted(sent.sequences, numbers, "right") - 1
+        known = np.flatnonzero((places >= 0) & (np.append(sent.sequences, 0)[places] == numbers))
         self._compared += len(known)
-        sent = [self._sent[place] for place in places[known].tolist()]
         equal = np.zeros(len(rows), np.bool_)
-        if sent:
-            sent_ns = np.array([message.t_ns for message in sent], np.int64)
-            bits = np.array([message.vector for message in sent]).view(np.int64)
-            same = (vectors[known].view(np.int64) == bits).all(axis=1)
-            equal[known] = same & (rows["t_ns"][known] == sent_ns) & (numbers > newest[:-1])[known]
+        if len(known):
+            at = places[known]
+            same = (vectors[known].view(np.int64) == sent.vectors[at].view(np.int64)).all(axis=1)
+            same &= rows["t_ns"][known] == sent.t_ns[at]
+            equal[known] = same & (numbers > newest[:-1])[known]
         self._newest = int(newest[-1])
         for row in np.flatnonzero(~equal).tolist():
             sequence, t_ns = int(numbers[row]), int(rows["t_ns"][row])
@@ -258,9 +254,11 @@ class _Hop:
 
     def _find(self, row: int, sequence: int, column: str, value: object) -> Message | None:
         """Return the message of a number if its sender was replayed that far and sent it."""
-        place = int(np.searchsorted(self._numbers, sequence, "right")) - 1
-        if place >= 0 and self._numbers[place] == sequence:
-            return self._sent[place]
+        place = int(np.searchsorted(self._sent.sequences, sequence, "right")) - 1
+        if place >= 0 and self._sent.sequences[place] == sequence:
+            return Message(
+                self._flow, sequence, int(self._sent.t_ns[place]), self._sent.vectors[place]
+            )
         kind = _CONTENT if sequence < 0 else _SENT
         self._differs(row, "was never sent", column, value, kind=kind)
         return None

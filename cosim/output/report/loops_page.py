@@ -18,6 +18,7 @@ from cosim.output.report.loops_figures import (
 )
 from cosim.output.report.report_page import environment_rows, templates
 from cosim.output.report.run_figures import Envelope, RunFigure, pictures
+from cosim.record.loops_run import loop_directories
 from cosim.record.run_directory import (
     ENVIRONMENT_FILE,
     LOOPS,
@@ -26,7 +27,6 @@ from cosim.record.run_directory import (
     read_object,
 )
 from cosim.record.run_record import RunRecord, load_record
-from cosim.record.shared_run import loop_directories
 from noack.core.errors import ExitStatus
 from noack.core.file_access import write_whole
 from noack.core.number_format import number

@@ -11,8 +11,8 @@ from cosim.output.viewer.loops_recording import ERROR, PICTURED, SIZE, LoopsReco
 from cosim.output.viewer.run_view import feed_record, require_space
 from cosim.output.viewer.table_feed import ViewFeed, log_level
 from cosim.record.decimate import is_long
+from cosim.record.loops_run import loop_directories
 from cosim.record.run_record import RunRecord, load_record
-from cosim.record.shared_run import loop_directories
 from noack.core.clock import NS_PER_S
 
 

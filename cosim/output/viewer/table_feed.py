@@ -19,8 +19,9 @@ from cosim.record.align import (
 )
 from cosim.record.decimate import decimate_all
 from cosim.record.estimation_error import true_states
+from cosim.record.packet_outcomes import updates_in
 from cosim.record.recorded_changes import claimed_until_s, model_flow
-from cosim.record.run_record import Rows, updates_in
+from cosim.record.run_record import Rows
 from cosim.record.since_event import EventFollower
 from noack.config.resolution import loop_of, policy_of, tables_of
 from noack.config.scenario import Scenario
@@ -37,10 +38,11 @@ from noack.protocol.record_tables import (
     Fate,
     effective,
 )
+from noack.theory.certified_bounds import ScenarioCertificate
 from noack.theory.error_bounds import ErrorMonitor
 from noack.theory.known_state import KnownStateBounds, known_state_bounds
 from noack.theory.run_conditions import allowed_conditions
-from noack.theory.scenario_certificates import ScenarioCertificate, certify
+from noack.theory.scenario_certificates import certify
 
 LAG_S = 0.2
 """Wall time by which the view lags, so that the batches of all processes have arrived."""

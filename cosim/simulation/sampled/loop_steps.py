@@ -13,6 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.trigger.self_triggered_interval import Forecast, interval_ns
+from noack.trigger.trigger_arrays import (
+    auxiliary_after,
+    auxiliary_rate,
+    is_event,
+    start_condition,
+    weighted_norm,
+)
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -73,27 +80,16 @@ class Scales(NamedTuple):
 
 
 class Rule(NamedTuple):
-    """A trigger rule; names as in :class:`noack.trigger.trigger_rule.TriggerRule`."""
+    """A trigger rule, with the condition since the last event."""
 
-    up: Array
-    down: Array
-    level: float
-    rate_per_s: float
-    floor: float
-    from_event: bool
-    grid_ns: int
-    integrates: bool
-    idle_ns: float
-    longest_ns: float
-    shortest_ns: float
+    trigger: Any
+    """(1,) :data:`noack.trigger.trigger_arrays.TRIGGER`."""
+    matrices: Array
+    """Its matrices."""
     forecasts: bool
     forecast: Forecast
-    weight: Array
-    """W of the forecast, (n, n)."""
-    has_dynamic_variable: bool
-    decay_per_s: float
-    gain_up: Array
-    gain_down: Array
+    shortest_ns: float
+    longest_ns: float
 
 
 class Runs(NamedTuple):
@@ -136,15 +132,10 @@ class Scratch(NamedTuple):
     b: Array
     z: Array
     """(x, e_s), (2n,)."""
-
-
-class Condition(NamedTuple):
-    """When the next event is due, as in :mod:`noack.trigger.trigger_condition`."""
-
-    level: float
-    since_ns: float
-    earliest_ns: float
-    latest_ns: float
+    sides: Array
+    """Both sides of the trigger's comparison, (2,)."""
+    products: Array
+    """Products with the trigger's matrices."""
 
 
 def follow(
@@ -164,11 +155,10 @@ def follow_one(
     runs.error[i] = runs.state[i] = runs.cost[i] = 0.0
     if k >= 0:
         finish(loop, runs, i, k, own)
-    place(own.z, runs.x_s[i], runs.x_s[i])
-    condition = condition_after(rule, max(k, 0) * loop.period_ns, runs.x_s[i], own)
-    if rule.integrates:
+    trigger, n, measured = rule.trigger[0], len(own.a), max(k, 0)
+    rate = start(rule, measured * loop.period_ns, runs.x_s[i], own)
+    if trigger.integrates != 0:
         runs.auxiliary[i] = 0.0
-    rate, measured = auxiliary_rate(rule, own), max(k, 0)
     while k < last:
         k += 1
         if k > 0:
@@ -185,12 +175,14 @@ def follow_one(
             if k > loop.known_from:
                 note_error(scales, runs, i, k, own)
             place(own.z, runs.y[i], runs.x_s[i])
-            following = auxiliary_rate(rule, own)
+            following = auxiliary_rate(trigger, rule.matrices, n, own.z, own.products)
             dt_s = (k - measured) * h_s
-            runs.auxiliary[i] = auxiliary_after(rule, dt_s, runs.auxiliary[i], rate, following)
-            rate, measured = following, k
-            t_ns = k * loop.period_ns
-            if tests and is_event(rule, condition, t_ns, runs.auxiliary[i], own):
+            auxiliary = auxiliary_after(trigger, dt_s, runs.auxiliary[i], rate, following)
+            runs.auxiliary[i], rate, measured = auxiliary, following, k
+            if tests and is_event(
+                trigger, rule.matrices, k * loop.period_ns, n, own.z, auxiliary, own.sides,
+                own.products,
+            ):  # fmt: skip
                 runs.is_event[i] = True
                 break
         finish(loop, runs, i, k, own)
@@ -256,49 +248,16 @@ def finish(loop: Loop, runs: Runs, i: int, k: int, own: Scratch) -> None:
         multiply(loop.input_of[loop.tick[k]], runs.x_c[i], runs.u_next[i])
 
 
-def condition_after(rule: Rule, t_ns: float, x: Array, own: Scratch) -> Condition:
-    """Return the condition after an event, or the start, at x; ``own.z`` is (x, 0)."""
-    level, since_ns, due_ns = rule.level, 0.0, rule.longest_ns
-    if rule.from_event:
-        level, since_ns = math.sqrt(square(rule.up, own.z)), t_ns
+def start(rule: Rule, t_ns: int, x: Array, own: Scratch) -> float:
+    """Apply the rule after an event, or the start, at x; return the rate of η or the integral."""
+    trigger, n = rule.trigger[0], len(x)
+    start_condition(trigger, rule.matrices, t_ns, x, 0, n, own.z, own.products)
     if rule.forecasts:
-        size = math.sqrt(square(rule.weight, x))
+        size = weighted_norm(trigger, rule.matrices, x, 0, n, own.products)
         due_ns = interval_ns(rule.forecast, size, t_ns * 1e-9, rule.shortest_ns, rule.longest_ns)
-    return Condition(level, since_ns, t_ns + rule.idle_ns, t_ns + due_ns)
-
-
-def is_event(rule: Rule, condition: Condition, t_ns: int, auxiliary: float, own: Scratch) -> bool:
-    """Return whether a measurement is an event; ``own.z`` is (y, e_s)."""
-    if t_ns >= condition.latest_ns:
-        return True
-    if t_ns < condition.earliest_ns or (rule.grid_ns > 0 and t_ns % rule.grid_ns != 0):
-        return False
-    decayed = condition.level * math.exp(-rule.rate_per_s * (t_ns - condition.since_ns) * 1e-9)
-    right = max(decayed, rule.floor)
-    if rule.integrates:
-        return auxiliary > right
-    total = right * right + square(rule.down, own.z) + max(auxiliary, 0.0)
-    return square(rule.up, own.z) > total
-
-
-def auxiliary_rate(rule: Rule, own: Scratch) -> float:
-    """Return the rate of η, or of the integral, at ``own.z``."""
-    if rule.integrates:
-        return math.sqrt(square(rule.up, own.z))
-    if rule.has_dynamic_variable:
-        return square(rule.gain_up, own.z) - square(rule.gain_down, own.z)
-    return 0.0
-
-
-def auxiliary_after(rule: Rule, dt_s: float, value: float, first: float, last: float) -> float:
-    """Return η, or the integral, after a time, from its rates at the first and the last time."""
-    if rule.integrates:
-        return value + dt_s * (first + last) / 2
-    if not rule.has_dynamic_variable:
-        return value
-    decay = rule.decay_per_s
-    gained_s = -math.expm1(-decay * dt_s) / decay if decay > 0.0 else dt_s
-    return value * math.exp(-decay * dt_s) + gained_s * first
+        trigger.latest_ns = t_ns + int(due_ns)
+    place(own.z, x, x)
+    return auxiliary_rate(trigger, rule.matrices, n, own.z, own.products)
 
 
 def place(z: Array, y: Array, x_s: Array) -> None:

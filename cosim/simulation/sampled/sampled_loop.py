@@ -13,18 +13,17 @@ from cosim.simulation.sampled.loop_steps import NO_TICK, Loop, Numbers, Rule, Ru
 from noack.config.resolution import LoopMatrices, loop_of, policy_of
 from noack.config.scenario import Scenario
 from noack.config.state_estimation import assumed_model
+from noack.core import ordered_arithmetic
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, discretise, transition
 from noack.theory.run_conditions import network_delay_ns
-from noack.trigger import self_triggered_interval
+from noack.trigger import self_triggered_interval, trigger_arrays
 from noack.trigger.self_triggered_interval import Forecast
 from noack.trigger.trigger_rule import TriggerRule
 from plant_server.disturbance_signal import disturbance_of
 from plant_server.measurement import measurement_model_of
 
 Stack = NDArray[np.float64]
-
-_NO_FORECAST = Forecast(1.0, 1.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class SampledLoop:
@@ -50,12 +49,14 @@ class SampledLoop:
         self.step_s = timing.plant_period_ns * 1e-9
         self.weight = np.eye(n) if self.matrices.weight is None else self.matrices.weight
         self.delay_ns = network_delay_ns(resolved, 0)
-        self._rule = rule_of(policy.trigger_rule(n), n)
+        self._rule = rule_of(policy.trigger_rule(n))
         self._first_auxiliary = policy.initial_dynamic_variable
         self._loop = _loop(resolved, self.matrices, self.delay_ns)
         self._under_way = self.delay_ns // timing.measurement_period_ns + 2
         size = max(n, len(self._loop.C))
-        self._own = Scratch(np.empty(n), np.empty(size), np.empty(2 * n))
+        self._own = Scratch(
+            np.empty(n), np.empty(size), np.empty(2 * n), np.empty(2), np.empty(4 * n)
+        )
 
     @property
     def known_start(self) -> bool:
@@ -139,28 +140,21 @@ def _compiled() -> Any:
     from netem.engine.compiled_rules import compile_kept, prepare
 
     return compile_kept(
-        loop_steps.follow, prepare("sampled", (self_triggered_interval, loop_steps))
+        loop_steps.follow,
+        prepare(
+            "sampled", (ordered_arithmetic, trigger_arrays, self_triggered_interval, loop_steps)
+        ),
     )
 
 
-def rule_of(rule: TriggerRule, n: int) -> Rule:
+def rule_of(rule: TriggerRule) -> Rule:
     """Return a trigger rule as numbers."""
-    nothing = np.zeros((0, 2 * n))
-    variable = rule.dynamic_variable
-    gain = (nothing, nothing) if variable is None else variable.gain
-    up, down, gain_up, gain_down = map(_dense, (*rule.form, *gain))
+    trigger, matrices = np.zeros(1, trigger_arrays.TRIGGER), list[float]()
+    trigger_arrays.set_rule(trigger[0], rule, rule.weight, matrices)
+    forecast = Forecast(*map(float, rule.forecast or (0.0,) * len(Forecast._fields)))
     return Rule(
-        up=up, down=down, level=float(rule.level), rate_per_s=float(rule.rate_per_s),
-        floor=float(rule.floor), from_event=rule.from_event, grid_ns=round(rule.grid_ns),
-        integrates=rule.integrates, idle_ns=float(rule.idle_ns),
-        longest_ns=float(rule.longest_ns), shortest_ns=float(rule.shortest_ns),
-        forecasts=rule.forecast is not None, forecast=Forecast(
-            *map(float, _NO_FORECAST if rule.forecast is None else rule.forecast)
-        ),
-        weight=np.eye(n) if rule.weight is None else _dense(rule.weight),
-        has_dynamic_variable=variable is not None,
-        decay_per_s=0.0 if variable is None else float(variable.decay_per_s),
-        gain_up=gain_up, gain_down=gain_down,
+        trigger, np.array([*matrices, 0.0]), rule.forecast is not None, forecast,
+        float(rule.shortest_ns), float(rule.longest_ns),
     )  # fmt: skip
 
 

@@ -13,9 +13,9 @@ import numpy as np
 
 from cosim.live.finalize import finalize
 from cosim.live.launcher import launch
+from cosim.record.loops_run import loop_directories
 from cosim.record.run_directory import SUMMARY_FILE, read_object
 from cosim.record.run_record import RunRecord, load_record
-from cosim.record.shared_run import loop_directories
 from cosim.studies.campaign.campaign_summary import GridPointResult
 from cosim.studies.campaign.draw_statistics import Estimate
 from cosim.studies.campaign.loops_draws import LOOPS_ROW, LoopsWork

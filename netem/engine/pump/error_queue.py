@@ -22,7 +22,7 @@ _HEADER_BYTES = HEADER.itemsize
 def take_errors(memory: Memory, socket: int) -> int:
     """Empty a socket's error queue; return the number of ICMP errors.
 
-    Port-unreachable errors of the server are counted.
+    Port-unreachable errors of the destination are counted.
     """
     pump, headers = memory.pump[0], memory.error_headers
     found, taken = 0, len(headers)

@@ -32,10 +32,10 @@ CARRY_ON = 5  # no reason to return
 CHANGE_DUE = 6  # other settings apply from the current datagram on
 
 # The socket that sends a direction's datagrams, and their destination.
-OWN_SOCKET = 0  # the client's socket, which is connected to the server
-SERVER_NAME = 1  # the link's sending socket, which is not connected, to the server
+OWN_SOCKET = 0  # the client's socket, which is connected to the destination
+DESTINATION_NAME = 1  # the link's sending socket, which is not connected, to the destination
 CLIENT_NAME = 2  # the link's listening socket, to the client
-LINK_SOCKET = 3  # the link's sending socket, which is connected to the server
+LINK_SOCKET = 3  # the link's sending socket, which is connected to the destination
 
 PUMP = np.dtype(
     [
@@ -112,7 +112,7 @@ CLIENT = np.dtype(
         ("key1", "<i8"),
         ("key2", "<i8"),
         ("key3", "<i8"),
-        ("last_ns", "<i8"),  # last datagram of the client or of the server
+        ("last_ns", "<i8"),  # last datagram of the client or of the destination
         ("number", "<i8"),  # number of its flows; -1: the row is free
         ("in_flight", "<i4"),
         ("link", "<i4"),
@@ -139,7 +139,7 @@ DIRECTION = np.dtype(
         ("limit", "<i8"),
         ("tracks", "<i8"),
         ("keeps", "<i8"),  # 1: datagrams can be delayed
-        ("sends", "<i8"),  # OWN_SOCKET, SERVER_NAME, CLIENT_NAME or LINK_SOCKET
+        ("sends", "<i8"),  # OWN_SOCKET, DESTINATION_NAME, CLIENT_NAME or LINK_SOCKET
         ("name_bytes", "<i8"),
         ("name", "u1", (NAME_BYTES,)),  # forward: the server's
         ("listen", "u1", (NAME_BYTES,)),  # the link's address

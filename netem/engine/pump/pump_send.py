@@ -131,7 +131,7 @@ def _address(memory: Memory, header: int, number: int, client: int) -> None:
     if direction.sends == layout.CLIENT_NAME:
         name = libc.address_of(memory.clients) + client * _CLIENT_BYTES + _CLIENT_NAME
         name_bytes = memory.clients[client].name_bytes
-    elif direction.sends == layout.SERVER_NAME:
+    elif direction.sends == layout.DESTINATION_NAME:
         name = libc.address_of(memory.directions) + number * _DIRECTION_BYTES + _DIRECTION_NAME
         name_bytes = direction.name_bytes
     memory.out_headers[header].name = name

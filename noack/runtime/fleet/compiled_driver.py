@@ -27,10 +27,15 @@ _CALLED: dict[str, Any] = {"_nrt": False}
 
 
 @cache
-def kept_driver(role: FleetRole) -> NativeFunction | None:
-    """Return the driver if it has been compiled on this machine, else None."""
-    file = _file(role)
+def kept_driver(role: FleetRole, what: str = "drive") -> NativeFunction | None:
+    """Return the driver if it has been compiled on this machine, else None; or the replay."""
+    file = _file(role, what)
     return None if file is None else load(file)
+
+
+def kept_replay(role: FleetRole) -> NativeFunction | None:
+    """Return the replay if it has been compiled on this machine, else None."""
+    return kept_driver(role, "replay")
 
 
 def compiled_driver(role: FleetRole, arguments: tuple[Any, ...]) -> NativeFunction:
@@ -49,14 +54,13 @@ def compiled_driver(role: FleetRole, arguments: tuple[Any, ...]) -> NativeFuncti
 
 def compiled_replay(role: FleetRole, arguments: tuple[Any, ...]) -> NativeFunction:
     """Return the replay of a role; compile it if that has not happened on this machine."""
-    file = _file(role, "replay")
-    if file is not None and (kept := load(file)) is not None:
+    if (kept := kept_replay(role)) is not None:
         return kept
     machine, _ = _registered(role)
     from noack.runtime.fleet.replay_driver import replay_driver_of
 
     replay = replay_driver_of(machine.handle, machine.on_timer)
-    return load_or_compile(file, replay, lambda: (*arguments, 0))
+    return load_or_compile(_file(role, "replay"), replay, lambda: (*arguments, 0))
 
 
 def _registered(role: FleetRole) -> tuple[Any, Any]:

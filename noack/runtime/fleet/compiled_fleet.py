@@ -147,6 +147,10 @@ class CompiledFleet:
         self._memory.driver["from_peer"] = 1
         return outputs.rows
 
+    def encode(self, message: Message) -> bytes:
+        """Return the datagram of a message."""
+        return self._encoder.encode(message)
+
     def handle(self, message: Message, now_ns: int) -> Sequence[Output]:
         """Process a message; return the outputs, without sockets."""
         self._put(self._encoder.encode(message), from_peer=True)
@@ -180,6 +184,11 @@ class CompiledFleet:
     def tables(self) -> tuple[str, ...]:
         """The tables of the role."""
         return tuple(dict.fromkeys((self._on_timer, self._on_message)))
+
+    @property
+    def sent_words(self) -> int:
+        """Words of number, time and vector of a message that the machines send."""
+        return 2 + self._sent
 
     def replay(self, code: Driver, tables: tuple[Any, ...], inputs: int) -> int:
         """Replay recorded inputs (:mod:`noack.runtime.fleet.replay_driver`); return the reason."""

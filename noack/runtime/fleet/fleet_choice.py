@@ -10,8 +10,14 @@ from noack.core.code_cache import while_compiling
 from noack.core.errors import CallerError
 from noack.protocol.wire_format import KEY_BYTES
 from noack.runtime.command_line import print_to_stderr
-from noack.runtime.fleet.compiled_driver import compiled_driver, kept_driver
+from noack.runtime.fleet.compiled_driver import (
+    compiled_driver,
+    compiled_replay,
+    kept_driver,
+    kept_replay,
+)
 from noack.runtime.fleet.compiled_fleet import CompiledFleet
+from noack.runtime.fleet.fleet_replay import replay_arguments
 from noack.runtime.peer_sockets import has_peer_sockets
 
 _FEWEST_LOOPS = 4
@@ -51,10 +57,11 @@ def prepare(roles: Sequence[tuple[str, FleetRole]], run: Scenario) -> None:
         return
     for name, role in roles:
         fleet = _fleet(role, name, run, loops, (0, bytes(KEY_BYTES)))
-        if fleet is not None and kept_driver(role) is None:
+        if fleet is not None and None in (kept_driver(role), kept_replay(role)):
             what = f"the {name}s of many loops"
             print_to_stderr(f"noack: {while_compiling(what, kept=True, about_s=_ABOUT_S)}")
             compiled_driver(role, fleet.arguments)
+            compiled_replay(role, replay_arguments(fleet))
 
 
 def _fleet(

@@ -1,6 +1,6 @@
-"""Replays the rows of all loops of a role by compiled code, and compares them bit for bit."""
+"""Replays recorded inputs of a role by compiled code, and compares the rows bit for bit."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -8,59 +8,82 @@ from numpy.typing import NDArray
 
 from noack.protocol.record_tables import LOOP
 from noack.runtime.fleet import replay_driver
-from noack.runtime.fleet.compiled_fleet import CompiledFleet
+from noack.runtime.fleet.compiled_fleet import CompiledFleet, Driver
 
 Rows = NDArray[np.void]
+Numbers = NDArray[np.int64]
 _VECTORS = ("x", "u")
 """The received vector, by its name in the rows of messages."""
 
 
-class FleetReplay(NamedTuple):
-    """The result of a replay."""
+class SentMessages(NamedTuple):
+    """Messages of a flow."""
 
-    inputs: int
-    """Number of inputs whose rows were found again."""
-    differs: tuple[str, int] | None
-    """Table and place of the first row that differs; None if no row does."""
+    sequences: Numbers
+    t_ns: Numbers
+    vectors: NDArray[np.float64]
+    """(k, entries)"""
+
+    def at(self, places: slice | Numbers) -> "SentMessages":
+        """Return those at some places."""
+        return SentMessages(self.sequences[places], self.t_ns[places], self.vectors[places])
+
+    def followed_by(self, more: "SentMessages") -> "SentMessages":
+        """Return these and more."""
+        if not len(self.sequences):
+            return more
+        return SentMessages(
+            np.concatenate([self.sequences, more.sequences]),
+            np.concatenate([self.t_ns, more.t_ns]),
+            np.concatenate([self.vectors, more.vectors]),
+        )
 
 
-def replay_fleet(
-    fleet: CompiledFleet, rows: Mapping[str, Rows], replay: Callable[..., int]
-) -> FleetReplay:
-    """Replay all rows of a role.
+class FleetReplay:
+    """The machines of a role under replay, part by part of the record.
 
     Args:
         fleet: new machines.
-        rows: the rows of its two tables, in any order of the loops.
-        replay: the compiled code.
+        code: from :func:`noack.runtime.fleet.compiled_driver.compiled_replay`.
     """
-    names = [table for table in fleet.tables if table in rows]
-    numbers = [(rows[name][LOOP].astype(np.int64), rows[name]["input"]) for name in names]
-    loops, inputs = (np.concatenate(part) for part in zip(*numbers, strict=True))
-    sizes = [len(rows[name]) * rows[name].dtype.itemsize for name in names]
-    begins = np.cumsum([0, *sizes[:-1]])
-    places = [
-        (begin + np.arange(len(rows[name])) * rows[name].dtype.itemsize) * 2
-        + (name == fleet.timer_table != fleet.message_table)
-        for begin, name in zip(begins.tolist(), names, strict=True)
-    ]
-    order = np.lexsort((inputs, loops))
-    entries = np.concatenate([[0], np.concatenate(places)[order]]).astype(np.int64)
-    record = np.frombuffer(b"".join(rows[name].tobytes() for name in names), np.uint8).copy()
-    tables = record, entries, _vector(rows[fleet.message_table].dtype), np.zeros(512, np.int64)
-    reason = fleet.replay(replay, tables, len(order))
-    done = int(entries[0])
-    if reason == replay_driver.DONE:
-        return FleetReplay(done, None)
-    row = int(order[done])
-    for name in names:
-        if row < len(rows[name]):
-            return FleetReplay(done, (name, row))
-        row -= len(rows[name])
-    raise IndexError("the tables have fewer rows")
+
+    def __init__(self, fleet: CompiledFleet, code: Driver) -> None:
+        self._fleet, self._code = fleet, code
+
+    def take(self, rows: Mapping[str, Rows], order: Numbers) -> SentMessages | None:
+        """Replay the next rows; return the messages sent, or None if anything differs.
+
+        Args:
+            rows: rows by table.
+            order: the places of the inputs in order, among the rows of all tables.
+        """
+        fleet = self._fleet
+        own = {table: rows[table] for table in fleet.tables}
+        if sum(map(len, own.values())) < sum(map(len, rows.values())):
+            return None  # such as changes of settings
+        entries = np.empty(1 + len(order), np.int64)
+        entries[0] = 0
+        places = [np.zeros(0, np.int64)]
+        begin = 0
+        for table, found in rows.items():
+            is_timer = table == fleet.timer_table != fleet.message_table
+            at = begin + np.arange(len(found)) * found.dtype.itemsize
+            places.append(at * 2 + is_timer)
+            begin += len(found) * found.dtype.itemsize
+        entries[1:] = np.concatenate(places)[order]
+        record = np.frombuffer(b"".join(found.tobytes() for found in rows.values()), np.uint8)
+        sent = np.empty(1 + len(order) * fleet.sent_words, np.int64)
+        sent[0] = 0
+        vector = _vector(own[fleet.message_table].dtype)
+        tables = record, entries, vector, np.zeros(512, np.int64), sent
+        if fleet.replay(self._code, tables, len(order)) != replay_driver.DONE:
+            return None
+        words = sent[1 : 1 + int(sent[0]) * fleet.sent_words].reshape(-1, fleet.sent_words)
+        vectors = np.ascontiguousarray(words[:, 2:]).view(np.float64)
+        return SentMessages(words[:, 0].copy(), words[:, 1].copy(), vectors)
 
 
-def _vector(dtype: np.dtype[np.void]) -> NDArray[np.int64]:
+def _vector(dtype: np.dtype[np.void]) -> Numbers:
     """Return where a message's vector is in a row, in words, and its length."""
     name = next(one for one in _VECTORS if one in (dtype.names or ()))
     assert dtype.fields is not None
@@ -71,7 +94,6 @@ def _vector(dtype: np.dtype[np.void]) -> NDArray[np.int64]:
 
 def replay_arguments(fleet: CompiledFleet) -> tuple[Any, ...]:
     """Return arguments of the replay; only their types matter."""
-    return (
-        *fleet.arguments, np.zeros(1, np.uint8), np.zeros(1, np.int64), np.zeros(2, np.int64),
-        np.zeros(1, np.int64),
-    )  # fmt: skip
+    numbers = np.zeros(1, np.int64)
+    return (*fleet.arguments, np.zeros(1, np.uint8), numbers, np.zeros(2, np.int64), numbers,
+            numbers)  # fmt: skip

@@ -59,8 +59,8 @@ class FleetSocket(CountingSocket[Message]):
         return None
 
     def send(self, message: Message) -> None:
-        """Raise: the fleet sends by itself."""
-        raise NotImplementedError
+        """Send a message outside the fleet's batches, which it sends by itself."""
+        self.put(self._fleet.encode(message), self._destination)
 
     def tend(self, now_ns: int) -> Sequence[Record | Notice]:
         """Begin the next interval of housekeeping; read datagrams of other sources."""

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from noack.config.fleet_layout import HEADER_WORDS, NEEDS_MATRIX
+from noack.config.fleet_layout import HEADER_WORDS, NEEDS_MATRIX, SENDS
 from noack.runtime.fleet.driver_layout import DriverMemory
 from noack.runtime.native import libc_calls as libc
 
@@ -19,8 +19,9 @@ def replay_driver_of(handle: Machine, on_timer: Machine) -> Machine:
     """Return the replay of a role with these two functions."""
 
     def replay(
-        memory: DriverMemory, own: Any, record: Any, order: Any, vector: Any, words: Any, end: int
-    ) -> Any:
+        memory: DriverMemory, own: Any, record: Any, order: Any, vector: Any, words: Any,
+        sent: Any, end: int,
+    ) -> Any:  # fmt: skip
         """Replay up to input ``end``; return why it stopped at input ``order[0]``.
 
         Args:
@@ -31,6 +32,7 @@ def replay_driver_of(handle: Machine, on_timer: Machine) -> Machine:
                 ``record``, plus 1 for a timer.
             vector: (2,) of a message's row, the place of the vector in words, and its entries.
             words: (k,) scratch; the row that differs.
+            sent: (1 + inputs * k,) number of messages sent; number, time and vector of each.
             end: number of inputs.
         """
         driver, fleet = memory.driver[0], memory.fleet
@@ -56,6 +58,11 @@ def replay_driver_of(handle: Machine, on_timer: Machine) -> Machine:
                 outputs = handle(fleet, own, loop, 0, words[3])
             if outputs == NEEDS_MATRIX:
                 return MATRIX_MISSING
+            if outputs & SENDS:
+                count = 2 + memory.wire.settings[0].entries_sent
+                for k in range(count):
+                    sent[1 + sent[0] * count + k] = fleet.out[2 + k]
+                sent[0] += 1
             fleet.fleet[0].out = 0
             for k in range(content_bytes // 8):
                 if fleet.row[k] != words[k]:

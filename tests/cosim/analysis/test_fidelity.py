@@ -243,6 +243,10 @@ def test_the_summary_has_the_comparison_or_the_reason(
     assert bad == NoFidelityPart(reason="RuntimeError('a bug')")
     monkeypatch.setattr(cosim.analysis.fidelity, "_STEPS_AT_THE_END", 100)
     assert "noack fidelity" in str(fidelity_for_summary(record).reason)
+    steps = record.count(PLANT_STEP)
+    monkeypatch.setattr(cosim.analysis.fidelity, "_STEPS_AT_THE_END", 10 * steps)
+    assert fidelity_for_summary(record, loops=10) == bad
+    assert "noack fidelity" in str(fidelity_for_summary(record, loops=11).reason)
 
 
 @pytest.mark.parametrize(

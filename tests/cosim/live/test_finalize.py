@@ -12,6 +12,7 @@ import pytest
 import cosim.live.finalize
 from cosim.live.finalize import finalize, reopen
 from cosim.record.environment import write_environment
+from cosim.record.process_reports import write_reports
 from cosim.record.run_directory import (
     ENDING_FILE,
     RECORDING_FILE,
@@ -20,12 +21,8 @@ from cosim.record.run_directory import (
     SUMMARY_FILE,
 )
 from cosim.record.run_ending import EndingFile, RunEnding
-from cosim.record.run_record import (
-    finish_record,
-    load_record,
-    write_record,
-    write_reports,
-)
+from cosim.record.run_record import load_record, write_record
+from cosim.record.spool_conversion import finish_record
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve

@@ -8,8 +8,8 @@ import pytest
 
 from cosim.analysis.claims.assumption_monitor import AssumptionMonitor
 from cosim.live.loops_monitor import MOST_CHECKED, Finding, LoopsMonitor
+from cosim.record.loops_run import LoopsRun
 from cosim.record.run_record import Rows, RunRecord
-from cosim.record.shared_run import SharedRun
 from cosim.simulation.shared_network import simulate_loops
 from noack.config.loops import phases_ns
 from noack.config.resolution import tables_of
@@ -35,7 +35,7 @@ def content(content: Content) -> Content:
     return content
 
 
-def live_rows(run: SharedRun) -> Iterator[tuple[str, Rows]]:
+def live_rows(run: LoopsRun) -> Iterator[tuple[str, Rows]]:
     """Yield the rows as the processes send them: those of all loops mixed, batch by batch."""
     network = run.network
     every = {NETEM_PACKET: network[NETEM_PACKET]}
@@ -59,7 +59,7 @@ def numbered(record: RunRecord, number: int, table: str, dtype: np.dtype[np.void
     return rows
 
 
-def found_by(monitor: LoopsMonitor, run: SharedRun) -> list[Finding]:
+def found_by(monitor: LoopsMonitor, run: LoopsRun) -> list[Finding]:
     found: list[Finding] = []
     for table, rows in live_rows(run):
         monitor.take(table, rows)

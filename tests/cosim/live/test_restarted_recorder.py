@@ -65,11 +65,13 @@ class Run:
         line = {"t_ns": 0, "level": "info", "text": role}
         self.send(NOTICES, 0, json.dumps(line).encode(), role, generation)
 
-    def report(self, role: str, generation: int = 0, **rows: int) -> Any:
+    def report(
+        self, role: str, generation: int = 0, stored: dict[str, Any] | None = None, **rows: int
+    ) -> Any:
         tables = {table: 0 for table in OWNER if OWNER[table] == role}
         report = {
             "ended": "horizon", "channel": {}, "rows": tables | {NOTICES: 0} | rows,
-            "generation": generation, "instance": role,
+            "generation": generation, "instance": role, "stored": stored or {},
         }  # fmt: skip
         query = Query(f"report/{role}", json.dumps(report).encode())
         self.plane.put("report", query)
@@ -92,6 +94,14 @@ def test_a_restarted_recorder_requests_no_rows_that_are_on_disk(run: Run) -> Non
     assert run.report("plant", **{PLANT_STEP: 5, NOTICES: 1}) == {}
     assert run.report("sensor", 1, **{NOTICES: 1}) == {}
     assert run.report("controller", **{NOTICES: 1}) == {NOTICES: [[0, 1]]}
+
+
+def test_rows_that_a_process_has_stored_are_not_requested_and_are_logged(run: Run) -> None:
+    run.rows(PLANT_STEP, 5)
+    stored = {PLANT_STEP: [[3, 7], [8, 10]]}
+    assert run.report("plant", stored=stored, **{PLANT_STEP: 10}) == {PLANT_STEP: [[7, 8]]}
+    ((_, line),) = read_chunks(run.run_dir / SPOOL, f"{NOTICES}_{RECORDER}")
+    assert "plant: 4 rows were written to disk by itself" in line.decode()
 
 
 def test_a_process_gets_the_acknowledgement_of_its_own_rows_only(run: Run) -> None:

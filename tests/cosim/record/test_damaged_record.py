@@ -11,7 +11,8 @@ import pytest
 
 from cosim.analysis.run_summary import summarise
 from cosim.record.run_directory import RECORD, REPORTS_FILE
-from cosim.record.run_record import finish_record, load_record
+from cosim.record.run_record import load_record
+from cosim.record.spool_conversion import finish_record
 from noack.core.errors import CallerError
 from noack.protocol.record_tables import PLANT_STEP
 from noack.runtime.spool import SPOOL, SpoolWriter

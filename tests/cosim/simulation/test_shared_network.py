@@ -7,8 +7,8 @@ import pytest
 
 from cosim.analysis.replay import replay
 from cosim.record.loop_rows import network_rows_by_loop
+from cosim.record.loops_run import LoopsRun
 from cosim.record.run_record import RunRecord
-from cosim.record.shared_run import SharedRun
 from cosim.simulation.shared_network import simulate_loops
 from cosim.simulation.virtual_time import simulate
 from noack.config.loops import loops_of, phases_ns
@@ -40,7 +40,7 @@ def short(content: Content) -> Content:
     return content
 
 
-def run(content: Content, *loops: Content) -> SharedRun:
+def run(content: Content, *loops: Content) -> LoopsRun:
     return simulate_loops(validate(content | {"loops": list(loops)}, "here"))
 
 

@@ -26,7 +26,8 @@ from cosim.record.run_directory import (
     SUMMARY_FILE,
 )
 from cosim.record.run_ending import RunEnding
-from cosim.record.run_record import finish_record, load_record, write_record
+from cosim.record.run_record import load_record, write_record
+from cosim.record.spool_conversion import finish_record
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
 from noack.config.scenario_file import dumps, validate

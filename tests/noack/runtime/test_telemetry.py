@@ -209,13 +209,15 @@ def test_notices_are_published_at_once_and_numbered() -> None:
     assert len({notices_of(role) for role in ("plant", "sensor", "netem")}) == 3
 
 
-def test_the_oldest_batch_is_dropped_at_the_memory_limit(
+def test_the_oldest_batch_is_stored_at_the_memory_limit(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(telemetry, "_HELD_BYTES", 25 * ROW.itemsize)
-    wire, again = Wire(), Wire()
-    buffer = TelemetryBuffer(TABLES, wire)
+    wire, again, disk = Wire(), Wire(), Wire()
+    buffer = TelemetryBuffer(TABLES, wire, store=disk)
     fill(buffer, range(40))
     assert len(wire.batches) == 4  # published anyway
+    assert disk.batches == wire.batches[:2]
+    assert buffer.stored() == {"one": [(0, 20)]}
     buffer.resend({"one": [(0, 40)]}, again)
     assert [first for _, first, _, _ in again.batches] == [20, 30]

@@ -11,8 +11,8 @@ from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.loops_feed import LoopsFeed
 from cosim.output.viewer.loops_recording import ERROR, MAP, QUEUE, SHARE, SIZE, open_loops_view
 from cosim.record.align import align_tables
+from cosim.record.loops_run import LoopsRun
 from cosim.record.run_directory import RECORDING_FILE
-from cosim.record.shared_run import SharedRun
 from cosim.shipped_files import find_shipped
 from cosim.simulation.shared_network import simulate_loops
 from noack.config.scenario_file import load
@@ -22,7 +22,7 @@ from tests.cosim.live.test_loops_monitor import live_rows
 from tests.cosim.output.viewer.test_viewer import Chunks, read, series
 
 
-def shown(folder: Path, count: int, *settings: str) -> tuple[SharedRun, Chunks, list[str]]:
+def shown(folder: Path, count: int, *settings: str) -> tuple[LoopsRun, Chunks, list[str]]:
     """Simulate loops, and pass their rows on as in a live run; read the recording."""
     given = ["horizon_s=2.0", f'loops=[{{ name = "p", count = {count} }}]', *settings]
     run = simulate_loops(load(find_shipped("shared_bottleneck", "scenarios"), given))

@@ -19,8 +19,8 @@ from cosim.output.viewer.loops_recording import (
 from cosim.output.viewer.loops_view import write_loops_view
 from cosim.record.align import align_tables
 from cosim.record.environment import write_environment
+from cosim.record.loops_run import LoopsRun, write_loops
 from cosim.record.run_directory import RECORDING_FILE, write_scenario
-from cosim.record.shared_run import SharedRun, write_shared_run
 from cosim.shipped_files import find_shipped
 from cosim.simulation.shared_network import simulate_loops
 from noack.config.scenario_file import load
@@ -30,13 +30,13 @@ from tests.cosim.output.viewer.test_viewer import Chunks, of_views, read, series
 MAX_BYTES = 3_000_000
 
 
-def shown(folder: Path, count: int) -> tuple[SharedRun, list[dict[str, Any]], Chunks]:
+def shown(folder: Path, count: int) -> tuple[LoopsRun, list[dict[str, Any]], Chunks]:
     """Simulate loops, and read their recording; the last loop but one is the worst."""
     settings = ["horizon_s=0.4", f'loops=[{{ name = "p", count = {count} }}]']
     scenario = load(find_shipped("shared_bottleneck", "scenarios"), settings)
     run = simulate_loops(write_scenario(scenario, folder))
     write_environment(folder, "simulated")
-    write_shared_run(run, folder)
+    write_loops(run, folder)
     horizon_ns = scenario.timing.horizon_ns
     loops: list[dict[str, Any]] = [
         {

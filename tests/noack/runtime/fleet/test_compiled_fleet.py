@@ -18,12 +18,17 @@ from noack.config.scenario_file import validate
 from noack.core.errors import CallerError
 from noack.protocol.fleet import Fleet
 from noack.protocol.machine_interface import Machine, Notice, Output, Record
-from noack.protocol.record_tables import CONTROLLER_SETTING, PLANT_ACTUATION, SENSOR_SETTING
+from noack.protocol.record_tables import (
+    CONTROLLER_SETTING,
+    LOOP,
+    PLANT_ACTUATION,
+    SENSOR_SETTING,
+)
 from noack.protocol.wire_format import Flow, Message
 from noack.runtime.fleet.compiled_driver import compiled_driver, compiled_replay
 from noack.runtime.fleet.compiled_fleet import CompiledFleet
 from noack.runtime.fleet.fleet_choice import may_be_compiled
-from noack.runtime.fleet.fleet_replay import replay_arguments, replay_fleet
+from noack.runtime.fleet.fleet_replay import FleetReplay, replay_arguments
 from plant_server.plant import plant_of
 from plant_server.plant_arrays import PLANT_FLEET
 from sensor_node.sensor import sensor_of
@@ -66,6 +71,8 @@ class Pair:
         self._compiled = compiled(name, run)
         self._compiled.use(compiled_driver(role, self._compiled.arguments))
         self._rows: dict[str, list[Any]] = {}
+        self.sent: list[tuple[int, int, list[float]]] = []
+        """Number, time and vector of each message."""
         self.notices: list[str] = []
 
     def announce(self, change: ParameterChange, now_ns: int) -> None:
@@ -96,7 +103,9 @@ class Pair:
                 self._rows.setdefault(output.table, []).append(output.row)
             elif isinstance(output, Notice):
                 self.notices.append(output.text)
-        return [one for one in single if isinstance(one, Message)]
+        messages = [one for one in single if isinstance(one, Message)]
+        self.sent += [(one.sequence, one.t_ns, one.vector.tolist()) for one in messages]
+        return messages
 
     @property
     def rows(self) -> dict[str, Any]:
@@ -204,16 +213,20 @@ def test_a_replay_finds_every_row_again_and_one_changed_bit(loops: Content) -> N
     for name, pair in drive(run, 3, loss=0.3, delay_ns=60_000_000).items():
         rows = pair.rows
         code = compiled_replay(ROLES[name][0], replay_arguments(compiled(name, run)))
-        count = sum(map(len, rows.values()))
-        assert replay_fleet(compiled(name, run), rows, code) == (count, None)
+        of_loops, inputs = (
+            np.concatenate([found[column] for found in rows.values()]) for column in (LOOP, "input")
+        )
+        order = np.lexsort((inputs, of_loops))
+        sent = FleetReplay(compiled(name, run), code).take(rows, order)
+        assert sent is not None
+        assert sorted(zip(*(one.tolist() for one in sent), strict=True)) == sorted(pair.sent)
         for table, recorded in rows.items():
             if table == PLANT_ACTUATION:
                 continue  # it has inputs only
-            row = len(recorded) // 2
             changed = recorded.copy()
-            changed.view(np.uint8).reshape(len(recorded), -1)[row, -9] ^= 1
-            found = replay_fleet(compiled(name, run), rows | {table: changed}, code)
-            assert found.differs == (table, row)
+            changed.view(np.uint8).reshape(len(recorded), -1)[len(recorded) // 2, -9] ^= 1
+            other = rows | {table: changed}
+            assert FleetReplay(compiled(name, run), code).take(other, order) is None
 
 
 def test_changes_of_the_network_have_the_rows_and_notices_of_the_single_machines(

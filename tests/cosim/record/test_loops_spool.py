@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from cosim.record.environment import write_environment
+from cosim.record.loops_run import LoopsRun, loop_directories
+from cosim.record.loops_spool import finish_run_record
 from cosim.record.run_directory import REPORTS_FILE, write_scenario
 from cosim.record.run_record import Rows, RunRecord, load_record
-from cosim.record.shared_run import SharedRun, loop_directories
-from cosim.record.shared_spool import finish_run_record
 from cosim.simulation.shared_network import simulate_loops
 from noack.config.resolution import network_tables, tables_of
 from noack.config.scenario_file import validate
@@ -26,7 +26,7 @@ LOOPS = 3
 
 
 @pytest.fixture
-def shared(content: dict[str, Any]) -> SharedRun:
+def shared(content: dict[str, Any]) -> LoopsRun:
     content["horizon_s"] = 2.0
     content["plant"] |= {"rate_hz": 100.0, "initial_state_halfwidth": [0.5, 0.5]}
     content["controller"] = {"rate_hz": 100.0}
@@ -36,7 +36,7 @@ def shared(content: dict[str, Any]) -> SharedRun:
     return simulate_loops(validate(content, "here"))
 
 
-def mixed_rows(shared: SharedRun) -> Mapping[str, Rows]:
+def mixed_rows(shared: LoopsRun) -> Mapping[str, Rows]:
     """All rows by table, as the processes emit them: with the loop's number, in order of time."""
     found = {}
     for table, dtype in tables_of(shared.network.scenario).items():
@@ -69,7 +69,7 @@ def spool(run_dir: Path, table: str, rows: Rows, *, writer: str = "recorder") ->
     out.close()
 
 
-def opened(shared: SharedRun, run_dir: Path) -> Path:
+def opened(shared: LoopsRun, run_dir: Path) -> Path:
     run_dir.mkdir()
     write_scenario(shared.network.scenario, run_dir)
     write_environment(run_dir, "live")
@@ -82,12 +82,12 @@ def same_rows(one: RunRecord, other: RunRecord, *but: str) -> None:
             assert one[table].tobytes() == other[table].tobytes(), table
 
 
-def records(run_dir: Path, shared: SharedRun) -> list[RunRecord]:
+def records(run_dir: Path, shared: LoopsRun) -> list[RunRecord]:
     return [load_record(one) for one in loop_directories(run_dir, shared.network.scenario)]
 
 
 def test_every_row_and_line_reaches_the_record_of_its_loop(
-    shared: SharedRun, tmp_path: Path
+    shared: LoopsRun, tmp_path: Path
 ) -> None:
     run_dir = opened(shared, tmp_path / "run")
     for table, rows in mixed_rows(shared).items():
@@ -112,7 +112,7 @@ def test_every_row_and_line_reaches_the_record_of_its_loop(
 
 
 def test_an_interrupted_attempt_is_repeated_and_later_rows_are_added(
-    shared: SharedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    shared: LoopsRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run_dir = opened(shared, tmp_path / "run")
     rows = mixed_rows(shared)
@@ -120,7 +120,7 @@ def test_an_interrupted_attempt_is_repeated_and_later_rows_are_added(
     for table, found in rows.items():
         spool(run_dir, table, found[: len(found) // 2])
     with monkeypatch.context() as patch:
-        patch.setattr("cosim.record.shared_spool.finish_record", _fail)
+        patch.setattr("cosim.record.loops_spool._spool_network", _fail)
         with pytest.raises(MachineError, match="is kept in"):
             finish_run_record(run_dir)
     finish_run_record(run_dir)
@@ -133,13 +133,11 @@ def test_an_interrupted_attempt_is_repeated_and_later_rows_are_added(
         same_rows(record, expected)
 
 
-def _fail(run_dir: Path) -> RunRecord:
+def _fail(*_: object) -> None:
     raise OSError(28, "No space left on device")
 
 
-def test_a_loops_reports_count_its_own_rows_and_datagrams(
-    shared: SharedRun, tmp_path: Path
-) -> None:
+def test_a_loops_reports_count_its_own_rows_and_datagrams(shared: LoopsRun, tmp_path: Path) -> None:
     """A row of the network that is missing is missing in every loop."""
     run_dir = opened(shared, tmp_path / "run")
     rows = dict(mixed_rows(shared))

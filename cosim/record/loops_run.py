@@ -18,7 +18,7 @@ from noack.core.file_access import write_whole
 
 
 @dataclass(frozen=True)
-class SharedRun:
+class LoopsRun:
     """The records of a run of several loops."""
 
     network: RunRecord
@@ -46,7 +46,7 @@ def write_loop(record: RunRecord, run_dir: Path, phase_ns: int) -> None:
     write_record(record, run_dir)
 
 
-def write_shared_run(run: SharedRun, run_dir: Path) -> None:
+def write_loops(run: LoopsRun, run_dir: Path) -> None:
     """Write the records of a run of several loops into its directory, which has its scenario.
 
     Raises:

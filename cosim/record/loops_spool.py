@@ -7,13 +7,15 @@ finished as that of a run of one loop.
 
 import json
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cosim.record.loop_rows import network_rows_by_loop
+from cosim.record.loops_run import loop_directories
 from cosim.record.record_source import Rows
 from cosim.record.run_directory import (
     ENVIRONMENT_FILE,
@@ -24,8 +26,8 @@ from cosim.record.run_directory import (
     read_object,
     write_scenario,
 )
-from cosim.record.run_record import RunRecord, finish_record, recorded_rows
-from cosim.record.shared_run import loop_directories
+from cosim.record.run_record import RunRecord
+from cosim.record.spool_conversion import finish_record, recorded_rows
 from noack.config.loops import phases_ns
 from noack.config.resolution import network_tables, resolved_loops, tables_of
 from noack.config.scenario import Scenario
@@ -38,7 +40,7 @@ from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.runtime.spool import SPOOL, SpoolWriter, read_chunks
 from noack.runtime.telemetry import notices_of
 
-_PART_BYTES = 16 * 1024 * 1024
+_PART_BYTES = 128 * 1024 * 1024
 """Rows of a table that are distributed at once."""
 _WRITER = "loops"
 
@@ -52,34 +54,48 @@ def finish_run_record(run_dir: Path) -> RunRecord:
     Raises:
         MachineError: a record cannot be written; the spool is kept.
     """
+    for folder in distribute_rows(run_dir):
+        finish_record(folder)
+    return finish_record(run_dir)
+
+
+def distribute_rows(
+    run_dir: Path, show: Callable[[float], None] = lambda share: None
+) -> Sequence[Path]:
+    """Distribute the rows of a run's spool to spools of its loops; return their directories.
+
+    Each of them then has all but the record of a run of one loop. There is none without [[loops]].
+    ``show`` is called with the completed share.
+
+    Raises:
+        MachineError: they cannot be written.
+    """
     scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
     if scenario.loops is None:
-        return finish_record(run_dir)
-    folders = loop_directories(run_dir, scenario)
+        return []
+    folders, phases = loop_directories(run_dir, scenario), phases_ns(scenario)
     try:
-        for number, (loop, folder) in enumerate(
-            zip(resolved_loops(scenario), folders, strict=True)
-        ):
-            place = {"number": number, "phase_ns": phases_ns(scenario)[number]}
-            _make_directory(run_dir, folder, loop, place)
-        _distribute(run_dir / SPOOL, scenario, folders)
+        for number, loop in enumerate(resolved_loops(scenario)):
+            place = {"number": number, "phase_ns": phases[number]}
+            _make_directory(run_dir, folders[number], loop, place)
+        _distribute(run_dir / SPOOL, scenario, folders, show)
         rows = {
             table: np.concatenate([np.zeros(0, dtype), *recorded_rows(run_dir, table, dtype)])
             for table, dtype in network_tables().items()
         }
         reports = read_object(run_dir / REPORTS_FILE)
-        by_loop = network_rows_by_loop(rows, phases_ns(scenario))
+        counts = _counts(reports, rows)
+        by_loop = network_rows_by_loop(rows, phases)
         for number, (folder, own) in enumerate(zip(folders, by_loop, strict=True)):
             _spool_network(folder, own)
-            content = _reports_of_loop(reports, number, rows, own)
+            content = _reports_of_loop(reports, number, counts, own)
             write_whole(folder / REPORTS_FILE, json.dumps(content, indent=2), make_folder=False)
-            finish_record(folder)
     except OSError as error:
         raise MachineError(
             f"{run_dir}: the records of the loops cannot be written: {why(error)}; what was "
             f"recorded is kept in {run_dir / SPOOL}, and `noack summary {run_dir}` finishes it"
         ) from None
-    return finish_record(run_dir)
+    return folders
 
 
 def _make_directory(run_dir: Path, folder: Path, loop: Scenario, place: Mapping[str, int]) -> None:
@@ -94,8 +110,11 @@ def _make_directory(run_dir: Path, folder: Path, loop: Scenario, place: Mapping[
     write_whole(folder / LOOP_FILE, json.dumps(place, indent=2))
 
 
-def _distribute(spool: Path, scenario: Scenario, folders: Sequence[Path]) -> None:
+def _distribute(
+    spool: Path, scenario: Scenario, folders: Sequence[Path], show: Callable[[float], None]
+) -> None:
     """Copy the rows and log lines of a spool to the spools of the loops."""
+    done_bytes, all_bytes = 0, sum(file.stat().st_size for file in spool.glob("*"))
     for table, dtype in tables_of(scenario).items():
         if OWNER[table] == "netem":
             continue
@@ -103,17 +122,18 @@ def _distribute(spool: Path, scenario: Scenario, folders: Sequence[Path]) -> Non
         names = [name for name in dtype.names or () if name != LOOP]
         own = np.dtype([(name, dtype[name]) for name in names])
         for rows in _parts(spool, table, dtype):
-            order = np.argsort(rows[LOOP], kind="stable")
-            ends = np.cumsum(np.bincount(rows[LOOP], minlength=len(folders)))
-            for loop in np.unique(rows[LOOP]).tolist():
-                if loop >= len(folders):  # damaged
-                    continue
-                chosen = rows[order[ends[loop - 1] if loop else 0 : ends[loop]]]
-                stripped = np.empty(len(chosen), own)
-                for name in names:
-                    stripped[name] = chosen[name]
-                _append(folders[loop], table, int(written[loop]), stripped.tobytes())
-                written[loop] += len(chosen)
+            done_bytes += rows.nbytes
+            show(done_bytes / all_bytes)
+            rows = rows[rows[LOOP] < len(folders)]  # the others are damaged
+            rows = rows[np.argsort(rows[LOOP], kind="stable")]
+            stripped = np.empty(len(rows), own)
+            for name in names:
+                stripped[name] = rows[name]
+            ends = np.cumsum(np.bincount(rows[LOOP], minlength=len(folders))).tolist()
+            for loop, (first, end) in enumerate(pairwise([0, *ends])):
+                if end > first:
+                    _append(folders[loop], table, int(written[loop]), stripped[first:end].tobytes())
+                    written[loop] += end - first
     for role in (*LOOP_ROLES, RECORDER):
         for number, data in read_chunks(spool, notices_of(role)):
             _distribute_notice(folders, notices_of(role), number, data)
@@ -163,38 +183,58 @@ def _spool_network(folder: Path, rows: Mapping[str, Rows]) -> None:
         _append(folder, table, 0, found.tobytes())
 
 
+_Counts = Mapping[tuple[str, int], int]
+"""Number of rows by table and generation."""
+
+
+def _counts(reports: Mapping[str, Any], rows: Mapping[str, Rows]) -> _Counts:
+    """Return the numbers of the network's rows in the record."""
+    generations = range(1 + max((_generation(one) for one in _each(reports)), default=0))
+    return {(table, k): _count(found, k) for table, found in rows.items() for k in generations}
+
+
+def _each(reports: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield all reports."""
+    for content in reports.values():
+        yield from content if isinstance(content, list) else [content]
+
+
+def _generation(report: Mapping[str, Any]) -> int:
+    return int(report.get("generation", 0))
+
+
 def _reports_of_loop(
-    reports: Mapping[str, Any], number: int, rows: Mapping[str, Rows], own: Mapping[str, Rows]
+    reports: Mapping[str, Any], number: int, counts: _Counts, own: Mapping[str, Rows]
 ) -> dict[str, Any]:
     """Return the processes' final reports as of one loop.
 
-    ``rows`` are the rows of the network, and ``own`` those of the loop. Rows of the network that
-    are missing in the record are missing in every loop.
+    ``counts`` are those of the rows of the network, and ``own`` the rows of the loop. Rows of the
+    network that are missing in the record are missing in every loop.
     """
     found: dict[str, Any] = {}
     for role, content in reports.items():
         every = content if isinstance(content, list) else [content]
-        converted = [_report_of_loop(one, number, rows, own) for one in every]
+        converted = [_report_of_loop(one, number, counts, own) for one in every]
         found[role] = converted if isinstance(content, list) else converted[0]
     return found
 
 
 def _report_of_loop(
-    report: dict[str, Any], number: int, rows: Mapping[str, Rows], own: Mapping[str, Rows]
+    report: dict[str, Any], number: int, counts: _Counts, own: Mapping[str, Rows]
 ) -> dict[str, Any]:
-    counts = dict(report["rows"])
+    written = dict(report["rows"])
     for table, by_loop in report.get("rows_by_loop", {}).items():
-        counts[table] = by_loop[number] if number < len(by_loop) else 0
-    for table in counts.keys() & own.keys():
-        generation = report.get("generation", 0)
-        counts[table] += _count(own[table], generation) - _count(rows[table], generation)
+        written[table] = by_loop[number] if number < len(by_loop) else 0
+    generation = _generation(report)
+    for table in written.keys() & own.keys():
+        written[table] += _count(own[table], generation) - counts[table, generation]
     channel = dict(report["channel"])
     of_loops = channel.pop("loops", [])
     channel |= of_loops[number] if number < len(of_loops) else {}
     if "acknowledgements" in channel:
         channel["acknowledgements"] = channel["acknowledgements"]["loops"][number]
-    rest = {key: value for key, value in report.items() if key != "rows_by_loop"}
-    return rest | {"rows": counts, "channel": channel}
+    rest = {key: value for key, value in report.items() if key not in ("rows_by_loop", "stored")}
+    return rest | {"rows": written, "channel": channel}
 
 
 def _count(rows: Rows, generation: int) -> int:
