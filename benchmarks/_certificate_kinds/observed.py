@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from benchmarks._certificate_kinds import Bounds, Broken, Kind, Observed
-from noack.theory.scenario_certificates import ScenarioCertificate
+from noack.theory.certified_bounds import ScenarioCertificate
 from tests.noack.theory.loops import RUNS
 from tests.noack.theory.observed_loops import ObservedLoop, random_observed_loop, worst_shares
 

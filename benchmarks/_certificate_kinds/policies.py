@@ -13,7 +13,8 @@ from benchmarks._certificate_kinds import Bounds, Broken, Kind, Observed
 from benchmarks._certificate_kinds.decaying import search
 from noack.config.scenario import Scenario
 from noack.theory.certificate import NetworkConditions
-from noack.theory.scenario_certificates import ScenarioCertificate, certify
+from noack.theory.certified_bounds import ScenarioCertificate
+from noack.theory.scenario_certificates import certify
 from tests.noack.theory.broken_policies import BROKEN_POLICIES
 from tests.noack.theory.loops import Flags, Steps, System, Trace, random_system, simulate
 from tests.noack.theory.policy_loops import KINDS, policy_case, shares_of

@@ -61,15 +61,17 @@ class PeriodLimit(NamedTuple):
     @property
     def text(self) -> str:
         """The limit in words."""
-        T = "T ≤" if self.is_longest else "T ="
+        apart = "updates at most" if self.is_longest else "an update every"
         if self.found is None:
-            return f"stable for every pattern up to T = {self.stable_s:g} s, the longest examined"
-        longer = f"{T} {self.unstable_s:g} s is undecided"
+            return (
+                f"stable for every pattern with {apart} {self.stable_s:g} s, the longest examined"
+            )
+        longer = f"{apart} {self.unstable_s:g} s: undecided"
         if self.found.verdict == "destabilised":
-            longer = f"this pattern destabilises {T} {self.unstable_s:g} s: {self.found.text}"
+            longer = f"{apart} {self.unstable_s:g} s: this pattern destabilises: {self.found.text}"
         if self.stable_s is None:
             return f"no stable period was found; {longer}"
-        return f"stable for every pattern with {T} {self.stable_s:g} s; {longer}"
+        return f"stable for every pattern with {apart} {self.stable_s:g} s; {longer}"
 
 
 @dataclass(frozen=True)

@@ -13,18 +13,13 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.impairments.markov_chain import NotPredictableError
 from noack.theory.assumptions import assumptions
+from noack.theory.certified_bounds import BOX, OWN_PLANT, ScenarioCertificate
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.loss_margin import LossMargin, Stability
 from noack.theory.network_limits import NetworkLimits, network_limits
 from noack.theory.paper_bounds import Theorem2, theorem_2
 from noack.theory.run_conditions import ideal_conditions, nominal_conditions
-from noack.theory.scenario_certificates import (
-    BOX,
-    OWN_PLANT,
-    ScenarioCertificate,
-    box,
-    own_plant,
-)
+from noack.theory.scenario_certificates import box, own_plant
 from noack.theory.setpoint_shift import about_setpoint, void_at_setpoint
 from noack.theory.unlimited_losses import UnlimitedLosses, unlimited_losses
 from noack.theory.weight import choose_weight

@@ -3,8 +3,8 @@
 from collections.abc import Callable, Iterator, Sequence
 
 from noack.core.number_format import NONE, number
+from noack.theory.certified_bounds import BOX, ScenarioCertificate
 from noack.theory.paper_bounds import Theorem2
-from noack.theory.scenario_certificates import BOX, ScenarioCertificate
 
 _PERSISTENT = {
     "‖e_c‖": "delta", "‖e_s‖": "overshoot", "‖u − Kx‖": "input_error", "‖x‖": "state",

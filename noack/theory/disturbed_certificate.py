@@ -18,7 +18,8 @@ from noack.core.linear_systems import Matrix
 from noack.theory.certificate import Constants, NetworkConditions, Part, VoidError, solve_sum
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.error_growth import TriggerBound
-from noack.theory.gains import ErrorGains, Forcing, PlantGains, error_gains
+from noack.theory.forcing import Forcing
+from noack.theory.gains import ErrorGains, PlantGains, error_gains
 from noack.theory.observer_error import EstimationError
 from noack.theory.persistent_causes import forcing_of
 from noack.theory.superposition import SHARES, solve_divided, soonest

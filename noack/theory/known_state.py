@@ -23,10 +23,10 @@ from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.certificate import Constants
+from noack.theory.certified_bounds import OWN_PLANT, ScenarioCertificate
 from noack.theory.enclosure import KernelBounds, response
 from noack.theory.gains import Output, PlantGains, error_gains
 from noack.theory.persistent_causes import forcing_of
-from noack.theory.scenario_certificates import OWN_PLANT, ScenarioCertificate
 
 Counts = NDArray[np.int64]
 

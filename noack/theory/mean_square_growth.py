@@ -47,10 +47,11 @@ class RandomGrowth(NamedTuple):
     @property
     def text(self) -> str:
         """What follows, as a sentence."""
-        square = f"√E‖z‖² grows by {self.mean_square:.6g} per period"
+        factor = f"{self.mean_square:.6g}"
+        square = f"√E‖z‖² of the loop's state z changes by the factor {factor} per period"
         if self.mean_square < 1:
             return f"{square}: stable in mean square and almost surely"
-        sure = f"almost surely ‖z‖ grows by at most {self.almost_sure:.6g}"
+        sure = f"almost surely ‖z‖ changes by at most the factor {self.almost_sure:.6g}"
         verdict = "stable" if self.almost_sure < 1 else "not decided"
         return f"{square}: not stable in mean square; {sure} per period: {verdict}"
 

@@ -26,7 +26,7 @@ from noack.core.linear_systems import Matrix, discretise
 from noack.theory.certificate import EstimationBound
 from noack.theory.contraction import largest_gains, spectral_norm, times
 from noack.theory.enclosure import NotDecayingError, factors
-from noack.theory.gains import Forcing
+from noack.theory.forcing import Forcing
 from noack.theory.persistent_causes import noise_bound, noise_deviations, normal_bounds
 
 Stack = NDArray[np.float64]

@@ -13,7 +13,7 @@ import numpy as np
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, Vector
-from noack.theory.gains import Forcing, NormalForcing
+from noack.theory.forcing import Forcing, NormalForcing
 
 
 class NormalBounds(NamedTuple):

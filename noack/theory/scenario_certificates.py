@@ -2,10 +2,9 @@
 
 import contextlib
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from noack.config.resolution import loop_of, policy_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.settings.matrices import Rows
-from noack.theory.assumptions import Assumption, below, certificate_assumptions
+from noack.theory.assumptions import below, certificate_assumptions
 from noack.theory.box import BoxGains
 from noack.theory.certificate import (
     Constants,
@@ -21,6 +20,7 @@ from noack.theory.certificate import (
     VoidError,
     solve,
 )
+from noack.theory.certified_bounds import BOX, OWN_PLANT, ScenarioCertificate
 from noack.theory.disturbed_certificate import DisturbedCertificate, PlantAt
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.gains import ErrorGains, PlantGains, error_gains
@@ -28,117 +28,10 @@ from noack.theory.run_conditions import kept_probability
 from noack.theory.superposition import soonest
 from noack.theory.trigger_bounds import TriggerBounds
 
-OWN_PLANT = "the scenario's plant"
-BOX = "every plant of the uncertainty box"
 _SLOWER = 0.9
 _SHARES_OF_ALPHA = (0.8, 0.6, 0.4, 0.2)
 
 _TOO_LARGE = "intermediate results are too large or too small for floating point"
-
-
-@dataclass(frozen=True)
-class ScenarioCertificate:
-    """The guaranteed bounds of a loop."""
-
-    scope: str
-    """The plants that it covers."""
-    beta: float
-    """β, or 0 if the threshold has no such part."""
-    alpha_per_s: float
-    floor: float
-    """ε: the constant part of the threshold, or 0."""
-    weighted: bool
-    """Whether the trigger's norm is weighted."""
-    conditions: NetworkConditions
-    assumptions: tuple[Assumption, ...]
-    constants: Constants | None
-    """None if there is no certificate."""
-    floor_constants: Constants | None
-    """The constants from ``floor_from_s`` on, with ε in place of βe^{−αt} and without decay."""
-    void: str | None
-    """Reason for having no certificate; None if there is one."""
-    persistent_constants: Constants | None = None
-    """The constants, in units of 1 and without decay, whose bounds are added to those of
-    ``constants`` under disturbances, noise, an observer or a constant threshold."""
-    other: "ScenarioCertificate | None" = None
-    """A second certificate of the same plants under the same conditions: both bounds hold."""
-
-    @property
-    def source(self) -> str:
-        """Name of the certificate as the source of a claim."""
-        return "certificate" if self.scope == OWN_PLANT else "box certificate"
-
-    @property
-    def floor_from_s(self) -> float:
-        """Time at which βe^{−αt} falls below the floor ε; infinite without a floor."""
-        return _floor_from_s(self.beta, self.alpha_per_s, self.floor)
-
-    @property
-    def inter_event_s(self) -> float | None:
-        """Lower bound of the inter-event time; None if there is none."""
-        found = [c.inter_event_s for c in (self.constants, self.floor_constants) if c is not None]
-        known = [value for value in found if value is not None]
-        return min(known) if known and len(known) == len(found) else None
-
-    @property
-    def unit(self) -> str:
-        """The unit of Δ and β̃: β or ε; empty for 1."""
-        if self.beta > 0 and self.beta >= self.floor:
-            return "β"
-        is_added = self.persistent_constants is not None
-        decays = self.constants is not None and self.constants.rate_per_s > 0
-        return "ε" if self.floor > 0 and not is_added and not decays else ""
-
-    @property
-    def level(self) -> str:
-        """The unit of the error bounds at all times: βe^{−αt}; without decay β or ε."""
-        rate = 0.0 if self.constants is None else self.constants.rate_per_s
-        return f"{self.unit}e^(−{rate:.3g}t)" if rate else self.unit
-
-    def sensor_error(self, t_s: Matrix) -> Matrix:
-        """Bound of ‖e_s‖_W at times (k,); NaN without a certificate."""
-        return self._envelope(t_s, lambda c, level: c.overshoot * level)
-
-    def controller_error(self, t_s: Matrix) -> Matrix:
-        """Bound of ‖e_c‖_W at times (k,); NaN without a certificate."""
-        return self._envelope(t_s, lambda c, level: c.delta * level)
-
-    def state(self, t_s: Matrix) -> Matrix:
-        """Bound of ‖x‖ at times (k,); NaN without a certificate."""
-        return self._envelope(t_s, lambda c, level: c.state)
-
-    def estimation_error(self, t_s: Matrix) -> Matrix:
-        """Bound of ‖x̂ − x‖_W at measurements (k,); NaN without a certificate."""
-        return self._envelope(t_s, lambda c, level: c.estimation_error)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return all fields for JSON."""
-        constants, late, rest = self.constants, self.floor_constants, self.persistent_constants
-        return asdict(self) | {
-            "conditions": self.conditions._asdict()
-            | {"constraints": [rule.name for rule in self.conditions.constraints]},
-            "assumptions": [assumption._asdict() for assumption in self.assumptions],
-            "constants": None if constants is None else constants._asdict(),
-            "floor_constants": None if late is None else late._asdict(),
-            "persistent_constants": None if rest is None else rest._asdict(),
-            "other": None if self.other is None else self.other.to_json(),
-            "inter_event_s": self.inter_event_s,
-            "floor_from_s": None if self.floor == 0 else self.floor_from_s,
-        }
-
-    def _envelope(self, t_s: Matrix, scale: Callable[[Constants, float], float]) -> Matrix:
-        if self.constants is None:
-            return np.full(len(t_s), np.nan)
-        level = max(self.beta, self.floor if self.constants.rate_per_s == 0 else 0.0)
-        bound = scale(self.constants, level or 1.0) * np.exp(-self.constants.rate_per_s * t_s)
-        if self.floor_constants is not None:
-            late = scale(self.floor_constants, self.floor)
-            bound = np.where(t_s < self.floor_from_s, bound, late)
-        if self.persistent_constants is not None:
-            bound = bound + scale(self.persistent_constants, 1.0)
-        if self.other is not None:
-            bound = np.minimum(bound, self.other._envelope(t_s, scale))
-        return np.asarray(bound)
 
 
 def trigger_bounds(resolved: Scenario) -> TriggerBounds:
@@ -147,12 +40,6 @@ def trigger_bounds(resolved: Scenario) -> TriggerBounds:
     weight = np.eye(loop.n) if loop.weight is None else loop.weight
     fastest = float(np.abs(np.linalg.eigvals(loop.A_model + loop.B_model @ loop.K)).max()) or 1.0
     return TriggerBounds(policy_of(resolved).trigger_rule(loop.n), weight, fastest)
-
-
-def _floor_from_s(beta: float, alpha_per_s: float, floor: float) -> float:
-    if floor == 0:
-        return math.inf
-    return math.log(beta / floor) / alpha_per_s if beta > floor else 0.0
 
 
 def certify(

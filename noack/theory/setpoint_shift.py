@@ -12,7 +12,7 @@ from noack.config.resolution import loop_of, setpoint_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Vector
 from noack.disturbances.step import StepDisturbance
-from noack.theory.scenario_certificates import BOX, OWN_PLANT
+from noack.theory.certified_bounds import BOX, OWN_PLANT
 
 _AT_REST = 1e-9
 """The plant rests if |A x_r + B u_r| is at most this share of its larger term."""

@@ -5,6 +5,7 @@ field ``policy``, and the behaviour that the settings describe;
 :mod:`noack.config.feature_kinds` finds it there.
 """
 
+import warnings
 from abc import abstractmethod
 from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple, Self
 
@@ -156,8 +157,15 @@ class LyapunovFunctionSettings(WeightedSettings):
                 "trigger.policy: this one needs a Lyapunov function, but Â + B̂K is not stable"
             )
         Q = np.eye(len(A)) if self.Q is None else np.array(self.Q)
-        P = np.asarray(solve_continuous_lyapunov(A.T, -Q), dtype=np.float64)
-        return (P + P.T) / 2, Q
+        with warnings.catch_warnings(action="ignore"):  # of an inaccurate P, which is checked
+            P = np.asarray(solve_continuous_lyapunov(A.T, -Q), dtype=np.float64)
+        P = (P + P.T) / 2
+        if not np.isfinite(P).all() or np.linalg.eigvalsh(P)[0] <= 0:
+            raise CallerError(
+                "trigger.policy: this one needs a Lyapunov function, and none is found within "
+                "rounding: modes of Â + B̂K differ too much"
+            )
+        return P, Q
 
 
 def nanoseconds(seconds: float) -> int:

@@ -14,7 +14,9 @@ from cosim.analysis.adversary.pattern_flow import Flags, Segments
 from cosim.simulation.sampled.loop_steps import Numbers, Runs, Scales
 from cosim.simulation.sampled.sampled_loop import SampledLoop
 from noack.core.linear_systems import Matrix, Vector
-from noack.theory.scenario_certificates import ScenarioCertificate
+from noack.theory.certified_bounds import ScenarioCertificate
+
+_TINY = float(np.finfo(np.float64).tiny)
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,10 @@ class SampledFlow:
         """Compute the levels."""
         scales = Scales(
             self.loop.weight,
-            *(1.0 / (bound / bound[0]) for bound in (self._bound(True), self._bound(False))),
+            *(
+                bound[0] / np.maximum(bound, _TINY) if bound[0] > 0 else np.ones(len(bound))
+                for bound in (self._bound(True), self._bound(False))
+            ),
         )
         object.__setattr__(self, "_scales", scales)
 

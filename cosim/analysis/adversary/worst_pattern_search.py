@@ -12,6 +12,8 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
+
 from cosim.analysis.adversary.beam_search import search_beam
 from cosim.analysis.adversary.cost_bound import cost_ceiling
 from cosim.analysis.adversary.loss_patterns import guess, improve
@@ -31,8 +33,9 @@ from cosim.simulation.sampled.sampled_loop import SampledLoop
 from noack.config.scenario import Scenario
 from noack.core.random_streams import stream
 from noack.theory.certificate import NetworkConditions
+from noack.theory.certified_bounds import ScenarioCertificate
 from noack.theory.run_conditions import ideal_conditions, nominal_conditions
-from noack.theory.scenario_certificates import ScenarioCertificate, certify
+from noack.theory.scenario_certificates import certify
 
 NODES = 500_000
 BEAM = 512
@@ -73,7 +76,8 @@ def find_worst(
     if certificate is None:
         certificate = certify(resolved, conditions_of(resolved, continuous=continuous))
     find = _find_continuous if continuous else _find_sampled
-    return find(resolved, objective, certificate, beam, most_nodes, report)
+    with np.errstate(all="ignore"):  # a loop that diverges overflows
+        return find(resolved, objective, certificate, beam, most_nodes, report)
 
 
 def conditions_of(resolved: Scenario, *, continuous: bool) -> NetworkConditions:

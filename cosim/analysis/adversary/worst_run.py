@@ -16,7 +16,7 @@ from noack.config.scenario import Scenario
 from noack.core.number_format import number
 from noack.impairments.loss_guarantee import outcome_letters
 from noack.theory.certificate import Constants
-from noack.theory.scenario_certificates import ScenarioCertificate
+from noack.theory.certified_bounds import ScenarioCertificate
 
 _BREACH = 1 + 1e-9
 

@@ -30,11 +30,12 @@ from noack.config.scenario import Scenario
 from noack.protocol.record_tables import NO_SEQUENCE
 from noack.protocol.topology import LOOP_ROLES
 from noack.theory.certificate import NetworkConditions
+from noack.theory.certified_bounds import ScenarioCertificate
 from noack.theory.error_bounds import ErrorMonitor
 from noack.theory.known_state import KnownStateBounds, known_state_bounds
 from noack.theory.paper_bounds import Theorem2, theorem_2
 from noack.theory.run_conditions import allowed_conditions, ideal_conditions, nominal_conditions
-from noack.theory.scenario_certificates import ScenarioCertificate, certify, certify_box
+from noack.theory.scenario_certificates import certify, certify_box
 
 _LONG_S = 1e300  # finite: the delay of an input that never arrived is infinite
 _ANY = NetworkConditions(sys.maxsize, _LONG_S, _LONG_S, _LONG_S, _LONG_S, _LONG_S)
@@ -149,7 +150,7 @@ class RunEvidence:
             longest_ns = int(np.diff(ends_ns).max(initial=found.longest_update_ns))
             fresh_ns = ends_ns[-1] if len(ends_ns) else None
             newest, last_ns = int(joined.received[-1]), int(joined.t_ns[-1])
-            largest = float(np.abs(both).max(initial=found.largest_state))
+            largest = float(np.abs(both[np.isfinite(both)]).max(initial=found.largest_state))
             found = found._replace(
                 any_in_common=bool(started[-1]),
                 largest_state=largest,
@@ -299,7 +300,8 @@ class RunEvidence:
 
 def _common(scenario: Scenario, joined: AlignedRun) -> NDArray[np.bool_]:
     """Return where sensor and controller share an update, and ‖e_c‖ is finite, (k,)."""
-    return np.asarray(np.isfinite(joined.e_c_norm) & in_common(scenario, joined))
+    finite = np.isfinite(joined.e_c_norm) & np.isfinite(joined.x_s).all(axis=1)
+    return np.asarray(finite & in_common(scenario, joined))
 
 
 def scheduled_certificates(

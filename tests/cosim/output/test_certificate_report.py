@@ -25,8 +25,9 @@ from noack.config.scenario_file import load
 from noack.core.errors import CallerError
 from noack.theory.assumptions import AssumptionStatus
 from noack.theory.certificate import Constants
+from noack.theory.certified_bounds import ScenarioCertificate
 from noack.theory.run_conditions import ideal_conditions
-from noack.theory.scenario_certificates import ScenarioCertificate, certify_box, outside_box
+from noack.theory.scenario_certificates import certify_box, outside_box
 
 ROOT = Path(__file__).parents[3]
 

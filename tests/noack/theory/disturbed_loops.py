@@ -10,7 +10,8 @@ from scipy.linalg import expm
 
 from noack.theory.certificate import Constants, EstimationBound, Part
 from noack.theory.error_growth import TriggerBound
-from noack.theory.gains import ErrorGains, Forcing, Growth, PlantGains
+from noack.theory.forcing import Forcing
+from noack.theory.gains import ErrorGains, Growth, PlantGains
 from noack.theory.superposition import solve_divided
 from tests.noack.theory.loops import (
     RUNS,

@@ -10,11 +10,13 @@ from noack.config.resolution import resolve
 from noack.config.scenario_file import load
 from noack.theory.box import BoxGains
 from noack.theory.certificate import Part, VoidError
+from noack.theory.certified_bounds import ScenarioCertificate
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.error_growth import TriggerBound
-from noack.theory.gains import ErrorGains, Forcing, NormalForcing, PlantGains
+from noack.theory.forcing import Forcing, NormalForcing
+from noack.theory.gains import ErrorGains, PlantGains
 from noack.theory.run_conditions import allowed_conditions
-from noack.theory.scenario_certificates import ScenarioCertificate, certify, certify_box
+from noack.theory.scenario_certificates import certify, certify_box
 from noack.theory.superposition import solve_divided
 from tests.noack.theory.disturbed_loops import Sum, random_disturbed_loop, signals
 from tests.noack.theory.loops import RUNS, STEPS, Plants, System, networks, random_system, simulate

@@ -11,6 +11,8 @@ from noack.config.feature_kinds import POLICIES
 from noack.config.resolution import policy_of, resolve
 from noack.config.scenario_file import validate
 from noack.core.errors import CallerError
+from noack.trigger.lyapunov import LyapunovSettings
+from noack.trigger.policy_settings import ModelMatrices
 from noack.trigger.trigger_condition import QuadraticForm
 from noack.trigger.trigger_policy import Trigger
 
@@ -91,3 +93,15 @@ def test_a_mistake_names_its_key(
 def test_an_accumulated_quantity_that_overflows_is_infinite_and_raises_nothing() -> None:
     form = QuadraticForm(np.eye(2), np.zeros((0, 2)))
     assert form.values(np.array([[1e200, 0.0]])) == [math.inf]
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_lyapunov_function_beyond_rounding_is_refused() -> None:
+    """One mode decays 1e16 times as slowly as the other; P is not positive definite as computed."""
+    B, K = (
+        np.array([[113.33624038521207], [43.17068933023515]]),
+        [[-3.896659939542095, -1.4842666344932138]],
+    )
+    settings = LyapunovSettings(policy="lyapunov", rate_per_s=0.3)
+    with pytest.raises(CallerError, match="within rounding"):
+        settings.trigger_policy(ModelMatrices(np.zeros((2, 2)), B, K))

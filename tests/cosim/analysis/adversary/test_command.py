@@ -28,7 +28,7 @@ def test_json_contains_all_results() -> None:
         assert len(worst["pattern"]) == len(worst["event_s"])
         assert worst["delivered"] == [i for i, fate in enumerate(worst["pattern"]) if fate == "D"]
         assert worst["delivered"][0] == 0
-        assert 0 < worst["tightness"] <= 1
+        assert 0 < worst["tightness"] <= 1 + 1e-9
     error = document["worst"]["error"]
     assert error["lossless"] < error["value"] <= error["certified"]
     assert document["certificate"]["conditions"]["sampling_s"] == 0
@@ -79,3 +79,19 @@ def test_a_refusal_names_the_option_that_needs_more(scenario: str) -> None:
     done = CliRunner().invoke(app, ["adversary", scenario, "--trigger", "continuous"])
     assert done.exit_code == ExitStatus.CALLER
     assert "--trigger continuous" in done.stderr
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("start", ["[0.0, 0.0]", "[1e-3, 0.0]"])
+def test_a_bound_of_zero_is_searched(start: str) -> None:
+    """Plant and model agree and nothing disturbs them: e_c is 0 after the first update."""
+    settings = [
+        "plant.draw=nominal", "plant.uncertainty_A=", "plant.uncertainty_B=",
+        'trigger={policy="periodic", period_s=0.1}', f"plant.initial_state={start}",
+    ]  # fmt: skip
+    words = [word for one in settings if not one.endswith("=") for word in ("--set", one)]
+    arguments = ["adversary", "double_integrator", "--horizon", "0.5", "--nodes", "100"]
+    done = CliRunner().invoke(app, [*arguments, *words, "--json"])
+    assert done.exit_code == ExitStatus.OK, done.output
+    for worst in json.loads(done.stdout)["worst"].values():
+        assert worst["tightness"] is None or worst["tightness"] <= 1 + 1e-9

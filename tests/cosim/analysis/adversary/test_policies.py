@@ -22,7 +22,8 @@ from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
 from noack.core.errors import CallerError
-from noack.theory.scenario_certificates import ScenarioCertificate, certify
+from noack.theory.certified_bounds import ScenarioCertificate
+from noack.theory.scenario_certificates import certify
 
 EXAMPLES = {
     name: example.model_dump(mode="json", exclude_none=True)

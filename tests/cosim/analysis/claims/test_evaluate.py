@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
+import noack
 from cosim.analysis.claims import catalogue
 from cosim.analysis.claims.claim_definition import CertifiedClaim, ClaimDefinition
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, definitions
@@ -453,3 +454,15 @@ def test_a_claim_is_not_held_where_the_record_has_no_rows(run: RunRecord) -> Non
         assert claim.verdict is not HELD
         assert claim.since_s is not None
         assert claim.since_s <= 2.02
+
+
+def test_an_estimate_that_overflows_refutes_nothing() -> None:
+    """The observer's error grows without limit, until x̂ and then x_s are not finite."""
+    scenario = noack.load("double_integrator", {
+        "horizon_s": 20.0, "plant.rate_hz": 50, "controller.rate_hz": 50, "network.mansd": 0,
+        "plant.measurement": {"C": [[1.0, 0.0]], "noise_bound": [1e-3]},
+        "observer": {"kind": "luenberger", "gain": [[1e4], [1e4]]},
+        "trigger": {"policy": "periodic", "period_s": 0.5},
+    })  # fmt: skip
+    claims = ClaimEvaluation(simulate(resolve(scenario))).judge()
+    assert {claim.verdict for claim in claims} == {VOID}
