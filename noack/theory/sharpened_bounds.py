@@ -177,7 +177,7 @@ class InvariantEllipsoids:
         count = len(edges_s) - 1
         late = edges_s.searchsorted(np.geomspace(float(edges_s[1]), float(edges_s[-1]), _NODES))
         even = np.linspace(1, count, _NODES).astype(int)
-        return np.asarray(states[np.unique([*late.clip(1, count), *even])])
+        return np.asarray(states[sorted({*late.clip(1, count), *even})])
 
     def _sizes(self, factors: Stack, limit: float) -> Vector:
         """Return about the smallest c for which ‖Λx‖ ≤ c is invariant and contains x(0), (c,).
