@@ -336,8 +336,8 @@ class _Step:
 
     @cached_property
     def _drift(self) -> Mapping[Output, tuple[float, float, float]]:
-        of = self._plant.growths(self._conditions.delay_s, COARSE_CELLS)
-        return {output: of(output).totals for output in self._error.outputs}
+        growths = self._plant.growths(self._conditions.delay_s, COARSE_CELLS)
+        return {output: growth.totals for output, growth in growths.items()}
 
     def _constants(self, bound: "_ErrorBound", events: int, spacing_s: float) -> Constants:
         from_errors = self._from_errors(bound, spacing_s)
