@@ -122,11 +122,11 @@ class _Stage:
         terms, bends = F @ F @ self._z[:-1], np.zeros(len(steps_s))
         for order in range(1, _TAYLOR_TERMS + 1):
             seen = terms[:, self._flow.n :]
-            bends += np.sqrt(np.einsum("jab,jbc,jac->j", seen, inverse, seen))
+            bends += np.sqrt(np.abs(np.einsum("jab,jbc,jac->j", seen, inverse, seen)))
             terms = F @ terms * (steps_s / order)
         with np.errstate(over="ignore"):
             growth = np.exp(max(logarithmic_norm(F), 0.0) * steps_s[:, 0, 0])
-        bends += growth * np.sqrt(np.einsum("jab,jbc,jac->j", terms, inverse, terms))
+        bends += growth * np.sqrt(np.abs(np.einsum("jab,jbc,jac->j", terms, inverse, terms)))
         return np.asarray(steps_s[:, 0, 0] ** 2 / 8 * bends * ROUNDING)
 
     def next_event_s(self, level: float, bend: float, most_s: float) -> float:
