@@ -1,10 +1,12 @@
-"""Time from the start of ``noack run`` to the first control step.
+"""Time from the start of ``noack run`` to the first control step, and that of ``noack certify``.
 
 The progress lines give an upper bound of this time (:func:`benchmarks._runs.first_step_s`). The
-alternative is a Python that only imports the libraries that every process of a run needs.
+alternative is a Python that only imports the libraries that every process of a run needs. That of
+``noack certify`` is one that only imports python-control, with which such loops are analysed.
 """
 
 import argparse
+import resource
 import sys
 from collections.abc import Sequence
 
@@ -17,6 +19,9 @@ GOAL_S = Goal("<", 3)
 _IMPORT_LIBRARIES = (
     "import numpy, scipy.linalg, pydantic, zenoh, sys; print('ready', file=sys.stderr)"
 )
+_CERTIFY = (sys.executable, "-m", "cosim.cli", "certify", "lane_following")
+_IMPORT_CONTROL = (sys.executable, "-c", "import control")
+_CERTIFY_GOAL_S = Goal("<", 1)
 _SHORT = ("--set", "horizon_s=1")
 
 
@@ -42,6 +47,22 @@ def imported_s() -> float:
     return finished.lines[-1].at_s - finished.begun_s
 
 
+def cpu_s(command: Sequence[str]) -> float:
+    """Return the CPU seconds of a program, which other load changes less than its duration."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    execute(command)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def certify_row(ours_s: Sequence[float], imports_s: Sequence[float]) -> Row:
+    """Return the row of ``noack certify`` from the rounds of both sides, CPU seconds."""
+    return Row(
+        "noack certify lane_following, with all limits", median(ours_s), "CPU s",
+        Peer("Python that imports python-control", median(imports_s)), goal=_CERTIFY_GOAL_S,
+    )  # fmt: skip
+
+
 def rows_of(
     ours_s: Sequence[float], launches_s: Sequence[float], imports_s: Sequence[float]
 ) -> list[Row]:
@@ -61,6 +82,7 @@ def rows_of(
 def measure(options: argparse.Namespace) -> list[Row]:
     """Start several short runs, and the alternative in turn."""
     ours_s, launches_s, imports_s = [], [], []
+    certify_s, control_s = [], []
     for number in range(ROUNDS):
         say(f"round {number + 1} of {ROUNDS}")
         total_s, launch_s = started()
@@ -68,7 +90,9 @@ def measure(options: argparse.Namespace) -> list[Row]:
         imports_s.append(imported_s())
         if launch_s is not None:
             launches_s.append(launch_s)
-    return rows_of(ours_s, launches_s, imports_s)
+        certify_s.append(cpu_s(_CERTIFY))
+        control_s.append(cpu_s(_IMPORT_CONTROL))
+    return [*rows_of(ours_s, launches_s, imports_s), certify_row(certify_s, control_s)]
 
 
 BENCHMARK = Benchmark("startup", "Time to the first control step", measure)

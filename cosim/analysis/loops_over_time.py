@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from cosim.record.align import aligned_parts
 from cosim.record.run_directory import LOOPS, SUMMARY_FILE, read_object
-from cosim.record.run_record import RunRecord
+from cosim.record.run_record import Rows, RunRecord
 from noack.config.loops import phases_ns
+from noack.config.scenario import Scenario
 from noack.core.errors import ExitStatus
 from noack.core.linear_systems import row_norms
 from noack.core.number_format import number as shown
@@ -57,27 +58,38 @@ def loops_over_time(network: RunRecord, loops: Iterable[RunRecord]) -> LoopsOver
     The loops are read one after the other.
     """
     horizon_ns, phases = network.scenario.timing.horizon_ns, phases_ns(network.scenario)
-    errors, states = np.full((2, len(phases), INTERVALS), np.nan)
+    found = empty_over_time(network.scenario)
     for number, (record, phase_ns) in enumerate(zip(loops, phases, strict=True)):
         with np.errstate(all="ignore"):  # a loop may diverge
             for part in aligned_parts(record):
                 aligned = part.aligned
-                place = _places(aligned.t_ns + phase_ns, horizon_ns)
-                np.fmax.at(states[number], place, row_norms(aligned.x))
+                place = places(aligned.t_ns + phase_ns, horizon_ns)
+                np.fmax.at(found.states[number], place, row_norms(aligned.x))
                 common = aligned.since_delivery(record.scenario)
-                np.fmax.at(errors[number], place[common], aligned.e_c_norm[common])
-    link_bytes = np.zeros((len(phases), INTERVALS))
-    packets = network[NETEM_PACKET]
+                np.fmax.at(found.errors[number], place[common], aligned.e_c_norm[common])
+    add_link_bytes(found.link_bytes, network[NETEM_PACKET], horizon_ns)
+    return found
+
+
+def empty_over_time(scenario: Scenario) -> LoopsOverTime:
+    """Return the quantities of a run of several loops of which nothing is known yet."""
+    loops = len(phases_ns(scenario))
+    errors, states = np.full((2, loops, INTERVALS), np.nan)
+    edges_s = np.linspace(0, scenario.horizon_s, INTERVALS + 1)
+    return LoopsOverTime(edges_s, errors, states, np.zeros((loops, INTERVALS)))
+
+
+def add_link_bytes(link_bytes: Reals, packets: Rows, horizon_ns: int) -> None:
+    """Add the bytes of the packets that left the network to their loops, (L, intervals)."""
     left = (packets["release_ns"] >= 0) & (packets["release_ns"] <= horizon_ns)
-    left &= packets["flow"] < len(phases)  # the others are acknowledgements
+    left &= packets["flow"] < len(link_bytes)  # the others are of the other direction
     packets = packets[left]
-    place = _places(packets["release_ns"], horizon_ns)
+    place = places(packets["release_ns"], horizon_ns)
     np.add.at(link_bytes, (packets["flow"], place), packets["size_bytes"])
-    edges_s = np.linspace(0, network.scenario.horizon_s, INTERVALS + 1)
-    return LoopsOverTime(edges_s, errors, states, link_bytes)
 
 
-def _places(t_ns: NDArray[np.int64], horizon_ns: int) -> NDArray[np.int64]:
+def places(t_ns: NDArray[np.int64], horizon_ns: int) -> NDArray[np.int64]:
+    """Return the interval of each time of the run."""
     return np.asarray(np.minimum(t_ns * INTERVALS // horizon_ns, INTERVALS - 1))
 
 

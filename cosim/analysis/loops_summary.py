@@ -228,28 +228,40 @@ def _delays_ns(packets: Rows) -> NDArray[np.int64]:
 
 def in_flight(packets: Rows, horizon_ns: int) -> InFlightPart:
     """Return how many datagrams were inside the network, in intervals of equal width."""
+    means, largest = counts_inside(*times_inside(packets), np.linspace(0, horizon_ns, _BINS + 1))
+    return InFlightPart(
+        mean=float(means.mean()),
+        max=int(largest.max()),
+        width_s=horizon_ns / _BINS / NS_PER_S,
+        mean_by_interval=means.round(6).tolist(),
+        max_by_interval=largest.tolist(),
+    )
+
+
+def times_inside(packets: Rows) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return when each delayed datagram, or its copy, came into the network, and when it left."""
     begins, ends = [], []
     for column in ("release_ns", "copy_ns"):
         delayed = packets[packets[column] > packets["now_ns"]]
         begins.append(delayed["now_ns"])
         ends.append(delayed[column])
-    begin_ns, end_ns = np.sort(np.concatenate(begins)), np.sort(np.concatenate(ends))
-    edges_ns = np.linspace(0, horizon_ns, _BINS + 1)
+    return np.concatenate(begins), np.concatenate(ends)
+
+
+def counts_inside(
+    begin_ns: NDArray[np.int64], end_ns: NDArray[np.int64], edges_ns: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return mean and largest number of datagrams in the network between the edges, (k + 1,)."""
+    begin_ns, end_ns = np.sort(begin_ns), np.sort(end_ns)
     # The number of datagrams at t is the number of begins minus the number of ends up to t; its
     # integral from 0 to t is the sum of the times since each begin, minus that since each end.
     integral = _time_since(begin_ns, edges_ns) - _time_since(end_ns, edges_ns)
-    at_ns = np.unique(np.concatenate([begin_ns, edges_ns[:-1].astype(np.int64)]))
+    first_ns, last_ns = (edges_ns[place].astype(np.int64) for place in (slice(-1), -1))
+    new_ns = begin_ns[(begin_ns > first_ns[0]) & (begin_ns < last_ns)]
+    at_ns = np.unique(np.concatenate([new_ns, first_ns]))
     counts = np.searchsorted(begin_ns, at_ns, "right") - np.searchsorted(end_ns, at_ns, "right")
-    places = np.searchsorted(at_ns, edges_ns[:-1].astype(np.int64))
-    largest = np.maximum.reduceat(counts, places)
-    width_ns = horizon_ns / _BINS
-    return InFlightPart(
-        mean=float(integral[-1] / horizon_ns),
-        max=int(largest.max()),
-        width_s=width_ns / NS_PER_S,
-        mean_by_interval=(np.diff(integral) / width_ns).round(6).tolist(),
-        max_by_interval=largest.tolist(),
-    )
+    largest = np.maximum.reduceat(counts, np.searchsorted(at_ns, first_ns))
+    return np.diff(integral) / np.diff(edges_ns), largest
 
 
 def _time_since(moments_ns: NDArray[np.int64], at_ns: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -96,6 +96,10 @@ RunArgument = Annotated[
         help="Run directory; the last run by default.", autocompletion=completion.run_directories
     ),
 ]
+LoopOption = Annotated[
+    str | None,
+    typer.Option("--loop", metavar="NAME", help="The loop of this name, in a run of several."),
+]
 SetOption = Annotated[
     list[str] | None,
     typer.Option(

@@ -97,8 +97,6 @@ def launch(
         resolved = loops[0] if scenario.loops is None else scenario
         require_disk_space(loops, runs)
         control = resolved.ports.control
-        if live and scenario.loops is not None:
-            raise CallerError("--live shows a run of one loop only; this scenario has [[loops]]")
         if control:
             require_free_tcp_port(control, "ports.control")
         if PLANT in spawn:

@@ -86,7 +86,7 @@ class _RunProgress:
     def update(self, report: dict[str, Any]) -> None:
         """Show the recorder's progress report."""
         self._print_new("live", [report["live"]] if report["live"] else [], "{}")
-        self._print_new("void", report.get("void", []), "[yellow]{}[/]")
+        self._print_new("warnings", report.get("warnings", []), "[yellow]{}[/]")
         self._print_new("changes", report.get("changes", []), "changed: {}")
         text = progress_text(report, self._scenario.horizon_s, self._loops)
         if self._task is not None:

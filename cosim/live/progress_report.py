@@ -17,6 +17,8 @@ from noack.protocol.record_tables import (
     effective,
 )
 
+_MOST_LINES = 30
+
 
 class ProgressReport:
     """Fields of :class:`noack.runtime.control_messages.RunProgress`.
@@ -27,12 +29,16 @@ class ProgressReport:
     def __init__(self, live: str | None) -> None:
         self._fields: dict[str, Any] = {
             "t_s": 0.0, "events": 0, "deliveries": 0, "longest_loss_burst": 0, "x_norm": None,
-            "live": live, "void": [], "changes": [],
+            "live": live, "warnings": [], "changes": [],
         }  # fmt: skip
 
-    def add_void(self, text: str) -> None:
-        """Add a line about void claims."""
-        self._fields["void"].append(text)
+    def add_warning(self, text: str) -> None:
+        """Add a line, e.g. about void claims; of many, the last says where the others are."""
+        lines = self._fields["warnings"]
+        if len(lines) < _MOST_LINES:
+            lines.append(text)
+        elif len(lines) == _MOST_LINES:
+            lines.append("further void claims and diverging loops are in the logs of the loops")
 
     def add_change(self, text: str) -> None:
         """Add a line about a change of runtime parameters."""

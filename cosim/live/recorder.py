@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
-from cosim.analysis.claims.assumption_monitor import AssumptionMonitor
-from cosim.analysis.claims.observed_conditions import AssumptionViolation
+from cosim.live.loops_monitor import Finding, LoopsMonitor
 from cosim.live.progress_report import ProgressReport
 from cosim.live.telemetry_store import TelemetryStore
 from cosim.record.decimate import is_long
@@ -19,9 +18,7 @@ from cosim.record.process_reports import report_of, write_reports
 from cosim.record.run_directory import active_run
 from cosim.record.run_record import Rows, RunRecord
 from cosim.record.spool_conversion import finish_record
-from noack.config.loops import loops_of
 from noack.config.parameter_changes import ParameterChange, change_notice
-from noack.config.resolution import resolve
 from noack.config.runtime_parameters import is_of_loss_alone
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
@@ -37,6 +34,8 @@ from noack.runtime.telemetry import NOTICES, first_row
 
 if TYPE_CHECKING:
     from cosim.output.viewer.live_viewer import LiveView
+    from cosim.output.viewer.loops_feed import LoopsFeed
+    from cosim.output.viewer.loops_recording import LoopsRecording
     from cosim.output.viewer.recording import RunView
     from cosim.output.viewer.table_feed import ViewFeed
 
@@ -70,12 +69,10 @@ class Recorder:
         self._plane = plane
         self._store = TelemetryStore(scenario, run_dir, plane.instance, start)
         self._scenario = scenario
-        self._feed: ViewFeed | None = None
+        self._feed: ViewFeed | LoopsFeed | None = None
         self.lost: MachineError | None = None
         """Why some stored rows are no longer on disk; known at the end."""
-        self._monitor = AssumptionMonitor(resolve(loops_of(scenario)[0]))
-        if scenario.loops is not None:
-            self._monitor.stop("the run has several loops")
+        self._monitor = LoopsMonitor(scenario)
         self._blind_reported = self._monitoring_ended = False
         session, key = plane.session, plane.key
         self._batches = session.declare_subscriber(
@@ -109,11 +106,18 @@ class Recorder:
             for role in LOOP_ROLES
         )
 
-    def show_in(self, view: "RunView") -> None:
+    def show_in(self, view: "RunView | LoopsRecording") -> None:
         """Show the telemetry in a view, from the first batch that is handled afterwards."""
-        from cosim.output.viewer.table_feed import ViewFeed
+        from cosim.output.viewer.recording import RunView
 
-        self._feed = ViewFeed(self._scenario, view)
+        if isinstance(view, RunView):
+            from cosim.output.viewer.table_feed import ViewFeed
+
+            self._feed = ViewFeed(self._scenario, view)
+        else:
+            from cosim.output.viewer.loops_feed import LoopsFeed
+
+            self._feed = LoopsFeed(self._scenario, view, self._progress.add_warning)
 
     def poll(self) -> bool:
         """Handle messages that have arrived; return whether there may be more.
@@ -235,25 +239,23 @@ class Recorder:
         if self._feed is not None:
             self._feed.add(table, rows)
 
-    def _monitor_assumptions(self, check: Callable[[], list[AssumptionViolation]]) -> None:
+    def _monitor_assumptions(self, check: Callable[[], list[Finding]]) -> None:
         """Report violated assumptions in the log, the view and the progress report."""
         if self._monitoring_ended:
             return
         try:
-            violations = check()
+            findings = check()
         except Exception as error:  # whatever it is: recording goes on
-            violations = []
+            findings = []
             self._monitor.stop(repr(error))
-        for one in violations:
-            text = f"void (assumption violated) from {one.t_s:.3f} s on: {one.text}"
-            notice = Notice(round(one.t_s * NS_PER_S), "void", text)
+        for notice, text in findings:
             self.note(notice)
-            self._progress.add_void(text)
+            self._progress.add_warning(text)
             if self._feed is not None:
                 self._feed.log(notice.line())
         if self._monitor.stopped is not None and not self._blind_reported:
             self._blind_reported = True
-            self._progress.add_void(
+            self._progress.add_warning(
                 f"claims are checked after the run only: {self._monitor.stopped}"
             )
 
@@ -358,11 +360,15 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
         raise recorder.lost
 
 
-def _open_view(process: RunProcess, live_view: "LiveView | None") -> "RunView":
+def _open_view(process: RunProcess, live_view: "LiveView | None") -> "RunView | LoopsRecording":
+    scenario, run_id, run_dir = process.scenario, process.ticket.run_id, process.ticket.run_dir
+    if scenario.loops is not None:
+        from cosim.output.viewer.loops_recording import open_loops_view
+
+        return open_loops_view(scenario, Path(run_dir), run_id, live_view)
     from cosim.output.viewer.run_view import open_view
 
-    ticket = process.ticket
-    return open_view(ticket.scenario, Path(ticket.run_dir), ticket.run_id, live_view)
+    return open_view(scenario, Path(run_dir), run_id, live_view)
 
 
 def _poll_to_the_end(process: RunProcess, recorder: Recorder) -> bool:

@@ -6,7 +6,6 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cosim.analysis.claims.claim_definition import envelope_formula
 from cosim.output.all_certificates import SCHEDULE, Certificates
 from cosim.output.assumptions_table import print_assumptions
 from cosim.output.certificate_rows import constant_rows, plants_of
@@ -14,6 +13,7 @@ from cosim.output.unlimited_losses_report import print_unlimited
 from noack.core.number_format import duration
 from noack.theory.assumptions import assumptions
 from noack.theory.certified_bounds import BOX
+from noack.theory.envelope_formula import envelope_formula
 from noack.theory.network_limits import MOST_S
 from noack.theory.scenario_certificates import outside_box
 

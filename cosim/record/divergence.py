@@ -15,10 +15,11 @@ cannot be distinguished from a transient. A run that is disturbed, saturated or 
 does not meet the criterion.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
@@ -79,6 +80,41 @@ def divergence(
         f"diverged: ‖x‖ passed {GROWTH * scale:.3g} ({GROWTH:g} times its expected size) at "
         f"{at_s:g} s, reached {last:.3g}, and was still growing at the end",
     )
+
+
+class GrowthMonitor:
+    """Finds the loops whose state leaves its scale, while they run; each loop is found once.
+
+    Whether it then keeps growing, as :func:`divergence` asks, is known at the end only.
+
+    Args:
+        loops: the resolved scenario of each loop.
+    """
+
+    def __init__(self, loops: Sequence[Scenario]) -> None:
+        self._early_ns = loops[0].timing.horizon_ns // 10
+        self._scales = np.array([_scale(one) for one in loops])
+        self._found = np.zeros(len(loops), np.bool_)
+
+    @np.errstate(all="ignore")
+    def take(
+        self, loops: NDArray[np.integer], t_ns: NDArray[np.int64], x: Matrix
+    ) -> list[tuple[int, int, str]]:
+        """Add states x, (k, n), of loops, (k,), at their times; return loop, time and text."""
+        norms = row_norms(x)
+        lost, early = ~np.isfinite(norms), t_ns < self._early_ns
+        np.fmax.at(self._scales, loops[early & ~lost], norms[early & ~lost])
+        limits = GROWTH * self._scales[loops]
+        beyond = np.flatnonzero(lost | (~early & (limits > 0) & (norms > limits)))
+        new = []
+        for place in beyond[~self._found[loops[beyond]]].tolist():
+            if self._found[loop := int(loops[place])]:
+                continue
+            self._found[loop] = True
+            passed = f"‖x‖ passed {limits[place]:.3g} ({GROWTH:g} times its expected size)"
+            text = "x is not finite" if lost[place] else passed
+            new.append((loop, int(t_ns[place]), text))
+        return new
 
 
 def _scale(scenario: Scenario) -> float:

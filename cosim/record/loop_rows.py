@@ -13,11 +13,39 @@ from numpy.typing import NDArray
 from cosim.record.record_source import Rows
 from noack.config.resolution import network_tables
 from noack.protocol.machine_interface import GENERATION
-from noack.protocol.record_tables import NETEM_SETTING
+from noack.protocol.record_tables import LOOP, NETEM_SETTING, OWNER
 
 _TIMES = ("t_ns", "now_ns", "since_ns", "release_ns", "copy_ns")
 _NEVER = ("release_ns", "copy_ns")
 """Columns in which −1 is no time."""
+
+
+def rows_by_loop(table: str, rows: Rows, phases_ns: Sequence[int]) -> Iterator[tuple[int, Rows]]:
+    """Yield the number and the rows of each loop, from a part of a table of the live record.
+
+    The inputs of the emulator keep their numbers. Rows of a run without [[loops]] are of loop 0.
+    """
+    shared = OWNER[table] == "netem"
+    names = [name for name in rows.dtype.names or () if name != LOOP]
+    if not shared and len(names) == len(rows.dtype.names or ()):
+        yield 0, rows
+        return
+    own = np.dtype([(name, rows.dtype[name]) for name in names])
+    numbers = rows["flow"] % len(phases_ns) if shared else rows[LOOP].astype(np.int64)
+    order = np.argsort(numbers, kind="stable")
+    ends = np.cumsum(np.bincount(numbers, minlength=len(phases_ns)))
+    for number in np.unique(numbers).tolist():
+        if number >= len(phases_ns):  # damaged
+            continue
+        chosen = rows[order[ends[number - 1] if number else 0 : ends[number]]]
+        found = chosen if shared else np.empty(len(chosen), own)
+        if shared:
+            _shift(found, phases_ns[number])
+            found["flow"] //= len(phases_ns)
+        else:
+            for name in names:
+                found[name] = chosen[name]
+        yield number, found
 
 
 def network_rows_by_loop(

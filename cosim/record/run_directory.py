@@ -32,6 +32,7 @@ LOOPS = "loops"
 LOOP_FILE = "loop.json"
 """In the run directory of a loop: its number in the run, and its phase."""
 LATEST = "latest"
+_MOST_NAMES = 12
 _LOCK = ".lock"
 _MOST_JSON_BYTES = 64 * 2**20
 LEAST_FREE_BYTES = 16 * 1024 * 1024
@@ -147,19 +148,32 @@ def latest_run(runs: Path) -> Path:
     return run_dir
 
 
-def chosen_run(run_dir: Path | None, runs: Path) -> Path:
+def chosen_run(run_dir: Path | None, runs: Path, loop: str | None = None) -> Path:
     """Return the given run directory, or the newest below ``runs`` if none is given.
+
+    Of a run of several loops, it is the directory of the ``loop`` of this name, if one is given.
 
     Raises:
         CallerError: as :func:`latest_run`, which also resolves a given ``latest``; or the path is
-            not UTF-8.
+            not UTF-8; or there is no such loop.
     """
     _require_utf8(run_dir or runs)
     if run_dir is None:
-        return latest_run(runs)
-    if run_dir.name == LATEST and run_dir.is_symlink():
-        return latest_run(run_dir.parent)
-    return run_dir
+        run_dir = latest_run(runs)
+    elif run_dir.name == LATEST and run_dir.is_symlink():
+        run_dir = latest_run(run_dir.parent)
+    return run_dir if loop is None else _loop_directory(run_dir, loop)
+
+
+def _loop_directory(run_dir: Path, loop: str) -> Path:
+    folder = run_dir / LOOPS
+    if not folder.is_dir():
+        raise CallerError(f"--loop {loop}: {run_dir} has no records of several loops")
+    names = sorted(one.name for one in folder.iterdir() if one.is_dir())
+    if loop not in names:
+        few = ", ".join(names[:_MOST_NAMES]) + (", …" if len(names) > _MOST_NAMES else "")
+        raise CallerError(f"--loop {loop}: {run_dir} has no such loop; its {len(names)} are {few}")
+    return folder / loop
 
 
 @contextmanager

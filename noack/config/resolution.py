@@ -70,7 +70,8 @@ def resolve(scenario: Scenario) -> Scenario:
     """
     if scenario.loops is not None:
         raise CallerError(
-            f"{scenario.name}: it has [[loops]]; this is for the scenario of one loop only"
+            f"{scenario.name}: it has several loops; this is for one: give a scenario without "
+            "[[loops]]"
         )
     scenario.plant.system.require_installed()
     model = _explicit_model(scenario.model)

@@ -166,8 +166,9 @@ class RunProgress(ControlMessage):
     longest_loss_burst: Count
     x_norm: float | None
     live: str | None
-    void: list[str] = []
-    """Which claims are void so far, and why; or why that cannot be checked during the run."""
+    warnings: list[str] = []
+    """Which claims are void so far, and why; which loops diverge; what cannot be checked or shown
+    during the run."""
     changes: list[str] = []  # changes of runtime parameters during the run
 
 

@@ -44,6 +44,8 @@ from noack.theory.nonnegative_system import Solution, solve_inequalities
 from noack.theory.sharpened_bounds import InvariantEllipsoids, SharpenedBounds
 
 _SETTLED = 1e-3
+_SHARPER = 0.99
+"""Bounds from the flow are computed again if Δ has become smaller by this factor."""
 _ATTEMPTS = 200
 _SIGNALS = 6
 
@@ -181,13 +183,13 @@ def _sharpened(found: Constants, part: "Part", conditions: NetworkConditions) ->
     dropouts, unit = conditions.dropouts, bound.beta if bound.unit is None else bound.unit
     size = found.overshoot * unit
 
-    def lost(spacing_s: float | None) -> float:
-        """Bound ‖e_c‖_W up to a lost event: before it, one event less is missing than may be."""
-        if dropouts == 0:
-            return 0.0
-        return (1 + error.missing(Output.WEIGHTED, dropouts - 1, spacing_s or 0.0)) * size
+    def plain(spacing_s: float | None) -> Vector:
+        """Bound ‖e_c‖_W while at most 0, 1, … events are missing."""
+        missing = [error.missing(Output.WEIGHTED, j, spacing_s or 0.0) for j in range(dropouts + 1)]
+        return (1 + np.array(missing)) * size
 
-    ellipsoids = InvariantEllipsoids(plant, found.delta * unit)
+    errors = plain(found.inter_event_s)
+    ellipsoids = InvariantEllipsoids(plant, float(errors[-1]))
     while True:
         before = found
         known = SharpenedBounds(
@@ -197,13 +199,11 @@ def _sharpened(found: Constants, part: "Part", conditions: NetworkConditions) ->
             found.mismatch,
             found.inter_event_s,
         )
-        known = ellipsoids.sharpened(
-            known, found.delta * unit, lost(found.inter_event_s), bound.reached
-        )
-        missing = error.missing(Output.WEIGHTED, dropouts, known.inter_event_s or 0.0)
-        delta = (1 + missing) * size / unit
+        known, errors = ellipsoids.sharpened(known, errors, bound.reached, size)
+        errors = np.minimum(errors, plain(known.inter_event_s))
+        delta = float(errors[-1]) / unit
         found = found._replace(**known._asdict(), delta=min(delta, found.delta))
-        if not found.delta < (1 - _SETTLED) * before.delta:
+        if not found.delta < _SHARPER * before.delta:
             return found
 
 
@@ -336,8 +336,8 @@ class _Step:
 
     @cached_property
     def _drift(self) -> Mapping[Output, tuple[float, float, float]]:
-        of = self._plant.growths(self._conditions.delay_s, COARSE_CELLS)
-        return {output: of(output).totals for output in self._error.outputs}
+        growths = self._plant.growths(self._conditions.delay_s, COARSE_CELLS)
+        return {output: growth.totals for output, growth in growths.items()}
 
     def _constants(self, bound: "_ErrorBound", events: int, spacing_s: float) -> Constants:
         from_errors = self._from_errors(bound, spacing_s)

@@ -42,7 +42,7 @@ _ALONE = 40.0
 """λ = 1, to rounding: only ‖Λξ‖ ≤ 1 is used."""
 _NEIGHBOURS, _WIDTHS = np.array([-1.0, 0.0, 1.0]), np.array([1.5, 0.75, 0.37, 0.18, 0.09])
 _AT_ONCE = 16
-_SHARES = np.array([
+SHARES = np.array([
     (first, (1 - first) * (1 - last), (1 - first) * last)
     for first in (0.01, 0.03, 0.1, 0.3) for last in (0.1, 0.3, 0.5, 0.7, 0.9)
 ])  # fmt: skip
@@ -151,6 +151,18 @@ class Starts:
             np.linalg.norm(x_c @ self.inverse, 2)
         )
 
+    def late_forms(self, limit: float) -> tuple[Stack, Matrix]:
+        """Return three forms of (x + e_c, e_c), at most 1, and what makes z of it after T'.
+
+        They follow from ‖x + e_c‖ ≤ h and ‖e_c‖ ≤ D, T' before, and ‖e_c‖ ≤ D now.
+        """
+        n = self.flow.n
+        moved, h = self.late
+        one, none = np.eye(n), np.zeros((n, n))
+        moved = moved @ np.block([[one, -one], [none, one]])
+        rows = [np.hstack([one, none]) / h, np.hstack([none, one]) / limit, moved[n:] / limit]
+        return np.array([row.T @ row for row in rows]), moved
+
 
 @dataclass(frozen=True)
 class Reach:
@@ -177,16 +189,9 @@ class Reach:
         return self.size * max(bounds.sup(limit, first), self._afterwards(C, limit))
 
     def _afterwards(self, C: Matrix, limit: float) -> float:
-        """Bound ‖C z‖ after the last node, for c = 1.
-
-        It follows from ‖x + e_c‖ ≤ h and ‖e_c‖ ≤ D, T' before, and ‖e_c‖ ≤ D now.
-        """
-        n = len(self.starts.shape)
-        moved, h = self.starts.late
-        one, none = np.eye(n), np.zeros((n, n))
-        moved = moved @ np.block([[one, -one], [none, one]])
-        rows = [np.hstack([one, none]) / h, np.hstack([none, one]) / limit, moved[n:] / limit]
-        values, V = np.linalg.eigh(np.tensordot(_SHARES, [row.T @ row for row in rows], axes=1))
+        """Bound ‖C z‖ after the last node, for c = 1."""
+        grams, moved = self.starts.late_forms(limit)
+        values, V = np.linalg.eigh(np.tensordot(SHARES, grams, axes=1))
         sizes = spectral_norms(C @ moved @ V / np.sqrt(values)[:, None])
         found = float(sizes.min()) * ROUNDING
         return found if math.isfinite(found) else math.inf

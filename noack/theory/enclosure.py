@@ -227,8 +227,12 @@ class _Bends:
 
     columns: Sequence[slice]
     """Groups of D's columns."""
-    terms: Stack
-    """(n, r, 4k), Taylor's terms G^j e^{Gτ} D s^{j−2}/(j−2)! at the left nodes, by order."""
+    powers: Stack
+    """(4, n, n), G^j of Taylor's terms G^j e^{Gτ} D s^{j−2}/(j−2)!."""
+    scales: Matrix
+    """(4, k), s^{j−2}/(j−2)!"""
+    nodes: Stack
+    """(n, r, k), e^{Gτ} D at the left nodes."""
     rest: Stack
     """(groups, k), factor of ‖C‖ in a bound of the remainder."""
     decay: Decay | None
@@ -239,8 +243,17 @@ class _Bends:
 
     def over(self, outputs: Outputs[Name]) -> Stack:
         """Return the bounds for output matrices C, (outputs, groups, k)."""
-        found = outputs.sizes(times(outputs.stacked, self.terms), self.columns)
-        bound = found.reshape(*found.shape[:2], _TAYLOR_TERMS, -1).sum(axis=2)
+        turned = (outputs.stacked @ self.powers).reshape(-1, len(self.nodes))
+        terms = times(turned, self.nodes)
+        terms = terms.reshape(len(self.powers), -1, *terms.shape[1:])
+
+        def total(values: Stack) -> Stack:
+            norms = np.sqrt(np.einsum("jirk,jirk->jk", values, values))
+            return np.asarray((norms * self.scales).sum(axis=0))
+
+        bound = np.array(
+            [[total(terms[:, rows, group]) for group in self.columns] for rows in outputs.rows]
+        )
         rest = outputs.norms[:, None, None] * self.rest
         if self.decay is None:
             return np.asarray(bound + rest)
@@ -257,21 +270,25 @@ def _bends(
     growth = np.where(
         exponents < _LARGEST_EXPONENT, np.exp(exponents.clip(max=_LARGEST_EXPONENT)), np.inf
     )
-    terms = [times(generator, times(generator, nodes))]
+    powers, scales = [generator @ generator], [np.ones(len(steps_s))]
     for order in range(1, _TAYLOR_TERMS + 1):
-        terms.append(times(generator, terms[-1]) * (steps_s / order))
+        powers.append(generator @ powers[-1])
+        scales.append(scales[-1] * (steps_s / order))
 
-    def norms(values: Stack) -> Stack:
+    def norms(matrix: Matrix) -> Stack:
+        values = times(matrix, nodes)
         return np.array([sizes(values[:, group]) for group in columns])
 
     none = np.zeros(0)
     return _Bends(
         columns,
-        np.concatenate(terms[:-1], axis=2),
-        growth * norms(terms[-1]),
+        np.array(powers[:-1]),
+        np.array(scales[:-1]),
+        nodes,
+        growth * scales[-1] * norms(powers[-1]),
         decay,
-        none if decay is None else norms(times(decay.factor, terms[-1])),
-        none if decay is None else norms(times(decay.factor, terms[0])),
+        none if decay is None else scales[-1] * norms(decay.factor @ powers[-1]),
+        none if decay is None else norms(decay.factor @ powers[0]),
     )
 
 
@@ -378,7 +395,8 @@ def _powers(entries: bytes, n: int, step_s: float, least: int) -> tuple[Stack, M
     generator = np.frombuffer(entries).reshape(n, n)
     powers, leap = np.eye(n)[None], exponential(generator * step_s)
     while len(powers) < least:
-        powers, leap = np.concatenate([powers, product(leap, powers)]), leap @ leap
+        later = (powers.reshape(-1, n) @ leap).reshape(-1, n, n)
+        powers, leap = np.concatenate([powers, later]), leap @ leap
     return powers, leap
 
 

@@ -9,7 +9,7 @@ and, by identity (I1), e_c is e_s plus the contributions of the missing events. 
 interest are the weighted norm W, the state itself, E x, and K H x (the error rate of a held input).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
@@ -120,9 +120,10 @@ class ErrorGains:
         """All outputs, whose bounds are computed at once."""
         return Outputs(self.outputs)
 
-    @cached_method
-    def _stack(self, output: Output) -> Outputs[Output]:
-        return Outputs({output: self.outputs[output]})
+    @cached_property
+    def stacked_norm(self) -> Outputs[Output]:
+        """The trigger's norm alone."""
+        return Outputs({Output.WEIGHTED: self.weight})
 
     @cached_property
     def kernels(self) -> Mapping[Output, KernelBounds]:
@@ -179,23 +180,21 @@ class ErrorGains:
         """Whether e^{(H+αI)τ} decays, or is constant in a hold."""
         return not self.scaled_H.any() or spectral_abscissa(self.scaled_H) < 0
 
-    def growth(self, columns: Columns, until_s: float, cells: int) -> Callable[[Output], Growth]:
-        """Return the growth of every output C e_s, with what drives e_s through these columns."""
+    def growths(
+        self, columns: Columns, until_s: float, cells: int, outputs: Outputs[Output]
+    ) -> dict[Output, Growth]:
+        """Return the growth of some outputs C e_s, with what drives e_s through these columns."""
         driven = np.hstack([columns.mismatch, columns.input_error])
         groups = (0, columns.mismatch.shape[1])
-        followed = response_until(self.scaled_H, driven, until_s, cells, groups)
-        disturbed = None
+        kernels = response_until(self.scaled_H, driven, until_s, cells, groups)
+        areas = dict.fromkeys(outputs.names, np.zeros(cells))
         if columns.disturbed.size:
             disturbed = response_until(self.scaled_H, columns.disturbed, until_s, cells)
-
-        def of(output: Output) -> Growth:
-            areas = np.zeros(cells)
-            if disturbed is not None:
-                areas = disturbed.areas_of_columns(self.outputs[output])
-            mismatch, forced = followed.through_groups(self._stack(output))[output]
-            return Growth(mismatch, forced, areas)
-
-        return of
+            areas = {C: disturbed.areas_of_columns(self.outputs[C]) for C in outputs.names}
+        return {
+            output: Growth(mismatch, input_error, areas[output])
+            for output, (mismatch, input_error) in kernels.through_groups(outputs).items()
+        }
 
     @cached_method
     def stretch(self, until_s: float) -> float:
@@ -383,14 +382,16 @@ class PlantGains:
         """The columns through which e_s is driven."""
         return Columns(self.split_mismatch[0], self.input_matrix, self._forcing.limited)
 
+    @cached_method
     def growth(self, until_s: float, cells: int) -> Growth:
         """Return the growth of ‖e_s‖_W over ``until_s``, on a grid."""
-        return self.growths(until_s, cells)(Output.WEIGHTED)
+        error = self.error
+        return error.growths(self.columns, until_s, cells, error.stacked_norm)[Output.WEIGHTED]
 
     @cached_method
-    def growths(self, until_s: float, cells: int) -> Callable[[Output], Growth]:
+    def growths(self, until_s: float, cells: int) -> Mapping[Output, Growth]:
         """Return the growth of every output C e_s over ``until_s``, on a grid."""
-        return self.error.growth(self.columns, until_s, cells)
+        return self.error.growths(self.columns, until_s, cells, self.error.stacked)
 
 
 def deviations(covariance: Matrix) -> Matrix:

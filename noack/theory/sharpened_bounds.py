@@ -21,10 +21,11 @@ import numpy as np
 
 from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
-from noack.core.matrix_functions import exponential, solve_lyapunov
+from noack.core.matrix_functions import solve_lyapunov
 from noack.theory.contraction import Stack
 from noack.theory.delivery_flow import ROUNDING, DeliveryFlow, Reach, Starts
-from noack.theory.gains import PlantGains
+from noack.theory.gains import Output, PlantGains
+from noack.theory.lost_events import bend_of_error, error_after, errors_after_losses
 
 _MARGINS = (1.0, 1.01, 1.02, 1.05, 1.08, 1.12, 1.2, 1.35)
 """Factors of the ellipsoid's computed size that are tried."""
@@ -60,19 +61,20 @@ class InvariantEllipsoids:
     """The largest D, for which Λ is chosen."""
 
     def sharpened(
-        self, known: SharpenedBounds, limit: float, lost: float, level: float | None
-    ) -> SharpenedBounds:
+        self, known: SharpenedBounds, errors: Vector, level: float | None, size: float
+    ) -> tuple[SharpenedBounds, Vector]:
         """Return the smaller of the known bounds and those from the flow.
 
         Args:
             known: bounds that hold.
-            limit: D, a bound of ‖e_c‖_W.
-            lost: the same up to a lost event, at which one event less is missing than may be.
+            errors: bounds of ‖e_c‖_W while at most 0, 1, … events have been lost.
             level: ‖e_s‖_W at an event, at least; None if it may be arbitrarily small.
+            size: bound of ‖e_s‖_W.
         """
+        limit = float(errors[-1])
         reach = self.within(limit)
         if reach is None:
-            return known
+            return known, errors
         flow, inverse = self.flow, reach.size * reach.starts.inverse
         gain = self.plant.error.split_K[1] @ flow.inverse
 
@@ -86,11 +88,15 @@ class InvariantEllipsoids:
             min(known.mismatch, of_state(flow.mismatch)),
             known.inter_event_s,
         )
-        if level is None or known.inter_event_s is None:
-            return found
-        at_events = replace(reach, limit=max(min(lost, limit), _LEAST_SHARE * limit))
-        next_s = _next_event_s(reach, at_events, level, known.inter_event_s)
-        return found._replace(inter_event_s=next_s)
+        if level is None or not known.inter_event_s:
+            return found, errors
+        at_event = max(float(errors_at_events(errors)[-1]), _LEAST_SHARE * limit)
+        bend = bend_of_error(reach, level)
+        at_events = replace(reach, limit=at_event)
+        next_s = _next_event_s(at_events, level, known.inter_event_s, bend)
+        kernel = self.plant.error.kernels[Output.WEIGHTED]
+        errors = errors_after_losses(reach, errors, size, level, next_s, kernel, bend)
+        return found._replace(inter_event_s=next_s), errors
 
     def within(self, limit: float) -> Reach | None:
         """Return the flow from an ellipsoid for these bounds; None if none is found."""
@@ -171,7 +177,7 @@ class InvariantEllipsoids:
         count = len(edges_s) - 1
         late = edges_s.searchsorted(np.geomspace(float(edges_s[1]), float(edges_s[-1]), _NODES))
         even = np.linspace(1, count, _NODES).astype(int)
-        return np.asarray(states[np.unique([*late.clip(1, count), *even])])
+        return np.asarray(states[sorted({*late.clip(1, count), *even})])
 
     def _sizes(self, factors: Stack, limit: float) -> Vector:
         """Return about the smallest c for which ‖Λx‖ ≤ c is invariant and contains x(0), (c,).
@@ -200,26 +206,28 @@ class InvariantEllipsoids:
         return np.asarray(np.sqrt(found))
 
 
-def _next_event_s(reach: Reach, at_events: Reach, level: float, known_s: float) -> float:
+def errors_at_events(errors: Vector) -> Vector:
+    """Bound ‖e_c‖_W after each event: 0 if it is received; a lost one was not missing before."""
+    return np.append(0.0, errors[:-1])
+
+
+def _next_event_s(at_events: Reach, level: float, known_s: float, bend: float) -> float:
     """Return a time before which ‖e_s‖_W cannot reach ``level`` after an event.
 
     It is at least the known one. Over a step s, e_s differs from its chord by at most s²/8 times a
     bound of its second derivative, which holds as long as ‖e_s‖_W is below the level.
     """
-    flow, found_s = reach.starts.flow, known_s
-    n, F, H = flow.n, flow.generator, flow.H
-    bend = reach.sup((F @ F)[n:] - np.hstack([np.zeros((n, n)), H @ H]))
-    bend += float(np.linalg.norm(H @ H, 2)) * level
+    flow, found_s = at_events.starts.flow, known_s
     if not (0 < known_s < math.inf and 0 < bend < math.inf):
         return known_s
-    size, tries = at_events.sup(_error_after(flow, found_s)), 0
+    size, tries = at_events.sup(error_after(flow, found_s)), 0
     slope = size / found_s
     while size < level:
         step_s = min(math.sqrt(4 * (level - size) / bend), found_s)
         if slope * step_s > 0.99 * (level - size):
             step_s = 0.99 * (level - size) / slope
         while tries < _MOST_STEPS and step_s > _SETTLED * found_s:
-            later, tries = at_events.sup(_error_after(flow, found_s + step_s)), tries + 1
+            later, tries = at_events.sup(error_after(flow, found_s + step_s)), tries + 1
             if max(size, later) + step_s**2 / 8 * bend < level:
                 break
             step_s *= 0.6
@@ -238,10 +246,3 @@ def _squares(image: Stack, error: Stack, multipliers: Matrix) -> tuple[Vector, V
     best = found.argmin(axis=1)
     rows = np.arange(len(found))
     return found[rows, best], multipliers[rows, best]
-
-
-def _error_after(flow: DeliveryFlow, time_s: float) -> Matrix:
-    """Return C_r: e_s a time after an event is C_r z."""
-    found = np.asarray(exponential(flow.generator * time_s)[flow.n :])
-    found[:, flow.n :] -= exponential(flow.H * time_s)
-    return found

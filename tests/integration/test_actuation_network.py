@@ -1,6 +1,7 @@
 """A live run whose updates and actuations cross the network."""
 
 import json
+import signal
 
 import numpy as np
 import pytest
@@ -8,14 +9,20 @@ import pytest
 from cosim.record.packet_outcomes import packet_outcomes
 from cosim.record.run_record import RunRecord, load_record
 from netem.engine.native_pump import compiled_pump
+from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_ACTUATION, PLANT_STEP
 from noack.protocol.wire_format import Flow
+from tests.integration import conftest as live
 from tests.integration.conftest import AT_RATE, Finished, run_scenario
+from tests.integration.test_restarts import KEEPS, goes_on, let_run, spooled
 
 ACTUATION = (
     'network.actuation={mansd=3, loss={model="bernoulli", probability=0.4}, '
     'impairments=[{kind="delay", delay_s=0.005, jitter_s=0.01}]}'
 )
+
+
+RESTARTED = ("controller", "netem")
 
 
 @pytest.fixture(scope="module")
@@ -62,3 +69,51 @@ def test_the_plant_applies_the_entry_whose_time_has_come(record: RunRecord) -> N
     assert (steps["entry"] == entries).all()
     assert (steps["u"] == inputs[np.arange(len(steps)), entries]).all()
     assert len(np.unique(entries)) > 2
+
+
+@pytest.fixture(scope="module")
+def restarted(tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    """A run in which controller and emulator were killed while actuations were lost."""
+    with live.begun(tmp_path_factory.mktemp("restarted")) as start:
+        running = start(
+            *live.settings(horizon_s=4000.0, recovery__rejoin_within_s=60, realtime__enabled=False),
+            *live.settings(controller__predictions=5),
+            *AT_RATE,
+            *("--set", ACTUATION),
+        )
+        running.wait_started()
+        for role in RESTARTED:
+            live.wait_for(lambda role=role: len(spooled(running, KEEPS[role])) > 0)
+            before = live.child_of(running.process, role)
+            assert before is not None
+            before.kill()
+            live.wait_for(lambda role=role: goes_on(running, role))
+        let_run(running, 2)
+        running.process.send_signal(signal.SIGINT)
+        return running.finish()
+
+
+def test_restarted_processes_go_on_with_lossy_actuations(restarted: Finished) -> None:
+    assert restarted.status == 130, restarted.stderr
+    assert restarted.summary["replay"]["bit_exact"]
+    assert {one["process"] for one in restarted.summary["restarts"]} == set(RESTARTED)
+    record = load_record(restarted.run_dir)
+    steps, actuations = record[CONTROLLER_STEP], record[PLANT_ACTUATION]
+    # The plant applies inputs of the restarted controller, through the restarted emulator.
+    assert (actuations["sequence"] >= GENERATION).any()
+    newest = record[PLANT_STEP]["actuation"]
+    assert newest[-1] >= GENERATION
+    assert (np.diff(newest) >= 0).all()
+    at = np.searchsorted(steps["sequence"], actuations["sequence"])
+    recorded = steps["sequence"][np.minimum(at, len(steps) - 1)] == actuations["sequence"]
+    assert (steps["u"][at[recorded]] == actuations["u"][recorded]).all()
+    assert recorded.mean() > 0.9  # the last ticks of a killed controller may not be on disk
+
+
+def test_claims_of_a_restarted_run_are_judged(restarted: Finished) -> None:
+    found = restarted.summary["actuations"]
+    assert found["lost"] > 0.2 * found["sent"]
+    claims = restarted.summary["claims"]
+    assert claims
+    assert {claim["verdict"] for claim in claims} <= {"held", "void", "not applicable"}
+    assert restarted.summary["assumption_violations"]  # e.g. the input of a dead controller was old

@@ -64,7 +64,7 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def finished(scenario: Path, tmp_path_factory: pytest.TempPathFactory) -> live.Finished:
     with live.begun(tmp_path_factory.mktemp("shared")) as start:
-        return start(command=("run", str(scenario))).finish()
+        return start(command=("run", str(scenario), "--live")).finish()
 
 
 def record_of(run: live.Finished, name: str) -> RunRecord:
@@ -87,6 +87,17 @@ def test_one_loop_diverges_and_the_others_go_on(finished: live.Finished) -> None
     for name in NAMES[:2]:
         assert loop_of(finished, name)["exit"] == {"status": 0, "reason": "horizon"}
         assert np.linalg.norm(record_of(finished, name)[PLANT_STEP]["x"][-1]) < 0.1
+
+
+def test_the_diverging_loop_is_named_during_the_run(finished: live.Finished) -> None:
+    """In its own log only; its time is before the end."""
+    said = {
+        name: [one for one in record_of(finished, name).notices if one["level"] == "diverges"]
+        for name in NAMES
+    }
+    assert [len(said[name]) for name in NAMES] == [0, 0, 1]
+    assert 1e9 < said["wild"][0]["t_ns"] < 8e9
+    assert "wild: diverges from " in finished.stderr
 
 
 def test_the_loops_compete_for_the_bottleneck_and_the_guarantee_holds_for_each(

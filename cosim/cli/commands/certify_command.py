@@ -37,13 +37,17 @@ def certify(
 
     Exit status 1: nothing can be certified.
     """
-    from cosim.live.progress import work_bar
     from cosim.output.all_certificates import certificates_of
     from cosim.output.certificate_report import print_certificates
 
     loaded = cli.load_scenario(scenario, settings)
-    with work_bar("choosing the weight") as progress:
-        found = certificates_of(loaded, weight, late, progress)
+    if weight == "chosen":
+        from cosim.live.progress import work_bar
+
+        with work_bar("choosing the weight") as progress:
+            found = certificates_of(loaded, weight, late, progress)
+    else:
+        found = certificates_of(loaded, weight, late)
     if json:
         cli.print_json(found.to_json())
     else:

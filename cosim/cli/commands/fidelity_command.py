@@ -19,6 +19,7 @@ def fidelity(
     run_dir: cli.RunArgument = None,
     *,
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
+    loop: cli.LoopOption = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", help="Write a figure of the differences over time (.svg, .png)."),
@@ -33,7 +34,7 @@ def fidelity(
     from cosim.output.report.signal_figures import fidelity_figure
     from cosim.record.run_record import load_record
 
-    path = chosen_run(run_dir, runs)
+    path = chosen_run(run_dir, runs, loop)
     with PatientConsole(stderr=True).status("comparing"):
         found = compute_fidelity(load_record(path))
         if out is not None:

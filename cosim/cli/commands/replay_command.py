@@ -13,6 +13,7 @@ def replay(
     run_dir: cli.RunArgument = None,
     *,
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
+    loop: cli.LoopOption = None,
     json: cli.JsonOption = False,
 ) -> int:
     """Replay a run's recorded inputs; compare the outputs bit for bit."""
@@ -22,7 +23,7 @@ def replay(
     from cosim.record.environment import changed_since
     from cosim.record.run_record import load_record
 
-    path = chosen_run(run_dir, runs)
+    path = chosen_run(run_dir, runs, loop)
     with PatientConsole(stderr=True).status("replaying"):
         found = replay_record(load_record(path, network=True))
     changed = changed_since(path)

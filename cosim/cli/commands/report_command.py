@@ -17,6 +17,7 @@ def report(
     run_dir: cli.RunArgument = None,
     *,
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
+    loop: cli.LoopOption = None,
     again: Annotated[
         bool, typer.Option("--again", help="Write the report again, even if there is one.")
     ] = False,
@@ -25,7 +26,7 @@ def report(
     """Print the path of a run's report (one HTML page with all figures); write it if missing."""
     from cosim.live.finalize import run_report
 
-    path = run_report(chosen_run(run_dir, runs), again=again)
+    path = run_report(chosen_run(run_dir, runs, loop), again=again)
     if json:
         cli.print_json({"report": str(path)})
     else:

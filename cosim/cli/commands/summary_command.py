@@ -14,6 +14,7 @@ def summary(
     run_dir: cli.RunArgument = None,
     *,
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
+    loop: cli.LoopOption = None,
     verbose: cli.VerboseOption = False,
     json: cli.JsonOption = False,
 ) -> int:
@@ -24,7 +25,7 @@ def summary(
     from cosim.live.finalize import reopen
     from cosim.output.run_verdict import print_outcome
 
-    outcome = reopen(chosen_run(run_dir, runs))
+    outcome = reopen(chosen_run(run_dir, runs, loop))
     if json:
         cli.print_json(outcome.summary)
     else:

@@ -7,13 +7,14 @@ import typer
 
 from cosim.cli import command as cli
 from cosim.cli import completion
-from cosim.record.run_directory import RECORDING_FILE, chosen_run
+from cosim.record.run_directory import LOOP_FILE, RECORDING_FILE, chosen_run
 from noack.core.errors import ExitStatus
 
 
 @cli.command(cli.RUNS, 40, [
     ("noack view", "the last run, in a window if there is a display"),
     ("noack view runs/latest --web", "in a browser on this machine"),
+    ("noack view --loop pendulum-07", "one loop of a run of several, in detail"),
 ])  # fmt: skip
 def view(
     recording: Annotated[
@@ -25,18 +26,34 @@ def view(
     ] = None,
     *,
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
+    loop: cli.LoopOption = None,
     web: Annotated[
         bool, typer.Option("--web", help="Show it in a browser on this machine.")
     ] = False,
     json: cli.JsonOption = False,
 ) -> int:
-    """Show a run in the rerun viewer."""
+    """Show a run in the rerun viewer.
+
+    The recording of one of several loops is written when it is first viewed.
+    """
     from cosim.output.viewer.live_viewer import view_recording
 
-    path = chosen_run(recording, runs)
+    path = chosen_run(recording, runs, loop)
     path = path / RECORDING_FILE if path.is_dir() else path
+    if not path.is_file() and (path.parent / LOOP_FILE).is_file():
+        _write(path.parent)
     if json:
         cli.print_json({"recording": str(path), "exists": path.is_file()})
         return ExitStatus.OK if path.is_file() else ExitStatus.CALLER
     view_recording(path, native=False if web else None)
     return ExitStatus.OK
+
+
+def _write(loop_dir: Path) -> None:
+    from cosim.live.progress import PatientConsole
+    from cosim.output.viewer.run_view import write_view
+    from cosim.record.run_record import load_record
+
+    record = load_record(loop_dir)
+    with PatientConsole(stderr=True).status("writing the recording of the loop"):
+        write_view(record, loop_dir, (record.number or 0) + 1)

@@ -49,6 +49,7 @@ from cosim.output.palette import FORCED as FORCED_COLOUR
 from cosim.output.viewer.colour_key import ColourKey, input_colour
 from cosim.output.viewer.pictures.network_picture import NetworkDiagram
 from cosim.output.viewer.pictures.picture import TIMELINE, Picture, panel
+from cosim.output.viewer.recording_file import LOG
 
 ABOUT = "about"
 ERROR = "error/norm"
@@ -58,7 +59,6 @@ INPUT = "input"
 EVENT, EVENT_STEM, EVENT_CERTIFIED = "event/interval", "event/stem", "event/certified"
 RECEPTION, FORCED, RECEPTION_STEM = "reception/interval", "reception/forced", "reception/stem"
 DROP = "drop"
-LOG = "log"
 
 _PAGE_OF_FEW, _PAGE_OF_MANY, _MANY = 4, 9, 16
 _BEFORE, _AFTER = 0.02, 0.06
@@ -236,16 +236,21 @@ def _texts(input_names: Sequence[str], *, lateness: bool) -> rrb.Container:
         ColourKey(input_names).panel(),
         rrb.TextDocumentView(origin=ABOUT, name="About this run"),
         *([plot("Lateness [µs]", "lateness", ["$origin/**"])] if lateness else []),
-        rrb.TextLogView(
-            origin=LOG,
-            name="Log",
-            # The column of times would be too narrow: the text contains the time.
-            columns=rrb.TextLogColumns(
-                timeline_columns=rrb.encodings.TimelineColumn(TIMELINE, visible=False),
-                text_log_columns=["loglevel", "body"],
-            ),
-            format_options=rrb.TextLogFormat(monospace_body=True),
+        log_view(),
+    )
+
+
+def log_view() -> rrb.View:
+    """Return the panel of the run's log."""
+    return rrb.TextLogView(
+        origin=LOG,
+        name="Log",
+        # The column of times would be too narrow: the text contains the time.
+        columns=rrb.TextLogColumns(
+            timeline_columns=rrb.encodings.TimelineColumn(TIMELINE, visible=False),
+            text_log_columns=["loglevel", "body"],
         ),
+        format_options=rrb.TextLogFormat(monospace_body=True),
     )
 
 

@@ -199,12 +199,6 @@ class RunView(RecordingFile):
         if process in self._lateness:
             self.send(self._lateness[process], t_ns, lateness_us)
 
-    def log(self, t_ns: int, level: str, text: str) -> None:
-        """Add one line to the log; ``level`` is one of rerun's, such as INFO or WARN."""
-        line = f"{t_ns / 1e9:8.3f} s  {text}"
-        columns = rr.TextLog.columns(text=[line], level=[level])
-        self.send_columns(bp.LOG, np.array([t_ns], dtype=np.int64), columns)
-
     def close(self) -> None:
         """Write the waiting data and the file's footer; a second call does nothing.
 
@@ -255,8 +249,7 @@ class LoopView(RunView):
         self._whole.send_columns(f"{self._folder}/{entity}", times_ns, columns)
 
     def flush(self) -> None:
-        """Pass buffered data to the operating system."""
-        self._whole.flush()
+        """Nothing: the recording of all loops is flushed as a whole."""
 
     def close(self) -> None:
         """Write the waiting data; the recording stays open."""

@@ -16,6 +16,8 @@ Floats = npt.NDArray[np.float64]
 Nanoseconds = npt.NDArray[np.int64]
 
 APPLICATION_ID = "noack"
+LOG = "log"
+"""Entity of the run's log."""
 
 
 class ViewError(MachineError):
@@ -82,6 +84,12 @@ class RecordingFile:
         """Add lines from 0 to each height (k,) at times (k,), with a gap after each."""
         line = np.stack((np.zeros_like(height), height, np.full_like(height, np.nan)), axis=1)
         self.send(entity, np.repeat(t_ns, 3), line.ravel())
+
+    def log(self, t_ns: int, level: str, text: str) -> None:
+        """Add one line to the log; ``level`` is one of rerun's, such as INFO or WARN."""
+        line = f"{t_ns / 1e9:8.3f} s  {text}"
+        columns = rr.TextLog.columns(text=[line], level=[level])
+        self.send_columns(LOG, np.array([t_ns], dtype=np.int64), columns)
 
     def flush(self) -> None:
         """Pass buffered data to the operating system."""

@@ -44,18 +44,26 @@ from noack.theory.known_state import KnownStateBounds, known_state_bounds
 from noack.theory.run_conditions import allowed_conditions
 from noack.theory.scenario_certificates import certify
 
-_LAG_S = 0.2
+LAG_S = 0.2
 """Wall time by which the view lags, so that the batches of all processes have arrived."""
 _PATIENCE_S = 1.0
 """Maximum wall time to wait for a controller that sends no rows."""
 
-_SHOWN = (
+SHOWN = (
     CONTROLLER_STEP, CONTROLLER_DELIVERY, CONTROLLER_SETTING, NETEM_PACKET, PLANT_STEP,
     SENSOR_MEASUREMENT,
 )  # fmt: skip
 
 Times = NDArray[np.int64]
 Reals = NDArray[np.float64]
+
+
+_WARNINGS = ("failed", "violation", "void", "diverges", "watchdog")
+
+
+def log_level(notice: Mapping[str, Any]) -> str:
+    """Return the viewer's level of a line of the run's log."""
+    return "WARN" if notice["level"] in _WARNINGS else "INFO"
 
 
 class ViewFeed:
@@ -65,15 +73,23 @@ class ViewFeed:
         scenario: the resolved scenario.
         view: receives the aligned batches.
         columns: reduce each batch to the extremes in so many columns; None keeps all rows.
+        certified: show the certified bounds, which take up to some seconds to compute.
     """
 
-    def __init__(self, scenario: Scenario, view: RunView, columns: int | None = None) -> None:
-        self._columns = columns
+    def __init__(
+        self,
+        scenario: Scenario,
+        view: RunView,
+        columns: int | None = None,
+        *,
+        certified: bool = True,
+    ) -> None:
+        self._columns, self._is_certified = columns, certified and scenario.coverage.is_certifiable
         self._scenario = scenario
         self._loop = loop_of(scenario)
         self._view = view
         # Other tables are not shown.
-        self._pending: dict[str, list[Rows]] = {table: [] for table in _SHOWN}
+        self._pending: dict[str, list[Rows]] = {table: [] for table in SHOWN}
         self._types = tables_of(scenario)
         self._track: ControllerTrack = initial_track(scenario)
         self._undrawn: list[Rows] = []
@@ -97,8 +113,7 @@ class ViewFeed:
     def log(self, notice: Mapping[str, Any]) -> None:
         """Add a line of the run's log."""
         text = f"{notice['process']}: {notice['text']}" if "process" in notice else notice["text"]
-        level = "WARN" if notice["level"] in ("failed", "violation", "void", "watchdog") else "INFO"
-        self._view.log(int(notice["t_ns"]), level, str(text))
+        self._view.log(int(notice["t_ns"]), log_level(notice), str(text))
 
     @np.errstate(all="ignore")  # a run may diverge
     def advance(self, *, final: bool = False) -> None:
@@ -120,7 +135,7 @@ class ViewFeed:
             newest_ns = int(waiting[-1]["t_ns"][-1]) if waiting else reach_ns
             wall_ns = NS_PER_S * self._scenario.speed
             until_ns = max(reach_ns, newest_ns - int(_PATIENCE_S * wall_ns))
-            until_ns -= int(_LAG_S * wall_ns)
+            until_ns -= int(LAG_S * wall_ns)
         self._packets(self._take(NETEM_PACKET, None))
         self._view.travel(self._scenario.timing.horizon_ns if until_ns is None else until_ns)
         self._inputs(steps)
@@ -182,7 +197,7 @@ class ViewFeed:
     @cached_property
     def _certificate(self) -> ScenarioCertificate | None:
         """The run's certificate; None if there is none. Computed at first use, since it is slow."""
-        if not self._scenario.coverage.is_certifiable or self._loop.setpoint is not None:
+        if not self._is_certified or self._loop.setpoint is not None:
             return None  # with a set-point, it bounds the deviations from it
         certificate = certify(self._scenario, allowed_conditions(self._scenario))
         if certificate.inter_event_s is not None:

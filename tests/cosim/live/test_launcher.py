@@ -219,13 +219,13 @@ def test_a_progress_report_that_arrives_at_the_end_is_shown(case: Case) -> None:
 
         def progress(self) -> dict[str, Any] | None:
             self.looks += 1
-            return {"void": ["late"]} if self.looks == 2 else None
+            return {"warnings": ["late"]} if self.looks == 2 else None
 
     shown: list[Any] = []
     children = case.children(None)
     run = case.run(children, Ending(1.0), progress=shown.append)
     assert run.watch(Signals(), lambda status, reason: None)[0] is ExitStatus.OK
-    assert shown == [{"void": ["late"]}]
+    assert shown == [{"warnings": ["late"]}]
 
 
 def test_a_refused_session_leaves_no_run_directory(

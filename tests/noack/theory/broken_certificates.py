@@ -49,12 +49,9 @@ class NoMismatch(PlantGains):
 class NoDrift(PlantGains):
     """Ignores what drives e_c while updates are in flight."""
 
-    def growth(self, until_s: float, cells: int) -> Growth:
-        return super().growths(until_s, cells)(Output.WEIGHTED)
-
-    def growths(self, until_s: float, cells: int) -> Callable[[Output], Growth]:
+    def growths(self, until_s: float, cells: int) -> dict[Output, Growth]:
         still = constant_kernel(0.0)
-        return lambda output: Growth(still, still, np.zeros(1))
+        return dict.fromkeys(self.error.outputs, Growth(still, still, np.zeros(1)))
 
 
 class NoCurvature(ErrorGains):

@@ -8,7 +8,8 @@ from unittest.mock import patch
 
 import numpy as np
 
-from noack.theory import sharpened_bounds
+from noack.core.linear_systems import Vector
+from noack.theory import lost_events, sharpened_bounds
 from noack.theory.delivery_flow import DeliveryFlow, Reach
 from noack.theory.gains import PlantGains
 from noack.theory.sharpened_bounds import InvariantEllipsoids
@@ -28,17 +29,34 @@ def only_the_start() -> AbstractContextManager[Any]:
 
 def no_lost_updates() -> AbstractContextManager[Any]:
     """At an event e_c is 0."""
-    exact = InvariantEllipsoids.sharpened
+    return patch.object(sharpened_bounds, "errors_at_events", np.zeros_like)
+
+
+def no_event_at_the_end() -> AbstractContextManager[Any]:
+    """A lost event adds nothing to e_c."""
+    exact = sharpened_bounds.errors_after_losses
+
+    def shifted(*given: Any) -> Vector:
+        found = exact(*given)
+        return np.append(found[:1], found[:-1])
+
+    return patch.object(sharpened_bounds, "errors_after_losses", shifted)
+
+
+def half_of_the_threshold() -> AbstractContextManager[Any]:
+    """Between events ‖e_s‖ stays below half of the threshold."""
+    exact = lost_events._Stage.largest_error
     return patch.object(
-        InvariantEllipsoids, "sharpened",
-        lambda self, known, limit, lost, level: exact(self, known, limit, 0.0, level),
-    )  # fmt: skip
+        lost_events._Stage,
+        "largest_error",
+        lambda self, size, added: exact(self, 0.5 * size, added),
+    )
 
 
 def no_drive_of_the_error() -> AbstractContextManager[Any]:
     """After an event e_s stays what H makes of it."""
     return patch.object(
-        sharpened_bounds, "_error_after", lambda flow, time_s: np.zeros((flow.n, 2 * flow.n))
+        sharpened_bounds, "error_after", lambda flow, time_s: np.zeros((flow.n, 2 * flow.n))
     )
 
 
@@ -55,6 +73,8 @@ def no_mismatch() -> AbstractContextManager[Any]:
 BROKEN_FLOWS: Mapping[str, Callable[[], AbstractContextManager[Any]]] = {
     "the ellipsoid holds x(0) only": only_the_start,
     "no lost updates at an event": no_lost_updates,
+    "a lost event adds nothing": no_event_at_the_end,
+    "half of the threshold after a lost event": half_of_the_threshold,
     "no drive of e_s": no_drive_of_the_error,
     "no mismatch in the flow": no_mismatch,
 }

@@ -181,7 +181,7 @@ def test_the_constants_solve_the_inequalities(system: System) -> None:
 
     def by_drift(output: Output) -> float:
         """The value d ago, and what has driven e_c since."""
-        grown = plant.growths(conditions.delay_s, 64)(output)
+        grown = plant.growths(conditions.delay_s, 64)[output]
         missing = error.missing(output, conditions.dropouts, spacing_s)
         drift = grown.mismatch.integral_on_grid() * state(Output.MISMATCH)
         drift += grown.input_error.integral_on_grid() * (p + before)

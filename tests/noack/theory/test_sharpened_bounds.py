@@ -10,6 +10,8 @@ from scipy.linalg import expm
 from noack.core.linear_systems import Matrix
 from noack.theory.certificate import Constants, NetworkConditions
 from noack.theory.delivery_flow import Reach
+from noack.theory.gains import Output
+from noack.theory.lost_events import bend_of_error, errors_after_losses
 from noack.theory.sharpened_bounds import InvariantEllipsoids
 from tests.noack.theory.broken_flow import BROKEN_FLOWS
 from tests.noack.theory.exact_loops import observe
@@ -22,7 +24,7 @@ from tests.noack.theory.loops import (
     systems,
 )
 
-SHARP = ("x", "x_W", "E x", "p", "inter-event time")
+SHARP = ("x", "x_W", "E x", "p", "e_c", "inter-event time")
 
 
 def weighted(**changes: object) -> System:
@@ -50,6 +52,7 @@ def shares(system: System, found: Constants, seed: int) -> dict[str, float]:
             ("x_W", samples.x @ W.T, found.state_weighted),
             ("E x", samples.x @ (W @ E).T, found.mismatch),
             ("p", samples.e_c @ system.K.T, found.input_error),
+            ("e_c", samples.e_c @ W.T, found.delta * system.beta),
         ):
             size = float((growth * np.linalg.norm(values, axis=1)).max())
             largest[name] = max(largest[name], size / max(bound, 1e-12))
@@ -126,3 +129,41 @@ def test_what_follows_a_delivery_is_bounded(system: System, seed: int) -> None:
         for z in followed(smaller):
             size = float(np.linalg.norm(smaller.starts.shape @ z[:2], axis=0).max())
             assert size <= smaller.size * ROUNDING
+
+
+@settings(SEARCH, max_examples=10)
+@given(systems(n=2, beta=0.3, mismatch=0.5, known_start=True), seeds)
+def test_what_follows_lost_events_is_bounded(system: System, seed: int) -> None:
+    plant, beta, lost = system.gains(), system.beta, 3
+    plain = beta * np.arange(1.0, lost + 2) * plant.error.kernels[Output.WEIGHTED].sup()
+    ellipsoids = InvariantEllipsoids(plant, float(plain[-1]))
+    reach = ellipsoids.within(float(plain[-1]))
+    if reach is None:
+        return
+    flow = ellipsoids.flow
+    angles = np.linspace(0.0, 2 * np.pi, 400)
+    xi = reach.size * reach.starts.inverse @ np.vstack([np.cos(angles), np.sin(angles)])
+    step_s = float(flow.edges_s[-1]) / 4000
+    leap, forget = expm(flow.generator * step_s), expm(flow.H * step_s)
+    z, missed = np.vstack([xi, 0 * xi]), np.zeros_like(xi)
+    events, since_s = np.zeros(len(angles), dtype=int), np.zeros(len(angles))
+    largest, spacing_s, size = np.zeros(lost + 1), np.inf, beta
+    for _ in range(4000):  # every event is lost
+        z, missed, since_s = leap @ z, forget @ missed, since_s + step_s
+        e_c = z[flow.n :]
+        np.maximum.at(
+            largest, events.clip(max=lost), np.linalg.norm(e_c, axis=0) * (events <= lost)
+        )
+        e_s = np.linalg.norm(e_c - missed, axis=0)
+        is_event, size = e_s >= beta, max(size, float(e_s[events <= lost].max(initial=0.0)))
+        spacing_s = min(spacing_s, float(since_s[is_event & (events <= lost)].min(initial=np.inf)))
+        missed[:, is_event], since_s[is_event] = e_c[:, is_event], 0.0
+        events += is_event
+    if not np.isfinite(spacing_s):
+        return
+    kernel = plant.error.kernels[Output.WEIGHTED]
+    # An event is seen at the next node of the grid; until then e_s grows further.
+    apart_s, plain = max(spacing_s - step_s, step_s), plain * size / beta
+    bend = bend_of_error(reach, beta)
+    found = errors_after_losses(reach, plain, size, beta, apart_s, kernel, bend)
+    assert (largest <= found * ROUNDING).all()

@@ -5,10 +5,10 @@ from cosim.analysis.claims.claim_definition import (
     CertifiedClaim,
     Envelope,
     controller_error_bound,
-    envelope_formula,
 )
 from cosim.analysis.claims.run_evidence import RunEvidence, Samples
 from noack.theory.certified_bounds import ScenarioCertificate
+from noack.theory.envelope_formula import envelope_formula
 
 
 def _bound(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> Bound | None:

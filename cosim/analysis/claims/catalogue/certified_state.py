@@ -4,12 +4,12 @@ from cosim.analysis.claims.claim_definition import (
     Bound,
     CertifiedClaim,
     Envelope,
-    envelope_formula,
     upper_shares,
 )
 from cosim.analysis.claims.run_evidence import RunEvidence, Samples
 from noack.core.linear_systems import row_norms
 from noack.theory.certified_bounds import ScenarioCertificate
+from noack.theory.envelope_formula import envelope_formula
 
 
 def _bound(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> Bound | None:

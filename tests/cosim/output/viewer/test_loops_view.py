@@ -8,15 +8,15 @@ import numpy as np
 from cosim.analysis.loops_over_time import INTERVALS, QUANTILES, loops_over_time
 from cosim.analysis.loops_summary import in_flight
 from cosim.output.viewer import blueprint as bp
-from cosim.output.viewer.loops_view import (
+from cosim.output.viewer.loops_recording import (
     ERROR,
     MAP,
     QUEUE,
     SHARE,
     SIZE,
     map_pixels,
-    write_loops_view,
 )
+from cosim.output.viewer.loops_view import write_loops_view
 from cosim.record.align import align_tables
 from cosim.record.environment import write_environment
 from cosim.record.loops_run import LoopsRun, write_loops

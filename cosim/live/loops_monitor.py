@@ -1,0 +1,132 @@
+"""Checks the claims of all loops during a run: violated assumptions, and states that grow.
+
+A turn takes little time: of many loops, it checks as many as fit. More than ``MOST_CHECKED`` loops
+are checked after the run only; which of them diverge is reported for any number.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from cosim.analysis.claims.assumption_monitor import AssumptionMonitor
+from cosim.analysis.claims.condition_reader import READ
+from cosim.analysis.claims.observed_conditions import AssumptionViolation
+from cosim.record.divergence import GrowthMonitor
+from cosim.record.loop_rows import rows_by_loop
+from cosim.record.run_record import Rows
+from noack.config.loops import phases_ns
+from noack.config.resolution import resolved_loops
+from noack.config.scenario import Scenario
+from noack.core.clock import NS_PER_S
+from noack.protocol.machine_interface import Notice
+from noack.protocol.record_tables import LOOP, SENSOR_MEASUREMENT
+
+MOST_CHECKED = 100
+_TURN_S = 0.01
+"""CPU time of a turn; the recorder makes ten a second."""
+
+
+class Finding(NamedTuple):
+    """What a run has shown about its claims."""
+
+    notice: Notice
+    """For the log of the loop, in the loop's time."""
+    text: str
+    """For the log of the run: the name of the loop, and the time of the run."""
+
+
+class LoopsMonitor:
+    """Reports each violated assumption of each loop once; with [[loops]], diverging loops, too."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        loops = resolved_loops(scenario)
+        self._names = None if scenario.loops is None else [one.name for one in loops]
+        self._phases_ns = phases_ns(scenario)
+        self._stopped: str | None = None
+        self._until_s = np.inf
+        checked = loops if len(loops) <= MOST_CHECKED else ()
+        self._monitors = [AssumptionMonitor(one) for one in checked]
+        if not checked:
+            self.stop(f"the run has {len(loops)} loops; up to {MOST_CHECKED} are checked during it")
+        self._growth = GrowthMonitor(loops) if scenario.loops is not None else None
+        self._found: list[Finding] = []
+        self._waiting: dict[str, list[Rows]] = {}
+        self._due: list[int] = []
+        """The loops that are still to be checked in this round."""
+
+    @property
+    def stopped(self) -> str | None:
+        """Reason why assumptions are checked no longer; None while they are."""
+        ended = (one.stopped for one in self._monitors if one.stopped is not None)
+        return self._stopped or next(ended, None)
+
+    def stop(self, why: str) -> None:
+        """Report no more violations: rows are missing, so the conditions cannot be determined."""
+        self._stopped = self._stopped or why
+        self._waiting = {}
+
+    def end_at(self, t_s: float) -> None:
+        """Ignore what happens after a change of settings at a time of the run."""
+        self._until_s = min(self._until_s, t_s)
+        for one, phase_ns in zip(self._monitors, self._phases_ns, strict=False):
+            one.end_at(t_s - phase_ns / NS_PER_S)
+
+    def take(self, table: str, rows: Rows) -> None:
+        """Add rows of a table, in their order."""
+        if self._growth is not None and table == SENSOR_MEASUREMENT:
+            for loop, t_ns, text in self._growth.take(rows[LOOP], rows["t_ns"], rows["x"]):
+                if self._of_run_s(loop, t_ns) < self._until_s:
+                    self._add(loop, t_ns, "diverges", "diverges", text)
+        if table in READ and self.stopped is None:
+            self._waiting.setdefault(table, []).append(rows)
+
+    def advance(self) -> list[Finding]:
+        """Return what was found since the last call."""
+        if self.stopped is None:
+            began_s, first = time.thread_time(), True
+            if not self._due:
+                self._hand_out()
+            while self._due and (first or time.thread_time() - began_s < _TURN_S):
+                self._check(self._due.pop(0), AssumptionMonitor.advance)
+                first = False
+        return self._take_found()
+
+    def end(self) -> list[Finding]:
+        """Return the findings from the rows that were still waiting; no more rows follow."""
+        if self.stopped is None:
+            self._hand_out()
+            for loop in range(len(self._monitors)):
+                self._check(loop, AssumptionMonitor.end)
+        return self._take_found()
+
+    def _hand_out(self) -> None:
+        """Begin a round: give each loop its rows."""
+        waiting, self._waiting = self._waiting, {}
+        for table, batches in waiting.items():
+            for loop, rows in rows_by_loop(table, np.concatenate(batches), self._phases_ns):
+                self._monitors[loop].take(table, rows)
+        self._due = [*range(len(self._monitors))]
+
+    def _check(
+        self, loop: int, check: Callable[[AssumptionMonitor], Sequence[AssumptionViolation]]
+    ) -> None:
+        for one in check(self._monitors[loop]):
+            t_ns = round(one.t_s * NS_PER_S)
+            self._add(loop, t_ns, "void", "void (assumption violated)", one.text)
+
+    def _add(self, loop: int, t_ns: int, level: str, what: str, why: str) -> None:
+        own = f"{what} from {t_ns / NS_PER_S:.3f} s on: {why}"
+        if self._names is None:
+            self._found.append(Finding(Notice(t_ns, level, own), own))
+            return
+        of_run = f"{self._names[loop]}: {what} from {self._of_run_s(loop, t_ns):.3f} s on: {why}"
+        self._found.append(Finding(Notice(t_ns, level, own, loop), of_run))
+
+    def _of_run_s(self, loop: int, t_ns: int) -> float:
+        return (t_ns + self._phases_ns[loop]) / NS_PER_S
+
+    def _take_found(self) -> list[Finding]:
+        found, self._found = self._found, []
+        return found

@@ -1,0 +1,118 @@
+"""The monitor of several loops during a run, against the monitor of each loop alone."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cosim.analysis.claims.assumption_monitor import AssumptionMonitor
+from cosim.live.loops_monitor import MOST_CHECKED, Finding, LoopsMonitor
+from cosim.record.loops_run import LoopsRun
+from cosim.record.run_record import Rows, RunRecord
+from cosim.simulation.shared_network import simulate_loops
+from noack.config.loops import phases_ns
+from noack.config.resolution import tables_of
+from noack.config.scenario_file import validate
+from noack.core.clock import NS_PER_S
+from noack.protocol.record_tables import LOOP, NETEM_PACKET, OWNER
+
+Content = dict[str, Any]
+BATCH_NS = 100_000_000
+
+
+@pytest.fixture
+def content(content: Content) -> Content:
+    """Three loops behind a slow link, which breaks assumptions on delay; one diverges."""
+    content["horizon_s"] = 6.0
+    content["plant"] |= {"rate_hz": 50.0}
+    content["controller"] = {"rate_hz": 50.0}
+    content["trigger"] = {"policy": "periodic", "period_s": 0.1}
+    content["network"] |= {"impairments": [{"kind": "rate", "rate_bps": 20_000, "queue": 4}]}
+    content["certificate"] = {"network_delay_s": 0.001}
+    wild = {"draw": "given", "A": [[3.0, 0.0], [0.0, 3.0]], "B": [[0.0], [0.0]]}
+    content["loops"] = [{"name": "good", "count": 2}, {"name": "wild", "plant": wild}]
+    return content
+
+
+def live_rows(run: LoopsRun) -> Iterator[tuple[str, Rows]]:
+    """Yield the rows as the processes send them: those of all loops mixed, batch by batch."""
+    network = run.network
+    every = {NETEM_PACKET: network[NETEM_PACKET]}
+    for table, dtype in tables_of(network.scenario).items():
+        if OWNER[table] != "netem":
+            of_loops = [numbered(one, i, table, dtype) for i, one in enumerate(run.loops)]
+            every[table] = np.concatenate(of_loops)
+    for begin_ns in range(0, 2 * network.scenario.timing.horizon_ns, BATCH_NS):
+        for table, rows in every.items():
+            now_ns = rows["now_ns"]
+            chosen = rows[(now_ns >= begin_ns) & (now_ns < begin_ns + BATCH_NS)]
+            if len(chosen):
+                yield table, chosen
+
+
+def numbered(record: RunRecord, number: int, table: str, dtype: np.dtype[np.void]) -> Rows:
+    rows = np.zeros(record.count(table), dtype)
+    rows[LOOP] = number
+    for name in record[table].dtype.names or ():
+        rows[name] = record[table][name]
+    return rows
+
+
+def found_by(monitor: LoopsMonitor, run: LoopsRun) -> list[Finding]:
+    found: list[Finding] = []
+    for table, rows in live_rows(run):
+        monitor.take(table, rows)
+        found += monitor.advance()
+    return found + monitor.end()
+
+
+def test_each_loop_is_checked_as_by_its_own_monitor(content: Content) -> None:
+    run = simulate_loops(validate(content, "here"))
+    scenario = run.network.scenario
+    found = found_by(LoopsMonitor(scenario), run)
+    voids = 0
+    for number, (record, phase_ns) in enumerate(zip(run.loops, phases_ns(scenario), strict=True)):
+        alone = AssumptionMonitor(record.scenario)
+        for table in tables_of(record.scenario):
+            alone.take(table, record[table])
+        own = [one for one in found if one.notice[1:4:2] == ("void", number)]
+        expected = alone.end()
+        assert {one.notice.text.split(": ", 1)[1].split(",")[0][:24] for one in own} == {
+            one.text.split(",")[0][:24] for one in expected
+        }
+        for one in own:
+            at_s = (one.notice.t_ns + phase_ns) / NS_PER_S
+            name = record.scenario.name
+            assert one.text.startswith(f"{name}: void (assumption violated) from {at_s:.3f} s on")
+        voids += len(own)
+    assert voids > 0
+
+
+def test_a_diverging_loop_is_named_once_also_among_many(content: Content) -> None:
+    for many in (False, True):
+        if many:
+            content["loops"][0]["count"] = MOST_CHECKED
+            content["horizon_s"] = 4.0
+            del content["network"]["impairments"]
+        run = simulate_loops(validate(content, "here"))
+        monitor = LoopsMonitor(run.network.scenario)
+        assert (monitor.stopped is not None) == many
+        found = [one for one in found_by(monitor, run) if one.notice.level == "diverges"]
+        (only,) = found
+        assert only.text.startswith("wild: diverges from ")
+        assert only.notice.loop == len(run.loops) - 1
+        x = run.loops[-1]["plant_step"]
+        at = np.searchsorted(x["t_ns"], only.notice.t_ns)
+        early = np.linalg.norm(
+            x["x"][x["t_ns"] < run.network.scenario.timing.horizon_ns / 10], axis=1
+        )
+        assert np.linalg.norm(x["x"][at]) > 1000 * early.max() >= np.linalg.norm(x["x"][at - 1])
+
+
+def test_missing_rows_end_the_check_of_assumptions(content: Content) -> None:
+    run = simulate_loops(validate(content, "here"))
+    monitor = LoopsMonitor(run.network.scenario)
+    monitor.stop("telemetry is missing")
+    assert {one.notice.level for one in found_by(monitor, run)} == {"diverges"}
+    assert monitor.stopped == "telemetry is missing"

@@ -1,0 +1,92 @@
+"""The recording of several loops that is written while they run, against that of the record."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cosim.analysis.loops_over_time import INTERVALS, loops_over_time, quantiles
+from cosim.analysis.loops_summary import counts_inside, times_inside
+from cosim.output.viewer import blueprint as bp
+from cosim.output.viewer.loops_feed import LoopsFeed
+from cosim.output.viewer.loops_recording import ERROR, MAP, QUEUE, SHARE, SIZE, open_loops_view
+from cosim.record.align import align_tables
+from cosim.record.loops_run import LoopsRun
+from cosim.record.run_directory import RECORDING_FILE
+from cosim.shipped_files import find_shipped
+from cosim.simulation.shared_network import simulate_loops
+from noack.config.scenario_file import load
+from noack.protocol.machine_interface import Notice
+from noack.protocol.record_tables import NETEM_PACKET
+from tests.cosim.live.test_loops_monitor import live_rows
+from tests.cosim.output.viewer.test_viewer import Chunks, read, series
+
+
+def shown(folder: Path, count: int, *settings: str) -> tuple[LoopsRun, Chunks, list[str]]:
+    """Simulate loops, and pass their rows on as in a live run; read the recording."""
+    given = ["horizon_s=2.0", f'loops=[{{ name = "p", count = {count} }}]', *settings]
+    run = simulate_loops(load(find_shipped("shared_bottleneck", "scenarios"), given))
+    scenario, said = run.network.scenario, list[str]()
+    with open_loops_view(scenario, folder, 9, None) as view:
+        feed = LoopsFeed(scenario, view, said.append)
+        for table, rows in live_rows(run):
+            feed.add(table, rows)
+            feed.advance()
+        feed.log(Notice(10**9, "diverges", "x is not finite", loop=1).line())
+        feed.advance(final=True)
+    return run, read(folder / RECORDING_FILE), said
+
+
+@pytest.mark.parametrize("count", [3, 30])
+@pytest.mark.parametrize("phase", ["0.0", "0.3"])
+def test_all_loops_are_shown_as_from_the_record(tmp_path: Path, count: int, phase: str) -> None:
+    run, found, said = shown(tmp_path, count, f"controller.phase={phase}")
+    expected = loops_over_time(run.network, run.loops)
+    for entity, values in ((ERROR, expected.errors), (SIZE, expected.states)):
+        t_ns, drawn = series(found, entity)
+        assert (np.diff(t_ns) > 0).all()
+        assert len(t_ns) == INTERVALS
+        curves = (values if count == 3 else quantiles(values)).T
+        known = np.isfinite(curves)
+        difference = np.abs(10**drawn - curves)[known]
+        least = 1e-5 * np.nanmax(curves)  # curves are cut off below
+        close = difference <= 1e-3 * curves[known] + least
+        assert close.mean() > 0.99  # at the start, the newest tick may be before x(0)
+    horizon_ns = run.network.scenario.timing.horizon_ns
+    edges_ns = np.linspace(0, horizon_ns, INTERVALS + 1)
+    means, largest = counts_inside(*times_inside(run.network[NETEM_PACKET]), edges_ns)
+    np.testing.assert_allclose(
+        series(found, QUEUE)[1], np.column_stack([largest, means]), atol=1e-6
+    )
+    shares = 100 * expected.shares()[1]
+    curves = (shares if count == 3 else quantiles(shares)).T
+    np.testing.assert_allclose(series(found, SHARE)[1], curves, rtol=1e-6)
+    assert (MAP in found) == (count == 30)
+    assert not said
+    assert bp.LOG in found
+
+
+def test_few_loops_are_shown_in_detail(tmp_path: Path) -> None:
+    run, found, _ = shown(tmp_path, 3)
+    for record in run.loops:
+        folder = bp.loop_path(record.scenario.name)
+        aligned = align_tables(record)
+        t_ns, states = series(found, f"{folder}/{bp.state_path('angle')}")
+        assert np.ptp(t_ns - aligned.t_ns) == 0
+        np.testing.assert_array_equal(states[:, 2], aligned.x_c[:, 0])
+        assert any(one.startswith(f"{folder}/picture/") for one in found)
+    assert f"{bp.loop_path('p-2')}/log" in found
+
+
+def test_loops_in_detail_that_cannot_keep_up_are_given_up_and_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cosim.output.viewer.loops_feed._TURN_S", -1.0)  # one loop a turn
+    monkeypatch.setattr("cosim.output.viewer.loops_feed._NAMED_S", 0.05)
+    monkeypatch.setattr("cosim.output.viewer.loops_feed._PATIENCE_S", 0.5)
+    monkeypatch.setattr("cosim.output.viewer.loops_feed._SHARE", 1e-4)
+    _, found, said = shown(tmp_path, 3)
+    assert "in detail end here" in said[-1]
+    assert len(series(found, ERROR)[0]) == INTERVALS
+    with pytest.raises(ValueError, match="at least one array"):  # nothing but static data
+        series(found, f"{bp.loop_path('p-1')}/{bp.state_path('angle')}")
