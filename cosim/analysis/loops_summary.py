@@ -14,6 +14,7 @@ from cosim.analysis.summary_model import (
     Count,
     Counts,
     ExitPart,
+    FlowPart,
     Real,
     ReplayPart,
     SummaryPart,
@@ -54,6 +55,12 @@ class LoopPart(SummaryPart):
     diverged_at_s: Real
     claims: Counts
     """Number of claims by verdict."""
+    actuations: FlowPart | None = None
+    """None if they do not cross the network."""
+    missing_samples: Count
+    unintended_losses: Count
+    bit_exact: bool | None
+    """The result of the loop's replay; None for a simulated run, or if it was not possible."""
 
 
 class InFlightPart(SummaryPart):
@@ -183,7 +190,8 @@ def _loop_part(
     delays_s = _delays_ns(packets) / NS_PER_S
     same = (
         "events", "deliveries", "drops", "drops_by_cause", "forced_deliveries",
-        "longest_loss_burst", "sup_e_c_norm", "final_state_norm", "diverged_at_s",
+        "longest_loss_burst", "sup_e_c_norm", "final_state_norm", "diverged_at_s", "actuations",
+        "missing_samples", "unintended_losses",
     )  # fmt: skip
     return LoopPart(
         name=Path(outcome.run_dir).name,
@@ -194,6 +202,7 @@ def _loop_part(
         delay_mean_s=float(delays_s.mean()) if len(delays_s) else None,
         delay_max_s=float(delays_s.max()) if len(delays_s) else None,
         claims=dict(Counter(str(claim["verdict"]) for claim in summary["claims"])),
+        bit_exact=(summary["replay"] or {}).get("bit_exact"),
         **{key: summary[key] for key in same},
     )
 

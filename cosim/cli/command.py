@@ -126,7 +126,14 @@ TriggerOption = Annotated[
     ),
 ]
 RunsOption = Annotated[Path, typer.Option("--runs", help="Folder of the run directories.")]
-LiveOption = Annotated[bool, typer.Option("--live", help="Show the run in the rerun viewer.")]
+LiveOption = Annotated[
+    bool,
+    typer.Option(
+        "--live",
+        help="Show the run in the rerun viewer: in a window, or without a display in a browser, at "
+        "the address that is printed.",
+    ),
+]
 ReportOption = Annotated[
     bool,
     typer.Option(

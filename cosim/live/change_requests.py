@@ -33,6 +33,7 @@ class ChangeRequests:
     def __init__(self, ticket: Ticket, plane: ControlPlane) -> None:
         self._scenario, self._run_dir = ticket.scenario, ticket.run_dir
         self._plane = plane
+        self._of_network_alone = may_be_compiled(ticket.scenario)
         loops = ticket.scenario.loops or ()
         self._schedule, *self._of_loops = (
             ChangeSchedule(one)
@@ -55,11 +56,11 @@ class ChangeRequests:
         settings = parse_message(ChangeRequest, request).get("settings", {})
         from_s, now_ns = None, clock()
         if settings:
-            if may_be_compiled(self._scenario) and not is_of_network_alone(settings):
+            if self._of_network_alone and not is_of_network_alone(settings):
                 raise CallerError(
                     f"{text_of(settings)}: of this run only network.loss, network.mansd and "
                     "network.constraints can be changed, as its loops may run as compiled code; "
-                    "schedule other changes in the scenario"
+                    "`changes` in the scenario can set other runtime parameters"
                 )
             if obstacle is not None:
                 raise CallerError(obstacle)
@@ -84,7 +85,11 @@ class ChangeRequests:
             "run_dir": self._run_dir,
             "t_s": now_ns / NS_PER_S,
             "from_s": from_s,
-            "runtime_parameters": current_parameters(self._schedule.last),
+            "runtime_parameters": {
+                key: value
+                for key, value in current_parameters(self._schedule.last).items()
+                if not self._of_network_alone or is_of_network_alone({key: value})
+            },
         }
 
     def _add(self, change: ParameterChange, requested_ns: int, requested_at: str) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from cosim.analysis.claims.claim_definition import Envelope
 from cosim.analysis.claims.claims_by_part import RunClaims
 from cosim.analysis.fidelity import fidelity_for_summary
 from cosim.analysis.loops_over_time import worst_loop
-from cosim.analysis.loops_summary import LoopsSummary, is_complete
+from cosim.analysis.loops_summary import LoopsSummary, has_loops, is_complete
 from cosim.analysis.loss_statistics import list_violations
 from cosim.analysis.model_comparison import linearisation
 from cosim.analysis.replay import replay
@@ -107,8 +107,6 @@ def _finalize_loops(
     """Write summary, report and recording of a run of several loops, which are finalised."""
     _write_summary(ending.run_dir, summary)
     status, reason = ExitStatus(summary.exit.status), summary.exit.reason
-    if (ending.status, ending.reason) != (status, reason):
-        _correct_ending(replace(ending, status=status, reason=reason))
     content = summary.model_dump(mode="json")
     if report:
         with _report_is_optional(ending.run_dir):
@@ -199,10 +197,12 @@ def reopen(run_dir: Path) -> Outcome:
     if not (run_dir / SCENARIO_FILE).is_file():
         raise CallerError(f"{run_dir}: not a run directory (no {SCENARIO_FILE})")
     summary = read_object(run_dir / SUMMARY_FILE)
-    ending = _ending(run_dir, summary)
     # The summary is missing or damaged; or a process that was frozen spooled rows after the end.
     if not is_complete(summary) or (run_dir / SPOOL).is_dir():
-        return finalize(ending, again=True)
+        # A summary of several loops is failed if one of them failed; the others did not.
+        known = {} if has_loops(summary) else summary
+        return finalize(_ending(run_dir, known), again=True)
+    ending = _ending(run_dir, summary)
     return Outcome(run_dir, ending.status, ending.reason, summary)
 
 

@@ -25,7 +25,7 @@ from cosim.live.start_limit import DEFAULT_S, StartLimit
 from cosim.record.environment import write_environment
 from cosim.record.run_directory import active_run, new_run_dir, point_to_latest, write_scenario
 from cosim.record.run_ending import EndingFile, RunEnding
-from noack.config.resolution import resolved_loops
+from noack.config.resolution import resolved_loops, tables_of
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError, ExitStatus, NeverStartedError
 from noack.protocol.topology import PLANT, RECORDER, ROLES
@@ -95,6 +95,7 @@ def launch(
         server = server or stack.enter_context(fork_server())
         loops = resolved_loops(scenario)
         resolved = loops[0] if scenario.loops is None else scenario
+        tables_of(resolved)  # refuses loops of different sizes
         require_disk_space(loops, runs)
         control = resolved.ports.control
         if control:

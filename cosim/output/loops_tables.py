@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -21,25 +22,25 @@ CAPTION = (
 
 
 def print_loops(console: Console, summary: Summary, *, verbose: bool = False) -> None:
-    """Print how the run ended, the network, and the loops; without ``verbose`` the worst only."""
-    end, reached = summary["exit"], f"{summary['reached_s']:g} s"
-    if end["status"] == ExitStatus.OK:
-        console.print(f"[green]completed {reached}[/], {len(summary['loops'])} loops")
-    else:
-        reached += f" of {summary['horizon_s']:g} s"
-        console.print(f"[bold red]failed after {reached}:[/] {escape(end['reason'])}")
+    """Print the network, and the loops; without ``verbose`` the worst only."""
     console.print(_network_table(summary))
     loops = sorted(summary["loops"], key=badness, reverse=True)
     shown = loops if verbose else loops[:_MOST_LOOPS]
     if len(shown) == len(loops):
         shown = summary["loops"]
     table = Table(
-        title="loops" + ("" if len(shown) == len(loops) else ", the worst first"), caption=CAPTION
-    )
+        title=f"{len(loops)} loops" + (", the worst first" if len(shown) < len(loops) else ""),
+        caption=CAPTION, box=SIMPLE_HEAD,
+        collapse_padding=True, pad_edge=False,
+    )  # fmt: skip
+    rows = [loop_row(loop) for loop in shown]
     for place, heading in enumerate(HEADINGS):
-        table.add_column(heading, justify="right" if place else "left", no_wrap=not place)
-    for loop in shown:
-        table.add_row(*map(escape, loop_row(loop)))
+        cells = [heading, *(row[place] for row in rows)]
+        # Headings and claims may break between words; names and numbers have no spaces.
+        least = max(len(word) for cell in cells for word in cell.split())
+        table.add_column(heading, justify="right" if place else "left", min_width=least)
+    for row in rows:
+        table.add_row(*map(escape, row))
     console.print(table)
     if more := len(loops) - len(shown):
         console.print(f"and {more} more loops: --verbose shows all")
@@ -64,7 +65,7 @@ def network_rows(summary: Summary) -> list[tuple[str, str]]:
         f", {n} {cause.replace('_', ' ')}" for cause, n in network["drops_by_cause"].items()
     )
     rows = [
-        ("datagrams of all loops", f"{sent} ({sent / summary['horizon_s']:.4g} /s)"),
+        ("updates of all loops", f"{sent} ({sent / summary['horizon_s']:.4g} /s)"),
         ("lost", f"{lost} ({ratio(lost, sent)}){causes}"),
         ("longest loss burst, cap", f"{network['longest_loss_burst']}, {summary['mansd']}"),
         ("forced by the guarantee", str(network["forced_deliveries"])),
@@ -73,9 +74,21 @@ def network_rows(summary: Summary) -> list[tuple[str, str]]:
     if network["rate_bps"] is not None:
         used = f"{100 * network['utilisation']:.3g} % of {network['rate_bps']:,} bit/s"
         rows.append(("link used", used.replace(",", " ")))
+    loops = summary["loops"]
+    if flows := [one["actuations"] for one in loops if one["actuations"] is not None]:
+        sent, lost = (sum(one[key] for one in flows) for key in ("sent", "lost"))
+        rows.append(("actuations of all loops", f"{sent} ({sent / summary['horizon_s']:.4g} /s)"))
+        burst = max(one["longest_loss_burst"] for one in flows)
+        rows.append(("  lost, longest loss burst", f"{lost} ({ratio(lost, sent)}), {burst}"))
     if (replay := summary["replay"]) is not None:
         exact = {True: "bit-exact", False: "differs", None: "not possible"}[replay["bit_exact"]]
         rows.append(("replay of the network", exact))
+        count = sum(one["bit_exact"] is True for one in loops)
+        rows.append(("replay of the loops", f"bit-exact: {count} of {len(loops)}"))
+        missing, lost = (
+            sum(one[key] for one in loops) for key in ("missing_samples", "unintended_losses")
+        )
+        rows.append(("missing samples, unintended losses", f"{missing}, {lost}"))
     return rows
 
 

@@ -35,10 +35,11 @@ class VerdictLine(NamedTuple):
 
 def verdict(summary: Summary) -> tuple[VerdictLine, VerdictLine, VerdictLine]:
     """Return three lines: how the run ended, its transmissions, its claims."""
-    return _ending(summary), VerdictLine(_transmissions(summary), NEUTRAL), _claims(summary)
+    return ending_line(summary), VerdictLine(_transmissions(summary), NEUTRAL), _claims(summary)
 
 
-def _ending(summary: Summary) -> VerdictLine:
+def ending_line(summary: Summary) -> VerdictLine:
+    """Return how a run ended, of one loop or several."""
     end, reached = summary["exit"], f"{summary['reached_s']:g} s"
     reached_of = f"{reached} of {summary['horizon_s']:g} s"
     if end["status"] == ExitStatus.OK:
@@ -86,7 +87,11 @@ def print_outcome(console: Console, outcome: Outcome, *, verbose: bool = False) 
     """
     summary = outcome.summary
     if has_loops(summary):
+        ending = ending_line(summary)
+        console.print(Text(ending.text, ending.style), soft_wrap=True)
         print_loops(console, summary, verbose=verbose)
+        one = f"{_program()} summary {outcome.run_dir} --loop NAME"
+        console.print(f"one loop       {one}", highlight=False, soft_wrap=True)
         if (report := outcome.run_dir / REPORT_FILE).is_file():
             console.print(f"report         {report}", highlight=False, soft_wrap=True)
         console.print(f"run directory  {outcome.run_dir}", highlight=False, soft_wrap=True)

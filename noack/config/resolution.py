@@ -185,7 +185,8 @@ def _tables_of_loops(scenario: Scenario) -> Mapping[str, np.dtype[np.void]]:
         if one != first:
             raise CallerError(
                 f"loops.{place}: its vectors have other sizes than those of loops.0; the loops of "
-                "a live run have the same numbers of states, inputs and outputs"
+                "a live run have the same numbers of states, inputs and outputs (`noack simulate` "
+                "allows different ones)"
             )
     return {
         table: dtype if OWNER[table] == "netem" else np.dtype([("loop", "<u2"), *dtype.descr])

@@ -18,6 +18,7 @@ from cosim.output.report.loops_figures import (
 )
 from cosim.output.report.report_page import environment_rows, templates
 from cosim.output.report.run_figures import Envelope, RunFigure, pictures
+from cosim.output.run_verdict import ending_line
 from cosim.record.loops_run import loop_directories
 from cosim.record.run_directory import (
     ENVIRONMENT_FILE,
@@ -82,18 +83,12 @@ def write_loops_report(
 
 def _verdict(summary: Mapping[str, Any]) -> list[str]:
     """Return how the run ended, and how many claims about its loops have each verdict."""
-    end = summary["exit"]
-    reached = f"{summary['reached_s']:g} s"
-    if end["status"] != ExitStatus.OK:
-        reached = f"failed after {reached} of {summary['horizon_s']:g} s: {end['reason']}"
-    else:
-        reached = f"completed {reached}"
     counts: dict[str, int] = {}
     for loop in summary["loops"]:
         for verdict, count in loop["claims"].items():
             counts[verdict] = counts.get(verdict, 0) + count
     claims = ", ".join(f"{count} {verdict}" for verdict, count in sorted(counts.items()))
-    return [reached, f"claims of all loops: {claims or 'none'}"]
+    return [ending_line(summary).text, f"claims of all loops: {claims or 'none'}"]
 
 
 def _link(run_dir: Path, name: str) -> str | None:

@@ -116,9 +116,9 @@ def tables_of(
 
     Each table repeats the label columns, whose headings are ``axes``.
     """
-    labels = sum(_width(axis, [row.labels[i] for row in rows]) for i, axis in enumerate(axes))
+    axis_widths = [_width(axis, [row.labels[i] for row in rows]) for i, axis in enumerate(axes)]
     widths = [_width(words, [row.cells[i] for row in rows]) for i, words in enumerate(headings)]
-    begin = 0
+    labels, begin = sum(axis_widths), 0
     while begin < len(headings):
         end = begin + 1
         while end < len(headings) and labels + sum(widths[begin : end + 1]) <= width:
@@ -127,10 +127,17 @@ def tables_of(
             title=escape(title) if begin == 0 else None, title_justify="left", box=SIMPLE_HEAD,
             pad_edge=False, collapse_padding=True,
         )  # fmt: skip
-        for words in axes:
-            table.add_column(escape(words), overflow="fold")
-        for words, least in zip(headings[begin:end], widths[begin:end], strict=True):
-            table.add_column(escape(words), justify="right", min_width=least - _APART)
+        columns = [*zip(axes, axis_widths, strict=True)]
+        columns += zip(headings[begin:end], widths[begin:end], strict=True)
+        unbroken = sum(max(len(words) + _APART, least) for words, least in columns)
+        for place, (words, least) in enumerate(columns):
+            table.add_column(
+                escape(words),
+                justify="right" if place >= len(axes) else "left",
+                overflow="fold",
+                min_width=least - _APART if place >= len(axes) else None,
+                max_width=least - _APART if unbroken > width else None,
+            )
         for row in rows:
             table.add_row(*map(escape, row.labels), *row.cells[begin:end])
         yield table

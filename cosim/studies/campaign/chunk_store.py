@@ -205,7 +205,9 @@ def _difference(there: Any, here: Any, key: str = "") -> str | None:
     if isinstance(there, dict) and isinstance(here, dict):
         names: list[Any] = sorted(there.keys() | here.keys())
         pairs = [(there.get(name), here.get(name)) for name in names]
-    elif isinstance(there, list) and isinstance(here, list) and len(there) == len(here):
+    elif isinstance(there, list) and isinstance(here, list):
+        if len(there) != len(here):
+            return f"{key} has {len(there)} entries there, {len(here)} here"
         names, pairs = list(range(len(here))), list(zip(there, here, strict=True))
     else:
         texts = [shortened(json.dumps(one, ensure_ascii=False), 60) for one in (there, here)]

@@ -23,6 +23,7 @@ from cosim.output.viewer.opening_time import opening_time_ns
 from cosim.record.align import align_tables
 from cosim.record.run_record import load_record
 from noack.config.resolution import network_tables
+from noack.core.number_format import number as written
 from noack.protocol.record_tables import NETEM_PACKET
 
 PATH = Path(__file__).parents[3] / "scenarios" / "shared_bottleneck.toml"
@@ -193,7 +194,8 @@ def test_the_worst_loop(tmp_path: Path) -> None:
 def test_a_loop_that_diverges_is_named_and_the_others_go_on(tmp_path: Path) -> None:
     own = "A = [[0.0, 1.0], [50.0, 0.0]], B = [[0.0], [1.0]]"
     wild = f'{{ name = "wild", plant = {{ draw = "given", {own} }} }}'
-    done = simulated(tmp_path, "horizon_s=3", f'loops=[{{ name = "calm", count = 2 }}, {wild}]')
+    loops = f'loops=[{{ name = "calm", count = 2 }}, {wild}]'
+    done = simulated(tmp_path, "horizon_s=3", "network.actuation={}", loops)
     assert done.exit_code == 1
     summary = json.loads(done.stdout)
     assert "1 of 3 loops failed (wild diverged at " in summary["exit"]["reason"]
@@ -202,6 +204,18 @@ def test_a_loop_that_diverges_is_named_and_the_others_go_on(tmp_path: Path) -> N
     for name in ("calm-1", "calm-2"):
         assert json.loads((tmp_path / f"latest/loops/{name}/summary.json").read_text())[
             "exit"]["status"] == 0  # fmt: skip
+    # Finalised again, it is the same; and the tables show all numbers in 80 columns.
+    path = tmp_path / "latest/summary.json"
+    path.unlink()
+    shown = noack("summary", path.parent).stdout.splitlines()
+    assert json.loads(path.read_text()) == summary
+    (row,) = [line for line in shown if line.startswith(" wild")]
+    assert written(summary["loops"][2]["sup_e_c_norm"]) in row
+    sent = sum(one["actuations"]["sent"] for one in summary["loops"])
+    assert sent == pytest.approx(3 * 3 * 100, abs=6)
+    assert any(f" {sent} (" in line for line in shown)
+    table = [line for line in shown if not line.startswith(("one loop", "report", "run dir"))]
+    assert max(map(len, table)) <= 80
 
 
 def test_check_prints_the_loops_and_refuses_a_link_that_is_too_slow() -> None:

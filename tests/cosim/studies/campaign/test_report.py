@@ -279,3 +279,15 @@ def test_the_tables_fit_narrow_terminals(width: int) -> None:
         assert all(any(word in line for line in lines) for word in heading.split())
     assert all(len(line) <= width for line in lines)
     assert (len(found) == 1) == (width > 88)
+
+
+def test_a_long_axis_name_does_not_push_a_column_out() -> None:
+    headings = ["cost", "cost of the worst loop", "share of loops that diverged"]
+    rows = [SummaryRow(["model_based", "30"], ["7.849e+11 ± 1.7e+10", "1.897e+12 ± 4.1e+10", "1"])]
+    console = Console(width=80, file=StringIO(), record=True)
+    for table in tables_of("all", ["policy", "number of loops"], headings, rows, 80):
+        console.print(table)
+    text = console.export_text()
+    assert all(word in text for heading in headings for word in heading.split())
+    assert "…" not in text
+    assert text.count(" 1 ") == 1

@@ -106,7 +106,11 @@ def use(path: Path, folder: Path, draws: int | None = None) -> int:
         ("chunk", 4, "campaign.chunk is 3 there, 4 here"),
         ("settings", {"horizon_s": 2.0}, "campaign.settings.horizon_s is null there, 2.0 here"),
         ("metrics", {"settle": 0.1}, "campaign.metrics.settle is 0.02 there, 0.1 here"),
-        ("axes", [{"name": "m", "key": "network.mansd", "values": [1]}], "campaign.axes is "),
+        (
+            "axes",
+            [{"name": "m", "key": "network.mansd", "values": [1]}],
+            "campaign.axes has 2 entries there, 1 here",
+        ),
     ],
 )
 def test_another_campaign_is_refused_in_the_same_folder(
