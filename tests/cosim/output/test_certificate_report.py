@@ -55,7 +55,7 @@ def weighted() -> Certificates:
 def test_the_lane_example_has_its_documented_figures(
     lane: Certificates, weighted: Certificates
 ) -> None:
-    """A hundred times the paper's inter-event time; Δ ≤ M = 5 in a chosen weight, less for one plant."""
+    """A hundred times the paper's inter-event time; Δ ≤ M = 5 in a chosen weight."""
     assert lane.theorem_2 is not None
     printed_s = lane.theorem_2.inter_event_s
     assert constants(lane.paper).inter_event_s >= 100 * printed_s
