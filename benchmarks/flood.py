@@ -1,8 +1,8 @@
-"""Effect of a flood on a run at speed 1: with and without the per-peer kernel sockets (shield).
+"""Effect of a flood on a run at speed 1: with and without a kernel socket for each peer.
 
 In the middle of a run of the paper's example, another process sends datagrams of another run to one
-port or to all: at five times the loop's rate, and as fast as possible. Without the shield, traffic
-from the peer and traffic from unknown sources share a queue, as on systems without peer sockets.
+port or to all: at five times the loop's rate, and as fast as possible. Without these
+sockets, traffic from the peer and from unknown sources shares a queue, as on other systems.
 """
 
 import argparse
@@ -33,8 +33,8 @@ FLOOD_S = 2.0
 MARGIN_S = 0.1
 """Omitted at both ends of a flood: its time in the run is known to this accuracy."""
 LOOP_HZ = 500.0
-SHIELDED, UNSHIELDED = "with the shield", "without the shield"
-_UNSHIELDED_CODE = Path(__file__).parent / "_unshielded"
+WITH, WITHOUT = "with peer sockets", "without peer sockets"
+_WITHOUT_CODE = Path(__file__).parent / "_without_peer_sockets"
 
 
 class Case(NamedTuple):
@@ -81,7 +81,7 @@ def figures_of(run: FaultedRun[Flood]) -> Figures:
     }
 
 
-def flooded(case: Case, *, shielded: bool) -> Figures:
+def flooded(case: Case, *, peer_sockets: bool) -> Figures:
     """Flood a run.
 
     Raises:
@@ -89,19 +89,19 @@ def flooded(case: Case, *, shielded: bool) -> Figures:
     """
     settings = [f"horizon_s={HORIZON_S}"]
     settings += [] if case.asked else ["realtime.enabled=false"]
-    with _environment(shielded):
+    with _environment(peer_sockets):
         run = faulted_run(case.name, settings, BEGIN_S, partial(_flood, case))
-    shields = {report["channel"]["peer_sockets"] for report in run.record.reports.values()}
-    if shields != {shielded}:
-        raise MeasurementError(f"{case.name}: shielded {shields}, expected {shielded}")
+    used = {report["channel"]["peer_sockets"] for report in run.record.reports.values()}
+    if used != {peer_sockets}:
+        raise MeasurementError(f"{case.name}: peer sockets {used}, expected {peer_sockets}")
     return figures_of(run)
 
 
 @contextmanager
-def _environment(shielded: bool) -> Iterator[None]:
+def _environment(peer_sockets: bool) -> Iterator[None]:
     before = os.environ.get("PYTHONPATH")
-    if not shielded:
-        os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(_UNSHIELDED_CODE), before]))
+    if not peer_sockets:
+        os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(_WITHOUT_CODE), before]))
     try:
         yield
     finally:
@@ -122,7 +122,7 @@ def _flood(case: Case, processes: Processes) -> Flood:
 
 
 def rows_of(case: Case, rounds: Rounds) -> list[Row]:
-    """Return a case's rows: with the shield, compared with those without."""
+    """Return a case's rows: with peer sockets, compared with those without."""
     figures = (
         ("the flood", "datagrams/s", "rate_hz"),
         ("measurements missed", "", "missed"),
@@ -132,20 +132,20 @@ def rows_of(case: Case, rounds: Rounds) -> list[Row]:
         ("last late step after the end", "ms", "back_ms"),
     )
     return [
-        rounds.row(f"{case.name}: {figure}", unit, quantity, SHIELDED, UNSHIELDED)
+        rounds.row(f"{case.name}: {figure}", unit, quantity, WITH, WITHOUT)
         for figure, unit, quantity in figures
     ]
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
-    """Measure each flood with and without the shield in turn."""
+    """Measure each flood with and without peer sockets in turn."""
     rows = []
     for case in CASES:
         say(case.name)
         rounds = Rounds()
         for _ in range(ROUNDS):
-            for side in (SHIELDED, UNSHIELDED):
-                rounds.add(side, flooded(case, shielded=side == SHIELDED))
+            for side in (WITH, WITHOUT):
+                rounds.add(side, flooded(case, peer_sockets=side == WITH))
         rows += rows_of(case, rounds)
     return rows
 

@@ -65,9 +65,11 @@ def finalize(
     run_dir = ending.run_dir
     with _with_reason(ending), finished_run(run_dir), ExitStack() as stack:
         unfinished = (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir()
-        scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
-        if scenario.loops is not None:
-            count = sum(section.count for section in scenario.loops)
+        sections = None
+        if loops == 1:
+            sections = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES).loops
+        if sections is not None:
+            count = sum(section.count for section in sections)
             few = report and count <= _FEW_LOOPS
             of_loop = partial(finalize, report=few, again=again, loops=count)
             network, shared = finalize_loops(ending, of_loop, unfinished=unfinished)

@@ -11,7 +11,7 @@ run count them: by the rules of the guarantee, and
 * by a delay: from the end of the longest time that the certificate allows an update in the network,
   until it is received.
 
-A packet that a later one overtakes counts as lost if the later one arrives after the allowed delay.
+A packet that arrives out of order counts as lost if the newer one arrives after the allowed delay.
 A claim about a run is void from the first violation on, since its bounds depend on all that
 happened before.
 """
@@ -42,7 +42,7 @@ class VoidShare:
 
     cause: str
     """``delay``, or the name of a rule of the guarantee; with ``(out of order)`` if the rule would
-    hold without the overtaken packets."""
+    hold without the packets that arrive out of order."""
     share: float
     """Of the trace's time."""
     first_s: float
@@ -144,8 +144,8 @@ def _violations(
     """Yield the intervals of each cause."""
     found, sent_ns, allowed_s = outcomes(trace), trace.sent_ns, delay_ns * 1e-9
     sent_s, dropped_s = np.asarray(sent_ns * 1e-9), np.where(found.lost, np.inf, 0.0)
-    overtaken, replaced_s = found.out_of_order, dropped_s.copy()
-    replaced_s[overtaken] = (found.newer_ns - sent_ns)[overtaken] * 1e-9
+    stale, replaced_s = found.out_of_order, dropped_s.copy()
+    replaced_s[stale] = (found.newer_ns - sent_ns)[stale] * 1e-9
     # A violation by a lost packet lasts until a newer one is received; else, to the next packet.
     until_ns = np.where(replaced_s > 0, found.newer_ns, np.append(sent_ns[1:], end_ns))
     until_ns = np.minimum(until_ns, end_ns)
@@ -162,8 +162,8 @@ def _violations(
                 rule.name + suffix, sent_ns[these], until_ns[these], worst, rule.violation(worst)
             )
     delays = trace.received_ns - sent_ns
-    beyond = ~found.lost & ~overtaken & (delays > delay_ns)
-    worst = float(delays[~found.lost & ~overtaken].max(initial=0)) * 1e-9
+    beyond = ~found.lost & ~stale & (delays > delay_ns)
+    worst = float(delays[~found.lost & ~stale].max(initial=0)) * 1e-9
     yield _Spans(
         DELAY, sent_ns[beyond] + delay_ns, trace.received_ns[beyond], worst,
         f"an update was in the network for {worst:.4g} s, {allowed_s:.4g} s allowed",

@@ -25,12 +25,6 @@ class Segment(NamedTuple):
     read: Callable[[], Rows]
 
 
-def in_memory(rows: Rows) -> Iterator[Segment]:
-    """Yield a batch in memory as a segment; nothing if it is empty."""
-    if len(rows):
-        yield Segment(int(rows["input"].min()), int(rows["input"].max()), lambda: rows)
-
-
 def spool_segments(spool: Path, table: str, dtype: np.dtype[np.void]) -> Iterator[Segment]:
     """Yield the segments of a table in a spool."""
     for path in spool_files(spool, table):

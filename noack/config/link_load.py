@@ -44,12 +44,10 @@ class LinkLoad(NamedTuple):
 
     key: str
     rate_bps: int
-    all_at_most_bps: float
-    """All datagrams, if each loop transmits as often as it can."""
     mandatory_at_most_bps: float
-    """Of these, those that must pass."""
+    """Those datagrams that must pass, if each loop transmits as often as it can."""
     mandatory_at_least_bps: float
-    """Those that must pass, if each loop transmits as rarely as it can."""
+    """The same, if each loop transmits as rarely as it can."""
     delay_bound_s: float | None
     """Bound of a datagram's delay in this queue; None: there is none."""
 
@@ -85,12 +83,9 @@ def link_loads(scenario: Scenario) -> list[LinkLoad]:
             elif every * must_pass < one.rate_bps and not network.constraints:
                 spare_bps = one.rate_bps - every * must_pass
                 delay_s = (one.queue * max(bits) + together) / spare_bps
-        found.append(
-            LinkLoad(
-                f"network.impairments.{place}", one.rate_bps,
-                every, every * must_pass, least * must_pass, delay_s,
-            )
-        )  # fmt: skip
+        key = f"network.impairments.{place}"
+        needed_bps = every * must_pass, least * must_pass
+        found.append(LinkLoad(key, one.rate_bps, *needed_bps, delay_s))
     return found
 
 

@@ -297,7 +297,7 @@ class RunProcess:
         # All messages to the recorder pass the coordinator.
         reachable = reachable and not self.plane.coordinator_gone()
         if not (reachable and deliver_report(self.plane, self.report, telemetry)):
-            self._spool.write_rest(telemetry)
+            telemetry.store_all()
 
 
 def lifeline_cut() -> bool:

@@ -32,7 +32,7 @@ def deliver_report(
 ) -> bool:
     """Send the final report to the recorder, and again the rows that it misses.
 
-    Return whether the recorder has everything.
+    Rows that a slow recorder misses after that are stored. Return whether nothing is left to do.
     """
     try:
         for _ in range(_REPORT_ATTEMPTS):
@@ -41,9 +41,12 @@ def deliver_report(
             if not missing:
                 return True
             telemetry.resend(missing, plane.publish_telemetry_blocking)
+        telemetry.store_all()
+        report = {**report, "stored": telemetry.stored()}
+        plane.request("report", report, timeout_s=_REPORT_TIMEOUT_S)
     except PeerError:
-        pass
-    return False
+        return False
+    return True
 
 
 class OwnSpool:
@@ -68,9 +71,3 @@ class OwnSpool:
         if table == NOTICES:
             table, first = notices_of(self._role), notice_number(generation, first)
         self._files.append(table, first, payload)
-
-    def write_rest(self, telemetry: TelemetryBuffer) -> None:
-        """Write all rows that the buffer still holds, and close the files."""
-        totals = telemetry.totals()
-        telemetry.resend({table: [(0, n)] for table, n in totals.items()}, self.append)
-        self._files.close()

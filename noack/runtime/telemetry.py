@@ -141,8 +141,13 @@ class TelemetryBuffer:
         """Rows published so far of each loop, up to the last with rows; empty without [[loops]]."""
         return {table: counts.tolist() for table, counts in self._by_loop.items()}
 
+    def store_all(self) -> None:
+        """Store all batches that are held."""
+        while self._held:
+            self._store_oldest()
+
     def stored(self) -> dict[str, Ranges]:
-        """Ranges of the rows that were stored at the limit of memory, by table."""
+        """Ranges of the rows that were stored, by table."""
         return {table: found.ranges for table, found in self._stored.items()}
 
     def resend(self, missing: Mapping[str, list[tuple[int, int]]], publish: Publish) -> int:

@@ -80,6 +80,8 @@ def session_config(
         "transport/shared_memory/enabled": False,
         "transport/unicast/accept_timeout": _SHAKE_HANDS_MS,
         "transport/link/tx/lease": LEASE_MS,
+        # Rows of many loops take more than the two default places of 64 KiB: they would never fit.
+        "transport/link/tx/queue/size/background": 16,
         # A batch without room is dropped at once: the loop must not wait.
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
     }

@@ -192,8 +192,9 @@ class Reach:
         """Bound ‖C z‖ after the last node, for c = 1."""
         grams, moved = self.starts.late_forms(limit)
         values, V = np.linalg.eigh(np.tensordot(SHARES, grams, axes=1))
-        sizes = spectral_norms(C @ moved @ V / np.sqrt(values)[:, None])
-        found = float(sizes.min()) * ROUNDING
+        usable = values[:, 0] > 1e-12 * values[:, -1]  # others are too flat for their rounding
+        sizes = spectral_norms(C @ moved @ V[usable] / np.sqrt(values[usable])[:, None])
+        found = float(sizes.min(initial=math.inf)) * ROUNDING
         return found if math.isfinite(found) else math.inf
 
 

@@ -16,6 +16,7 @@ from noack.core.linear_systems import Matrix
 from noack.theory.interval_matrix import IntervalMatrix, exactly, inverse
 from noack.theory.switched_system import SwitchedSystem
 
+_TINY = float(np.finfo(np.float64).tiny)
 _SQUARINGS = 44
 _SUBTRACTED = 1 - 1e-15
 
@@ -108,7 +109,7 @@ def find_cycle(system: SwitchedSystem, most_edges: int, beam: int) -> Cycle:
             if found > growth * (1 + 1e-12):
                 best, growth = one.edges, found
         scale = growth or 1.0
-        paths.sort(key=lambda one: one.norm / scale**one.duration, reverse=True)
+        paths.sort(key=lambda one: one.norm / max(scale**one.duration, _TINY), reverse=True)
         paths = [_joined(one, step) for one in paths[:beam] for step in leaving[one.target]]
     if not best:
         return NO_CYCLE

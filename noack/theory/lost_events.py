@@ -22,8 +22,8 @@ _NEAR, _RATIO, _MOST_NODES = (0.0, 0.5, 0.75, 1.0), 1.1, 80
 """First nodes of r in units of δ; then the ratio from node to node."""
 _LATEST = 6.0
 """Largest r in units of δ at which events are looked for."""
-_SOUGHT = 0.9
-"""The bound that is hoped for, in units of that without the flow."""
+_SOUGHT = 0.8
+"""‖e^{(H+αI)r}‖_W at the last r, if possible."""
 _WORTH = 0.999
 """Share of the bound without the flow from which on nothing is gained."""
 _NOTHING = 1e-3
@@ -39,6 +39,7 @@ def errors_after_losses(
     level: float,
     spacing_s: float,
     kernel: KernelBounds,
+    bend: float,
 ) -> Vector:
     """Bound ‖e_c‖_W while at most 0, 1, … events have been lost since the delivery.
 
@@ -49,16 +50,19 @@ def errors_after_losses(
         level: ‖e_s‖_W at an event, at least.
         spacing_s: the least time between events.
         kernel: of ‖e^{(H+αI)τ}‖_W.
+        bend: that of e_s, see :func:`bend_of_error`.
     """
-    found, since_s, bend = plain.copy(), 0.0, bend_of_error(reach, level)
-    most_s = float(reach.starts.flow.edges_s[-1]) / 4  # e^{Fτ} is accurate until 4 times as late
-    for lost in range(len(plain) if spacing_s < most_s else 0):
+    found, since_s, flow = plain.copy(), 0.0, reach.starts.flow
+    most_s = float(flow.edges_s[-1]) / 4  # e^{Fτ} is accurate until 4 times as late
+    if spacing_s >= most_s or len(plain) == 1:
+        return found
+    r_s = _nodes_s(spacing_s, kernel, 2 * most_s)
+    flows = np.array([exponential(flow.generator * time_s) for time_s in r_s.tolist()])
+    for lost in range(len(plain)):
         earlier = float(found[lost - 1]) if lost else _NOTHING * size
-        sought = (_SOUGHT * (size + earlier) - size) / earlier
-        r_s = _nodes_s(spacing_s, kernel, sought)
-        stage = _Stage(reach, min(since_s, most_s), earlier, r_s[r_s <= 2 * most_s])
+        stage = _Stage(reach, min(since_s, most_s), earlier, r_s, flows)
         if lost:
-            added = size + kernel.sups(stage.r_s) * earlier
+            added = size + kernel.sups(r_s) * earlier
             largest = max(stage.largest_error(size, added), float(added[-1]), earlier)
             found[lost] = min(plain[lost], largest)
             if lost > 1 and found[lost] > _WORTH * float(added[0]):
@@ -76,28 +80,31 @@ def bend_of_error(reach: Reach, level: float) -> float:
     return bend + float(np.linalg.norm(H @ H, 2)) * level
 
 
-def _nodes_s(spacing_s: float, kernel: KernelBounds, sought: float) -> Vector:
+def _nodes_s(spacing_s: float, kernel: KernelBounds, most_s: float) -> Vector:
     """Return times r, if possible up to one at which ‖e^{(H+αI)r}‖_W has fallen below a value."""
     found = [spacing_s * share for share in _NEAR]
-    while len(found) < _MOST_NODES and kernel.sup(found[-1]) > sought:
+    while len(found) < _MOST_NODES and kernel.sup(found[-1]) > _SOUGHT:
         found.append(found[-1] * _RATIO)
-    return np.array(found)
+    return np.array([time_s for time_s in found if time_s <= most_s])
 
 
 class _Stage:
     """What follows an event, a time w or more after the delivery, for times r since it."""
 
-    def __init__(self, reach: Reach, window_s: float, earlier: float, r_s: Vector) -> None:
-        self._flow, self.r_s, self._earlier = reach.starts.flow, r_s, earlier
+    def __init__(
+        self, reach: Reach, window_s: float, earlier: float, r_s: Vector, flows: Stack
+    ) -> None:
+        self._flow, self._r_s, self._earlier = reach.starts.flow, r_s, earlier
         n, one = self._flow.n, np.eye(2 * self._flow.n)
         half = exponential(self._flow.generator * window_s / 2)
         rows = [one[n:] / earlier, half[n:] / earlier, (half @ half)[n:] / earlier]
         rows.append(reach.starts.shape @ one[:n] / reach.size)
         forms = np.array([row.T @ row for row in rows])
         self._forms = np.broadcast_to(forms, (len(r_s), *forms.shape))
-        self._z = _exponentials(self._flow.generator, r_s) @ half @ half
-        held = np.pad(_exponentials(self._flow.H, r_s), ((0, 0), (0, 0), (n, 0)))
-        self._e_s = self._z[:, n:] - held @ half @ half
+        self._z = flows @ half @ half
+        # x + e_c follows the models: e^{Hr} is the sum of both rows of e^{Fr} (I, 0).
+        models = flows[:, :n, :n] + flows[:, n:, :n]
+        self._e_s = self._z[:, n:] - models @ (half @ half)[n:]
 
     def largest_error(self, size: float, added: Vector) -> float:
         """Bound ‖e_c‖_W up to the last r, given bounds without the flow for the nodes."""
@@ -110,29 +117,25 @@ class _Stage:
 
     def _sags(self, forms: Stack, weights: Stack) -> Vector:
         """Bound how much e_c differs from its chord in each cell of r."""
-        F, steps_s = self._flow.generator, np.diff(self.r_s)[:, None, None]
+        F, steps_s = self._flow.generator, np.diff(self._r_s)[:, None, None]
         inverse = np.linalg.inv(np.einsum("ji,jiab->jab", weights, forms))
         terms, bends = F @ F @ self._z[:-1], np.zeros(len(steps_s))
         for order in range(1, _TAYLOR_TERMS + 1):
             seen = terms[:, self._flow.n :]
-            bends += np.sqrt(np.einsum("jab,jbc,jac->j", seen, inverse, seen))
+            bends += np.sqrt(np.abs(np.einsum("jab,jbc,jac->j", seen, inverse, seen)))
             terms = F @ terms * (steps_s / order)
         with np.errstate(over="ignore"):
             growth = np.exp(max(logarithmic_norm(F), 0.0) * steps_s[:, 0, 0])
-        bends += growth * np.sqrt(np.einsum("jab,jbc,jac->j", terms, inverse, terms))
+        bends += growth * np.sqrt(np.abs(np.einsum("jab,jbc,jac->j", terms, inverse, terms)))
         return np.asarray(steps_s[:, 0, 0] ** 2 / 8 * bends * ROUNDING)
 
     def next_event_s(self, level: float, bend: float, most_s: float) -> float:
         """Return a time before which ‖e_s‖_W does not reach a level."""
-        near = self.r_s <= most_s
+        near = self._r_s <= most_s
         ends, _ = _largest(self._forms[near], self._e_s[near], 0.9 * level, all_of_them=True)
-        sags = np.diff(self.r_s[near]) ** 2 / 8 * bend
+        sags = np.diff(self._r_s[near]) ** 2 / 8 * bend
         reached = np.maximum(ends[1:], ends[:-1]) + sags >= level
-        return float(self.r_s[np.append(reached, True).argmax()])
-
-
-def _exponentials(generator: Matrix, times_s: Vector) -> Stack:
-    return np.array([exponential(generator * float(time_s)) for time_s in times_s])
+        return float(self._r_s[np.append(reached, True).argmax()])
 
 
 def error_after(flow: DeliveryFlow, time_s: float) -> Matrix:

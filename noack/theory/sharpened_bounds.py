@@ -91,9 +91,11 @@ class InvariantEllipsoids:
         if level is None or not known.inter_event_s:
             return found, errors
         at_event = max(float(errors_at_events(errors)[-1]), _LEAST_SHARE * limit)
-        next_s = _next_event_s(reach, replace(reach, limit=at_event), level, known.inter_event_s)
+        bend = bend_of_error(reach, level)
+        at_events = replace(reach, limit=at_event)
+        next_s = _next_event_s(at_events, level, known.inter_event_s, bend)
         kernel = self.plant.error.kernels[Output.WEIGHTED]
-        errors = errors_after_losses(reach, errors, size, level, next_s, kernel)
+        errors = errors_after_losses(reach, errors, size, level, next_s, kernel, bend)
         return found._replace(inter_event_s=next_s), errors
 
     def within(self, limit: float) -> Reach | None:
@@ -209,13 +211,13 @@ def errors_at_events(errors: Vector) -> Vector:
     return np.append(0.0, errors[:-1])
 
 
-def _next_event_s(reach: Reach, at_events: Reach, level: float, known_s: float) -> float:
+def _next_event_s(at_events: Reach, level: float, known_s: float, bend: float) -> float:
     """Return a time before which ‖e_s‖_W cannot reach ``level`` after an event.
 
     It is at least the known one. Over a step s, e_s differs from its chord by at most s²/8 times a
     bound of its second derivative, which holds as long as ‖e_s‖_W is below the level.
     """
-    flow, found_s, bend = reach.starts.flow, known_s, bend_of_error(reach, level)
+    flow, found_s = at_events.starts.flow, known_s
     if not (0 < known_s < math.inf and 0 < bend < math.inf):
         return known_s
     size, tries = at_events.sup(error_after(flow, found_s)), 0

@@ -93,7 +93,7 @@ class Rule(NamedTuple):
 
 
 class Runs(NamedTuple):
-    """N runs, changed in place; r is the number of updates that may be under way."""
+    """N runs, changed in place; r is the number of updates that may be in flight."""
 
     step: Numbers
     """The step of the event before, which is decided; −1 at a start that is no event, (N,)."""
@@ -107,7 +107,7 @@ class Runs(NamedTuple):
     u_next: Array
     """The newest actuation, (N, m)."""
     sent: Array
-    """The step of each update under way, the oldest first; −1 for none, (N, r)."""
+    """The step of each update in flight, the oldest first; −1 for none, (N, r)."""
     updates: Array
     """Their states, (N, r, n)."""
     auxiliary: Array

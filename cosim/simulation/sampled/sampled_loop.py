@@ -52,7 +52,7 @@ class SampledLoop:
         self._rule = rule_of(policy.trigger_rule(n))
         self._first_auxiliary = policy.initial_dynamic_variable
         self._loop = _loop(resolved, self.matrices, self.delay_ns)
-        self._under_way = self.delay_ns // timing.measurement_period_ns + 2
+        self._most_in_flight = self.delay_ns // timing.measurement_period_ns + 2
         size = max(n, len(self._loop.C))
         self._own = Scratch(
             np.empty(n), np.empty(size), np.empty(2 * n), np.empty(2), np.empty(4 * n)
@@ -110,7 +110,7 @@ class SampledLoop:
 
     def empty(self, count: int) -> Runs:
         """Return runs at 0."""
-        n, m, r = self.matrices.n, self.matrices.m, self._under_way
+        n, m, r = self.matrices.n, self.matrices.m, self._most_in_flight
         return Runs(
             np.zeros(count, np.int64), np.zeros((count, n)), np.zeros((count, n)),
             np.zeros((count, n)), np.zeros((count, n)), np.zeros((count, m)),

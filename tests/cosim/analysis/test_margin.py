@@ -139,3 +139,15 @@ def test_growth_does_not_depend_on_the_set_point() -> None:
         for point in ([0.0, 0.0], [2.0, 0.0])
     )
     assert at_0.caps == at_2.caps
+
+
+def test_a_loop_that_forgets_at_once_is_stable() -> None:
+    """e^(−120) underflows in the powers of the growth."""
+    fast = noack.load({
+        "name": "fast", "horizon_s": 1.0, "mode": "zoh",
+        "model": {"A": [[-6e4]], "B": [[1.0]], "gain": [[0.0]]},
+        "plant": {"initial_state": [1.0], "rate_hz": 500.0}, "controller": {"rate_hz": 500.0},
+        "trigger": {"policy": "periodic", "period_s": 0.002},
+        "network": {"mansd": 2, "loss": {"model": "bernoulli", "probability": 0.5}},
+    })  # fmt: skip
+    assert noack.margin(fast, most_m=3, period=False).stable_m == 3

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosim.record.spool_merge import in_memory, merged
+from cosim.record.spool_merge import Segment, merged
 
 ROW = np.dtype([("input", "<i8"), ("value", "<f8")])
 
@@ -17,7 +17,11 @@ def batch(first: int, end: int) -> np.ndarray:
 
 
 def merge_rows(batches: list[np.ndarray]) -> np.ndarray:
-    segments = [segment for rows in batches for segment in in_memory(rows)]
+    segments = [
+        Segment(int(rows["input"].min()), int(rows["input"].max()), lambda rows=rows: rows)
+        for rows in batches
+        if len(rows)
+    ]
     return np.concatenate([np.zeros(0, ROW), *merged(segments, ROW)])
 
 

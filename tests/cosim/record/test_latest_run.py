@@ -10,6 +10,7 @@ import pytest
 from cosim.api.runs import open_run
 from cosim.record.run_directory import (
     LATEST,
+    LOOPS,
     SCENARIO_FILE,
     chosen_run,
     latest_run,
@@ -90,3 +91,15 @@ def test_a_folder_whose_name_is_not_utf_8_is_refused(tmp_path: Path) -> None:
     for refused in (lambda: new_run_dir(folder, "x"), lambda: chosen_run(folder, tmp_path)):
         with pytest.raises(CallerError, match="is not UTF-8; rename it"):
             refused()
+
+
+def test_a_loop_is_chosen_by_its_name(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / "run" / LOOPS / name).mkdir(parents=True)
+    assert chosen_run(tmp_path / "run", tmp_path, "b") == tmp_path / "run" / LOOPS / "b"
+    for run, loop, what in (
+        ("run", "c", "no such loop; its 2 are a, b"),
+        ("run/loops/a", "a", "no r"),
+    ):
+        with pytest.raises(CallerError, match=f"--loop {loop}: .*{what}"):
+            chosen_run(tmp_path / run, tmp_path, loop)

@@ -221,3 +221,6 @@ def test_the_oldest_batch_is_stored_at_the_memory_limit(
     assert buffer.stored() == {"one": [(0, 20)]}
     buffer.resend({"one": [(0, 40)]}, again)
     assert [first for _, first, _, _ in again.batches] == [20, 30]
+    buffer.store_all()
+    assert disk.batches == wire.batches
+    assert buffer.stored() == {"one": [(0, 40)]}
