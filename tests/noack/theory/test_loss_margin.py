@@ -31,6 +31,17 @@ DWELL = '{policy="dwell", interval_s=0.11, rule={policy="absolute", delta=1}}'
 DEADLINE = f'{{policy="deadline", interval_s=0.3, rule={DWELL}}}'
 DELAYED = 'network.impairments=[{kind="delay", delay_s=0.0333}]'
 
+FAST = """
+name = "fast"
+mode = "zoh"
+horizon_s = 10.0
+model = {{ A = [[{rate_per_s}.0]], B = [[1.0]], gain = [[{gain}.0]] }}
+plant = {{ initial_state = [1.0], rate_hz = 10.0 }}
+controller = {{ rate_hz = 10.0 }}
+trigger = {{ policy = "periodic", period_s = {period_s} }}
+network = {{ mansd = 2, loss = {{ model = "worst_case" }} }}
+"""
+
 
 def scenario(name: str, *settings: str) -> Scenario:
     settings = (PERIODIC, "network.mansd=20", *settings)
@@ -251,6 +262,16 @@ def test_paths_are_the_admissible_patterns(guarantee: LossGuarantee, slots: int)
 def test_what_is_not_covered_is_refused_in_one_line(settings: Sequence[str], message: str) -> None:
     with pytest.raises(CallerError, match=message):
         LossMargin(scenario("double_integrator", *settings)).stability()
+
+
+@pytest.mark.parametrize(("rate_per_s", "period_s"), [(100, 1.0), (300, 2.0), (1000, 2.0)])
+def test_growth_beyond_the_numbers_of_the_machine_is_refused(
+    tmp_path: Path, rate_per_s: int, period_s: float
+) -> None:
+    path = tmp_path / "fast.toml"
+    path.write_text(FAST.format(rate_per_s=rate_per_s, gain=-3 - rate_per_s, period_s=period_s))
+    with pytest.raises(CallerError, match="grows beyond 1e308"):
+        LossMargin(resolve(load(path))).stability()
 
 
 def test_capped_replaces_the_cap_alone() -> None:

@@ -288,14 +288,14 @@ def test_the_lane_example_in_a_weight_from_any_lyapunov_function() -> None:
 def test_a_threshold_without_an_inter_event_time_is_rejected_in_few_steps(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    calls, growth = 0, ErrorGains.growth
+    calls, growths = 0, ErrorGains.growths
 
     def counted(*arguments: Any) -> Any:
         nonlocal calls
         calls += 1
-        return growth(*arguments)
+        return growths(*arguments)
 
-    monkeypatch.setattr(ErrorGains, "growth", counted)
+    monkeypatch.setattr(ErrorGains, "growths", counted)
     resolved = shipped("lane_following", "trigger.beta=5e-324")
     for found in (certify, certify_box):
         certificate = found(resolved, ideal_conditions(resolved))
