@@ -88,7 +88,7 @@ def _verdict(summary: Mapping[str, Any]) -> list[str]:
         for verdict, count in loop["claims"].items():
             counts[verdict] = counts.get(verdict, 0) + count
     claims = ", ".join(f"{count} {verdict}" for verdict, count in sorted(counts.items()))
-    return [ending_line(summary).text, f"claims of all loops: {claims or 'none'}"]
+    return [ending_line(dict(summary)).text, f"claims of all loops: {claims or 'none'}"]
 
 
 def _link(run_dir: Path, name: str) -> str | None:
