@@ -110,7 +110,7 @@ def loop_row(loop: dict[str, Any]) -> tuple[str, ...]:
     claims = loop["claims"]
     held = f"{claims.get('held', 0)} of {sum(claims.values())}"
     worse = [f"{claims['violated']} violated"] if claims.get("violated") else []
-    if loop["exit"]["status"] != ExitStatus.OK:
+    if loop["exit"]["status"] == ExitStatus.FAILED:
         worse = ["failed"]
     return (
         loop["name"], str(loop["events"]), str(loop["drops"]),

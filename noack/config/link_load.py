@@ -3,6 +3,7 @@
 Of any M successive datagrams of a loop, one must pass (M − 1 = the longest burst of losses). Let b
 be the bits of loop k's datagram on the link, d the least and D the largest time between two of its
 transmissions. The datagrams that must pass need between Σ b/(M D) and Σ b/(M d) bits per second.
+For actuations d and D are the controller's period.
 
 If r bits per second exceed m = Σ b/(M d), the delay D in a tail-drop queue of Q places is bounded.
 Datagrams leave in their order, so those before the end of a transmission came within D. At most Q
@@ -19,12 +20,14 @@ from typing import NamedTuple
 from noack.config.loops import loop_scenario
 from noack.config.resolution import policy_of, resolve
 from noack.config.scenario import Scenario
+from noack.config.sections.network_section import DirectionSection
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
+from noack.impairments.constraints import guarantee_of
 from noack.impairments.disciplines.tail_drop import TailDrop
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.kinds.rate import Rate
-from noack.protocol.wire_format import datagram_bytes
+from noack.protocol.wire_format import Flow, datagram_bytes
 from noack.trigger.periodic_trigger import PeriodicSettings
 
 
@@ -43,6 +46,9 @@ class LinkLoad(NamedTuple):
     """What the loops need of a bottleneck; rates in bits per second."""
 
     key: str
+    flow: Flow
+    window: int
+    """One of any so many successive datagrams of a loop must pass; 0: none must."""
     rate_bps: int
     mandatory_at_most_bps: float
     """Those datagrams that must pass, if each loop transmits as often as it can."""
@@ -52,7 +58,7 @@ class LinkLoad(NamedTuple):
     """Bound of a datagram's delay in this queue; None: there is none."""
 
 
-def demands(scenario: Scenario) -> list[Demand]:
+def demands(scenario: Scenario, flow: Flow = Flow.UPDATE) -> list[Demand]:
     """Return the transmissions of the loops, by entry of [[loops]].
 
     Raises:
@@ -61,15 +67,30 @@ def demands(scenario: Scenario) -> list[Demand]:
     sections = scenario.loops
     loops = [scenario] if sections is None else [loop_scenario(scenario, one) for one in sections]
     counts = [1] if sections is None else [one.count for one in sections]
-    return [_demand(resolve(loop), count) for loop, count in zip(loops, counts, strict=True)]
+    demand_of = _demand if flow is Flow.UPDATE else _actuations
+    return [demand_of(resolve(loop), count) for loop, count in zip(loops, counts, strict=True)]
 
 
 def link_loads(scenario: Scenario) -> list[LinkLoad]:
-    """Return what the loops need of each bottleneck of the network."""
-    loops, network = demands(scenario), scenario.network
-    must_pass = 1 / (network.longest_burst + 1) if network.enforce_mansd else 0.0
+    """Return what the loops need of each bottleneck of the network, in either direction.
+
+    Acknowledgements are left out: how many there are depends on the losses of updates.
+    """
+    found = _link_loads(scenario, Flow.UPDATE, scenario.network, "network")
+    if (actuation := scenario.network.actuation) is not None:
+        found += _link_loads(scenario, Flow.ACTUATION, actuation, "network.actuation")
+    return found
+
+
+def _link_loads(
+    scenario: Scenario, flow: Flow, direction: DirectionSection, path: str
+) -> list[LinkLoad]:
+    link = direction.link
+    loops, burst = demands(scenario, flow), guarantee_of(link.mansd, link.constraints).longest_burst
+    window = 0 if burst is None else burst + 1
+    must_pass = 1 / window if window else 0.0
     found = []
-    for place, one in enumerate(network.impairments):
+    for place, one in enumerate(direction.impairments):
         if not isinstance(one, Rate):
             continue
         bits = [int(one.line_bits(loop.payload_bytes)) for loop in loops]
@@ -77,15 +98,15 @@ def link_loads(scenario: Scenario) -> list[LinkLoad]:
         least = sum(b * loop.loops / loop.largest_s for b, loop in zip(bits, loops, strict=True))
         together = sum(b * loop.loops for b, loop in zip(bits, loops, strict=True))
         delay_s = None
-        if _is_first(scenario, place) and isinstance(one.discipline, TailDrop):
+        if _is_first(direction, place) and isinstance(one.discipline, TailDrop):
             if every <= one.rate_bps:
                 delay_s = together / one.rate_bps
-            elif every * must_pass < one.rate_bps and not network.constraints:
+            elif every * must_pass < one.rate_bps and not direction.constraints:
                 spare_bps = one.rate_bps - every * must_pass
                 delay_s = (one.queue * max(bits) + together) / spare_bps
-        key = f"network.impairments.{place}"
         needed_bps = every * must_pass, least * must_pass
-        found.append(LinkLoad(key, one.rate_bps, *needed_bps, delay_s))
+        key = f"{path}.impairments.{place}"
+        found.append(LinkLoad(key, flow, window, one.rate_bps, *needed_bps, delay_s))
     return found
 
 
@@ -95,7 +116,7 @@ def require_capacity(scenario: Scenario) -> None:
         if load.mandatory_at_least_bps > load.rate_bps:
             raise CallerError(
                 f"{load.key}.rate_bps = {load.rate_bps}: the datagrams that must pass, one of any "
-                f"{scenario.network.longest_burst + 1} of each loop, need "
+                f"{load.window} of each loop, need "
                 f"{math.ceil(load.mandatory_at_least_bps)} bit/s; the queue would grow without "
                 "bound"
             )
@@ -110,6 +131,8 @@ def load_warnings(loads: Sequence[LinkLoad], scenario: Scenario) -> Iterator[str
                 f"can, the datagrams that must pass need {math.ceil(load.mandatory_at_most_bps)} "
                 "bit/s; then the queue grows without bound"
             )
+        if load.flow is not Flow.UPDATE:
+            continue  # the rest is about certificate.network_delay_s, the delay of updates
         certified_s = scenario.certificate.network_delay_s
         if certified_s is None:
             certified_s = scenario.network.link.longest_delay_s
@@ -136,7 +159,14 @@ def _demand(loop: Scenario, count: int) -> Demand:
     return Demand(count, size_bytes, least_ns / NS_PER_S, largest_ns / NS_PER_S)
 
 
-def _is_first(scenario: Scenario, place: int) -> bool:
+def _actuations(loop: Scenario, count: int) -> Demand:
+    """The controller sends one at each of its ticks."""
+    size_bytes = datagram_bytes(loop.message_sizes.actuation_entries)
+    period_s = loop.timing.controller_period_ns / NS_PER_S
+    return Demand(count, size_bytes, period_s, period_s)
+
+
+def _is_first(direction: DirectionSection, place: int) -> bool:
     """Whether datagrams reach an impairment once each, and as they were sent."""
-    before = scenario.network.impairments[:place]
+    before = direction.impairments[:place]
     return all(isinstance(one, LossOf) for one in before)

@@ -18,6 +18,7 @@ from cosim.analysis.loops_over_time import (
 )
 from cosim.analysis.loops_summary import in_flight, is_complete
 from cosim.cli import app
+from cosim.output.loops_tables import loop_row
 from cosim.output.report.loops_figures import error_map, norms_figure
 from cosim.output.viewer.opening_time import opening_time_ns
 from cosim.record.align import align_tables
@@ -80,6 +81,9 @@ def test_the_summary_adds_up(run_dir: Path) -> None:
     network, loops = summary["network"], summary["loops"]
     assert [one["number"] for one in loops] == [*range(LOOPS)]
     assert sum(one["link_share"] for one in loops) == pytest.approx(1)
+    stopped, failed = ({"status": status, "reason": ""} for status in (130, 1))
+    assert "failed" not in loop_row(loops[0] | {"exit": stopped})[-1]
+    assert "failed" in loop_row(loops[0] | {"exit": failed})[-1]
     for one in loops:
         alone = json.loads((run_dir / "loops" / one["name"] / "summary.json").read_text())
         assert one["events"] == alone["events"] == one["deliveries"] + one["drops"]

@@ -46,6 +46,24 @@ def test_the_rate_for_what_must_pass_is_the_limit(
     require_capacity(scenario_of(content, 1000, 5, loops, enforce_mansd=False))
 
 
+def test_the_actuations_need_a_rate_too(content: dict[str, Any]) -> None:
+    """30 controllers with 500 ticks a second; one of any 5 actuations must pass."""
+    inputs = len(content["model"].get("B", [[0]])[0])
+    bits = 8 * (datagram_bytes(inputs) + 28)
+    needed_bps = 30 * bits * 500 // 5
+
+    def checked(rate_bps: int, **actuation: Any) -> None:
+        rate = {"kind": "rate", "rate_bps": rate_bps, "queue": 5}
+        network = content["network"] | {"actuation": {"impairments": [rate], **actuation}}
+        loops = [{"name": "a", "count": 30}]
+        require_capacity(validate(content | {"network": network, "loops": loops}, "here"))
+
+    checked(needed_bps, mansd=4)
+    with pytest.raises(CallerError, match=rf"network\.actuation.*any 5 .* need {needed_bps} bit/s"):
+        checked(needed_bps - 1, mansd=4)
+    checked(1000)  # without a guarantee nothing must pass
+
+
 def test_an_event_trigger_is_only_warned_about(content: dict[str, Any]) -> None:
     loops = {"name": "a", "count": 30}
     slow = scenario_of(content, 1000, 5, loops)
