@@ -133,15 +133,15 @@ def comparisons(result: CapacityResult) -> Iterator[str]:
         other = found[PERIODIC, disturbance]
         if policy == PERIODIC:
             continue
-        how = "no difference to"
+        how = "no difference"
         if own.low > other.high or (own.low == math.inf > other.high):
-            how = "wins over"
+            how = "wins"
         elif own.high < other.low:
-            how = "loses to"
-        where = "with a common disturbance" if disturbance == COMMON else "loops disturbed as given"
+            how = "loses"
+        where = "with a common disturbance" if disturbance == COMMON else "as in the scenario"
         yield (
-            f"{where}: {policy} {how} {PERIODIC}: {_shown(own, last)} against "
-            f"{_shown(other, last)} loops"
+            f"{policy} against {PERIODIC}, {where}: {how} ({_shown(own, last)} and "
+            f"{_shown(other, last)} loops)"
         )
 
 
@@ -224,6 +224,7 @@ def print_result(console: Console, result: CapacityResult) -> None:
         table.add_row(*row[: len(shown)])
     console.print(table)
     lines = [
+        "loops carried: median [95 % interval], which is finite from six draws on",
         f"periodic every {plan.period_s:g} s: the rate carries {plan.periodic_loops:.4g} loops",
         *comparisons(result),
         *(f"live: {one.policy}, {one.loops} loops: {live_row(one)[-1]}" for one in result.live),
