@@ -1,5 +1,6 @@
 """Terminal output of a run of several loops: its network, and its loops, the worst first."""
 
+from collections import Counter
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
@@ -22,7 +23,8 @@ CAPTION = (
 
 
 def print_loops(console: Console, summary: Summary, *, verbose: bool = False) -> None:
-    """Print the network, and the loops; without ``verbose`` the worst only."""
+    """Print claims, the network, and the loops; without ``verbose`` the worst only."""
+    console.print(claims_line(summary), highlight=False, soft_wrap=True)
     console.print(_network_table(summary))
     loops = sorted(summary["loops"], key=badness, reverse=True)
     shown = loops if verbose else loops[:_MOST_LOOPS]
@@ -44,6 +46,13 @@ def print_loops(console: Console, summary: Summary, *, verbose: bool = False) ->
     console.print(table)
     if more := len(loops) - len(shown):
         console.print(f"and {more} more loops: --verbose shows all")
+
+
+def claims_line(summary: Summary) -> str:
+    """Return how many claims about the loops have each verdict."""
+    counts = sum((Counter(loop["claims"]) for loop in summary["loops"]), Counter[str]())
+    claims = ", ".join(f"{count} {verdict}" for verdict, count in sorted(counts.items()))
+    return f"claims of all loops: {claims or 'none'}"
 
 
 def badness(loop: dict[str, Any]) -> tuple[Any, ...]:

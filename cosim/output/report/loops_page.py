@@ -8,7 +8,14 @@ from urllib.parse import quote
 import numpy as np
 
 from cosim.analysis.loops_over_time import LoopsOverTime, loops_over_time, worst_loop
-from cosim.output.loops_tables import CAPTION, HEADINGS, badness, loop_row, network_rows
+from cosim.output.loops_tables import (
+    CAPTION,
+    HEADINGS,
+    badness,
+    claims_line,
+    loop_row,
+    network_rows,
+)
 from cosim.output.report.loops_figures import (
     NAMED,
     QueueLength,
@@ -83,12 +90,7 @@ def write_loops_report(
 
 def _verdict(summary: Mapping[str, Any]) -> list[str]:
     """Return how the run ended, and how many claims about its loops have each verdict."""
-    counts: dict[str, int] = {}
-    for loop in summary["loops"]:
-        for verdict, count in loop["claims"].items():
-            counts[verdict] = counts.get(verdict, 0) + count
-    claims = ", ".join(f"{count} {verdict}" for verdict, count in sorted(counts.items()))
-    return [ending_line(dict(summary)).text, f"claims of all loops: {claims or 'none'}"]
+    return [ending_line(dict(summary)).text, claims_line(dict(summary))]
 
 
 def _link(run_dir: Path, name: str) -> str | None:

@@ -1,6 +1,7 @@
 """A simulated run of several loops: its directories, its summary, and the commands that read it."""
 
 import json
+import re
 import tomllib
 from pathlib import Path
 
@@ -213,6 +214,7 @@ def test_a_loop_that_diverges_is_named_and_the_others_go_on(tmp_path: Path) -> N
     path.unlink()
     shown = noack("summary", path.parent).stdout.splitlines()
     assert json.loads(path.read_text()) == summary
+    assert re.match(r"claims of all loops: \d+ held", shown[1])
     (row,) = [line for line in shown if line.startswith(" wild")]
     assert written(summary["loops"][2]["sup_e_c_norm"]) in row
     sent = sum(one["actuations"]["sent"] for one in summary["loops"])
