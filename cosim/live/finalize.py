@@ -1,7 +1,7 @@
 """The end of a run: its record completed, its summary and report written."""
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
@@ -197,23 +197,23 @@ def reopen(run_dir: Path) -> Outcome:
     if not (run_dir / SCENARIO_FILE).is_file():
         raise CallerError(f"{run_dir}: not a run directory (no {SCENARIO_FILE})")
     summary = read_object(run_dir / SUMMARY_FILE)
-    # The summary is missing or damaged; or a process that was frozen spooled rows after the end.
-    if not is_complete(summary) or (run_dir / SPOOL).is_dir():
-        # A summary of several loops is failed if one of them failed; the others did not.
-        known = {} if has_loops(summary) else summary
-        return finalize(_ending(run_dir, known), again=True)
     ending = _ending(run_dir, summary)
-    return Outcome(run_dir, ending.status, ending.reason, summary)
+    # A process that was frozen may have spooled rows after the end.
+    if ending is not None and is_complete(summary) and not (run_dir / SPOOL).is_dir():
+        return Outcome(run_dir, ending.status, ending.reason, summary)
+    # A summary of several loops is failed if one of them failed; the others did not.
+    if ending is None or has_loops(summary):
+        ending = _ending(run_dir, read_object(run_dir / ENDING_FILE))
+    unknown = RunEnding(run_dir, 0, ExitStatus.FAILED, "the launcher ended early")
+    return finalize(ending or unknown, again=True)
 
 
-def _ending(run_dir: Path, summary: Summary) -> RunEnding:
-    """How a run ended, from its summary or else from its launcher's file."""
-    for found in (summary, read_object(run_dir / ENDING_FILE)):
-        with suppress(LookupError, TypeError, ValueError):
-            status, reason = ExitStatus(found["exit"]["status"]), str(found["exit"]["reason"])
-            return RunEnding(run_dir, 0, status, reason, found["startup_s"])
-        summary.clear()  # a summary without an exit cannot be trusted
-    return RunEnding(run_dir, 0, ExitStatus.FAILED, "the launcher ended early")
+def _ending(run_dir: Path, found: Mapping[str, Any]) -> RunEnding | None:
+    """Return how a run ended by its summary or its launcher's file; None if it is not there."""
+    with suppress(LookupError, TypeError, ValueError):
+        status, reason = ExitStatus(found["exit"]["status"]), str(found["exit"]["reason"])
+        return RunEnding(run_dir, 0, status, reason, found["startup_s"])
+    return None
 
 
 @np.errstate(all="ignore")

@@ -72,7 +72,7 @@ def test_the_recorder_reports_a_violation_once_and_records_it(
         recorder.show()
     cause = "an input was 0.101 s old, 0.007 s allowed"
     line = f"void (assumption violated) from 0.506 s on: {cause}"
-    void = [report["void"] for report in plane.reports]
+    void = [report["warnings"] for report in plane.reports]
     assert void == [[]] * 5 + [[line]] * 6
     notices = recorder.finish().notices
     assert notices == [{"t_ns": 506_000_000, "level": "void", "text": line, "process": "recorder"}]
@@ -95,7 +95,7 @@ def test_a_violation_found_at_the_end_is_reported(run: RunRecord, tmp_path: Path
     send(plane, run, 1_200_000_000, {})
     recorder.poll()
     (notice,) = recorder.finish().notices
-    assert [report["void"] for report in plane.reports] == [[notice["text"]]]
+    assert [report["warnings"] for report in plane.reports] == [[notice["text"]]]
 
 
 def test_missing_rows_are_reported_as_an_unknown_result(run: RunRecord, tmp_path: Path) -> None:
@@ -107,7 +107,7 @@ def test_missing_rows_are_reported_as_an_unknown_result(run: RunRecord, tmp_path
     recorder.poll()
     recorder.show()
     recorder.show()
-    assert plane.reports[-1]["void"] == [
+    assert plane.reports[-1]["warnings"] == [
         "claims are checked after the run only: telemetry is missing or arrived out of order"
     ]
     assert recorder.finish().notices == []
@@ -125,7 +125,7 @@ def test_the_terminal_reports_each_cause_once(run: RunRecord, terminal: bool) ->
         watcher.started(Path())
         watcher.progress(report)
         for void in ([], ["one [cause]"], ["one [cause]"], ["one [cause]", "another"]):
-            watcher.progress(report | {"void": void})
+            watcher.progress(report | {"warnings": void})
     assert shown.getvalue().count("one [cause]") == 1
     assert shown.getvalue().count("another") == 1
 
