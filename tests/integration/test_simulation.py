@@ -121,7 +121,7 @@ def test_margin_plays_the_destabilising_pattern(tmp_path: Path) -> None:
     done = subprocess.run(played, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert done.returncode == 0, done.stderr
     pattern = "DDLLLDLLL"
-    assert f"destabilises M = 4: {' '.join(pattern)}" in " ".join(done.stdout.split())
+    assert f"destabilises M = 4: {pattern}" in " ".join(done.stdout.split())
     packets = load_record((tmp_path / "latest").resolve())[NETEM_PACKET]
     lost = packets["fate"] == Fate.DROPPED
     assert len(lost) >= len(pattern)
