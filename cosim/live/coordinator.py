@@ -5,7 +5,7 @@ over the address of the one before it, and numbers its messages above all earlie
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import zenoh
@@ -23,7 +23,7 @@ from noack.runtime.control_messages import (
 )
 from noack.runtime.control_plane import ControlPlane
 from noack.runtime.join_ticket import Ticket
-from noack.runtime.life_cycle import HORIZON, Event, LifeCycle, Side, State
+from noack.runtime.life_cycle import AWAY_S, HORIZON, Event, LifeCycle, Side, State
 
 _START_DELAY_NS = 100_000_000
 """From the last arrival to the common epoch: time for the message to reach all processes."""
@@ -58,11 +58,17 @@ class _Member(LifeCycle):
 class Coordinator:
     """Admission, start barrier, liveliness and stop of one run.
 
+    Args:
+        ticket: the run's ticket.
+        launched: roles whose exit the launcher observes. Such a process is lost only if its
+            connection does not come back: on a busy machine a living process loses its connection.
+
     Raises:
         PeerError: the endpoint cannot be listened on.
     """
 
-    def __init__(self, ticket: Ticket) -> None:
+    def __init__(self, ticket: Ticket, launched: Collection[str] = ()) -> None:
+        self._launched = launched
         self.plane = ControlPlane(ticket, COORDINATOR, listen=True)
         session, key = self.plane.session, self.plane.key
         self._admissions = session.declare_queryable(key("admit", "*"), FifoChannel(64))
@@ -108,7 +114,8 @@ class Coordinator:
             vanished = token.kind == zenoh.SampleKind.DELETE
             self._apply(token.key_expr, Event.DISCONNECT if vanished else Event.RECONNECT)
         for member in self._members.values():
-            if member.state is State.UNREACHABLE and member.age_s() > _REPORT_GRACE_S:
+            grace_s = AWAY_S if member.role in self._launched else _REPORT_GRACE_S
+            if member.state is State.UNREACHABLE and member.age_s() > grace_s:
                 member.apply(Event.TIME_OUT)
         if self._clock is None:
             self._clear_barrier()

@@ -11,6 +11,8 @@ from enum import Enum
 from noack.core.errors import CallerError, PeerError
 
 HORIZON = "horizon"  # reason of a process that has reached the end of the run
+AWAY_S = 8.0
+"""Four leases of the connection: a connection that a busy machine broke comes back by then."""
 LAUNCHER_GONE = "the launcher ended early"  # reason of a process whose launcher has ended before it
 
 

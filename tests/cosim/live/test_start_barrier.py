@@ -1,4 +1,4 @@
-"""The start barrier: a process that loses its connection may join again."""
+"""The start barrier, and processes that lose their connection."""
 
 import json
 from typing import Any
@@ -8,7 +8,7 @@ import zenoh
 
 from cosim.live import coordinator
 from cosim.live.coordinator import Coordinator
-from noack.protocol.topology import ROLES
+from noack.protocol.topology import LOOP_ROLES, ROLES
 from tests.fuzz.parsers.ticket import _TICKET
 from tests.fuzz.plane import FakePlane, Query, Sample
 
@@ -25,9 +25,12 @@ def barrier(plane: FakePlane, monkeypatch: pytest.MonkeyPatch) -> Coordinator:
     return Coordinator(_TICKET)
 
 
-def ask(plane: FakePlane, barrier: Coordinator, what: str, instance: str = "one") -> Query:
-    hello: dict[str, Any] = {"pid": 1, "instance": instance, "address": ["127.0.0.1", 5]}
-    plane.put(what, query := Query(f"noack/0/{what}/sensor", json.dumps(hello).encode()))
+def ask(
+    plane: FakePlane, barrier: Coordinator, what: str, instance: str = "one", role: str = "sensor"
+) -> Query:
+    address = ["127.0.0.1", 5] if role in LOOP_ROLES else None
+    hello: dict[str, Any] = {"pid": 1, "instance": instance, "address": address}
+    plane.put(what, query := Query(f"noack/0/{what}/{role}", json.dumps(hello).encode()))
     barrier.poll()
     return query
 
@@ -65,6 +68,29 @@ def test_a_process_may_not_join_again_once_another_has_its_role(
     assert ask(plane, barrier, "join").error == (
         "cannot join: another sensor is in this run already"
     )
+
+
+def test_a_launched_process_is_lost_only_if_its_connection_stays_away(
+    plane: FakePlane, barrier: Coordinator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The launcher observes the exit of a process that died; a living one connects again."""
+    launched = Coordinator(_TICKET, ROLES)
+    for one in (barrier, launched):
+        for role in ROLES:
+            ask(plane, one, "admit", role=role)
+            ask(plane, one, "join", role=role)
+        assert one.running_generation("sensor") == 0
+        lose(plane, one)
+        one.poll()
+    lost = {"sensor": "sensor stopped responding"}
+    assert barrier.failures() == lost
+    assert launched.failures() == {}
+    plane.put("alive", Sample("noack/0/alive/sensor/one"))
+    launched.poll()
+    assert launched.running_generation("sensor") == 0
+    monkeypatch.setattr(coordinator, "AWAY_S", -1.0)
+    lose(plane, launched)
+    assert launched.failures() == lost
 
 
 def test_the_reason_for_an_end_is_the_reported_one(plane: FakePlane, barrier: Coordinator) -> None:
