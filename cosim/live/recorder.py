@@ -1,4 +1,4 @@
-"""The recorder's process: drives a recorder to the end of its run, with a live viewer on request."""
+"""The recorder's process: drives a recorder to the end of its run; a live viewer on request."""
 
 import sys
 import time
