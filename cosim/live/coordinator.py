@@ -5,7 +5,7 @@ over the address of the one before it, and numbers its messages above all earlie
 """
 
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import zenoh
@@ -30,7 +30,7 @@ _START_DELAY_NS = 100_000_000
 _RESTART_DELAY_S = 0.3
 """Wall time from the admission of a restarted process to its first deadline."""
 _REPORT_GRACE_S = 0.3
-"""A process's last message may arrive this much later than its token vanishes."""
+"""A process's last message may arrive this much later than its exit is seen."""
 _EXIT_GRACE_S = 5.0
 """By then a process has exited that has reported its end."""
 
@@ -58,17 +58,11 @@ class _Member(LifeCycle):
 class Coordinator:
     """Admission, start barrier, liveliness and stop of one run.
 
-    Args:
-        ticket: the run's ticket.
-        launched: roles whose exit the launcher observes. Such a process is lost only if its
-            connection does not come back: on a busy machine a living process loses its connection.
-
     Raises:
         PeerError: the endpoint cannot be listened on.
     """
 
-    def __init__(self, ticket: Ticket, launched: Collection[str] = ()) -> None:
-        self._launched = launched
+    def __init__(self, ticket: Ticket) -> None:
         self.plane = ControlPlane(ticket, COORDINATOR, listen=True)
         session, key = self.plane.session, self.plane.key
         self._admissions = session.declare_queryable(key("admit", "*"), FifoChannel(64))
@@ -114,8 +108,7 @@ class Coordinator:
             vanished = token.kind == zenoh.SampleKind.DELETE
             self._apply(token.key_expr, Event.DISCONNECT if vanished else Event.RECONNECT)
         for member in self._members.values():
-            grace_s = AWAY_S if member.role in self._launched else _REPORT_GRACE_S
-            if member.state is State.UNREACHABLE and member.age_s() > grace_s:
+            if member.state is State.UNREACHABLE and member.age_s() > AWAY_S:
                 member.apply(Event.TIME_OUT)
         if self._clock is None:
             self._clear_barrier()
@@ -287,6 +280,9 @@ class Coordinator:
             PeerError: it is not over.
         """
         before = self._members.get(role)
+        if before is not None and before.state is State.UNREACHABLE:
+            left = f"{AWAY_S - before.age_s():.0f} s"
+            raise PeerError(f"the {role} before it may still come back; try again in {left}")
         if before is not None and not before.is_over:
             raise PeerError(f"another {role} is in this run already")
         return before

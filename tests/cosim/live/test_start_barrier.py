@@ -1,4 +1,4 @@
-"""The start barrier, and processes that lose their connection."""
+"""The start barrier: a process that loses its connection may join again."""
 
 import json
 from typing import Any
@@ -8,7 +8,7 @@ import zenoh
 
 from cosim.live import coordinator
 from cosim.live.coordinator import Coordinator
-from noack.protocol.topology import LOOP_ROLES, ROLES
+from noack.protocol.topology import RECORDER, ROLES
 from tests.fuzz.parsers.ticket import _TICKET
 from tests.fuzz.plane import FakePlane, Query, Sample
 
@@ -26,20 +26,28 @@ def barrier(plane: FakePlane, monkeypatch: pytest.MonkeyPatch) -> Coordinator:
 
 
 def ask(
-    plane: FakePlane, barrier: Coordinator, what: str, instance: str = "one", role: str = "sensor"
+    plane: FakePlane,
+    barrier: Coordinator,
+    what: str,
+    instance: str = "one",
+    role: str = "sensor",
 ) -> Query:
-    address = ["127.0.0.1", 5] if role in LOOP_ROLES else None
+    address = None if role == RECORDER else ["127.0.0.1", 5]
     hello: dict[str, Any] = {"pid": 1, "instance": instance, "address": address}
     plane.put(what, query := Query(f"noack/0/{what}/{role}", json.dumps(hello).encode()))
     barrier.poll()
     return query
 
 
-def lose(plane: FakePlane, barrier: Coordinator) -> None:
-    gone = Sample("noack/0/alive/sensor/one")
-    gone.kind = zenoh.SampleKind.DELETE  # type: ignore[assignment]
-    plane.put("alive", gone)
+def token(plane: FakePlane, barrier: Coordinator, kind: zenoh.SampleKind | None) -> None:
+    change = Sample("noack/0/alive/sensor/one")
+    change.kind = kind  # type: ignore[assignment]
+    plane.put("alive", change)
     barrier.poll()
+
+
+def lose(plane: FakePlane, barrier: Coordinator) -> None:
+    token(plane, barrier, zenoh.SampleKind.DELETE)
 
 
 def test_a_process_may_join_again_after_a_lost_connection(
@@ -70,29 +78,6 @@ def test_a_process_may_not_join_again_once_another_has_its_role(
     )
 
 
-def test_a_launched_process_is_lost_only_if_its_connection_stays_away(
-    plane: FakePlane, barrier: Coordinator, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The launcher observes the exit of a process that died; a living one connects again."""
-    launched = Coordinator(_TICKET, ROLES)
-    for one in (barrier, launched):
-        for role in ROLES:
-            ask(plane, one, "admit", role=role)
-            ask(plane, one, "join", role=role)
-        assert one.running_generation("sensor") == 0
-        lose(plane, one)
-        one.poll()
-    lost = {"sensor": "sensor stopped responding"}
-    assert barrier.failures() == lost
-    assert launched.failures() == {}
-    plane.put("alive", Sample("noack/0/alive/sensor/one"))
-    launched.poll()
-    assert launched.running_generation("sensor") == 0
-    monkeypatch.setattr(coordinator, "AWAY_S", -1.0)
-    lose(plane, launched)
-    assert launched.failures() == lost
-
-
 def test_the_reason_for_an_end_is_the_reported_one(plane: FakePlane, barrier: Coordinator) -> None:
     assert barrier.reported_failure("sensor") is None
     plane.put("ended", Sample("noack/0/ended/sensor/one", b"the disk is full"))
@@ -101,3 +86,25 @@ def test_the_reason_for_an_end_is_the_reported_one(plane: FakePlane, barrier: Co
     plane.put("ended", Sample("noack/0/ended/netem/one", b"horizon"))
     barrier.poll()
     assert barrier.reported_failure("netem") is None
+
+
+def test_a_running_process_is_lost_only_if_its_connection_does_not_come_back(
+    plane: FakePlane, barrier: Coordinator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for role in ROLES:
+        ask(plane, barrier, "admit", role=role)
+        ask(plane, barrier, "join", role=role)
+    assert barrier.epoch_ns is not None
+    lose(plane, barrier)
+    assert barrier.failures() == {}
+    barrier.allow_restart("sensor", "stopped responding", dead=False)
+    assert ask(plane, barrier, "admit", "two").error == (
+        "cannot join: the sensor before it may still come back; try again in 8 s"
+    )
+    token(plane, barrier, None)
+    monkeypatch.setattr(coordinator, "AWAY_S", -1.0)
+    barrier.poll()
+    assert barrier.failures() == {}
+    lose(plane, barrier)
+    assert barrier.failures() == {"sensor": "sensor stopped responding"}
+    assert ask(plane, barrier, "admit", "two").error is None
