@@ -52,7 +52,7 @@ _CHANGES_AT_ONCE = 2
 _FEW_LOOPS = 8
 _GATHER_PARTS = 8
 """Deadlines of more than a few loops are gathered for this part of a period."""
-_GRACE_S = 0.15  # wall time after the horizon for packets in flight
+_GRACE_TURNS = 3  # of housekeeping, 50 ms each, after the horizon for packets in flight
 
 
 class ReportingChannel(Channel[T], Protocol[T]):
@@ -215,6 +215,7 @@ class RunProcess:
             telemetry,
             end_ns=self._end_ns,
             stop=lambda: self.stopping,
+            turns_after_end=_GRACE_TURNS,
             spin_us=self.scenario.realtime.spin_us,
             gather_ns=self._gather_ns,
             rehearsal=self.rehearsal,
@@ -241,9 +242,8 @@ class RunProcess:
 
     @property
     def _end_ns(self) -> int:
-        """When the loop ends: the last horizon of all loops, and time for packets in flight."""
-        grace_ns = int(_GRACE_S * NS_PER_S * self.scenario.speed)
-        return loops_of(self.scenario)[0].timing.horizon_ns + max(self.phases_ns) + grace_ns
+        """The last horizon of all loops."""
+        return loops_of(self.scenario)[0].timing.horizon_ns + max(self.phases_ns)
 
     def fail(self, error: BaseException) -> None:
         """Stop with an error as the reason."""
