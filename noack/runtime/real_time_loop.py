@@ -22,8 +22,8 @@ T = TypeVar("T")
 _HOUSEKEEPING_S = 0.05
 _OVERLOAD_PAUSE_S = 0.002
 _OVERLOAD_SHARE = 0.9  # of CPU time in the time since the last housekeeping
-_TURNS_TO_CATCH_UP = 40
-"""Of housekeeping, two seconds: a machine that is late at its end has this time to catch up."""
+_TURNS_TO_CATCH_UP = 20
+"""Of housekeeping, one second: a machine that is late at its end has this time to catch up."""
 _QUIET_S = 0.0005
 """Housekeeping and rehearsals take 0.1 to 0.2 ms; they wait when the deadline is nearer."""
 _yield_core: Callable[[], None] = getattr(os, "sched_yield", lambda: None)
@@ -118,7 +118,7 @@ def run_loop(
     serve the deadlines of that time together. It rehearses between its steps, unless a deadline is
     near.
 
-    It goes on for ``turns_after_end`` turns of housekeeping, 50 ms each, and for up to two seconds
+    It goes on for ``turns_after_end`` turns of housekeeping, 50 ms each, and for up to a second
     while the machine is late: the computer may not have run for a while.
 
     Returns:
