@@ -88,9 +88,8 @@ class Run:
         The run of all loops has the ``tables``, the ``plot`` and the ``replay`` of the network that
         they share; ``samples``, ``events`` and ``fidelity`` are of one loop.
         """
-        if not self._record.is_network:
+        if "loops" not in self.summary:  # computing it finalises the loops, too
             return {}
-        self.summary  # noqa: B018  # writes the records of the loops
         folders = loop_directories(self.directory, self._record.scenario)
         return {folder.name: Run(folder, partial(_reopen, self, folder)) for folder in folders}
 
