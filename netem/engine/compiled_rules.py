@@ -152,32 +152,29 @@ def _register(modules: Sequence[ModuleType]) -> None:
 def compiled_dispatch(packet: Any, stage: Any, memory: Any) -> Callable[..., None]:
     """Return :func:`noack.impairments.stage_dispatch.apply_stage` for compiled code.
 
-    It compares a stage's kind with each behaviour's number in order: ``if kind == 0: ... else: if
-    kind == 1: ...``; the compiler makes a jump table of it.
+    It finds the behaviour of a stage's kind by halving the numbers that it may have.
     """
-    return _comparisons()
+    return _choice(0, len(BEHAVIOURS))
 
 
 @cache
-def _comparisons() -> Callable[..., None]:
+def _choice(first: int, end: int) -> Callable[..., None]:
+    """Return the choice between the behaviours ``first`` … ``end`` − 1."""
     from numba.extending import register_jitable
 
-    def nothing(packet: Any, stage: Any, memory: Any) -> None:
-        pass
+    if end - first == 1:
+        return BEHAVIOURS[first].apply
+    middle = (first + end) // 2
+    lower, upper = _choice(first, middle), _choice(middle, end)
 
-    def one(kind: int, behaviour: Any, others: Any) -> Callable[..., None]:
-        def dispatch(packet: Any, stage: Any, memory: Any) -> None:
-            if stage.kind == kind:
-                behaviour(packet, stage, memory)
-            else:
-                others(packet, stage, memory)
+    def choose(packet: Any, stage: Any, memory: Any) -> None:
+        if stage.kind < middle:
+            lower(packet, stage, memory)
+        else:
+            upper(packet, stage, memory)
 
-        return dispatch
-
-    chain: Callable[..., None] = register_jitable(**_OPTIONS)(nothing)
-    for kind in reversed(range(len(BEHAVIOURS))):
-        chain = register_jitable(**_OPTIONS)(one(kind, BEHAVIOURS[kind].apply, chain))
-    return chain
+    chosen: Callable[..., None] = register_jitable(**_OPTIONS)(choose)
+    return chosen
 
 
 def _compiled_modules() -> Iterator[tuple[str, str]]:
