@@ -4,16 +4,16 @@ import shutil
 import tempfile
 import threading
 import weakref
-from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import cached_property
+from functools import cached_property, partial
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cosim.api.scenarios import Source, load
 from cosim.output.row_display import as_html, as_text
+from cosim.record.loops_run import loop_directories
 from cosim.record.run_directory import RECORD, SCENARIO_FILE, chosen_run
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError, ExitStatus
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from cosim.analysis.fidelity import Fidelity
     from cosim.analysis.replay import Replay
     from cosim.analysis.run_summary import Outcome
+    from cosim.output.report.run_figures import RunFigure
     from cosim.record.run_record import RunRecord
     from cosim.studies.comparison.run_comparison import RunComparison
 
@@ -71,9 +72,27 @@ class Run:
 
     @property
     def claims(self) -> list[dict[str, Any]]:
-        """The claims about the run, each with its ``verdict``: held, violated or void."""
-        claims: list[dict[str, Any]] = self.summary.get("claims") or []
-        return claims
+        """The claims about the run, each with its ``verdict``: held, violated or void.
+
+        Those of several loops have the name of their ``loop``.
+        """
+        of_loops = [
+            {"loop": name} | claim for name, one in self.loops.items() for claim in one.claims
+        ]
+        return of_loops or self.summary.get("claims") or []
+
+    @property
+    def loops(self) -> "Mapping[str, Run]":
+        """The loops of a scenario with [[loops]], each as a run, by name; empty without.
+
+        The run of all loops has the ``tables``, the ``plot`` and the ``replay`` of the network that
+        they share; ``samples``, ``events`` and ``fidelity`` are of one loop.
+        """
+        if not self._record.is_network:
+            return {}
+        self.summary  # noqa: B018  # writes the records of the loops
+        folders = loop_directories(self.directory, self._record.scenario)
+        return {folder.name: Run(folder, partial(_reopen, self, folder)) for folder in folders}
 
     @property
     def scenario(self) -> Scenario:
@@ -120,7 +139,7 @@ class Run:
         """
         from cosim.api.data_frames import samples
 
-        return samples(self._record)
+        return samples(self._record_of_loop)
 
     def events(self) -> "pa.Table":
         """Return the sensor's transmissions, one row each.
@@ -134,21 +153,29 @@ class Run:
         """
         from cosim.api.data_frames import events
 
-        return events(self._record)
+        return events(self._record_of_loop)
 
     def plot(self, figure: str = "states") -> "Figure":
         """Draw a figure of the report.
 
         Args:
             figure: states, errors, state-norm, input or inter-event; for a live run also lateness
-                or latency. Certified bounds are drawn next to the bounded quantity.
+                or latency. Certified bounds are drawn next to the bounded quantity. Of several
+                loops: network, loops or map.
 
         Raises:
             NoackError: the run has no such figure.
         """
         from cosim.output.report.run_figures import BOUNDED, pictures
 
-        known = pictures(self._record, self._envelopes if figure in BOUNDED else ())
+        known: Mapping[str, Callable[[], RunFigure]]
+        if self._record.is_network:
+            from cosim.output.report.loops_page import loops_pictures
+
+            drawn = loops_pictures(self._record, self.directory, self.summary)
+            known = {name: partial(drawn.__getitem__, name) for name in drawn}
+        else:
+            known = pictures(self._record, self._envelopes if figure in BOUNDED else ())
         if figure not in known:
             raise CallerError(f'"{figure}": no such figure of this run; it has {", ".join(known)}')
         return known[figure]().figure
@@ -184,7 +211,7 @@ class Run:
         """
         from cosim.analysis.fidelity import compute_fidelity
 
-        return compute_fidelity(self._record)
+        return compute_fidelity(self._record_of_loop)
 
     @cached_property
     def _outcome(self) -> "Outcome":
@@ -194,7 +221,14 @@ class Run:
     def _record(self) -> "RunRecord":
         from cosim.record.run_record import load_record
 
-        return load_record(self.directory)
+        return load_record(self.directory, network=True)
+
+    @property
+    def _record_of_loop(self) -> "RunRecord":
+        if self._record.is_network:
+            one = next(iter(self.loops))
+            raise CallerError(f'a run of several loops: take one of them, e.g. run.loops["{one}"]')
+        return self._record
 
     @cached_property
     def _envelopes(self) -> list[Any]:
@@ -202,28 +236,23 @@ class Run:
 
         return RunClaims(self._record).envelopes()
 
-    def _facts(self) -> Iterator[tuple[str, str]]:
-        """The most important facts, in a few lines."""
-        found = self.summary
-        mode = "model-based" if found["mode"] == "model" else "zero-order hold"
-        yield "run", f"{found['scenario']}, {mode}, {found['kind']}, M − 1 = {found['mansd']}"
-        yield "ended", f"at {found['reached_s']:g} s of {found['horizon_s']:g} s: {self.reason}"
-        yield (
-            "events",
-            f"{found['events']}; {found['deliveries']} received, {found['drops']} lost, "
-            f"longest loss burst {found['longest_loss_burst']}",
-        )
-        norms = (found["initial_state_norm"], found["final_state_norm"])
-        yield "‖x‖", " → ".join("unknown" if norm is None else f"{norm:.3g}" for norm in norms)
-        verdicts = Counter(claim["verdict"] for claim in self.claims)
-        yield "claims", ", ".join(f"{n} {verdict}" for verdict, n in verdicts.items()) or "none"
-        yield "directory", str(self.directory)
-
     def __repr__(self) -> str:
-        return as_text([*self._facts()])
+        from cosim.api.run_facts import run_facts
+
+        return as_text(run_facts(self))
 
     def _repr_html_(self) -> str:
-        return as_html([*self._facts()])
+        from cosim.api.run_facts import run_facts
+
+        return as_html(run_facts(self))
+
+
+def _reopen(parent: Run, folder: Path) -> "Outcome":
+    """Return the outcome of a loop; ``parent`` keeps a temporary folder."""
+    from cosim.live.finalize import reopen
+
+    parent.summary  # noqa: B018  # the loops are finalised with it
+    return reopen(folder)
 
 
 def simulate(scenario: Source, *, runs: Folder | None = None) -> Run:

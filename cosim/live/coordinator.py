@@ -23,14 +23,14 @@ from noack.runtime.control_messages import (
 )
 from noack.runtime.control_plane import ControlPlane
 from noack.runtime.join_ticket import Ticket
-from noack.runtime.life_cycle import HORIZON, Event, LifeCycle, Side, State
+from noack.runtime.life_cycle import AWAY_S, HORIZON, Event, LifeCycle, Side, State
 
 _START_DELAY_NS = 100_000_000
 """From the last arrival to the common epoch: time for the message to reach all processes."""
 _RESTART_DELAY_S = 0.3
 """Wall time from the admission of a restarted process to its first deadline."""
 _REPORT_GRACE_S = 0.3
-"""A process's last message may arrive this much later than its token vanishes."""
+"""A process's last message may arrive this much later than its exit is seen."""
 _EXIT_GRACE_S = 5.0
 """By then a process has exited that has reported its end."""
 
@@ -108,7 +108,7 @@ class Coordinator:
             vanished = token.kind == zenoh.SampleKind.DELETE
             self._apply(token.key_expr, Event.DISCONNECT if vanished else Event.RECONNECT)
         for member in self._members.values():
-            if member.state is State.UNREACHABLE and member.age_s() > _REPORT_GRACE_S:
+            if member.state is State.UNREACHABLE and member.age_s() > AWAY_S:
                 member.apply(Event.TIME_OUT)
         if self._clock is None:
             self._clear_barrier()
@@ -280,6 +280,9 @@ class Coordinator:
             PeerError: it is not over.
         """
         before = self._members.get(role)
+        if before is not None and before.state is State.UNREACHABLE:
+            left = f"{AWAY_S - before.age_s():.0f} s"
+            raise PeerError(f"the {role} before it may still come back; try again in {left}")
         if before is not None and not before.is_over:
             raise PeerError(f"another {role} is in this run already")
         return before

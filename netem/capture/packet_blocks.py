@@ -16,7 +16,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.code_cache import cache_folder, compiler
+from noack.core.code_cache import CALLED_BY_CODE, cache_folder, compiler
 
 Bytes = NDArray[np.uint8]
 Counts = NDArray[np.int64]
@@ -26,7 +26,7 @@ FOLDER = cache_folder("capture", [Path(__file__)])
 """Cache folder of the compiled code; None if there is no cache."""
 _compiled = cast(Callable[[_Function], _Function], compiler(FOLDER, nogil=True))
 _integer = cast(Callable[[Any], int], np.int64)  # uint64 with int64 would give float64
-_part = cast(Callable[[_Function], _Function], numba.njit)
+_part = cast(Callable[[_Function], _Function], numba.njit(**CALLED_BY_CODE))
 
 MAX_HEADER_BYTES = 40 + 8
 """IPv6 and UDP."""

@@ -21,7 +21,7 @@ from netem import relay_events
 from netem.engine import histogram
 from netem.rule_program import empty_state, loss_width, new_flow, recent_width
 from noack.core import code_cache
-from noack.core.code_cache import cache_folder, compiler
+from noack.core.code_cache import CALLED_BY_CODE, cache_folder, compiler
 from noack.impairments import link_records
 from noack.impairments.link_records import (
     NEVER_NS,
@@ -86,7 +86,7 @@ def set_flow(
 
 # No reference counting: nothing is allocated, and counting references to the twenty arrays of
 # program and state at each call would take twenty times as long as the decision.
-_OPTIONS = {"_nrt": False, "forceinline": True}
+_OPTIONS = {**CALLED_BY_CODE, "_nrt": False, "forceinline": True}
 
 
 @cache
@@ -128,7 +128,11 @@ def prepare(name: str = "netem", modules: tuple[ModuleType, ...] = ()) -> Path |
 def folder(name: str = "netem", modules: tuple[ModuleType, ...] = ()) -> Path | None:
     """Return the cache folder, without loading the compiler; see :func:`prepare`."""
     more = (*modules, relay_events, record_tables, object_code, socket_structs)
-    sources = [*(path for _, path in _compiled_modules()), *(str(one.__file__) for one in more)]
+    sources = [
+        __file__,
+        *(path for _, path in _compiled_modules()),
+        *(str(one.__file__) for one in more),
+    ]
     return cache_folder(name, map(Path, sources))
 
 
@@ -152,29 +156,28 @@ def _register(modules: Sequence[ModuleType]) -> None:
 def compiled_dispatch(packet: Any, stage: Any, memory: Any) -> Callable[..., None]:
     """Return :func:`noack.impairments.stage_dispatch.apply_stage` for compiled code.
 
-    It finds the behaviour of a stage's kind by halving the numbers that it may have.
+    It compares a stage's kind with each behaviour's number in order: ``if kind == 0: ... elif kind
+    == 1: ...``; the compiler makes a jump table of it.
     """
-    return _choice(0, len(BEHAVIOURS))
+    return _comparisons()
 
 
 @cache
-def _choice(first: int, end: int) -> Callable[..., None]:
-    """Return the choice between the behaviours ``first`` … ``end`` − 1."""
-    from numba.extending import register_jitable
+def _comparisons() -> Callable[..., None]:
+    """Return the comparisons as one function, made from text.
 
-    if end - first == 1:
-        return BEHAVIOURS[first].apply
-    middle = (first + end) // 2
-    lower, upper = _choice(first, middle), _choice(middle, end)
-
-    def choose(packet: Any, stage: Any, memory: Any) -> None:
-        if stage.kind < middle:
-            lower(packet, stage, memory)
-        else:
-            upper(packet, stage, memory)
-
-    chosen: Callable[..., None] = register_jitable(**_OPTIONS)(choose)
-    return chosen
+    Functions that call each other, one for each comparison, would take half of the compilation: the
+    compiler translates each with all that it calls.
+    """
+    lines = ["def dispatch(packet: Any, stage: Any, memory: Any):"]
+    for kind in range(len(BEHAVIOURS)):
+        lines += [f" {'elif' if kind else 'if'} stage.kind == {kind}:"]
+        lines += [f"  apply_{kind}(packet, stage, memory)"]
+    functions: dict[str, Any] = {"__name__": __name__, "Any": Any}
+    functions |= {f"apply_{i}": one.apply for i, one in enumerate(BEHAVIOURS)}
+    exec("\n".join(lines), functions)
+    dispatch: Callable[..., None] = functions["dispatch"]
+    return dispatch
 
 
 def _compiled_modules() -> Iterator[tuple[str, str]]:

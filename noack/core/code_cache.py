@@ -13,7 +13,7 @@ import stat
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
@@ -23,6 +23,9 @@ from noack.core.file_access import locked
 
 _ROOM_BYTES = 16 * 1024 * 1024
 _KEPT_S = 30 * 24 * 3600
+CALLED_BY_CODE: Mapping[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+"""numba's options of a function that only compiled code calls. It is compiled without the entries
+for Python and C, each of which would hold its code once more."""
 
 
 def cache_folder(name: str, sources: Iterable[Path]) -> Path | None:

@@ -12,6 +12,8 @@ from noack.core.errors import CallerError, PeerError
 
 HORIZON = "horizon"  # reason of a process that has reached the end of the run
 LAUNCHER_GONE = "the launcher ended early"  # reason of a process whose launcher has ended before it
+AWAY_S = 8.0
+"""Four leases of a connection: one that a busy machine broke comes back by then."""
 
 
 class Side(Enum):
@@ -30,7 +32,7 @@ class State(Enum):
     RUNNING = "running"
     STOPPING = "stopping"
     UNREACHABLE = "unreachable"
-    """Its liveliness token has vanished a moment ago; its report may still arrive."""
+    """Its liveliness token has vanished; its report or its connection may still come."""
     LOST = "lost"
     """Its token vanished and no report arrived. It may come back with its connection."""
     GONE = "gone"

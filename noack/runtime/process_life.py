@@ -34,7 +34,7 @@ from noack.runtime.control_messages import Admission, ControlMessage, RunStart, 
 from noack.runtime.control_plane import ControlPlane, ParameterUpdates
 from noack.runtime.fleet.fleet_socket import FLEET_BUFFER_BYTES
 from noack.runtime.join_ticket import Ticket
-from noack.runtime.life_cycle import HORIZON, LAUNCHER_GONE, Event, LifeCycle, Side, State
+from noack.runtime.life_cycle import AWAY_S, HORIZON, LAUNCHER_GONE, Event, LifeCycle, Side, State
 from noack.runtime.real_time_loop import Channel, run_loop
 from noack.runtime.real_time_settings import realtime
 from noack.runtime.record_handover import OwnSpool, deliver_report, persisted_rows
@@ -47,14 +47,12 @@ T = TypeVar("T")
 
 _JOIN_TIMEOUT_S = 24 * 3600.0  # a person may start the other processes late; Ctrl-C ends the wait
 _ADMISSION_TIMEOUT_S = 10.0
-_COORDINATOR_AWAY_S = 8.0
-"""Four leases of the connection: a connection that a busy machine broke comes back by then."""
 _CHANGES_AT_ONCE = 2
 """Changes taken in the loop every 50 ms: a machine needs some tenths of a millisecond for each."""
 _FEW_LOOPS = 8
 _GATHER_PARTS = 8
 """Deadlines of more than a few loops are gathered for this part of a period."""
-_GRACE_S = 0.15  # wall time after the horizon for packets in flight
+_GRACE_TURNS = 3  # of housekeeping, 50 ms each, after the horizon for packets in flight
 
 
 class ReportingChannel(Channel[T], Protocol[T]):
@@ -217,6 +215,7 @@ class RunProcess:
             telemetry,
             end_ns=self._end_ns,
             stop=lambda: self.stopping,
+            turns_after_end=_GRACE_TURNS,
             spin_us=self.scenario.realtime.spin_us,
             gather_ns=self._gather_ns,
             rehearsal=self.rehearsal,
@@ -243,9 +242,8 @@ class RunProcess:
 
     @property
     def _end_ns(self) -> int:
-        """When the loop ends: the last horizon of all loops, and time for packets in flight."""
-        grace_ns = int(_GRACE_S * NS_PER_S * self.scenario.speed)
-        return loops_of(self.scenario)[0].timing.horizon_ns + max(self.phases_ns) + grace_ns
+        """The last horizon of all loops."""
+        return loops_of(self.scenario)[0].timing.horizon_ns + max(self.phases_ns)
 
     def fail(self, error: BaseException) -> None:
         """Stop with an error as the reason."""
@@ -274,7 +272,7 @@ class RunProcess:
         # A running loop does not need the control plane. A launched process has its lifeline: on
         # a busy machine the coordinator may only seem to be gone.
         waiting = self.life.state in (State.REQUESTED, State.AT_BARRIER)
-        if waiting and self.plane.coordinator_gone(for_s=_COORDINATOR_AWAY_S):
+        if waiting and self.plane.coordinator_gone(for_s=AWAY_S):
             return "lost the connection to the run's coordinator"
         return None
 

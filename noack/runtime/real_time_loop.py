@@ -22,6 +22,8 @@ T = TypeVar("T")
 _HOUSEKEEPING_S = 0.05
 _OVERLOAD_PAUSE_S = 0.002
 _OVERLOAD_SHARE = 0.9  # of CPU time in the time since the last housekeeping
+_TURNS_TO_CATCH_UP = 20
+"""Of housekeeping, one second: a machine that is late at its end has this time to catch up."""
 _QUIET_S = 0.0005
 """Housekeeping and rehearsals take 0.1 to 0.2 ms; they wait when the deadline is nearer."""
 _yield_core: Callable[[], None] = getattr(os, "sched_yield", lambda: None)
@@ -102,6 +104,7 @@ def run_loop(
     *,
     end_ns: int | None,
     stop: Callable[[], bool],
+    turns_after_end: int = 0,
     spin_us: float = 0.0,
     gather_ns: int = 0,
     rehearsal: Rehearsing | None = None,
@@ -115,6 +118,9 @@ def run_loop(
     serve the deadlines of that time together. It rehearses between its steps, unless a deadline is
     near.
 
+    It goes on for ``turns_after_end`` turns of housekeeping, 50 ms each, and for up to a second
+    while the machine is late: the computer may not have run for a while.
+
     Returns:
         How late the machine's next deadline was at the end, in ns; 0 if it was not late.
     """
@@ -124,13 +130,16 @@ def run_loop(
     loop.rehearsal = rehearsal
     # Looked up once: after milliseconds of sleep the code runs cold, and every step counts.
     step, housekeeping_is_due = loop.step, loop.housekeeping_is_due
+    turns = 0
     while True:
         step()
         if housekeeping_is_due():
             loop.do_housekeeping()
-            if stop() or (end_ns is not None and clock.now_ns() >= end_ns):
-                deadline_ns = machine.next_deadline_ns()
-                return 0 if deadline_ns is None else max(clock.now_ns() - deadline_ns, 0)
+            now_ns, deadline_ns = clock.now_ns(), machine.next_deadline_ns()
+            late_ns = 0 if deadline_ns is None else max(now_ns - deadline_ns, 0)
+            turns += end_ns is not None and now_ns >= end_ns
+            if stop() or turns > (_TURNS_TO_CATCH_UP if late_ns else turns_after_end):
+                return late_ns
             loop.schedule_housekeeping()
 
 

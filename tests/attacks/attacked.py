@@ -146,7 +146,7 @@ def attack(
 ) -> Attacked:
     """Attack all four ports of a run of the paper's example while it runs.
 
-    Repeat it with another run if a busy machine let the run end before the attack.
+    Repeat it with a longer run if a busy machine let the run end before the attack.
 
     Args:
         folder: the folder for the run directories.
@@ -156,25 +156,40 @@ def attack(
         speed: the speed of the run relative to real time.
     """
     sending_s = per_port / rate_hz
-    horizon_s = speed * (1.5 * sending_s + 7.0)
-    options = ("--set", f"speed={speed}", "--set", f"horizon_s={horizon_s:.0f}")
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         pool.submit(carry_out, Plan((), 0, 1.0, False, 0.0)).result()  # the process has started
         for attempt in range(_ATTEMPTS):
             (folder / str(attempt)).mkdir()
+            horizon_s = 3**attempt * speed * (1.5 * sending_s + 7.0)
+            options = ("--set", f"speed={speed}", "--set", f"horizon_s={horizon_s:.0f}")
             with Run(folder / str(attempt), *options) as run:
                 targets = run.targets()
                 until_s = time.monotonic() + 1.5 * sending_s + 3.0
                 plan = Plan(targets, per_port, rate_hz, forge_addresses, until_s)
                 sent = pool.submit(carry_out, plan).result()
-                all_received = are_open(targets)
+                all_received = have_read(targets)
                 attacked = run.finish(sent)
             if all_received:
                 break
     return attacked
 
 
-def are_open(targets: list[Target]) -> bool:
-    """Whether the ports of all processes are still open."""
-    ports = {one.laddr.port for one in psutil.net_connections("udp4") if one.laddr}
-    return {target.port for target in targets} <= ports
+def have_read(targets: list[Target]) -> bool:
+    """Wait until the processes have read what was sent; whether none has ended before."""
+    ports = {target.port for target in targets}
+    while True:
+        waiting_bytes = unread_bytes()
+        if not ports <= waiting_bytes.keys():
+            return False
+        if not any(waiting_bytes[port] for port in ports):
+            return True
+        time.sleep(0.02)
+
+
+def unread_bytes() -> Counter[int]:
+    """Return the bytes that wait in the UDP sockets of each local port, from Linux's table."""
+    found: Counter[int] = Counter()
+    for line in Path("/proc/net/udp").read_text().splitlines()[1:]:
+        _, local, _, _, queues, *_ = line.split()
+        found[int(local.rpartition(":")[2], 16)] += int(queues.rpartition(":")[2], 16)
+    return found

@@ -116,3 +116,6 @@ class FakePlane:
 
     def request_stop(self, reason: str) -> None:
         pass
+
+    def coordinator_gone(self) -> bool:
+        return False

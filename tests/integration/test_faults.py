@@ -100,7 +100,7 @@ def test_an_overloaded_run_does_not_claim_its_horizon(tmp_path: Path) -> None:
     finished = live.run_scenario(
         tmp_path,
         *live.settings(
-            speed=1000.0, horizon_s=400.0, plant__rate_hz=500.0, plant__measure_every=100
+            speed=1000.0, horizon_s=400.0, plant__rate_hz=10_000.0, plant__measure_every=2000
         ),
     )
     assert finished.status == 1

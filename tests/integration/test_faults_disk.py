@@ -74,7 +74,7 @@ def noack(*arguments: str) -> Result:
 def test_a_run_on_a_disk_that_fills_up_can_be_finalised_later(
     start: Start, small: Disk, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    running = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=60.0))
+    running = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=240.0))
     wait_recording(running)
     run_dir = (running.runs / "latest").resolve()
     small.fill()
@@ -140,7 +140,8 @@ def test_a_run_does_not_begin_on_a_full_disk(small: Disk) -> None:
 @pytest.mark.parametrize("small", [64], indirect=True)
 def test_a_folder_that_becomes_read_only_gives_clear_errors(start: Start, small: Disk) -> None:
     """Open files can still be written; new files cannot be created."""
-    running = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=16.0))
+    horizon_s = 24.0
+    running = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=horizon_s))
     wait_recording(running)
     run_dir = (running.runs / "latest").resolve()
     mounted(small.path, "--bind", str(small.path))
@@ -161,7 +162,7 @@ def test_a_folder_that_becomes_read_only_gives_clear_errors(start: Start, small:
     summary = json.loads((run_dir / "summary.json").read_text())
     assert summary["exit"] == {"status": 1, "reason": f"recorder: {why}"}
     steps = load_record(run_dir)["plant_step"]
-    assert np.array_equal(steps["sequence"], np.arange(16 * live.RATE_HZ + 1))
+    assert np.array_equal(steps["sequence"], np.arange(horizon_s * live.RATE_HZ + 1))
 
 
 def test_a_removed_run_directory_ends_the_run_with_clear_lines(start: Start) -> None:

@@ -54,18 +54,22 @@ def test_a_full_and_then_closed_pipe_does_not_disturb_the_run(tmp_path: Path) ->
     )
     os.close(writing)
     try:
-        latest = tmp_path / "latest"
-        live.wait_for(lambda: latest.exists() or process.poll() is not None)
-        loop = [child for role in ROLES if (child := live.child_of(process, role)) is not None]
-        assert len(loop) == len(ROLES)
+        loop: dict[str, psutil.Process] = {}
+
+        def all_are_found() -> bool:
+            found = {role: live.child_of(process, role) for role in ROLES}
+            loop.update({role: child for role, child in found.items() if child is not None})
+            return len(loop) == len(ROLES) or process.poll() is not None
+
+        live.wait_for(all_are_found)  # before the start: the run takes two seconds
         # The loop and the recorder end although the pipe is not read.
-        live.wait_for(lambda: all(live.is_over(child) for child in loop))
+        live.wait_for(lambda: all(live.is_over(child) for child in loop.values()))
         assert process.poll() is None
-        assert any(child.is_running() for child in loop)  # not reaped yet
+        assert any(child.is_running() for child in loop.values())  # not reaped yet
     finally:
         os.close(reading)
     assert process.wait(live.PATIENCE_S) == 0
-    assert is_whole(latest.resolve())
+    assert is_whole((tmp_path / "latest").resolve())
 
 
 def test_a_log_that_cannot_be_written_is_named(

@@ -61,7 +61,6 @@ def write_loops_report(
         MachineError: the report cannot be written.
     """
     directories = loop_directories(run_dir, network.scenario)
-    over_time = loops_over_time(network, map(load_record, directories))
     worst = worst_loop(run_dir, summary["loops"])
     drawings = pictures(load_record(directories[worst.number]), envelopes)
     lines = _verdict(summary)
@@ -74,7 +73,7 @@ def write_loops_report(
         verdict_lines=lines,
         verdict_tone="bad" if is_bad else "doubt" if "void" in lines[1] else "good",
         network=network_rows(dict(summary)),
-        figures=_figures(over_time, summary),
+        figures=list(loops_pictures(network, run_dir, summary).values()),
         worst_name=directories[worst.number].name,
         worst_why=worst.why[:1].upper() + worst.why[1:],
         worst_figures=[drawings[name]() for name in _OF_WORST],
@@ -97,6 +96,19 @@ def _link(run_dir: Path, name: str) -> str | None:
     """Return the address of a loop's report; None if it is not written."""
     path = Path(LOOPS, name, REPORT_FILE)
     return quote(path.as_posix()) if (run_dir / path).is_file() else None
+
+
+def loops_pictures(
+    network: RunRecord, run_dir: Path, summary: Mapping[str, Any]
+) -> dict[str, RunFigure]:
+    """Draw the figures of all loops, by name.
+
+    Raises:
+        CallerError: the record of a loop is missing.
+    """
+    directories = loop_directories(run_dir, network.scenario)
+    figures = _figures(loops_over_time(network, map(load_record, directories)), summary)
+    return {figure.name: figure for figure in figures}
 
 
 def _figures(over_time: LoopsOverTime, summary: Mapping[str, Any]) -> list[RunFigure]:

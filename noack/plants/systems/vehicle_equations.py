@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.code_cache import cache_folder, compiler, is_kept, while_compiling
+from noack.core.code_cache import CALLED_BY_CODE, cache_folder, compiler, is_kept, while_compiling
 from noack.core.linear_systems import Vector
 from noack.plants.systems import jump_integrator
 from noack.plants.systems.jump_integrator import Work, advance, buffers
@@ -31,6 +31,7 @@ _COMPILED = ("std", "mb")
 Rates = Callable[[Vector, float, float], Vector]
 """ż as a function of z (N,), steering rate (rad/s) and acceleration (m/s²)."""
 _WHEELS = 4
+_OPTIONS: Any = {**CALLED_BY_CODE, "error_model": "python"}
 _TYRE_FIELDS = [
     ("evaluations", np.int64, 0),
     ("wheel", np.int64, 0),
@@ -186,8 +187,8 @@ def _compiled(model: str) -> Any:
     own = [one for _, one in inspect.getmembers(jump_integrator, inspect.isfunction)]
     functions: set[Callable[..., Any]] = {*_needed(dynamics), *own, rates}
     for function in functions - {lateral}:
-        register_jitable(error_model="python")(function)
-    overload(lateral, jit_options={"error_model": "python"})(_held)
+        register_jitable(**_OPTIONS)(function)
+    overload(lateral, jit_options=_OPTIONS)(_held)
     return compiler(_folder(model), error_model="python")(_integrator(dynamics))
 
 
@@ -201,7 +202,7 @@ def _held(alpha: Any, gamma: Any, F_z: Any, p: Any) -> Any:
 
     original = library("utils.tire_model", "formula_lateral")
     formula = FunctionType(original.__code__, original.__globals__)
-    register_jitable(error_model="python")(formula)
+    register_jitable(**_OPTIONS)(formula)
 
     def lateral(alpha: Any, gamma: Any, F_z: Any, p: Any) -> Any:
         wheel = p.wheel

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from noack.config.fleet_layout import FleetRole
-from noack.core.code_cache import cache_folder
+from noack.core.code_cache import CALLED_BY_CODE, cache_folder
 from noack.runtime.fleet.wire_words import compute_tag
 from noack.runtime.native.object_code import NativeFunction, code_file, load, load_or_compile
 
@@ -21,8 +21,8 @@ _SOURCES = (
     "noack.runtime.native.object_code", "noack.runtime.native.socket_structs", __name__,
     "noack.runtime.fleet.driver_layout", "noack.protocol.wire_format",
 )  # fmt: skip
-_OPTIONS: dict[str, Any] = {"_nrt": False, "forceinline": True}
-_CALLED: dict[str, Any] = {"_nrt": False}
+_OPTIONS: dict[str, Any] = {**CALLED_BY_CODE, "_nrt": False, "forceinline": True}
+_CALLED: dict[str, Any] = {**CALLED_BY_CODE, "_nrt": False}
 """For a function that is long and called at two places."""
 
 

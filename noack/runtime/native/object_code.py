@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from noack.core.code_cache import compiling_alone
+from noack.core.code_cache import CALLED_BY_CODE, compiling_alone
 from noack.core.file_access import write_whole
 
 
@@ -127,7 +127,8 @@ def compile_native(function: Callable[..., Any], arguments: tuple[Any, ...]) -> 
 
     compiling: Any = compiler
     kinds: Any = numba.typeof(arguments)  # type: ignore[no-untyped-call]
-    unpack, call = _unpacker(kinds), register_jitable(_nrt=False, forceinline=True)(function)
+    call = register_jitable(**CALLED_BY_CODE, _nrt=False, forceinline=True)(function)
+    unpack = _unpacker(kinds)
 
     def entry(words: int) -> Any:
         return np.int64(call(*unpack(words)))

@@ -33,7 +33,11 @@ GOOD: dict[str, Any] = {
 def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
     runs = tmp_path_factory.mktemp("runs")
     told: list[str] = []
-    found = soak(FOLDER / "day.toml", ("horizon_s=96", "speed=24"), runs, told.append)
+    for horizon_s in (96, 384):  # a machine that stalls may leave no time for samples
+        settings = (f"horizon_s={horizon_s}", "speed=24")
+        found = soak(FOLDER / "day.toml", settings, runs, told.append)
+        if set(found.watched) == ROLES:
+            break
     assert told
     return found
 
@@ -47,7 +51,7 @@ def test_every_process_is_watched(result: Result) -> None:
 def test_a_real_run_has_no_faults_at_its_end(result: Result) -> None:
     assert result.summary["events"] > 100
     record = load_record(result.run_dir)
-    assert len(record["plant_step"]) == 96 * 20 + 1
+    assert len(record["plant_step"]) == record.scenario.horizon_s * 20 + 1
     stale = int(record["netem_release"]["stale"].sum())
     assert ended_badly(result.summary, 0, stale) == []
 

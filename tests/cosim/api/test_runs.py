@@ -28,6 +28,26 @@ def test_a_run_gives_its_results(simulated: noack.Run) -> None:
     assert len(repr(simulated).splitlines()) < 10
 
 
+def test_a_run_of_several_loops_has_each_loop_as_a_run() -> None:
+    network = {"network.loss.probability": 0.5, "horizon_s": 1.0}
+    loops = [{"name": "fast", "count": 2}, {"name": "held", "mode": "zoh"}]
+    run = noack.simulate(noack.load("double_integrator", network | {"loops": loops}))
+    assert run.ok
+    assert "3 loops" in repr(run)
+    assert list(run.loops) == ["fast-1", "fast-2", "held"]
+    events = {name: one.summary["events"] for name, one in run.loops.items()}
+    assert events == {one["name"]: one["events"] for one in run.summary["loops"]}
+    assert sum(events.values()) == len(run.table("netem_packet"))
+    assert {claim["loop"] for claim in run.claims} == set(run.loops)
+    held = run.loops["held"]
+    assert held.scenario.mode == "zoh"
+    assert len(held.events()) == events["held"]
+    assert held.loops == {}
+    assert isinstance(run.plot("loops"), Figure)
+    with pytest.raises(noack.NoackError, match=r'take one of them, e\.g\. run\.loops\["fast-1"\]'):
+        run.samples()
+
+
 def test_a_run_is_replayed(simulated: noack.Run) -> None:
     assert simulated.replay().bit_exact
     assert simulated.fidelity().explained

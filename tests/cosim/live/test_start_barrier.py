@@ -8,7 +8,7 @@ import zenoh
 
 from cosim.live import coordinator
 from cosim.live.coordinator import Coordinator
-from noack.protocol.topology import ROLES
+from noack.protocol.topology import RECORDER, ROLES
 from tests.fuzz.parsers.ticket import _TICKET
 from tests.fuzz.plane import FakePlane, Query, Sample
 
@@ -25,18 +25,29 @@ def barrier(plane: FakePlane, monkeypatch: pytest.MonkeyPatch) -> Coordinator:
     return Coordinator(_TICKET)
 
 
-def ask(plane: FakePlane, barrier: Coordinator, what: str, instance: str = "one") -> Query:
-    hello: dict[str, Any] = {"pid": 1, "instance": instance, "address": ["127.0.0.1", 5]}
-    plane.put(what, query := Query(f"noack/0/{what}/sensor", json.dumps(hello).encode()))
+def ask(
+    plane: FakePlane,
+    barrier: Coordinator,
+    what: str,
+    instance: str = "one",
+    role: str = "sensor",
+) -> Query:
+    address = None if role == RECORDER else ["127.0.0.1", 5]
+    hello: dict[str, Any] = {"pid": 1, "instance": instance, "address": address}
+    plane.put(what, query := Query(f"noack/0/{what}/{role}", json.dumps(hello).encode()))
     barrier.poll()
     return query
 
 
-def lose(plane: FakePlane, barrier: Coordinator) -> None:
-    gone = Sample("noack/0/alive/sensor/one")
-    gone.kind = zenoh.SampleKind.DELETE  # type: ignore[assignment]
-    plane.put("alive", gone)
+def token(plane: FakePlane, barrier: Coordinator, kind: zenoh.SampleKind | None) -> None:
+    change = Sample("noack/0/alive/sensor/one")
+    change.kind = kind  # type: ignore[assignment]
+    plane.put("alive", change)
     barrier.poll()
+
+
+def lose(plane: FakePlane, barrier: Coordinator) -> None:
+    token(plane, barrier, zenoh.SampleKind.DELETE)
 
 
 def test_a_process_may_join_again_after_a_lost_connection(
@@ -75,3 +86,25 @@ def test_the_reason_for_an_end_is_the_reported_one(plane: FakePlane, barrier: Co
     plane.put("ended", Sample("noack/0/ended/netem/one", b"horizon"))
     barrier.poll()
     assert barrier.reported_failure("netem") is None
+
+
+def test_a_running_process_is_lost_only_if_its_connection_does_not_come_back(
+    plane: FakePlane, barrier: Coordinator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for role in ROLES:
+        ask(plane, barrier, "admit", role=role)
+        ask(plane, barrier, "join", role=role)
+    assert barrier.epoch_ns is not None
+    lose(plane, barrier)
+    assert barrier.failures() == {}
+    barrier.allow_restart("sensor", "stopped responding", dead=False)
+    assert ask(plane, barrier, "admit", "two").error == (
+        "cannot join: the sensor before it may still come back; try again in 8 s"
+    )
+    token(plane, barrier, None)
+    monkeypatch.setattr(coordinator, "AWAY_S", -1.0)
+    barrier.poll()
+    assert barrier.failures() == {}
+    lose(plane, barrier)
+    assert barrier.failures() == {"sensor": "sensor stopped responding"}
+    assert ask(plane, barrier, "admit", "two").error is None

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from noack.core.clock import RunClock
 from noack.protocol.machine_interface import Notice, Record
+from noack.runtime import real_time_loop
 from noack.runtime.real_time_loop import RowSink, run_loop
 
 PERIOD_NS = 1_000_000
@@ -258,6 +259,26 @@ class Late(Ticker):
     def on_timer(self, now_ns: int) -> Sequence[Notice]:
         self.late_ns.append(now_ns - self.served * PERIOD_NS)
         return super().on_timer(now_ns)
+
+
+class Slow(Late):
+    """Each step takes a millisecond."""
+
+    def on_timer(self, now_ns: int) -> Sequence[Notice]:
+        time.sleep(PERIOD_NS * 1e-9)
+        return super().on_timer(now_ns)
+
+
+@pytest.mark.parametrize("turns", [20, 0])
+def test_a_machine_that_is_late_at_its_end_catches_up_for_a_while(
+    always_readable: int, turns: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The computer did not run for ten seconds; its steps take two turns or more."""
+    monkeypatch.setattr(real_time_loop, "_TURNS_TO_CATCH_UP", turns)
+    clock, machine = RunClock(time.monotonic_ns() - 10**10), Slow()
+    channel = Flooded(always_readable, clock, machine)
+    late_ns = run_loop(machine, channel, clock, Log(), end_ns=1, stop=lambda: False)
+    assert (machine.served == STEPS) == (late_ns == 0) == (turns == 20)
 
 
 def test_deadlines_are_gathered_and_never_served_early(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,17 +7,17 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numba.extending import register_jitable
+from numba import njit
 from numpy.typing import NDArray
 
-from noack.core.code_cache import cache_folder, compiler
+from noack.core.code_cache import CALLED_BY_CODE, cache_folder, compiler
 
+COMPILED = compiler(cache_folder("tests", [Path(__file__)]))
+"""Its lock keeps two processes of the tests from compiling the same."""
+PART = njit(**CALLED_BY_CODE)
 Reals = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Steps = NDArray[np.int64]
-
-_whole = compiler(cache_folder("test_loops", [Path(__file__)]))
-"""Compiles a function with the parts that it calls; these need no interface to Python."""
 
 
 class Schedule(NamedTuple):
@@ -101,7 +101,7 @@ class Seen(NamedTuple):
     """(steps, runs) number of the newest update that has arrived."""
 
 
-@register_jitable
+@PART
 def add_product(total: Reals, v: Reals, matrix: Reals, first: int) -> None:
     """Add v M, of the rows of M from ``first`` on; v and the total have shapes (n, runs)."""
     for j in range(total.shape[0]):
@@ -111,7 +111,7 @@ def add_product(total: Reals, v: Reals, matrix: Reals, first: int) -> None:
                 total[j, run] += factor * v[i, run]
 
 
-@register_jitable
+@PART
 def distances(found: Reals, v: Reals, w: Reals, matrix: Reals) -> None:
     """Set ‖(v − w) M‖, (runs,); v and w have the shapes (n, runs)."""
     rest, found[:] = np.empty_like(found), 0.0
@@ -127,7 +127,7 @@ def distances(found: Reals, v: Reals, w: Reals, matrix: Reals) -> None:
         found[run] = np.sqrt(found[run])
 
 
-@_whole
+@COMPILED
 def follow(
     first: int, last: int, schedule: Schedule, own: Propagators, given: Given, state: State,
     seen: Seen, known: Reals, event: Flags,
@@ -169,7 +169,7 @@ def follow(
         _advance(step, schedule, own, given, state, u, has_input)
 
 
-@register_jitable
+@PART
 def _send(
     run: int, step: int, own: Propagators, given: Given, state: State, seen: Seen, estimate: Reals
 ) -> None:
@@ -191,7 +191,7 @@ def _send(
     state.events[run] = number + 1
 
 
-@register_jitable
+@PART
 def _deliver(slot: int, state: State) -> None:
     """Let the updates arrive that are due; an older one than the newest is discarded."""
     for run in range(len(state.newest)):
@@ -202,7 +202,7 @@ def _deliver(slot: int, state: State) -> None:
         state.arrives[slot, run] = 0
 
 
-@register_jitable
+@PART
 def _command(step: int, schedule: Schedule, own: Propagators, state: State) -> None:
     """Note the controller's command of this step."""
     if schedule.hold == 0 or step % schedule.hold == 0:
@@ -213,7 +213,7 @@ def _command(step: int, schedule: Schedule, own: Propagators, state: State) -> N
         state.commanded[step] = state.commanded[step - 1]
 
 
-@register_jitable
+@PART
 def _advance(
     step: int, schedule: Schedule, own: Propagators, given: Given, state: State, u: Reals,
     has_input: Flags,
@@ -247,7 +247,7 @@ def _advance(
         models[:] = moved
 
 
-@_whole
+@COMPILED
 def allow(lost: Flags, mansd: int, most: int, width: int, recovery: int) -> None:
     """Deliver what the guarantee does not allow to be lost, (runs, events), in place."""
     for run in range(lost.shape[0]):

@@ -5,17 +5,20 @@ exponential, and in a step with an event by its Taylor series; the event is foun
 Values just before an event count, too.
 """
 
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.linalg import expm
 
+from noack.core.code_cache import cache_folder, compiler
 from noack.core.linear_systems import Matrix, Vector
+from tests.noack.theory.compiled_loops import PART
 from tests.noack.theory.loops import STEPS, Flags, Reals, Steps, System
 
 _ORDER = 16
 _HALVINGS = 60
+_COMPILED = compiler(cache_folder("tests_continuous", [Path(__file__)]))
 
 
 class ContinuousTrace(NamedTuple):
@@ -56,7 +59,7 @@ def simulate_continuous_time(system: System, delivered: Flags, _: Steps) -> Cont
     return ContinuousTrace(*largest.T[..., None], float(shortest_s))
 
 
-@njit(cache=True)
+@PART
 def _series(F: Matrix, z: Vector) -> Matrix:  # pragma: no cover
     """The coefficients of e^{Fs} z, (order + 1, 3n)."""
     found = np.empty((_ORDER + 1, len(z)))
@@ -70,7 +73,7 @@ def _series(F: Matrix, z: Vector) -> Matrix:  # pragma: no cover
     return found
 
 
-@njit(cache=True)
+@PART
 def _at(series: Matrix, s: float) -> Vector:  # pragma: no cover
     found = series[_ORDER].copy()
     for k in range(_ORDER - 1, -1, -1):
@@ -78,7 +81,7 @@ def _at(series: Matrix, s: float) -> Vector:  # pragma: no cover
     return found
 
 
-@njit(cache=True)
+@PART
 def _size(signals: Matrix, first: int, last: int, z: Vector) -> float:  # pragma: no cover
     total = 0.0
     for row in range(first, last):
@@ -89,7 +92,7 @@ def _size(signals: Matrix, first: int, last: int, z: Vector) -> float:  # pragma
     return np.sqrt(total)
 
 
-@njit(cache=True)
+@_COMPILED
 def _follow(
     F: Matrix, leap: Matrix, signals: Matrix, rows: Steps, delivered: Flags, start: Vector,
     alpha: float, beta: float, step_s: float, steps: int,
