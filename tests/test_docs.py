@@ -1,11 +1,7 @@
-"""Run the documentation's commands and snippets, and compare its key tables with the code."""
+"""Compare the documentation's key tables with the code."""
 
 import json
 import re
-import shlex
-import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
@@ -13,7 +9,6 @@ from typing import Any, get_args
 import pytest
 from pydantic import BaseModel
 from typer.main import get_command
-from typer.testing import CliRunner
 
 from cosim.cli import app
 from cosim.studies.campaign.campaign_file import Axis, Campaign, Figure, Metrics, PairedComparison
@@ -30,126 +25,7 @@ from noack.impairments.constraints import CONSTRAINTS
 from noack.impairments.disciplines import DISCIPLINES
 from noack.impairments.kinds import IMPAIRMENTS
 from noack.impairments.loss_models import LOSS_MODELS
-
-ROOT = Path(__file__).parents[1]
-PAGES = (
-    "README.md", "docs/record.md", "docs/scenarios.md", "docs/paper.md", "docs/netem.md",
-    "docs/netem-programs.md", "docs/campaigns.md", "docs/design.md", "docs/plants.md",
-    "docs/library.md", "docs/command-line.md", "docs/howto.md", "docs/guarantees.md",
-    "docs/benchmarks.md", "docs/measure.md", "docs/capacity.md",
-)  # fmt: skip
-
-
-def blocks(page: str, language: str) -> list[str]:
-    text = (ROOT / page).read_text()
-    return re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
-
-
-def commands() -> Iterator[str]:
-    for page in PAGES:
-        for block in blocks(page, "sh"):
-            lines = (line.partition("#")[0].strip() for line in block.splitlines())
-            yield from (line.removeprefix(".venv/bin/") for line in filter(None, lines))
-
-
-@pytest.fixture(scope="module")
-def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the repository's files and a short run, in which commands can run."""
-    folder = tmp_path_factory.mktemp("docs")
-    (folder / "scenarios").symlink_to(ROOT / "scenarios")
-    (links,) = blocks("docs/netem.md", "toml")
-    (folder / "links.toml").write_text(links)
-    for code in [*blocks("docs/plants.md", "python"), *blocks("docs/plants.md", "toml")]:
-        if (named := re.match(r"# (\w+\.(?:py|toml))\n", code)) is not None:
-            (folder / named[1]).write_text(code)
-        elif code.startswith("import control"):  # this snippet writes the matrices file
-            subprocess.run([sys.executable, "-c", code], cwd=folder, check=True)
-    result = subprocess.run(
-        [
-            sys.executable, "-m", "cosim.cli", "run", "lane_following", "--json",
-            "--set", "ports={}", "--set", "horizon_s=2",
-        ],
-        cwd=folder, capture_output=True, text=True, check=False, timeout=250,
-    )  # fmt: skip
-    assert result.returncode == 0, result.stderr
-    for name in ("model", "hold"):  # two runs for `compare`, as commands run in any order
-        (folder / "runs" / name).mkdir()
-        (folder / "runs" / name / "latest").symlink_to((folder / "runs/latest").resolve())
-    return folder
-
-
-SHORTER = {
-    "simulate": ("--no-report", "--set", "horizon_s=4"),
-    "demo": ("--no-report",),
-    "run": ("--no-report",),
-    "adversary": ("--set", "horizon_s=2", "--nodes", "2000"),
-    "design": ("--draws", "100"),
-    "capacity": ("--draws", "1", "--loops", "2", "--set", "horizon_s=1"),
-    "margin": ("--no-period",),
-    "doctor": ("--seconds", "0.1"),
-}
-"""Arguments added to a command to shorten it; other tests cover reports and long runs."""
-
-
-def shorter(words: list[str]) -> list[str]:
-    more = SHORTER.get(words[0], ())
-    return [*words, *(more[:1] if "horizon_s" in " ".join(words) else more)]
-
-
-@pytest.mark.parametrize("command", sorted(set(commands())))
-def test_every_command_works(
-    command: str, run_folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    program, *words = shlex.split(command.partition(" > ")[0])
-    if program == "make":
-        # Running a make target could run this test again: check only that the target exists.
-        done = subprocess.run(
-            ["make", "--dry-run", *words], cwd=ROOT, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stderr
-        return
-    assert program == "noack"
-    if command in blocks("README.md", "sh")[-1]:
-        emulate(words, run_folder)
-        return
-    if "--listen" in words or "--links" in words:
-        words.insert(1, "--explain")  # the emulator does not start
-    monkeypatch.chdir(run_folder)
-    finished = CliRunner().invoke(app, shorter(words))
-    assert finished.exit_code == 0, finished.output
-    if "--json" in words:
-        json.loads(finished.stdout)
-
-
-def emulate(words: list[str], folder: Path) -> None:
-    """Start the network emulator, wait until it is ready, and end it as Ctrl-C does."""
-    plain = ["netem", "--engine", "plain", *words[1:]]  # needs no compilation
-    with subprocess.Popen(
-        [sys.executable, "-m", "cosim.cli", *plain], cwd=folder,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    ) as process:  # fmt: skip
-        assert process.stderr is not None
-        assert any("Ctrl-C ends" in line for line in process.stderr)
-        process.send_signal(signal.SIGINT)
-        _, stderr = process.communicate(timeout=250)
-    assert process.returncode == 0, stderr
-
-
-def snippets() -> list[str]:
-    """Return programs; a snippet that begins with a file name is a file instead."""
-    pages = ("docs/plants.md", "docs/record.md", "docs/library.md", "docs/howto.md")
-    found = [code for page in pages for code in blocks(page, "python")]
-    return [snippet for snippet in found if not snippet.startswith("#")]
-
-
-@pytest.mark.parametrize("snippet", snippets())
-def test_every_snippet_runs(
-    snippet: str, run_folder: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
-    monkeypatch.chdir(run_folder)
-    exec(compile(snippet, "snippet", "exec"), {"__name__": "__main__"})
-    assert capsys.readouterr().out.strip()
+from tests.pages import PAGES, ROOT, blocks
 
 
 def keys_of(section: type[BaseModel], prefix: str = "") -> Iterator[str]:

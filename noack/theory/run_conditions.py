@@ -18,8 +18,9 @@ def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> NetworkCond
     first step with an actuation from a tick at or after the update. The model state of an applied
     input ages until the step after it. At equal times, the plant's step comes before arrivals. If
     the network delay has no bound, four times its jitter is used; a run with a longer delay
-    violates the conditions. Lost and delayed actuations delay updates and make inputs older; of
-    predicted inputs, the plant applies the one whose time has come.
+    violates the conditions. Lost and delayed actuations delay updates and make inputs older; if
+    their losses have no bound, an input may be as old as the run. Of predicted inputs, the plant
+    applies the one whose time has come.
     """
     step_ns, tick_ns = resolved.timing.plant_period_ns, resolved.timing.controller_period_ns
     phase_ns, sample_ns = (
@@ -37,7 +38,7 @@ def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> NetworkCond
         wait_ns = under_way_ns + tick_ns - 1
     gap_ns = resolved.timing.actuation_gap_ns
     if gap_ns is None:
-        raise ValueError("the age of the applied input has no bound")
+        gap_ns = resolved.timing.horizon_ns
     delay_ns, first_ns = (
         ((t_ns + gap_ns) // step_ns + 1) * step_ns for t_ns in (wait_ns, phase_ns)
     )

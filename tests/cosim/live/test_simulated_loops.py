@@ -216,7 +216,8 @@ def test_a_loop_that_diverges_is_named_and_the_others_go_on(tmp_path: Path) -> N
     path.unlink()
     shown = noack("summary", path.parent).stdout.splitlines()
     assert json.loads(path.read_text()) == summary
-    assert shown[1] == "claims of all loops: none"  # none covers a network of actuations
+    # Certificates do not cover actuations that are lost without a bound; other claims are judged.
+    assert re.match(r"claims of all loops: \d+ held", shown[1])
     (row,) = [line for line in shown if line.startswith(" wild")]
     assert written(summary["loops"][2]["sup_e_c_norm"]) in row
     sent = sum(one["actuations"]["sent"] for one in summary["loops"])

@@ -1,0 +1,84 @@
+"""Run the commands of the documentation."""
+
+import json
+import shlex
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from cosim.cli import app
+from tests.pages import PAGES, ROOT, blocks, fill
+
+
+def commands() -> Iterator[str]:
+    for page in PAGES:
+        for block in blocks(page, "sh"):
+            lines = (line.partition("#")[0].strip() for line in block.splitlines())
+            yield from (line.removeprefix(".venv/bin/") for line in filter(None, lines))
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return fill(tmp_path_factory.mktemp("docs"))
+
+
+SHORTER = {
+    "simulate": ("--no-report", "--set", "horizon_s=4"),
+    "demo": ("--no-report",),
+    "run": ("--no-report",),
+    "adversary": ("--set", "horizon_s=2", "--nodes", "2000"),
+    "design": ("--draws", "100"),
+    "capacity": ("--draws", "1", "--loops", "2", "--set", "horizon_s=1"),
+    "margin": ("--no-period",),
+    "doctor": ("--seconds", "0.1"),
+}
+"""Arguments added to a command to shorten it; other tests cover reports and long runs."""
+
+
+def shorter(words: list[str]) -> list[str]:
+    more = SHORTER.get(words[0], ())
+    return [*words, *(more[:1] if "horizon_s" in " ".join(words) else more)]
+
+
+@pytest.mark.parametrize("command", sorted(set(commands())))
+def test_every_command_works(
+    command: str, run_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program, *words = shlex.split(command.partition(" > ")[0])
+    if program == "make":
+        # Running a make target could run this test again: check only that the target exists.
+        done = subprocess.run(
+            ["make", "--dry-run", *words], cwd=ROOT, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        return
+    assert program == "noack"
+    if command in blocks("README.md", "sh")[-1]:
+        emulate(words, run_folder)
+        return
+    if "--listen" in words or "--links" in words:
+        words.insert(1, "--explain")  # the emulator does not start
+    monkeypatch.chdir(run_folder)
+    finished = CliRunner().invoke(app, shorter(words))
+    assert finished.exit_code == 0, finished.output
+    if "--json" in words:
+        json.loads(finished.stdout)
+
+
+def emulate(words: list[str], folder: Path) -> None:
+    """Start the network emulator, wait until it is ready, and end it as Ctrl-C does."""
+    plain = ["netem", "--engine", "plain", *words[1:]]  # needs no compilation
+    with subprocess.Popen(
+        [sys.executable, "-m", "cosim.cli", *plain], cwd=folder,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        assert process.stderr is not None
+        assert any("Ctrl-C ends" in line for line in process.stderr)
+        process.send_signal(signal.SIGINT)
+        _, stderr = process.communicate(timeout=250)
+    assert process.returncode == 0, stderr
