@@ -5,7 +5,7 @@ over the address of the one before it, and numbers its messages above all earlie
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import zenoh
@@ -23,7 +23,7 @@ from noack.runtime.control_messages import (
 )
 from noack.runtime.control_plane import ControlPlane
 from noack.runtime.join_ticket import Ticket
-from noack.runtime.life_cycle import AWAY_S, HORIZON, Event, LifeCycle, Side, State
+from noack.runtime.life_cycle import AWAY_S, HORIZON, LAUNCHED_AWAY_S, Event, LifeCycle, Side, State
 
 _START_DELAY_NS = 100_000_000
 """From the last arrival to the common epoch: time for the message to reach all processes."""
@@ -58,11 +58,16 @@ class _Member(LifeCycle):
 class Coordinator:
     """Admission, start barrier, liveliness and stop of one run.
 
+    Args:
+        ticket: the run's ticket.
+        launched: roles of the processes that the launcher has started.
+
     Raises:
         PeerError: the endpoint cannot be listened on.
     """
 
-    def __init__(self, ticket: Ticket) -> None:
+    def __init__(self, ticket: Ticket, launched: Collection[str] = ()) -> None:
+        self._launched = launched
         self.plane = ControlPlane(ticket, COORDINATOR, listen=True)
         session, key = self.plane.session, self.plane.key
         self._admissions = session.declare_queryable(key("admit", "*"), FifoChannel(64))
@@ -108,7 +113,7 @@ class Coordinator:
             vanished = token.kind == zenoh.SampleKind.DELETE
             self._apply(token.key_expr, Event.DISCONNECT if vanished else Event.RECONNECT)
         for member in self._members.values():
-            if member.state is State.UNREACHABLE and member.age_s() > AWAY_S:
+            if member.state is State.UNREACHABLE and self._away_s(member) < 0:
                 member.apply(Event.TIME_OUT)
         if self._clock is None:
             self._clear_barrier()
@@ -194,6 +199,11 @@ class Coordinator:
     def _apply(self, key_expr: object, event: Event, reason: str | None = None) -> None:
         if (member := self._admitted.get(_sender(key_expr))) is not None:
             member.apply(event, reason)
+
+    def _away_s(self, member: _Member) -> float:
+        """For how long an unreachable process may still come back, in seconds."""
+        most_s = LAUNCHED_AWAY_S if member.role in self._launched else AWAY_S
+        return most_s - member.age_s()
 
     def _clear_barrier(self) -> None:
         """Before the start: free the place of a process that has left the barrier."""
@@ -281,8 +291,10 @@ class Coordinator:
         """
         before = self._members.get(role)
         if before is not None and before.state is State.UNREACHABLE:
-            left = f"{AWAY_S - before.age_s():.0f} s"
-            raise PeerError(f"the {role} before it may still come back; try again in {left}")
+            left_s = self._away_s(before)
+            raise PeerError(
+                f"the {role} before it may still come back; try again in {left_s:.0f} s"
+            )
         if before is not None and not before.is_over:
             raise PeerError(f"another {role} is in this run already")
         return before

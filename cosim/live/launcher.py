@@ -114,7 +114,7 @@ def launch(
         signals = stack.enter_context(Signals().handled())
         stack.enter_context(active_run(run_dir))
         ending = stack.enter_context(EndingFile(run_dir))
-        coordinator = Coordinator(ticket)
+        coordinator = Coordinator(ticket, spawn)
         stack.callback(coordinator.close)
         if session is not None:
             _publish_session(stack, ticket, session)

@@ -9,7 +9,7 @@ from zenoh.handlers import RingChannel
 
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.control_plane import ControlPlane
-from noack.runtime.life_cycle import AWAY_S
+from noack.runtime.life_cycle import LAUNCHED_AWAY_S
 
 _DISCOVERY_S = 5.0
 """By then a restarted recorder has received the tokens of all running processes."""
@@ -49,7 +49,7 @@ class ProcessTokens:
         if self._plane.coordinator_gone():
             self._connected_s = now_s
             return False
-        away_s = 0.0 if stopping else AWAY_S
+        away_s = 0.0 if stopping else LAUNCHED_AWAY_S
         discovered = self._restarted and now_s - self._began_s > _DISCOVERY_S
         return all(
             discovered if not known else all(

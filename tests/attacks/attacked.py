@@ -31,7 +31,7 @@ from noack.runtime.join_ticket import Ticket, loads
 from tests.attacks.kinds import Target
 from tests.attacks.sender import Plan, Sent, carry_out
 
-PATIENCE_S = 150.0
+PATIENCE_S = 300.0
 _ATTEMPTS = 3
 
 

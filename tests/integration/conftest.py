@@ -19,7 +19,7 @@ from benchmarks.soak.watch import is_of, udp_port
 EPHEMERAL = ("--set", "ports={}")
 BARE = (*EPHEMERAL, "--no-report")
 """Without a report; tests that need one add ``--report``."""
-PATIENCE_S = 150.0
+PATIENCE_S = 300.0
 
 
 def noack_command(*arguments: str) -> list[str]:

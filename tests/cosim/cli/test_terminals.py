@@ -17,7 +17,7 @@ from cosim.cli.program import patient_stream
 
 NOACK = (sys.executable, "-m", "cosim.cli")
 ROOT = Path(__file__).parents[3]
-PATIENCE_S = 150.0
+PATIENCE_S = 300.0
 SIMULATE = ("simulate", "double_integrator", "--set", "horizon_s=1", "--no-report")
 COMMANDS = (("--help",), ("certify", "--help"), ("check", "lane_following"), SIMULATE)
 COLOUR = re.compile(r"\x1b\[[0-9;]*\b(3[0-8]|4[0-8]|9[0-7]|10[0-7])[0-9;]*m")
