@@ -291,10 +291,8 @@ class Coordinator:
         """
         before = self._members.get(role)
         if before is not None and before.state is State.UNREACHABLE:
-            left_s = self._away_s(before)
-            raise PeerError(
-                f"the {role} before it may still come back; try again in {left_s:.0f} s"
-            )
+            left = f"{self._away_s(before):.0f} s"
+            raise PeerError(f"the {role} before it may still come back; try again in {left}")
         if before is not None and not before.is_over:
             raise PeerError(f"another {role} is in this run already")
         return before
