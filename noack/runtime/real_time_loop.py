@@ -122,7 +122,8 @@ def run_loop(
     while the machine is late: the computer may not have run for a while.
 
     Returns:
-        How late the machine's next deadline was at the end, in ns; 0 if it was not late.
+        How late the machine's next deadline was at the end, in ns; 0 if it was not late, or if that
+        deadline is after ``end_ns``.
     """
     kind = _SelfDrivenLoop if isinstance(machine, SelfDrivenMachine) else _Loop
     loop: _Loop[T] = kind(machine, channel, clock, telemetry, spin_us * 1e-6, news)
@@ -136,6 +137,8 @@ def run_loop(
         if housekeeping_is_due():
             loop.do_housekeeping()
             now_ns, deadline_ns = clock.now_ns(), machine.next_deadline_ns()
+            if end_ns is not None and deadline_ns is not None and deadline_ns > end_ns:
+                deadline_ns = None  # not part of the run
             late_ns = 0 if deadline_ns is None else max(now_ns - deadline_ns, 0)
             turns += end_ns is not None and now_ns >= end_ns
             if stop() or turns > (_TURNS_TO_CATCH_UP if late_ns else turns_after_end):

@@ -277,8 +277,19 @@ def test_a_machine_that_is_late_at_its_end_catches_up_for_a_while(
     monkeypatch.setattr(real_time_loop, "_TURNS_TO_CATCH_UP", turns)
     clock, machine = RunClock(time.monotonic_ns() - 10**10), Slow()
     channel = Flooded(always_readable, clock, machine)
-    late_ns = run_loop(machine, channel, clock, Log(), end_ns=1, stop=lambda: False)
+    end_ns = STEPS * PERIOD_NS
+    late_ns = run_loop(machine, channel, clock, Log(), end_ns=end_ns, stop=lambda: False)
     assert (machine.served == STEPS) == (late_ns == 0) == (turns == 20)
+
+
+def test_a_deadline_after_the_end_is_not_late(always_readable: int) -> None:
+    """The emulator may have packets in its queue for times after the end."""
+    clock, machine = RunClock(time.monotonic_ns() - 10**10), Slow()
+    machine.served = 1  # the next deadline is after the first period, which is the end
+    channel = Flooded(always_readable, clock, machine)
+    late_ns = run_loop(machine, channel, clock, Log(), end_ns=1, stop=lambda: False)
+    assert late_ns == 0
+    assert machine.served < STEPS
 
 
 def test_deadlines_are_gathered_and_never_served_early(monkeypatch: pytest.MonkeyPatch) -> None:
