@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Container
+from collections.abc import Container, Mapping
 
 import zenoh
 from zenoh.handlers import RingChannel
@@ -43,7 +43,8 @@ class ProcessTokens:
         """Whether each process has reported its end, or is gone.
 
         A token may vanish because a busy machine broke a connection, also the recorder's own. The
-        process is gone if it does not come back. A run that is ``stopping`` does not wait for it.
+        process is gone if it does not come back, or if one that replaced it has reported. A run
+        that is ``stopping`` does not wait for it.
         """
         now_s = time.monotonic()
         if self._plane.coordinator_gone():
@@ -51,10 +52,13 @@ class ProcessTokens:
             return False
         away_s = 0.0 if stopping else LAUNCHED_AWAY_S
         discovered = self._restarted and now_s - self._began_s > _DISCOVERY_S
-        return all(
-            discovered if not known else all(
-                instance in reported or now_s - max(vanished_s, self._connected_s) > away_s
-                for instance, vanished_s in known.items()
-            )
-            for known in self._vanished_s.values()
-        )  # fmt: skip
+
+        def is_done(known: Mapping[str, float]) -> bool:
+            if not known:
+                return discovered
+            waiting = [vanished for one, vanished in known.items() if one not in reported]
+            if len(waiting) < len(known):
+                return math.inf not in waiting
+            return all(now_s - max(vanished, self._connected_s) > away_s for vanished in waiting)
+
+        return all(map(is_done, self._vanished_s.values()))

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import zenoh
 
 from cosim.live import process_tokens
 from cosim.live.telemetry_recorder import Recorder
@@ -66,12 +67,17 @@ class Run:
         self.send(NOTICES, 0, json.dumps(line).encode(), role, generation)
 
     def report(
-        self, role: str, generation: int = 0, stored: dict[str, Any] | None = None, **rows: int
+        self,
+        role: str,
+        generation: int = 0,
+        stored: dict[str, Any] | None = None,
+        instance: str = "",
+        **rows: int,
     ) -> Any:
         tables = {table: 0 for table in OWNER if OWNER[table] == role}
         report = {
             "ended": "horizon", "channel": {}, "rows": tables | {NOTICES: 0} | rows,
-            "generation": generation, "instance": role, "stored": stored or {},
+            "generation": generation, "instance": instance or role, "stored": stored or {},
         }  # fmt: skip
         query = Query(f"report/{role}", json.dumps(report).encode())
         self.plane.put("report", query)
@@ -131,6 +137,20 @@ def test_a_restarted_recorder_does_not_wait_for_ended_processes(
     monkeypatch.setattr(process_tokens, "_DISCOVERY_S", -1.0)
     assert not run.recorder.finished
     assert run.report("plant") == {}
+    assert run.recorder.finished
+
+
+def test_a_process_is_gone_once_the_one_that_replaced_it_has_reported(run: Run) -> None:
+    gone = Sample("noack/0/alive/plant/plant")
+    gone.kind = zenoh.SampleKind.DELETE  # type: ignore[assignment]
+    run.plane.put("alive", gone)
+    for role in set(LOOP_ROLES) - {"plant"}:
+        assert run.report(role) == {}
+    assert not run.recorder.finished  # it may come back
+    run.plane.put("alive", Sample("noack/0/alive/plant/plant2"))
+    run.recorder.poll()
+    assert not run.recorder.finished
+    assert run.report("plant", generation=1, instance="plant2") == {}
     assert run.recorder.finished
 
 
