@@ -88,10 +88,12 @@ class Run:
         The run of all loops has the ``tables``, the ``plot`` and the ``replay`` of the network that
         they share; ``samples``, ``events`` and ``fidelity`` are of one loop.
         """
-        if "loops" not in self.summary:  # computing it finalises the loops, too
+        from cosim.analysis.loops_summary import has_loops
+
+        if not has_loops(self.summary):  # computing it finalises the loops, too
             return {}
         folders = loop_directories(self.directory, self._record.scenario)
-        return {folder.name: Run(folder, partial(_reopen, self, folder)) for folder in folders}
+        return {one.name: Run(one, partial(_reopen_loop, one, self)) for one in folders}
 
     @property
     def scenario(self) -> Scenario:
@@ -246,11 +248,10 @@ class Run:
         return as_html(run_facts(self))
 
 
-def _reopen(parent: Run, folder: Path) -> "Outcome":
-    """Return the outcome of a loop; ``parent`` keeps a temporary folder."""
+def _reopen_loop(folder: Path, _: Run) -> "Outcome":
+    """Return the outcome of a loop; the run of all loops holds their temporary folder."""
     from cosim.live.finalize import reopen
 
-    parent.summary  # noqa: B018  # the loops are finalised with it
     return reopen(folder)
 
 

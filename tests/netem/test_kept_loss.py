@@ -39,7 +39,7 @@ def test_the_realised_loss_is_the_asked_one(decide: Any, words: str) -> None:
 
 def test_the_rate_is_continuous_with_a_correlation() -> None:
     """The chain of a correlation has states that hardly ever occur."""
-    words = "loss {p}% 50% mansd 2 atmost 3 in 7 corrupt 5%"
+    words = "loss {p}% 50% mansd 3 atmost 3 in 10 corrupt 5%"
     rates = [expected_loss(settings_of(words.format(p=p))).rate or 0.0 for p in range(0, 101, 5)]
     steps = np.diff(rates)
     assert (steps > 0).all()
