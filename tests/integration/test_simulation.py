@@ -1,7 +1,8 @@
 """A live run and a simulated run of the same scenario have the same events, fates and states.
 
-The steps are 50 ms long, so only a stall of 25 ms changes the order of events. After such a stall
-the runs differ. The test compares them up to the stall and repeats a live run with an early stall.
+The steps are 200 ms long, so only a stall of 100 ms changes the order of events. After such a
+stall the runs differ. The test compares them up to the stall and repeats a live run with an early
+stall.
 """
 
 import subprocess
@@ -23,8 +24,9 @@ from noack.protocol.record_tables import (
 )
 from tests.integration.conftest import PATIENCE_S, noack_command, run_scenario, settings
 
-HORIZON_S = 2.0
-ENOUGH_S = 1.0
+RATE_HZ = 5.0
+HORIZON_S = 8.0
+ENOUGH_S = 4.0
 ATTEMPTS = 4
 SAME = {
     PLANT_STEP: ("input", "sequence", "t_ns", "actuation"),
@@ -52,6 +54,7 @@ def in_turn_until_ns(live: RunRecord, simulated: RunRecord) -> int:
     first_ns = simulated.scenario.timing.horizon_ns + 1
     for table, columns in (
         (PLANT_STEP, ("input", "actuation")),
+        (PLANT_ACTUATION, ("input",)),
         (CONTROLLER_STEP, ("input",)),
         (CONTROLLER_DELIVERY, ("input",)),
     ):
@@ -66,8 +69,8 @@ def in_turn_until_ns(live: RunRecord, simulated: RunRecord) -> int:
 def test_a_live_run_agrees_with_the_simulated_run(tmp_path: Path) -> None:
     values = {
         "horizon_s": HORIZON_S,
-        "plant__rate_hz": 20.0,
-        "controller__rate_hz": 20.0,
+        "plant__rate_hz": RATE_HZ,
+        "controller__rate_hz": RATE_HZ,
         "trigger__beta": 0.02,
         "network__loss__probability": 0.6,
         "network__initial_sync": "known_state",
