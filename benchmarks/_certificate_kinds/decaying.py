@@ -12,7 +12,7 @@ from itertools import product
 import numpy as np
 
 from benchmarks._certificate_kinds import Bounds, Broken, Kind, Observed
-from noack.theory.certificate import Constants, VoidError
+from noack.theory.certificate_terms import Constants, VoidError
 from noack.theory.enclosure import NotDecayingError
 from tests.noack.theory.broken_certificates import MUTANTS
 from tests.noack.theory.loops import (

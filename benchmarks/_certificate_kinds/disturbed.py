@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 
 from benchmarks._certificate_kinds import Bounds, Broken, Kind, Observed
-from noack.theory.certificate import VoidError
+from noack.theory.certificate_terms import VoidError
 from noack.theory.enclosure import NotDecayingError
 from tests.noack.theory.disturbed_loops import (
     BROKEN,

@@ -12,7 +12,7 @@ import numpy as np
 from benchmarks._certificate_kinds import Bounds, Broken, Kind, Observed
 from benchmarks._certificate_kinds.decaying import search
 from noack.config.scenario import Scenario
-from noack.theory.certificate import NetworkConditions
+from noack.theory.certificate_terms import NetworkConditions
 from noack.theory.certified_bounds import ScenarioCertificate
 from noack.theory.scenario_certificates import certify
 from tests.noack.theory.broken_policies import BROKEN_POLICIES

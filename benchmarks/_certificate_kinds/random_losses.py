@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks._certificate_kinds import Bounds, Broken, Kind, Observed
-from noack.theory.certificate import VoidError
+from noack.theory.certificate_terms import VoidError
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.gains import PlantGains
 from noack.theory.random_losses import moments

@@ -28,7 +28,7 @@ from cosim.analysis.claims.run_evidence import scheduled_certificates
 from cosim.measurement.loss_bursts import outcomes
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
-from noack.theory.certificate import NetworkConditions
+from noack.theory.certificate_terms import NetworkConditions
 from noack.theory.run_conditions import allowed_conditions, network_delay_ns
 from noack.traces.packet_trace import PacketTrace
 

@@ -16,7 +16,7 @@ from noack.config.state_estimation import SteadyState, steady_state
 from noack.config.theory_coverage import UNCERTIFIED_ACKNOWLEDGEMENTS
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, spectral_abscissa
-from noack.theory.certificate import Constants, NetworkConditions
+from noack.theory.certificate_terms import Constants, NetworkConditions
 from noack.theory.persistent_causes import normal_bounds
 from noack.theory.run_conditions import certified_delay_s
 

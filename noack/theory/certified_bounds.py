@@ -9,7 +9,7 @@ import numpy as np
 
 from noack.core.linear_systems import Matrix
 from noack.theory.assumptions import Assumption
-from noack.theory.certificate import Constants, NetworkConditions
+from noack.theory.certificate_terms import Constants, NetworkConditions
 
 OWN_PLANT = "the scenario's plant"
 BOX = "every plant of the uncertainty box"

@@ -15,7 +15,8 @@ import numpy as np
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix
-from noack.theory.certificate import Constants, NetworkConditions, Part, VoidError, solve_sum
+from noack.theory.certificate import solve_sum
+from noack.theory.certificate_terms import Constants, NetworkConditions, Part, VoidError
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.error_growth import TriggerBound
 from noack.theory.forcing import Forcing

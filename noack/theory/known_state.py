@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix, Vector
-from noack.theory.certificate import Constants
+from noack.theory.certificate_terms import Constants
 from noack.theory.certified_bounds import OWN_PLANT, ScenarioCertificate
 from noack.theory.enclosure import KernelBounds, response
 from noack.theory.gains import Output, PlantGains, error_gains

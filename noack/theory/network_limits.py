@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from noack.theory.certificate import NetworkConditions
+from noack.theory.certificate_terms import NetworkConditions
 from noack.theory.scenario_certificates import CertificateScope
 
 MOST_S = 10.0

@@ -23,7 +23,7 @@ from noack.config.scenario import Scenario
 from noack.config.state_estimation import assumed_model
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, discretise
-from noack.theory.certificate import EstimationBound
+from noack.theory.certificate_terms import EstimationBound
 from noack.theory.contraction import largest_gains, spectral_norm, times
 from noack.theory.enclosure import NotDecayingError, factors
 from noack.theory.forcing import Forcing

@@ -24,7 +24,7 @@ import numpy as np
 
 from noack.core.linear_systems import Vector
 from noack.impairments.loss_process import LossProcess
-from noack.theory.certificate import NetworkConditions, VoidError
+from noack.theory.certificate_terms import NetworkConditions, VoidError
 from noack.theory.enclosure import KernelBounds, NotDecayingError, response, response_until
 from noack.theory.gains import ErrorGains, Output, PlantGains
 from noack.theory.nonnegative_system import solve_inequalities

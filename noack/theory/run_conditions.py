@@ -8,7 +8,7 @@ from noack.core.clock import NS_PER_S
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.loss_process import loss_process
 from noack.impairments.markov_chain import NotPredictableError
-from noack.theory.certificate import NetworkConditions
+from noack.theory.certificate_terms import NetworkConditions
 
 
 def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> NetworkConditions:

@@ -14,12 +14,8 @@ from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.settings.matrices import Rows
 from noack.theory.assumptions import below, certificate_assumptions
 from noack.theory.box import BoxGains
-from noack.theory.certificate import (
-    Constants,
-    NetworkConditions,
-    VoidError,
-    solve,
-)
+from noack.theory.certificate import solve
+from noack.theory.certificate_terms import Constants, NetworkConditions, VoidError
 from noack.theory.certified_bounds import BOX, OWN_PLANT, ScenarioCertificate
 from noack.theory.disturbed_certificate import DisturbedCertificate, PlantAt
 from noack.theory.enclosure import NotDecayingError

@@ -43,7 +43,7 @@ _LEAST_SHARE = 1e-6
 
 
 class SharpenedBounds(NamedTuple):
-    """Bounds of all times; see :class:`noack.theory.certificate.Constants`."""
+    """Bounds of all times; see :class:`noack.theory.certificate_terms.Constants`."""
 
     input_error: float
     state: float

@@ -15,13 +15,8 @@ from typing import TypeVar
 import numpy as np
 
 from noack.core.linear_systems import Vector
-from noack.theory.certificate import (
-    Constants,
-    NetworkConditions,
-    Part,
-    VoidError,
-    solve_sum,
-)
+from noack.theory.certificate import solve_sum
+from noack.theory.certificate_terms import Constants, NetworkConditions, Part, VoidError
 from noack.theory.enclosure import NotDecayingError
 
 _RATES = (0.05, 0.2, 0.4, 0.7)

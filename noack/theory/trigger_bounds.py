@@ -17,7 +17,7 @@ import numpy as np
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
 from noack.core.number_format import number
-from noack.theory.certificate import NetworkConditions, VoidError
+from noack.theory.certificate_terms import NetworkConditions, VoidError
 from noack.theory.error_growth import TriggerBound
 from noack.trigger.error_promise import ErrorPromise, error_promise
 from noack.trigger.trigger_rule import TriggerRule

@@ -21,7 +21,7 @@ from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.loss_process import LossProcess, loss_process
 from noack.impairments.markov_chain import NotPredictableError
 from noack.theory.assumptions import below
-from noack.theory.certificate import NetworkConditions, VoidError
+from noack.theory.certificate_terms import NetworkConditions, VoidError
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.gains import PlantGains, error_gains
 from noack.theory.random_losses import Moments, moment_at_events, moments

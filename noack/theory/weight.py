@@ -17,7 +17,8 @@ import numpy as np
 
 from noack.config.resolution import LoopMatrices
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
-from noack.theory.certificate import NetworkConditions, VoidError, solve
+from noack.theory.certificate import solve
+from noack.theory.certificate_terms import NetworkConditions, VoidError
 from noack.theory.contraction import Stack, product, spectral_norms
 from noack.theory.enclosure import KernelBounds, NotDecayingError, response
 from noack.theory.error_growth import TriggerBound

@@ -15,7 +15,7 @@ from cosim.analysis.adversary.search_nodes import Pattern
 from noack.config.scenario import Scenario
 from noack.core.number_format import number
 from noack.impairments.loss_guarantee import outcome_letters
-from noack.theory.certificate import Constants
+from noack.theory.certificate_terms import Constants
 from noack.theory.certified_bounds import ScenarioCertificate
 
 _BREACH = 1 + 1e-9

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from noack.config.scenario import Scenario
 from noack.impairments.loss_guarantee import LongestBurst, LossRule
-from noack.theory.certificate import NetworkConditions
+from noack.theory.certificate_terms import NetworkConditions
 from noack.theory.run_conditions import ideal_conditions
 
 _TOLERANCE_S = 1e-9
@@ -110,7 +110,7 @@ class AssumptionViolation(NamedTuple):
 
 
 class ObservedConditions(NamedTuple):
-    """The conditions of :class:`noack.theory.certificate.NetworkConditions`, as observed."""
+    """The conditions of :class:`noack.theory.certificate_terms.NetworkConditions`, as observed."""
 
     losses: PacketLosses
     """Updates that the controller never received, or received too late."""

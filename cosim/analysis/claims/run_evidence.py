@@ -29,7 +29,7 @@ from noack.config.resolution import policy_of
 from noack.config.scenario import Scenario
 from noack.protocol.record_tables import NO_SEQUENCE
 from noack.protocol.topology import LOOP_ROLES
-from noack.theory.certificate import NetworkConditions
+from noack.theory.certificate_terms import NetworkConditions
 from noack.theory.certified_bounds import ScenarioCertificate
 from noack.theory.error_bounds import ErrorMonitor
 from noack.theory.known_state import KnownStateBounds, known_state_bounds

@@ -13,7 +13,7 @@ from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.config.sections.run_sections import SeedsSection
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
-from noack.theory.certificate import Constants
+from noack.theory.certificate_terms import Constants
 from noack.theory.paper_bounds import theorem_2
 from noack.theory.run_conditions import ideal_conditions
 from noack.theory.scenario_certificates import certify

@@ -24,7 +24,7 @@ from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
 from noack.core.errors import CallerError
 from noack.theory.assumptions import AssumptionStatus
-from noack.theory.certificate import Constants
+from noack.theory.certificate_terms import Constants
 from noack.theory.certified_bounds import ScenarioCertificate
 from noack.theory.run_conditions import ideal_conditions
 from noack.theory.scenario_certificates import certify_box, outside_box

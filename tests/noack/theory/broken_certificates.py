@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from noack.theory.certificate import Constants
+from noack.theory.certificate_terms import Constants
 from noack.theory.enclosure import constant_kernel
 from noack.theory.gains import Coefficients, ErrorGains, Growth, Output, PlantGains
 from tests.noack.theory.loops import System

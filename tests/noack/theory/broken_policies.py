@@ -7,7 +7,7 @@ from unittest.mock import patch
 
 from noack.config.scenario import Scenario
 from noack.theory import scenario_certificates
-from noack.theory.certificate import NetworkConditions
+from noack.theory.certificate_terms import NetworkConditions
 from noack.theory.certified_bounds import ScenarioCertificate
 from noack.theory.error_growth import TriggerBound
 from noack.theory.scenario_certificates import certify, trigger_bounds

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import expm
 
-from noack.theory.certificate import Constants, EstimationBound, Part
+from noack.theory.certificate_terms import Constants, EstimationBound, Part
 from noack.theory.error_growth import TriggerBound
 from noack.theory.forcing import Forcing
 from noack.theory.gains import ErrorGains, Growth, PlantGains

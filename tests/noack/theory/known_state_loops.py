@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.linalg import expm
 
-from noack.theory.certificate import Constants
+from noack.theory.certificate_terms import Constants
 from noack.theory.gains import Output
 from noack.theory.known_state import KnownStateBounds, KnownStatePart
 from tests.noack.theory.disturbed_loops import DisturbedLoop, random_disturbed_loop

@@ -22,7 +22,8 @@ from noack.impairments.loss_guarantee import (
     LossGuarantee,
     LossRule,
 )
-from noack.theory.certificate import Constants, NetworkConditions, VoidError, solve
+from noack.theory.certificate import solve
+from noack.theory.certificate_terms import Constants, NetworkConditions, VoidError
 from noack.theory.error_growth import TriggerBound
 from noack.theory.gains import ErrorGains, PlantGains
 from tests.noack.theory.compiled_loops import (

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.box import BoxGains
-from noack.theory.certificate import Constants, NetworkConditions, VoidError, solve
+from noack.theory.certificate import solve
+from noack.theory.certificate_terms import Constants, NetworkConditions, VoidError
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.error_growth import TriggerBound
 from noack.theory.gains import Coefficients, Output, PlantGains

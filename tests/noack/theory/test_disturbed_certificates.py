@@ -9,7 +9,7 @@ import pytest
 from noack.config.resolution import resolve
 from noack.config.scenario_file import load
 from noack.theory.box import BoxGains
-from noack.theory.certificate import Part, VoidError
+from noack.theory.certificate_terms import Part, VoidError
 from noack.theory.certified_bounds import ScenarioCertificate
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.error_growth import TriggerBound

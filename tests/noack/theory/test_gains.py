@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix
-from noack.theory.certificate import NetworkConditions
+from noack.theory.certificate_terms import NetworkConditions
 from noack.theory.error_growth import first_passage_s
 from noack.theory.gains import Output
 from tests.noack.theory.loops import SEARCH, System, certified_or_skipped, systems
@@ -158,7 +158,7 @@ def test_growth_between_two_tests(system: System, reach: float) -> None:
 @settings(SOME)
 @given(systems())
 def test_the_constants_solve_the_inequalities(system: System) -> None:
-    """Each bound satisfies its equation in the head of certificate.py with equality.
+    """Each bound satisfies its equation in the head of error_inequalities.py with equality.
 
     Without windows, Γ_C is gain_C D_K.
     """

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from scipy.linalg import expm
 
-from noack.theory.certificate import Constants
+from noack.theory.certificate_terms import Constants
 from noack.theory.enclosure import response
 from noack.theory.gains import ErrorGains, PlantGains
 from noack.theory.known_state import KnownStateBounds, KnownStatePart, integral_until

@@ -13,7 +13,8 @@ from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix
 from noack.impairments.loss_guarantee import LongestBurst, LossesInWindow, LossWindow
-from noack.theory.certificate import NetworkConditions, solve
+from noack.theory.certificate import solve
+from noack.theory.certificate_terms import NetworkConditions
 from noack.theory.error_growth import TriggerBound
 from noack.theory.gains import ErrorGains, Output, PlantGains
 from noack.theory.loss_accumulation import LossAccumulation

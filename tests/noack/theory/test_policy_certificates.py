@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from noack.config.resolution import policy_of, resolve
 from noack.config.scenario_file import load
-from noack.theory.certificate import NetworkConditions
+from noack.theory.certificate_terms import NetworkConditions
 from noack.theory.known_state import known_state_bounds
 from noack.theory.run_conditions import allowed_conditions
 from noack.theory.scenario_certificates import certify

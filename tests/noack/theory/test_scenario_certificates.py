@@ -20,7 +20,7 @@ from noack.config.scenario import Scenario
 from noack.config.scenario_file import load, validate
 from noack.core.linear_systems import spectral_abscissa
 from noack.theory.assumptions import AssumptionStatus
-from noack.theory.certificate import Constants, NetworkConditions
+from noack.theory.certificate_terms import Constants, NetworkConditions
 from noack.theory.certified_bounds import OWN_PLANT, ScenarioCertificate
 from noack.theory.gains import ErrorGains
 from noack.theory.paper_bounds import theorem_2

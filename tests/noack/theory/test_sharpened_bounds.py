@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix
-from noack.theory.certificate import Constants, NetworkConditions
+from noack.theory.certificate_terms import Constants, NetworkConditions
 from noack.theory.delivery_flow import Reach
 from noack.theory.gains import Output
 from noack.theory.lost_events import bend_of_error, errors_after_losses

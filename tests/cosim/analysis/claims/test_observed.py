@@ -17,7 +17,7 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
-from noack.theory.certificate import NetworkConditions
+from noack.theory.certificate_terms import NetworkConditions
 from noack.theory.run_conditions import nominal_conditions
 from tests.cosim.analysis.claims.conftest import (
     Make,
