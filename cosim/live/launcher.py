@@ -254,7 +254,10 @@ class _Run:
         here = [role for role in ROLES if not self._coordinator.is_over(role)]
         # The recorder waits for the others.
         late = [role for role in here if role != RECORDER] or here
-        return f"the run did not end at its horizon: no report from {', '.join(late)}"
+        return (
+            f"the run did not end at its horizon: no report from {', '.join(late)}, too slow or "
+            "stopped; reduce the speed or the rates"
+        )
 
 
 def _signalled(signals: Signals) -> Failure | None:

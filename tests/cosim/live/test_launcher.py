@@ -195,7 +195,10 @@ def test_a_run_that_does_not_end_names_the_late_process(
     coordinator = FakeCoordinator(2.0)
     coordinator._running = running
     reason = case.run(case.children(None), coordinator)._overdue()
-    assert reason == f"the run did not end at its horizon: no report from {late}"
+    assert reason == (
+        f"the run did not end at its horizon: no report from {late}, too slow or stopped; "
+        "reduce the speed or the rates"
+    )
 
 
 def test_a_recorder_that_sorts_a_long_record_need_not_respond(case: Case) -> None:
