@@ -29,7 +29,20 @@ Publish = Callable[[str, bytes, bytes], None]  # publishes a batch: table, heade
 
 NOTICES = "notices"
 
-Ranges = Sequence[tuple[int, int]]  # half-open ranges of row numbers
+Ranges = Sequence[tuple[int, int]]
+"""Disjoint, ascending, half-open ranges of row numbers."""
+
+
+def contain(ranges: Ranges, first: int, end: int) -> bool:
+    """Return whether one of the ranges has all numbers from ``first`` to before ``end``."""
+    after = bisect_right(ranges, first, key=lambda known: known[0])
+    return after > 0 and end <= ranges[after - 1][1]
+
+
+def overlap(ranges: Ranges, first: int, end: int) -> bool:
+    """Return whether the ranges have one of the numbers from ``first`` to before ``end``."""
+    place = bisect_right(ranges, first, key=lambda known: known[1])
+    return place < len(ranges) and ranges[place][0] < end
 
 
 class ReceivedRows:
@@ -37,7 +50,6 @@ class ReceivedRows:
 
     def __init__(self) -> None:
         self.ranges: list[tuple[int, int]] = []
-        """Disjoint, ascending, half-open."""
 
     @property
     def end(self) -> int:
@@ -68,7 +80,7 @@ class ReceivedRows:
 class TelemetryBuffer:
     """Collects rows by table and passes them to ``publish``, which does not block.
 
-    ``persisted`` returns ranges of rows that are newly confirmed to be on disk, by table.
+    ``persisted`` returns the rows that are on disk, by table, if this was newly confirmed.
     ``store`` writes a batch to disk, or raises MachineError.
     """
 
@@ -150,11 +162,11 @@ class TelemetryBuffer:
         """Ranges of the rows that were stored, by table."""
         return {table: found.ranges for table, found in self._stored.items()}
 
-    def resend(self, missing: Mapping[str, list[tuple[int, int]]], publish: Publish) -> int:
+    def resend(self, missing: Mapping[str, Ranges], publish: Publish) -> int:
         """Publish the held batches again that overlap missing row ranges; return their number."""
         sent = 0
         for table, first, rows, payload in self._held:
-            if any(low < first + rows and first < high for low, high in missing.get(table, ())):
+            if overlap(missing.get(table, ()), first, first + rows):
                 publish(table, self._header(first, rows), payload)
                 sent += 1
         return sent
@@ -188,8 +200,7 @@ class TelemetryBuffer:
         old = 0
         for i, batch in enumerate(self._held):
             table, first, count, _ = batch
-            ranges = rows.get(table, ())
-            if not any(low <= first and first + count <= high for low, high in ranges):
+            if not contain(rows.get(table, ()), first, first + count):
                 held.append(batch)
                 old += i < self._old
         # Newer batches may have been in flight when the recorder sent its confirmation.

@@ -1,4 +1,5 @@
 import json
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -190,6 +191,34 @@ def test_lost_batches_are_sent_again_during_the_run() -> None:
         buffer.flush()
         assert len(wire.batches) - before <= 8
     assert [first for _, first, _, _ in wire.batches[sent:]] == list(range(50, 250, 10))
+
+
+class CountedRanges(Sequence[tuple[int, int]]):
+    """Ranges (10k, 10k + 5), each read counted."""
+
+    def __init__(self, length: int) -> None:
+        self._length, self.reads = length, 0
+
+    def __len__(self) -> int:
+        return self._length
+
+    def __getitem__(self, place: Any) -> Any:
+        if not 0 <= place < self._length:
+            raise IndexError(place)
+        self.reads += 1
+        return 10 * place, 10 * place + 5
+
+
+def test_the_work_for_lost_batches_is_not_quadratic() -> None:
+    """Thousands of batches may be held; the loop looks through them between its steps."""
+    confirmed: list[dict[str, Any]] = []
+    buffer = TelemetryBuffer(TABLES, Wire(), 0, lambda: confirmed.pop() if confirmed else {})
+    fill(buffer, range(10_000))
+    ranges = CountedRanges(1000)
+    confirmed.append({"one": ranges})
+    buffer.flush()
+    assert buffer.resend({"one": ranges}, Wire()) == 1000  # batches of 10 rows, half of them there
+    assert ranges.reads < 40 * 1000
 
 
 def test_notices_are_published_at_once_and_numbered() -> None:
