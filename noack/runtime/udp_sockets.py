@@ -30,7 +30,9 @@ _UNKNOWN_READ_AT_END = 4096
 """Datagrams of that buffer read at the end: all of them, unless the flood goes on."""
 _SO_MEMINFO = 55
 _MEMINFO_WORDS = 9
-_MEMINFO_DROPS = 8
+_MEMINFO_WAITING_BYTES, _MEMINFO_DROPS = 0, 8
+_LEAST_WAITING_BYTES = 512
+"""The kernel needs at least so much memory for a datagram that waits, with its own data."""
 _READ_AT_ONCE = 8  # datagrams read before the next look at deadlines: about 50 µs
 SHED = "shed"
 """Rejection reason of datagrams from unknown sources that the kernel dropped in a flood."""
@@ -98,12 +100,22 @@ def drops_of(endpoint: socket.socket) -> int | None:
     This counter is always exact and costs nothing per datagram. The one that arrives with
     datagrams (SO_RXQ_OVFL) is exact only after the next datagram.
     """
+    return _memory_information(endpoint, _MEMINFO_DROPS)
+
+
+def most_waiting(endpoint: socket.socket) -> int | None:
+    """Upper bound of the datagrams that wait at a socket; None if the system cannot tell."""
+    waiting_bytes = _memory_information(endpoint, _MEMINFO_WAITING_BYTES)
+    return None if waiting_bytes is None else waiting_bytes // _LEAST_WAITING_BYTES
+
+
+def _memory_information(endpoint: socket.socket, word: int) -> int | None:
     try:
         found = endpoint.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * _MEMINFO_WORDS)
     except OSError:
         return None
     words = struct.unpack(f"={len(found) // 4}I", found[: len(found) // 4 * 4])
-    return words[_MEMINFO_DROPS] if len(words) > _MEMINFO_DROPS else None
+    return words[word] if len(words) > word else None
 
 
 class CountingSocket(ABC, Generic[T]):

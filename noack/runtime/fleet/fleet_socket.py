@@ -11,10 +11,10 @@ from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.wire_format import Flow, Message
 from noack.runtime.address import Address
 from noack.runtime.fleet.compiled_fleet import CompiledFleet
-from noack.runtime.udp_sockets import CountingSocket, enlarge_buffer
+from noack.runtime.udp_sockets import CountingSocket, enlarge_buffer, most_waiting
 
-_READ_AT_ONCE = 512
-"""Reads by Python in one turn; more would delay the fleet."""
+_READ_AT_ONCE = 4096
+"""Datagrams read by Python in one turn; more would delay the fleet."""
 _ALL = 10_000_000
 FLEET_BUFFER_BYTES = 64 * 1024 * 1024
 """At 50,000 datagrams a second this covers a stall of a second."""
@@ -45,12 +45,17 @@ class FleetSocket(CountingSocket[Message]):
             raise PeerError("the system refused to open a socket for the peer")
         self._fleet, self._sends, self._source = fleet, sends, source
         self._outputs: list[Record | Notice] = []
-        self._passed_on, self._begun = 0, False
+        self._passed_on = 0
         enlarge_buffer(self._beside[0], FLEET_BUFFER_BYTES)
         fleet.open(clock, endpoint, self._beside[0], destination)
         peer = self._beside[0].fileno()
-        # A socket that was empty when already connected has the peer's datagrams only.
-        self._to_read = [endpoint.fileno(), *([] if peer in self._source_of else [peer])]
+        # A socket that was empty when already connected has the peer's datagrams only. In another
+        # one, datagrams of other sources may be among those that wait now.
+        self._to_read = {endpoint.fileno(): _ALL}
+        """Most datagrams to read in the next turn, by file descriptor."""
+        if peer not in self._source_of:
+            waiting = most_waiting(self._beside[0])
+            self._to_read[peer] = _ALL if waiting is None else waiting
 
     def judge(self, data: bytes, source: Address) -> Message | None:
         """Pass a datagram to the fleet, which rejects all but those of the peer."""
@@ -65,14 +70,15 @@ class FleetSocket(CountingSocket[Message]):
     def tend(self, now_ns: int) -> Sequence[Record | Notice]:
         """Begin the next interval of housekeeping; read datagrams of other sources."""
         notices = super().tend(now_ns)
-        for readable in self._to_read:
-            # At the start, all that came before the peer's socket: the fleet would reject it later.
-            for _ in range(_READ_AT_ONCE if self._begun else _ALL):
-                if readable not in self.watched or not select.select([readable], (), (), 0)[0]:
+        # At the start, all that came before the peer's socket: the fleet would reject it later.
+        # From then on the fleet reads that socket: datagrams may come faster than Python reads.
+        for readable, most in self._to_read.items():
+            end = self._passed_on + most
+            while self._passed_on < end and readable in self.watched:
+                if not select.select([readable], (), (), 0)[0]:
                     break
                 self.receive(readable)
-        self._begun = True
-        del self._to_read[1:]  # from now on the fleet reads the peer's socket
+        self._to_read = {self._endpoint.fileno(): _READ_AT_ONCE}
         outputs, self._outputs = [*notices, *self._outputs], []
         return outputs
 
