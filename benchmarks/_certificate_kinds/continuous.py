@@ -14,7 +14,7 @@ import numpy as np
 from benchmarks._certificate_kinds import Bounds, Broken, Kind, Observed
 from benchmarks._certificate_kinds.decaying import bounds_of, search
 from noack.theory.certificate_terms import NetworkConditions, VoidError
-from noack.theory.enclosure import NotDecayingError
+from noack.theory.kernel_bounds import NotDecayingError
 from tests.noack.theory.broken_flow import BROKEN_FLOWS
 from tests.noack.theory.continuous_runs import ContinuousTrace, simulate_continuous_time
 from tests.noack.theory.loops import System, random_system

@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks._certificate_kinds import Bounds, Broken, Kind, Observed
 from noack.theory.certificate_terms import Constants, VoidError
-from noack.theory.enclosure import NotDecayingError
+from noack.theory.kernel_bounds import NotDecayingError
 from tests.noack.theory.broken_certificates import MUTANTS
 from tests.noack.theory.loops import (
     Flags,

@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks._certificate_kinds import Bounds, Broken, Kind, Observed
 from noack.theory.certificate_terms import VoidError
-from noack.theory.enclosure import NotDecayingError
+from noack.theory.kernel_bounds import NotDecayingError
 from tests.noack.theory.disturbed_loops import (
     BROKEN,
     DisturbedLoop,

@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks._certificate_kinds import Bounds, Broken, Kind, Observed
 from benchmarks._certificate_kinds.decaying import search
 from noack.theory.certificate_terms import VoidError
-from noack.theory.enclosure import NotDecayingError
+from noack.theory.kernel_bounds import NotDecayingError
 from noack.theory.known_state import KnownStateBounds
 from tests.noack.theory.disturbed_loops import DisturbedLoop, simulate_disturbed
 from tests.noack.theory.known_state_loops import (

@@ -14,7 +14,7 @@ from noack.core.linear_systems import Matrix
 from noack.impairments.markov_chain import NotPredictableError
 from noack.theory.assumptions import assumptions
 from noack.theory.certified_bounds import BOX, OWN_PLANT, ScenarioCertificate
-from noack.theory.enclosure import NotDecayingError
+from noack.theory.kernel_bounds import NotDecayingError
 from noack.theory.loss_margin import LossMargin, Stability
 from noack.theory.network_limits import NetworkLimits, network_limits
 from noack.theory.paper_bounds import Theorem2, theorem_2

@@ -22,8 +22,10 @@ import numpy as np
 from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.contraction import logarithmic_norm
-from noack.theory.enclosure import NotDecayingError, ResponseBounds, response
-from noack.theory.gains import Coefficients, Columns, Output, PlantGains
+from noack.theory.enclosure import ResponseBounds, response
+from noack.theory.error_gains import Columns, Output
+from noack.theory.kernel_bounds import NotDecayingError
+from noack.theory.plant_gains import Coefficients, PlantGains
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,11 @@ from noack.theory.certificate_terms import (
     Part,
     VoidError,
 )
-from noack.theory.enclosure import NotDecayingError
+from noack.theory.error_gains import ErrorGains, Output
 from noack.theory.error_growth import LONGEST_S, TriggerBound
 from noack.theory.error_inequalities import ErrorInequalities
-from noack.theory.gains import ErrorGains, Output, PlantGains
+from noack.theory.kernel_bounds import NotDecayingError
+from noack.theory.plant_gains import PlantGains
 from noack.theory.sharpened_bounds import InvariantEllipsoids, SharpenedBounds
 
 _SETTLED = 1e-3

@@ -6,8 +6,9 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, LossRule
+from noack.theory.error_gains import ErrorGains
 from noack.theory.error_growth import TriggerBound
-from noack.theory.gains import ErrorGains, PlantGains
+from noack.theory.plant_gains import PlantGains
 
 
 class NetworkConditions(NamedTuple):

@@ -33,7 +33,8 @@ from noack.theory.contraction import (
     product,
     spectral_norms,
 )
-from noack.theory.gains import Output, PlantGains
+from noack.theory.error_gains import Output
+from noack.theory.plant_gains import PlantGains
 
 _CELLS_PER_STEP, _FIRST_STEP, _MOST_STEP = 32, 0.005, 0.02
 _MOST_GROWTH, _SETTLED, _MOST_CELLS = 1e6, 0.03, 3000

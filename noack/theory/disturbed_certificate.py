@@ -17,12 +17,13 @@ from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix
 from noack.theory.certificate import solve_sum
 from noack.theory.certificate_terms import Constants, NetworkConditions, Part, VoidError
-from noack.theory.enclosure import NotDecayingError
+from noack.theory.error_gains import ErrorGains, error_gains
 from noack.theory.error_growth import TriggerBound
 from noack.theory.forcing import Forcing
-from noack.theory.gains import ErrorGains, PlantGains, error_gains
+from noack.theory.kernel_bounds import NotDecayingError
 from noack.theory.observer_error import EstimationError
 from noack.theory.persistent_causes import forcing_of
+from noack.theory.plant_gains import PlantGains
 from noack.theory.superposition import SHARES, solve_divided, soonest
 from noack.theory.trigger_bounds import TriggerBounds
 

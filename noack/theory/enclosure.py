@@ -40,6 +40,7 @@ from noack.theory.contraction import (
     spectral_norms,
     times,
 )
+from noack.theory.kernel_bounds import KernelBounds, NotDecayingError
 
 _ROUNDING = 1.0 + 1e-9
 _TAYLOR_TERMS = 4
@@ -55,55 +56,6 @@ _MOST_ENTRIES = 4_000_000
 """Largest number of entries of all matrices of a response. With many states there are fewer cells,
 and the looser bound beyond the grid applies earlier."""
 _TAIL_SHARE = 1e-5
-
-
-class NotDecayingError(ArithmeticError):
-    """The generator is not Hurwitz: bounds over all times would be infinite."""
-
-
-@dataclass(frozen=True)
-class KernelBounds:
-    """Upper bounds of k(τ) = ‖C e^{Gτ} D‖ (spectral norm) on a grid of cells, and beyond it."""
-
-    edges_s: NDArray[np.float64]
-    """(cells + 1,) nodes of the grid, from 0."""
-    highest: NDArray[np.float64]
-    """(cells,) bound of k over each cell."""
-    area: NDArray[np.float64]
-    """(cells,) bound of ∫k over each cell."""
-    tail_highest: float
-    """Bound of k beyond the grid; infinite if it was not requested."""
-    tail_area: float
-    """Bound of ∫k beyond the grid."""
-    tail_rate_per_s: float
-    """Decay rate of the bound of k beyond the grid."""
-
-    def sup(self, after_s: float = 0.0) -> float:
-        """Sup of k(τ) over τ ≥ ``after_s``."""
-        return float(self.sups(np.array([after_s]))[0])
-
-    def sups(self, after_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Sup of k(τ) over τ ≥ a for each a, (j,)."""
-        first = np.searchsorted(self.edges_s, after_s, side="right") - 1
-        beyond_s = np.maximum(after_s - self.edges_s[-1], 0.0)
-        return np.asarray(self._from_cell[first] * np.exp(-self.tail_rate_per_s * beyond_s))
-
-    @cached_property
-    def _from_cell(self) -> NDArray[np.float64]:
-        """Sup of k from the begin of each cell on."""
-        return np.maximum.accumulate(np.append(self.highest, self.tail_highest)[::-1])[::-1]
-
-    def integral(self) -> float:
-        """∫k over all times."""
-        return float(self.area.sum()) + self.tail_area
-
-    def sup_on_grid(self) -> float:
-        """Sup of k over the grid only."""
-        return float(self.highest.max(initial=0.0))
-
-    def integral_on_grid(self) -> float:
-        """∫k over the grid only."""
-        return float(self.area.sum())
 
 
 Name = TypeVar("Name", bound=str)
@@ -355,12 +307,6 @@ def response_until(
         endless=False,
         groups=groups,
     )
-
-
-def constant_kernel(value: float) -> KernelBounds:
-    """Return the kernel of a constant response."""
-    edges_s = np.array([0.0, 1.0])
-    return KernelBounds(edges_s, np.full(1, value), np.full(1, value), value, math.inf, 0.0)
 
 
 def factors(matrix: Matrix) -> tuple[Matrix, Matrix]:

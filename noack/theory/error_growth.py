@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.theory.gains import Output, PlantGains
+from noack.theory.error_gains import Output
+from noack.theory.plant_gains import PlantGains
 
 COARSE_CELLS = 64
 _FINE_CELLS = 256

@@ -26,10 +26,11 @@ import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.certificate_terms import Constants, NetworkConditions, Part, VoidError
+from noack.theory.error_gains import Output
 from noack.theory.error_growth import COARSE_CELLS, ErrorGrowth, first_passage_s, growths_of
-from noack.theory.gains import Coefficients, Output
 from noack.theory.loss_accumulation import LossAccumulation
 from noack.theory.nonnegative_system import Solution, solve_inequalities
+from noack.theory.plant_gains import Coefficients
 
 _SIGNALS = 6
 

@@ -24,9 +24,11 @@ from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.certificate_terms import Constants
 from noack.theory.certified_bounds import OWN_PLANT, ScenarioCertificate
-from noack.theory.enclosure import KernelBounds, response
-from noack.theory.gains import Output, PlantGains, error_gains
+from noack.theory.enclosure import response
+from noack.theory.error_gains import Output, error_gains
+from noack.theory.kernel_bounds import KernelBounds
 from noack.theory.persistent_causes import forcing_of
+from noack.theory.plant_gains import PlantGains
 
 Counts = NDArray[np.int64]
 

@@ -23,8 +23,9 @@ import numpy as np
 
 from noack.core.linear_systems import Vector
 from noack.impairments.loss_guarantee import LossWindow
-from noack.theory.enclosure import KernelBounds
-from noack.theory.gains import Output, PlantGains
+from noack.theory.error_gains import Output
+from noack.theory.kernel_bounds import KernelBounds
+from noack.theory.plant_gains import PlantGains
 
 _CELLS = 2048
 _MOST_BINS = 1 << 16

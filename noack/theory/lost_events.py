@@ -16,7 +16,7 @@ from noack.core.linear_systems import Matrix, Vector
 from noack.core.matrix_functions import exponential
 from noack.theory.contraction import Stack, logarithmic_norm
 from noack.theory.delivery_flow import ROUNDING, DeliveryFlow, Reach
-from noack.theory.enclosure import KernelBounds
+from noack.theory.kernel_bounds import KernelBounds
 
 _NEAR, _RATIO, _MOST_NODES = (0.0, 0.5, 0.75, 1.0), 1.1, 80
 """First nodes of r in units of δ; then the ratio from node to node."""

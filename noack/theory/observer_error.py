@@ -25,8 +25,9 @@ from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, discretise
 from noack.theory.certificate_terms import EstimationBound
 from noack.theory.contraction import largest_gains, spectral_norm, times
-from noack.theory.enclosure import NotDecayingError, factors
+from noack.theory.enclosure import factors
 from noack.theory.forcing import Forcing
+from noack.theory.kernel_bounds import NotDecayingError
 from noack.theory.persistent_causes import noise_bound, noise_deviations, normal_bounds
 
 Stack = NDArray[np.float64]

@@ -15,7 +15,8 @@ import numpy as np
 
 from noack.config.resolution import LoopMatrices
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
-from noack.theory.enclosure import NotDecayingError, response, response_until
+from noack.theory.enclosure import response, response_until
+from noack.theory.kernel_bounds import NotDecayingError
 
 _SHARE, _NEAREST = 1e-2, 0.98
 _GOLDEN = (math.sqrt(5) - 1) / 2

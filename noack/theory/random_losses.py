@@ -25,9 +25,11 @@ import numpy as np
 from noack.core.linear_systems import Vector
 from noack.impairments.loss_process import LossProcess
 from noack.theory.certificate_terms import NetworkConditions, VoidError
-from noack.theory.enclosure import KernelBounds, NotDecayingError, response, response_until
-from noack.theory.gains import ErrorGains, Output, PlantGains
+from noack.theory.enclosure import response, response_until
+from noack.theory.error_gains import ErrorGains, Output
+from noack.theory.kernel_bounds import KernelBounds, NotDecayingError
 from noack.theory.nonnegative_system import solve_inequalities
+from noack.theory.plant_gains import PlantGains
 
 _TERMS = 1024
 _CELLS = 64

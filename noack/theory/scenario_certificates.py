@@ -18,8 +18,9 @@ from noack.theory.certificate import solve
 from noack.theory.certificate_terms import Constants, NetworkConditions, VoidError
 from noack.theory.certified_bounds import BOX, OWN_PLANT, ScenarioCertificate
 from noack.theory.disturbed_certificate import DisturbedCertificate, PlantAt
-from noack.theory.enclosure import NotDecayingError
-from noack.theory.gains import ErrorGains, PlantGains, error_gains
+from noack.theory.error_gains import ErrorGains, error_gains
+from noack.theory.kernel_bounds import NotDecayingError
+from noack.theory.plant_gains import PlantGains
 from noack.theory.run_conditions import kept_probability
 from noack.theory.superposition import soonest
 from noack.theory.trigger_bounds import TriggerBounds

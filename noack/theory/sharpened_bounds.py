@@ -24,8 +24,9 @@ from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.core.matrix_functions import solve_lyapunov
 from noack.theory.contraction import Stack
 from noack.theory.delivery_flow import ROUNDING, DeliveryFlow, Reach, Starts
-from noack.theory.gains import Output, PlantGains
+from noack.theory.error_gains import Output
 from noack.theory.lost_events import bend_of_error, error_after, errors_after_losses
+from noack.theory.plant_gains import PlantGains
 
 _MARGINS = (1.0, 1.01, 1.02, 1.05, 1.08, 1.12, 1.2, 1.35)
 """Factors of the ellipsoid's computed size that are tried."""

@@ -17,7 +17,7 @@ import numpy as np
 from noack.core.linear_systems import Vector
 from noack.theory.certificate import solve_sum
 from noack.theory.certificate_terms import Constants, NetworkConditions, Part, VoidError
-from noack.theory.enclosure import NotDecayingError
+from noack.theory.kernel_bounds import NotDecayingError
 
 _RATES = (0.05, 0.2, 0.4, 0.7)
 """Rates that are tried, as shares of the loop's decay rate."""

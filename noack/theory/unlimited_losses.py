@@ -22,8 +22,9 @@ from noack.impairments.loss_process import LossProcess, loss_process
 from noack.impairments.markov_chain import NotPredictableError
 from noack.theory.assumptions import below
 from noack.theory.certificate_terms import NetworkConditions, VoidError
-from noack.theory.enclosure import NotDecayingError
-from noack.theory.gains import PlantGains, error_gains
+from noack.theory.error_gains import error_gains
+from noack.theory.kernel_bounds import NotDecayingError
+from noack.theory.plant_gains import PlantGains
 from noack.theory.random_losses import Moments, moment_at_events, moments
 from noack.theory.run_conditions import most_events
 from noack.theory.scenario_certificates import CertificateScope

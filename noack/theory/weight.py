@@ -20,9 +20,11 @@ from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.theory.certificate import solve
 from noack.theory.certificate_terms import NetworkConditions, VoidError
 from noack.theory.contraction import Stack, product, spectral_norms
-from noack.theory.enclosure import KernelBounds, NotDecayingError, response
+from noack.theory.enclosure import response
+from noack.theory.error_gains import ErrorGains, Output
 from noack.theory.error_growth import TriggerBound
-from noack.theory.gains import Coefficients, ErrorGains, Output, PlantGains
+from noack.theory.kernel_bounds import KernelBounds, NotDecayingError
+from noack.theory.plant_gains import Coefficients, PlantGains
 
 _ROUNDS_PER_SCALE, _ROUNDS, _ROUNDS_PER_ENTRY = 15, 40, 12
 _MOST_FREE = 7

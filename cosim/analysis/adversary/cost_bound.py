@@ -19,8 +19,9 @@ from cosim.analysis.adversary.pattern_tree import Ceiling
 from cosim.analysis.adversary.search_nodes import Nodes
 from cosim.simulation.continuous.continuous_loop import ContinuousLoop
 from noack.core.linear_systems import Vector
-from noack.theory.enclosure import NotDecayingError, response
-from noack.theory.gains import ErrorGains, Output
+from noack.theory.enclosure import response
+from noack.theory.error_gains import ErrorGains, Output
+from noack.theory.kernel_bounds import NotDecayingError
 
 
 def cost_ceiling(

@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.analysis.replay.machine_replay import MachineReplay, received_vectors, sent_messages
+from cosim.analysis.replay.machine_replay import MachineReplay, sent_messages
+from cosim.analysis.replay.recorded_inputs import received_vectors
 from cosim.analysis.replay.replay_result import MessagesReplay, difference, first_entry
 from cosim.record.record_source import Slice
 from cosim.record.run_record import RunRecord

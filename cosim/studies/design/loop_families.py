@@ -11,7 +11,7 @@ from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.theory.certificate_terms import NetworkConditions
-from noack.theory.enclosure import NotDecayingError
+from noack.theory.kernel_bounds import NotDecayingError
 from noack.theory.weight import choose_weight
 
 NORMS = ("identity", "given", "chosen")

@@ -11,7 +11,7 @@ import numpy as np
 from noack.core.linear_systems import Vector
 from noack.theory import lost_events, sharpened_bounds
 from noack.theory.delivery_flow import DeliveryFlow, Reach
-from noack.theory.gains import PlantGains
+from noack.theory.plant_gains import PlantGains
 from noack.theory.sharpened_bounds import InvariantEllipsoids
 
 

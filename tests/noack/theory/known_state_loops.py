@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from noack.theory.certificate_terms import Constants
-from noack.theory.gains import Output
+from noack.theory.error_gains import Output
 from noack.theory.known_state import KnownStateBounds, KnownStatePart
 from tests.noack.theory.disturbed_loops import DisturbedLoop, random_disturbed_loop
 from tests.noack.theory.loops import STEPS, System, Trace, random_system, times_s

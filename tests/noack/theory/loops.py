@@ -24,8 +24,9 @@ from noack.impairments.loss_guarantee import (
 )
 from noack.theory.certificate import solve
 from noack.theory.certificate_terms import Constants, NetworkConditions, VoidError
+from noack.theory.error_gains import ErrorGains
 from noack.theory.error_growth import TriggerBound
-from noack.theory.gains import ErrorGains, PlantGains
+from noack.theory.plant_gains import PlantGains
 from tests.noack.theory.compiled_loops import (
     Given,
     Propagators,

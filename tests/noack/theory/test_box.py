@@ -15,9 +15,10 @@ from noack.core.linear_systems import Matrix, Vector
 from noack.theory.box import BoxGains
 from noack.theory.certificate import solve
 from noack.theory.certificate_terms import Constants, NetworkConditions, VoidError
-from noack.theory.enclosure import NotDecayingError
+from noack.theory.error_gains import Output
 from noack.theory.error_growth import TriggerBound
-from noack.theory.gains import Coefficients, Output, PlantGains
+from noack.theory.kernel_bounds import NotDecayingError
+from noack.theory.plant_gains import Coefficients, PlantGains
 from tests.noack.theory.loops import (
     RUNS,
     SEARCH,

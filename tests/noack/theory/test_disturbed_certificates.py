@@ -11,10 +11,11 @@ from noack.config.scenario_file import load
 from noack.theory.box import BoxGains
 from noack.theory.certificate_terms import Part, VoidError
 from noack.theory.certified_bounds import ScenarioCertificate
-from noack.theory.enclosure import NotDecayingError
+from noack.theory.error_gains import ErrorGains
 from noack.theory.error_growth import TriggerBound
 from noack.theory.forcing import Forcing, NormalForcing
-from noack.theory.gains import ErrorGains, PlantGains
+from noack.theory.kernel_bounds import NotDecayingError
+from noack.theory.plant_gains import PlantGains
 from noack.theory.run_conditions import allowed_conditions
 from noack.theory.scenario_certificates import certify, certify_box
 from noack.theory.superposition import solve_divided

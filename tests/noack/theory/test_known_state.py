@@ -9,8 +9,9 @@ from scipy.linalg import expm
 
 from noack.theory.certificate_terms import Constants
 from noack.theory.enclosure import response
-from noack.theory.gains import ErrorGains, PlantGains
+from noack.theory.error_gains import ErrorGains
 from noack.theory.known_state import KnownStateBounds, KnownStatePart, integral_until
+from noack.theory.plant_gains import PlantGains
 from tests.noack.theory.loops import (
     SEARCH,
     STEPS,

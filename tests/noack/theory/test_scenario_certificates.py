@@ -22,7 +22,7 @@ from noack.core.linear_systems import spectral_abscissa
 from noack.theory.assumptions import AssumptionStatus
 from noack.theory.certificate_terms import Constants, NetworkConditions
 from noack.theory.certified_bounds import OWN_PLANT, ScenarioCertificate
-from noack.theory.gains import ErrorGains
+from noack.theory.error_gains import ErrorGains
 from noack.theory.paper_bounds import theorem_2
 from noack.theory.run_conditions import ideal_conditions
 from noack.theory.scenario_certificates import certify, certify_box

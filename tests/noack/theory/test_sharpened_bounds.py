@@ -10,7 +10,7 @@ from scipy.linalg import expm
 from noack.core.linear_systems import Matrix
 from noack.theory.certificate_terms import Constants, NetworkConditions
 from noack.theory.delivery_flow import Reach
-from noack.theory.gains import Output
+from noack.theory.error_gains import Output
 from noack.theory.lost_events import bend_of_error, errors_after_losses
 from noack.theory.sharpened_bounds import InvariantEllipsoids
 from tests.noack.theory.broken_flow import BROKEN_FLOWS

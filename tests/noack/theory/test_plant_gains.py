@@ -12,8 +12,8 @@ from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix
 from noack.theory.certificate_terms import NetworkConditions
+from noack.theory.error_gains import Output
 from noack.theory.error_growth import first_passage_s
-from noack.theory.gains import Output
 from tests.noack.theory.loops import SEARCH, System, certified_or_skipped, systems
 
 SOME = settings(SEARCH, max_examples=6)
