@@ -58,7 +58,7 @@ name = "loop"
 count = {loops}
 """
 _KIBI = 1024
-_POLL_S = 0.5
+_POLL_S = 2.0
 _SINGLE_S = 60.0
 _FLAT_MIB = 32.0
 _BATCH = 50, 10.0
