@@ -6,12 +6,12 @@ these, 1/M or 1 − m/K. Let b be the bits of loop k's datagram on the link, d t
 largest time between two of its transmissions. The datagrams that must pass need between Σ s b/D and
 Σ s b/d bits per second. For actuations d and D are the controller's period.
 
-Without constraints: if r bits per second exceed m = Σ b/(M d), the delay D in a tail-drop queue of Q places is bounded.
-Datagrams leave in their order, so those before the end of a transmission came within D. At most Q
-of them found a free place; of each loop, at most 1 + D/(M d) had to pass. Hence D is at most
-(Q max b + Σ b)/(r − m). If r is even at least Σ b/d, a queue that has been busy for t got at most
-1 + t/d datagrams of each loop, and has sent r t bits: D is at most Σ b/r. A live run adds the
-lateness of its processes.
+Without constraints: if r bits per second exceed m = Σ b/(M d), the delay D in a tail-drop queue of
+Q places is bounded. Datagrams leave in their order, so those before the end of a transmission came
+within D. At most Q of them found a free place; of each loop, at most 1 + D/(M d) had to pass. Hence
+D is at most (Q max b + Σ b)/(r − m). If r is even at least Σ b/d, a queue that has been busy for t
+got at most 1 + t/d datagrams of each loop, and has sent r t bits: D is at most Σ b/r. A live run
+adds the lateness of its processes.
 """
 
 import math
