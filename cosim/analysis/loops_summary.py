@@ -94,6 +94,16 @@ class NetworkPart(SummaryPart):
     in_flight: InFlightPart
 
 
+class DeadlinesPart(SummaryPart):
+    """The deadlines of a process, over all loops."""
+
+    steps: Count
+    late_steps: Count
+    """Late by more than a period."""
+    max_us: Real
+    """Largest lateness, in wall µs."""
+
+
 class LoopsSummary(SummaryPart):
     """The content of ``summary.json`` of a run of several loops."""
 
@@ -107,6 +117,8 @@ class LoopsSummary(SummaryPart):
     reached_s: float
     network: NetworkPart
     loops: Annotated[list[LoopPart], Field(min_length=1)]
+    deadlines: dict[Text, DeadlinesPart] = Field(default_factory=dict)
+    """By process; empty for a simulated run."""
     replay: ReplayPart | None = None
     """The replay of the network; those of the other processes are in the loops' summaries."""
     exit: ExitPart
@@ -167,8 +179,22 @@ def summarise_loops(
         reached_s=reached_s,
         network=_network_part(network, packets, parts, reached_s),
         loops=parts,
+        deadlines=_deadlines([one.summary["lateness_us"] for one in loops]),
         exit=end if end.status != ExitStatus.OK else _end(end, parts),
     )
+
+
+def _deadlines(lateness_us: Sequence[Mapping[str, Any]]) -> dict[str, DeadlinesPart]:
+    return {
+        role: DeadlinesPart(
+            steps=sum(one[role]["steps"] for one in lateness_us),
+            late_steps=sum(one[role]["late_steps"] for one in lateness_us),
+            max_us=max(
+                (one[role]["max"] for one in lateness_us if one[role]["steps"]), default=None
+            ),
+        )
+        for role in lateness_us[0]
+    }
 
 
 def _end(end: ExitPart, loops: Sequence[LoopPart]) -> ExitPart:

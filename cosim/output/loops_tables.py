@@ -11,7 +11,7 @@ from rich.table import Table
 
 from cosim.analysis.run_summary import Summary
 from noack.core.errors import ExitStatus
-from noack.core.number_format import number, ratio
+from noack.core.number_format import duration, number, ratio
 
 _MOST_LOOPS = 12
 HEADINGS = (
@@ -90,6 +90,11 @@ def network_rows(summary: Summary) -> list[tuple[str, str]]:
         rows.append(("actuations of all loops", f"{sent} ({sent / reached_s:.4g} /s)"))
         burst = max(one["longest_loss_burst"] for one in flows)
         rows.append(("  lost, longest loss burst", f"{lost} ({ratio(lost, sent)}), {burst}"))
+    if deadlines := summary.get("deadlines"):
+        rows.append(("deadlines missed", _missed(deadlines)))
+        worst = max(deadlines, key=lambda role: deadlines[role]["max_us"] or 0.0)
+        latest_s = 1e-6 * (deadlines[worst]["max_us"] or 0.0)
+        rows.append(("  largest lateness", f"{duration(latest_s)} ({worst})"))
     if (replay := summary["replay"]) is not None:
         exact = {True: "bit-exact", False: "differs", None: "not possible"}[replay["bit_exact"]]
         rows.append(("replay of the network", exact))
@@ -100,6 +105,15 @@ def network_rows(summary: Summary) -> list[tuple[str, str]]:
         )
         rows.append(("missing samples, unintended losses", f"{missing}, {lost}"))
     return rows
+
+
+def _missed(deadlines: dict[str, Any]) -> str:
+    missed = [
+        f"{role} {ratio(one['late_steps'], one['steps'])}"
+        for role, one in deadlines.items()
+        if one["late_steps"]
+    ]
+    return ", ".join(missed) or "none"
 
 
 def _network_table(summary: Summary) -> Table:

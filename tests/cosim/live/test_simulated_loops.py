@@ -169,7 +169,7 @@ def test_figures_of_few_and_many_loops(count: int) -> None:
     values = np.random.default_rng(1).uniform(0.1, 1, (count, INTERVALS))
     names = [f"loop-{i}" for i in range(count)]
     over_time = LoopsOverTime(np.linspace(0, 2, INTERVALS + 1), values, 2 * values, values)
-    upper, lower = norms_figure(over_time, names).axes
+    upper, lower = norms_figure(over_time, names, np.full(count, True)).axes
     for axes, factor in ((upper, 1), (lower, 2)):
         drawn = [np.asarray(line.get_ydata()) for line in axes.lines]
         if count == 3:
@@ -177,8 +177,22 @@ def test_figures_of_few_and_many_loops(count: int) -> None:
         else:
             np.testing.assert_allclose(drawn[0], factor * np.median(values, axis=0))
             np.testing.assert_array_equal(drawn[1], factor * values.max(axis=0))
-    image = error_map(over_time, names).axes[0].images[0].get_array()
+    image = error_map(over_time, names, np.full(count, True)).axes[0].images[0].get_array()
     np.testing.assert_array_equal(image, values)
+
+
+def test_a_loop_that_diverged_does_not_hide_the_others() -> None:
+    values = np.random.default_rng(1).uniform(0.1, 1, (3, INTERVALS))
+    values[1] *= 10.0 ** np.linspace(0, 20, INTERVALS)
+    over_time = LoopsOverTime(np.linspace(0, 2, INTERVALS + 1), values, values, values)
+    names, stayed = ["a", "b", "c"], np.array([True, False, True])
+    for axes in norms_figure(over_time, names, stayed).axes:
+        assert axes.get_ylim()[0] < 0.1
+        assert axes.get_ylim()[1] < 1e7
+    colours = error_map(over_time, names, stayed).axes[0].images[0].norm
+    assert colours.vmax == values[stayed].max()
+    everything = error_map(over_time, names, np.full(3, False)).axes[0].images[0].norm
+    assert everything.vmax == values.max()
 
 
 def test_the_worst_loop(tmp_path: Path) -> None:
