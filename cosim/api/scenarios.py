@@ -138,7 +138,10 @@ def _take_away(content: dict[str, Any], key: str) -> None:
     table: Any = content
     *path, last = key.split(".")
     for part in path:
-        table = table.get(part) if isinstance(table, dict) else None
+        if isinstance(table, list) and part.isdecimal():
+            table = table[int(part)] if int(part) < len(table) else None
+        else:
+            table = table.get(part) if isinstance(table, dict) else None
     if isinstance(table, dict):
         table.pop(last, None)
 

@@ -74,7 +74,7 @@ def warn_of_violations(scenario: "Scenario") -> None:
     """Print the assumptions of Theorem 2 that the scenario violates, on standard error.
 
     For several loops: also what may go wrong at the bottleneck that they share. Raise CallerError
-    if it cannot carry the datagrams that must pass.
+    if a bottleneck cannot carry the datagrams that must pass.
     """
     from noack.config.link_load import link_loads, load_warnings, require_capacity
     from noack.config.loops import loop_scenario
@@ -82,8 +82,8 @@ def warn_of_violations(scenario: "Scenario") -> None:
     from noack.theory.assumptions import AssumptionStatus, assumptions
 
     alone = {"": scenario}
+    require_capacity(scenario)
     if scenario.loops is not None:
-        require_capacity(scenario)
         for line in load_warnings(link_loads(scenario), scenario):
             print(f"noack: warning: {line}", file=sys.stderr)
         alone = {f"{one.name}: ": loop_scenario(scenario, one) for one in scenario.loops}

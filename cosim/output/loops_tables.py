@@ -1,5 +1,6 @@
 """Terminal output of a run of several loops: its network, and its loops, the worst first."""
 
+import math
 from collections import Counter
 from typing import Any
 
@@ -10,7 +11,7 @@ from rich.table import Table
 
 from cosim.analysis.run_summary import Summary
 from noack.core.errors import ExitStatus
-from noack.core.number_format import number, ratio
+from noack.core.number_format import duration, number, ratio
 
 _MOST_LOOPS = 12
 HEADINGS = (
@@ -68,13 +69,13 @@ def badness(loop: dict[str, Any]) -> tuple[Any, ...]:
 def network_rows(summary: Summary) -> list[tuple[str, str]]:
     """Return the quantities of the network, and their values as text."""
     network, flying = summary["network"], summary["network"]["in_flight"]
-    sent = network["datagrams"]
+    sent, reached_s = network["datagrams"], summary["reached_s"] or math.inf
     lost = sum(network["drops_by_cause"].values())
     causes = "".join(
         f", {n} {cause.replace('_', ' ')}" for cause, n in network["drops_by_cause"].items()
     )
     rows = [
-        ("updates of all loops", f"{sent} ({sent / summary['horizon_s']:.4g} /s)"),
+        ("updates of all loops", f"{sent} ({sent / reached_s:.4g} /s)"),
         ("lost", f"{lost} ({ratio(lost, sent)}){causes}"),
         ("longest loss burst, cap", f"{network['longest_loss_burst']}, {summary['mansd']}"),
         ("forced by the guarantee", str(network["forced_deliveries"])),
@@ -86,9 +87,14 @@ def network_rows(summary: Summary) -> list[tuple[str, str]]:
     loops = summary["loops"]
     if flows := [one["actuations"] for one in loops if one["actuations"] is not None]:
         sent, lost = (sum(one[key] for one in flows) for key in ("sent", "lost"))
-        rows.append(("actuations of all loops", f"{sent} ({sent / summary['horizon_s']:.4g} /s)"))
+        rows.append(("actuations of all loops", f"{sent} ({sent / reached_s:.4g} /s)"))
         burst = max(one["longest_loss_burst"] for one in flows)
         rows.append(("  lost, longest loss burst", f"{lost} ({ratio(lost, sent)}), {burst}"))
+    if deadlines := summary.get("deadlines"):
+        rows.append(("deadlines missed", _missed(deadlines)))
+        worst = max(deadlines, key=lambda role: deadlines[role]["max_us"] or 0.0)
+        latest_s = 1e-6 * (deadlines[worst]["max_us"] or 0.0)
+        rows.append(("  largest lateness", f"{duration(latest_s)} ({worst})"))
     if (replay := summary["replay"]) is not None:
         exact = {True: "bit-exact", False: "differs", None: "not possible"}[replay["bit_exact"]]
         rows.append(("replay of the network", exact))
@@ -99,6 +105,15 @@ def network_rows(summary: Summary) -> list[tuple[str, str]]:
         )
         rows.append(("missing samples, unintended losses", f"{missing}, {lost}"))
     return rows
+
+
+def _missed(deadlines: dict[str, Any]) -> str:
+    missed = [
+        f"{role} {ratio(one['late_steps'], one['steps'])}"
+        for role, one in deadlines.items()
+        if one["late_steps"]
+    ]
+    return ", ".join(missed) or "none"
 
 
 def _network_table(summary: Summary) -> Table:

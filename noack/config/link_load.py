@@ -1,16 +1,17 @@
 """What the loops of a run need of a bottleneck that they share, before the run.
 
-Of any M successive datagrams of a loop, one must pass (M − 1 = the longest burst of losses). Let b
-be the bits of loop k's datagram on the link, d the least and D the largest time between two of its
-transmissions. The datagrams that must pass need between Σ b/(M D) and Σ b/(M d) bits per second.
-For actuations d and D are the controller's period.
+Of any M successive datagrams of a loop, one must pass (M − 1 = the longest burst of losses); a
+constraint can require more, at least K − m of any K. The share s that must pass is the largest of
+these, 1/M or 1 − m/K. Let b be the bits of loop k's datagram on the link, d the least and D the
+largest time between two of its transmissions. The datagrams that must pass need between Σ s b/D and
+Σ s b/d bits per second. For actuations d and D are the controller's period.
 
-If r bits per second exceed m = Σ b/(M d), the delay D in a tail-drop queue of Q places is bounded.
-Datagrams leave in their order, so those before the end of a transmission came within D. At most Q
-of them found a free place; of each loop, at most 1 + D/(M d) had to pass. Hence D is at most
-(Q max b + Σ b)/(r − m). If r is even at least Σ b/d, a queue that has been busy for t got at most
-1 + t/d datagrams of each loop, and has sent r t bits: D is at most Σ b/r. A live run adds the
-lateness of its processes.
+Without constraints: if r bits per second exceed m = Σ b/(M d), the delay D in a tail-drop queue of
+Q places is bounded. Datagrams leave in their order, so those before the end of a transmission came
+within D. At most Q of them found a free place; of each loop, at most 1 + D/(M d) had to pass. Hence
+D is at most (Q max b + Σ b)/(r − m). If r is even at least Σ b/d, a queue that has been busy for t
+got at most 1 + t/d datagrams of each loop, and has sent r t bits: D is at most Σ b/r. A live run
+adds the lateness of its processes.
 """
 
 import math
@@ -20,13 +21,16 @@ from typing import NamedTuple
 from noack.config.loops import loop_scenario
 from noack.config.resolution import policy_of, resolve
 from noack.config.scenario import Scenario
+from noack.config.scenario_changes import with_settings
 from noack.config.sections.network_section import DirectionSection
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.impairments.constraints import guarantee_of
 from noack.impairments.disciplines.tail_drop import TailDrop
 from noack.impairments.kinds.loss import LossOf
+from noack.impairments.kinds.opportunities import Opportunities
 from noack.impairments.kinds.rate import Rate
+from noack.impairments.loss_guarantee import LossWindow
 from noack.protocol.wire_format import Flow, datagram_bytes
 from noack.trigger.periodic_trigger import PeriodicSettings
 
@@ -47,9 +51,10 @@ class LinkLoad(NamedTuple):
 
     key: str
     flow: Flow
-    window: int
-    """One of any so many successive datagrams of a loop must pass; 0: none must."""
-    rate_bps: int
+    window: LossWindow
+    """How many of successive datagrams of a loop may be lost; the others must pass."""
+    rate_bps: float
+    """What it carries; a link with recorded opportunities: on average."""
     mandatory_at_most_bps: float
     """Those datagrams that must pass, if each loop transmits as often as it can."""
     mandatory_at_least_bps: float
@@ -58,8 +63,14 @@ class LinkLoad(NamedTuple):
     """Bound of a datagram's delay in this queue; None: there is none."""
 
 
-def demands(scenario: Scenario, flow: Flow = Flow.UPDATE) -> list[Demand]:
-    """Return the transmissions of the loops, by entry of [[loops]].
+def link_loads(scenario: Scenario, changes: int = 0) -> list[LinkLoad]:
+    """Return what the loops need of each bottleneck of the network, in either direction.
+
+    Acknowledgements are left out: how many there are depends on the losses of updates.
+
+    Args:
+        scenario: the scenario.
+        changes: how many of its changes have taken effect.
 
     Raises:
         CallerError: a loop cannot be resolved, or its trigger excludes its model.
@@ -67,38 +78,35 @@ def demands(scenario: Scenario, flow: Flow = Flow.UPDATE) -> list[Demand]:
     sections = scenario.loops
     loops = [scenario] if sections is None else [loop_scenario(scenario, one) for one in sections]
     counts = [1] if sections is None else [one.count for one in sections]
-    demand_of = _demand if flow is Flow.UPDATE else _actuations
-    return [demand_of(resolve(loop), count) for loop, count in zip(loops, counts, strict=True)]
-
-
-def link_loads(scenario: Scenario) -> list[LinkLoad]:
-    """Return what the loops need of each bottleneck of the network, in either direction.
-
-    Acknowledgements are left out: how many there are depends on the losses of updates.
-    """
-    found = _link_loads(scenario, Flow.UPDATE, scenario.network, "network")
-    if (actuation := scenario.network.actuation) is not None:
-        found += _link_loads(scenario, Flow.ACTUATION, actuation, "network.actuation")
+    for change in scenario.changes[:changes]:
+        loops = [with_settings(loop, change.set) for loop in loops]
+    network, loops = loops[0].network, [resolve(loop) for loop in loops]
+    updates = [*map(_demand, loops, counts)]
+    found = _link_loads(updates, Flow.UPDATE, network, "network")
+    if network.actuation is not None:
+        actuations = [*map(_actuations, loops, counts)]
+        found += _link_loads(actuations, Flow.ACTUATION, network.actuation, "network.actuation")
     return found
 
 
 def _link_loads(
-    scenario: Scenario, flow: Flow, direction: DirectionSection, path: str
+    loops: Sequence[Demand], flow: Flow, direction: DirectionSection, path: str
 ) -> list[LinkLoad]:
     link = direction.link
-    loops, burst = demands(scenario, flow), guarantee_of(link.mansd, link.constraints).longest_burst
-    window = 0 if burst is None else burst + 1
-    must_pass = 1 / window if window else 0.0
+    windows = guarantee_of(link.mansd, link.constraints).windows
+    window = min(windows, key=lambda one: one.losses / one.packets, default=LossWindow(1, 1))
+    must_pass = (window.packets - window.losses) / window.packets
     found = []
     for place, one in enumerate(direction.impairments):
-        if not isinstance(one, Rate):
+        if not isinstance(one, Rate | Opportunities):
             continue
         bits = [int(one.line_bits(loop.payload_bytes)) for loop in loops]
         every = sum(b * loop.loops / loop.least_s for b, loop in zip(bits, loops, strict=True))
         least = sum(b * loop.loops / loop.largest_s for b, loop in zip(bits, loops, strict=True))
         together = sum(b * loop.loops for b, loop in zip(bits, loops, strict=True))
         delay_s = None
-        if _is_first(direction, place) and isinstance(one.discipline, TailDrop):
+        is_queue = isinstance(one, Rate) and isinstance(one.discipline, TailDrop)
+        if is_queue and _is_first(direction, place):
             if every <= one.rate_bps:
                 delay_s = together / one.rate_bps
             elif every * must_pass < one.rate_bps and not direction.constraints:
@@ -112,14 +120,16 @@ def _link_loads(
 
 def require_capacity(scenario: Scenario) -> None:
     """Raise CallerError if a bottleneck cannot carry the datagrams of the loops that must pass."""
-    for load in link_loads(scenario):
-        if load.mandatory_at_least_bps > load.rate_bps:
-            raise CallerError(
-                f"{load.key}.rate_bps = {load.rate_bps}: the datagrams that must pass, one of any "
-                f"{load.window} of each loop, need "
-                f"{math.ceil(load.mandatory_at_least_bps)} bit/s; the queue would grow without "
-                "bound"
-            )
+    for changes in range(len(scenario.changes) + 1):
+        after = f"from changes.{changes - 1} on, " if changes else ""
+        for load in link_loads(scenario, changes):
+            if load.mandatory_at_least_bps > load.rate_bps:
+                losses, packets = load.window
+                raise CallerError(
+                    f"{load.key}: {after}the datagrams that must pass, {packets - losses} of any "
+                    f"{packets} of each loop, need {math.ceil(load.mandatory_at_least_bps)} bit/s, "
+                    f"and it carries {load.rate_bps:.0f}; the queue would grow without bound"
+                )
 
 
 def load_warnings(loads: Sequence[LinkLoad], scenario: Scenario) -> Iterator[str]:
@@ -127,7 +137,7 @@ def load_warnings(loads: Sequence[LinkLoad], scenario: Scenario) -> Iterator[str
     for load in loads:
         if load.mandatory_at_most_bps > load.rate_bps:
             yield (
-                f"{load.key}.rate_bps = {load.rate_bps}: if all loops transmit as often as they "
+                f"{load.key}, {load.rate_bps:.0f} bit/s: if all loops transmit as often as they "
                 f"can, the datagrams that must pass need {math.ceil(load.mandatory_at_most_bps)} "
                 "bit/s; then the queue grows without bound"
             )

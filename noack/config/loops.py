@@ -129,8 +129,8 @@ def check_loops(scenario: "Scenario") -> None:
         for key, value in _rates(loop).items():
             if value != rates[key]:
                 raise ValueError(
-                    f"loops.{place}.{key}: all loops have the same periods; that of loops.0 is "
-                    f"{rates[key]:g}"
+                    f"loops.{place}.{key}: should be {rates[key]:g}, as for loops.0: all loops "
+                    "have the same periods"
                 )
         for name in section.names:
             if name in names:

@@ -1,5 +1,6 @@
 """Scenario files: a TOML file is read into a frozen scenario, with one line per mistake."""
 
+import copy
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -154,16 +155,29 @@ def value_of(text: str, source: str) -> Any:
 def put(content: dict[str, Any], key: str, value: Any, source: str) -> None:
     """Set the value of a key such as ``trigger.beta``; missing tables are created.
 
+    An entry of a list is named by its number: ``network.impairments.0.rate_bps``.
+
     Raises:
-        CallerError: a part of the key is a value, not a table; or the key has too many parts.
+        CallerError: a part of the key is a value, not a table; a list has no such entry; or the key
+            has too many parts.
     """
-    table = content
+    table: Any = content
     *path, last = key.split(".")
     if len(path) >= toml_file.MOST_LEVELS:
         raise CallerError(f"{source}: the key has more than {toml_file.MOST_LEVELS} parts")
-    for part in path:
-        table = table.setdefault(part, {})
-        if not isinstance(table, dict):
-            whole = " (a list is set as a whole)" if isinstance(table, list) else ""
-            raise CallerError(printable(f"{source}: {part} is not a table{whole}"))
-    table[last] = value
+    for depth, part in enumerate(path):
+        place = _place(table, part, f"{source}: {'.'.join(path[:depth])}")
+        table = table.setdefault(place, {}) if isinstance(table, dict) else table[place]
+    table[_place(table, last, f"{source}: {'.'.join(path)}")] = copy.deepcopy(value)
+
+
+def _place(table: Any, part: str, source: str) -> Any:
+    """Return a key of a table, or the number of an entry of a list."""
+    if isinstance(table, dict):
+        return part
+    if not isinstance(table, list):
+        raise CallerError(printable(f"{source} is not a table"))
+    if part.isdecimal() and int(part) < len(table):
+        return int(part)
+    entries = f"the entries 0 to {len(table) - 1}" if table else "no entries"
+    raise CallerError(printable(f"{source} has {entries}, not {part}"))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from cosim.analysis.replay import replay
+from cosim.output.loops_tables import network_rows
 from cosim.record.packet_outcomes import updates_in
 from cosim.record.run_record import RunRecord, load_record
 from noack.config.loops import phases_ns
@@ -121,6 +122,18 @@ def test_each_loop_and_the_network_are_replayed_bit_by_bit(finished: live.Finish
     for name in NAMES:
         found = replay(record_of(finished, name))
         assert found.bit_exact, found
+
+
+def test_the_summary_counts_the_missed_deadlines_of_all_loops(finished: live.Finished) -> None:
+    steps = np.concatenate([record_of(finished, name)[PLANT_STEP] for name in NAMES])
+    late_ns = steps["now_ns"] - steps["t_ns"]
+    found = finished.summary["deadlines"]["plant"]
+    assert (found["steps"], found["late_steps"]) == (3 * 401, (late_ns > 20_000_000).sum())
+    assert found["max_us"] == pytest.approx(late_ns.max() / 1e3 / 2)  # twice as fast
+    rows = dict(network_rows(finished.summary))
+    assert (rows["deadlines missed"] == "none") == (
+        not any(one["late_steps"] for one in finished.summary["deadlines"].values())
+    )
 
 
 def test_loops_begin_at_their_phases(finished: live.Finished) -> None:

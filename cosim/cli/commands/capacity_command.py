@@ -1,5 +1,6 @@
 """``noack capacity``: how many loops a link carries."""
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,7 +22,11 @@ Loops = Annotated[
 ]
 RateBps = Annotated[
     int | None,
-    typer.Option(help="Rate of the bottleneck, bits per second; by default the scenario's.", min=1),
+    typer.Option(
+        help="Rate of the bottleneck, bits per second; by default the scenario's.",
+        min=1,
+        max=10**12,
+    ),
 ]
 Period = Annotated[
     float | None,
@@ -133,6 +138,7 @@ def _plan(
 ) -> "CapacityPlan":  # fmt: skip
     from cosim.studies.capacity import capacity_plan as plans
     from noack.config.scenario_file import load, value_of
+    from noack.config.sections.loop_section import NAME_PATTERN
 
     settings: dict[str, Any] = {}
     for text in overrides:
@@ -150,14 +156,19 @@ def _plan(
     for option, seconds in (("--update-period", period_s), ("--late-after", deadline_s)):
         if seconds is not None and not 0 < seconds < given.horizon_s:
             raise CallerError(f"{option} {seconds:g}: between 0 and the horizon of the scenario")
-    period_s = period_s or plans.sampling_period_s(given)
+    if period_s is None:
+        period_s = plans.sampling_period_s(given)
+    period_s = plans.require_multiple(period_s, given)
     deadline_s = deadline_s or given.certificate.network_delay_s or period_s
     settings["certificate.network_delay_s"] = deadline_s
     compared = plans.default_policies(given, period_s)
     for text in policies:
         name, equals, trigger = text.partition("=")
-        if not equals or not name.strip() or name in compared:
-            raise CallerError(f"--policy {text}: write it as NAME=TRIGGER, with a new name")
+        if not equals or not re.match(NAME_PATTERN, name.strip()) or name.strip() in compared:
+            raise CallerError(
+                f"--policy {text}: write it as NAME=TRIGGER, with a new name of letters, digits, _ "
+                "and -"
+            )
         compared[name.strip()] = {"trigger": value_of(trigger, f"--policy {name}")}
     fitting = plans.periodic_loops(given, rate_bps, period_s)
     counts = (

@@ -29,6 +29,7 @@ def check(
     A nonlinear plant is also started and linearised. For a plant in Python this runs its code.
     """
     from cosim.output.assumptions_table import print_assumptions
+    from noack.config.link_load import require_capacity
     from noack.config.resolution import policy_of, resolve
     from noack.config.scenario_file import dumps as scenario_toml
     from noack.theory.assumptions import assumptions
@@ -39,6 +40,7 @@ def check(
         return _check_loops(loaded, json=json)
     resolved = resolve(loaded)
     new_trigger(policy_of(resolved))  # some need a stable loop, others a user's class
+    require_capacity(loaded)
     verdicts = [assumption._asdict() for assumption in assumptions(resolved)]
     console = cli.console()
     console.width -= len(_COMMENT)
@@ -77,7 +79,7 @@ def _check_loops(scenario: "Scenario", *, json: bool) -> int:
     for load in loads:
         delay = load.delay_bound_s
         print(
-            f"{_COMMENT}{load.key}: {load.rate_bps} bit/s; datagrams that must pass: "
+            f"{_COMMENT}{load.key}: {load.rate_bps:.0f} bit/s; datagrams that must pass: "
             f"{load.mandatory_at_least_bps:.0f} to {load.mandatory_at_most_bps:.0f} bit/s; delay: "
             + ("no bound" if delay is None else f"at most {delay:.4g} s in virtual time")
         )

@@ -26,6 +26,7 @@ _BANDS = ((0, 4, 0.25, "5 to 95 % of the loops"), (1, 3, 0.45, "25 to 75 %"))
 _MEDIAN, _LARGEST = 2, 5
 
 Reals = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 
 
 class QueueLength(NamedTuple):
@@ -56,23 +57,29 @@ def network_figure(over_time: LoopsOverTime, names: Sequence[str], queue: QueueL
 
 
 @styled
-def norms_figure(over_time: LoopsOverTime, names: Sequence[str]) -> Figure:
-    """Draw ‖e_c‖ and ‖x‖ of all loops on logarithmic axes."""
+def norms_figure(over_time: LoopsOverTime, names: Sequence[str], stayed: Bools) -> Figure:
+    """Draw ‖e_c‖ and ‖x‖ of all loops on logarithmic axes, whose range is for those that stayed."""
     figure, panels = _two_panels(_labels(names))
     drawn = ((r"$\|e_c\|$ controller", over_time.errors), (r"$\|x\|$ plant", over_time.states))
     for axes, (label, values) in zip(panels, drawn, strict=True):
         draw.logarithmic(axes, "y")
         _curves(axes, over_time.middles_s, draw.finite(values, positive=True), names)
         axes.set(title=label)
-        draw.limit_log_axis(axes, values, _DECADES)
+        draw.limit_log_axis(axes, _scale(values, stayed), _DECADES)
         draw.finish(axes, over_time.edges_s)
     panels[1].set_xlabel(draw.TIME)
     return figure
 
 
 @styled
-def error_map(over_time: LoopsOverTime, names: Sequence[str]) -> Figure:
-    """Draw ‖e_c‖ of each loop, a row, over time, as colours."""
+def error_map(over_time: LoopsOverTime, names: Sequence[str], stayed: Bools) -> Figure:
+    """Draw ‖e_c‖ of each loop, a row, over time, as colours, whose range is for those that stayed.
+
+    Args:
+        over_time: the errors.
+        names: of the loops.
+        stayed: (L,) the loops that did not diverge.
+    """
     count = len(names)
     height_in = min(max(count * _ROW_IN, _LOWEST_IN), _HIGHEST_IN)
     above_in = draw.head_in([])
@@ -89,8 +96,9 @@ def error_map(over_time: LoopsOverTime, names: Sequence[str]) -> Figure:
     if not np.isfinite(values).any():
         draw.finish(axes)
         return figure
-    most = float(np.nanmax(values))
-    least = max(float(np.nanmin(values)), most / 10**_DECADES)
+    measured = _scale(values, stayed)
+    most = float(np.nanmax(measured))
+    least = max(float(np.nanmin(measured)), most / 10**_DECADES)
     values[over_time.errors == 0] = least  # just after an update
     norm = LogNorm(least, most if most > least else 2 * least)
     image = axes.imshow(
@@ -99,9 +107,15 @@ def error_map(over_time: LoopsOverTime, names: Sequence[str]) -> Figure:
     )  # fmt: skip
     left_in = draw.WIDTH_IN - draw.RIGHT_IN - 3 * _BAR_IN
     bar = draw.place(figure, left_in, above_in, _BAR_IN, height_in)
-    figure.colorbar(image, cax=bar)
+    figure.colorbar(image, cax=bar, extend="max" if float(np.nanmax(values)) > most else "neither")
     bar.grid(visible=False)
     return figure
+
+
+def _scale(values: Reals, stayed: Bools) -> Reals:
+    """Return the values of the loops that did not diverge; if none is known, of all."""
+    measured = values[stayed]
+    return measured if np.isfinite(measured).any() else values
 
 
 def _labels(names: Sequence[str]) -> list[str]:

@@ -116,6 +116,8 @@ def _figures(over_time: LoopsOverTime, summary: Mapping[str, Any]) -> list[RunFi
     flying = summary["network"]["in_flight"]
     queue = QueueLength(flying["width_s"], flying["mean_by_interval"], flying["max_by_interval"])
     drawn = "Each loop has a curve." if len(names) <= NAMED else "Bands: quantiles over the loops."
+    stayed = np.array([loop["diverged_at_s"] is None for loop in summary["loops"]])
+    left = "" if stayed.all() else " A loop that diverged leaves the range of the axis."
     largest = over_time.errors[np.isfinite(over_time.errors)].max(initial=0.0)
     return [
         RunFigure(
@@ -126,14 +128,14 @@ def _figures(over_time: LoopsOverTime, summary: Mapping[str, Any]) -> list[RunFi
             f"Below, the shares of {len(names)} loops in the bytes that the network forwarded.",
         ),
         RunFigure(
-            "loops", norms_figure(over_time, names),
+            "loops", norms_figure(over_time, names, stayed),
             "Largest error ‖e_c‖ of the controller's model, and largest norm ‖x‖ of the plant's "
-            f"state, in each of {len(over_time.middles_s)} intervals. {drawn}",
+            f"state, in each of {len(over_time.middles_s)} intervals. {drawn}{left}",
             f"Norms of {len(names)} loops over time on logarithmic axes; ‖e_c‖ is at most "
             f"{number(largest)}.",
         ),
         RunFigure(
-            "map", error_map(over_time, names),
+            "map", error_map(over_time, names, stayed),
             "Largest ‖e_c‖ of each loop in each interval; no colour before its first delivery.",
             f"A row of colours for each of {len(names)} loops: ‖e_c‖ over time.",
         ),

@@ -145,11 +145,34 @@ def sampling_period_s(scenario: Scenario) -> float:
     """Return the period that the loop needs by the usual rule ω h ≤ 0.3.
 
     ω is the largest absolute eigenvalue of Â + B̂K; h is a multiple of the measurement period.
+
+    Raises:
+        CallerError: h is not shorter than the run.
     """
     loop = loop_of(resolve(scenario))
     fastest = float(np.abs(np.linalg.eigvals(loop.A_model + loop.B_model @ loop.K)).max())
     measured_s = scenario.timing.measurement_period_ns / NS_PER_S
+    if fastest * scenario.horizon_s <= _PERIOD_PER_TIME_CONSTANT:
+        raise CallerError(
+            f"--update-period: 0.3 / {fastest:.3g}, from the fastest eigenvalue of A + BK, is not "
+            f"shorter than the run of {scenario.horizon_s:g} s; give a period"
+        )
     return max(math.floor(_PERIOD_PER_TIME_CONSTANT / fastest / measured_s), 1) * measured_s
+
+
+def require_multiple(period_s: float, scenario: Scenario) -> float:
+    """Return a period of transmissions; between two measurements there is none.
+
+    Raises:
+        CallerError: it is not a multiple of the measurement period.
+    """
+    measured_ns = scenario.timing.measurement_period_ns
+    if round(period_s * NS_PER_S) % measured_ns:
+        raise CallerError(
+            f"--update-period {period_s:g}: not a multiple of the time between two measurements, "
+            f"{measured_ns / NS_PER_S:g} s"
+        )
+    return period_s
 
 
 def default_counts(periodic: float) -> tuple[int, ...]:
@@ -166,7 +189,7 @@ def default_policies(scenario: Scenario, period_s: float) -> dict[str, dict[str,
     if isinstance(scenario.trigger, PeriodicSettings):
         raise CallerError(
             'trigger.policy = "periodic": the event-triggered loops need an event-triggered '
-            "policy, e.g. --set 'trigger={ policy = \"absolute\", threshold = 0.05 }'"
+            "policy, e.g. --set 'trigger={ policy = \"absolute\", delta = 0.05 }'"
         )
     periodic = {"policy": "periodic", "period_s": period_s}
     return {

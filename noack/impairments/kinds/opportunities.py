@@ -136,6 +136,16 @@ class Opportunities(Impairment):
         return (self.times_ms or (0,))[-1] * _NS_PER_MS
 
     @property
+    def rate_bps(self) -> float:
+        """Bits per second that it delivers on average; the times must have been read."""
+        times = len(self.times_ms or ())
+        return times * OPPORTUNITY_BYTES * 8 * NS_PER_S / self.length_ns
+
+    def line_bits(self, payload_bytes: int) -> int:
+        """Return the bits that a payload needs on the link."""
+        return 8 * max(payload_bytes + self.overhead_bytes, 1)
+
+    @property
     def longest_s(self) -> float:
         """Longest time until a full queue of packets of one opportunity each has been delivered."""
         if self.times_ms is None:
@@ -186,10 +196,9 @@ class Opportunities(Impairment):
         what = self.file
         if self.times_ms is not None:
             length_s = self.length_ns / NS_PER_S
-            rate_bps = len(self.times_ms) * OPPORTUNITY_BYTES * 8 / length_s
             what = (
                 f"{len(self.times_ms)} times in {brief_number(length_s)} s, "
-                f"{brief_number(rate_bps / 1e6)} Mbit/s on average"
+                f"{brief_number(self.rate_bps / 1e6)} Mbit/s on average"
             )
         most = "" if self.queue_bytes is None else f" or {self.queue_bytes} bytes"
         return (

@@ -46,6 +46,50 @@ def test_the_rate_for_what_must_pass_is_the_limit(
     require_capacity(scenario_of(content, 1000, 5, loops, enforce_mansd=False))
 
 
+@pytest.mark.parametrize(
+    ("constraint", "share"),
+    [({"kind": "at_most", "losses": 1, "window": 10}, 9 / 10),
+     ({"kind": "recovery", "deliveries": 3}, 3 / 5)],
+)  # fmt: skip
+def test_a_constraint_can_require_more_than_m(
+    content: dict[str, Any], constraint: dict[str, Any], share: float
+) -> None:
+    """With M − 1 = 2 alone it would be a third."""
+    loops = {"name": "a", "count": 30, "trigger": PERIODIC}
+    needed_bps = round(30 * BITS / 0.05 * share)
+    require_capacity(scenario_of(content, needed_bps, 5, loops, constraints=[constraint]))
+    with pytest.raises(CallerError, match=f"need {needed_bps} bit/s"):
+        require_capacity(scenario_of(content, needed_bps - 1, 5, loops, constraints=[constraint]))
+
+
+def test_a_change_can_require_more(content: dict[str, Any]) -> None:
+    """From M − 1 = 2 to 0: each of the 20 datagrams a second of each of 30 loops must pass."""
+    content["changes"] = [{"at_s": 0.5, "set": {"network.mansd": 0}}]
+    content["horizon_s"] = 1.0
+    loops = {"name": "a", "count": 30, "trigger": PERIODIC}
+    needed_bps = 30 * BITS * 20
+    require_capacity(scenario_of(content, needed_bps, 5, loops))
+    with pytest.raises(CallerError, match=rf"changes\.0 .* 1 of any 1 .* need {needed_bps} bit/s"):
+        require_capacity(scenario_of(content, needed_bps - 1, 5, loops))
+
+
+def test_recorded_opportunities_are_a_bottleneck(content: dict[str, Any]) -> None:
+    """An opportunity carries 1504 bytes; a datagram has 32 more than its payload."""
+    bits = 8 * (datagram_bytes(2) + 32)
+    loops = {"name": "a", "count": 30, "trigger": PERIODIC}
+    needed_bps = 30 * bits / 0.05 / 3
+
+    def checked(period_ms: int) -> None:
+        stage = {"kind": "opportunities", "times_ms": [period_ms]}
+        content["network"]["impairments"] = [stage]
+        require_capacity(validate(content | {"loops": [loops]}, "here"))
+
+    most_ms = int(1000 * 8 * 1504 / needed_bps)
+    checked(most_ms)
+    with pytest.raises(CallerError, match=f"need {int(needed_bps)} bit/s"):
+        checked(most_ms + 1)
+
+
 def test_the_actuations_need_a_rate_too(content: dict[str, Any]) -> None:
     """30 controllers with 500 ticks a second; one of any 5 actuations must pass."""
     inputs = len(content["model"].get("B", [[0]])[0])

@@ -106,11 +106,11 @@ def test_the_file_of_a_loop_is_found_beside_the_scenario(
         ([{"name": "a", "network": {"mansd": 1}}],
          'loops.0.network = {"mansd": 1}: all loops share it; set it at the top level'),
         ([{"name": "a"}, {"name": "b", "plant": {"rate_hz": 250.0}}],
-         "loops.1.plant.rate_hz = 250.0: all loops have the same periods; "
-         "that of loops.0 is 500"),
+         "loops.1.plant.rate_hz = 250.0: should be 500, as for loops.0: all loops "
+         "have the same periods"),
         ([{"name": "a"}, {"name": "b", "controller": {"rate_hz": 250.0}}],
-         "loops.1.controller.rate_hz = 250.0: all loops have the same periods; "
-         "that of loops.0 is 500"),
+         "loops.1.controller.rate_hz = 250.0: should be 500, as for loops.0: all loops "
+         "have the same periods"),
         ([{"name": "a", "plant": {"initial_state": [1.0]}}],
          "loops.0.plant.initial_state = [1.0]: expected 2 entries (one per state), found 1"),
         ([{"name": "a", "trigger": {"bta": 1.0}}],

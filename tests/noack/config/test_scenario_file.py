@@ -356,6 +356,17 @@ def test_settings_replace_values_of_the_file(
     assert changed.ports == load(path).ports  # all other settings are unchanged
 
 
+def test_a_setting_names_an_entry_of_a_list(tmp_path: Path) -> None:
+    path = tmp_path / "scenario.toml"
+    path.write_text(LANE + '[[loops]]\nname = "a"\n[[loops]]\nname = "b"\n')
+    found = load(path, ["plant.initial_state.2=0.5", "loops.1.mode=zoh", "loops.1.name=c"])
+    assert found.plant.initial_state[2] == 0.5
+    assert found.loops is not None
+    assert [(one.name, one.mode) for one in found.loops] == [("a", None), ("c", "zoh")]
+    with pytest.raises(CallerError, match=r"^--set loops\.1\.name = .a.: the name a is already"):
+        load(path, ["loops.1.name=a"])
+
+
 def test_the_last_setting_of_a_key_wins(path: Path) -> None:
     assert load(path, ["speed=2", "speed=3"]).speed == 3
 
@@ -365,15 +376,14 @@ def test_the_last_setting_of_a_key_wins(path: Path) -> None:
     [
         ("trigger.beta", "--set trigger.beta: write it as key=value, e.g. trigger.beta=0.3"),
         (" =3", "--set  =3: write it as key=value, e.g. trigger.beta=0.3"),
-        ("trigger.beta.x=1", "--set trigger.beta.x=1: beta is not a table"),
+        ("trigger.beta.x=1", "--set trigger.beta.x=1: trigger.beta is not a table"),
         ("plant.initial_state=[1,2",
          "--set plant.initial_state: not valid TOML: Unclosed array (at end of document)"),
         ('mode="zoh', "--set mode: not valid TOML: Unterminated string (at end of document)"),
-        (
-            "plant.initial_state.0=1",
-            "--set plant.initial_state.0=1: initial_state is not a table "
-            "(a list is set as a whole)",
-        ),
+        ("plant.initial_state.4=1",
+         "--set plant.initial_state.4=1: plant.initial_state has the entries 0 to 3, not 4"),
+        ("plant.initial_state.x=1",
+         "--set plant.initial_state.x=1: plant.initial_state has the entries 0 to 3, not x"),
     ],
 )  # fmt: skip
 def test_a_setting_that_cannot_be_applied_is_reported(

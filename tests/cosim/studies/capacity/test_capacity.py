@@ -139,7 +139,14 @@ def test_the_command_compares_the_policies_and_confirms_a_point_live(tmp_path: P
         (["--loops", "0,3"], "numbers of loops are at least 1"),
         (["--loops", "few"], "--loops few: write it as"),
         (["--update-period", "99"], "--update-period 99: between 0 and the horizon"),
+        (
+            ["--update-period", "0.015"],
+            "0.015: not a multiple of the time between two measurements",
+        ),
+        (["--set", "model.gain=[[-3.0, -0.001]]", "--set", "horizon_s=0.2"], "give a period"),
         (["--policy", "zoh={}"], "with a new name"),
+        (["--policy", " zoh={}"], "with a new name"),
+        (["--policy", "../x={ policy = 'periodic', period_s = 0.2 }"], "letters, digits"),
         (["--set", "trigger={ policy = 'periodic', period_s = 0.2 }"], "need an event-triggered"),
     ],
 )
