@@ -24,6 +24,7 @@ from noack.runtime.control_messages import (
 from noack.runtime.control_plane import ControlPlane
 from noack.runtime.join_ticket import Ticket
 from noack.runtime.life_cycle import AWAY_S, HORIZON, LAUNCHED_AWAY_S, Event, LifeCycle, Side, State
+from noack.runtime.zenoh_session import header_of, next_payload
 
 _START_DELAY_NS = 100_000_000
 """From the last arrival to the common epoch: time for the message to reach all processes."""
@@ -106,6 +107,8 @@ class Coordinator:
     def poll(self) -> None:
         """Handle all messages that have arrived; call often."""
         while (end := self._ends.try_recv()) is not None:
+            if header_of(end) is None:
+                continue
             reason = end.payload.to_bytes().decode(errors="replace")
             self._reported[_sender(end.key_expr)[0]] = reason
             self._apply(end.key_expr, Event.END, reason)
@@ -188,11 +191,11 @@ class Coordinator:
 
     def progress(self) -> dict[str, Any] | None:
         """The recorder's newest progress report; None without a new one."""
-        sample = self._progress.try_recv()
-        if sample is None:
+        payload = next_payload(self._progress)
+        if payload is None:
             return None
         try:
-            return parse_message(RunProgress, sample.payload.to_bytes())
+            return parse_message(RunProgress, payload)
         except PeerError:  # not from the recorder
             return None
 

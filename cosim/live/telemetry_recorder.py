@@ -25,6 +25,7 @@ from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.command_line import print_to_stderr
 from noack.runtime.control_plane import ControlPlane
 from noack.runtime.telemetry import NOTICES, first_row
+from noack.runtime.zenoh_session import header_of
 
 if TYPE_CHECKING:
     from cosim.output.viewer.loops_feed import LoopsFeed
@@ -190,7 +191,8 @@ class Recorder:
         role, table = str(sample.key_expr).split("/")[-2:]
         payload = sample.payload.to_bytes()
         try:
-            header = b"" if sample.attachment is None else sample.attachment.to_bytes()
+            if (header := header_of(sample)) is None:
+                raise PeerError("it was sent with another key")
             generation, first = first_row(header)
             if table == NOTICES and role in LOOP_ROLES:
                 line = self._store.add_notice(role, generation, first, payload)
@@ -236,7 +238,7 @@ class Recorder:
             )
 
     def _publish_progress(self) -> None:
-        self._plane.session.put(self._plane.key("progress"), self._progress.dumps())
+        self._plane.publish("progress", content=self._progress.dumps())
 
     def _take_report(self, query: zenoh.Query) -> None:
         """Answer a final report with the rows that are missing."""

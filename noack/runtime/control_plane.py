@@ -23,7 +23,14 @@ from noack.impairments.kept_loss import remember
 from noack.protocol.topology import COORDINATOR
 from noack.runtime.control_messages import ChangeAnnouncement, parse_message
 from noack.runtime.join_ticket import Ticket
-from noack.runtime.zenoh_session import SessionSecret, cause_of, first_reply, open_session
+from noack.runtime.zenoh_session import (
+    SessionSecret,
+    cause_of,
+    first_reply,
+    label,
+    next_payload,
+    open_session,
+)
 
 _REQUEST_AGAIN_S = 5.0
 _POLL_S = 0.01
@@ -90,10 +97,9 @@ class ControlPlane:
     def stop_requested(self) -> str | None:
         """The reason of the coordinator's stop request; None without a request."""
         if self._stop_reason is None:
-            sample = self._stops.try_recv()
-            if sample is not None:
-                reason = sample.payload.to_bytes().decode(errors="replace")
-                self._stop_reason = reason or "stopped"
+            reason = next_payload(self._stops)
+            if reason is not None:
+                self._stop_reason = reason.decode(errors="replace") or "stopped"
         return self._stop_reason
 
     def coordinator_gone(self, *, for_s: float = 0.0) -> bool:
@@ -107,56 +113,54 @@ class ControlPlane:
         since_s = self._coordinator_gone_s
         return since_s is not None and time.monotonic() - since_s >= for_s
 
+    def publish(self, *parts: str, content: str | bytes, header: bytes = b"", **how: Any) -> None:
+        """Send a message to the subscribers of a key; ``how`` has options of zenoh."""
+        key = self.key(*parts)
+        self.session.put(key, content, attachment=label(key, header), **how)
+
     def request_stop(self, reason: str) -> None:
         """Ask all processes of the run to stop."""
-        self.session.put(self.key("stop"), reason, priority=Priority.REAL_TIME)
+        self.publish("stop", content=reason, priority=Priority.REAL_TIME)
 
     def acknowledge_rows(self, role: str, content: object) -> None:
         """Confirm to a process which of its rows are on disk."""
-        self.session.put(
-            self.key("persisted", role),
-            json.dumps(content),
+        self.publish(
+            "persisted",
+            role,
+            content=json.dumps(content),
             congestion_control=CongestionControl.DROP,
         )
 
     def persisted(self) -> bytes | None:
         """The recorder's newest confirmation of rows of this process; None without a new one."""
-        sample = self._persisted.try_recv()
-        return None if sample is None else sample.payload.to_bytes()
+        return next_payload(self._persisted)
 
     def announce_change(self, content: object) -> None:
         """Announce a change of runtime parameters to all processes."""
-        self.session.put(self.key("change"), json.dumps(content), priority=Priority.REAL_TIME)
+        self.publish("change", content=json.dumps(content), priority=Priority.REAL_TIME)
 
     def next_change(self) -> bytes | None:
         """The next announced change; None if there is none."""
-        sample = self._changes.try_recv()
-        return None if sample is None else sample.payload.to_bytes()
+        return next_payload(self._changes)
 
     def report_end(self, reason: str) -> None:
         """Report to the coordinator why this process ends; without a report it counts as dead."""
-        self.session.put(
-            self.key("ended", self.role, self.instance), reason, priority=Priority.REAL_TIME
-        )
+        self.publish("ended", self.role, self.instance, content=reason, priority=Priority.REAL_TIME)
 
     def publish_telemetry(self, table: str, header: bytes, payload: bytes) -> None:
         """Publish a batch without blocking; it is dropped if the recorder cannot keep up."""
-        self.session.put(
-            self.key("telemetry", self.role, table),
-            payload,
-            attachment=header,
-            congestion_control=CongestionControl.DROP,
-            priority=Priority.BACKGROUND,
-        )
+        self.publish(
+            "telemetry", self.role, table,
+            content=payload, header=header,
+            congestion_control=CongestionControl.DROP, priority=Priority.BACKGROUND,
+        )  # fmt: skip
 
     def publish_telemetry_blocking(self, table: str, header: bytes, payload: bytes) -> None:
         """Publish a batch outside the loop; block until there is room."""
-        self.session.put(
-            self.key("telemetry", self.role, table),
-            payload,
-            attachment=header,
-            congestion_control=CongestionControl.BLOCK,
-        )
+        self.publish(
+            "telemetry", self.role, table,
+            content=payload, header=header, congestion_control=CongestionControl.BLOCK,
+        )  # fmt: skip
 
     @staticmethod
     def answer(query: zenoh.Query, content: object) -> None:

@@ -16,7 +16,9 @@ from zenoh.handlers import FifoChannel
 
 from noack.core.errors import CallerError
 
-LEASE_MS = 2000  # A peer that is silent for longer is gone
+LEASE_MS = 6000
+"""A connection whose other end is silent for longer breaks. On a busy machine a process may not run
+for seconds."""
 _CONNECT_MS = 5000
 _SHAKE_HANDS_MS = 2000
 """zenoh serves at most 100 connections at a time that have not yet shown the secret."""
@@ -114,6 +116,31 @@ def first_reply(
         if reply is not None:
             return reply
         time.sleep(poll_s)
+    return None
+
+
+def label(key: str, header: bytes = b"") -> bytes:
+    """Return the attachment of a message: the key with which it is sent, and a header."""
+    return b"\n".join((key.encode(), header))
+
+
+def header_of(sample: zenoh.Sample) -> bytes | None:
+    """Return the header of a message; None if it was sent with another key.
+
+    On an overloaded machine, after connections had broken, zenoh delivered a message to the
+    subscriber of another key: a confirmation of rows as a request to stop.
+    """
+    attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+    key, _, header = attachment.partition(b"\n")
+    return header if key == str(sample.key_expr).encode() else None
+
+
+def next_payload(subscriber: Any) -> bytes | None:
+    """Return the payload of a subscriber's next message with its key; None without one."""
+    while (sample := subscriber.try_recv()) is not None:
+        if header_of(sample) is not None:
+            payload: bytes = sample.payload.to_bytes()
+            return payload
     return None
 
 

@@ -5,6 +5,8 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
+from noack.runtime.zenoh_session import label
+
 
 class Payload:
     """Bytes with zenoh's interface."""
@@ -20,12 +22,14 @@ class Payload:
 
 
 class Sample:
-    """A publication."""
+    """A publication; ``sent_as`` is the key with which it was sent."""
 
-    def __init__(self, key: str, payload: bytes | None = b"", attachment: bytes | None = None):
+    def __init__(
+        self, key: str, payload: bytes | None = b"", header: bytes | None = b"", sent_as: str = ""
+    ):
         self.key_expr = key
         self.payload = Payload(payload or b"")
-        self.attachment = None if attachment is None else Payload(attachment)
+        self.attachment = None if header is None else Payload(label(sent_as or key, header))
         self.kind = None
 
 
@@ -95,8 +99,10 @@ class FakePlane:
         return self
 
     def put(self, key: str, content: Any) -> None:
-        if not isinstance(content, str):
-            self._channels[key].append(content)
+        self._channels[key].append(content)
+
+    def publish(self, *parts: str, content: Any) -> None:
+        pass
 
     def answer(self, query: Query, content: Any) -> None:
         self.answers.append(content)

@@ -21,7 +21,7 @@ from cosim.record.run_record import load_record
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.control_plane import secret_of
 from noack.runtime.join_ticket import Ticket, loads
-from noack.runtime.zenoh_session import session_config
+from noack.runtime.zenoh_session import label, session_config
 from tests.integration.conftest import PATIENCE_S, Finished, Running, settings, wait_for
 
 GARBAGE_BYTES = 10 * 2**20
@@ -90,7 +90,8 @@ class Intruder:
             config = session_config(self._ticket.endpoint, listen=False, more=more)
             with contextlib.suppress(zenoh.ZError), zenoh.open(config) as session:
                 self.let_in += 1
-                session.put(f"noack/{self._ticket.run_id:016x}/stop", "intruded")
+                key = f"noack/{self._ticket.run_id:016x}/stop"
+                session.put(key, "intruded", attachment=label(key))
 
 
 class Attacked:

@@ -39,10 +39,9 @@ class RecordingPlane(FakePlane):
         super().__init__()
         self.reports: list[dict[str, Any]] = []
 
-    def put(self, key: str, content: Any) -> None:
-        if isinstance(content, str):
-            self.reports.append(parse_message(RunProgress, content))
-        super().put(key, content)
+    def publish(self, *parts: str, content: Any) -> None:
+        assert parts == ("progress",)
+        self.reports.append(parse_message(RunProgress, content))
 
 
 def recorder_of(scenario: Scenario, run_dir: Path, plane: FakePlane) -> Recorder:

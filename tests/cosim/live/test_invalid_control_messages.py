@@ -63,6 +63,7 @@ def test_the_recorder_ignores_invalid_telemetry_and_stores_the_rest(
         plane.put("telemetry", Sample("t/plant/plant_step", row, junk))
         plane.put("telemetry", Sample("t/sensor/plant_step", row, header))
         plane.put("telemetry", Sample("t/plant/notices", junk, header))
+        plane.put("telemetry", Sample("t/plant/plant_step", row, header, "t/plant/plant_x"))
         bad = Query("report/plant", junk)
         plane.put("report", bad)
         recorder.poll()

@@ -80,6 +80,9 @@ def test_a_process_may_not_join_again_once_another_has_its_role(
 
 def test_the_reason_for_an_end_is_the_reported_one(plane: FakePlane, barrier: Coordinator) -> None:
     assert barrier.reported_failure("sensor") is None
+    plane.put("ended", Sample("noack/0/ended/sensor/one", b"rows", sent_as="noack/0/progress"))
+    barrier.poll()
+    assert barrier.reported_failure("sensor") is None
     plane.put("ended", Sample("noack/0/ended/sensor/one", b"the disk is full"))
     barrier.poll()
     assert barrier.reported_failure("sensor") == "the disk is full"

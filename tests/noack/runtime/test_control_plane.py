@@ -30,7 +30,7 @@ from noack.runtime.process_entry import _admitted
 from noack.runtime.process_life import RunProcess
 from noack.runtime.signals import Signals
 from noack.runtime.udp_sockets import free_tcp_port
-from noack.runtime.zenoh_session import SessionSecret, open_session, session_config
+from noack.runtime.zenoh_session import SessionSecret, label, open_session, session_config
 from tests.fuzz.plane import FakePlane
 from tests.integration.conftest import wait_for
 
@@ -109,7 +109,8 @@ def test_a_refused_session_neither_sends_nor_receives(
         for session in strangers:
             for key in ("stop", f"ended/plant/{plant.instance}", "progress",
                         "telemetry/plant/plant_step", "persisted/plant"):  # fmt: skip
-                session.put(plant.key(*key.split("/")), "evil")
+                full = plant.key(*key.split("/"))
+                session.put(full, "evil", attachment=label(full))
             session.liveliness().declare_token(plant.key("alive", "sensor", "evil"))
             for what in ("admit", "join", "report"):
                 key = plant.key(what, "plant")
@@ -138,6 +139,30 @@ def test_a_refused_session_neither_sends_nor_receives(
 def _is_own(sample: zenoh.Sample) -> bool:
     assert sample.payload.to_bytes() == b"own"
     return True
+
+
+def test_a_message_that_arrives_under_another_key_is_ignored(
+    coordinator: Coordinator, ticket: Ticket
+) -> None:
+    """zenoh once delivered a confirmation of rows as a request to stop."""
+    with ControlPlane(ticket, "plant") as plant:
+        listener, sent_as = coordinator.plane, label(plant.key("persisted", "plant"))
+
+        def arrives() -> bool:
+            listener.acknowledge_rows("plant", {"rows": {}})
+            return plant.persisted() is not None
+
+        wait_for(arrives)  # the listener knows the subscriptions
+        for key in ("stop", "change"):
+            listener.session.put(plant.key(key), "misdelivered", attachment=sent_as)
+            listener.session.put(plant.key(key), "without a label")
+        listener.announce_change("own")
+        changes: list[bytes] = []
+        wait_for(lambda: changes.append(plant.next_change() or b"") or any(changes))
+        assert any(changes) and max(changes) == b'"own"'  # the earlier ones have arrived, too
+        assert plant.stop_requested() is None
+        listener.request_stop("enough")
+        wait_for(lambda: plant.stop_requested() == "enough")
 
 
 def test_a_process_refuses_an_endpoint_without_authentication(ticket: Ticket) -> None:
