@@ -25,6 +25,8 @@ from cosim.record.run_record import Rows, RunRecord
 from noack.config.loops import phases_ns
 from noack.core.clock import NS_PER_S
 from noack.core.errors import ExitStatus
+from noack.impairments.feature import Impairment
+from noack.impairments.kinds.duplicate import Duplicate
 from noack.impairments.kinds.rate import Rate
 from noack.protocol.record_tables import NETEM_PACKET, Fate, effective
 
@@ -67,6 +69,7 @@ class InFlightPart(SummaryPart):
     """Datagrams inside the network: those that wait, are sent or are delayed."""
 
     mean: float
+    """Over the time that the run reached."""
     max: Count
     width_s: float
     """Width of the intervals of the two lists."""
@@ -86,7 +89,8 @@ class NetworkPart(SummaryPart):
     rate_bps: Count | None
     """The lowest rate of its bottlenecks; None without one."""
     utilisation: Real
-    """Share of this rate that the datagrams used that left until the end, with their overhead."""
+    """Share of this rate that the datagrams used that left until the end of the run, with their
+    overhead; with a duplication before the bottleneck, their copies, too."""
     in_flight: InFlightPart
 
 
@@ -156,6 +160,7 @@ def summarise_loops(
         packets["flow"], np.where(packets["release_ns"] >= 0, packets["size_bytes"], 0), len(loops)
     )
     phases = phases_ns(scenario)
+    reached_s = min(float(one.summary["reached_s"]) for one in loops)
     parts = [
         _loop_part(
             number, phases[number], one, packets[packets["flow"] == number],
@@ -171,8 +176,8 @@ def summarise_loops(
         constraints=[one.text() for one in scenario.network.constraints],
         horizon_s=scenario.horizon_s,
         speed=scenario.speed,
-        reached_s=min(float(one.summary["reached_s"]) for one in loops),
-        network=_network_part(network, packets, parts),
+        reached_s=reached_s,
+        network=_network_part(network, packets, parts, reached_s),
         loops=parts,
         deadlines=_deadlines([one.summary["lateness_us"] for one in loops]),
         exit=end if end.status != ExitStatus.OK else _end(end, parts),
@@ -233,25 +238,36 @@ def _loop_part(
     )
 
 
-def _network_part(network: RunRecord, packets: Rows, loops: Sequence[LoopPart]) -> NetworkPart:
-    fates, forwarded = packets["fate"], packets["release_ns"] >= 0
-    rates = [one for one in network.scenario.network.impairments if isinstance(one, Rate)]
+def _network_part(
+    network: RunRecord, packets: Rows, loops: Sequence[LoopPart], reached_s: float
+) -> NetworkPart:
+    fates, stages = packets["fate"], network.scenario.network.impairments
+    rates = [one for one in stages if isinstance(one, Rate)]
     slowest = min(rates, key=lambda one: one.rate_bps, default=None)
-    horizon_ns = network.scenario.timing.horizon_ns
-    in_time = forwarded & (packets["release_ns"] <= horizon_ns)
-    bits = 0 if slowest is None else slowest.line_bits(packets["size_bytes"][in_time]).sum()
+    reached_ns = max(round(reached_s * NS_PER_S), 1)
     return NetworkPart(
         datagrams=len(packets),
-        forwarded=int(forwarded.sum()),
+        forwarded=int((packets["release_ns"] >= 0).sum()),
         forced_deliveries=int((fates == Fate.FORCED).sum()),
         drops_by_cause=dict(sum((Counter(one.drops_by_cause) for one in loops), Counter())),
         longest_loss_burst=max(one.longest_loss_burst for one in loops),
         rate_bps=None if slowest is None else slowest.rate_bps,
         utilisation=(
-            None if slowest is None else float(bits / slowest.rate_bps / horizon_ns * NS_PER_S)
+            None if slowest is None else _utilisation(packets, slowest, stages, reached_ns)
         ),
-        in_flight=in_flight(packets, horizon_ns),
+        in_flight=in_flight(packets, network.scenario.timing.horizon_ns, reached_ns),
     )
+
+
+def _utilisation(
+    packets: Rows, bottleneck: Rate, stages: Sequence[Impairment], until_ns: int
+) -> float:
+    """Return the share of a bottleneck's rate that was used until a time."""
+    copied = any(isinstance(one, Duplicate) for one in stages[: stages.index(bottleneck)])
+    left = [packets[name] for name in (("release_ns", "copy_ns") if copied else ("release_ns",))]
+    times = sum(((at_ns >= 0) & (at_ns <= until_ns)).astype(np.int64) for at_ns in left)
+    bits = (bottleneck.line_bits(packets["size_bytes"]) * times).sum()
+    return float(bits / bottleneck.rate_bps / until_ns * NS_PER_S)
 
 
 def _delays_ns(packets: Rows) -> NDArray[np.int64]:
@@ -261,11 +277,13 @@ def _delays_ns(packets: Rows) -> NDArray[np.int64]:
     return delays
 
 
-def in_flight(packets: Rows, horizon_ns: int) -> InFlightPart:
+def in_flight(packets: Rows, horizon_ns: int, reached_ns: int) -> InFlightPart:
     """Return how many datagrams were inside the network, in intervals of equal width."""
-    means, largest = counts_inside(*times_inside(packets), np.linspace(0, horizon_ns, _BINS + 1))
+    inside = times_inside(packets)
+    means, largest = counts_inside(*inside, np.linspace(0, horizon_ns, _BINS + 1))
+    (mean,), _ = counts_inside(*inside, np.array([0.0, reached_ns]))
     return InFlightPart(
-        mean=float(means.mean()),
+        mean=float(mean),
         max=int(largest.max()),
         width_s=horizon_ns / _BINS / NS_PER_S,
         mean_by_interval=means.round(6).tolist(),

@@ -1,5 +1,6 @@
 """Terminal output of a run of several loops: its network, and its loops, the worst first."""
 
+import math
 from collections import Counter
 from typing import Any
 
@@ -68,13 +69,13 @@ def badness(loop: dict[str, Any]) -> tuple[Any, ...]:
 def network_rows(summary: Summary) -> list[tuple[str, str]]:
     """Return the quantities of the network, and their values as text."""
     network, flying = summary["network"], summary["network"]["in_flight"]
-    sent = network["datagrams"]
+    sent, reached_s = network["datagrams"], summary["reached_s"] or math.inf
     lost = sum(network["drops_by_cause"].values())
     causes = "".join(
         f", {n} {cause.replace('_', ' ')}" for cause, n in network["drops_by_cause"].items()
     )
     rows = [
-        ("updates of all loops", f"{sent} ({sent / summary['horizon_s']:.4g} /s)"),
+        ("updates of all loops", f"{sent} ({sent / reached_s:.4g} /s)"),
         ("lost", f"{lost} ({ratio(lost, sent)}){causes}"),
         ("longest loss burst, cap", f"{network['longest_loss_burst']}, {summary['mansd']}"),
         ("forced by the guarantee", str(network["forced_deliveries"])),
@@ -86,7 +87,7 @@ def network_rows(summary: Summary) -> list[tuple[str, str]]:
     loops = summary["loops"]
     if flows := [one["actuations"] for one in loops if one["actuations"] is not None]:
         sent, lost = (sum(one[key] for one in flows) for key in ("sent", "lost"))
-        rows.append(("actuations of all loops", f"{sent} ({sent / summary['horizon_s']:.4g} /s)"))
+        rows.append(("actuations of all loops", f"{sent} ({sent / reached_s:.4g} /s)"))
         burst = max(one["longest_loss_burst"] for one in flows)
         rows.append(("  lost, longest loss burst", f"{lost} ({ratio(lost, sent)}), {burst}"))
     if deadlines := summary.get("deadlines"):

@@ -19,7 +19,7 @@ from cosim.analysis.loops_over_time import (
 )
 from cosim.analysis.loops_summary import in_flight, is_complete
 from cosim.cli import app
-from cosim.output.loops_tables import loop_row
+from cosim.output.loops_tables import loop_row, network_rows
 from cosim.output.report.loops_figures import error_map, norms_figure
 from cosim.output.viewer.opening_time import opening_time_ns
 from cosim.record.align import align_tables
@@ -94,6 +94,10 @@ def test_the_summary_adds_up(run_dir: Path) -> None:
     # Little's law: the mean number in the network is the rate times the mean time in it.
     times_s = sum(one["deliveries"] * (one["delay_mean_s"] or 0.0) for one in loops)
     assert network["in_flight"]["mean"] == pytest.approx(times_s / 3, rel=0.02)
+    # A run that was stopped at half of its horizon.
+    assert (
+        f"({network['datagrams'] / 1.5:.4g} /s)" in network_rows(summary | {"reached_s": 1.5})[0][1]
+    )
 
 
 def test_commands_read_the_run_and_its_loops(run_dir: Path) -> None:
@@ -260,8 +264,23 @@ def test_the_number_in_flight_over_time() -> None:
     packets["copy_ns"] = -1
     packets["now_ns"] = np.array([0, 10, 50, 60]) * 10**9
     packets["release_ns"] = np.array([20 * 10**9, 30 * 10**9, 50 * 10**9, -1])
-    found = in_flight(packets, 100 * 10**9)
+    found = in_flight(packets, 100 * 10**9, 100 * 10**9)
     assert (found.mean, found.max, found.width_s) == (pytest.approx(0.4), 2, 0.5)
     assert found.max_by_interval[:60] == [1] * 20 + [2] * 20 + [1] * 20
     assert not any(found.max_by_interval[61:])
     assert found.mean_by_interval[20:40] == [2.0] * 20
+    assert in_flight(packets, 100 * 10**9, 40 * 10**9).mean == pytest.approx(1.0)  # stopped
+
+
+def test_the_copies_of_a_duplication_use_the_bottleneck(tmp_path: Path) -> None:
+    """And not the ones that are made behind it; a datagram of two states has 736 bits on it."""
+    rate, twice = '{ kind = "rate", rate_bps = 1000000 }', '{ kind = "duplicate", probability = 1 }'
+    for stages, times in ((f"[{twice}, {rate}]", 2), (f"[{rate}, {twice}]", 1)):
+        settings = (
+            "horizon_s=1.0",
+            "network.loss.probability=0.0",
+            f"network.impairments={stages}",
+        )
+        network = json.loads(simulated(tmp_path, *settings).stdout)["network"]
+        used = network["datagrams"] * times * 736 / 1e6
+        assert network["utilisation"] == pytest.approx(used, rel=0.1)  # the last may leave later
