@@ -25,6 +25,7 @@ from noack.protocol.topology import ENDS, LOOP_ROLES
 from noack.protocol.wire_format import Flow
 from noack.runtime.life_cycle import HORIZON
 
+_ARRIVES_AFTER_END_S = 0.1
 VIOLATION = "violation"
 """Level of a notice: a process detected that an assumption was violated."""
 
@@ -59,7 +60,13 @@ def from_controller(record: RunRecord) -> dict[str, FlowPart]:
 
 
 def unintended_losses(record: RunRecord) -> dict[str, int]:
-    """Return the number of datagrams lost without a decision of the emulator, by hop."""
+    """Return the number of datagrams lost without a decision of the emulator, by hop.
+
+    The processes receive for at least 150 ms of wall time beyond the horizon. A datagram that was
+    to leave the emulator less than 50 ms before this, or later, is not lost: its receiver may have
+    ended.
+    """
+    last_ns = record.scenario.timing.horizon_ns + _ARRIVES_AFTER_END_S * record.scenario.speed * 1e9
     outcomes, events = packet_outcomes(record), record.events()["event"]
     received = record.columns(CONTROLLER_DELIVERY, "sequence")["sequence"]
     every = record.scenario.plant.measure_every
@@ -71,7 +78,7 @@ def unintended_losses(record: RunRecord) -> dict[str, int]:
     legs = {
         "measurement": measured,
         "update to netem": _Unmatched().take(events, outcomes.sequence),
-        "update to controller": _Unmatched().take(outcomes.sequence[outcomes.forwarded], received),
+        "update to controller": _Unmatched().take(_left_until(outcomes, last_ns), received),
         "actuation": actuated,
     }
     for flow in record.scenario.network.flows[1:]:
@@ -82,10 +89,15 @@ def unintended_losses(record: RunRecord) -> dict[str, int]:
         legs.pop(name, None)
         legs[f"{name} to netem"] = _Unmatched().take(sent, answers.sequence)
         legs[f"{name} to {ENDS[flow].receiver}"] = _Unmatched().take(
-            answers.sequence[answers.forwarded], arrived
+            _left_until(answers, last_ns), arrived
         )
     complete = all(record.reports.get(role, {}).get("ended") == HORIZON for role in LOOP_ROLES)
     return {leg: one.count(complete=complete) for leg, one in legs.items()}
+
+
+def _left_until(outcomes: PacketOutcome, last_ns: float) -> NDArray[np.int64]:
+    """Return the numbers of the datagrams that were forwarded, and were due until then."""
+    return outcomes.sequence[outcomes.forwarded & (outcomes.due_ns <= last_ns)]
 
 
 class _Unmatched:

@@ -28,6 +28,8 @@ class PacketOutcome(NamedTuple):
     """Dropped, corrupted, or delivered out of order (stale)."""
     in_flight: NDArray[np.bool_]
     """Not yet forwarded when the run ended."""
+    due_ns: NDArray[np.int64]
+    """When it was to leave the network emulator; the time of arrival if it was not delayed."""
 
     @property
     def forwarded(self) -> NDArray[np.bool_]:
@@ -78,10 +80,10 @@ def _outcomes(
     numbers = 2 * rows["sequence"] + which
     effectively = effective(rows["fate"])
     stale = np.isin(numbers, forwarded[was_stale])
-    delayed = np.where(which == 1, rows["copy_ns"], rows["release_ns"]) > rows["now_ns"]
-    in_flight = effectively & delayed & ~np.isin(numbers, forwarded)
+    due_ns = np.maximum(np.where(which == 1, rows["copy_ns"], rows["release_ns"]), rows["now_ns"])
+    in_flight = effectively & (due_ns > rows["now_ns"]) & ~np.isin(numbers, forwarded)
     fate, lost = rows["fate"].astype(np.int8), ~effectively | stale
-    return PacketOutcome(sequence, event_ns, rows["now_ns"].copy(), fate, lost, in_flight)
+    return PacketOutcome(sequence, event_ns, rows["now_ns"].copy(), fate, lost, in_flight, due_ns)
 
 
 def updates_in(

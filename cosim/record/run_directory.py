@@ -168,7 +168,7 @@ def chosen_run(run_dir: Path | None, runs: Path, loop: str | None = None) -> Pat
 def _loop_directory(run_dir: Path, loop: str) -> Path:
     folder = run_dir / LOOPS
     if not folder.is_dir():
-        raise CallerError(f"--loop {loop}: {run_dir} has no records of several loops")
+        raise CallerError(f"--loop {loop}: {run_dir} is no run of several loops")
     names = sorted(one.name for one in folder.iterdir() if one.is_dir())
     if loop not in names:
         few = ", ".join(names[:_MOST_NAMES]) + (", …" if len(names) > _MOST_NAMES else "")

@@ -70,7 +70,7 @@ def resolve(scenario: Scenario) -> Scenario:
     """
     if scenario.loops is not None:
         raise CallerError(
-            f"{scenario.name}: it has several loops; this is for one: give a scenario without "
+            f"{scenario.name}: it has several loops; give one loop: a scenario without "
             "[[loops]], such as loops/NAME/scenario.toml in a run directory"
         )
     scenario.plant.system.require_installed()

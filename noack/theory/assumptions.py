@@ -230,10 +230,10 @@ def _network_delay(resolved: Scenario) -> str:
     if not link.longest_delay_s:
         return ""
     longest_ms, certified_ms = 1e3 * link.longest_delay_s, 1e3 * certified_delay_s(resolved)
-    if not link.delay_is_bounded:
-        return f"; the network's delay has no bound; the certificates allow for {certified_ms:g} ms"
-    text = f"; the network delays updates by up to {longest_ms:g} ms"
     allowed = f"; the certificates allow for {certified_ms:g} ms"
+    if not link.delay_is_bounded:
+        return f"; no setting bounds the network's delay{allowed}"
+    text = f"; the network delays updates by up to {longest_ms:g} ms"
     return text if certified_ms == longest_ms else text + allowed
 
 

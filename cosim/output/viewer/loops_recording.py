@@ -52,6 +52,8 @@ _ANIMATED = 4
 """Up to so many loops have a diagram of their packets, which is most of a recording."""
 QUEUE, SHARE, ERROR, SIZE, MAP = "link/queue", "link/share", "all/error", "all/size", "all/map"
 _DECADES = 5
+_RANGE = 100.0
+"""Errors above the usual largest one by this factor have the same colour: a loop may diverge."""
 _ROW_PIXELS = 600
 """Least height of the map in pixels."""
 
@@ -92,7 +94,7 @@ class LoopsRecording(RecordingFile):
         layout = bp.over_time(_layout([*pages.values()], len(self.names), worst), run.horizon_s)
         path, indexed = run_dir / RECORDING_FILE, live is None
         super().__init__(path, f"{run_id:016x}", layout, indexed=indexed)
-        self._live, self._most = live, float(np.finfo(float).tiny)
+        self._live, self._usual = live, float(np.finfo(float).tiny)
         self._describe(run, worst)
         phases = phases_ns(run)
         self.views = {
@@ -142,11 +144,13 @@ Curves of more than {len(SERIES)} loops are quantiles over the loops:
     def norms(self, entity: str, t_ns: Nanoseconds, values: Reals) -> None:
         """Add norms of each loop, (L, k), to ``ERROR`` or ``SIZE``.
 
-        Their logarithm is cut off some decades below the largest value so far: a norm may be 0.
+        Their logarithm is cut off some decades from the usual largest value so far: a norm may be
+        0, and a loop that diverges would hide the others.
         """
         curves = _reduced(values)
-        self._most = float(np.nanmax(curves, initial=self._most))
-        self.send(entity, t_ns, np.log10(np.maximum(curves, self._most / 10**_DECADES)).T)
+        self._usual = max(self._usual, usual_largest(curves))
+        least, most = self._usual / 10**_DECADES, self._usual * 10**_DECADES
+        self.send(entity, t_ns, np.log10(np.clip(curves, least, most)).T)
 
     def map(self, errors: Reals, t_ns: int | None = None) -> None:
         """Show ‖e_c‖ of each loop, (L, k), from a time on; None: at all times."""
@@ -244,11 +248,17 @@ def _reduced(values: Reals) -> Reals:
     return values if len(values) <= len(SERIES) else quantiles(values)
 
 
+def usual_largest(curves: Reals) -> float:
+    """Return the median over curves (L, k) of their largest values; a tiny number if unknown."""
+    largest = np.where(np.isfinite(curves), curves, 0.0).max(axis=1, initial=0.0)
+    return float(np.median(largest[largest > 0])) if largest.any() else np.finfo(float).tiny
+
+
 def map_pixels(errors: Reals) -> NDArray[np.uint8]:
     """Return the colours of norms (L, k), with rows as high as needed; black where unknown."""
     known = np.isfinite(errors)
     levels = np.log10(np.where(known, np.maximum(errors, np.finfo(float).tiny), 1.0))
-    most = levels[known].max(initial=-np.inf)
+    most = min(levels[known].max(initial=-np.inf), np.log10(_RANGE * usual_largest(errors)))
     share = np.clip(1 + (levels - most) / _DECADES, 0, 1) if known.any() else levels
     pixels = colormaps["viridis"](share, bytes=True)[..., :3]
     pixels[~known] = 0

@@ -133,7 +133,7 @@ def comparisons(result: CapacityResult) -> Iterator[str]:
         other = found[PERIODIC, disturbance]
         if policy == PERIODIC:
             continue
-        how = "no difference"
+        how = "undecided, the intervals overlap"
         if own.low > other.high or (own.low == math.inf > other.high):
             how = "wins"
         elif own.high < other.low:

@@ -188,8 +188,10 @@ class GilbertElliottLoss(LossModel):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if (self.state is None) != (self.step_s is None):
-            raise ValueError('step_s: state = "link" and step_s go together')
+        if self.state is not None and self.step_s is None:
+            raise ValueError('step_s: state = "link" needs it: how often the state may change')
+        if self.state is None and self.step_s is not None:
+            raise ValueError('step_s: it is for state = "link" only')
         chain = (self.good_to_bad, self.bad_to_good)
         means = (self.mean_loss, self.mean_burst)
         if (None in chain) == (None in means) or (None in chain and chain != (None, None)):

@@ -27,7 +27,7 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
 )
 from noack.protocol.wire_format import Flow
-from tests.cosim.record.changed_records import flipped
+from tests.cosim.record.changed_records import changed, flipped
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 H_S, TICKS = 0.05, 8
@@ -143,6 +143,23 @@ def test_each_direction_has_its_own_losses_and_guarantee(messy: RunRecord) -> No
     assert part.lost == actuations.lost.sum() > 90
     assert set(messy[NETEM_PACKET]["flow"].tolist()) == {0, 1}
     assert sum(unintended_losses(messy).values()) == 0
+
+
+@pytest.mark.parametrize(("after_end_ms", "lost"), [(90, 1), (120, 0)])
+def test_a_receiver_that_may_have_ended_loses_nothing(
+    messy: RunRecord, after_end_ms: int, lost: int
+) -> None:
+    """An actuation that was delayed leaves the emulator after the end, and does not arrive."""
+    received, packets = messy[PLANT_ACTUATION], messy[NETEM_PACKET].copy()
+    outcomes = packet_outcomes(messy, Flow.ACTUATION)
+    of_plant = np.isin(outcomes.sequence, received["sequence"])
+    delayed = np.flatnonzero(of_plant & (outcomes.due_ns > outcomes.now_ns))[-1]
+    place = np.flatnonzero(packets["flow"] == 1)[delayed]
+    assert packets["bit"][place] == -1
+    packets["release_ns"][place] = messy.scenario.timing.horizon_ns + after_end_ms * 10**6
+    others = received[received["sequence"] != outcomes.sequence[delayed]]
+    late = changed(messy, {PLANT_ACTUATION: others, NETEM_PACKET: packets})
+    assert sum(unintended_losses(late).values()) == lost
 
 
 def test_the_plant_receives_the_inputs_of_the_model(messy: RunRecord) -> None:

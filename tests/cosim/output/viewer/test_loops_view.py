@@ -15,6 +15,7 @@ from cosim.output.viewer.loops_recording import (
     SHARE,
     SIZE,
     map_pixels,
+    usual_largest,
 )
 from cosim.output.viewer.loops_view import write_loops_view
 from cosim.record.align import align_tables
@@ -45,7 +46,7 @@ def shown(folder: Path, count: int) -> tuple[LoopsRun, list[dict[str, Any]], Chu
         }
         for i, record in enumerate(run.loops)
     ]  # fmt: skip
-    flying = in_flight(run.network[NETEM_PACKET], horizon_ns).model_dump()
+    flying = in_flight(run.network[NETEM_PACKET], horizon_ns, horizon_ns).model_dump()
     write_loops_view(run.network, {"loops": loops, "network": {"in_flight": flying}}, folder, 9)
     return run, loops, read(folder / RECORDING_FILE)
 
@@ -75,7 +76,7 @@ def test_of_many_loops_quantiles_a_map_and_the_worst_are_recorded(tmp_path: Path
         t_ns, drawn = series(found, entity)
         assert len(t_ns) == INTERVALS
         last = np.quantile(values[:, -1], QUANTILES)
-        least = 10 ** np.nanmax(drawn) / 1e5  # curves are cut off below
+        least = np.median(np.nanmax(10**drawn, axis=0)) / 1e5  # curves are cut off below
         np.testing.assert_allclose(10 ** drawn[-1], np.maximum(last, least), rtol=1e-9)
     _, queue = series(found, QUEUE)
     assert queue[:, 0].max() > 1
@@ -92,3 +93,14 @@ def test_the_map_has_the_colours_of_the_norms() -> None:
     found = pixels[::high, ::wide].tolist()
     assert found[0] == [[253, 231, 36], [68, 1, 84], [0, 0, 0]]  # the ends of viridis
     assert found[1][0] == found[1][2] not in found[0]
+
+
+def test_a_loop_that_diverges_does_not_hide_the_others() -> None:
+    errors = np.array([[1.0, 0.1, 0.01], [0.5, 0.5, 0.5], [1.0, 1e9, 1e20]])
+    pixels = map_pixels(errors)
+    high, wide = pixels.shape[0] // 3, pixels.shape[1] // 3
+    colours = {tuple(pixels[0, place]) for place in (0, wide, 2 * wide)}
+    assert len(colours) == 3
+    assert tuple(pixels[2 * high, 2 * wide]) == (253, 231, 36)
+    assert usual_largest(errors) == 1.0
+    assert usual_largest(np.full((2, 3), np.nan)) > 0
