@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from controller_node.controller_arrays import CONTROLLER_FLEET
 from cosim.live.child_processes import ChildProcesses, Failure, signal_name
+from cosim.live.compilation import compile_for
 from cosim.live.coordinator import Coordinator
 from cosim.live.disk_space import require_disk_space
 from cosim.live.fork_server import ForkServer, fork_server
@@ -30,13 +30,10 @@ from noack.config.scenario import Scenario
 from noack.core.errors import CallerError, ExitStatus, NeverStartedError
 from noack.protocol.topology import PLANT, RECORDER, ROLES
 from noack.runtime import run_registry
-from noack.runtime.fleet.fleet_choice import prepare as prepare_fleets
 from noack.runtime.join_ticket import Ticket, new_ticket, published
 from noack.runtime.life_cycle import HORIZON
 from noack.runtime.signals import Signals
 from noack.runtime.udp_sockets import LOOPBACK, free_tcp_port, require_free_tcp_port
-from plant_server.plant_arrays import PLANT_FLEET
-from sensor_node.sensor_arrays import SENSOR_FLEET
 
 _STOPPED: Mapping[int, str] = {
     signal.SIGINT: "stopped by the user",
@@ -47,11 +44,6 @@ _POLL_S = 0.01
 _STOP_TIMEOUT_S = 15.0
 _OVERTIME_S, _OVERTIME_SHARE = 20.0, 0.2
 """After the horizon: the recorder writes the record, and a long run has many rows."""
-
-
-_FLEETS = (
-    ("plant", PLANT_FLEET), ("sensor", SENSOR_FLEET), ("controller", CONTROLLER_FLEET),
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -104,7 +96,7 @@ def launch(
             # Compile now: the start barrier has a time limit.
             for system in {repr(loop.plant.system): loop.plant.system for loop in loops}.values():
                 system.prepare()
-        prepare_fleets([(name, role) for name, role in _FLEETS if name in spawn], scenario)
+        compile_for(scenario, spawn)
         endpoint = f"tcp/{LOOPBACK}:{control or free_tcp_port()}"
         run_dir = new_run_dir(runs, resolved.name)
         resolved = write_scenario(resolved, run_dir)

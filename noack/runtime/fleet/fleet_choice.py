@@ -22,7 +22,7 @@ from noack.runtime.peer_sockets import has_peer_sockets
 
 _FEWEST_LOOPS = 4
 """For fewer loops the single machines are used."""
-_COMPILED_FROM_LOOPS = 20
+COMPILED_FROM_LOOPS = 20
 """For fewer loops a run does not wait for a compilation."""
 _ABOUT_S = 25.0
 
@@ -53,7 +53,7 @@ def fleet_of(
 
 def prepare(roles: Sequence[tuple[str, FleetRole]], run: Scenario) -> None:
     """Compile the machines of a run with many loops, unless they are in the cache."""
-    if not may_be_compiled(run) or len(loops := resolved_loops(run)) < _COMPILED_FROM_LOOPS:
+    if not may_be_compiled(run) or len(loops := resolved_loops(run)) < COMPILED_FROM_LOOPS:
         return
     for name, role in roles:
         fleet = _fleet(role, name, run, loops, (0, bytes(KEY_BYTES)))

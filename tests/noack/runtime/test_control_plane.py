@@ -159,7 +159,7 @@ def test_a_message_that_arrives_under_another_key_is_ignored(
         listener.announce_change("own")
         changes: list[bytes] = []
         wait_for(lambda: changes.append(plant.next_change() or b"") or any(changes))
-        assert any(changes) and max(changes) == b'"own"'  # the earlier ones have arrived, too
+        assert max(changes) == b'"own"'  # the earlier ones have arrived, too
         assert plant.stop_requested() is None
         listener.request_stop("enough")
         wait_for(lambda: plant.stop_requested() == "enough")
