@@ -58,6 +58,7 @@ def run_processes(
 
         scenario, ending = load(), None
         warn_of_violations(scenario)
+        warn_of_other_runs()
         try:
             with progress_line(PatientConsole(stderr=True), scenario, session) as watcher:
                 ending = launch(
@@ -91,6 +92,18 @@ def warn_of_violations(scenario: "Scenario") -> None:
         for one in assumptions(resolve(loop)):
             if one.verdict == AssumptionStatus.VIOLATED and one.source == "Theorem 2":
                 print(f"noack: warning: {name}violated: {one.what}: {one.why}", file=sys.stderr)
+
+
+def warn_of_other_runs() -> None:
+    """Print on standard error which runs are active: each may make the others late."""
+    from noack.runtime.run_registry import active_runs
+
+    for run in active_runs():
+        print(
+            f"noack: warning: {run.run_dir} is active, too: runs at the same time share the cores "
+            "and may miss deadlines",
+            file=sys.stderr,
+        )
 
 
 def finalize_run(ending: "RunEnding", output: RunOutput) -> int:

@@ -22,7 +22,6 @@ class LockFile(NamedTuple):
     """A file whose process runs."""
 
     path: Path
-    written_ns: int
     content: bytes
 
 
@@ -82,6 +81,6 @@ def _alive(folder: PrivateFolder, name: str) -> LockFile | None:
     with os.fdopen(descriptor, "rb") as file:
         status = os.fstat(file.fileno())
         if not lock(file):
-            return LockFile(folder.path / name, status.st_mtime_ns, file.read())
+            return LockFile(folder.path / name, file.read())
         folder.remove_same(name, status)
     return None

@@ -49,28 +49,32 @@ def published(ticket: Ticket, session: str | None) -> Iterator[Path]:
         yield path
 
 
-def find(session: str | None = None, run_dir: Path | None = None) -> OpenRun:
-    """Return the user's newest active run, of this session or with this run directory.
+def active_runs() -> list[OpenRun]:
+    """Return the user's active runs. Raise PeerError if the file of one is not valid."""
+    return [_read(file) for file in lock_file.live_lock_files(_KIND)]
 
-    Raise CallerError if no such run is active.
+
+def find(session: str | None = None, run_dir: Path | None = None) -> OpenRun:
+    """Return the user's active run, of this session or with this run directory.
+
+    Raise CallerError if no such run is active, or several are.
     """
-    newest_first = sorted(
-        lock_file.live_lock_files(_KIND), key=lambda file: file.written_ns, reverse=True
-    )
-    found = [_read(file) for file in newest_first]
+    found = active_runs()
     fitting = [
         run
         for run in found
         if (session is None or run.session == session)
         and (run_dir is None or Path(run.run_dir) == run_dir.resolve())
     ]
-    if fitting:
+    if len(fitting) == 1:
         return fitting[0]
     if not found:
         raise CallerError("no run is active; start one, e.g. `noack demo`")
+    active = "active: " + ", ".join(run.run_dir for run in fitting or found)
+    if fitting:
+        raise CallerError(f"several runs are {active}; choose one by --run DIRECTORY")
     which = f"in session {session!r}" if run_dir is None else f"in {run_dir}"
-    others = ", ".join(run.run_dir for run in found)
-    raise CallerError(f"no run is active {which}; active: {others}")
+    raise CallerError(f"no run is active {which}; {active}")
 
 
 def request_change(run: OpenRun, settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -39,7 +39,7 @@ def set_(
         Path | None,
         typer.Option(
             "--run",
-            help="Directory of the run; the newest run by default.",
+            help="Directory of the run; needed if several runs are active.",
             autocompletion=completion.run_directories,
         ),
     ] = None,

@@ -1,7 +1,6 @@
 """`noack set`: its arguments, and the run that it applies to."""
 
 import json
-import os
 import stat
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +11,7 @@ from typer.testing import CliRunner
 
 from cosim.cli import app
 from cosim.cli.commands.set_command import parsed
+from cosim.cli.execute_run import warn_of_other_runs
 from cosim.live.coordinator import Coordinator
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
@@ -68,17 +68,20 @@ def test_a_missing_run_is_reported(ticket: Ticket) -> None:
     assert "no run is active" in done.stderr
 
 
-def test_a_run_is_found_by_its_session_its_directory_or_as_the_newest(ticket: Ticket) -> None:
+def test_a_run_is_found_by_its_session_its_directory_or_as_the_only_one(
+    ticket: Ticket, capsys: pytest.CaptureFixture[str]
+) -> None:
     other = new_ticket(ticket.scenario, ticket.endpoint, Path("elsewhere"), launched=True)
-    with (
-        run_registry.published(other, "lab") as first,
-        run_registry.published(ticket, None) as path,
-    ):
-        os.utime(first, (0, 0))
+    with run_registry.published(other, "lab"):
+        assert run_registry.find().run_dir == "elsewhere"
+        warn_of_other_runs()
+        assert "elsewhere is active, too" in capsys.readouterr().err
+    with run_registry.published(other, "lab"), run_registry.published(ticket, None) as path:
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
         assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
         assert ticket.key.hex() not in path.read_text()
-        assert run_registry.find().run_dir == ticket.run_dir
+        with pytest.raises(CallerError, match="several runs are active: "):
+            run_registry.find()
         assert run_registry.find(session="lab").run_dir == "elsewhere"
         assert run_registry.find(run_dir=Path(ticket.run_dir)).run_dir == ticket.run_dir
         with pytest.raises(CallerError, match="no run is active in session 'none'; active: "):
