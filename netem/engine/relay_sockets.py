@@ -15,7 +15,7 @@ from noack.core.errors import CallerError
 from noack.runtime.address import text_of
 from noack.runtime.native.socket_structs import SocketName as SocketName
 from noack.runtime.native.socket_structs import packed_name as packed_name
-from noack.runtime.udp_sockets import enlarge_buffer
+from noack.runtime.peer_sockets import enlarge_buffer
 
 _BUFFER_BYTES = 4 * 1024 * 1024
 _SO_SNDBUFFORCE = 32

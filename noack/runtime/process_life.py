@@ -35,13 +35,14 @@ from noack.runtime.control_plane import ControlPlane, ParameterUpdates
 from noack.runtime.fleet.fleet_socket import FLEET_BUFFER_BYTES
 from noack.runtime.join_ticket import Ticket
 from noack.runtime.life_cycle import AWAY_S, HORIZON, LAUNCHER_GONE, Event, LifeCycle, Side, State
+from noack.runtime.peer_sockets import enlarge_buffer
 from noack.runtime.real_time_loop import Channel, run_loop
 from noack.runtime.real_time_settings import realtime
 from noack.runtime.record_handover import OwnSpool, deliver_report, persisted_rows
 from noack.runtime.rehearsal import Rehearsal
 from noack.runtime.signals import Signals
 from noack.runtime.telemetry import TelemetryBuffer
-from noack.runtime.udp_sockets import bind, enlarge_buffer
+from noack.runtime.udp_sockets import bind
 
 T = TypeVar("T")
 

@@ -15,14 +15,10 @@ from noack.protocol.fleet import FleetDecoder
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.wire_format import MAX_DATAGRAM_BYTES, Decoder, Encoder, Flow, Message, flow_of
 from noack.runtime.address import Address, text_of
-from noack.runtime.peer_sockets import FloodWatch, SourceCount, open_beside
+from noack.runtime.peer_sockets import FloodWatch, SourceCount, enlarge_buffer, open_beside
 
 LOOPBACK = "127.0.0.1"
 
-# The default receive buffer holds 256 small datagrams; 4 MiB hold about 10,000. A datagram lost by
-# overflow is an unintended loss, which breaks the MANSD guarantee.
-_BUFFER_BYTES = 4 * 1024 * 1024
-_SO_RCVBUFFORCE = 33
 _UNKNOWN_BYTES = 128 * 1024
 """Receive buffer for datagrams from unknown sources; the kernel doubles it. It holds about 300
 datagrams, as many as are read between two turns of housekeeping."""
@@ -61,17 +57,6 @@ def bind(port: int, key: str) -> socket.socket:
     endpoint.setblocking(False)
     enlarge_buffer(endpoint)
     return endpoint
-
-
-def enlarge_buffer(endpoint: socket.socket, size_bytes: int | None = None) -> int:
-    """Request a receive buffer, by default of 4 MiB; return the size that the kernel set."""
-    size_bytes = size_bytes or _BUFFER_BYTES
-    try:
-        endpoint.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, size_bytes)
-    except OSError:
-        with suppress(OSError):
-            endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, size_bytes)
-    return endpoint.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
 
 
 def free_tcp_port() -> int:
@@ -137,8 +122,6 @@ class CountingSocket(ABC, Generic[T]):
         if self._beside:
             self._unknown_fd = endpoint.fileno()
             endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _UNKNOWN_BYTES)
-            for one in self._beside:
-                enlarge_buffer(one)
         self._sockets = {one.fileno(): one for one in (*self._beside, endpoint)}
         self._source_of = {
             one.fileno(): peer

@@ -11,7 +11,7 @@ from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.wire_format import Flow, Message
 from noack.runtime.address import Address
 from noack.runtime.fleet.compiled_fleet import CompiledFleet
-from noack.runtime.udp_sockets import CountingSocket, enlarge_buffer, most_waiting
+from noack.runtime.udp_sockets import CountingSocket, most_waiting
 
 _READ_AT_ONCE = 4096
 """Datagrams read by Python in one turn; more would delay the fleet."""
@@ -46,7 +46,6 @@ class FleetSocket(CountingSocket[Message]):
         self._fleet, self._sends, self._source = fleet, sends, source
         self._outputs: list[Record | Notice] = []
         self._passed_on = 0
-        enlarge_buffer(self._beside[0], FLEET_BUFFER_BYTES)
         fleet.open(clock, endpoint, self._beside[0], destination)
         peer = self._beside[0].fileno()
         # A socket that was empty when already connected has the peer's datagrams only. In another

@@ -13,7 +13,7 @@ from netem.engine.engine_choice import Engine, open_relay
 from netem.engine.relay_base import Relay
 from netem.engine.relay_interface import Address, LinkReport, LinkSpec, Tap
 from noack.impairments.link_settings import LinkSettings
-from noack.runtime.udp_sockets import enlarge_buffer
+from noack.runtime.peer_sockets import enlarge_buffer
 
 PATIENCE_S = 60
 """Timeout for events that never happen; no test measures time with it."""

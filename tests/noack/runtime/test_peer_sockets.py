@@ -274,3 +274,12 @@ def test_many_sources_take_bounded_memory_and_a_short_report() -> None:
     assert len(report) <= 20
     assert sum(report.values()) == total
     assert count.report() == report
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has peer sockets")
+def test_a_peer_socket_has_the_receive_buffer_of_the_first_one_from_the_start() -> None:
+    with ExitStack() as stack:
+        endpoint = stack.enter_context(bind(0, "port"))
+        (one,) = map(stack.enter_context, open_beside(endpoint, [(LOOPBACK, 9)]))
+        first, other = (s.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) for s in (endpoint, one))
+        assert other == first

@@ -17,8 +17,8 @@ from noack.runtime import udp_sockets
 from noack.runtime.fleet.compiled_driver import compiled_driver
 from noack.runtime.fleet.compiled_fleet import CompiledFleet
 from noack.runtime.fleet.fleet_socket import FLEET_BUFFER_BYTES, FleetSocket
-from noack.runtime.peer_sockets import has_peer_sockets, open_beside
-from noack.runtime.udp_sockets import bind, enlarge_buffer
+from noack.runtime.peer_sockets import enlarge_buffer, has_peer_sockets, open_beside
+from noack.runtime.udp_sockets import bind
 from sensor_node.sensor_arrays import SENSOR_FLEET
 
 RUN_ID, KEY = 7, bytes(range(32))
