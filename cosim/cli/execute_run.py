@@ -96,9 +96,14 @@ def warn_of_violations(scenario: "Scenario") -> None:
 
 def warn_of_other_runs() -> None:
     """Print on standard error which runs are active: each may make the others late."""
+    from noack.core.errors import PeerError
     from noack.runtime.run_registry import active_runs
 
-    for run in active_runs():
+    try:
+        others = active_runs()
+    except PeerError:  # a damaged file of another run must not prevent this one
+        return
+    for run in others:
         print(
             f"noack: warning: {run.run_dir} is active, too: runs at the same time share the cores "
             "and may miss deadlines",

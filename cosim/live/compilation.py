@@ -4,7 +4,6 @@ from collections.abc import Collection
 
 from controller_node.controller_arrays import CONTROLLER_FLEET
 from netem.engine.native_pump import compiled_pump, kept_pump
-from noack.config.resolution import resolved_loops
 from noack.config.scenario import Scenario
 from noack.core.code_cache import while_compiling
 from noack.runtime.command_line import print_to_stderr
@@ -23,7 +22,8 @@ def compile_for(run: Scenario, spawn: Collection[str]) -> None:
     The start barrier has a time limit, so they do not compile it themselves.
     """
     prepare([(name, role) for name, role in _FLEETS.items() if name in spawn], run)
-    if "netem" not in spawn or len(resolved_loops(run)) < COMPILED_FROM_LOOPS:
+    loops = sum(section.count for section in run.loops or ())
+    if "netem" not in spawn or loops < COMPILED_FROM_LOOPS:
         return
     if has_peer_sockets() and kept_pump() is None:
         about = while_compiling("the emulator", kept=True, about_s=_EMULATOR_ABOUT_S)

@@ -27,7 +27,7 @@ from tests.integration.conftest import PATIENCE_S, noack_command, run_scenario, 
 RATE_HZ = 5.0
 HORIZON_S = 8.0
 ENOUGH_S = 4.0
-ATTEMPTS = 4
+ATTEMPTS = 20
 SAME = {
     PLANT_STEP: ("input", "sequence", "t_ns", "actuation"),
     PLANT_ACTUATION: ("input", "sequence", "t_ns"),
