@@ -1,0 +1,33 @@
+"""Clocks with an added offset and drift, for measurements whose true offset is known."""
+
+from noack.runtime.arrival_times import HostClocks
+
+
+class DrivenClocks(HostClocks):
+    """The clocks of this host, with an added offset and drift of the monotonic clock.
+
+    Kernel stamps and the real-time clock have the same drift, as the clocks of a real host have.
+    """
+
+    def __init__(self, offset_ns: int = 0, drift_ppb: int = 0) -> None:
+        self._begin_ns = super().monotonic_ns()
+        self._real_begin_ns = super().realtime_ns()
+        self._offset_ns = offset_ns
+        self._drift_ppb = drift_ppb
+
+    def added_ns(self, true_ns: int) -> int:
+        """What is added to the monotonic clock at its own reading ``true_ns``."""
+        return self._offset_ns + self._drift_ppb * (true_ns - self._begin_ns) // 10**9
+
+    def monotonic_ns(self) -> int:
+        true_ns = super().monotonic_ns()
+        return true_ns + self.added_ns(true_ns)
+
+    def realtime_ns(self) -> int:
+        return self._drifted(super().realtime_ns())
+
+    def stamp_ns(self, stamp: bytes) -> int:
+        return self._drifted(super().stamp_ns(stamp))
+
+    def _drifted(self, real_ns: int) -> int:
+        return real_ns + self._drift_ppb * (real_ns - self._real_begin_ns) // 10**9

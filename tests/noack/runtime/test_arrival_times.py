@@ -1,0 +1,152 @@
+"""The time of arrival is never too early, whatever the real-time clock does."""
+
+import socket
+import sys
+import time
+from collections.abc import Iterator
+from random import Random
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from noack.runtime import arrival_times
+from noack.runtime.arrival_times import (
+    ArrivalSocket,
+    ClockDifference,
+    latest_arrival_ns,
+    read_difference,
+)
+from tests.noack.runtime.fake_host import PS, FakeHost, stamp_of
+
+CHANGES_PS = [sign * 10**k * PS for k in range(11) for sign in (1, -1)]
+ARRIVALS = 1000
+
+
+class FakeEndpoint:
+    """A UDP socket of a fake host: datagrams arrive while the host's time goes on."""
+
+    def __init__(self, host: FakeHost, random: Random, *, stamps: bool = True) -> None:
+        self.host, self._random, self._stamps = host, random, stamps
+        self.arrived_ps: list[int] = []
+        self._unread: list[tuple[int, int]] = []
+
+    def setblocking(self, blocking: bool) -> None:
+        assert not blocking
+
+    def setsockopt(self, *_: int) -> None:
+        pass
+
+    def arrive(self) -> None:
+        self.host.wait(self._random.choice((100, 10**6, 10**8)))
+        self._unread.append((self.host.now_ps, self.host.kernel_stamp_ns()))
+
+    def recvmsg(self, *_: int) -> tuple[bytes, list[Any], int, tuple[str, int]]:
+        if self._random.random() < 0.1:
+            self.arrive()
+        if not self._unread:
+            raise BlockingIOError
+        arrived_ps, stamp_ns = self._unread.pop(0)
+        self.arrived_ps.append(arrived_ps)
+        return b"x", [stamp_of(stamp_ns)] if self._stamps else [], 0, ("::1", 5)
+
+
+def check_arrivals(random: Random, number: int, *, stamps: bool = True) -> int:
+    """Fail if an arrival is too early; return how often the clock was seen to be set.
+
+    The real-time clock is set now and then, by any amount, but not twice between two turns.
+    """
+    settings_ps: list[tuple[int, int]] = []
+    host = FakeHost(random, settings_ps)
+    endpoint = FakeEndpoint(host, random, stamps=stamps)
+    arrivals = ArrivalSocket(endpoint, 10, host)  # type: ignore[arg-type]
+    arrivals.receive(1)
+    last_set_ps, turn_ps = -1, 0
+    while len(endpoint.arrived_ps) < number:
+        if last_set_ps < turn_ps and random.random() < 0.3:
+            added_ps = host.difference_ps(host.now_ps) - host.difference_ps(-1)
+            last_set_ps = host.now_ps + random.randint(0, 10 ** random.choice((3, 6, 8)) * PS)
+            settings_ps[:] = [(0, added_ps), (last_set_ps, random.choice(CHANGES_PS))]
+        turn_ps = host.now_ps
+        for _ in range(random.randint(0, 3)):
+            endpoint.arrive()
+        known = len(endpoint.arrived_ps)
+        found = arrivals.receive(random.choice((1, 2, 64)))
+        for arrival, arrived_ps in zip(found, endpoint.arrived_ps[known:], strict=True):
+            assert arrived_ps < (arrival.latest_ns + 1) * PS
+            assert arrival.latest_ns <= host.now_ps // PS
+    return arrivals.clock_sets
+
+
+@given(st.integers(0, 2**32), st.booleans())
+def test_no_arrival_is_too_early_though_the_real_time_clock_is_set(seed: int, stamps: bool) -> None:
+    assert check_arrivals(Random(seed), ARRIVALS, stamps=stamps) > 0
+
+
+def without_width(stamp_ns: int, read_ns: int, difference: ClockDifference) -> int:
+    middle_ns = (difference.lower_ns + difference.upper_ns) // 2
+    return read_ns if difference.was_set else min(read_ns, stamp_ns + 1 - middle_ns)
+
+
+def with_the_largest_difference(stamp_ns: int, read_ns: int, difference: ClockDifference) -> int:
+    return latest_arrival_ns(stamp_ns, read_ns, difference._replace(least_ns=difference.lower_ns))
+
+
+@pytest.mark.parametrize("broken", [without_width, with_the_largest_difference])
+def test_the_check_finds_a_mistake(broken: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(arrival_times, "latest_arrival_ns", broken)
+    with pytest.raises(AssertionError):
+        check_arrivals(Random(1), ARRIVALS)
+
+
+@given(st.integers(0, 2**32))
+def test_while_the_clock_is_not_set_a_stamp_is_late_by_the_widths_only(seed: int) -> None:
+    random = Random(seed)
+    host = FakeHost(random, [])
+    before = read_difference(host)
+    arrived_ps, stamp_ns = host.now_ps, host.kernel_stamp_ns()
+    host.wait(10**9)
+    after = read_difference(host)
+    for one in (before, after):
+        assert one.lower_ns * PS < host.difference_ps(0) < one.upper_ns * PS
+    difference = before.joined(after)
+    assert not difference.was_set
+    found = latest_arrival_ns(stamp_ns, host.monotonic_ns(), difference)
+    width_ns = max(one.upper_ns - one.lower_ns for one in (before, after))
+    assert arrived_ps // PS <= found <= arrived_ps // PS + width_ns + 1
+
+
+@pytest.mark.parametrize("change_ns", [10**6, -(10**6)])
+def test_after_the_clock_was_set_the_time_of_reading_is_used(change_ns: int) -> None:
+    before, after = (ClockDifference(d, d, d + 200) for d in (10**9, 10**9 + change_ns))
+    assert latest_arrival_ns(10**9 + 500, 2000, before.joined(after)) == 2000
+    assert latest_arrival_ns(10**9 + 500, 2000, before.joined(before)) == 501
+
+
+@pytest.fixture(params=["127.0.0.1", "::1"])
+def endpoint(request: pytest.FixtureRequest) -> Iterator[socket.socket]:
+    family = socket.AF_INET6 if ":" in request.param else socket.AF_INET
+    with socket.socket(family, socket.SOCK_DGRAM) as one:
+        one.bind((request.param, 0))
+        yield one
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="kernel stamps are those of Linux")
+def test_a_datagram_that_waited_has_the_time_of_its_arrival(endpoint: socket.socket) -> None:
+    """Unless the machine stalls while the clocks are read, which is tried again."""
+    clocks = arrival_times.HostClocks()
+    arrivals = ArrivalSocket(endpoint, 10, clocks)
+    for _ in range(1000):
+        assert arrivals.receive(5) == []
+        sent_ns = clocks.monotonic_ns()
+        endpoint.sendto(b"0123456789abcdef", endpoint.getsockname()[:2])
+        time.sleep(0.01)
+        later_ns = clocks.monotonic_ns()
+        (found,) = arrivals.receive(5)
+        assert found.data == b"0123456789a"  # cut
+        assert found.source == endpoint.getsockname()[:2]
+        assert sent_ns <= found.latest_ns
+        if found.latest_ns < later_ns - 5_000_000:
+            return
+    pytest.fail("no datagram had the kernel's time of arrival")
