@@ -88,15 +88,15 @@ def plant_arrays_of(resolved: Sequence[Scenario]) -> FleetParts | None:
     return FleetParts(arrays, layout.new_loops(resolved, ticks_ns), notice=_notice)
 
 
-def _notice(own: PlantArrays, fleet: Any) -> Notice:
-    plant = own.plants[fleet["note_loop"]]
-    t_ns, since_ns = int(fleet["note_ns"]), int(fleet["note_since_ns"])
+def _notice(own: PlantArrays, note: Any) -> Notice:
+    plant = own.plants[note["loop"]]
+    t_ns, since_ns = int(note["t_ns"]), int(note["since_ns"])
     if since_ns != _IN_TIME:
         return arrive_again(t_ns, since_ns)
-    none = plant["newest_sequence"] == NO_SEQUENCE
+    none = note["newest_sequence"] == NO_SEQUENCE
     name = FALLBACK_NAMES["zero" if plant["policy"] == _ZERO else "hold"]
     return are_missing(
-        t_ns, int(plant["newest_ns"]), int(plant["timeout_ns"]), name, none=bool(none)
+        t_ns, int(note["newest_ns"]), int(plant["timeout_ns"]), name, none=bool(none)
     )
 
 
@@ -119,7 +119,7 @@ def on_timer(memory: FleetMemory, own: PlantArrays, loop: int, now_ns: int) -> i
         multiply(own.Bd, loop * n * m, own.u, loop * m, memory.scratch, n, (n, m))
         for k in range(n):
             own.x[loop * n + k] = memory.scratch[k] + memory.scratch[n + k]
-    outputs = _choose_input(memory, own, loop, t_ns)
+    _choose_input(memory, own, loop, t_ns)
     layout.begin_row(memory, loop, step, t_ns, now_ns)
     copy_reals(own.x, loop * n, memory.row_reals, 4, n)
     copy_reals(own.u, loop * m, memory.row_reals, 4 + n, m)
@@ -128,22 +128,24 @@ def on_timer(memory: FleetMemory, own: PlantArrays, loop: int, now_ns: int) -> i
     if step % plant.measure_every == 0:
         layout.write_message(memory, plant.measurements, t_ns, own.x, loop * n, n)
         plant.measurements += 1
-        outputs += layout.SENDS
-    return int(outputs)
+        return layout.SENDS
+    return 0
 
 
-def _choose_input(memory: FleetMemory, own: PlantArrays, loop: int, t_ns: int) -> int:
-    """Do what :meth:`plant_server.watchdog.Watchdog.input` does; return NOTES or 0."""
+def _choose_input(memory: FleetMemory, own: PlantArrays, loop: int, t_ns: int) -> None:
+    """Do what :meth:`plant_server.watchdog.Watchdog.input` does; write a note if it notices."""
     plant, fleet = own.plants[loop], memory.fleet[0]
     is_old = t_ns - plant.newest_ns > plant.timeout_ns
     for k in range(loop * fleet.m, (loop + 1) * fleet.m):
         own.u[k] = 0.0 if is_old and plant.policy == _ZERO else own.newest_u[k]
     is_missing = t_ns - plant.newest_ns > plant.notice_ns
     if is_missing == (plant.noticed_ns != _IN_TIME):
-        return 0
-    fleet.note_loop, fleet.note_ns, fleet.note_since_ns = loop, t_ns, plant.noticed_ns
+        return
+    note = memory.notes[fleet.notes]
+    note.loop, note.t_ns, note.since_ns = loop, t_ns, plant.noticed_ns
+    note.newest_ns, note.newest_sequence = plant.newest_ns, plant.newest_sequence
+    fleet.notes += 1
     plant.noticed_ns = t_ns if is_missing else _IN_TIME
-    return layout.NOTES
 
 
 PLANT_FLEET = FleetRole(__name__, PLANT_ACTUATION, PLANT_STEP, plant_arrays_of)

@@ -8,8 +8,7 @@ from typing import Any, Self, cast
 import zenoh
 from zenoh.handlers import RingChannel
 
-from netem.control.control_server import secret_of
-from netem.control.emulator_session import Session, running
+from netem.control.emulator_session import EMULATORS, running
 from netem.control.emulator_statistics import Statistics
 from noack.core.errors import PeerError
 from noack.runtime.zenoh_session import answer_to, cause_of, open_session
@@ -20,22 +19,18 @@ _POLL_S = 0.02
 
 
 class Client:
-    """A connection to a running emulator, from its address and secret.
+    """A connection to the running emulator of this name.
 
     Raises:
         PeerError: the emulator does not accept the connection.
     """
 
-    def __init__(self, session: Session) -> None:
-        self._name = session.name
-        self._token = session.token
+    def __init__(self, name: str) -> None:
+        self._name = name
         try:
-            self._session = open_session(session.endpoint, secret_of(self._token), listen=False)
+            self._session = open_session(EMULATORS, name, listen=False)
         except zenoh.ZError as error:
-            raise PeerError(
-                f"emulator {self._name!r} cannot be reached at {session.endpoint}: "
-                f"{cause_of(error)}"
-            ) from None
+            raise PeerError(f"emulator {name!r} cannot be reached: {cause_of(error)}") from None
 
     def __enter__(self) -> Self:
         return self
@@ -50,9 +45,8 @@ class Client:
             CallerError: the query has a mistake.
             PeerError: there is no answer.
         """
-        payload = json.dumps(content | {"token": self._token})
         key = f"netem/{self._name}/{what}"
-        answer = answer_to(self._session, key, payload, _ANSWER_S)
+        answer = answer_to(self._session, key, json.dumps(content), _ANSWER_S)
         if answer is not None:
             return json.loads(answer)
         raise PeerError(f"emulator {self._name!r} does not answer")

@@ -1,18 +1,12 @@
-"""Live control of a relay over zenoh, on loopback, in a thread of its own.
+"""Live control of a relay over zenoh, in a thread of its own.
 
-A running emulator listens on a free TCP port of the loopback interface; its session file
-(:mod:`netem.control.emulator_session`) holds the address and a secret. Below ``netem/NAME`` it
+A running emulator listens on a Unix socket that only its user can reach. Below ``netem/NAME`` it
 answers ``report``, ``settings`` and ``change``, and publishes ``statistics`` once a second, as
 docs/netem-control.md describes. A query with a mistake is answered with one line, and changes
 nothing.
-
-zenoh authenticates each connection with the secret as its password, by challenge and response: this
-never sends the secret itself. In addition, each query must contain the secret.
 """
 
-import hmac
 import json
-import secrets
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -24,7 +18,7 @@ from zenoh import CongestionControl, Priority
 from zenoh.handlers import RingChannel
 
 from netem.control.command_queue import CommandQueue
-from netem.control.emulator_session import Session, published
+from netem.control.emulator_session import EMULATORS, published
 from netem.control.emulator_statistics import Statistics
 from netem.control.statistics_thread import StatisticsThread
 from netem.engine.relay_interface import DIRECTIONS, Direction
@@ -33,18 +27,11 @@ from noack.config.validation_messages import brief
 from noack.core.errors import CallerError, MachineError, NoackError
 from noack.impairments.kept_loss import with_kept_loss
 from noack.impairments.link_settings import LinkSettings
-from noack.runtime.udp_sockets import LOOPBACK, free_tcp_port
-from noack.runtime.zenoh_session import SessionSecret, cause_of, open_session
+from noack.runtime.zenoh_session import cause_of, open_session
 
-_TOKEN_BYTES = 32
 _PUBLISH_S = 1.0
 _QUERIES = 64
 """Maximum number of waiting queries of each kind; a new query replaces the oldest."""
-
-
-def secret_of(token: str) -> SessionSecret:
-    """Return the secret for zenoh's connections."""
-    return SessionSecret("netem", token)
 
 
 class SettingsChange(BaseModel):
@@ -73,20 +60,19 @@ class ControlServer:
 
     Raises:
         CallerError: the name is not allowed, or in use.
-        MachineError: no port can be listened on.
+        MachineError: the socket cannot be listened on.
     """
 
     def __init__(self, name: str, commands: CommandQueue) -> None:
         self._name = name
         self._commands = commands
-        self._token = secrets.token_hex(_TOKEN_BYTES)
         self._thread = StatisticsThread(commands, _PUBLISH_S, self._publish, poll=self._serve)
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
-            endpoint = f"tcp/{LOOPBACK}:{free_tcp_port()}"
-            self._session = self._open(endpoint)
+            stack.enter_context(published(self._name))
+            self._session = self._open()
             stack.callback(self._session.close)
             self._queryables = [
                 (self._session.declare_queryable(self._key(what), RingChannel(_QUERIES)), answer)
@@ -96,7 +82,6 @@ class ControlServer:
                     ("change", self._change),
                 )
             ]
-            stack.enter_context(published(Session(self._name, endpoint, self._token)))
             stack.enter_context(self._thread)
             self._stack = stack.pop_all()
         return self
@@ -104,11 +89,11 @@ class ControlServer:
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    def _open(self, endpoint: str) -> zenoh.Session:
+    def _open(self) -> zenoh.Session:
         try:
-            return open_session(endpoint, secret_of(self._token), listen=True)
+            return open_session(EMULATORS, self._name, listen=True)
         except zenoh.ZError as error:
-            raise MachineError(f"cannot listen on {endpoint}: {cause_of(error)}") from None
+            raise MachineError(f"live control cannot be started: {cause_of(error)}") from None
 
     def _key(self, what: str) -> str:
         return f"netem/{self._name}/{what}"
@@ -128,7 +113,7 @@ class ControlServer:
 
     def _reply(self, query: zenoh.Query, answer: Callable[[dict[str, Any]], object]) -> None:
         try:
-            content = json.dumps(answer(self._admitted(query)))
+            content = json.dumps(answer(_content(query)))
             query.reply(query.key_expr, content)
         except NoackError as error:
             query.reply_err(str(error))
@@ -137,18 +122,6 @@ class ControlServer:
             query.reply_err(f"internal error of the emulator: {error!r}")
         finally:
             query.drop()  # type: ignore[no-untyped-call]
-
-    def _admitted(self, query: zenoh.Query) -> dict[str, Any]:
-        """Return the content of a query without its token."""
-        try:
-            content = json.loads(query.payload.to_string() if query.payload else "")
-            token = content.pop("token")
-            known = hmac.compare_digest(str(token).encode(), self._token.encode())
-        except (ValueError, LookupError, TypeError, AttributeError):
-            raise CallerError('a query is a JSON object with "token", the secret') from None
-        if not known:
-            raise CallerError("the token is not this emulator's")
-        return dict(content)
 
     def _report(self, _: Mapping[str, Any]) -> object:
         return self._thread.now()
@@ -200,3 +173,14 @@ def _require_read(settings: LinkSettings) -> None:
         file = getattr(getattr(impairment, "loss", impairment), "file", None)
         if file is not None:
             raise CallerError(f"{file}: read the file first, and send its content as settings")
+
+
+def _content(query: zenoh.Query) -> dict[str, Any]:
+    """Return the content of a query; raise CallerError unless it is a JSON object."""
+    try:
+        content = json.loads(query.payload.to_string() if query.payload else "{}")
+    except ValueError:
+        content = None
+    if not isinstance(content, dict):
+        raise CallerError("a query is a JSON object")
+    return content

@@ -12,7 +12,7 @@ from typing import Any
 from rich.console import Console
 
 from netem.control.control_client import Client
-from netem.control.emulator_session import Session, find, running
+from netem.control.emulator_session import find, running
 from netem.control.live_screen import Screen
 from netem.control.statistics_view import History, render
 from netem.engine.relay_interface import DIRECTIONS
@@ -55,8 +55,8 @@ def _parser(
     return parser
 
 
-def _session(options: argparse.Namespace) -> Session:
-    """Return the session that NAME or --control NAME selects."""
+def _chosen(options: argparse.Namespace) -> str:
+    """Return the emulator that NAME or --control NAME selects."""
     if options.control is not None and options.name not in (None, options.control):
         raise CallerError(f"--control {options.control}: NAME is {options.name} already")
     return find(options.control or options.name)
@@ -69,8 +69,8 @@ def _show(arguments: Sequence[str]) -> ExitStatus:
     )  # fmt: skip
     parser.add_argument("name", nargs="?", help=_NAME_HELP)
     options = parser.parse_args(arguments)
-    session = _session(options)
-    with Client(session) as client:
+    name = _chosen(options)
+    with Client(name) as client:
         statistics = client.ask("report")
     if options.json:
         print(json.dumps(statistics, indent=2), flush=True)
@@ -78,7 +78,7 @@ def _show(arguments: Sequence[str]) -> ExitStatus:
         history = History()
         history.add(statistics)
         console = _Console()
-        console.print(render(history, _title(session), console.width, None))
+        console.print(render(history, _title(name), console.width, None))
     return ExitStatus.OK
 
 
@@ -102,7 +102,7 @@ def _set(arguments: Sequence[str]) -> ExitStatus:
     options = parser.parse_intermixed_args(arguments)
     options.name, settings = _name_and_settings(options.words)
     settings = read_files(settings, Path())
-    with Client(_session(options)) as client:
+    with Client(_chosen(options)) as client:
         before = client.ask("settings")
         answer = client.ask(
             "change", link=options.link, direction=options.direction,
@@ -163,11 +163,11 @@ def _watch(arguments: Sequence[str]) -> ExitStatus:
     )  # fmt: skip
     parser.add_argument("name", nargs="?", help=_NAME_HELP)
     options = parser.parse_args(arguments)
-    session = _session(options)
+    name = _chosen(options)
     with (
         Signals().handled() as signals,
-        Client(session) as client,
-        Screen(_title(session), as_json=options.json) as screen,
+        Client(name) as client,
+        Screen(_title(name), as_json=options.json) as screen,
     ):
 
         def stop() -> bool:
@@ -180,8 +180,8 @@ def _watch(arguments: Sequence[str]) -> ExitStatus:
     return ExitStatus.OK
 
 
-def _title(session: Session) -> str:
-    return f"noack netem {session.name}"
+def _title(name: str) -> str:
+    return f"noack netem {name}"
 
 
 class _Console(Console):

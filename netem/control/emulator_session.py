@@ -1,34 +1,19 @@
-"""Session files: the address of a running emulator, and its secret.
+"""Session files: the running emulators of this user.
 
-While the emulator runs, its file is in the user's runtime directory, readable by its owner only
-(:mod:`noack.runtime.lock_file`).
+While an emulator runs, its file is in the user's runtime directory (:mod:`noack.runtime.lock_file`)
+beside its socket.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
-from typing import NamedTuple
 
-from pydantic import TypeAdapter, ValidationError
-
-from noack.config.validation_messages import brief
 from noack.core.errors import CallerError, PeerError
 from noack.runtime import lock_file
 from noack.runtime.private_folder import require_name
 
-
-class Session(NamedTuple):
-    """Address and secret of an emulator."""
-
-    name: str
-    endpoint: str
-    """zenoh endpoint, for example ``tcp/127.0.0.1:7447``."""
-    token: str
-    """The secret; see :mod:`netem.control.control_server`."""
-
-
-_SESSION = TypeAdapter(Session)
-_KIND = "netem"
+EMULATORS = "netem"
+"""The folder of the files."""
 _STARTING = "netem_starting"
 
 
@@ -37,23 +22,23 @@ def _in_use(name: str) -> CallerError:
 
 
 @contextmanager
-def _locked(kind: str, name: str, content: Mapping[str, object]) -> Iterator[Path]:
+def _locked(kind: str, name: str) -> Iterator[Path]:
     require_name(name, "emulator")
     with ExitStack() as stack:
         try:
-            path = stack.enter_context(lock_file.lock_file(kind, name, content))
+            path = stack.enter_context(lock_file.lock_file(kind, name, {}))
         except FileExistsError:
             raise _in_use(name) from None
         yield path
 
 
-def published(session: Session) -> AbstractContextManager[Path]:
-    """Keep a session's file within the context.
+def published(name: str) -> AbstractContextManager[Path]:
+    """Keep an emulator's file within the context.
 
     Raises:
         CallerError: the name is not allowed or in use, or the folder is not the user's own.
     """
-    return _locked(_KIND, session.name, session._asdict())
+    return _locked(EMULATORS, name)
 
 
 @contextmanager
@@ -66,7 +51,7 @@ def starting(name: str | None) -> Iterator[None]:
     if name is None:
         yield
         return
-    with _locked(_STARTING, name, {}):
+    with _locked(_STARTING, name):
         if name in running():
             raise _in_use(name)
         yield
@@ -81,12 +66,12 @@ def running() -> list[str]:
     return list(_files())
 
 
-def find(name: str | None) -> Session:
-    """Return the session of the named emulator; if ``name`` is None, of the only running one.
+def find(name: str | None) -> str:
+    """Return the name of a running emulator; if ``name`` is None, of the only one.
 
     Raises:
         CallerError: there is no such emulator, or several run and none is named.
-        PeerError: it is still starting, or its session file cannot be read.
+        PeerError: it is still starting.
     """
     files = _files()
     begun = [file.path.stem for file in lock_file.live_lock_files(_STARTING)]
@@ -105,13 +90,8 @@ def find(name: str | None) -> Session:
     name = name or next(iter(files))
     if name not in files:
         raise CallerError(f"no emulator {name!r}; running: {', '.join(files)}")
-    try:
-        return _SESSION.validate_json(files[name].content, strict=True)
-    except ValidationError as error:
-        raise PeerError(
-            f"emulator {name!r}: its session file cannot be read: {brief(error)}"
-        ) from None
+    return name
 
 
 def _files() -> dict[str, lock_file.LockFile]:
-    return {file.path.stem: file for file in lock_file.live_lock_files(_KIND)}
+    return {file.path.stem: file for file in lock_file.live_lock_files(EMULATORS)}

@@ -2,8 +2,8 @@
 
 A role has two functions, which run as they stand or compiled: ``handle`` takes a message, and
 ``on_timer`` does what is due. Both write one row of the record, without the loop's number in front,
-to ``row``, and a message to the next place of ``out``. They return a sum of :data:`SENDS` and
-:data:`NOTES`, or :data:`NEEDS_MATRIX`; then they have changed nothing and are called again.
+to ``row``, and a message to the next place of ``out``. They return :data:`SENDS` if they wrote a
+message, or else 0; or :data:`NEEDS_MATRIX`: then they have changed nothing and are called again.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -20,8 +20,6 @@ from noack.protocol.wire_format import HEADER_BYTES, MAX_DIMENSION, TAG_BYTES
 
 SENDS = 1
 """A message was written."""
-NOTES = 2
-"""Python writes a line for the log; see the fields of FLEET."""
 NEEDS_MATRIX = -1
 """A transition matrix is missing in the table."""
 HEADER_WORDS = HEADER_BYTES // 8
@@ -51,10 +49,23 @@ FLEET = np.dtype(
         for name in (
             "n", "m", "loops",
             "out",  # messages that wait to be sent
-            "note_loop", "note_ns", "note_since_ns",
+            "notes",  # that wait to be written to the log
         )
     ]
 )  # fmt: skip
+NOTE = np.dtype(
+    [
+        (name, "<i8")
+        for name in (
+            "loop",
+            "t_ns",
+            "since_ns",  # when actuations began to be missing, if they arrive again
+            "newest_ns",  # the time of the newest actuation
+            "newest_sequence",
+        )
+    ]
+)
+"""What a plant's line for the log is made of."""
 
 
 class FleetMemory(NamedTuple):
@@ -71,6 +82,8 @@ class FleetMemory(NamedTuple):
     arrived: NDArray[np.int64]
     """(k STRIDE,) Datagrams received."""
     arrived_reals: NDArray[np.float64]
+    notes: NDArray[Any]
+    """(k,) :data:`NOTE`."""
     row: NDArray[np.int64]
     """(words of the longest row,)"""
     row_reals: NDArray[np.float64]
@@ -135,7 +148,7 @@ class FleetParts(NamedTuple):
     transitions: Transitions | None = None
     """Of a role with models, the field ``models`` of its arrays."""
     notice: Callable[[Any, Any], Notice] | None = None
-    """Returns the line for the log that a machine asked for, from its arrays and FLEET's row."""
+    """Returns the line for the log that a machine asked for, from its arrays and a NOTE."""
     inspect: Callable[[NDArray[np.void]], Sequence[tuple[int, Notice]]] | None = None
     """Returns lines for the log about new rows of ``on_message``, each with its loop."""
     changes: str = ""

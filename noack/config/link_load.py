@@ -46,9 +46,20 @@ class Demand(NamedTuple):
     """Largest time between two transmissions; infinite if there is none."""
 
 
+class _Stage(NamedTuple):
+    """A part of the run, between two changes of settings."""
+
+    begin: str
+    """Where it begins, in words; empty: at the start of the run."""
+    direction: DirectionSection
+    loops: Sequence[Demand]
+
+
 class LinkLoad(NamedTuple):
     """What the loops need of a bottleneck; rates in bits per second."""
 
+    begin: str
+    """From when on, in words; empty: from the start of the run."""
     key: str
     flow: Flow
     window: LossWindow
@@ -60,17 +71,14 @@ class LinkLoad(NamedTuple):
     mandatory_at_least_bps: float
     """The same, if each loop transmits as rarely as it can."""
     delay_bound_s: float | None
-    """Bound of a datagram's delay in this queue; None: there is none."""
+    """Bound of a datagram's delay in this queue, in the whole run; None: there is none."""
 
 
-def link_loads(scenario: Scenario, changes: int = 0) -> list[LinkLoad]:
+def link_loads(scenario: Scenario) -> list[LinkLoad]:
     """Return what the loops need of each bottleneck of the network, in either direction.
 
-    Acknowledgements are left out: how many there are depends on the losses of updates.
-
-    Args:
-        scenario: the scenario.
-        changes: how many of its changes have taken effect.
+    A change of settings that alters it adds an element. Acknowledgements are left out: how many
+    there are depends on the losses of updates.
 
     Raises:
         CallerError: a loop cannot be resolved, or its trigger excludes its model.
@@ -78,58 +86,92 @@ def link_loads(scenario: Scenario, changes: int = 0) -> list[LinkLoad]:
     sections = scenario.loops
     loops = [scenario] if sections is None else [loop_scenario(scenario, one) for one in sections]
     counts = [1] if sections is None else [one.count for one in sections]
-    for change in scenario.changes[:changes]:
-        loops = [with_settings(loop, change.set) for loop in loops]
-    network, loops = loops[0].network, [resolve(loop) for loop in loops]
-    updates = [*map(_demand, loops, counts)]
-    found = _link_loads(updates, Flow.UPDATE, network, "network")
-    if network.actuation is not None:
-        actuations = [*map(_actuations, loops, counts)]
-        found += _link_loads(actuations, Flow.ACTUATION, network.actuation, "network.actuation")
-    return found
+    updates, actuations = list[_Stage](), list[_Stage]()
+    for number in range(len(scenario.changes) + 1):
+        begin = f"from changes.{number - 1} on, " if number else ""
+        if number:
+            loops = [with_settings(loop, scenario.changes[number - 1].set) for loop in loops]
+        network, resolved = loops[0].network, [resolve(loop) for loop in loops]
+        updates.append(_Stage(begin, network, [*map(_demand, resolved, counts)]))
+        if network.actuation is not None:
+            demands = [*map(_actuations, resolved, counts)]
+            actuations.append(_Stage(begin, network.actuation, demands))
+    found = _link_loads(updates, Flow.UPDATE, "network")
+    return found + _link_loads(actuations, Flow.ACTUATION, "network.actuation")
 
 
-def _link_loads(
-    loops: Sequence[Demand], flow: Flow, direction: DirectionSection, path: str
-) -> list[LinkLoad]:
-    link = direction.link
-    windows = guarantee_of(link.mansd, link.constraints).windows
-    window = min(windows, key=lambda one: one.losses / one.packets, default=LossWindow(1, 1))
-    must_pass = (window.packets - window.losses) / window.packets
-    found = []
-    for place, one in enumerate(direction.impairments):
+def _link_loads(stages: Sequence[_Stage], flow: Flow, path: str) -> list[LinkLoad]:
+    found: list[LinkLoad] = []
+    # The impairments cannot change.
+    for place, one in enumerate(stages[0].direction.impairments if stages else ()):
         if not isinstance(one, Rate | Opportunities):
             continue
-        bits = [int(one.line_bits(loop.payload_bytes)) for loop in loops]
-        every = sum(b * loop.loops / loop.least_s for b, loop in zip(bits, loops, strict=True))
-        least = sum(b * loop.loops / loop.largest_s for b, loop in zip(bits, loops, strict=True))
-        together = sum(b * loop.loops for b, loop in zip(bits, loops, strict=True))
-        delay_s = None
-        is_queue = isinstance(one, Rate) and isinstance(one.discipline, TailDrop)
-        if is_queue and _is_first(direction, place):
-            if every <= one.rate_bps:
-                delay_s = together / one.rate_bps
-            elif every * must_pass < one.rate_bps and not direction.constraints:
-                spare_bps = one.rate_bps - every * must_pass
-                delay_s = (one.queue * max(bits) + together) / spare_bps
-        needed_bps = every * must_pass, least * must_pass
-        key = f"{path}.impairments.{place}"
-        found.append(LinkLoad(key, flow, window, one.rate_bps, *needed_bps, delay_s))
+        before: LinkLoad | None = None
+        delay_s = _delay_bound_s(stages, place)
+        for begin, direction, loops in stages:
+            window = _window(direction)
+            bits = [int(one.line_bits(loop.payload_bytes)) * loop.loops for loop in loops]
+            needed_bps = (
+                sum(b / loop.least_s for b, loop in zip(bits, loops, strict=True)),
+                sum(b / loop.largest_s for b, loop in zip(bits, loops, strict=True)),
+            )
+            at_most_bps, at_least_bps = (_share(window) * bps for bps in needed_bps)
+            key = f"{path}.impairments.{place}"
+            load = LinkLoad(
+                begin, key, flow, window, one.rate_bps, at_most_bps, at_least_bps, delay_s
+            )
+            if before is None or load._replace(begin=before.begin) != before:
+                found.append(load)
+            before = load
     return found
+
+
+def _window(direction: DirectionSection) -> LossWindow:
+    link = direction.link
+    windows = guarantee_of(link.mansd, link.constraints).windows
+    return min(windows, key=lambda one: one.losses / one.packets, default=LossWindow(1, 1))
+
+
+def _share(window: LossWindow) -> float:
+    """Return the share of datagrams that must pass."""
+    return (window.packets - window.losses) / window.packets
+
+
+def _delay_bound_s(stages: Sequence[_Stage], place: int) -> float | None:
+    """Return the bound for the least M and the shortest times between transmissions of the run.
+
+    What waits in the queue at a change was sent before it, so no stage has a bound of its own.
+    """
+    direction = stages[0].direction
+    one = direction.impairments[place]
+    if not (isinstance(one, Rate) and isinstance(one.discipline, TailDrop)):
+        return None
+    if not _is_first(direction, place):
+        return None
+    bits = [int(one.line_bits(loop.payload_bytes)) for loop in stages[0].loops]
+    counts = [loop.loops for loop in stages[0].loops]
+    by_loops = zip(*(stage.loops for stage in stages), strict=True)
+    least_s: list[float] = [min(one.least_s for one in each) for each in by_loops]
+    every: float = sum(b * k / d for b, k, d in zip(bits, counts, least_s, strict=True))
+    together = sum(b * k for b, k in zip(bits, counts, strict=True))
+    if every <= one.rate_bps:
+        return together / one.rate_bps
+    spare_bps = one.rate_bps - every * max(_share(_window(stage.direction)) for stage in stages)
+    if spare_bps > 0 and not any(stage.direction.constraints for stage in stages):
+        return (one.queue * max(bits) + together) / spare_bps
+    return None
 
 
 def require_capacity(scenario: Scenario) -> None:
     """Raise CallerError if a bottleneck cannot carry the datagrams of the loops that must pass."""
-    for changes in range(len(scenario.changes) + 1):
-        after = f"from changes.{changes - 1} on, " if changes else ""
-        for load in link_loads(scenario, changes):
-            if load.mandatory_at_least_bps > load.rate_bps:
-                losses, packets = load.window
-                raise CallerError(
-                    f"{load.key}: {after}the datagrams that must pass, {packets - losses} of any "
-                    f"{packets} of each loop, need {math.ceil(load.mandatory_at_least_bps)} bit/s, "
-                    f"and it carries {load.rate_bps:.0f}; the queue would grow without bound"
-                )
+    for load in link_loads(scenario):
+        if load.mandatory_at_least_bps > load.rate_bps:
+            losses, packets = load.window
+            raise CallerError(
+                f"{load.key}: {load.begin}the datagrams that must pass, {packets - losses} of any "
+                f"{packets} of each loop, need {math.ceil(load.mandatory_at_least_bps)} bit/s, "
+                f"and it carries {load.rate_bps:.0f}; the queue would grow without bound"
+            )
 
 
 def load_warnings(loads: Sequence[LinkLoad], scenario: Scenario) -> Iterator[str]:
@@ -137,12 +179,12 @@ def load_warnings(loads: Sequence[LinkLoad], scenario: Scenario) -> Iterator[str
     for load in loads:
         if load.mandatory_at_most_bps > load.rate_bps:
             yield (
-                f"{load.key}, {load.rate_bps:.0f} bit/s: if all loops transmit as often as they "
-                f"can, the datagrams that must pass need {math.ceil(load.mandatory_at_most_bps)} "
-                "bit/s; then the queue grows without bound"
+                f"{load.key}, {load.rate_bps:.0f} bit/s: {load.begin}if all loops transmit as "
+                "often as they can, the datagrams that must pass need "
+                f"{math.ceil(load.mandatory_at_most_bps)} bit/s; then the queue grows without bound"
             )
-        if load.flow is not Flow.UPDATE:
-            continue  # the rest is about certificate.network_delay_s, the delay of updates
+        if load.flow is not Flow.UPDATE or load.begin:
+            continue  # the rest is about the delay of updates in the whole run
         certified_s = scenario.certificate.network_delay_s
         if certified_s is None:
             certified_s = scenario.network.link.longest_delay_s

@@ -77,8 +77,8 @@ def matrices_of(system: Any, gain: Any = None) -> dict[str, Matrix]:
         missing = [key for key in ("A", "B", "C", "D") if not hasattr(system, key)]
         if missing:
             raise CallerError(
-                f"the system: a {type(system).__name__} has no {missing[0]}; give a state space, "
-                "e.g. with .to_ss(), control.ss, or a tuple (A, B, C, D)"
+                f"the system: an object of type {type(system).__name__} has no {missing[0]}; "
+                "give a state space, e.g. with .to_ss(), control.ss, or a tuple (A, B, C, D)"
             )
         A, B, C, D, dt = system.A, system.B, system.C, system.D, getattr(system, "dt", None)
     found = {"A": _matrix("A", A), "B": _matrix("B", B)}

@@ -81,7 +81,8 @@ class TheoryCoverage:
             return (
                 f'plant.watchdog.policy = "{policy}": it replaces the input after '
                 f"{timing.actuation_timeout_ns / NS_PER_S:g} s, and an actuation may be "
-                f"{oldest_ns / NS_PER_S:g} s old; use more controller.predictions"
+                f"{oldest_ns / NS_PER_S:g} s old; use more controller.predictions, or a longer "
+                "plant.watchdog.timeout_s"
             )
         return None
 

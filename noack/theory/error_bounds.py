@@ -7,7 +7,6 @@ By (I1), e_c = e_s + Σ e^{H(t−t_k)} e_s(t_k⁻) over the missing events. Two 
 """
 
 import math
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -16,8 +15,6 @@ from numpy.typing import NDArray
 from noack.core.linear_systems import Matrix, Propagator, Vector, norm, row_norms
 from noack.trigger.decaying import DecayingTrigger
 from noack.trigger.trigger_policy import Policy
-
-_CACHED_AGES = 4096
 
 
 class ErrorBounds(NamedTuple):
@@ -32,10 +29,11 @@ class ErrorMonitor:
     """Computes the bounds along a run, measurement by measurement.
 
     A measurement needs a few array operations over the missing events: a network without a bound
-    may lose thousands of consecutive updates. H is the matrix of both models between updates.
+    may lose thousands of consecutive updates. H is the matrix of both models between updates; times
+    of measurements differ by multiples of ``period_ns``.
     """
 
-    def __init__(self, H: Matrix, trigger: Policy) -> None:
+    def __init__(self, H: Matrix, trigger: Policy, period_ns: int) -> None:
         n = len(H)
         self._trigger = trigger
         self._propagate = Propagator(H)
@@ -48,8 +46,9 @@ class ErrorMonitor:
         self._thens_ns = np.zeros(0, dtype=np.int64)
         self._thresholds = np.zeros(0)
         self._jumps = np.zeros((0, n))  # e^{H(t−t_k)} e_s(t_k⁻)
-        # Measurements lie on a grid, so there are few different ages.
-        self._grown = lru_cache(_CACHED_AGES)(self._growth)
+        self._period_ns = period_ns
+        self._growths = np.ones(0)
+        """‖e^{Hτ}‖_W at the multiples of the period."""
 
     def sample(self, t_ns: int, e_s: Vector, event: int, received: int) -> ErrorBounds:
         """Add a measurement with e_s before any reset, (n,); return the bounds at its time.
@@ -63,11 +62,9 @@ class ErrorMonitor:
             self._append(event, e_s)
         self._keep(self._sequences > received)
         identity = 0.0 if event >= 0 else norm(self._weight @ e_s)
-        ages_ns = (t_ns - self._thens_ns).tolist()
-        growths = np.array([self._grown(age_ns) for age_ns in ages_ns])
         return ErrorBounds(
             identity + float(row_norms(self._jumps @ self._weight.T).sum()),
-            self._threshold(t_ns) + float(growths @ self._thresholds),
+            self._threshold(t_ns) + self._grown_thresholds(t_ns),
         )
 
     def samples(
@@ -116,9 +113,7 @@ class ErrorMonitor:
             norms = row_norms(np.concatenate(jumps) @ self._weight.T)
             identity += norms.reshape(-1, missing).sum(axis=1)
             if isinstance(self._trigger, DecayingTrigger):
-                thens_ns = self._thens_ns.tolist()
-                growths = [[self._grown(one - then) for then in thens_ns] for one in times_ns]
-                printed += [float(row @ self._thresholds) for row in np.array(growths)]
+                printed += [self._grown_thresholds(one_ns) for one_ns in times_ns]
         self._t_ns = times_ns[-1]
         return np.column_stack([identity, printed])
 
@@ -136,6 +131,17 @@ class ErrorMonitor:
         if not kept.all():
             self._sequences, self._thens_ns = self._sequences[kept], self._thens_ns[kept]
             self._thresholds, self._jumps = self._thresholds[kept], self._jumps[kept]
+
+    def _grown_thresholds(self, t_ns: int) -> float:
+        """Return the sum of the missing events' thresholds, each times ‖e^{Hτ}‖_W of its age."""
+        if not len(self._thens_ns) or not isinstance(self._trigger, DecayingTrigger):
+            return 0.0
+        periods = (t_ns - self._thens_ns) // self._period_ns
+        known, oldest = len(self._growths), int(periods[0])
+        if oldest >= known:
+            more = [self._growth(i * self._period_ns) for i in range(known, oldest + 1)]
+            self._growths = np.append(self._growths, more)
+        return float(self._growths[periods] @ self._thresholds)
 
     def _growth(self, age_ns: int) -> float:
         """Return ‖e^{Hτ}‖_W."""

@@ -95,7 +95,7 @@ def page(result: CapacityResult) -> str:
         title=plan.scenario.name,
         subtitle=f"{plan.rate_bps / 1000:g} kbit/s, {plan.draws:,} draws at each number of loops, "
         f"seed {plan.seed}",
-        verdict=f"The rate carries {plan.periodic_loops:.4g} loops that transmit every "
+        verdict=f"The rate carries {plan.periodic_loops:.1f} loops that transmit every "
         f"{plan.period_s:g} s.",
         comparisons=list(comparisons(result)),
         counts=", ".join(map(str, plan.counts)),
@@ -225,7 +225,7 @@ def print_result(console: Console, result: CapacityResult) -> None:
     console.print(table)
     lines = [
         "loops carried: median [95 % interval], which is finite from six draws on",
-        f"periodic every {plan.period_s:g} s: the rate carries {plan.periodic_loops:.4g} loops",
+        f"periodic every {plan.period_s:g} s: the rate carries {plan.periodic_loops:.1f} loops",
         *comparisons(result),
         *(f"live: {one.policy}, {one.loops} loops: {live_row(one)[-1]}" for one in result.live),
     ]

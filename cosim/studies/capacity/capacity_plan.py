@@ -108,6 +108,12 @@ class CapacityPlan:
         )  # fmt: skip
 
 
+def loops_with_own_settings(scenario: Scenario) -> list[str]:
+    """Return the names of [[loops]] with settings of their own, which a study leaves out."""
+    drawn = {"name", "count", "phase", "seeds"}
+    return [one.name for one in scenario.loops or () if one.model_fields_set - drawn]
+
+
 def bottleneck(scenario: Scenario) -> Rate:
     """Return the slowest bottleneck of the network.
 

@@ -64,7 +64,7 @@ class SeedsSection(ScenarioSection):
 
 
 class PortsSection(ScenarioSection):
-    """UDP ports on the loopback interface, and the control plane's TCP port; 0 takes a free one."""
+    """UDP ports on the loopback interface; 0 takes a free one."""
 
     plant: Port = 0
     """Where the plant receives actuation."""
@@ -74,13 +74,11 @@ class PortsSection(ScenarioSection):
     """Where the network receives the sensor's updates."""
     controller: Port = 0
     """Where the controller receives the delivered updates."""
-    control: Port = 0
-    """TCP port of the zenoh control plane."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         taken: dict[int, str] = {}
-        for key in ("plant", "sensor", "netem", "controller"):
+        for key in type(self).model_fields:
             port = getattr(self, key)
             if port and port in taken:
                 raise ValueError(

@@ -4,23 +4,21 @@ import json
 import threading
 from typing import Any
 
-import psutil
 import pytest
-import zenoh
 from zenoh.handlers import FifoChannel
 
 from netem.control import control_server
 from netem.control.command_queue import CommandQueue
 from netem.control.control_client import Client
-from netem.control.control_server import ControlServer, secret_of
-from netem.control.emulator_session import Session, find, running
+from netem.control.control_server import ControlServer
+from netem.control.emulator_session import EMULATORS, find, running
 from netem.engine.relay_interface import DIRECTIONS
 from netem.words.words_to_settings import settings_of
 from noack.core.errors import CallerError
 from noack.impairments.link_records import Counters
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.private_folder import private_folder
-from noack.runtime.zenoh_session import open_session, session_config
+from noack.runtime.zenoh_session import open_session
 from tests.netem.control.relays import SETTINGS, FakeRelay
 
 
@@ -125,55 +123,28 @@ def test_a_mistake_gets_one_line_and_changes_nothing(relay: FakeRelay, client: C
     assert relay.changes == 0
 
 
-def ask_with(session: Session, payload: str | bytes | None, what: str = "change") -> str:
-    """Send a query on an authenticated connection; return the error."""
-    secret = secret_of(session.token)
-    with open_session(session.endpoint, secret, listen=False) as connection:
-        key = f"netem/{session.name}/{what}"
+def ask_with(name: str, payload: str | bytes | None, what: str = "change") -> str:
+    """Send a query; return the error."""
+    with open_session(EMULATORS, name, listen=False) as connection:
+        key = f"netem/{name}/{what}"
         replies = connection.get(key, FifoChannel(4), payload=payload, timeout=60)
         (error,) = [reply.err for reply in replies if reply.err is not None]
         return error.payload.to_string()
 
 
-def test_a_query_without_the_token_is_refused(relay: FakeRelay, server: ControlServer) -> None:
-    session = find("lab")
-    queries = [("report", "0" * 64), ("settings", "0" * 64)]
-    queries += [("change", token) for token in ("", "é", None, ["a"])]
-    for what, token in queries:
-        content = {"token": token, "link": "up", "words": "loss 5%"}
-        assert "the token is not this emulator's" in ask_with(session, json.dumps(content), what)
-    for payload in (None, "{", "[]", "{}", b"\xff\xfe"):
-        expected = 'a query is a JSON object with "token", the secret'
-        assert ask_with(session, payload) == expected
+def test_a_query_that_is_no_object_is_refused(relay: FakeRelay, server: ControlServer) -> None:
+    for payload in ("{", "[]", "7", "null", b"\xff\xfe"):
+        assert ask_with(find("lab"), payload) == "a query is a JSON object"
     assert relay.changes == 0
 
 
-def test_a_client_without_the_secret_cannot_connect(server: ControlServer) -> None:
-    session = find("lab")
-    for secret in (
-        {}, {"user": "netem", "password": "0" * 64}, {"user": "root", "password": session.token},
-    ):  # fmt: skip
-        more = {f"transport/auth/usrpwd/{key}": value for key, value in secret.items()}
-        config = session_config(
-            session.endpoint, listen=False, more=more | {"connect/timeout_ms": 200}
-        )
-        with pytest.raises(zenoh.ZError, match="Unable to connect"):
-            zenoh.open(config)
-
-
-def test_the_control_server_listens_on_loopback_only(server: ControlServer) -> None:
-    port = int(find("lab").endpoint.rpartition(":")[2])
-    own = psutil.Process().net_connections()
-    listening = [c.laddr for c in own if c.status == psutil.CONN_LISTEN and c.laddr.port == port]
-    assert [address.ip for address in listening] == ["127.0.0.1"]
-
-
-def test_the_secret_is_nowhere_but_in_the_session_file(server: ControlServer) -> None:
+def test_a_second_server_of_the_name_is_refused(server: ControlServer) -> None:
     folder = private_folder() / "netem"
-    assert [path.name for path in folder.iterdir()] == ["lab.json"]
+    files = ["lab.json", "lab.sock", "lab.sock.lock"]
+    assert sorted(path.name for path in folder.iterdir()) == files
     with pytest.raises(CallerError, match="runs; choose another name"):
         ControlServer("lab", CommandQueue(FakeRelay("up"))).__enter__()
-    assert [path.name for path in folder.iterdir()] == ["lab.json"]
+    assert sorted(path.name for path in folder.iterdir()) == files
     assert running() == ["lab"]
 
 
@@ -197,7 +168,7 @@ def test_a_client_that_blocks_the_server_does_not_block_the_relay(
 
 def test_the_server_leaves_nothing_behind_at_its_end(commands: CommandQueue) -> None:
     with ControlServer("lab", commands):
-        session = find("lab")
+        folder = private_folder() / "netem"
+        assert len([*folder.iterdir()]) == 3
     assert running() == []
-    with pytest.raises(zenoh.ZError):
-        zenoh.open(session_config(session.endpoint, listen=False, more={"connect/timeout_ms": 200}))
+    assert [*folder.iterdir()] == []

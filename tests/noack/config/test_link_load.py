@@ -8,11 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cosim.simulation.shared_network import simulate_loops
 from netem.link_machine import Datagram, Link
 from noack.config.link_load import link_loads, load_warnings, require_capacity
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
 from noack.core.errors import CallerError
+from noack.protocol.record_tables import NETEM_PACKET
 from noack.protocol.wire_format import datagram_bytes
 
 PERIODIC = {"policy": "periodic", "period_s": 0.05}
@@ -116,6 +118,23 @@ def test_an_event_trigger_is_only_warned_about(content: dict[str, Any]) -> None:
     assert f"need {30 * BITS * 500 // 3} bit/s" in warning
     fast = scenario_of(content, 30 * BITS * 500, 5, loops)
     assert [*load_warnings(link_loads(fast), fast)] == []
+
+
+def test_the_bound_of_the_delay_covers_changes(content: dict[str, Any]) -> None:
+    """The link carries all datagrams of 20 loops at first, and half of them after the change."""
+    content["plant"] |= {"rate_hz": 100.0, "initial_state_halfwidth": [0.5, 0.5]}
+    content["controller"] = {"rate_hz": 100.0}
+    content["changes"] = [{"at_s": 1.0, "set": {"trigger.period_s": 0.05}}]
+    content["horizon_s"] = 3.0
+    content["trigger"] = {"policy": "periodic", "period_s": 0.1}
+    loops = {"name": "a", "count": 20, "phase": 0.0}
+    scenario = scenario_of(content, 20 * BITS * 10, 100, loops, mansd=5)
+    packets = simulate_loops(scenario).network[NETEM_PACKET]
+    longest_s = 1e-9 * (packets["release_ns"] - packets["now_ns"]).max()
+    loads = link_loads(scenario)
+    assert [load.begin for load in loads] == ["", "from changes.0 on, "]
+    assert all(longest_s <= (load.delay_bound_s or 0.0) for load in loads)
+    assert longest_s > 0.12  # the bound for the settings at the start is 0.1
 
 
 @settings(max_examples=15)

@@ -88,7 +88,7 @@ LANE_MISTAKES = [
     ("xyzzy=2", "xyzzy = 2: unknown key; ", "the keys here are certificate, .*, trigger"),
     ("pland.rate_hz=9", 'pland = {"rate_hz": 9}: unknown key; ', "did you mean plant?"),
     ("network.loss.p=0.5", "network.loss.p = 0.5: unknown key; ", "model, probability"),
-    ("ports.recorder=9", "ports.recorder = 9: unknown key; ", "control, controller, netem"),
+    ("ports.recorder=9", "ports.recorder = 9: unknown key; ", "controller, netem, plant, sensor"),
     ("model.parameters.a13=1", "model.parameters.a13 = 1: ", "a11, a12, a21, a22, b1, b2"),
     # Types.
     ("horizon_s=20 s", 'horizon_s = "20 s": ', "should be a valid number"),

@@ -14,6 +14,7 @@ from noack.theory.error_bounds import ErrorBounds, ErrorMonitor
 from noack.trigger.decaying import DecayingTrigger
 from tests.noack.theory.loops import seeds
 
+PERIOD_NS = 10_000_000
 NS = 1e-9
 
 
@@ -51,7 +52,7 @@ def histories(draw: st.DrawFn) -> History:
     in_flight: list[tuple[int, int, Vector]] = []
     sent = 0
     for _ in range(draw(st.integers(1, 25))):
-        step_ns = int(rng.integers(0, 300_000_000))
+        step_ns = int(rng.integers(0, 30)) * PERIOD_NS
         t_ns += step_ns
         moved = expm(H * step_ns * NS)
         x, x_s, x_c = x + rng.normal(size=n), moved @ x_s, moved @ x_c
@@ -71,7 +72,7 @@ def histories(draw: st.DrawFn) -> History:
 
 
 def follow(history: History, trigger: DecayingTrigger) -> list[ErrorBounds]:
-    monitor = ErrorMonitor(history.H, trigger)
+    monitor = ErrorMonitor(history.H, trigger, PERIOD_NS)
     return [monitor.sample(*moment[:-1]) for moment in history.moments]
 
 

@@ -115,6 +115,13 @@ def capacity(*words: str) -> Result:
     return CliRunner().invoke(app, ["capacity", *words])
 
 
+def test_loops_with_settings_of_their_own_are_named() -> None:
+    drawn = load(FILE, ["loops=[{ name = 'a', count = 3, phase = 0.5, seeds = { noise = 1 } }]"])
+    assert plans.loops_with_own_settings(drawn) == []
+    own = load(FILE, ["loops=[{ name = 'a' }, { name = 'b', mode = 'zoh' }]"])
+    assert plans.loops_with_own_settings(own) == ["b"]
+
+
 def test_the_command_compares_the_policies_and_confirms_a_point_live(tmp_path: Path) -> None:
     result = capacity(
         str(FILE), "--loops", "2", "--draws", "1", "--workers", "1", "--json", *SHORT,
