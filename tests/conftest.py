@@ -61,6 +61,16 @@ def no_signal_is_ignored_by_children() -> Iterator[None]:
         signal.signal(number, signal.SIG_IGN)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def runs_of_other_workers_are_unknown(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[None]:
+    """Give this worker a runtime directory of its own: a run warns of other active runs."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.mktemp("runtime")))
+        yield
+
+
 @pytest.fixture
 def usual_signals() -> Iterator[None]:
     """Let signals do what they usually do, also in a process that was started to ignore them."""

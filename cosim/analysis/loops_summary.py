@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError, model_validator
 
-from cosim.analysis.run_summary import Outcome
+from cosim.analysis.run_summary import Outcome, change_parts
 from cosim.analysis.summary_model import (
+    ChangePart,
     Count,
     Counts,
     ExitPart,
@@ -57,6 +58,10 @@ class LoopPart(SummaryPart):
     diverged_at_s: Real
     claims: Counts
     """Number of claims by verdict."""
+    void_because: list[Text] = Field(default_factory=list)
+    """The reasons of its void claims, each once."""
+    watchdog_trips: Count = 0
+    """The number of times that the plant's watchdog acted."""
     actuations: FlowPart | None = None
     """None if they do not cross the network."""
     missing_samples: Count
@@ -117,6 +122,8 @@ class LoopsSummary(SummaryPart):
     reached_s: float
     network: NetworkPart
     loops: Annotated[list[LoopPart], Field(min_length=1)]
+    changes: list[ChangePart]
+    """The changes of settings during the run, in the time of the run."""
     deadlines: dict[Text, DeadlinesPart] = Field(default_factory=dict)
     """By process; empty for a simulated run."""
     replay: ReplayPart | None = None
@@ -179,6 +186,7 @@ def summarise_loops(
         reached_s=reached_s,
         network=_network_part(network, packets, parts, reached_s),
         loops=parts,
+        changes=change_parts(network),
         deadlines=_deadlines([one.summary["lateness_us"] for one in loops]),
         exit=end if end.status != ExitStatus.OK else _end(end, parts),
     )
@@ -210,7 +218,7 @@ def _end(end: ExitPart, loops: Sequence[LoopPart]) -> ExitPart:
 
 def _brief(loop: LoopPart) -> str:
     if loop.diverged_at_s is not None:
-        return f"diverged at {loop.diverged_at_s:.2f} s"
+        return f"diverged at {loop.diverged_at_s + loop.phase_s:.2f} s"
     return f"failed: {loop.exit.reason}"
 
 
@@ -233,6 +241,10 @@ def _loop_part(
         delay_mean_s=float(delays_s.mean()) if len(delays_s) else None,
         delay_max_s=float(delays_s.max()) if len(delays_s) else None,
         claims=dict(Counter(str(claim["verdict"]) for claim in summary["claims"])),
+        void_because=[
+            *dict.fromkeys(c["why"] for c in summary["claims"] if c["verdict"] == "void")
+        ],
+        watchdog_trips=summary["watchdog"]["trips"],
         bit_exact=(summary["replay"] or {}).get("bit_exact"),
         **{key: summary[key] for key in same},
     )

@@ -86,7 +86,7 @@ def summarise(
         assumption_violations=reported_violations(record),
         assumptions=[AssumptionPart(**one._asdict()) for one in assumptions(scenario)],
         restarts=_restarts(record),
-        changes=_changes(record),
+        changes=change_parts(record),
         missing_samples=sum(missing.values()),
         missing_by_table={table: n for table, n in missing.items() if n},
         unintended_losses=sum(lost.values()),
@@ -125,7 +125,7 @@ def _transmissions(record: RunRecord) -> dict[str, Any]:
         "events": len(events),
         "deliveries": len(deliveries),
         "drops": int(outcomes.lost.sum()),
-        "loss_expected": None if scenario.changes else expected_loss(scenario.network.link).rate,
+        "loss_expected": None if changes_of(record) else expected_loss(scenario.network.link).rate,
         "drops_by_cause": drops_by_cause(outcomes),
         "forced_deliveries": int((outcomes.fate == Fate.FORCED).sum()),
         "longest_loss_burst": max(outcomes.longest_loss_burst(), longest),
@@ -170,8 +170,8 @@ def _divergence(record: RunRecord) -> Divergence | None:
     return found
 
 
-def _changes(record: RunRecord) -> list[ChangePart]:
-    """The changes of settings during the run."""
+def change_parts(record: RunRecord) -> list[ChangePart]:
+    """Return the changes of settings during the run."""
     return [
         ChangePart(
             number=made.change.number,

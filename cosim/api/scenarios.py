@@ -13,6 +13,7 @@ from noack.config import toml_file
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import completed, put
 from noack.config.state_space import matrices_of, model_of
+from noack.core.errors import CallerError
 from noack.core.linear_systems import spectral_abscissa
 
 Source = Scenario | str | PathLike[str] | Mapping[str, Any]
@@ -126,6 +127,11 @@ def from_system(
 
 def _completed(content: dict[str, Any], settings: Mapping[str, Any] | None, path: Path) -> Scenario:
     """Apply settings, validate, and read the named files, relative to ``path``."""
+    if not isinstance(settings, Mapping | None):
+        raise CallerError(
+            f"settings: {settings!r} is no table; give values by key, "
+            '{"network.loss.probability": 0.8}'
+        )
     for key, value in (settings or {}).items():
         if value is None:
             _take_away(content, key)

@@ -217,9 +217,9 @@ def _control(machine: MachineFacts) -> MachineFinding:
     what, found = "control plane", machine.control
     if isinstance(found, str):
         means = "the processes of a run cannot join it"
-        remedy = "allow TCP connections to 127.0.0.1"
+        remedy = "set XDG_RUNTIME_DIR to a folder of yours that is closed to others"
         return MachineFinding(what, BAD, found, means, remedy)
-    text = f"zenoh over TCP on the loopback answers in {duration(found)}"
+    text = f"zenoh over a Unix socket answers in {duration(found)}"
     return MachineFinding(what, GOOD, text)
 
 

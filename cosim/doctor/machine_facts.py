@@ -111,7 +111,7 @@ class MachineFacts:
     ports_taken: Sequence[str]
     """A line for each port of the scenario that is in use."""
     control: float | str
-    """Seconds per query over the control plane (zenoh, TCP on the loopback)."""
+    """Seconds per query over the control plane (zenoh, over a Unix socket)."""
     disk: Disk | str
     runtime_folder: str | None
     """Why the folder for the user's private files cannot be used; None if it can."""

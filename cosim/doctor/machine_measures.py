@@ -3,7 +3,6 @@
 import ctypes
 import json
 import os
-import secrets
 import shutil
 import socket
 import subprocess
@@ -37,10 +36,10 @@ from noack.core.clock import NS_PER_S
 from noack.core.code_cache import cache_folder
 from noack.core.errors import CallerError, MachineError, NoackError, one_line, why
 from noack.core.python_process import python_command
-from noack.protocol.topology import LOOP_ROLES
+from noack.runtime.control_plane import RUNS
 from noack.runtime.private_folder import open_private
-from noack.runtime.udp_sockets import LOOPBACK, bind, free_tcp_port, require_free_tcp_port
-from noack.runtime.zenoh_session import SessionSecret, answer_to, cause_of, open_session
+from noack.runtime.udp_sockets import LOOPBACK, bind
+from noack.runtime.zenoh_session import answer_to, cause_of, open_session
 
 T = TypeVar("T")
 
@@ -188,22 +187,18 @@ def _buffer() -> Buffer:
 def _ports_taken(wanted: RunRequirements) -> Iterable[str]:
     for name, port in wanted.ports.items():
         try:
-            if name in LOOP_ROLES:
-                bind(port, f"ports.{name}").close()
-            else:
-                require_free_tcp_port(port, f"ports.{name}")
+            bind(port, f"ports.{name}").close()
         except CallerError as error:
             yield str(error)
 
 
 def _control() -> float:
     """Return the time of a query in seconds, over zenoh sessions as in the control plane."""
-    secret = SessionSecret("doctor", secrets.token_hex(16))
-    endpoint, key = f"tcp/{LOOPBACK}:{free_tcp_port()}", "noack/doctor"
-    centre = open_session(endpoint, secret, listen=True)
+    name, key = f"doctor-{os.getpid()}", "noack/doctor"
+    centre = open_session(RUNS, name, listen=True)
     try:
         with centre.declare_queryable(key, FifoChannel(4)) as answering:
-            other = open_session(endpoint, secret, listen=False)
+            other = open_session(RUNS, name, listen=False)
             try:
                 ended = threading.Event()
                 thread = threading.Thread(target=_answer, args=(answering, key, ended))

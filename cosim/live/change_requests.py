@@ -60,7 +60,7 @@ class ChangeRequests:
                 raise CallerError(
                     f"{text_of(settings)}: of this run only network.loss, network.mansd and "
                     "network.constraints can be changed, as its loops may run as compiled code; "
-                    "`changes` in the scenario can set other runtime parameters"
+                    "`changes` in the scenario can set the trigger's numbers and the set point, too"
                 )
             if obstacle is not None:
                 raise CallerError(obstacle)

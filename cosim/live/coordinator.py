@@ -64,7 +64,7 @@ class Coordinator:
         launched: roles of the processes that the launcher has started.
 
     Raises:
-        PeerError: the endpoint cannot be listened on.
+        PeerError: the control plane cannot be started.
     """
 
     def __init__(self, ticket: Ticket, launched: Collection[str] = ()) -> None:

@@ -64,10 +64,12 @@ def finalize(
     """
     run_dir = ending.run_dir
     with _with_reason(ending), finished_run(run_dir), ExitStack() as stack:
+        if not (scenario_file := run_dir / SCENARIO_FILE).exists():
+            raise MachineError(f"{scenario_file}: no such file")  # the run directory was replaced
         unfinished = (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir()
         sections = None
         if loops == 1:
-            sections = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES).loops
+            sections = load(scenario_file, most_bytes=MOST_RECORDED_BYTES).loops
         if sections is not None:
             count = sum(section.count for section in sections)
             few = report and count <= _FEW_LOOPS
@@ -231,6 +233,25 @@ def run_report(run_dir: Path, *, again: bool = False) -> Path:
     if record.is_network:
         return _loops_report(record, outcome.summary, run_dir)
     return _report(record, outcome.summary, run_dir, RunClaims(record))
+
+
+def write_recording(run_dir: Path) -> None:
+    """Write the recording of an earlier run, or of one of its loops.
+
+    Raises:
+        CallerError: it is not a run directory, or the run is still under way.
+        MachineError: the recording cannot be written.
+    """
+    outcome, record = reopen(run_dir), load_record(run_dir, network=True)
+    run_id = (record.number or 0) + 1  # the viewer knows recordings by it
+    if record.is_network:
+        from cosim.output.viewer.loops_view import write_loops_view
+
+        write_loops_view(record, outcome.summary, run_dir, run_id)
+    else:
+        from cosim.output.viewer.run_view import write_view
+
+        write_view(record, run_dir, run_id)
 
 
 def _report(record: RunRecord, summary: Summary, run_dir: Path, claims: RunClaims) -> Path:

@@ -27,13 +27,12 @@ from cosim.record.run_directory import active_run, new_run_dir, point_to_latest,
 from cosim.record.run_ending import EndingFile, RunEnding
 from noack.config.resolution import resolved_loops, tables_of
 from noack.config.scenario import Scenario
-from noack.core.errors import CallerError, ExitStatus, NeverStartedError
+from noack.core.errors import ExitStatus, NeverStartedError, NoackError
 from noack.protocol.topology import PLANT, RECORDER, ROLES
 from noack.runtime import run_registry
 from noack.runtime.join_ticket import Ticket, new_ticket, published
 from noack.runtime.life_cycle import HORIZON
 from noack.runtime.signals import Signals
-from noack.runtime.udp_sockets import LOOPBACK, free_tcp_port, require_free_tcp_port
 
 _STOPPED: Mapping[int, str] = {
     signal.SIGINT: "stopped by the user",
@@ -89,28 +88,24 @@ def launch(
         resolved = loops[0] if scenario.loops is None else scenario
         tables_of(resolved)  # refuses loops of different sizes
         require_disk_space(loops, runs)
-        control = resolved.ports.control
-        if control:
-            require_free_tcp_port(control, "ports.control")
         if PLANT in spawn:
             # Compile now: the start barrier has a time limit.
             for system in {repr(loop.plant.system): loop.plant.system for loop in loops}.values():
                 system.prepare()
         compile_for(scenario, spawn)
-        endpoint = f"tcp/{LOOPBACK}:{control or free_tcp_port()}"
         run_dir = new_run_dir(runs, resolved.name)
         resolved = write_scenario(resolved, run_dir)
         write_environment(run_dir, "live")
-        ticket = new_ticket(resolved, endpoint, run_dir.resolve(), launched=True)
+        ticket = new_ticket(resolved, run_dir.resolve(), launched=True)
         children = ChildProcesses(ticket, run_dir, spawn, server)
         signals = stack.enter_context(Signals().handled())
         stack.enter_context(active_run(run_dir))
         ending = stack.enter_context(EndingFile(run_dir))
+        _publish_run(stack, ticket, session)  # first: its file leads to a killed run's socket
         coordinator = Coordinator(ticket, spawn)
         stack.callback(coordinator.close)
         if session is not None:
             _publish_session(stack, ticket, session)
-        _publish_run(stack, ticket, session)
         stack.enter_context(children.started(live=live))
         run = _Run(ticket, run_dir, coordinator, children, watcher or Watcher())
         status, reason = run.watch(signals, ending.store)
@@ -126,10 +121,11 @@ def _publish_session(stack: contextlib.ExitStack, ticket: Ticket, session: str) 
 
     Raises:
         CallerError: another run is open in the session.
+        MachineError: the ticket cannot be written.
     """
     try:
         stack.enter_context(published(ticket.model_copy(update={"launched": False}), session))
-    except CallerError:
+    except NoackError:
         shutil.rmtree(ticket.run_dir, ignore_errors=True)
         raise
 
@@ -138,7 +134,7 @@ def _publish_run(stack: contextlib.ExitStack, ticket: Ticket, session: str | Non
     """Let `noack set` find the run; without that the run goes on."""
     try:
         stack.enter_context(run_registry.published(ticket, session))
-    except (CallerError, OSError) as error:
+    except NoackError as error:
         print(f"noack: warning: `noack set` cannot reach this run: {error}", file=sys.stderr)
 
 

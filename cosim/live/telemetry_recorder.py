@@ -24,7 +24,8 @@ from noack.protocol.machine_interface import BEGINNING, Notice, Start
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.command_line import print_to_stderr
 from noack.runtime.control_plane import ControlPlane
-from noack.runtime.telemetry import NOTICES, first_row
+from noack.runtime.log_lines import NOTICES
+from noack.runtime.telemetry import first_row
 from noack.runtime.zenoh_session import header_of
 
 if TYPE_CHECKING:
@@ -195,9 +196,10 @@ class Recorder:
                 raise PeerError("it was sent with another key")
             generation, first = first_row(header)
             if table == NOTICES and role in LOOP_ROLES:
-                line = self._store.add_notice(role, generation, first, payload)
+                lines = self._store.add_notices(role, generation, first, payload)
                 if self._feed is not None:
-                    self._feed.log(line)
+                    for line in lines:
+                        self._feed.log(line)
             else:
                 rows, follows = self._store.add_rows(role, table, generation, first, payload)
                 self._take_rows(table, rows, follows=follows)

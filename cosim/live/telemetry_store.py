@@ -16,8 +16,9 @@ from noack.protocol.machine_interface import GENERATION, Notice, Start
 from noack.protocol.record_tables import OWNER
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.runtime.control_messages import LogLine, parse_message
+from noack.runtime.log_lines import NOTICES, lines_in, notice_number, notices_of
 from noack.runtime.spool import SPOOL, SpoolWriter, read_chunks
-from noack.runtime.telemetry import NOTICES, ReceivedRows, notice_number, notices_of
+from noack.runtime.telemetry import ReceivedRows
 
 
 class TelemetryStore:
@@ -43,16 +44,18 @@ class TelemetryStore:
         self._received: defaultdict[tuple[str, str, int], ReceivedRows] = defaultdict(ReceivedRows)
         """By role, table and generation."""
 
-    def add_notice(self, role: str, generation: int, number: int, payload: bytes) -> dict[str, Any]:
-        """Store a line of the log; return its fields.
+    def add_notices(
+        self, role: str, generation: int, first: int, payload: bytes
+    ) -> list[dict[str, Any]]:
+        """Store a batch of lines of the log; return the fields of each.
 
         Raises:
-            PeerError: the payload is not a line of the log.
+            PeerError: the payload has something else.
         """
-        line = parse_message(LogLine, payload) | {"process": role}
-        self._writer.append(notices_of(role), notice_number(generation, number), payload)
-        self._received[role, NOTICES, generation].add(number, number + 1)
-        return line
+        lines = [parse_message(LogLine, one) | {"process": role} for one in lines_in(payload)]
+        self._writer.append(notices_of(role), notice_number(generation, first), payload)
+        self._received[role, NOTICES, generation].add(first, first + len(lines))
+        return lines
 
     def add_rows(
         self, role: str, table: str, generation: int, first: int, payload: bytes
@@ -103,9 +106,10 @@ class TelemetryStore:
                     self._received[OWNER[table], table, generation].add(first, first + len(rows))
                     on_rows(table, rows)
         for role in LOOP_ROLES:
-            for number, _ in read_chunks(self._folder, notices_of(role)):
+            for number, payload in read_chunks(self._folder, notices_of(role)):
                 generation, first = divmod(number, GENERATION)
-                self._received[role, NOTICES, generation].add(first, first + 1)
+                end = first + len(lines_in(payload))
+                self._received[role, NOTICES, generation].add(first, end)
 
     def missing(self, report: Mapping[str, Any]) -> dict[str, list[tuple[int, int]]]:
         """Ranges of rows that a process has reported and that are not stored, by table."""

@@ -10,22 +10,25 @@ from rich.markup import escape
 from rich.table import Table
 
 from cosim.analysis.run_summary import Summary
+from cosim.output.run_tables import changes_in, longest_burst
 from noack.core.errors import ExitStatus
 from noack.core.number_format import duration, number, ratio
 
 _MOST_LOOPS = 12
+_MOST_REASONS = 3
 HEADINGS = (
-    "loop", "sent", "lost", "burst", "forced", "link, %", "delay, s", "‖e_c‖", "claims held",
+    "loop", "sent", "lost", "burst", "forced", "share, %", "delay, s", "‖e_c‖", "claims held",
 )  # fmt: skip
 CAPTION = (
-    "burst: most consecutive losses; forced: delivered by the guarantee; link: share of the "
+    "burst: most consecutive losses; forced: delivered by the guarantee; share: of the "
     "forwarded bytes; delay and ‖e_c‖: largest"
 )
 
 
 def print_loops(console: Console, summary: Summary, *, verbose: bool = False) -> None:
     """Print claims, the network, and the loops; without ``verbose`` the worst only."""
-    console.print(claims_line(summary), highlight=False, soft_wrap=True)
+    for line in (claims_line(summary), *void_lines(summary)):
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
     console.print(_network_table(summary))
     loops = sorted(summary["loops"], key=badness, reverse=True)
     shown = loops if verbose else loops[:_MOST_LOOPS]
@@ -56,6 +59,18 @@ def claims_line(summary: Summary) -> str:
     return f"claims of all loops: {claims or 'none'}"
 
 
+def void_lines(summary: Summary) -> list[str]:
+    """Return why claims are void, the most frequent reasons first, with the number of loops."""
+    reasons = Counter(why for loop in summary["loops"] for why in loop["void_because"])
+    lines = [
+        f"void: {why}" + (f" ({count} loops)" if count > 1 else "")
+        for why, count in reasons.most_common(_MOST_REASONS)
+    ]
+    if more := len(reasons) - len(lines):
+        lines.append(f"and {more} more reasons: the summaries of the loops have them")
+    return lines
+
+
 def badness(loop: dict[str, Any]) -> tuple[Any, ...]:
     """Return a key that is larger for a worse loop."""
     claims = loop["claims"]
@@ -77,7 +92,7 @@ def network_rows(summary: Summary) -> list[tuple[str, str]]:
     rows = [
         ("updates of all loops", f"{sent} ({sent / reached_s:.4g} /s)"),
         ("lost", f"{lost} ({ratio(lost, sent)}){causes}"),
-        ("longest loss burst, cap", f"{network['longest_loss_burst']}, {summary['mansd']}"),
+        longest_burst(summary, network["longest_loss_burst"]),
         ("forced by the guarantee", str(network["forced_deliveries"])),
         ("in the network: mean, max", f"{flying['mean']:.3g}, {flying['max']} datagrams"),
     ]
@@ -90,6 +105,8 @@ def network_rows(summary: Summary) -> list[tuple[str, str]]:
         rows.append(("actuations of all loops", f"{sent} ({sent / reached_s:.4g} /s)"))
         burst = max(one["longest_loss_burst"] for one in flows)
         rows.append(("  lost, longest loss burst", f"{lost} ({ratio(lost, sent)}), {burst}"))
+    if trips := [one["watchdog_trips"] for one in loops if one["watchdog_trips"]]:
+        rows.append(("watchdog acted", f"{sum(trips)} times, in {len(trips)} loops"))
     if deadlines := summary.get("deadlines"):
         rows.append(("deadlines missed", _missed(deadlines)))
         worst = max(deadlines, key=lambda role: deadlines[role]["max_us"] or 0.0)
@@ -104,12 +121,12 @@ def network_rows(summary: Summary) -> list[tuple[str, str]]:
             sum(one[key] for one in loops) for key in ("missing_samples", "unintended_losses")
         )
         rows.append(("missing samples, unintended losses", f"{missing}, {lost}"))
-    return rows
+    return [*rows, *changes_in(summary)]
 
 
 def _missed(deadlines: dict[str, Any]) -> str:
     missed = [
-        f"{role} {ratio(one['late_steps'], one['steps'])}"
+        f"{role} {one['late_steps']} of {one['steps']}"
         for role, one in deadlines.items()
         if one["late_steps"]
     ]

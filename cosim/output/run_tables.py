@@ -1,6 +1,6 @@
 """Tables of a run: key numbers, timing, claims."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from rich.console import Console
@@ -53,9 +53,11 @@ def short_numbers(summary: Summary) -> Numbers:
     """Return the most important numbers of a run, for 80 columns."""
     fidelity = summary.get("fidelity")
     compared = fidelity is not None and fidelity["reason"] is None
+    actuations = summary.get("actuations")
     return (
         _lost(summary),
-        _longest_burst(summary),
+        *([_lost_of("actuations", actuations)] if actuations is not None else ()),
+        longest_burst(summary, summary["longest_loss_burst"]),
         _forced(summary),
         *_intervals(summary),
         *_norms(summary),
@@ -67,7 +69,11 @@ def short_numbers(summary: Summary) -> Numbers:
 
 def loss_and_interval_rows(summary: Summary) -> Numbers:
     """Return losses, the longest loss burst, and inter-event times."""
-    return _lost(summary), _longest_burst(summary), *_intervals(summary)
+    return (
+        _lost(summary),
+        longest_burst(summary, summary["longest_loss_burst"]),
+        *_intervals(summary),
+    )
 
 
 def key_numbers(summary: Summary) -> Numbers:
@@ -100,13 +106,17 @@ def _losses(summary: Summary) -> Iterator[tuple[str, str]]:
     for name in ("acknowledgements", "actuations"):
         if (sent := summary.get(name)) is not None:
             yield name, str(sent["sent"])
-            yield "  lost", f"{sent['lost']} ({ratio(sent['lost'], sent['sent'])})"
-            yield "  longest loss burst", str(sent["longest_loss_burst"])
-    yield _longest_burst(summary)
+            yield _lost_of(name, sent)
+            yield f"longest loss burst of {name}", str(sent["longest_loss_burst"])
+    yield longest_burst(summary, summary["longest_loss_burst"])
     causes = [one["cause"] for one in summary["assumption_violations"]]
     yield "loss bursts beyond M − 1", str(causes.count("dropouts"))
     for constraint in summary.get("constraints", ()):
         yield f"violations of {constraint}", str(causes.count(constraint))
+
+
+def _lost_of(name: str, sent: Mapping[str, int]) -> tuple[str, str]:
+    return f"{name} lost", f"{sent['lost']} ({ratio(sent['lost'], sent['sent'])})"
 
 
 def _lost(summary: Summary) -> tuple[str, str]:
@@ -114,8 +124,9 @@ def _lost(summary: Summary) -> tuple[str, str]:
     return "lost in the network", f"{lost} ({ratio(lost, lost + summary['deliveries'])})"
 
 
-def _longest_burst(summary: Summary) -> tuple[str, str]:
-    cap, longest = summary["mansd"], summary["longest_loss_burst"]
+def longest_burst(summary: Summary, longest: int) -> tuple[str, str]:
+    """Return the row of the longest loss burst, with the most consecutive losses allowed."""
+    cap = summary["mansd"]
     words = [f"mansd {cap}", *summary.get("constraints", ())]
     limit = settings_of(" ".join(words)).longest_burst
     if limit != cap:

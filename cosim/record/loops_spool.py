@@ -32,13 +32,14 @@ from noack.config.loops import phases_ns
 from noack.config.resolution import network_tables, resolved_loops, tables_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
-from noack.core.errors import MachineError, why
+from noack.core.errors import MachineError, PeerError, why
 from noack.core.file_access import write_whole
 from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import LOOP, OWNER
 from noack.protocol.topology import LOOP_ROLES, RECORDER
+from noack.runtime.control_messages import LogLine, parse_message
+from noack.runtime.log_lines import batch_of, notices_of, stored_lines
 from noack.runtime.spool import SPOOL, SpoolWriter, read_chunks
-from noack.runtime.telemetry import notices_of
 
 _PART_BYTES = 128 * 1024 * 1024
 """Rows of a table that are distributed at once."""
@@ -135,20 +136,24 @@ def _distribute(
                     _append(folders[loop], table, int(written[loop]), stripped[first:end].tobytes())
                     written[loop] += end - first
     for role in (*LOOP_ROLES, RECORDER):
-        for number, data in read_chunks(spool, notices_of(role)):
-            _distribute_notice(folders, notices_of(role), number, data)
+        for loop, lines in enumerate(_lines_by_loop(spool, role, len(folders))):
+            if lines:
+                _append(folders[loop], notices_of(role), 0, batch_of(lines))
 
 
-def _distribute_notice(folders: Sequence[Path], table: str, number: int, data: bytes) -> None:
-    """Copy a log line to its loop, or to all loops if it names none."""
-    try:
-        line = json.loads(data)
-        loop = line.pop(LOOP, None)
-        chosen = folders if loop is None else [folders[loop]]
-    except (ValueError, LookupError, AttributeError, TypeError):  # damaged
-        return
-    for folder in chosen:
-        _append(folder, table, number, json.dumps(line).encode())
+def _lines_by_loop(spool: Path, role: str, loops: int) -> list[list[bytes]]:
+    """Return the log lines of a process, by loop; those without a loop are of all loops."""
+    found: list[list[bytes]] = [[] for _ in range(loops)]
+    for text in stored_lines(spool, role):
+        try:
+            line = parse_message(LogLine, text)
+            loop = line.pop(LOOP, None)
+            chosen = found if loop is None else [found[loop]]
+        except (PeerError, IndexError):  # damaged
+            continue
+        for lines in chosen:
+            lines.append(json.dumps(line).encode())
+    return found
 
 
 def _parts(spool: Path, table: str, dtype: np.dtype[np.void]) -> Iterator[Rows]:

@@ -52,11 +52,12 @@ class RecordedChange(NamedTuple):
 def changes_of(record: RunRecord) -> list[RecordedChange]:
     """Return the changes of a run, in the order in which they came into force.
 
-    Invalid changes, from a damaged record, are omitted.
+    Invalid changes, from a damaged record, are omitted. The record of a network of several loops
+    has the settings of the network alone.
     """
     since: dict[int, dict[str, int]] = {}
     found: dict[int, ParameterChange] = {}
-    for table in SETTINGS:
+    for table in (one for one in SETTINGS if one in record.tables):
         for change, since_ns in _changes_in(record[table]):
             found.setdefault(change.number, change)
             since.setdefault(change.number, {}).setdefault(OWNER[table], since_ns)

@@ -18,8 +18,8 @@ from noack.core.errors import MachineError, PeerError, why
 from noack.protocol.record_tables import LOOP
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.runtime.control_messages import LogLine, parse_message
-from noack.runtime.spool import SPOOL, read_chunks
-from noack.runtime.telemetry import notices_of
+from noack.runtime.log_lines import stored_lines
+from noack.runtime.spool import SPOOL
 
 
 def finish_record(run_dir: Path) -> RunRecord:
@@ -86,9 +86,9 @@ def _notices(folder: Path, spool: Path) -> list[dict[str, Any]]:
     notices = read_notices(folder)
     known = {json.dumps(notice, sort_keys=True) for notice in notices}
     for role in (*LOOP_ROLES, RECORDER):
-        for _, data in read_chunks(spool, notices_of(role)):
+        for line in stored_lines(spool, role):
             try:
-                notice = parse_message(LogLine, data) | {"process": role}
+                notice = parse_message(LogLine, line) | {"process": role}
             except PeerError:  # damaged
                 continue
             if (text := json.dumps(notice, sort_keys=True)) not in known:

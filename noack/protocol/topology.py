@@ -53,6 +53,7 @@ def sender_to(role: str, flow: Flow, network: Collection[Flow] = PAPER) -> str:
 
 LOOP_ROLES = tuple(RECEIVES)
 PLANT = "plant"
+WITH_DEADLINES = ("plant", "controller")  # processes that act at nominal times
 CHANGEABLE = ("sensor", "netem", "controller")  # processes with runtime parameters
 RECORDER = "recorder"
 COORDINATOR = "coordinator"

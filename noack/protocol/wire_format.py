@@ -125,8 +125,8 @@ def loop_number(datagram: bytes) -> int | None:
     return datagram[6] | datagram[7] << 8 if len(datagram) >= HEADER_BYTES else None
 
 
-class _Tagger:
-    """Computes tags under one key; keying is done once."""
+class Tagger:
+    """Computes the tag of a datagram's content under one key; keying is done once."""
 
     def __init__(self, key: bytes) -> None:
         if len(key) != KEY_BYTES:
@@ -134,6 +134,7 @@ class _Tagger:
         self._keyed = hashlib.blake2b(key=key, digest_size=TAG_BYTES)
 
     def __call__(self, content: bytes) -> bytes:
+        """Return the tag."""
         state = self._keyed.copy()
         state.update(content)
         return state.digest()
@@ -144,7 +145,7 @@ class Encoder:
 
     def __init__(self, run_id: int, key: bytes) -> None:
         self._run_id = run_id
-        self._tag = _Tagger(key)
+        self._tag = Tagger(key)
 
     def encode(self, message: Message) -> bytes:
         """Return the datagram of a message; raise ValueError if a value does not fit."""
@@ -191,7 +192,7 @@ class Decoder:
         self._dimension = dimension
         self._vector = struct.Struct(f"<{dimension}d")
         self._run_id = run_id
-        self._tag = _Tagger(key)
+        self._tag = Tagger(key)
         self._newest = -1
         self._not_before_ns = not_before_ns
         self.accepted = 0

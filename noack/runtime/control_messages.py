@@ -132,6 +132,7 @@ class LogLine(ControlMessage):
     t_ns: Nanoseconds
     level: str
     text: str
+    loop: Count | None = None  # in a run of several loops, that it is about
 
 
 class ChannelCounters(ControlMessage):

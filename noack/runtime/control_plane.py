@@ -1,10 +1,9 @@
 """The control plane: start barrier, liveliness, stop, telemetry, all on zenoh.
 
-The coordinator listens on TCP on loopback. All other processes connect to it with a secret that is
-derived from the run's key. Loop data never travels here, and the loop never waits for it.
+The coordinator listens on a socket that no other user can reach; all other processes connect to it.
+Loop data never travels here, and the loop never waits for it.
 """
 
-import hashlib
 import json
 import secrets
 import time
@@ -24,7 +23,6 @@ from noack.protocol.topology import COORDINATOR
 from noack.runtime.control_messages import ChangeAnnouncement, parse_message
 from noack.runtime.join_ticket import Ticket
 from noack.runtime.zenoh_session import (
-    SessionSecret,
     cause_of,
     first_reply,
     label,
@@ -37,10 +35,13 @@ _POLL_S = 0.01
 """Twenty runs that wait at the start barrier are a hundred processes that poll at this rate."""
 
 
-def secret_of(ticket: Ticket) -> SessionSecret:
-    """Return the secret of a run's control plane; the run's key cannot be derived from it."""
-    keyed = hashlib.blake2b(b"the control plane's password", key=ticket.key, digest_size=32)
-    return SessionSecret(f"{ticket.run_id:016x}", keyed.hexdigest())
+RUNS = "runs"
+"""Folder of the active runs in the user's runtime directory: sockets, lock files."""
+
+
+def run_name(run_id: int) -> str:
+    """Return a run's name in that folder and in the keys of its control plane."""
+    return f"{run_id:016x}"
 
 
 class ControlPlane:
@@ -49,19 +50,19 @@ class ControlPlane:
     Every key lies below ``noack/RUN``. With ``listen`` the process is the coordinator.
 
     Raises:
-        NoAnswerError: the coordinator cannot be reached, or the endpoint cannot be listened on.
+        NoAnswerError: the coordinator cannot be reached, or the socket cannot be listened on.
+        CallerError: other users have access to the user's runtime directory.
     """
 
     def __init__(self, ticket: Ticket, role: str, *, listen: bool = False) -> None:
-        self._prefix = f"noack/{ticket.run_id:016x}"
+        self._prefix = f"noack/{run_name(ticket.run_id)}"
         self.role = role
         self.instance = secrets.token_hex(8)
-        endpoint = ticket.endpoint
         try:
-            self.session = open_session(endpoint, secret_of(ticket), listen=listen)
+            self.session = open_session(RUNS, run_name(ticket.run_id), listen=listen)
         except zenoh.ZError as error:
-            verb = "listen on" if listen else "reach the run's coordinator at"
-            raise NoAnswerError(f"cannot {verb} {endpoint}: {cause_of(error)}") from None
+            what = "start the control plane" if listen else "reach the run's coordinator"
+            raise NoAnswerError(f"cannot {what}: {cause_of(error)}") from None
         self._token = self.session.liveliness().declare_token(
             self.key("alive", role, self.instance)
         )
@@ -75,6 +76,8 @@ class ControlPlane:
         self._changes = self.session.declare_subscriber(
             self.key("change"), RingChannel(MOST_CHANGES)
         )
+        self._dones = self.session.declare_subscriber(self.key("done", "*"), RingChannel(8))
+        self._done: set[str] = set()
         self._persisted = self.session.declare_subscriber(
             self.key("persisted", role), RingChannel(1)
         )
@@ -142,6 +145,17 @@ class ControlPlane:
     def next_change(self) -> bytes | None:
         """The next announced change; None if there is none."""
         return next_payload(self._changes)
+
+    def announce_done(self) -> None:
+        """Tell the other processes that this one has done its last step."""
+        self._done.add(self.role)
+        self.publish("done", self.role, content=self.role, priority=Priority.REAL_TIME)
+
+    def done(self) -> set[str]:
+        """The roles whose process has announced that it is done."""
+        while (role := next_payload(self._dones)) is not None:
+            self._done.add(role.decode(errors="replace"))
+        return self._done
 
     def report_end(self, reason: str) -> None:
         """Report to the coordinator why this process ends; without a report it counts as dead."""

@@ -8,7 +8,7 @@ in a file of the user's runtime directory, which only its owner can read.
 import secrets
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -19,8 +19,8 @@ from noack.config.validation_messages import brief
 from noack.core.errors import CallerError, PeerError
 from noack.impairments.kept_loss import found_probabilities, remember
 from noack.protocol.wire_format import KEY_BYTES
-from noack.runtime.lock_file import lock_file
-from noack.runtime.private_folder import open_private, private_folder, require_name
+from noack.runtime.lock_file import live_lock_file, lock_file
+from noack.runtime.private_folder import private_folder, require_name
 from noack.settings.section import ScenarioSection, Seed
 
 DEFAULT_SESSION = "default"
@@ -33,7 +33,6 @@ class Ticket(ScenarioSection):
 
     run_id: Seed
     key: Annotated[bytes, Field(min_length=KEY_BYTES, max_length=KEY_BYTES)]
-    endpoint: str  # zenoh endpoint of the control plane, e.g. ``tcp/127.0.0.1:7447``
     run_dir: str
     launched: bool  # whether a launcher holds the process's standard input open as its lifeline
     kept_losses: Annotated[dict[str, FiniteFloat], AfterValidator(remember)] = Field({})
@@ -41,12 +40,11 @@ class Ticket(ScenarioSection):
     scenario: Scenario  # resolved
 
 
-def new_ticket(scenario: Scenario, endpoint: str, run_dir: Path, *, launched: bool) -> Ticket:
+def new_ticket(scenario: Scenario, run_dir: Path, *, launched: bool) -> Ticket:
     """Return a ticket with a fresh run id and key."""
     return Ticket(
         run_id=secrets.randbits(64),
         key=secrets.token_bytes(KEY_BYTES),
-        endpoint=endpoint,
         run_dir=str(run_dir),
         launched=launched,
         kept_losses=found_probabilities(*map(scenario.network.link_of, scenario.network.flows)),
@@ -97,8 +95,8 @@ def wait_for_ticket(
     deadline_s = time.monotonic() + timeout_s
     waiting = False
     while True:
-        with suppress(FileNotFoundError), open_private() as folder:
-            return loads(folder.read_text(path.name))
+        if (file := live_lock_file("", session)) is not None:
+            return loads(file.content.decode())
         if stop() or time.monotonic() > deadline_s:
             raise PeerError(
                 f"no run to join in session {session!r}: start `noack record SCENARIO` first"

@@ -64,11 +64,6 @@ class PrivateFolder:
             raise CallerError(f"{self.path / name}: must be a file of yours")
         return descriptor
 
-    def read_text(self, name: str) -> str:
-        """Return what a file contains; raises what :meth:`open` raises."""
-        with os.fdopen(self.open(name)) as file:
-            return file.read()
-
     def names(self) -> list[str]:
         """Return the names of all files."""
         return os.listdir(self.descriptor)  # noqa: PTH208 - a Path has no descriptor
@@ -81,12 +76,14 @@ class PrivateFolder:
         """Remove a file; raise FileNotFoundError if there is none."""
         os.unlink(name, dir_fd=self.descriptor)
 
-    def remove_same(self, name: str, status: os.stat_result) -> None:
-        """Remove a file unless it was replaced."""
+    def remove_same(self, name: str, status: os.stat_result) -> bool:
+        """Remove a file unless it was replaced; return whether it was removed."""
         with suppress(FileNotFoundError):
             now = os.stat(name, dir_fd=self.descriptor, follow_symlinks=False)
             if os.path.samestat(now, status):
                 self.remove(name)
+                return True
+        return False
 
 
 @contextmanager
@@ -97,6 +94,10 @@ def open_private(*inside: str, create: bool = False) -> Iterator[PrivateFolder]:
     to others; FileNotFoundError if it does not exist and ``create`` is false.
     """
     path = private_folder()
+    if not path.parent.is_dir():
+        raise CallerError(
+            f"{path.parent}: no such folder; set XDG_RUNTIME_DIR to a folder of yours"
+        )
     with ExitStack() as stack:
         descriptor: int | None = None
         for folder in (path, *(path := path / name for name in inside)):

@@ -27,6 +27,7 @@ from noack.protocol.topology import (
     CHANGEABLE,
     LOOP_ROLES,
     RECORDER,
+    WITH_DEADLINES,
 )
 from noack.runtime.address import Address
 from noack.runtime.command_line import print_to_stderr
@@ -217,6 +218,7 @@ class RunProcess:
             end_ns=self._end_ns,
             stop=lambda: self.stopping,
             turns_after_end=_GRACE_TURNS,
+            all_done=self._all_done,
             spin_us=self.scenario.realtime.spin_us,
             gather_ns=self._gather_ns,
             rehearsal=self.rehearsal,
@@ -229,6 +231,16 @@ class RunProcess:
                 Event.STOP, f"overrun: {late_s:g} s late; reduce the speed or the rates"
             )
         return reached_ns
+
+    def _all_done(self, done: bool) -> bool:
+        """Whether plant and controller have done their last steps; told whether this process has.
+
+        One that was stopped for a while does them after the horizon. The others must still receive
+        what it sends then.
+        """
+        if done and self.role in WITH_DEADLINES:
+            self.plane.announce_done()
+        return done and self.plane.done().issuperset(WITH_DEADLINES)
 
     @property
     def _gather_ns(self) -> int:

@@ -24,6 +24,9 @@ _OVERLOAD_PAUSE_S = 0.002
 _OVERLOAD_SHARE = 0.9  # of CPU time in the time since the last housekeeping
 _TURNS_TO_CATCH_UP = 20
 """Of housekeeping, one second: a machine that is late at its end has this time to catch up."""
+_TURNS_TO_WAIT = 2 * _TURNS_TO_CATCH_UP
+"""Of housekeeping, for the others: they may be late, and then need a moment to say that they are
+done."""
 _QUIET_S = 0.0005
 """Housekeeping and rehearsals take 0.1 to 0.2 ms; they wait when the deadline is nearer."""
 _yield_core: Callable[[], None] = getattr(os, "sched_yield", lambda: None)
@@ -105,6 +108,7 @@ def run_loop(
     end_ns: int | None,
     stop: Callable[[], bool],
     turns_after_end: int = 0,
+    all_done: Callable[[bool], bool] = lambda done: done,
     spin_us: float = 0.0,
     gather_ns: int = 0,
     rehearsal: Rehearsing | None = None,
@@ -118,8 +122,10 @@ def run_loop(
     serve the deadlines of that time together. It rehearses between its steps, unless a deadline is
     near.
 
-    It goes on for ``turns_after_end`` turns of housekeeping, 50 ms each, and for up to a second
-    while the machine is late: the computer may not have run for a while.
+    The computer may not have run for a while before the end. So the loop goes on for up to a second
+    while the machine is late, and for up to two seconds until ``all_done`` is true: it is told
+    whether this machine has done its work, and returns whether all machines of the run have. Then
+    come ``turns_after_end`` turns of housekeeping, 50 ms each.
 
     Returns:
         How late the machine's next deadline was at the end, in ns; 0 if it was not late, or if that
@@ -131,7 +137,7 @@ def run_loop(
     loop.rehearsal = rehearsal
     # Looked up once: after milliseconds of sleep the code runs cold, and every step counts.
     step, housekeeping_is_due = loop.step, loop.housekeeping_is_due
-    turns = 0
+    turns = turns_done = 0
     while True:
         step()
         if housekeeping_is_due():
@@ -140,8 +146,11 @@ def run_loop(
             if end_ns is not None and deadline_ns is not None and deadline_ns > end_ns:
                 deadline_ns = None  # not part of the run
             late_ns = 0 if deadline_ns is None else max(now_ns - deadline_ns, 0)
-            turns += end_ns is not None and now_ns >= end_ns
-            if stop() or turns > (_TURNS_TO_CATCH_UP if late_ns else turns_after_end):
+            if end_ns is not None and now_ns >= end_ns:
+                turns += 1
+                turns_done += all_done(not late_ns)
+            most = _TURNS_TO_CATCH_UP if late_ns else _TURNS_TO_WAIT
+            if stop() or turns_done > turns_after_end or turns > most:
                 return late_ns
             loop.schedule_housekeeping()
 

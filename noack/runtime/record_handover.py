@@ -7,8 +7,9 @@ from pathlib import Path
 from noack.core.errors import PeerError
 from noack.runtime.control_messages import MissingRows, PersistedAck, parse_message
 from noack.runtime.control_plane import ControlPlane
+from noack.runtime.log_lines import NOTICES, notice_number, notices_of
 from noack.runtime.spool import SPOOL, SpoolWriter
-from noack.runtime.telemetry import NOTICES, TelemetryBuffer, first_row, notice_number, notices_of
+from noack.runtime.telemetry import TelemetryBuffer, first_row
 
 _REPORT_TIMEOUT_S = 5.0
 _REPORT_ATTEMPTS = 3

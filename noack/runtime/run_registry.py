@@ -1,7 +1,7 @@
 """The user's active runs, and how to reach them from another terminal.
 
-The launcher keeps a lock file for its run (:mod:`noack.runtime.lock_file`). It holds the secret of
-the run's control plane. The key that authenticates the loop's datagrams cannot be derived from it.
+The launcher keeps a lock file for its run (:mod:`noack.runtime.lock_file`), beside the socket of
+its control plane.
 """
 
 import json
@@ -17,23 +17,19 @@ from noack.config.validation_messages import brief
 from noack.core.errors import CallerError, PeerError
 from noack.runtime import lock_file
 from noack.runtime.control_messages import ChangeReply, parse_message
-from noack.runtime.control_plane import secret_of
+from noack.runtime.control_plane import RUNS, run_name
 from noack.runtime.join_ticket import Ticket
-from noack.runtime.zenoh_session import SessionSecret, answer_to, cause_of, open_session
+from noack.runtime.zenoh_session import answer_to, cause_of, open_session
 
-_KIND = "runs"
 _ANSWER_S = 30.0
 
 
 class OpenRun(NamedTuple):
     """How to reach a run."""
 
-    run_id: str  # as in the keys of its control plane
+    name: str  # of its socket, and in the keys of its control plane
     run_dir: str
     session: str | None  # session name for processes started by hand; None if all were launched
-    endpoint: str  # zenoh endpoint of the control plane
-    user: str
-    password: str
 
 
 _OPEN_RUN = TypeAdapter(OpenRun)
@@ -42,16 +38,14 @@ _OPEN_RUN = TypeAdapter(OpenRun)
 @contextmanager
 def published(ticket: Ticket, session: str | None) -> Iterator[Path]:
     """Keep a run's lock file while the context lasts."""
-    secret = secret_of(ticket)
-    run_id = f"{ticket.run_id:016x}"
-    run = OpenRun(run_id, ticket.run_dir, session, ticket.endpoint, secret.user, secret.password)
-    with lock_file.lock_file(_KIND, run_id, run._asdict()) as path:
+    run = OpenRun(run_name(ticket.run_id), ticket.run_dir, session)
+    with lock_file.lock_file(RUNS, run.name, run._asdict()) as path:
         yield path
 
 
 def active_runs() -> list[OpenRun]:
     """Return the user's active runs. Raise PeerError if the file of one is not valid."""
-    return [_read(file) for file in lock_file.live_lock_files(_KIND)]
+    return [_read(file) for file in lock_file.live_lock_files(RUNS)]
 
 
 def find(session: str | None = None, run_dir: Path | None = None) -> OpenRun:
@@ -82,14 +76,13 @@ def request_change(run: OpenRun, settings: Mapping[str, Any]) -> dict[str, Any]:
 
     Raise CallerError, with one line per mistake, for wrong settings, PeerError without an answer.
     """
-    secret = SessionSecret(run.user, run.password)
     try:
-        plane = open_session(run.endpoint, secret, listen=False)
+        plane = open_session(RUNS, run.name, listen=False)
     except zenoh.ZError as error:
         raise PeerError(f"{run.run_dir}: the run cannot be reached: {cause_of(error)}") from None
     try:
         request = json.dumps({"settings": dict(settings)})
-        key = f"noack/{run.run_id}/runtime_parameters"
+        key = f"noack/{run.name}/runtime_parameters"
         answer = answer_to(plane, key, request, _ANSWER_S)
     finally:
         plane.close()  # type: ignore[no-untyped-call]

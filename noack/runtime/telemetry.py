@@ -14,9 +14,10 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.protocol.machine_interface import GENERATION, Notice, Record
+from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import LOOP
 from noack.runtime.control_messages import BatchHeader, parse_message
+from noack.runtime.log_lines import NOTICES, batch_of
 
 _BATCH_ROWS = 256
 _HELD_BYTES = 64 * 1024 * 1024
@@ -26,8 +27,6 @@ _Batch = tuple[str, int, int, bytes]
 """Table, number of the first row, rows, and the rows themselves."""
 
 Publish = Callable[[str, bytes, bytes], None]  # publishes a batch: table, header (JSON), rows
-
-NOTICES = "notices"
 
 Ranges = Sequence[tuple[int, int]]
 """Disjoint, ascending, half-open ranges of row numbers."""
@@ -98,6 +97,7 @@ class TelemetryBuffer:
         self._persisted = persisted
         self._rows = {table: np.zeros(_BATCH_ROWS, dtype) for table, dtype in tables.items()}
         self._filled = dict.fromkeys(tables, 0)
+        self._lines: list[bytes] = []
         self._published = dict.fromkeys([*tables, NOTICES], 0)
         of_loops = [table for table, dtype in tables.items() if LOOP in (dtype.names or ())]
         self._by_loop = {table: np.zeros(0, np.int64) for table in of_loops}
@@ -130,15 +130,20 @@ class TelemetryBuffer:
             self.flush()
 
     def notice(self, notice: Notice) -> None:
-        """Publish a line for the run's log at once."""
-        self._send(NOTICES, 1, json.dumps(notice.line()).encode())
+        """Add a line for the run's log; many are published together."""
+        self._lines.append(json.dumps(notice.line()).encode())
+        if len(self._lines) == _BATCH_ROWS:
+            self.flush()
 
     def flush(self) -> None:
-        """Publish all collected rows; send again what was lost."""
+        """Publish all collected rows and lines; send again what was lost."""
         for table, filled in self._filled.items():
             if filled:
                 self._filled[table] = 0
                 self._publish_rows(table, self._rows[table][:filled])
+        if self._lines:
+            lines, self._lines = self._lines, []
+            self._send(NOTICES, len(lines), batch_of(lines))
         if rows := self._persisted():
             self._forget(rows)
         for _ in range(min(len(self._to_resend), _RESENT_AT_ONCE)):
@@ -217,13 +222,3 @@ def first_row(header: bytes) -> tuple[int, int]:
     """Generation and number of a batch's first row, from its header; raise PeerError if invalid."""
     found = parse_message(BatchHeader, header)
     return found.get("generation", 0), found["first"]
-
-
-def notice_number(generation: int, first: int) -> int:
-    """Number of a process's log line in the spool; it contains the generation."""
-    return generation * GENERATION + first
-
-
-def notices_of(role: str) -> str:
-    """Name of a process's log lines in the spool."""
-    return f"{NOTICES}_{role}"

@@ -59,26 +59,6 @@ def bind(port: int, key: str) -> socket.socket:
     return endpoint
 
 
-def free_tcp_port() -> int:
-    """Return a TCP port that is free now."""
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
-        probe.bind((LOOPBACK, 0))
-        return int(probe.getsockname()[1])
-
-
-def require_free_tcp_port(port: int, key: str) -> None:
-    """Raise CallerError if a TCP port cannot be listened on."""
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((LOOPBACK, port))
-        except OSError as error:
-            raise CallerError(
-                f"control plane: TCP port {LOOPBACK}:{port} cannot be bound ({error.strerror}); "
-                f"set {key} to another port, or to 0 for any"
-            ) from None
-
-
 def drops_of(endpoint: socket.socket) -> int | None:
     """Datagrams that the kernel dropped at a socket; None if the system has no such counter.
 

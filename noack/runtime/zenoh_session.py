@@ -1,61 +1,51 @@
-"""zenoh sessions over TCP: one process listens, the others connect with a shared secret.
+"""zenoh sessions over Unix sockets: one process listens, the others connect.
 
-No session opens without a secret. zenoh checks it by challenge and response, so that it is never
-sent, and refuses all other connections.
+A socket is in the user's runtime directory, which is closed to other users: nobody else can connect
+to it, or listen in its place.
 """
 
 import json
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
 
 import zenoh
 from zenoh.handlers import FifoChannel
 
 from noack.core.errors import CallerError
+from noack.runtime.private_folder import open_private
 
 LEASE_MS = 6000
 """A connection whose other end is silent for longer breaks. On a busy machine a process may not run
 for seconds."""
 _CONNECT_MS = 5000
-_SHAKE_HANDS_MS = 2000
-"""zenoh serves at most 100 connections at a time that have not yet shown the secret."""
 _RETRY = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5}
-"""Of a connection that finds 100 before it."""
+"""Of a connection whose other end does not answer."""
+_FOLDERS: dict[Path, int] = {}
+"""Descriptors of folders with sockets; they stay open, because zenoh may connect again."""
 
 
-class SessionSecret(NamedTuple):
-    """User and password of a session; neither contains a colon or a line break."""
+def open_session(kind: str, name: str, *, listen: bool) -> zenoh.Session:
+    """Open a session that listens on a socket, or connects to it.
 
-    user: str
-    password: str
-
-
-def open_session(endpoint: str, secret: SessionSecret, *, listen: bool) -> zenoh.Session:
-    """Open a session that listens on the endpoint, or connects to it.
-
-    Raise zenoh.ZError if that fails, or the secret is wrong.
+    The socket is ``NAME.sock`` in the folder ``kind`` of the user's runtime directory. Raise
+    zenoh.ZError if that fails, CallerError if other users have access to the folder.
     """
-    if not listen:
-        shown = {f"transport/auth/usrpwd/{key}": value for key, value in secret._asdict().items()}
-        return zenoh.open(session_config(endpoint, listen=False, more=shown))
-    with _dictionary(secret) as path:
-        more = {"transport/auth/usrpwd/dictionary_file": path}
-        return zenoh.open(session_config(endpoint, listen=True, more=more))
+    return zenoh.open(session_config(endpoint_of(kind, name), listen=listen))
 
 
-@contextmanager
-def _dictionary(secret: SessionSecret) -> Iterator[str]:
-    """A password file for zenoh that is never on a disk: zenoh reads passwords from files only."""
-    reading, writing = os.pipe()
-    try:
-        with os.fdopen(writing, "w") as pipe:
-            pipe.write(f"{secret.user}:{secret.password}\n")
-        yield f"/dev/fd/{reading}"
-    finally:
-        os.close(reading)
+def endpoint_of(kind: str, name: str) -> str:
+    """Return the zenoh endpoint of a socket, in the words of this process.
+
+    The path of a socket has at most 107 bytes, so it goes through an open descriptor.
+    """
+    with open_private(kind, create=True) as folder:
+        known = _FOLDERS.get(folder.path)
+        if known is None or not os.path.samestat(os.fstat(known), os.fstat(folder.descriptor)):
+            known = _FOLDERS[folder.path] = os.dup(folder.descriptor)
+    return f"unixsock-stream//proc/self/fd/{known}/{name}.sock"
 
 
 def session_config(
@@ -77,10 +67,9 @@ def session_config(
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "scouting/delay": 0,
-        "adminspace/enabled": False,  # it would publish the configuration with the secret
+        "adminspace/enabled": False,  # it would publish the configuration
         # Shared memory would bypass the socket for payloads of 3 KiB and more.
         "transport/shared_memory/enabled": False,
-        "transport/unicast/accept_timeout": _SHAKE_HANDS_MS,
         "transport/link/tx/lease": LEASE_MS,
         # Rows of many loops take more than the two default places of 64 KiB: they would never fit.
         "transport/link/tx/queue/size/background": 16,

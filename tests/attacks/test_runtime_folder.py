@@ -23,7 +23,7 @@ from noack.runtime.join_ticket import Ticket, new_ticket, published, ticket_path
 from tests.attacks.other_user import NOBODY, needs_root
 
 OWN = f"noack-{os.getuid()}"
-EMULATOR = emulator_session.Session("lab", "tcp/127.0.0.1:1", "secret")
+EMULATOR = "lab"
 
 _swaps: list[Callable[[str], None]] = []
 """Actions of the other user as this process opens a file; an audit hook cannot be removed."""
@@ -48,7 +48,7 @@ def shared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def ticket(content: dict[str, Any]) -> Ticket:
     scenario = resolve(validate(content, "small"))
-    return new_ticket(scenario, "tcp/127.0.0.1:1", Path("run"), launched=False)
+    return new_ticket(scenario, Path("run"), launched=False)
 
 
 def join() -> Ticket:

@@ -101,6 +101,13 @@ class Running:
         assert self.process.poll() is None, self.process.communicate()
         self._children = psutil.Process(self.process.pid).children(recursive=True)
 
+    def wait_recording(self) -> None:
+        """Wait until the recorder has stored rows of plant, sensor and controller."""
+        self.wait_started()
+        for table in ("plant_step", "sensor_measurement", "controller_step"):
+            spooled = self.runs / "latest" / "spool" / f"{table}.recorder"
+            wait_for(lambda spooled=spooled: spooled.exists() and spooled.stat().st_size > 10_000)
+
     def child(self, role: str) -> psutil.Process:
         for child in self._children:
             if is_of(role, child):

@@ -18,7 +18,6 @@ from cosim.record.run_record import RunRecord, load_record
 from noack.protocol.topology import ROLES
 from tests.cosim.output.viewer.test_viewer import is_left, read
 from tests.integration import conftest as live
-from tests.integration.test_faults import wait_recording
 
 HORIZON_S = 36.0
 HOUR_S = 3600
@@ -103,7 +102,7 @@ def disturbed_run(folder: Path) -> Disturbed:
         running = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=HORIZON_S), "--live")
         for name in clock.environment:
             environment.delenv(name)
-        wait_recording(running)
+        running.wait_recording()
         viewers = viewers_of(running)
         (group,) = {os.getpgid(viewer.pid) for viewer in viewers}
         os.killpg(group, signal.SIGSTOP)

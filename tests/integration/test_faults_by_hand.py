@@ -13,7 +13,6 @@ from cosim.live.finalize import reopen
 from cosim.record.run_record import load_record
 from noack.protocol.topology import LOOP_ROLES
 from tests.integration import conftest as live
-from tests.integration.test_faults import wait_recording
 
 Start = Callable[..., live.Running]
 ByHand = Callable[[str], subprocess.Popen[str]]
@@ -56,7 +55,7 @@ def test_the_loop_outlives_the_coordinator(start: Start, by_hand: ByHand) -> Non
     horizon_s = 24.0  # a machine that stalls for seconds does not reach it before the kill
     recording = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=horizon_s), command=RECORD)
     processes = {role: by_hand(role) for role in LOOP_ROLES}
-    wait_recording(recording)
+    recording.wait_recording()
     run_dir = (recording.runs / "latest").resolve()
     recording.process.kill()
     ended(recording.process)

@@ -16,7 +16,6 @@ from cosim.live.finalize import reopen
 from cosim.record.run_record import load_record
 from noack.core.errors import MachineError
 from tests.integration import conftest as live
-from tests.integration.test_faults import wait_recording
 
 Start = Callable[..., live.Running]
 
@@ -75,7 +74,7 @@ def test_a_run_on_a_disk_that_fills_up_can_be_finalised_later(
     start: Start, small: Disk, capsys: pytest.CaptureFixture[str]
 ) -> None:
     running = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=240.0))
-    wait_recording(running)
+    running.wait_recording()
     run_dir = (running.runs / "latest").resolve()
     small.fill()
     stdout, stderr = running.process.communicate(timeout=live.PATIENCE_S)
@@ -142,7 +141,7 @@ def test_a_folder_that_becomes_read_only_gives_clear_errors(start: Start, small:
     """Open files can still be written; new files cannot be created."""
     horizon_s = 24.0
     running = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=horizon_s))
-    wait_recording(running)
+    running.wait_recording()
     run_dir = (running.runs / "latest").resolve()
     mounted(small.path, "--bind", str(small.path))
     try:
@@ -167,7 +166,7 @@ def test_a_folder_that_becomes_read_only_gives_clear_errors(start: Start, small:
 
 def test_a_removed_run_directory_ends_the_run_with_clear_lines(start: Start) -> None:
     running = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=400.0))
-    wait_recording(running)
+    running.wait_recording()
     run_dir = (running.runs / "latest").resolve()
     run_dir.rename(running.runs.parent / "removed")  # at once; rmtree would race with new files
     _, stderr = running.process.communicate(timeout=live.PATIENCE_S)

@@ -1,5 +1,6 @@
 """The launcher's streams are closed or full, or their reader ends."""
 
+import contextlib
 import fcntl
 import os
 import subprocess
@@ -47,28 +48,31 @@ def test_a_run_with_closed_streams_is_complete(tmp_path: Path) -> None:
 def test_a_full_and_then_closed_pipe_does_not_disturb_the_run(tmp_path: Path) -> None:
     """The launcher is blocked until the reader of its progress closes the pipe."""
     reading, writing = os.pipe()
-    room = fcntl.fcntl(writing, F_SETPIPE_SZ, 4096)
-    os.write(writing, b"x" * (room - 10))
+    fcntl.fcntl(writing, F_SETPIPE_SZ, 4096)
     process = subprocess.Popen(
         run(tmp_path), stdout=subprocess.DEVNULL, stderr=writing, env=AS_A_TERMINAL
     )
     os.close(writing)
     try:
-        loop: dict[str, psutil.Process] = {}
+        rows = tmp_path / "latest" / "spool" / "plant_step.recorder"  # from the start on
+        live.wait_for(lambda: rows.exists() or process.poll() is not None)
+        filling = os.open(f"/proc/self/fd/{reading}", os.O_WRONLY | os.O_NONBLOCK)
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                os.write(filling, b"x")
+        os.close(filling)
+        launcher = psutil.Process(process.pid)
 
-        def all_are_found() -> bool:
-            found = {role: live.child_of(process, role) for role in ROLES}
-            loop.update({role: child for role, child in found.items() if child is not None})
-            return len(loop) == len(ROLES) or process.poll() is not None
+        def has_ended() -> bool:
+            """Whether the loop and the recorder have; the blocked launcher reaps no process."""
+            over = sum(live.is_over(child) for child in launcher.children())
+            return over >= len(ROLES) or process.poll() is not None
 
-        live.wait_for(all_are_found)  # before the start: the run takes two seconds
-        # The loop and the recorder end although the pipe is not read.
-        live.wait_for(lambda: all(live.is_over(child) for child in loop.values()))
-        assert process.poll() is None
-        assert any(child.is_running() for child in loop.values())  # not reaped yet
+        live.wait_for(has_ended)  # although the pipe is not read
     finally:
         os.close(reading)
-    assert process.wait(live.PATIENCE_S) == 0
+        status = process.wait(live.PATIENCE_S)
+    assert status == 0
     assert is_whole((tmp_path / "latest").resolve())
 
 

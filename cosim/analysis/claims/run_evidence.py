@@ -112,7 +112,9 @@ class RunEvidence:
     def samples(self) -> Iterator[Samples]:
         """Yield all measurements in order, part by part."""
         scenario = self.record.scenario
-        monitor = ErrorMonitor(self.record.loop.H, policy_of(scenario))
+        monitor = ErrorMonitor(
+            self.record.loop.H, policy_of(scenario), scenario.timing.measurement_period_ns
+        )
         residual = IdentityResidual(scenario)
         last_ns, follower = np.zeros(0, np.int64), EventFollower(scenario)
         for part in aligned_parts(self.record):

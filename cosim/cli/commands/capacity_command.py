@@ -9,6 +9,7 @@ import typer
 from cosim.cli import command as cli
 from cosim.cli.execute_campaign import Workers, execute_campaign, worker_pool
 from noack.core.errors import CallerError, ExitStatus
+from noack.runtime.command_line import print_to_stderr
 
 if TYPE_CHECKING:
     from cosim.studies.capacity.capacity_plan import CapacityPlan
@@ -144,7 +145,8 @@ def _plan(
     for text in overrides:
         key, _, value = text.partition("=")
         settings[key.strip()] = value_of(value, f"--set {key}")
-    given = load(path, overrides).model_copy(update={"loops": None})
+    loaded = load(path, overrides)
+    given = loaded.model_copy(update={"loops": None})
     if rate_bps is not None:
         given = plans.with_rate(given, rate_bps)
         stages = [
@@ -174,6 +176,11 @@ def _plan(
     counts = (
         plans.default_counts(fitting) if loops is None else plans.require_counts(_counts(loops))
     )
+    if own := plans.loops_with_own_settings(loaded):
+        print_to_stderr(
+            "noack capacity: all loops are as at the top level of the scenario, "
+            f"without the settings of [[loops]] {', '.join(own)}"
+        )
     return plans.CapacityPlan(
         given, path, settings, rate_bps, period_s, deadline_s, counts, compared, **more
     )

@@ -79,8 +79,9 @@ def _check_loops(scenario: "Scenario", *, json: bool) -> int:
     for load in loads:
         delay = load.delay_bound_s
         print(
-            f"{_COMMENT}{load.key}: {load.rate_bps:.0f} bit/s; datagrams that must pass: "
-            f"{load.mandatory_at_least_bps:.0f} to {load.mandatory_at_most_bps:.0f} bit/s; delay: "
+            f"{_COMMENT}{load.key}: {load.begin}{load.rate_bps:.0f} bit/s; "
+            f"datagrams that must pass: {load.mandatory_at_least_bps:.0f} to "
+            f"{load.mandatory_at_most_bps:.0f} bit/s; delay: "
             + ("no bound" if delay is None else f"at most {delay:.4g} s in virtual time")
         )
     for line in load_warnings(loads, scenario):

@@ -7,7 +7,7 @@ import typer
 
 from cosim.cli import command as cli
 from cosim.cli import completion
-from cosim.record.run_directory import LOOP_FILE, RECORDING_FILE, chosen_run
+from cosim.record.run_directory import RECORDING_FILE, chosen_run
 from noack.core.errors import ExitStatus
 
 
@@ -34,13 +34,13 @@ def view(
 ) -> int:
     """Show a run in the rerun viewer.
 
-    The recording of one of several loops is written when it is first viewed.
+    A missing recording, as of one of several loops, is written first.
     """
     from cosim.output.viewer.live_viewer import view_recording
 
     path = chosen_run(recording, runs, loop)
     path = path / RECORDING_FILE if path.is_dir() else path
-    if not path.is_file() and (path.parent / LOOP_FILE).is_file():
+    if path.name == RECORDING_FILE and path.parent.is_dir() and not path.is_file():
         _write(path.parent)
     if json:
         cli.print_json({"recording": str(path), "exists": path.is_file()})
@@ -49,11 +49,9 @@ def view(
     return ExitStatus.OK
 
 
-def _write(loop_dir: Path) -> None:
+def _write(run_dir: Path) -> None:
+    from cosim.live.finalize import write_recording
     from cosim.live.progress import PatientConsole
-    from cosim.output.viewer.run_view import write_view
-    from cosim.record.run_record import load_record
 
-    record = load_record(loop_dir)
-    with PatientConsole(stderr=True).status("writing the recording of the loop"):
-        write_view(record, loop_dir, (record.number or 0) + 1)
+    with PatientConsole(stderr=True).status("writing the recording"):
+        write_recording(run_dir)

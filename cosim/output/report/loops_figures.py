@@ -20,7 +20,7 @@ NAMED = len(palette.SERIES)
 _PANEL_IN, _BETWEEN_IN = 1.7, 0.35
 _ROW_IN, _LOWEST_IN, _HIGHEST_IN, _BAR_IN = 0.22, 1.2, 4.5, 0.2
 _DECADES = 5
-_MOST_ROWS = 24
+MOST_ROWS = 24
 """Up to so many rows of the map have the names of their loops."""
 _BANDS = ((0, 4, 0.25, "5 to 95 % of the loops"), (1, 3, 0.45, "25 to 75 %"))
 _MEDIAN, _LARGEST = 2, 5
@@ -89,7 +89,7 @@ def error_map(over_time: LoopsOverTime, names: Sequence[str], stayed: Bools) -> 
     values = draw.finite(over_time.errors, positive=True)
     axes.set(title=r"$\|e_c\|$ of each loop", xlabel=draw.TIME)
     axes.grid(visible=False)
-    if count <= _MOST_ROWS:
+    if count <= MOST_ROWS:
         axes.set_yticks(range(count), [draw.plain(name) for name in names])
     else:
         axes.set_ylabel("number of the loop")

@@ -17,6 +17,7 @@ from cosim.output.loops_tables import (
     network_rows,
 )
 from cosim.output.report.loops_figures import (
+    MOST_ROWS,
     NAMED,
     QueueLength,
     error_map,
@@ -37,7 +38,7 @@ from cosim.record.run_directory import (
 from cosim.record.run_record import RunRecord, load_record
 from noack.core.errors import ExitStatus
 from noack.core.file_access import write_whole
-from noack.core.number_format import number
+from noack.core.number_format import number, seconds
 
 _OF_WORST = ("states", "errors", "losses")
 
@@ -75,7 +76,9 @@ def write_loops_report(
         network=network_rows(dict(summary)),
         figures=list(loops_pictures(network, run_dir, summary).values()),
         worst_name=directories[worst.number].name,
+        worst_number=worst.number,
         worst_why=worst.why[:1].upper() + worst.why[1:],
+        worst_phase=seconds(summary["loops"][worst.number]["phase_s"]),
         worst_figures=[drawings[name]() for name in _OF_WORST],
         caption=CAPTION,
         headings=HEADINGS,
@@ -115,15 +118,20 @@ def _figures(over_time: LoopsOverTime, summary: Mapping[str, Any]) -> list[RunFi
     names = [loop["name"] for loop in summary["loops"]]
     flying = summary["network"]["in_flight"]
     queue = QueueLength(flying["width_s"], flying["mean_by_interval"], flying["max_by_interval"])
-    drawn = "Each loop has a curve." if len(names) <= NAMED else "Bands: quantiles over the loops."
+    drawn = (
+        "Each loop has a curve."
+        if len(names) <= NAMED
+        else "Bands: quantiles over the loops; dashed: the largest value."
+    )
     stayed = np.array([loop["diverged_at_s"] is None for loop in summary["loops"]])
     left = "" if stayed.all() else " A loop that diverged leaves the range of the axis."
+    order = "" if len(names) <= MOST_ROWS else " Loops are numbered from 0, as in the scenario."
     largest = over_time.errors[np.isfinite(over_time.errors)].max(initial=0.0)
     return [
         RunFigure(
             "network", network_figure(over_time, names, queue),
-            "Datagrams that wait, are sent or are delayed in the network; and of the bytes that "
-            f"left it, the share of each loop. {drawn}",
+            "Above: datagrams that wait, are sent or are delayed in the network. Below: each "
+            f"loop's share of the bytes that left it. {drawn}",
             f"Above, the number of datagrams in the network over time, up to {flying['max']}. "
             f"Below, the shares of {len(names)} loops in the bytes that the network forwarded.",
         ),
@@ -136,7 +144,8 @@ def _figures(over_time: LoopsOverTime, summary: Mapping[str, Any]) -> list[RunFi
         ),
         RunFigure(
             "map", error_map(over_time, names, stayed),
-            "Largest ‖e_c‖ of each loop in each interval; no colour before its first delivery.",
+            "Largest ‖e_c‖ of each loop in each interval; no colour before its first delivery."
+            f"{order}",
             f"A row of colours for each of {len(names)} loops: ‖e_c‖ over time.",
         ),
     ]  # fmt: skip

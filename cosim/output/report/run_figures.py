@@ -208,12 +208,16 @@ def _state_norms(record: RunRecord) -> tuple[Reals, Reals]:
 
 
 def _input(record: RunRecord) -> RunFigure:
-    (t_s, u), names = _reduced(record, CONTROLLER_STEP, "u"), record.loop.input_names
+    names, table = record.loop.input_names, CONTROLLER_STEP
+    title, caption = "Control input $u = K x_c$", "Control input u = K x_c, held between ticks."
+    if record.scenario.network.actuation is not None:
+        table, title = PLANT_STEP, "Applied input"
+        caption = "Input that the plant applied, also while actuations were missing."
+    t_s, u = _reduced(record, table, "u")
     return RunFigure(
         "input",
-        signal_figures.input_figure(t_s, u, names),
-        "Control input u = K x_c, held between the controller's ticks. Equal inputs are drawn one "
-        "inside the other.",
+        signal_figures.input_figure(t_s, u, names, title),
+        f"{caption} Equal inputs are drawn one inside the other.",
         f"Control inputs {', '.join(names)} over time.",
     )
 

@@ -239,13 +239,16 @@ def _norms(
 
 
 @styled
-def input_figure(t_s: Reals, u: Reals, input_names: Sequence[str]) -> Figure:
+def input_figure(
+    t_s: Reals, u: Reals, input_names: Sequence[str], title: str = "Control input"
+) -> Figure:
     """Control inputs; each is held until the next.
 
     Args:
         t_s: (k,) times from which each input is held.
         u: (k, m) inputs.
         input_names: m names.
+        title: of the figure.
     """
     m = len(input_names)
     names = [draw.plain(name) for name in input_names]
@@ -261,7 +264,7 @@ def input_figure(t_s: Reals, u: Reals, input_names: Sequence[str]) -> Figure:
         }
         shown += draw.line(axes, t_s, draw.finite(u[:, i]), name, **style)
     draw.legend(axes, shown)
-    axes.set(title=r"Control input $u = K x_c$", xlabel=draw.TIME, ylabel="input")
+    axes.set(title=title, xlabel=draw.TIME, ylabel="input")
     draw.finish(axes, t_s)
     return figure
 

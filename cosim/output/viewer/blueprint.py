@@ -227,7 +227,7 @@ def _norms() -> rrb.Container:
 
 
 def _inputs() -> rrb.View:
-    return plot("Control input u = K x_c", INPUT)
+    return plot("Control input u", INPUT)
 
 
 def _texts(input_names: Sequence[str], *, lateness: bool) -> rrb.Container:

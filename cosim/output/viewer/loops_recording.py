@@ -122,6 +122,9 @@ class LoopsRecording(RecordingFile):
 
 Curves of more than {len(SERIES)} loops are quantiles over the loops:
 {", ".join(f"{100 * q:g} %" for q in QUANTILES)}.
+Curves of norms are cut off at 10^±{_DECADES} times the usual largest value, so that a loop that
+diverges does not hide the others. In the map, each row is a loop, the first at the top; time goes
+to the right.
 """
         queue = rr.SeriesLines(names=["largest", "mean"], colors=[LOST, NETWORK], widths=[1.0, 2.0])
         self.describe(

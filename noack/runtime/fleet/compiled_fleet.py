@@ -242,11 +242,6 @@ class CompiledFleet:
         reason = self._run(self._memory, self._own, until_ns)
         if reason == layout.MATRIX_MISSING:
             self._add_matrix()
-        elif reason == layout.NOTE:
-            assert self._parts.notice is not None
-            fleet = self._memory.fleet.fleet[0]
-            notice = self._parts.notice(self._own, fleet)
-            self._notices.append(notice._replace(loop=int(fleet["note_loop"])))
         return reason
 
     def _add_matrix(self) -> None:
@@ -256,6 +251,14 @@ class CompiledFleet:
         transitions.add_wanted()
         if transitions.table is not self._own.models:
             self._own = self._own._replace(models=transitions.table)
+
+    def _take_notes(self) -> None:
+        """Word the lines for the log that the machines asked for."""
+        fleet, word = self._memory.fleet, self._parts.notice
+        if word is not None:
+            for note in fleet.notes[: fleet.fleet[0]["notes"]]:
+                self._notices.append(word(self._own, note)._replace(loop=int(note["loop"])))
+            fleet.fleet["notes"] = 0
 
     def _pass_rows(self, sink: RecordSink) -> None:
         """Hand over the rows and log lines."""
@@ -270,6 +273,7 @@ class CompiledFleet:
                 self._notices += [notice._replace(loop=loop) for loop, notice in found]
             sink.extend_table(self._on_message, deliveries)
         driver["timer_rows"] = driver["message_rows"] = 0
+        self._take_notes()
         for notice in self._notices:
             sink.notice(notice)
         self._notices.clear()

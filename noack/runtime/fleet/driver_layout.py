@@ -11,9 +11,8 @@ Array = NDArray[Any]
 
 # Why the driver returned.
 HOUSEKEEPING = 0  # the time for housekeeping has come
-ROWS_FULL = 1  # a buffer of rows must be emptied
+ROWS_FULL = 1  # a buffer of rows or notes must be emptied
 MATRIX_MISSING = 2  # a transition matrix must be computed
-NOTE = 3  # a line for the log must be written
 
 BUFFERS = 64
 """Datagrams that are received or sent at once."""

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from noack.config.fleet_layout import NEEDS_MATRIX, NEVER_NS, NOTES, SENDS, STRIDE
+from noack.config.fleet_layout import NEEDS_MATRIX, NEVER_NS, SENDS, STRIDE
 from noack.protocol.wire_format import HEADER_BYTES
 from noack.runtime.fleet.deadline_heap import lower_first
 from noack.runtime.fleet.driver_layout import (
@@ -11,7 +11,6 @@ from noack.runtime.fleet.driver_layout import (
     BUFFERS,
     HOUSEKEEPING,
     MATRIX_MISSING,
-    NOTE,
     ROWS_FULL,
     DriverMemory,
 )
@@ -58,9 +57,9 @@ def driver_of(
         driver.arrived_next += 1
         put_row(memory, loop, memory.message_rows, driver.message_rows, driver.message_row_bytes)
         driver.message_rows += 1
-        if outputs & SENDS:
+        if outputs == SENDS:
             put_message(memory, loop)
-        return NOTE if outputs & NOTES else _NONE
+        return _NONE
 
     @inline
     def serve_timer(memory: DriverMemory, own: Any, now_ns: int) -> Any:
@@ -79,19 +78,20 @@ def driver_of(
         lower_first(heap, driver.due)
         put_row(memory, loop, memory.timer_rows, driver.timer_rows, driver.timer_row_bytes)
         driver.timer_rows += 1
-        if outputs & SENDS:
+        if outputs == SENDS:
             put_message(memory, loop)
-        return NOTE if outputs & NOTES else _NONE
+        return _NONE
 
     def drive(memory: DriverMemory, own: Any, until_ns: int) -> Any:
         """Drive the fleet until Python is needed, or until a time; return the reason."""
         driver, fleet = memory.driver[0], memory.fleet.fleet[0]
         most_messages = len(memory.message_rows) // driver.message_row_bytes
         most_timers = len(memory.timer_rows) // driver.timer_row_bytes
+        most_notes = len(memory.fleet.notes)
         while True:
             works = False
             while driver.arrived_next < driver.arrived_end:
-                if driver.message_rows == most_messages:
+                if driver.message_rows == most_messages or fleet.notes == most_notes:
                     return ROWS_FULL
                 if fleet.out == BUFFERS:
                     send(memory)
@@ -103,7 +103,7 @@ def driver_of(
                 now_ns = time_ns(memory)
                 if driver.due == 0 or memory.heap[0] > now_ns:
                     break
-                if driver.timer_rows == most_timers:
+                if driver.timer_rows == most_timers or fleet.notes == most_notes:
                     return ROWS_FULL
                 if fleet.out == BUFFERS:
                     send(memory)

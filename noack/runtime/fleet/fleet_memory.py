@@ -7,6 +7,7 @@ import numpy as np
 from noack.config.fleet_layout import (
     FLEET,
     NEVER_NS,
+    NOTE,
     SCRATCH,
     STRIDE,
     FleetMemory,
@@ -21,6 +22,8 @@ from noack.runtime.native.socket_structs import HEADER, VECTOR
 
 _ROWS = 8192
 """Rows of each table that are collected before Python takes them."""
+_NOTES = 1024
+"""Notes that are collected likewise."""
 
 
 def driver_memory(
@@ -55,8 +58,8 @@ def driver_memory(
     vectors_in, headers_in = _headers(arrived, 8 * STRIDE)
     vectors_out, headers_out = _headers(out, datagram_bytes(int(wire.settings[0]["entries_sent"])))
     machines = FleetMemory(
-        fleet, loops, out, out.view(np.float64), arrived, arrived.view(np.float64), row,
-        row.view(np.float64), np.zeros(SCRATCH),
+        fleet, loops, out, out.view(np.float64), arrived, arrived.view(np.float64),
+        np.zeros(_NOTES, NOTE), row, row.view(np.float64), np.zeros(SCRATCH),
     )  # fmt: skip
     return DriverMemory(
         fleet=machines,

@@ -58,12 +58,12 @@ def replay_driver_of(handle: Machine, on_timer: Machine) -> Machine:
                 outputs = handle(fleet, own, loop, 0, words[3])
             if outputs == NEEDS_MATRIX:
                 return MATRIX_MISSING
-            if outputs & SENDS:
+            if outputs == SENDS:
                 count = 2 + memory.wire.settings[0].entries_sent
                 for k in range(count):
                     sent[1 + sent[0] * count + k] = fleet.out[2 + k]
                 sent[0] += 1
-            fleet.fleet[0].out = 0
+            fleet.fleet[0].out = fleet.fleet[0].notes = 0
             for k in range(content_bytes // 8):
                 if fleet.row[k] != words[k]:
                     return DIFFERS

@@ -72,6 +72,12 @@ def test_an_unknown_scenario_name_gives_one_line() -> None:
     assert "lane_following" in str(caught.value)
 
 
+def test_settings_that_are_no_table_give_one_line() -> None:
+    given: Any = ["network.mansd=2"]
+    with pytest.raises(noack.NoackError, match=r"^settings: \['network.mansd=2'\] is no table"):
+        noack.load("lane_following", given)
+
+
 def test_a_system_becomes_a_scenario_with_the_documented_choices() -> None:
     scenario = noack.from_system(SYSTEM, GAIN, [3.0, 4.0])
     decay_per_s = -np.linalg.eigvals(np.add(SYSTEM[0], np.matmul(SYSTEM[1], GAIN))).real.max()

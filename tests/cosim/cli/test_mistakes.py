@@ -1,6 +1,7 @@
 """A mistake in a command's arguments gives one line with the remedy."""
 
 import json
+import os
 import socket
 import subprocess
 import sys
@@ -97,11 +98,13 @@ def test_a_process_that_fails_is_named_once(tmp_path: Path) -> None:
         port = other.getsockname()[1]
         settings = ("ports={}", f"ports.sensor={port}", "horizon_s=1")
         done = subprocess.run(
-            [sys.executable, "-m", "cosim.cli", "run", "double_integrator", "--runs", tmp_path,
+            [sys.executable, "-m", "cosim.cli", "run", "double_integrator",
+             "--runs", tmp_path / "runs",
              *(word for setting in settings for word in ("--set", setting))],
             capture_output=True, text=True, check=False,
+            env=os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)},  # other runs would be warned of
         )  # fmt: skip
-    (run_dir,) = tmp_path.iterdir()
+    (run_dir,) = (tmp_path / "runs").iterdir()
     expected = (
         f"sensor: UDP port 127.0.0.1:{port} is already taken by another program; "
         "set ports.sensor to another port, or to 0 for any"

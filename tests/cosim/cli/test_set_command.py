@@ -18,15 +18,13 @@ from noack.config.scenario_file import validate
 from noack.core.errors import CallerError
 from noack.runtime import run_registry
 from noack.runtime.join_ticket import Ticket, new_ticket
-from noack.runtime.udp_sockets import LOOPBACK, free_tcp_port
 
 
 @pytest.fixture
 def ticket(content: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ticket:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    endpoint = f"tcp/{LOOPBACK}:{free_tcp_port()}"
     scenario = resolve(validate(content, "here"))
-    return new_ticket(scenario, endpoint, tmp_path / "run", launched=True)
+    return new_ticket(scenario, tmp_path / "run", launched=True)
 
 
 @pytest.fixture
@@ -71,7 +69,7 @@ def test_a_missing_run_is_reported(ticket: Ticket) -> None:
 def test_a_run_is_found_by_its_session_its_directory_or_as_the_only_one(
     ticket: Ticket, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    other = new_ticket(ticket.scenario, ticket.endpoint, Path("elsewhere"), launched=True)
+    other = new_ticket(ticket.scenario, Path("elsewhere"), launched=True)
     with run_registry.published(other, "lab"):
         assert run_registry.find().run_dir == "elsewhere"
         warn_of_other_runs()

@@ -22,7 +22,7 @@ from cosim.doctor.machine_measures import lateness
 
 WANTED = RunRequirements(
     name="loop", duration_s=20.0, period_ns=2_000_000, allowance_ns=4_000_000, realtime=True,
-    fifo_priority=50, spin_us=0.0, ports={"plant": 47001, "control": 47005},
+    fifo_priority=50, spin_us=0.0, ports={"plant": 47001, "netem": 47005},
 )  # fmt: skip
 PROMPT = Lateness(1000, 30.0, 100.0, 300.0, 0)
 ALL = ("sched_fifo", "memory_lock", "timer_slack", "affinity", "cpu_dma_latency")

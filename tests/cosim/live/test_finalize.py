@@ -105,6 +105,15 @@ def test_a_run_directory_that_was_deleted_is_not_created_again(
     assert not run_dir.exists()
 
 
+def test_the_reason_is_told_if_the_run_directory_was_replaced(tmp_path: Path) -> None:
+    ending = RunEnding(tmp_path, 1, ExitStatus.FAILED, "the record was moved", None)
+    with pytest.raises(MachineError) as caught:
+        finalize(ending)
+    reason, error = str(caught.value).splitlines()
+    assert reason == "the run failed: the record was moved"
+    assert error == f"{tmp_path / SCENARIO_FILE}: no such file"
+
+
 def test_a_difference_in_the_replay_does_not_fail_the_run(run_dir: Path) -> None:
     record = load_record(run_dir)
     record[PLANT_STEP]["u"][9, 0] = np.nan

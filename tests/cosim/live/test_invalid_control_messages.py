@@ -28,7 +28,7 @@ def test_an_invalid_request_is_refused_and_the_others_join(
     content: dict[str, Any], tmp_path: Path
 ) -> None:
     plane = FakePlane()
-    ticket = new_ticket(resolve(validate(content, "")), "tcp/127.0.0.1:1", tmp_path, launched=True)
+    ticket = new_ticket(resolve(validate(content, "")), tmp_path, launched=True)
     with patch.object(coordinator, "ControlPlane", lambda *_, **__: plane):
         barrier = coordinator.Coordinator(ticket)
     for junk in JUNK:

@@ -86,7 +86,7 @@ class Case:
 
     def __init__(self, content: dict[str, Any], run_dir: Path) -> None:
         resolved = resolve(validate(content | {"recovery": {"rejoin_within_s": 60}}, ""))
-        self.ticket = new_ticket(resolved, "tcp/127.0.0.1:1", run_dir, launched=True)
+        self.ticket = new_ticket(resolved, run_dir, launched=True)
         self.run_dir = run_dir
         (run_dir / "logs").mkdir()
         self.log = run_dir / "logs" / "sensor.log"
@@ -236,7 +236,7 @@ def test_a_refused_session_leaves_no_run_directory(
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     scenario = validate(content | {"ports": {}}, "")
-    ticket = new_ticket(resolve(scenario), "tcp/127.0.0.1:1", tmp_path, launched=False)
+    ticket = new_ticket(resolve(scenario), tmp_path, launched=False)
     with published(ticket, "lab"), pytest.raises(CallerError, match="another run is open in it"):
         launch(scenario, tmp_path / "runs", spawn=(), session="lab")
     assert list((tmp_path / "runs").iterdir()) == []

@@ -2,11 +2,13 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
 
 import noack
 from cosim.analysis.run_summary import summarise
-from cosim.output.run_tables import key_numbers
+from cosim.output.report.run_figures import pictures
+from cosim.output.run_tables import key_numbers, short_numbers
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
@@ -39,3 +41,22 @@ def test_a_claim_names_the_threshold_in_its_bound(beta: float, level: str) -> No
     of_the_sensor = next(bound for bound in bounds if bound.startswith("‖e_s‖ ≤ "))
     assert level in of_the_sensor
     assert ("β" in of_the_sensor) == ("β" in level)
+
+
+def test_of_lost_actuations_the_report_has_the_number_and_the_inputs_applied_without_them(
+    content: dict[str, Any],
+) -> None:
+    loss = {"model": "bernoulli", "probability": 0.5}
+    network = content["network"] | {"actuation": {"loss": loss, "mansd": 2}}
+    plant = content["plant"] | {"watchdog": {"policy": "zero"}}
+    record = simulate(resolve(validate(content | {"network": network, "plant": plant}, "")))
+    summary = summarise(record, 0, "horizon").to_json()
+    lost = summary["actuations"]["lost"]
+    assert lost > 0
+    for numbers in (key_numbers(summary), short_numbers(summary)):
+        assert dict(numbers)["actuations lost"].startswith(f"{lost} (")
+    drawn = pictures(record)["input"]().figure.axes[0].lines[0].get_ydata()
+    applied, sent = record["plant_step"]["u"][:, 0], record["controller_step"]["u"][:, 0]
+    late = np.count_nonzero(sent == 0) + 1  # 0 is sent, or applied before the first actuation
+    assert np.isin(drawn, applied).all()
+    assert np.count_nonzero(np.asarray(drawn) == 0) > late

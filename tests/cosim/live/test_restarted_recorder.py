@@ -22,8 +22,8 @@ from noack.core.errors import MachineError
 from noack.protocol.machine_interface import BEGINNING, GENERATION, Start
 from noack.protocol.record_tables import OWNER, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.topology import LOOP_ROLES, RECORDER
+from noack.runtime.log_lines import NOTICES, batch_of
 from noack.runtime.spool import SPOOL, read_chunks
-from noack.runtime.telemetry import NOTICES
 from tests.fuzz.plane import FakePlane, Query, Sample
 
 
@@ -62,9 +62,9 @@ class Run:
         rows["input"] = generation * GENERATION + np.arange(count)
         self.send(table, 0, rows.tobytes(), OWNER[table], generation)
 
-    def notice(self, role: str, generation: int = 0) -> None:
-        line = {"t_ns": 0, "level": "info", "text": role}
-        self.send(NOTICES, 0, json.dumps(line).encode(), role, generation)
+    def notices(self, role: str, count: int, generation: int = 0) -> None:
+        line = json.dumps({"t_ns": 0, "level": "info", "text": role}).encode()
+        self.send(NOTICES, 0, batch_of([line] * count), role, generation)
 
     def report(
         self,
@@ -94,10 +94,10 @@ def run(content: dict[str, Any], tmp_path: Path) -> Iterator[Run]:
 
 def test_a_restarted_recorder_requests_no_rows_that_are_on_disk(run: Run) -> None:
     run.rows(PLANT_STEP, 5)
-    run.notice("plant")
-    run.notice("sensor", 1)
+    run.notices("plant", 3)
+    run.notices("sensor", 1, generation=1)
     run.follow(Start(1, 0), "a")
-    assert run.report("plant", **{PLANT_STEP: 5, NOTICES: 1}) == {}
+    assert run.report("plant", **{PLANT_STEP: 5, NOTICES: 3}) == {}
     assert run.report("sensor", 1, **{NOTICES: 1}) == {}
     assert run.report("controller", **{NOTICES: 1}) == {NOTICES: [[0, 1]]}
 

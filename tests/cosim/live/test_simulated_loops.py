@@ -120,6 +120,40 @@ def test_commands_read_the_run_and_its_loops(run_dir: Path) -> None:
     assert link in page.read_text()
 
 
+LATE = "certificate.network_delay_s=0.001"
+LOST = "network.actuation={ mansd = 4, loss = { model = 'bernoulli', probability = 0.6 } }"
+
+
+@pytest.mark.parametrize("setting", [LATE, LOST])
+def test_the_whole_says_why_claims_are_void_and_that_watchdogs_acted(
+    setting: str, tmp_path: Path
+) -> None:
+    watchdog = 'plant.watchdog={ policy = "zero", timeout_s = 0.03 }'
+    words = [setting, watchdog] if setting == LOST else [setting]
+    assert simulated(tmp_path, "horizon_s=2", *words).exit_code == 0
+    loops = json.loads((tmp_path / "latest/summary.json").read_text())["loops"]
+    for one in loops:
+        own = json.loads((tmp_path / "latest/loops" / one["name"] / "summary.json").read_text())
+        assert one["watchdog_trips"] == own["watchdog"]["trips"]
+        void = {claim["why"] for claim in own["claims"] if claim["verdict"] == "void"}
+        assert sorted(one["void_because"]) == sorted(void)
+    trips = sum(one["watchdog_trips"] for one in loops)
+    reasons = {why for one in loops for why in one["void_because"]}
+    assert trips if setting == LOST else reasons
+    shown = noack("summary", tmp_path / "latest").stdout
+    assert (f"{trips} times, in {LOOPS} loops" in shown) == (setting == LOST)
+    assert shown.count("void: ") == min(len(reasons), 3)
+
+
+@pytest.mark.parametrize("loop", [None, "periodic"])
+def test_a_missing_recording_is_written_when_it_is_viewed(run_dir: Path, loop: str | None) -> None:
+    path = (run_dir if loop is None else run_dir / "loops" / loop) / "recording.rrd"
+    path.unlink(missing_ok=True)
+    done = noack("view", run_dir, "--json", *(() if loop is None else ("--loop", loop)))
+    assert json.loads(done.stdout) == {"recording": str(path), "exists": True}
+    assert path.read_bytes().startswith(b"RRF")
+
+
 def test_the_loops_over_time(run_dir: Path) -> None:
     summary = json.loads((run_dir / "summary.json").read_text())
     network = load_record(run_dir, network=True)
@@ -218,12 +252,16 @@ def test_the_worst_loop(tmp_path: Path) -> None:
 
 def test_a_loop_that_diverges_is_named_and_the_others_go_on(tmp_path: Path) -> None:
     own = "A = [[0.0, 1.0], [50.0, 0.0]], B = [[0.0], [1.0]]"
-    wild = f'{{ name = "wild", plant = {{ draw = "given", {own} }} }}'
+    wild = f'{{ name = "wild", phase = 0.75, plant = {{ draw = "given", {own} }} }}'
     loops = f'loops=[{{ name = "calm", count = 2 }}, {wild}]'
-    done = simulated(tmp_path, "horizon_s=3", "network.actuation={}", loops)
+    change = 'changes=[{ at_s = 1.5, set = { "network.mansd" = 1 } }]'
+    done = simulated(tmp_path, "horizon_s=3", "network.actuation={}", loops, change)
     assert done.exit_code == 1
     summary = json.loads(done.stdout)
-    assert "1 of 3 loops failed (wild diverged at " in summary["exit"]["reason"]
+    diverged_at_s = summary["loops"][2]["diverged_at_s"] + summary["loops"][2]["phase_s"]
+    reason = f"1 of 3 loops failed (wild diverged at {diverged_at_s:.2f} s)"
+    assert summary["exit"]["reason"] == reason
+    assert [(one["t_s"], one["what"]) for one in summary["changes"]] == [(1.5, "network.mansd = 1")]
     assert [one["exit"]["status"] for one in summary["loops"]] == [0, 0, 1]
     assert summary["reached_s"] == 3
     for name in ("calm-1", "calm-2"):
@@ -241,6 +279,7 @@ def test_a_loop_that_diverges_is_named_and_the_others_go_on(tmp_path: Path) -> N
     sent = sum(one["actuations"]["sent"] for one in summary["loops"])
     assert sent == pytest.approx(3 * 3 * 100, abs=6)
     assert any(f" {sent} (" in line for line in shown)
+    assert any(re.search(r"changed at 1.500 s .* network.mansd = 1 ", line) for line in shown)
     table = [line for line in shown if not line.startswith(("one loop", "report", "run dir"))]
     assert max(map(len, table)) <= 80
 

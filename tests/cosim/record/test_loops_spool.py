@@ -19,8 +19,8 @@ from noack.config.scenario_file import validate
 from noack.core.errors import MachineError
 from noack.protocol.machine_interface import Notice
 from noack.protocol.record_tables import LOOP, NETEM_PACKET, PLANT_STEP
+from noack.runtime.log_lines import notices_of
 from noack.runtime.spool import SPOOL, SpoolWriter
-from noack.runtime.telemetry import notices_of
 
 LOOPS = 3
 
@@ -109,6 +109,21 @@ def test_every_row_and_line_reaches_the_record_of_its_loop(
     assert lines == [["all"], ["mine", "all"], ["all"]]
     assert [line["text"] for line in network.notices] == ["all"]
     assert not (run_dir / SPOOL).exists()
+
+
+def test_a_line_of_no_loop_of_the_run_is_left_out(shared: LoopsRun, tmp_path: Path) -> None:
+    run_dir = opened(shared, tmp_path / "run")
+    out = SpoolWriter(run_dir / SPOOL, "recorder")
+    for number, loop in enumerate((-1, LOOPS, True, 1.0, "1", 2**70, [1])):
+        line = {"t_ns": number, "level": "info", "text": "damaged", "loop": loop}
+        out.append(notices_of("plant"), number, json.dumps(line).encode())
+    out.append(notices_of("plant"), 10, b"[" * 100_000)
+    out.append(notices_of("plant"), 11, json.dumps(Notice(5, "info", "own", 2).line()).encode())
+    out.close()
+    network = finish_run_record(run_dir)
+    lines = [[line["text"] for line in one.notices] for one in records(run_dir, shared)]
+    assert lines == [[], [], ["own"]]
+    assert not network.notices
 
 
 def test_an_interrupted_attempt_is_repeated_and_later_rows_are_added(

@@ -47,10 +47,7 @@ ANSWER = {
     "from_s": 0.7,
     "runtime_parameters": SETTINGS,
 }
-RUN = {
-    "run_id": "00", "run_dir": "runs/x", "session": None, "endpoint": "tcp/127.0.0.1:1",
-    "user": "u", "password": "p",
-}  # fmt: skip
+RUN = {"name": "00", "run_dir": "runs/x", "session": None}
 KNOWN = Vocabulary(
     (*ANNOUNCED, *ANSWER, *RUN, *SHORT.values(), *_SCENARIO.keys), (*SHORT, *_SCENARIO.words)
 )

@@ -31,8 +31,8 @@ from cosim.record.spool_conversion import finish_record
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
 from noack.config.scenario_file import dumps, validate
+from noack.runtime.log_lines import notices_of
 from noack.runtime.spool import SPOOL, SpoolWriter
-from noack.runtime.telemetry import notices_of
 from tests.fuzz.choices import Choices
 from tests.fuzz.edits import Vocabulary, edited
 from tests.fuzz.harness import refusal, workspace

@@ -13,7 +13,7 @@ from cosim.record.run_directory import SCENARIO_FILE
 from noack.config.resolution import resolve, tables_of
 from noack.config.scenario_file import dumps, validate
 from noack.protocol.record_tables import OWNER
-from noack.runtime.telemetry import NOTICES
+from noack.runtime.log_lines import NOTICES, batch_of
 from tests.fuzz.choices import Choices
 from tests.fuzz.edits import Vocabulary, edited
 from tests.fuzz.harness import workspace
@@ -71,7 +71,8 @@ def _batch(choices: Choices) -> Sample:
     table = choices.one([*OWNER, NOTICES, "", "nothing"])
     role = choices.one([OWNER.get(table, "plant"), "nobody"])
     if table == NOTICES:
-        payload = json.dumps(edited(choices, NOTICE, KNOWN)).encode()
+        lines = [edited(choices, NOTICE, KNOWN) for _ in range(1 + choices.below(3))]
+        payload = batch_of(json.dumps(line).encode() for line in lines)
     else:
         count = choices.below(3)
         numbers = [choices.integer() % 2**63 if choices.below(4) == 0 else 0 for _ in range(8)]

@@ -1,47 +1,43 @@
-"""Access to the control plane: only over loopback, and only with the run's key."""
+"""The control plane: who can reach it, and what arrives."""
 
-import hashlib
 import json
+import tempfile
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from functools import partial
-from itertools import product
 from pathlib import Path
 from typing import Any, cast
 
 import psutil
 import pytest
 import zenoh
-from zenoh.handlers import FifoChannel, RingChannel
+from zenoh.handlers import FifoChannel
 
 import noack.runtime.control_plane
 import noack.runtime.process_entry
+import noack.runtime.zenoh_session
 from cosim.live.coordinator import Coordinator
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
 from noack.core.errors import NoAnswerError, PeerError
 from noack.protocol.topology import COORDINATOR, LOOP_ROLES
 from noack.runtime.control_messages import Admission, MissingRows, RunStart, parse_message
-from noack.runtime.control_plane import ControlPlane, secret_of
+from noack.runtime.control_plane import RUNS, ControlPlane, run_name
 from noack.runtime.join_ticket import Ticket, new_ticket
+from noack.runtime.private_folder import private_folder
 from noack.runtime.process_entry import _admitted
 from noack.runtime.process_life import RunProcess
 from noack.runtime.signals import Signals
-from noack.runtime.udp_sockets import free_tcp_port
-from noack.runtime.zenoh_session import SessionSecret, label, open_session, session_config
+from noack.runtime.zenoh_session import cause_of, label
+from tests.attacks.other_user import needs_root, output_of_another_user
 from tests.fuzz.plane import FakePlane
 from tests.integration.conftest import wait_for
-
-HELLO = '{"pid": 1, "instance": "evil", "address": ["127.0.0.1", 9]}'
-STRANGERS = ["no secret", "wrong password", "wrong user", "no password", "another run's"]
 
 
 @pytest.fixture
 def ticket(content: dict[str, Any], tmp_path: Path) -> Ticket:
-    endpoint = f"tcp/127.0.0.1:{free_tcp_port()}"
-    return new_ticket(resolve(validate(content, "")), endpoint, tmp_path, launched=True)
+    return new_ticket(resolve(validate(content, "")), tmp_path, launched=True)
 
 
 @pytest.fixture
@@ -53,92 +49,6 @@ def coordinator(ticket: Ticket) -> Iterator[Coordinator]:
 
 def changed(ticket: Ticket, **update: Any) -> Ticket:
     return ticket.model_copy(update=update)
-
-
-def shown_by(stranger: str, ticket: Ticket) -> dict[str, str]:
-    """The credentials that a connection without the key presents."""
-    own = secret_of(ticket)
-    secrets = {
-        "wrong password": SessionSecret(own.user, "0" * len(own.password)),
-        "wrong user": SessionSecret("root", own.password),
-        "no password": SessionSecret(own.user, ""),
-        "another run's": secret_of(changed(ticket, key=bytes(32), run_id=ticket.run_id ^ 1)),
-    }
-    if stranger not in secrets:
-        return {}
-    return {f"transport/auth/usrpwd/{k}": v for k, v in secrets[stranger]._asdict().items()}
-
-
-def test_a_connection_without_the_secret_is_refused(
-    coordinator: Coordinator, ticket: Ticket
-) -> None:
-    def connect(attempt: tuple[str, str]) -> None:
-        stranger, mode = attempt
-        more = {"mode": mode, "connect/timeout_ms": 200, **shown_by(stranger, ticket)}
-        with pytest.raises(zenoh.ZError, match="Unable to connect"):
-            zenoh.open(session_config(ticket.endpoint, listen=False, more=more))
-
-    attempts = list(product(STRANGERS, ("client", "peer", "router")))
-    with ThreadPoolExecutor(len(attempts)) as pool:
-        list(pool.map(connect, attempts))
-
-
-def test_a_refused_session_neither_sends_nor_receives(
-    coordinator: Coordinator, ticket: Ticket
-) -> None:
-    """The refused sessions stay open and reconnect repeatedly, as zenoh's do by default."""
-    strangers = []
-    for stranger in STRANGERS:
-        more = {"connect/exit_on_failure": False, "connect/timeout_ms": 0, "mode": "peer"}
-        more |= shown_by(stranger, ticket)
-        config = session_config(ticket.endpoint, listen=False, more=more)
-        strangers.append(zenoh.open(config))
-    with ControlPlane(ticket, "plant") as plant:
-        batches = coordinator.plane.session.declare_subscriber(
-            plant.key("telemetry", "**"), RingChannel(100)
-        )
-        reports = coordinator.plane.session.declare_queryable(
-            plant.key("report", "*"), FifoChannel(100)
-        )
-        received = [session.declare_subscriber("**", RingChannel(100)) for session in strangers]
-        lives = [
-            session.liveliness().declare_subscriber("**", RingChannel(100), history=True)
-            for session in strangers
-        ]
-        asked = []
-        for session in strangers:
-            for key in ("stop", f"ended/plant/{plant.instance}", "progress",
-                        "telemetry/plant/plant_step", "persisted/plant"):  # fmt: skip
-                full = plant.key(*key.split("/"))
-                session.put(full, "evil", attachment=label(full))
-            session.liveliness().declare_token(plant.key("alive", "sensor", "evil"))
-            for what in ("admit", "join", "report"):
-                key = plant.key(what, "plant")
-                asked.append(session.get(key, FifoChannel(4), payload=HELLO, timeout=0.3))
-        plant.publish_telemetry_blocking("plant_step", b"{}", b"own")
-        # A later message on the same path: once it has arrived, all earlier ones have arrived, too.
-        wait_for(lambda: (sample := batches.try_recv()) is not None and _is_own(sample))
-        coordinator.poll()
-        assert batches.try_recv() is None
-        assert reports.try_recv() is None
-        assert coordinator.missing() == (*LOOP_ROLES, "recorder")
-        assert coordinator.failures() == {}
-        assert coordinator.progress() is None
-        assert plant.stop_requested() is None
-        assert plant.persisted() is None
-        for channel in (*received, *lives):  # each receives its own messages only
-            while (sample := channel.try_recv()) is not None:
-                assert sample.payload.to_bytes() in (b"", b"evil")
-                assert sample.payload.to_bytes() or "alive/sensor" in str(sample.key_expr)
-        for replies in asked:
-            assert all(reply.ok is None for reply in replies)
-    for session in strangers:
-        session.close()  # type: ignore[no-untyped-call]
-
-
-def _is_own(sample: zenoh.Sample) -> bool:
-    assert sample.payload.to_bytes() == b"own"
-    return True
 
 
 def test_a_message_that_arrives_under_another_key_is_ignored(
@@ -165,56 +75,76 @@ def test_a_message_that_arrives_under_another_key_is_ignored(
         wait_for(lambda: plant.stop_requested() == "enough")
 
 
-def test_a_process_refuses_an_endpoint_without_authentication(ticket: Ticket) -> None:
-    """Another process has taken a dead coordinator's port and does not have the key."""
-    secret = secret_of(ticket)._asdict()
-    shown = {f"transport/auth/usrpwd/{key}": value for key, value in secret.items()}
-    more = {"connect/timeout_ms": 200, **shown}
-    config = session_config(ticket.endpoint, listen=False, more=more)
-    with (
-        zenoh.open(session_config(ticket.endpoint, listen=True)),
-        pytest.raises(zenoh.ZError, match="Unable to connect"),
-    ):
-        zenoh.open(config)
+def test_the_coordinator_listens_on_no_port(ticket: Ticket) -> None:
+    own = psutil.Process()
+    before = set(own.net_connections("inet"))
+    coordinator = Coordinator(ticket)
+    assert set(own.net_connections("inet")) <= before
+    coordinator.close()
 
 
-def test_the_secret_is_derived_as_documented(ticket: Ticket) -> None:
-    known = changed(ticket, run_id=0x0123456789ABCDEF, key=bytes(range(32)))
-    password = hashlib.blake2b(
-        b"the control plane's password", key=bytes(range(32)), digest_size=32
-    ).hexdigest()
-    assert secret_of(known) == ("0123456789abcdef", password)
-    assert known.key.hex() not in password
+REACH = """
+import os, socket, sys
+path = sys.argv[1]
+for attempt in ("connect", "bind"):
+    with socket.socket(socket.AF_UNIX) as one:
+        try:
+            getattr(one, attempt)(path + (".other" if attempt == "bind" else ""))
+            print(attempt, "succeeded")
+        except PermissionError:
+            print(attempt, "refused")
+try:
+    os.unlink(path)
+except PermissionError:
+    print("unlink refused")
+"""
 
 
-def test_the_coordinator_listens_on_loopback_only(coordinator: Coordinator, ticket: Ticket) -> None:
-    port = int(ticket.endpoint.rpartition(":")[2])
-    own = psutil.Process().net_connections()
-    listening = {c.laddr for c in own if c.status == psutil.CONN_LISTEN}
-    assert [address.ip for address in listening if address.port == port] == ["127.0.0.1"]
-    assert not any(c.laddr.port in (7446, 7447) for c in own)  # zenoh's scouting, its default port
+@needs_root
+def test_another_user_can_neither_connect_nor_listen(
+    ticket: Ticket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with tempfile.TemporaryDirectory() as short:
+        Path(short).chmod(0o777)  # its users may come in, and make files
+        monkeypatch.setenv("XDG_RUNTIME_DIR", short)
+        coordinator = Coordinator(ticket)
+        path = private_folder() / RUNS / f"{run_name(ticket.run_id)}.sock"
+        assert path.is_socket()
+        said = output_of_another_user(REACH, str(path))
+        assert said.splitlines() == ["connect refused", "bind refused", "unlink refused"]
+        with ControlPlane(ticket, "plant"):  # its user can
+            pass
+        coordinator.close()
+        assert not path.exists()
 
 
-def test_every_zenoh_session_needs_a_secret() -> None:
+def test_a_process_without_a_coordinator_says_so(
+    ticket: Ticket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(noack.runtime.zenoh_session, "_CONNECT_MS", 200)
+    with pytest.raises(NoAnswerError, match="cannot reach the run's coordinator: Unable"):
+        ControlPlane(ticket, "plant")
+    error = zenoh.ZError("Timeout! at /home/builder/.cargo/git/zenoh/orchestrator.rs:388.")
+    assert cause_of(error) == "Timeout!"
+
+
+def test_a_path_longer_than_a_sockets_may_be_works(
+    ticket: Ticket, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / ("long" * 40)
+    folder.mkdir()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))
+    coordinator = Coordinator(ticket)
+    with ControlPlane(ticket, "plant") as plane:
+        meet(plane)
+    coordinator.close()
+
+
+def test_every_zenoh_session_is_opened_in_one_place() -> None:
     root = Path(noack.__file__).parents[1]
     rooms = ("noack", "netem", "cosim", "plant_server", "sensor_node", "controller_node")
     files = [file for room in rooms for file in (root / room).rglob("*.py")]
     assert [file.name for file in files if "zenoh.open" in file.read_text()] == ["zenoh_session.py"]
-
-
-def test_the_password_is_not_stored_on_disk_and_no_pipe_stays_open(ticket: Ticket) -> None:
-    own, before = psutil.Process(), pipes()
-    with open_session(ticket.endpoint, secret_of(ticket), listen=True):
-        assert not [f for f in own.open_files() if "password" in f.path]
-        assert pipes() == before
-
-
-def pipes() -> set[str]:
-    links = []
-    for descriptor in Path("/proc/self/fd").iterdir():
-        with suppress(FileNotFoundError):
-            links.append(str(descriptor.readlink()))
-    return {link for link in links if link.startswith("pipe:")}
 
 
 @pytest.mark.parametrize(

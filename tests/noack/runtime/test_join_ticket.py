@@ -11,8 +11,8 @@ import pytest
 
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
-from noack.core.errors import CallerError
-from noack.runtime.join_ticket import loads, new_ticket, published, ticket_path
+from noack.core.errors import CallerError, PeerError
+from noack.runtime.join_ticket import loads, new_ticket, published, ticket_path, wait_for_ticket
 
 KEY = "ab" * 32
 
@@ -20,7 +20,7 @@ KEY = "ab" * 32
 @pytest.fixture
 def fields(content: dict[str, Any]) -> dict[str, Any]:
     scenario = resolve(validate(content, "small"))
-    ticket = new_ticket(scenario, "tcp/127.0.0.1:7447", Path("run"), launched=True)
+    ticket = new_ticket(scenario, Path("run"), launched=True)
     return ticket.model_copy(update={"key": bytes.fromhex(KEY)}).model_dump(mode="json")
 
 
@@ -35,7 +35,7 @@ def test_a_ticket_is_read_back(fields: dict[str, Any]) -> None:
     [
         ("run_id", -1), ("run_id", 2**64), ("run_id", "7"), ("key", KEY[:-2]), ("key", KEY + "00"),
         ("key", KEY.replace("a", "g")), ("key", f"{KEY} "), ("key", [KEY]), ("key", {KEY: KEY}),
-        ("endpoint", None), ("run_dir", 3), ("launched", 1), ("launched", "yes"),
+        ("run_dir", 3), ("launched", 1), ("launched", "yes"),
         ("scenario", None), ("scenario", {}), ("more", 0),
     ],
 )  # fmt: skip
@@ -84,3 +84,23 @@ def test_exactly_one_of_many_concurrent_runs_opens_a_session(
         assert sorted(errors) == ["", *[refusal] * (at_once - 1)]
         assert loads(ticket_path("lab").read_text()).run_id == winner
     assert list(ticket_path("lab").parent.iterdir()) == []
+
+
+def test_a_ticket_whose_recorder_was_killed_is_not_joined(
+    fields: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    with published(loads(json.dumps(fields)), "lab") as path:
+        text = path.read_text()
+    path.write_text(text)
+    with pytest.raises(PeerError, match="no run to join in session 'lab'"):
+        wait_for_ticket("lab", 0.0, lambda: False, lambda path: None)
+    assert not path.exists()
+
+
+def test_a_missing_runtime_directory_is_not_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "none"))
+    with pytest.raises(CallerError, match=r"none: no such folder; set XDG_RUNTIME_DIR"):
+        wait_for_ticket("lab", 1e9, lambda: False, lambda path: None)

@@ -292,6 +292,26 @@ def test_a_deadline_after_the_end_is_not_late(always_readable: int) -> None:
     assert machine.served < STEPS
 
 
+@pytest.mark.parametrize("others_turns", [0, 7, 10**9])
+def test_a_machine_that_is_done_waits_for_the_others_for_a_while(
+    always_readable: int, others_turns: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(real_time_loop, "_HOUSEKEEPING_S", 0.0)
+    clock, machine, told = RunClock(time.monotonic_ns()), Ticker(), list[bool]()
+    machine.served = STEPS
+    channel = Flooded(always_readable, clock, machine)
+
+    def all_done(done: bool) -> bool:
+        told.append(done)
+        return done and told.count(True) > others_turns
+
+    run_loop(
+        machine, channel, clock, Log(), end_ns=0, stop=lambda: False,
+        turns_after_end=3, all_done=all_done,
+    )  # fmt: skip
+    assert told.count(True) == min(others_turns + 4, real_time_loop._TURNS_TO_WAIT + 1)
+
+
 def test_deadlines_are_gathered_and_never_served_early(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of 200 deadlines in 0.2 s, some 20 are served at each waking up."""
     clock, machine = RunClock(time.monotonic_ns() + 50 * PERIOD_NS), Late()

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from noack.protocol.machine_interface import Notice, Record
 from noack.runtime import telemetry
-from noack.runtime.telemetry import NOTICES, ReceivedRows, TelemetryBuffer, first_row, notices_of
+from noack.runtime.log_lines import NOTICES, lines_in, notices_of
+from noack.runtime.telemetry import ReceivedRows, TelemetryBuffer, first_row
 
 ROW = np.dtype([("number", "<i8"), ("x", "<f8", (2,))])
 TABLES = {"one": ROW, "two": ROW}
@@ -221,20 +222,22 @@ def test_the_work_for_lost_batches_is_not_quadratic() -> None:
     assert ranges.reads < 40 * 1000
 
 
-def test_notices_are_published_at_once_and_numbered() -> None:
+def test_log_lines_are_published_in_numbered_batches() -> None:
     wire = Wire()
     buffer = TelemetryBuffer(TABLES, wire)
     buffer.append(Record("one", row(0)))
-    for k in range(3):
+    for k in range(600):
         buffer.notice(Notice(10 * k, "violation", f"line {k}"))
-    assert [(table, first, rows) for table, first, rows, _ in wire.batches] == [
-        (NOTICES, k, 1) for k in range(3)
-    ]
-    assert json.loads(wire.batches[1][3]) == {"t_ns": 10, "level": "violation", "text": "line 1"}
-    assert buffer.totals() == {"one": 0, "two": 0, NOTICES: 3}
+    buffer.flush()
+    batches = [batch for batch in wire.batches if batch[0] == NOTICES]
+    assert [(first, rows) for _, first, rows, _ in batches] == [(0, 256), (256, 256), (512, 88)]
+    lines = [json.loads(line) for *_, payload in batches for line in lines_in(payload)]
+    assert lines[300] == {"t_ns": 3000, "level": "violation", "text": "line 300"}
+    assert [line["text"] for line in lines] == [f"line {k}" for k in range(600)]
+    assert buffer.totals() == {"one": 1, "two": 0, NOTICES: 600}
     again = Wire()
-    buffer.resend({NOTICES: [(1, 2)]}, again)
-    assert again.batches == [wire.batches[1]]
+    buffer.resend({NOTICES: [(300, 301)]}, again)
+    assert again.batches == [batches[1]]
     assert len({notices_of(role) for role in ("plant", "sensor", "netem")}) == 3
 
 

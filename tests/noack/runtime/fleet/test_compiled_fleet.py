@@ -25,6 +25,7 @@ from noack.protocol.record_tables import (
     SENSOR_SETTING,
 )
 from noack.protocol.wire_format import Flow, Message
+from noack.runtime.fleet import fleet_memory
 from noack.runtime.fleet.compiled_driver import compiled_driver, compiled_replay
 from noack.runtime.fleet.compiled_fleet import CompiledFleet
 from noack.runtime.fleet.fleet_choice import may_be_compiled
@@ -206,6 +207,18 @@ def test_compiled_machines_have_the_bits_of_the_single_ones(
     run = validate(loops, "here")
     pairs = drive(run, seed, loss=0.5, delay_ns=60_000_000)
     assert all(sum(map(len, pair.rows.values())) > 500 for pair in pairs.values())
+
+
+def test_all_plants_report_missing_actuations_at_once(
+    loops: Content, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fleet_memory, "_NOTES", 2)
+    loops["plant"]["watchdog"] = {"policy": "zero", "timeout_s": 0.04}
+    pair = Pair("plant", validate(loops, "here"))
+    while (due_ns := pair.due_ns()) is not None:
+        pair.on_timer(due_ns)
+    assert len(pair.notices) == 2 * len(POLICIES)
+    assert all("the input is 0" in text for text in pair.notices)
 
 
 def test_a_replay_finds_every_row_again_and_one_changed_bit(loops: Content) -> None:

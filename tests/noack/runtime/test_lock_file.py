@@ -1,0 +1,78 @@
+"""Lock files whose process has ended, and several readers at the same time."""
+
+import os
+import resource
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from noack.core import file_access
+from noack.core.errors import MachineError
+from noack.runtime import lock_file
+from noack.runtime.private_folder import open_private
+
+
+@pytest.fixture(autouse=True)
+def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+
+
+def leave(*names: str) -> None:
+    with open_private("k", create=True) as folder:
+        for name in names:
+            os.close(folder.create(name))
+
+
+def names() -> list[str]:
+    with open_private("k") as folder:
+        return sorted(folder.names())
+
+
+def test_a_file_is_stale_to_each_of_two_readers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second one looks while the first one has its lock."""
+    leave("lab.json")
+    found = []
+
+    def and_look(*arguments: Any, **how: Any) -> bool:
+        monkeypatch.setattr(lock_file, "lock", file_access.lock)
+        locked = file_access.lock(*arguments, **how)
+        found.extend(lock_file.live_lock_files("k"))
+        return locked
+
+    monkeypatch.setattr(lock_file, "lock", and_look)
+    assert lock_file.live_lock_files("k") == found == []
+
+
+def test_a_reader_that_was_stopped_removes_no_socket_of_a_new_process(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It had opened the file of the old process when a new one took the name."""
+    leave("lab.json", "lab.sock")
+    with ExitStack() as new:
+
+        def stopped(*arguments: Any, **how: Any) -> bool:
+            monkeypatch.setattr(lock_file, "lock", file_access.lock)
+            new.enter_context(lock_file.lock_file("k", "lab", {}))
+            leave("lab.sock", "lab.sock.lock")
+            return file_access.lock(*arguments, **how)
+
+        monkeypatch.setattr(lock_file, "lock", stopped)
+        lock_file.live_lock_files("k")
+        assert names() == ["lab.json", "lab.sock", "lab.sock.lock"]
+    assert names() == []
+
+
+def test_a_file_that_cannot_be_written_leaves_nothing() -> None:
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+    try:
+        with (
+            pytest.raises(MachineError, match=r"lab\.json: cannot be written: File too large"),
+            lock_file.lock_file("k", "lab", {"long": "x" * 2000}),
+        ):
+            raise AssertionError("it was written")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert names() == []
