@@ -73,7 +73,7 @@ def test_a_killed_launcher_leaves_no_process_behind(start: Start) -> None:
 
 def test_what_a_late_plant_sends_after_the_horizon_is_received(tmp_path: Path) -> None:
     """It is stopped before the horizon and goes on half a second after it."""
-    for attempt in range(3):  # a machine that stalls may let it go on too late
+    for attempt in range(10):  # a machine that stalls may stop it after its end, or go on too late
         (folder := tmp_path / str(attempt)).mkdir()
         with live.begun(folder) as start:
             running = start(*live.AT_RATE, *live.settings(horizon_s=3.0))
@@ -84,12 +84,13 @@ def test_what_a_late_plant_sends_after_the_horizon_is_received(tmp_path: Path) -
             plant.send_signal(signal.SIGCONT)
             finished = running.finish()
         lost = finished.summary["unintended_losses"] + finished.summary["missing_samples"]
-        if not lost and finished.status == 0:
+        steps = load_record(finished.run_dir)["plant_step"]
+        was_late = (steps["now_ns"] - steps["t_ns"]).max() > 1e9
+        if was_late and not lost and finished.status == 0:
             break
+    assert was_late
     assert lost == 0
     assert finished.status == 0
-    steps = load_record(finished.run_dir)["plant_step"]
-    assert (steps["now_ns"] - steps["t_ns"]).max() > 1e9
 
 
 def test_a_taken_port_gives_one_clear_line(tmp_path: Path) -> None:
