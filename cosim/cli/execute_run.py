@@ -10,6 +10,7 @@ from cosim.cli.command import console, print_json
 
 if TYPE_CHECKING:
     from cosim.live.fork_server import ForkServer
+    from cosim.live.remote_access import Listening
     from cosim.record.run_ending import RunEnding
     from noack.config.scenario import Scenario
 
@@ -37,6 +38,7 @@ def run_processes(
     session: str | None = None,
     live: bool = False,
     server: "ForkServer | None" = None,
+    listening: "Listening | None" = None,
 ) -> int:
     """Run a scenario live; print its verdict and return the exit status.
 
@@ -48,6 +50,7 @@ def run_processes(
         session: name that the processes of the run share.
         live: show the run in the viewer.
         server: starts the processes, and ends with the run; by default a new one.
+        listening: how processes on other hosts join.
     """
     from cosim.live.fork_server import fork_server
 
@@ -63,7 +66,7 @@ def run_processes(
             with progress_line(PatientConsole(stderr=True), scenario, session) as watcher:
                 ending = launch(
                     scenario, runs, spawn=spawn or ROLES, session=session, live=live,
-                    watcher=watcher, server=server,
+                    watcher=watcher, server=server, listening=listening,
                 )  # fmt: skip
         except OSError:  # a closed terminal must not end the run
             if ending is None:

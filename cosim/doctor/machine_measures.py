@@ -36,9 +36,10 @@ from noack.core.clock import NS_PER_S
 from noack.core.code_cache import cache_folder
 from noack.core.errors import CallerError, MachineError, NoackError, one_line, why
 from noack.core.python_process import python_command
+from noack.runtime.address import LOOPBACK
 from noack.runtime.control_plane import RUNS
 from noack.runtime.private_folder import open_private
-from noack.runtime.udp_sockets import LOOPBACK, bind
+from noack.runtime.udp_sockets import bind
 from noack.runtime.zenoh_session import answer_to, cause_of, open_session
 
 T = TypeVar("T")

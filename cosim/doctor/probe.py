@@ -8,9 +8,9 @@ from collections.abc import Sequence
 
 from noack.core.clock import NS_PER_S, RunClock
 from noack.protocol.machine_interface import Notice, Record
+from noack.runtime.address import LOOPBACK
 from noack.runtime.real_time_loop import run_loop
 from noack.runtime.real_time_settings import realtime
-from noack.runtime.udp_sockets import LOOPBACK
 
 _WARM_UP = 20
 """Wake-ups before the measurement, to warm up the code."""

@@ -6,7 +6,7 @@ over the address of the one before it, and numbers its messages above all earlie
 
 import time
 from collections.abc import Callable, Collection, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
@@ -34,6 +34,13 @@ _REPORT_GRACE_S = 0.3
 """A process's last message may arrive this much later than its exit is seen."""
 _EXIT_GRACE_S = 5.0
 """By then a process has exited that has reported its end."""
+
+
+class AdmissionPass(NamedTuple):
+    """Which roles a pass admits, and until when on the monotonic clock."""
+
+    roles: Collection[str] = ROLES
+    until_s: float = float("inf")
 
 
 class _Member(LifeCycle):
@@ -81,6 +88,7 @@ class Coordinator:
         self._change_queries = session.declare_queryable(key("runtime_parameters"), FifoChannel(64))
         self._changes = ChangeRequests(ticket, self.plane)
         self._speed = ticket.scenario.speed
+        self.passes = {ticket.admission_pass: AdmissionPass()}
         self._clock: RunClock | None = None
         self._admitted: dict[tuple[str, str], _Member] = {}
         """By role and instance."""
@@ -244,9 +252,11 @@ class Coordinator:
         Raises:
             PeerError: it cannot join.
         """
-        instance = parse_message(AdmissionRequest, _payload(query))["instance"]
+        request = parse_message(AdmissionRequest, _payload(query))
+        instance = request["instance"]
         if role not in ROLES:
             raise PeerError("a run has no such process")
+        self._require_pass(role, request.get("admission_pass", ""))
         before, failure = self._vacant(role), self._replaceable.get(role)
         if self._clock is not None and (before is None or failure is None):
             raise PeerError("the run has started without it")
@@ -256,6 +266,16 @@ class Coordinator:
         member.apply(Event.ADMIT)
         self._admitted[role, instance] = member
         self.plane.answer(query, admission)
+
+    def _require_pass(self, role: str, shown: str) -> None:
+        """Raise PeerError unless a pass admits a role now."""
+        found = self.passes.get(shown)
+        if found is None:
+            raise PeerError("its ticket or invitation is not of this run")
+        if role not in found.roles:
+            raise PeerError(f"its invitation is for the {', '.join(found.roles)} only")
+        if time.monotonic() > found.until_s:
+            raise PeerError("its invitation has expired")
 
     def _join(self, role: str, query: zenoh.Query) -> None:
         """Let a process wait at the start barrier; pass it if the run has started.

@@ -20,6 +20,7 @@ from cosim.live.compilation import compile_for
 from cosim.live.coordinator import Coordinator
 from cosim.live.disk_space import require_disk_space
 from cosim.live.fork_server import ForkServer, fork_server
+from cosim.live.remote_access import Listening, open_to_hosts
 from cosim.live.restart_policy import RestartPolicy
 from cosim.live.start_limit import DEFAULT_S, StartLimit
 from cosim.record.environment import write_environment
@@ -30,6 +31,7 @@ from noack.config.scenario import Scenario
 from noack.core.errors import ExitStatus, NeverStartedError, NoackError
 from noack.protocol.topology import PLANT, RECORDER, ROLES
 from noack.runtime import run_registry
+from noack.runtime.address import Address, text_of
 from noack.runtime.join_ticket import Ticket, new_ticket, published
 from noack.runtime.life_cycle import HORIZON
 from noack.runtime.signals import Signals
@@ -50,6 +52,7 @@ class Watcher:
     """Callbacks of a launched run; each must return at once."""
 
     waiting: Callable[[Sequence[str]], None] = lambda roles: None
+    listening: Callable[[str, Listening], None] = lambda address, how: None
     started: Callable[[Path], None] = lambda run_dir: None
     failed: Callable[[str, float, str | None], None] = lambda why, t_s, by_hand: None
     restarted: Callable[[str, float], None] = lambda role, t_s: None
@@ -65,6 +68,7 @@ def launch(
     live: bool = False,
     watcher: Watcher | None = None,
     server: ForkServer | None = None,
+    listening: Listening | None = None,
 ) -> RunEnding:
     """Run a scenario; :func:`cosim.live.finalize.finalize` completes its record.
 
@@ -76,6 +80,7 @@ def launch(
         live: show the run in a viewer while it runs.
         watcher: callbacks.
         server: starts the processes; by default a new one.
+        listening: how processes on other hosts join.
 
     Raises:
         CallerError, MachineError: the run could not be prepared.
@@ -104,16 +109,36 @@ def launch(
         _publish_run(stack, ticket, session)  # first: its file leads to a killed run's socket
         coordinator = Coordinator(ticket, spawn)
         stack.callback(coordinator.close)
+        watcher = watcher or Watcher()
+        if listening is not None:
+            ticket = ticket.model_copy(update={"host": listening.address[0]})
+            invited = _opened(stack, listening, ticket, coordinator)
+            watcher.listening(text_of(invited), listening)
         if session is not None:
             _publish_session(stack, ticket, session)
         stack.enter_context(children.started(live=live))
-        run = _Run(ticket, run_dir, coordinator, children, watcher or Watcher())
+        run = _Run(ticket, run_dir, coordinator, children, watcher)
         status, reason = run.watch(signals, ending.store)
         if coordinator.epoch_ns is None:
             raise NeverStartedError(f"{reason} (logs in {run_dir / 'logs'})", status)
         startup_s = (coordinator.epoch_ns - began_ns) * 1e-9
         ending.store(status, reason, startup_s)
     return RunEnding(run_dir, ticket.run_id, status, reason, startup_s)
+
+
+def _opened(
+    stack: contextlib.ExitStack, listening: Listening, ticket: Ticket, coordinator: Coordinator
+) -> Address:
+    """Open the run to other hosts; refused, leave no run directory.
+
+    Raises:
+        CallerError: the address cannot be used, or the invitation cannot be written.
+    """
+    try:
+        return stack.enter_context(open_to_hosts(listening, ticket, coordinator))
+    except NoackError:
+        shutil.rmtree(ticket.run_dir, ignore_errors=True)
+        raise
 
 
 def _publish_session(stack: contextlib.ExitStack, ticket: Ticket, session: str) -> None:

@@ -17,6 +17,7 @@ from noack.runtime.join_ticket import DEFAULT_SESSION
 
 if TYPE_CHECKING:
     from cosim.live.launcher import Watcher
+    from cosim.live.remote_access import Listening
 
 _PLAIN_LINES = 10
 """Progress lines of a run on a terminal that cannot redraw a line."""
@@ -40,7 +41,10 @@ def progress_line(
     columns = (BarColumn(bar_width=12), TextColumn("{task.description}"))
     with Progress(*columns, console=console, disable=not live, transient=False) as progress:
         shown = _RunProgress(console, progress, scenario, session)
-        yield Watcher(shown.waiting, shown.started, shown.failed, shown.restarted, shown.update)
+        yield Watcher(
+            shown.waiting, shown.listening, shown.started, shown.failed, shown.restarted,
+            shown.update,
+        )  # fmt: skip
 
 
 class _RunProgress:
@@ -60,6 +64,15 @@ class _RunProgress:
         """Name the processes that the start barrier waits for."""
         if roles:
             self._print(f"waiting for {', '.join(roles)}")
+
+    def listening(self, address: str, how: "Listening") -> None:
+        """Say how processes on other hosts join."""
+        role = how.role or "plant|sensor|netem|controller"
+        self._print(
+            f"listening on {escape(address)} (TCP); {escape(str(how.invitation))} has the secret "
+            f"keys to join for {how.valid_s / 60:g} min: copy it to the other hosts, and there "
+            f"`noack {role} --invitation {escape(how.invitation.name)}`"
+        )
 
     @property
     def _loops(self) -> int | None:

@@ -22,8 +22,8 @@ from netem.engine.relay_sockets import stamp_arrivals
 from netem.rules.settings_change import carry
 from noack.impairments.link_records import Counters, PacketDecision, dtype_of
 from noack.impairments.link_settings import LinkSettings
+from noack.runtime.address import LOOPBACK
 from noack.runtime.native.socket_structs import packed_name
-from noack.runtime.udp_sockets import LOOPBACK
 
 _COMPILING_S = 15.0
 _LONG_AGO_NS = -(2**62)

@@ -7,6 +7,8 @@ from noack.core.errors import CallerError
 
 Address = tuple[str, int]  # numeric host and port
 
+LOOPBACK = "127.0.0.1"
+
 _FORM = re.compile(r"(?:\[(?P<six>[^\[\]]+)\]|(?P<host>[^\[\]:]*)):(?P<port>[0-9]{1,5})")
 
 
@@ -26,7 +28,7 @@ def parse_address(text: str, what: str, like: Address | None = None) -> Address:
             f"found {text!r}{hint}"
         )
     family = socket.AF_INET if like is None else family_of(like)
-    host = found["six"] or found["host"] or ("::1" if family == socket.AF_INET6 else "127.0.0.1")
+    host = found["six"] or found["host"] or ("::1" if family == socket.AF_INET6 else LOOPBACK)
     wanted = socket.AF_INET6 if found["six"] else socket.AF_UNSPEC
     try:
         entries = socket.getaddrinfo(host, int(found["port"]), wanted, socket.SOCK_DGRAM)

@@ -47,6 +47,7 @@ class AdmissionRequest(ControlMessage):
     """A process asks for admission to the run."""
 
     instance: str  # random name of this process
+    admission_pass: str = ""
 
 
 class Admission(ControlMessage):

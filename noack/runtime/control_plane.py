@@ -1,6 +1,7 @@
 """The control plane: start barrier, liveliness, stop, telemetry, all on zenoh.
 
-The coordinator listens on a socket that no other user can reach; all other processes connect to it.
+The coordinator listens on a socket that no other user can reach; all other processes connect to it,
+those on other hosts by TLS.
 Loop data never travels here, and the loop never waits for it.
 """
 
@@ -8,7 +9,7 @@ import json
 import secrets
 import time
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import Any, Self
 
 import zenoh
@@ -27,6 +28,7 @@ from noack.runtime.zenoh_session import (
     first_reply,
     label,
     next_payload,
+    open_remote_session,
     open_session,
 )
 
@@ -58,8 +60,13 @@ class ControlPlane:
         self._prefix = f"noack/{run_name(ticket.run_id)}"
         self.role = role
         self.instance = secrets.token_hex(8)
+        self._resources = ExitStack()
         try:
-            self.session = open_session(RUNS, run_name(ticket.run_id), listen=listen)
+            self.session = (
+                open_session(RUNS, run_name(ticket.run_id), listen=listen)
+                if ticket.remote is None
+                else self._resources.enter_context(open_remote_session(ticket.remote))
+            )
         except zenoh.ZError as error:
             what = "start the control plane" if listen else "reach the run's coordinator"
             raise NoAnswerError(f"cannot {what}: {cause_of(error)}") from None
@@ -92,6 +99,7 @@ class ControlPlane:
         """Close the session; this process's liveliness token vanishes."""
         if not self.session.is_closed():
             self.session.close()  # type: ignore[no-untyped-call]
+        self._resources.close()
 
     def key(self, *parts: str) -> str:
         """Key expression below this run."""

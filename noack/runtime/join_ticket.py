@@ -19,11 +19,23 @@ from noack.config.validation_messages import brief
 from noack.core.errors import CallerError, PeerError
 from noack.impairments.kept_loss import found_probabilities, remember
 from noack.protocol.wire_format import KEY_BYTES
+from noack.runtime.address import LOOPBACK
 from noack.runtime.lock_file import live_lock_file, lock_file
 from noack.runtime.private_folder import private_folder, require_name
 from noack.settings.section import ScenarioSection, Seed
 
 DEFAULT_SESSION = "default"
+
+
+class RemoteAccess(ScenarioSection):
+    """How a process on another host reaches the coordinator: by TLS, with keys made for the run."""
+
+    host: str
+    port: Annotated[int, Field(ge=1, le=65_535)]
+    authority: str  # certificates, and the key of this one, as PEM text
+    certificate: str
+    private_key: str
+    valid_until: str  # for people; the coordinator measures the time itself
 
 
 class Ticket(ScenarioSection):
@@ -35,6 +47,10 @@ class Ticket(ScenarioSection):
     key: Annotated[bytes, Field(min_length=KEY_BYTES, max_length=KEY_BYTES)]
     run_dir: str
     launched: bool  # whether a launcher holds the process's standard input open as its lifeline
+    admission_pass: Annotated[str, Field(pattern="^[0-9a-f]{32}$")]
+    """The coordinator knows which roles it admits, and until when."""
+    host: str = LOOPBACK  # where the sockets of loop data listen
+    remote: RemoteAccess | None = None  # of an invitation
     kept_losses: Annotated[dict[str, FiniteFloat], AfterValidator(remember)] = Field({})
     """Probabilities that the check of the scenario needs."""
     scenario: Scenario  # resolved
@@ -47,9 +63,15 @@ def new_ticket(scenario: Scenario, run_dir: Path, *, launched: bool) -> Ticket:
         key=secrets.token_bytes(KEY_BYTES),
         run_dir=str(run_dir),
         launched=launched,
+        admission_pass=new_admission_pass(),
         kept_losses=found_probabilities(*map(scenario.network.link_of, scenario.network.flows)),
         scenario=scenario,
     )
+
+
+def new_admission_pass() -> str:
+    """Return a random pass."""
+    return secrets.token_hex(16)
 
 
 def loads(text: str) -> Ticket:

@@ -7,17 +7,20 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from pathlib import Path
 
 from setproctitle import setproctitle
 
 from noack.core.errors import ExitStatus, NoackError, NoAnswerError
 from noack.runtime.command_line import TICKET_ON_STDIN, Parser, failed
 from noack.runtime.control_plane import ControlPlane
+from noack.runtime.invitation import read_invitation
 from noack.runtime.join_ticket import DEFAULT_SESSION, Ticket, loads, wait_for_ticket
 from noack.runtime.life_cycle import HORIZON, Event
 from noack.runtime.process_life import RunProcess, lifeline_cut
 from noack.runtime.signals import Signals
 
+_RUNS = Path("runs")
 _TICKET_TIMEOUT_S = 24 * 3600.0  # a person may start the recorder late; Ctrl-C ends the wait
 
 
@@ -26,16 +29,24 @@ def run_process(
     body: Callable[[RunProcess], None],
     session: str = DEFAULT_SESSION,
     *,
+    invitation: Path | None = None,
+    runs: Path = _RUNS,
     as_json: bool = False,
 ) -> ExitStatus:
     """Join a run as ``role``, run ``body``, and return the exit status.
 
-    A caller's or a peer's error becomes one line on standard error, without a traceback; with
-    ``as_json`` also a document on standard output.
+    The run is that of an invitation, or else of a session on this host. A process that was invited
+    keeps below ``runs`` what it cannot send to the recorder. A caller's or a peer's error becomes
+    one line on standard error, without a traceback; with ``as_json`` also a document on standard
+    output.
     """
     with Signals().handled() as signals:
         try:
-            ticket = _ticket(role, session, signals)
+            ticket = (
+                _ticket(role, session, signals)
+                if invitation is None
+                else read_invitation(invitation, runs)
+            )
             if ticket.launched:
                 setproctitle(f"noack {role}")  # in lists of processes
             process = _admitted(role, ticket, signals)
@@ -63,7 +74,15 @@ def run_process(
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that all processes have."""
-    parser.add_argument("--session", default=DEFAULT_SESSION, help="name of the recorder's session")
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--session", default=DEFAULT_SESSION, help="name of the recorder's session")
+    where.add_argument(
+        "--invitation", type=Path, metavar="FILE", help="from `noack record --listen`"
+    )
+    parser.add_argument(
+        "--runs", type=Path, default=_RUNS, metavar="DIRECTORY",
+        help="of an invited process: where rows stay that cannot be sent to the recorder",
+    )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print the final report as JSON")
 
 
@@ -94,7 +113,10 @@ def join_run(
         if options.json:
             print(json.dumps(process.report, indent=2))
 
-    return run_process(role, body_and_report, options.session, as_json=options.json)
+    return run_process(
+        role, body_and_report, options.session,
+        invitation=options.invitation, runs=options.runs, as_json=options.json,
+    )  # fmt: skip
 
 
 def _ticket(role: str, session: str, signals: Signals) -> Ticket:

@@ -99,7 +99,8 @@ class RunProcess:
 
         Raise NoAnswerError without an answer within ten seconds, PeerError if it refuses.
         """
-        admission = self._request("admit", {}, Admission, _ADMISSION_TIMEOUT_S)
+        shown = {"admission_pass": self.ticket.admission_pass}
+        admission = self._request("admit", shown, Admission, _ADMISSION_TIMEOUT_S)
         self.life.apply(Event.ADMIT)
         self.start = Start(admission["generation"], admission["from_ns"])
         if self.start.is_restart:
@@ -153,13 +154,13 @@ class RunProcess:
         port = port if self._address is None else self._address[1]
         place = LOOP_ROLES.index(self.role) if settings.pin_cores else None
         with (
-            closing(bind(port, f"ports.{self.role}")) as endpoint,
+            closing(bind(port, f"ports.{self.role}", self.ticket.host)) as endpoint,
             # Before the barrier: locking memory may take a tenth of a second.
             realtime(settings.enabled, settings.fifo_priority, place) as applied,
         ):
             if self.scenario.loops is not None:
                 enlarge_buffer(endpoint, FLEET_BUFFER_BYTES)  # it may be late to the start
-            channel = open_channel(endpoint, self.join(endpoint.getsockname()))
+            channel = open_channel(endpoint, self.join(endpoint.getsockname()[:2]))
             telemetry = self._telemetry()
             if self.replaces is not None:
                 text = f"restarted: {self.replaces}"

@@ -1,4 +1,4 @@
-"""UDP sockets: bound to loopback, with large kernel buffers, never blocking."""
+"""UDP sockets: bound to one address, with large kernel buffers, never blocking."""
 
 import errno
 import select
@@ -14,10 +14,8 @@ from noack.core.errors import CallerError
 from noack.protocol.fleet import FleetDecoder
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.wire_format import MAX_DATAGRAM_BYTES, Decoder, Encoder, Flow, Message, flow_of
-from noack.runtime.address import Address, text_of
+from noack.runtime.address import LOOPBACK, Address, family_of, text_of
 from noack.runtime.peer_sockets import FloodWatch, SourceCount, enlarge_buffer, open_beside
-
-LOOPBACK = "127.0.0.1"
 
 _UNKNOWN_BYTES = 128 * 1024
 """Receive buffer for datagrams from unknown sources; the kernel doubles it. It holds about 300
@@ -37,14 +35,14 @@ MAX_UDP_BYTES = 65_535
 T = TypeVar("T")
 
 
-def bind(port: int, key: str) -> socket.socket:
-    """Return a non-blocking UDP socket on loopback, bound to a port (0: any free one).
+def bind(port: int, key: str, host: str = LOOPBACK) -> socket.socket:
+    """Return a non-blocking UDP socket, bound to an address and a port (0: any free one).
 
     Raise CallerError, which names the setting ``key``, if the port is taken or not permitted.
     """
-    endpoint = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    endpoint = socket.socket(family_of((host, port)), socket.SOCK_DGRAM)
     try:
-        endpoint.bind((LOOPBACK, port))
+        endpoint.bind((host, port))
     except OSError as error:
         endpoint.close()
         reason = {
@@ -52,7 +50,7 @@ def bind(port: int, key: str) -> socket.socket:
             errno.EACCES: "needs privileges that this user does not have",
         }.get(error.errno or 0, f"cannot be bound ({error.strerror})")
         raise CallerError(
-            f"UDP port {LOOPBACK}:{port} {reason}; set {key} to another port, or to 0 for any"
+            f"UDP port {text_of((host, port))} {reason}; set {key} to another port, or to 0 for any"
         ) from None
     endpoint.setblocking(False)
     enlarge_buffer(endpoint)
@@ -139,7 +137,8 @@ class CountingSocket(ABC, Generic[T]):
         for _ in range(_READ_AT_ONCE):
             try:
                 if peer is None:
-                    data, source = endpoint.recvfrom(self.most_bytes)
+                    data, (host, port, *_) = endpoint.recvfrom(self.most_bytes)
+                    source = host, port
                 else:  # takes half the time
                     data, source = endpoint.recv(self.most_bytes), peer
             except OSError:  # empty, or an ICMP error of an earlier send
@@ -210,9 +209,9 @@ class CountingSocket(ABC, Generic[T]):
             return
         with suppress(OSError):
             for _ in range(_UNKNOWN_READ_AT_END):
-                data, source = self._endpoint.recvfrom(self.most_bytes)
-                self._sources.add(source)
-                self.judge(data, source)
+                data, (host, port, *_) = self._endpoint.recvfrom(self.most_bytes)
+                self._sources.add((host, port))
+                self.judge(data, (host, port))
 
 
 class MessageSocket(CountingSocket[Message]):

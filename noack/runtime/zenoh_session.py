@@ -1,13 +1,19 @@
 """zenoh sessions over Unix sockets: one process listens, the others connect.
 
 A socket is in the user's runtime directory, which is closed to other users: nobody else can connect
-to it, or listen in its place.
+to it, or listen in its place. From another host, a session connects by TLS to
+:mod:`cosim.live.remote_access`, which forwards to such a socket. Both ends have certificates of the
+run.
 """
 
+import asyncio
+import base64
 import json
 import os
+import socket
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +21,9 @@ import zenoh
 from zenoh.handlers import FifoChannel
 
 from noack.core.errors import CallerError
+from noack.runtime.address import LOOPBACK, Address, family_of, text_of
+from noack.runtime.connection_forwarder import forwarding
+from noack.runtime.join_ticket import RemoteAccess
 from noack.runtime.private_folder import open_private
 
 LEASE_MS = 6000
@@ -36,16 +45,51 @@ def open_session(kind: str, name: str, *, listen: bool) -> zenoh.Session:
     return zenoh.open(session_config(endpoint_of(kind, name), listen=listen))
 
 
-def endpoint_of(kind: str, name: str) -> str:
-    """Return the zenoh endpoint of a socket, in the words of this process.
+@contextmanager
+def open_remote_session(remote: RemoteAccess) -> Iterator[zenoh.Session]:
+    """Give a session with a coordinator on another host; raise zenoh.ZError if that fails.
 
-    The path of a socket has at most 107 bytes, so it goes through an open descriptor.
+    zenoh's TLS does not accept an IPv6 address. The connection with one begins at a forwarder on
+    loopback; its two ends of TLS are the same.
+    """
+
+    def encoded(pem: str) -> str:
+        return base64.b64encode(pem.encode()).decode()
+
+    tls = {
+        "root_ca_certificate_base64": encoded(remote.authority),
+        "connect_certificate_base64": encoded(remote.certificate),
+        "connect_private_key_base64": encoded(remote.private_key),
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+    }
+    address: Address = remote.host, remote.port
+    with ExitStack() as stack:
+        if family_of(address) == socket.AF_INET6:
+            listening = stack.enter_context(socket.create_server((LOOPBACK, 0)))
+            stack.enter_context(forwarding(listening, lambda: asyncio.open_connection(*address)))
+            endpoint = f"tls/{text_of(listening.getsockname())}"
+        else:
+            endpoint = f"tls/{text_of(address)}"
+        more = {"transport/link/tls": tls}
+        yield zenoh.open(session_config(endpoint, listen=False, more=more))
+
+
+def endpoint_of(kind: str, name: str) -> str:
+    """Return the zenoh endpoint of a socket, in the words of this process."""
+    return f"unixsock-stream/{socket_path(kind, name)}"
+
+
+def socket_path(kind: str, name: str) -> str:
+    """Return the path of a socket, in the words of this process.
+
+    It may have at most 107 bytes, so it goes through an open descriptor.
     """
     with open_private(kind, create=True) as folder:
         known = _FOLDERS.get(folder.path)
         if known is None or not os.path.samestat(os.fstat(known), os.fstat(folder.descriptor)):
             known = _FOLDERS[folder.path] = os.dup(folder.descriptor)
-    return f"unixsock-stream//proc/self/fd/{known}/{name}.sock"
+    return f"/proc/self/fd/{known}/{name}.sock"
 
 
 def session_config(

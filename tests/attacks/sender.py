@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from noack.runtime.udp_sockets import LOOPBACK
+from noack.runtime.address import LOOPBACK
 from tests.attacks.kinds import FROM_ANYWHERE, FROM_THE_PEER, Expected, Target
 
 STRANGER, PEER = "stranger", "forged address"

@@ -1,21 +1,46 @@
 """``noack record``, ``plant``, ``sensor``, ``controller``, ``netem``: one terminal per process."""
 
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
 import typer
 
 from cosim.cli import command as cli
 from cosim.cli.execute_run import RunOutput, run_processes
+
+InvitationOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--invitation",
+        metavar="FILE",
+        help="Join a run on another host, by the file that `noack record --listen` wrote.",
+    ),
+]
+
+
+class Invited(StrEnum):
+    """Whom an invitation is for."""
+
+    ALL = "all"
+    PLANT = "plant"
+    SENSOR = "sensor"
+    NETEM = "netem"
+    CONTROLLER = "controller"
 
 
 def _examples(role: str) -> list[tuple[str, str]]:
     return [
         (f"noack {role}", "join the run that `noack record` has opened"),
         (f"noack {role} --session two --json", "in another session; print its report as JSON"),
+        (f"noack {role} --invitation invitation.json", "on another host"),
     ]
 
 
 @cli.command(cli.PROCESSES, 10, [
     ("noack record lane_following", "then start the other four, in any order"),
     ("noack record lane_following --session two --live", "beside another run"),
+    ("noack record lane_following --listen 192.0.2.1", "for processes on other hosts, too"),
 ])  # fmt: skip
 def record(
     context: typer.Context,
@@ -25,42 +50,84 @@ def record(
     session: cli.SessionOption = "default",
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
     live: cli.LiveOption = False,
+    listen: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS[:PORT]",
+            help="Let processes on other hosts join, at this address of this host.",
+        ),
+    ] = None,
+    invitation: Annotated[
+        Path, typer.Option(metavar="FILE", help="With --listen: where the invitation is written.")
+    ] = Path("invitation.json"),
+    invite: Annotated[
+        Invited, typer.Option(help="With --listen: which process the invitation is for.")
+    ] = Invited.ALL,
+    valid_minutes: Annotated[
+        float,
+        typer.Option(min=0.01, max=525_600, help="With --listen: how long one can join by it."),
+    ] = 60.0,
     report: cli.ReportOption = True,
     verbose: cli.VerboseOption = False,
     json: cli.JsonOption = False,
 ) -> int:
-    """Open a run and record it; the other four processes join from other terminals."""
+    """Open a run and record it; the other four processes join from other terminals or hosts."""
     from noack.protocol.topology import RECORDER
 
-    output = RunOutput(report, verbose, json)
+    output, listening = RunOutput(report, verbose, json), None
+    if listen is not None:
+        from cosim.live.remote_access import Listening, listen_address
+
+        role = None if invite is Invited.ALL else invite.value
+        address = listen_address(listen)
+        listening = Listening(address, invitation, role, 60 * valid_minutes)
     return run_processes(
         lambda: cli.load_scenario(scenario, settings), runs, output,
         spawn=(RECORDER,), session=session, live=live, server=context.obj,
+        listening=listening,
     )  # fmt: skip
 
 
 @cli.command(cli.PROCESSES, 20, _examples("plant"))
-def plant(*, session: cli.SessionOption = "default", json: cli.JsonOption = False) -> int:
+def plant(
+    *,
+    session: cli.SessionOption = "default",
+    invitation: InvitationOption = None,
+    runs: cli.RunsOption = cli.DEFAULT_RUNS,
+    json: cli.JsonOption = False,
+) -> int:
     """Join the open run as the plant: integrates the state, sends measurements."""
     from plant_server.__main__ import main
 
-    return main(_process_arguments(session, json=json))
+    return main(_process_arguments(session, invitation, runs, json=json))
 
 
 @cli.command(cli.PROCESSES, 30, _examples("sensor"))
-def sensor(*, session: cli.SessionOption = "default", json: cli.JsonOption = False) -> int:
+def sensor(
+    *,
+    session: cli.SessionOption = "default",
+    invitation: InvitationOption = None,
+    runs: cli.RunsOption = cli.DEFAULT_RUNS,
+    json: cli.JsonOption = False,
+) -> int:
     """Join the open run as the sensor: runs x_s and the trigger, sends updates."""
     from sensor_node.__main__ import main
 
-    return main(_process_arguments(session, json=json))
+    return main(_process_arguments(session, invitation, runs, json=json))
 
 
 @cli.command(cli.PROCESSES, 40, _examples("controller"))
-def controller(*, session: cli.SessionOption = "default", json: cli.JsonOption = False) -> int:
+def controller(
+    *,
+    session: cli.SessionOption = "default",
+    invitation: InvitationOption = None,
+    runs: cli.RunsOption = cli.DEFAULT_RUNS,
+    json: cli.JsonOption = False,
+) -> int:
     """Join the open run as the controller: runs x_c, sends u = K x_c."""
     from controller_node.__main__ import main
 
-    return main(_process_arguments(session, json=json))
+    return main(_process_arguments(session, invitation, runs, json=json))
 
 
 @cli.command(
@@ -75,5 +142,9 @@ def netem(context: typer.Context) -> int:
     return main(context.args)
 
 
-def _process_arguments(session: str, *, json: bool) -> list[str]:
-    return ["--session", session, *(["--json"] if json else [])]
+def _process_arguments(
+    session: str, invitation: Path | None, runs: Path, *, json: bool
+) -> list[str]:
+    invited = [] if invitation is None else ["--invitation", str(invitation)]
+    chosen = [] if session == "default" and invited else ["--session", session]
+    return [*chosen, *invited, "--runs", str(runs), *(["--json"] if json else [])]

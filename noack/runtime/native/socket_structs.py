@@ -24,12 +24,12 @@ SocketName = tuple[Any, ...]
 
 def packed_name(name: SocketName) -> tuple[bytes, int]:
     """Return a name as the kernel's struct sockaddr, padded to NAME_BYTES, and its length."""
-    host, port = name[:2]
-    if len(name) == 2:
+    host, port, flow, scope = (*name, 0, 0)[:4]
+    if ":" not in host:
         packed = struct.pack("=H", socket.AF_INET) + struct.pack("!H", port)
         packed += socket.inet_pton(socket.AF_INET, host) + bytes(8)
     else:
-        packed = struct.pack("=H", socket.AF_INET6) + struct.pack("!HI", port, name[2])
+        packed = struct.pack("=H", socket.AF_INET6) + struct.pack("!HI", port, flow)
         packed += socket.inet_pton(socket.AF_INET6, host.partition("%")[0])
-        packed += struct.pack("=I", name[3])
+        packed += struct.pack("=I", scope)
     return packed.ljust(NAME_BYTES, b"\0"), len(packed)

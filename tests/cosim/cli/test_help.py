@@ -154,6 +154,8 @@ def test_every_command_has_a_json_option(command: str) -> None:
 
 OF_THEIR_OWN = {
     "--draws": "at each grid point, in all, to choose by",
+    "--invitation": "the file to write, or to join by",
+    "--listen": "where probes arrive, or where processes of other hosts join",
     "--out": "a folder of results, or a scenario file",
     "--runs": "where they are made, or the last one is looked for",
 }

@@ -42,7 +42,8 @@ def test_an_invalid_request_is_refused_and_the_others_join(
             assert bad.error.startswith("cannot join: ")
     for number, role in enumerate((*LOOP_ROLES, RECORDER)):
         address = None if role == RECORDER else ["127.0.0.1", 1 + number]
-        request = json.dumps({"pid": 1, "instance": role, "address": address}).encode()
+        hello = {"instance": role, "address": address, "admission_pass": ticket.admission_pass}
+        request = json.dumps(hello).encode()
         for question in ("admit", "join"):
             plane.put(question, Query(f"noack/0/{question}/{role}", request))
             barrier.poll()

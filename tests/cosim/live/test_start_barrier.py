@@ -7,7 +7,7 @@ import pytest
 import zenoh
 
 from cosim.live import coordinator
-from cosim.live.coordinator import Coordinator
+from cosim.live.coordinator import AdmissionPass, Coordinator
 from noack.protocol.topology import RECORDER, ROLES
 from tests.fuzz.parsers.ticket import _TICKET
 from tests.fuzz.plane import FakePlane, Query, Sample
@@ -31,9 +31,10 @@ def ask(
     what: str,
     instance: str = "one",
     role: str = "sensor",
+    shown: str = _TICKET.admission_pass,
 ) -> Query:
     address = None if role == RECORDER else ["127.0.0.1", 5]
-    hello: dict[str, Any] = {"pid": 1, "instance": instance, "address": address}
+    hello: dict[str, Any] = {"instance": instance, "address": address, "admission_pass": shown}
     plane.put(what, query := Query(f"noack/0/{what}/{role}", json.dumps(hello).encode()))
     barrier.poll()
     return query
@@ -111,3 +112,25 @@ def test_a_running_process_is_lost_only_if_its_connection_does_not_come_back(
     lose(plane, barrier)
     assert barrier.failures() == {"sensor": "sensor stopped responding"}
     assert ask(plane, barrier, "admit", "two").error is None
+
+
+@pytest.mark.parametrize(
+    ("known", "shown", "role", "reason"),
+    [
+        (AdmissionPass(), "ab" * 16, "sensor", None),
+        (AdmissionPass(), "", "sensor", "its ticket or invitation is not of this run"),
+        (AdmissionPass(), "cd" * 16, "sensor", "its ticket or invitation is not of this run"),
+        (AdmissionPass(["plant"]), "ab" * 16, "plant", None),
+        (AdmissionPass(["plant"]), "ab" * 16, "sensor", "its invitation is for the plant only"),
+        (AdmissionPass(until_s=-1.0), "ab" * 16, "sensor", "its invitation has expired"),
+    ],
+)
+def test_a_pass_admits_its_roles_until_it_expires(
+    plane: FakePlane, barrier: Coordinator, known: AdmissionPass, shown: str, role: str,
+    reason: str | None,
+) -> None:  # fmt: skip
+    barrier.passes["ab" * 16] = known
+    asked = ask(plane, barrier, "admit", role=role, shown=shown)
+    assert asked.error == (None if reason is None else f"cannot join: {reason}")
+    joined = ask(plane, barrier, "join", role=role)
+    assert joined.error == (None if reason is None else "cannot join: it was not admitted")

@@ -12,7 +12,8 @@ from tests.fuzz.parsers.ticket import _TICKET
 from tests.fuzz.plane import FakePlane, Query, Sample
 from tests.fuzz.tables import damaged
 
-HELLO = {"pid": 1, "instance": "one", "address": ["127.0.0.1", 47001]}
+PASS = _TICKET.admission_pass
+HELLO = {"pid": 1, "instance": "one", "address": ["127.0.0.1", 47001], "admission_pass": PASS}
 PROGRESS = {"t_s": 0.0, "events": 0, "deliveries": 0, "longest_loss_burst": 0, "x_norm": None}
 KNOWN = Vocabulary((*HELLO, *PROGRESS), ("127.0.0.1", "", *ROLES))
 

@@ -12,6 +12,7 @@ import pytest
 from noack.protocol.machine_interface import Notice
 from noack.protocol.wire_format import Decoder, Encoder, Flow, Message, Rejection
 from noack.runtime import udp_sockets
+from noack.runtime.address import LOOPBACK
 from noack.runtime.peer_sockets import (
     IN_A_FLOOD,
     IN_AN_INTERVAL,
@@ -19,7 +20,7 @@ from noack.runtime.peer_sockets import (
     SourceCount,
     open_beside,
 )
-from noack.runtime.udp_sockets import LOOPBACK, SHED, MessageSocket, bind
+from noack.runtime.udp_sockets import SHED, MessageSocket, bind
 
 RUN_ID, KEY = 7, bytes(range(32))
 

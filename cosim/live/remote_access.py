@@ -1,0 +1,103 @@
+"""Opens a run to other hosts: TLS listener, invitation, and answers to questions about the time."""
+
+import asyncio
+import datetime
+import ipaddress
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from cosim.live.coordinator import AdmissionPass, Coordinator
+from noack.core.errors import CallerError, why
+from noack.protocol.topology import LOOP_ROLES
+from noack.runtime.address import Address, family_of, parse_address, text_of
+from noack.runtime.connection_forwarder import forwarding
+from noack.runtime.control_plane import RUNS, run_name
+from noack.runtime.invitation import write_invitation
+from noack.runtime.join_ticket import RemoteAccess, Ticket, new_admission_pass
+from noack.runtime.zenoh_session import socket_path
+
+_BACKLOG = 512
+
+
+class Listening(NamedTuple):
+    """Where a run listens, and whom it invites."""
+
+    address: Address
+    invitation: Path
+    role: str | None
+    """The one role that the invitation is for; None for all."""
+    valid_s: float
+
+
+def listen_address(text: str) -> Address:
+    """Parse an address of this host: ``192.0.2.1``, ``192.0.2.1:7000``, ``2001:db8::1``.
+
+    Raises:
+        CallerError: it is not an address at which others can reach this host.
+    """
+    try:
+        ipaddress.ip_address(text.strip("[]"))
+        text = f"[{text.strip('[]')}]:0" if ":" in text else f"{text}:0"
+    except ValueError:
+        pass
+    host, port = parse_address(text, "--listen")
+    found = ipaddress.ip_address(host.partition("%")[0])
+    if found.is_unspecified or found.is_multicast or found.is_link_local:
+        raise CallerError(
+            f"--listen: {host} is not an address at which other hosts can reach this one; "
+            "give one of `ip address`"
+        )
+    return host, port
+
+
+def _listen(address: Address) -> socket.socket:
+    endpoint = socket.socket(family_of(address), socket.SOCK_STREAM)
+    endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        endpoint.bind(address)
+        endpoint.listen(_BACKLOG)
+    except OSError as error:
+        endpoint.close()
+        raise CallerError(f"cannot listen on {text_of(address)}: {why(error)}") from None
+    return endpoint
+
+
+@contextmanager
+def open_to_hosts(
+    listening: Listening, ticket: Ticket, coordinator: Coordinator
+) -> Iterator[Address]:
+    """Listen for processes of other hosts meanwhile, and write their invitation.
+
+    Gives the address, with its port.
+
+    Raises:
+        CallerError: the address cannot be used, or the invitation cannot be written.
+    """
+    from cosim.live.tls_keys import coordinator_context, new_tls_keys
+
+    keys, path = new_tls_keys(listening.address[0]), socket_path(RUNS, run_name(ticket.run_id))
+    with ExitStack() as stack:
+        endpoint = stack.enter_context(_listen(listening.address))
+        host, port = endpoint.getsockname()[:2]
+        stack.enter_context(
+            forwarding(
+                endpoint, lambda: asyncio.open_unix_connection(path), coordinator_context(keys)
+            )
+        )
+        until = datetime.datetime.now().astimezone() + datetime.timedelta(seconds=listening.valid_s)
+        remote = RemoteAccess(
+            host=host, port=port, authority=keys.authority,
+            certificate=keys.joining.certificate, private_key=keys.joining.private_key,
+            valid_until=until.isoformat(timespec="seconds"),
+        )  # fmt: skip
+        shown = new_admission_pass()
+        roles = LOOP_ROLES if listening.role is None else (listening.role,)
+        coordinator.passes[shown] = AdmissionPass(roles, time.monotonic() + listening.valid_s)
+        invited = {"launched": False, "admission_pass": shown, "remote": remote}
+        write_invitation(listening.invitation, ticket.model_copy(update=invited))
+        stack.callback(listening.invitation.unlink, missing_ok=True)
+        yield host, port

@@ -1,0 +1,154 @@
+"""Runs across hosts: two network namespaces with a link between them."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+
+from benchmarks._report import MeasurementError
+from benchmarks._two_hosts import TwoHosts, two_hosts
+from cosim.record.run_record import load_record
+from noack.protocol.topology import LOOP_ROLES
+from tests.integration import conftest as live
+
+Start = Callable[..., subprocess.Popen[str]]
+INVITED = ("--invitation", "invitation.json")
+
+
+@pytest.fixture(scope="module")
+def hosts() -> Iterator[TwoHosts]:
+    if sys.platform != "linux" or os.geteuid() != 0:
+        pytest.skip("only root can make network namespaces")
+    try:
+        with two_hosts() as made:
+            yield made
+    except MeasurementError as error:
+        pytest.skip(f"no network namespaces here: {error}")
+
+
+@pytest.fixture
+def start(hosts: TwoHosts, tmp_path: Path) -> Iterator[Start]:
+    """Start a command of noack on a host, with a runtime directory of the host's own."""
+    with ExitStack() as stack:
+
+        def begin(host: int, *arguments: str) -> subprocess.Popen[str]:
+            runtime = tmp_path / f"host {host}"
+            runtime.mkdir(exist_ok=True)
+            command = hosts.inside(host, *live.noack_command(*arguments))
+            environment = os.environ | {"XDG_RUNTIME_DIR": str(runtime)}
+            return stack.enter_context(_started(command, tmp_path, environment))
+
+        yield begin
+
+
+@contextmanager
+def _started(
+    command: list[str], folder: Path, environment: Mapping[str, str]
+) -> Iterator[subprocess.Popen[str]]:
+    process = subprocess.Popen(
+        command, cwd=folder, env=environment, text=True, stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+def record(start: Start, folder: Path, host: str, *more: str) -> subprocess.Popen[str]:
+    """Open a run on the first host; return when it can be joined."""
+    scenario = live.settings(horizon_s=4.0)
+    process = start(
+        0, "record", "lane_following", "--listen", host, "--json", *live.BARE, *live.AT_RATE,
+        *scenario, *more,
+    )  # fmt: skip
+    invitation = folder / "invitation.json"
+    live.wait_for(lambda: invitation.exists() or process.poll() is not None)
+    assert process.poll() is None, process.communicate()
+    return process
+
+
+def ended(process: subprocess.Popen[str]) -> tuple[str, str]:
+    return process.communicate(timeout=live.PATIENCE_S)
+
+
+@pytest.mark.parametrize("ip", [4, 6])
+def test_two_hosts_carry_a_run(start: Start, hosts: TwoHosts, tmp_path: Path, ip: int) -> None:
+    own, other = (addresses[ip == 6] for addresses in hosts.addresses)
+    recording = record(start, tmp_path, own)
+    at_home = [start(0, role, "--json") for role in ("plant", "sensor")]
+    away = [start(1, role, "--json", *INVITED) for role in ("netem", "controller")]
+    for process in (*at_home, *away):
+        stdout, stderr = ended(process)
+        assert process.returncode == 0, stderr
+        expected = own if process in at_home else other
+        assert json.loads(stdout)["channel"]["local"].rpartition(":")[0].strip("[]") == expected
+    stdout, stderr = ended(recording)
+    assert recording.returncode == 0, stderr
+    summary = json.loads(stdout)
+    assert summary["missing_samples"] == summary["unintended_losses"] == 0
+    assert summary["replay"]["bit_exact"]
+    tables = load_record((tmp_path / "runs" / "latest").resolve())
+    assert len(tables["plant_step"]) == 4 * live.RATE_HZ + 1
+    assert not (tmp_path / "invitation.json").exists()
+
+
+def test_an_invitation_is_for_its_role_and_its_time(start: Start, tmp_path: Path) -> None:
+    record(start, tmp_path, "10.83.3.1", "--invite", "plant", "--valid-minutes", "0.01")
+    wrong = start(1, "sensor", *INVITED)
+    assert ended(wrong)[1].splitlines() == [
+        "noack sensor: cannot join: its invitation is for the plant only"
+    ]
+    time.sleep(0.6)
+    assert ended(start(1, "plant", *INVITED))[1].splitlines() == [
+        "noack plant: cannot join: its invitation has expired"
+    ]
+
+
+def test_without_an_invitation_nothing_is_reached(start: Start, tmp_path: Path) -> None:
+    """An invitation of another run has other keys, also for the same address."""
+    record(start, tmp_path, "10.83.3.1")
+    known = json.loads((tmp_path / "invitation.json").read_text())
+    other = record(start, tmp_path, "10.83.3.1", "--invitation", "other.json", "--session", "two")
+    live.wait_for((tmp_path / "other.json").exists)
+    foreign = json.loads((tmp_path / "other.json").read_text())
+    foreign["remote"] |= {key: known["remote"][key] for key in ("host", "port")}
+    (tmp_path / "other.json").write_text(json.dumps(foreign))
+    joining = start(1, "plant", "--invitation", "other.json")
+    _, stderr = ended(joining)
+    assert joining.returncode == 1
+    assert stderr.startswith("noack plant: cannot reach the run's coordinator: ")
+    assert other.poll() is None
+
+
+@pytest.mark.parametrize(
+    ("address", "reason"),
+    [
+        ("0.0.0.0", "--listen: 0.0.0.0 is not an address at which other hosts can reach this one"),
+        ("10.83.3.77", "cannot listen on 10.83.3.77:0: Cannot assign requested address"),
+        ("nonsense:port", "--listen: expected HOST:PORT"),
+    ],
+)
+def test_an_unfit_address_gives_one_line(start: Start, address: str, reason: str) -> None:
+    process = start(0, "record", "lane_following", "--listen", address, *live.BARE)
+    _, stderr = ended(process)
+    assert process.returncode == 2
+    assert stderr.startswith(f"noack: {reason}")
+    assert len(stderr.splitlines()) == 1
+
+
+def test_all_roles_of_the_loop_can_be_invited(start: Start, tmp_path: Path) -> None:
+    recording = record(start, tmp_path, "10.83.3.1")
+    for process in [start(1, role, *INVITED) for role in LOOP_ROLES]:
+        _, stderr = ended(process)
+        assert process.returncode == 0, stderr
+    assert ended(recording)
+    assert recording.returncode == 0

@@ -1,0 +1,83 @@
+"""Invitations: who can read them, and what this host makes of them."""
+
+import stat
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from noack.core.errors import CallerError, PeerError
+from noack.runtime.invitation import own_host, read_invitation, write_invitation
+from noack.runtime.join_ticket import RemoteAccess, Ticket
+from tests.fuzz.parsers.ticket import _TICKET
+
+REMOTE = RemoteAccess(
+    host="127.0.0.1", port=7000, authority="A", certificate="C", private_key="K",
+    valid_until="2030-01-01T00:00:00+00:00",
+)  # fmt: skip
+INVITED: Ticket = _TICKET.model_copy(update={"remote": REMOTE, "run_dir": "/elsewhere/runs/one"})
+
+
+def test_an_invitation_is_for_its_owner_only_and_is_read_again(tmp_path: Path) -> None:
+    path = tmp_path / "invitation.json"
+    path.write_text("an older one")
+    path.chmod(0o644)
+    write_invitation(path, INVITED)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    found = read_invitation(path, tmp_path / "kept")
+    expected = {"run_dir": str(tmp_path / "kept" / "one"), "host": "127.0.0.1"}
+    assert found == INVITED.model_copy(update=expected)
+    assert [one.name for one in tmp_path.iterdir()] == ["invitation.json"]
+
+
+def _absent(path: Path) -> None:
+    path.unlink()
+
+
+def _open_to_others(path: Path) -> None:
+    path.chmod(0o640)
+
+
+def _cut(path: Path) -> None:
+    path.write_text(path.read_text()[:100])
+
+
+def _no_text(path: Path) -> None:
+    path.write_bytes(b"\xff\xfe")
+
+
+def _of_this_host(path: Path) -> None:
+    path.write_text(_TICKET.model_dump_json())
+
+
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (_absent, "cannot be read: No such file or directory"),
+        (_open_to_others, "other users can read or change it; make it yours alone: chmod 600 "),
+        (_cut, "not an invitation: not a valid ticket: "),
+        (_no_text, "cannot be read: it is no text"),
+        (_of_this_host, "not an invitation, but a ticket for this host"),
+    ],
+)
+def test_a_spoiled_invitation_is_refused_in_one_line(
+    tmp_path: Path, spoil: Callable[[Path], None], reason: str
+) -> None:
+    path = tmp_path / "invitation.json"
+    write_invitation(path, INVITED)
+    spoil(path)
+    with pytest.raises(CallerError, match=reason) as caught:
+        read_invitation(path, tmp_path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_an_invitation_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    with pytest.raises(CallerError, match="the invitation cannot be written"):
+        write_invitation(tmp_path / "no_folder" / "invitation.json", INVITED)
+
+
+def test_the_own_address_is_that_of_the_route() -> None:
+    assert own_host(("127.0.0.1", 9)) == "127.0.0.1"
+    with pytest.raises(PeerError, match=r"cannot reach 255\.255\.255\.255:9"):
+        own_host(("255.255.255.255", 9))
