@@ -20,6 +20,8 @@ from noack.core.errors import CallerError, PeerError
 from noack.impairments.kept_loss import found_probabilities, remember
 from noack.protocol.wire_format import KEY_BYTES
 from noack.runtime.address import LOOPBACK
+from noack.runtime.control_messages import SocketAddress
+from noack.runtime.host_clock import clock_identity
 from noack.runtime.lock_file import live_lock_file, lock_file
 from noack.runtime.private_folder import private_folder, require_name
 from noack.settings.section import ScenarioSection, Seed
@@ -51,6 +53,10 @@ class Ticket(ScenarioSection):
     """The coordinator knows which roles it admits, and until when."""
     host: str = LOOPBACK  # where the sockets of loop data listen
     remote: RemoteAccess | None = None  # of an invitation
+    clock: str
+    """The coordinator's monotonic clock, of which the run's epoch is a reading."""
+    time_reference: SocketAddress | None = None
+    """Where processes with another clock compare it with the coordinator's, under the run's key."""
     kept_losses: Annotated[dict[str, FiniteFloat], AfterValidator(remember)] = Field({})
     """Probabilities that the check of the scenario needs."""
     scenario: Scenario  # resolved
@@ -64,6 +70,7 @@ def new_ticket(scenario: Scenario, run_dir: Path, *, launched: bool) -> Ticket:
         run_dir=str(run_dir),
         launched=launched,
         admission_pass=new_admission_pass(),
+        clock=clock_identity(),
         kept_losses=found_probabilities(*map(scenario.network.link_of, scenario.network.flows)),
         scenario=scenario,
     )

@@ -1,0 +1,23 @@
+"""Which monotonic clock a process reads."""
+
+import os
+import uuid
+from contextlib import suppress
+from pathlib import Path
+
+_BOOT = Path("/proc/sys/kernel/random/boot_id")
+_NAMESPACE = "/proc/self/ns/time"
+
+
+def clock_identity() -> str:
+    """Return a name of this process's monotonic clock; processes with the same name share it.
+
+    On Linux the clock is that of the boot, with the offset of the time namespace. Elsewhere the
+    name is a number of the machine.
+    """
+    with suppress(OSError):
+        namespace = ""
+        with suppress(OSError):  # a kernel before 5.6 has no time namespaces
+            namespace = os.readlink(_NAMESPACE)
+        return f"{_BOOT.read_text(encoding='ascii').strip()} {namespace}".strip()
+    return f"machine {uuid.getnode():x}"
