@@ -12,10 +12,10 @@ import pytest
 
 from cosim.live.fork_server import ForkedProcess, ForkServer, fork_server
 from noack.core.errors import ExitStatus, MachineError
+from tests.integration.conftest import wait_for
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the fork server is for Linux")
 PLANT = "plant_server.__main__"
-from tests.integration.conftest import wait_for
 
 
 @pytest.fixture(scope="module")
