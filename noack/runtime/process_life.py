@@ -10,7 +10,7 @@ import signal
 import socket
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from functools import cached_property
 from itertools import chain, repeat
 from pathlib import Path
@@ -20,7 +20,8 @@ from noack.config.loops import loops_of, phases_ns
 from noack.config.parameter_changes import ReconfigurableMachine
 from noack.config.resolution import tables_of
 from noack.core.clock import NS_PER_S, RunClock
-from noack.core.errors import CallerError, NoackError, PeerError, one_line
+from noack.core.errors import CallerError, MachineError, NoackError, PeerError, one_line
+from noack.core.file_access import write_whole
 from noack.protocol.machine_interface import BEGINNING, RESTART, Machine, Notice, Record, Start
 from noack.protocol.record_tables import OWNER
 from noack.protocol.topology import (
@@ -32,14 +33,19 @@ from noack.protocol.topology import (
 from noack.runtime.address import Address
 from noack.runtime.command_line import print_to_stderr
 from noack.runtime.control_messages import Admission, ControlMessage, RunStart, parse_message
-from noack.runtime.control_plane import ControlPlane, ParameterUpdates
+from noack.runtime.control_plane import ControlPlane, ParameterUpdates, run_name
 from noack.runtime.fleet.fleet_socket import FLEET_BUFFER_BYTES
 from noack.runtime.join_ticket import Ticket
 from noack.runtime.life_cycle import AWAY_S, HORIZON, LAUNCHER_GONE, Event, LifeCycle, Side, State
 from noack.runtime.peer_sockets import enlarge_buffer
 from noack.runtime.real_time_loop import Channel, run_loop
 from noack.runtime.real_time_settings import realtime
-from noack.runtime.record_handover import OwnSpool, deliver_report, persisted_rows
+from noack.runtime.record_handover import (
+    RUN_NAME_FILE,
+    OwnSpool,
+    deliver_report,
+    persisted_rows,
+)
 from noack.runtime.rehearsal import Rehearsal
 from noack.runtime.signals import Signals
 from noack.runtime.telemetry import TelemetryBuffer
@@ -195,7 +201,8 @@ class RunProcess:
     def _spool(self) -> OwnSpool:
         run_dir = Path(self.ticket.run_dir)
         if self.ticket.remote is not None:
-            run_dir.mkdir(parents=True, exist_ok=True)
+            with suppress(MachineError):  # another process writes it, too
+                write_whole(run_dir / RUN_NAME_FILE, run_name(self.ticket.run_id))
         return OwnSpool(run_dir, self.role, self.plane.instance)
 
     def _telemetry(self) -> TelemetryBuffer:

@@ -14,6 +14,8 @@ from noack.runtime.telemetry import TelemetryBuffer, first_row
 
 KEPT_REPORT = "report"
 """Name of a final report in the spool, in place of a table's."""
+RUN_NAME_FILE = "run_name.txt"
+"""In the folder of what a process on another host keeps: of which run it is."""
 _REPORT_TIMEOUT_S = 5.0
 _REPORT_ATTEMPTS = 3
 
