@@ -1,12 +1,11 @@
 """Which monotonic clock a process reads."""
 
-import os
 import uuid
 from contextlib import suppress
 from pathlib import Path
 
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
-_NAMESPACE = "/proc/self/ns/time"
+_NAMESPACE = Path("/proc/self/ns/time")
 
 
 def clock_identity() -> str:
@@ -18,6 +17,6 @@ def clock_identity() -> str:
     with suppress(OSError):
         namespace = ""
         with suppress(OSError):  # a kernel before 5.6 has no time namespaces
-            namespace = os.readlink(_NAMESPACE)
+            namespace = str(_NAMESPACE.readlink())
         return f"{_BOOT.read_text(encoding='ascii').strip()} {namespace}".strip()
     return f"machine {uuid.getnode():x}"
