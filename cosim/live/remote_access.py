@@ -18,6 +18,7 @@ from noack.runtime.connection_forwarder import forwarding
 from noack.runtime.control_plane import RUNS, run_name
 from noack.runtime.invitation import write_invitation
 from noack.runtime.join_ticket import RemoteAccess, Ticket, new_admission_pass
+from noack.runtime.time_exchange import TimeReference, answering
 from noack.runtime.zenoh_session import socket_path
 
 _BACKLOG = 512
@@ -88,6 +89,9 @@ def open_to_hosts(
                 endpoint, lambda: asyncio.open_unix_connection(path), coordinator_context(keys)
             )
         )
+        times = TimeReference((host, listening.address[1]), ticket.key)
+        stack.callback(times.close)
+        stack.enter_context(answering(times))
         until = datetime.datetime.now().astimezone() + datetime.timedelta(seconds=listening.valid_s)
         remote = RemoteAccess(
             host=host, port=port, authority=keys.authority,
@@ -97,7 +101,10 @@ def open_to_hosts(
         shown = new_admission_pass()
         roles = LOOP_ROLES if listening.role is None else (listening.role,)
         coordinator.passes[shown] = AdmissionPass(roles, time.monotonic() + listening.valid_s)
-        invited = {"launched": False, "admission_pass": shown, "remote": remote}
+        invited = {
+            "launched": False, "admission_pass": shown, "remote": remote,
+            "time_reference": times.address,
+        }  # fmt: skip
         write_invitation(listening.invitation, ticket.model_copy(update=invited))
         stack.callback(listening.invitation.unlink, missing_ok=True)
         yield host, port

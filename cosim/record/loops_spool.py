@@ -16,6 +16,7 @@ import numpy as np
 
 from cosim.record.loop_rows import network_rows_by_loop
 from cosim.record.loops_run import loop_directories
+from cosim.record.process_reports import add_kept_reports
 from cosim.record.record_source import Rows
 from cosim.record.run_directory import (
     ENVIRONMENT_FILE,
@@ -75,6 +76,7 @@ def distribute_rows(
     if scenario.loops is None:
         return []
     folders, phases = loop_directories(run_dir, scenario), phases_ns(scenario)
+    add_kept_reports(run_dir)
     try:
         for number, loop in enumerate(resolved_loops(scenario)):
             place = {"number": number, "phase_ns": phases[number]}

@@ -14,6 +14,8 @@ from noack.core.file_access import write_whole
 from noack.protocol.record_tables import OWNER
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.control_messages import ProcessReport, parse_message
+from noack.runtime.record_handover import KEPT_REPORT
+from noack.runtime.spool import SPOOL, read_chunks
 
 _EARLIER = "earlier"
 
@@ -42,6 +44,26 @@ def write_reports(run_dir: Path, reports: Iterable[Mapping[str, Any]]) -> None:
     content = newest | ({_EARLIER: earlier} if earlier else {})
     # A run directory that was deleted meanwhile is not created again.
     write_whole(run_dir / REPORTS_FILE, json.dumps(content, indent=2), make_folder=False)
+
+
+def add_kept_reports(run_dir: Path) -> None:
+    """Add the reports that are in the spool, because no recorder took them.
+
+    Raises:
+        MachineError: they cannot be written.
+    """
+    content = read_object(run_dir / REPORTS_FILE)
+    known = [one for one in content.get(_EARLIER, ()) if isinstance(one, dict)]
+    known += [content[role] for role in LOOP_ROLES if isinstance(content.get(role), dict)]
+    instances = {one.get("instance") for one in known}
+    kept = []
+    for _, text in read_chunks(run_dir / SPOOL, KEPT_REPORT):
+        with contextlib.suppress(PeerError):  # damaged
+            report = parse_message(ProcessReport, text)
+            if report.get("process") in LOOP_ROLES and report.get("instance") not in instances:
+                kept.append({"generation": 0} | report)
+    if kept:
+        write_reports(run_dir, [*known, *kept])
 
 
 def read_reports(

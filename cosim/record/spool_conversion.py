@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from cosim.record.process_reports import add_kept_reports
 from cosim.record.record_source import Rows
 from cosim.record.run_directory import RECORD, SCENARIO_FILE
 from cosim.record.run_record import RunRecord, load_record, read_notices, write_tables
@@ -24,6 +25,7 @@ from noack.runtime.spool import SPOOL
 
 def finish_record(run_dir: Path) -> RunRecord:
     """Convert a run's spool to its record, and remove the spool; see :func:`convert_spool`."""
+    add_kept_reports(run_dir)
     convert_spool(run_dir)
     remove_spool(run_dir)
     return load_record(run_dir, network=True)

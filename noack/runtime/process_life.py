@@ -216,7 +216,10 @@ class RunProcess:
 
     @cached_property
     def _spool(self) -> OwnSpool:
-        return OwnSpool(Path(self.ticket.run_dir), self.role, self.plane.instance)
+        run_dir = Path(self.ticket.run_dir)
+        if self.ticket.remote is not None:
+            run_dir.mkdir(parents=True, exist_ok=True)
+        return OwnSpool(run_dir, self.role, self.plane.instance)
 
     def _telemetry(self) -> TelemetryBuffer:
         tables = tables_of(self.scenario)
@@ -344,8 +347,15 @@ class RunProcess:
         reachable = self.ended != LAUNCHER_GONE and not self.ended.startswith(RECORDER)
         # All messages to the recorder pass the coordinator.
         reachable = reachable and not self.plane.coordinator_gone()
-        if not (reachable and deliver_report(self.plane, self.report, telemetry)):
-            telemetry.store_all()
+        if reachable and deliver_report(self.plane, self.report, telemetry):
+            return
+        telemetry.store_all()
+        self._spool.keep_report(self.report)
+        if self.ticket.remote is not None:
+            print_to_stderr(
+                f"noack {self.role}: the recorder is out of reach; its newest rows are kept in "
+                f"{self.ticket.run_dir} (there: `noack collect RUN HOST:{self.ticket.run_dir}`)"
+            )
 
 
 def lifeline_cut() -> bool:

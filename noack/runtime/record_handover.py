@@ -1,5 +1,6 @@
 """Handing a process's rows over to the recorder, or else to the run directory's spool."""
 
+import json
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -11,6 +12,8 @@ from noack.runtime.log_lines import NOTICES, notice_number, notices_of
 from noack.runtime.spool import SPOOL, SpoolWriter
 from noack.runtime.telemetry import TelemetryBuffer, first_row
 
+KEPT_REPORT = "report"
+"""Name of a final report in the spool, in place of a table's."""
 _REPORT_TIMEOUT_S = 5.0
 _REPORT_ATTEMPTS = 3
 
@@ -72,3 +75,8 @@ class OwnSpool:
         if table == NOTICES:
             table, first = notices_of(self._role), notice_number(generation, first)
         self._files.append(table, first, payload)
+
+    def keep_report(self, report: Mapping[str, object]) -> None:
+        """Write the final report; raise MachineError if it cannot be written."""
+        text = json.dumps({**report, "process": self._role})
+        self._files.append(KEPT_REPORT, 0, text.encode())

@@ -152,3 +152,60 @@ def test_all_roles_of_the_loop_can_be_invited(start: Start, tmp_path: Path) -> N
         assert process.returncode == 0, stderr
     assert ended(recording)
     assert recording.returncode == 0
+
+
+def test_rows_of_a_host_that_was_cut_off_are_collected(
+    start: Start, hosts: TwoHosts, tmp_path: Path
+) -> None:
+    """The link goes down in the run; its processes work on and keep their rows and reports."""
+    recording = record(start, tmp_path, "10.83.3.1", *live.settings(horizon_s=8.0))
+    at_home = [start(0, role) for role in ("plant", "sensor")]
+    kept = ("--runs", str(tmp_path / "kept"))
+    away = [start(1, role, *INVITED, *kept) for role in ("netem", "controller")]
+    run_dir = tmp_path / "runs" / "latest"
+    spooled = run_dir / "spool" / "controller_step.recorder"
+    live.wait_for(lambda: spooled.exists() and spooled.stat().st_size > 5000)
+    run_dir = run_dir.resolve()
+    with _cut_off(hosts):
+        errors = {process: ended(process)[1] for process in (*away, *at_home)}
+        ended(recording)
+    assert recording.returncode == 1
+    steps = len(load_record(run_dir)["controller_step"])
+    assert 0 < steps < 8 * live.RATE_HZ
+    folder = tmp_path / "kept" / run_dir.name
+    for process in away:
+        assert f"are kept in {folder} " in errors[process]
+    collecting = start(0, "collect", str(run_dir), str(folder), "--json")
+    stdout, stderr = ended(collecting)
+    assert collecting.returncode == 0, stderr
+    summary = json.loads(stdout)
+    assert summary["replay"]["bit_exact"]
+    assert summary["replay"]["complete"]
+    assert len(load_record(run_dir)["controller_step"]) == 8 * live.RATE_HZ
+    again = start(0, "collect", str(run_dir), str(folder), "--json")
+    assert json.loads(ended(again)[0])["replay"] == summary["replay"]
+
+
+@contextmanager
+def _cut_off(hosts: TwoHosts) -> Iterator[None]:
+    """Take the link down meanwhile."""
+    command = ["ip", "-n", hosts.names[1], "link", "set", "line"]
+    subprocess.run([*command, "down"], check=True)
+    yield
+    subprocess.run([*command, "up"], check=True)
+
+
+def test_what_is_no_kept_folder_is_refused(start: Start, tmp_path: Path) -> None:
+    recording = record(start, tmp_path, "10.83.3.1")
+    for process in [start(0, role) for role in LOOP_ROLES]:
+        ended(process)
+    ended(recording)
+    for source, reason in [
+        (str(tmp_path), f"{tmp_path}: nothing was kept there (no files in spool/)"),
+        ("nohost.invalid:kept", "nohost.invalid:kept: "),
+    ]:
+        collecting = start(0, "collect", str(tmp_path / "runs" / "latest"), source)
+        _, stderr = ended(collecting)
+        assert collecting.returncode in (1, 2)
+        assert stderr.startswith(f"noack: {reason}")
+        assert len(stderr.splitlines()) == 1

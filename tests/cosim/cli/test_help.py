@@ -128,8 +128,8 @@ def test_examples_work(example: str, folder: Path, monkeypatch: pytest.MonkeyPat
 
 def test_only_long_and_live_commands_have_no_example_that_is_run() -> None:
     assert set(OURS) - MORE.keys() == {
-        "campaign", "capacity", "compare", "controller", "demo", "design", "doctor", "paper",
-        "plant", "record", "run", "sensor", "set", "view",
+        "campaign", "capacity", "collect", "compare", "controller", "demo", "design", "doctor",
+        "paper", "plant", "record", "run", "sensor", "set", "view",
     }  # fmt: skip
 
 

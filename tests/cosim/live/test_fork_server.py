@@ -12,6 +12,7 @@ import pytest
 
 from cosim.live.fork_server import ForkedProcess, ForkServer, fork_server
 from noack.core.errors import ExitStatus, MachineError
+from tests.integration.conftest import wait_for
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the fork server is for Linux")
 PLANT = "plant_server.__main__"
@@ -65,7 +66,7 @@ def test_its_standard_input_ends_with_the_launchers_end(server: ForkServer, tmp_
 def test_a_process_is_a_child_in_a_session_of_its_own(server: ForkServer, tmp_path: Path) -> None:
     with started(server, tmp_path) as process:
         assert psutil.Process(process.pid).ppid() == os.getpid()
-        assert os.getsid(process.pid) == process.pid
+        wait_for(lambda: os.getsid(process.pid) == process.pid)  # its first act
         assert process.poll() is None
         process.kill()
         assert process.wait() == -signal.SIGKILL

@@ -16,7 +16,9 @@ from tests.fuzz.harness import refusal
 _TICKET = join_ticket.new_ticket(
     resolve(validate(bases("scenarios")[0], "base")), Path("run"),
     launched=True,
-).model_copy(update={"run_id": 7, "key": bytes(32), "admission_pass": "0" * 32, "clock": "one"})  # fmt: skip
+).model_copy(
+    update={"run_id": 7, "key": bytes(32), "admission_pass": "0" * 32, "clock": "one"}
+)  # fmt: skip
 TICKET: dict[str, Any] = json.loads(_TICKET.model_dump_json())
 _SCENARIO = vocabulary(json_schema(Scenario))
 KNOWN = Vocabulary((*TICKET, *_SCENARIO.keys), (*_SCENARIO.words, "00" * 31, "0g"))
