@@ -4,6 +4,7 @@ import argparse
 import json
 import os
 import sys
+import time
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -11,7 +12,7 @@ from pathlib import Path
 
 from setproctitle import setproctitle
 
-from noack.core.errors import ExitStatus, NoackError, NoAnswerError
+from noack.core.errors import ExitStatus, NoackError, NoAnswerError, PeerError
 from noack.runtime.command_line import TICKET_ON_STDIN, Parser, failed
 from noack.runtime.control_plane import ControlPlane
 from noack.runtime.invitation import read_invitation
@@ -21,6 +22,7 @@ from noack.runtime.process_life import RunProcess, lifeline_cut
 from noack.runtime.signals import Signals
 
 _RUNS = Path("runs")
+_POLL_S = 0.1
 _TICKET_TIMEOUT_S = 24 * 3600.0  # a person may start the recorder late; Ctrl-C ends the wait
 
 
@@ -42,11 +44,10 @@ def run_process(
     """
     with Signals().handled() as signals:
         try:
-            ticket = (
-                _ticket(role, session, signals)
-                if invitation is None
-                else read_invitation(invitation, runs)
-            )
+            if invitation is None:
+                ticket = _ticket(role, session, signals)
+            else:
+                ticket = _invited(role, invitation, runs, signals)
             if ticket.launched:
                 setproctitle(f"noack {role}")  # in lists of processes
             process = _admitted(role, ticket, signals)
@@ -133,6 +134,18 @@ def _ticket(role: str, session: str, signals: Signals) -> Ticket:
     )
     print(f"noack {role}: joining run of {ticket.scenario.name!r}", file=sys.stderr)
     return ticket
+
+
+def _invited(role: str, invitation: Path, runs: Path, signals: Signals) -> Ticket:
+    """Wait for an invitation and return its ticket; raise CallerError or PeerError without one."""
+    if not invitation.exists() and invitation.parent.is_dir():
+        print(f"noack {role}: waiting for {invitation}; Ctrl-C ends", file=sys.stderr)
+        deadline_s = time.monotonic() + _TICKET_TIMEOUT_S
+        while not invitation.exists() and time.monotonic() < deadline_s:
+            if signals.received is not None:
+                raise PeerError("no invitation")
+            time.sleep(_POLL_S)
+    return read_invitation(invitation, runs)
 
 
 def _admitted(role: str, ticket: Ticket, signals: Signals) -> RunProcess:

@@ -1,0 +1,79 @@
+"""The files for containers: read and compared; built on request where a container tool works."""
+
+import ipaddress
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+import yaml
+
+from cosim.cli import app
+from noack.protocol.topology import LOOP_ROLES
+from noack.runtime.command_line import Parser
+from noack.runtime.process_entry import add_options
+
+ROOT = Path(__file__).parents[1]
+COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "compose.yaml").read_text())
+SERVICES: dict[str, Any] = COMPOSE["services"]
+
+
+def test_each_process_has_a_container() -> None:
+    assert SERVICES.keys() == {"recorder", *LOOP_ROLES}
+    for role in LOOP_ROLES:
+        assert SERVICES[role]["command"][0] == role
+    assert SERVICES["recorder"]["command"][0] == "record"
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_its_command_is_one_of_noack(name: str) -> None:
+    command, *arguments = SERVICES[name]["command"]
+    if command == "netem":
+        add_options(parser := Parser(allow_abbrev=False))
+        assert parser.parse_args(arguments).invitation
+        return
+    one = typer.main.get_command(app).commands[command]  # type: ignore[attr-defined]
+    context = one.make_context(command, arguments)
+    assert str(context.params["invitation"]) == "/invitation/run.json"
+
+
+def test_the_recorder_listens_on_its_own_address() -> None:
+    recorder, (config,) = SERVICES["recorder"], COMPOSE["networks"]["loop"]["ipam"]["config"]
+    own = recorder["networks"]["loop"]["ipv4_address"]
+    command = recorder["command"]
+    assert command[command.index("--listen") + 1].partition(":")[0] == own
+    assert ipaddress.ip_address(own) in ipaddress.ip_network(config["subnet"])
+
+
+def test_volumes_and_folders_are_those_of_the_image() -> None:
+    image = (ROOT / "Containerfile").read_text()
+    for service in SERVICES.values():
+        for volume in service["volumes"]:
+            name, _, folder = volume.partition(":")
+            assert name in COMPOSE["volumes"]
+            assert re.search(rf"mkdir -p.* {folder}\b", image)
+    for copied in re.findall(r"^COPY (\S+) ", image, re.MULTILINE):
+        assert (ROOT / copied).exists()
+    python = re.search(r"^FROM \S+/python:(\d+)\.(\d+)", image, re.MULTILINE)
+    assert python is not None
+    assert tuple(map(int, python.groups())) >= (3, 11)
+
+
+def test_the_image_is_built_and_has_the_command(tmp_path: Path) -> None:
+    if not os.environ.get("NOACK_TEST_IMAGE"):
+        pytest.skip("it downloads an image and packages; set NOACK_TEST_IMAGE=1 for it")
+    tool = next((one for one in ("podman", "docker") if shutil.which(one)), None)
+    if tool is None:
+        pytest.skip("neither podman nor docker is installed")
+    info = subprocess.run([tool, "info"], capture_output=True, text=True, check=False)
+    if info.returncode:
+        pytest.skip(f"{tool} does not work here: {info.stderr.strip().splitlines()[-1]}")
+    build = [tool, "build", "--file", "Containerfile", "--iidfile", str(tmp_path / "id"), "."]
+    subprocess.run(build, cwd=ROOT, check=True)
+    image = (tmp_path / "id").read_text()
+    run = [tool, "run", "--rm", image, "simulate", "lane_following", "--no-report"]
+    assert "transmissions" in subprocess.run(run, capture_output=True, text=True, check=True).stdout
