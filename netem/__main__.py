@@ -52,9 +52,11 @@ def _in_a_run(node: RunProcess) -> None:
     def ways(addresses: Mapping[str, Address]) -> list[tuple[Address, Address]]:
         return [(addresses[ENDS[one].sender], addresses[ENDS[one].receiver]) for one in flows]
 
-    pump = kept_pump() if has_peer_sockets() else None
+    may_compile = has_peer_sockets() and not node.follows_reference
+    pump = kept_pump() if may_compile else None
     if pump is None:
-        print_to_stderr(NOT_COMPILED)
+        if not node.follows_reference:
+            print_to_stderr(NOT_COMPILED)
         node.run(
             network_of(node.scenario, node.start, loops=loops or 1),
             lambda endpoint, addresses: RelayShell(endpoint, ways(addresses), loops=loops),

@@ -31,7 +31,13 @@ from noack.config.scenario import Scenario
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, PeerError
 from noack.protocol.machine_interface import RESTART
-from noack.protocol.record_tables import NO_SEQUENCE, OWNER, PLANT_STEP, SENSOR_MEASUREMENT
+from noack.protocol.record_tables import (
+    CLOCK_TABLES,
+    NO_SEQUENCE,
+    OWNER,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+)
 from noack.protocol.topology import LOOP_ROLES
 from noack.protocol.wire_format import MAX_LOOPS
 from noack.runtime.control_messages import LogLine, parse_message
@@ -160,8 +166,9 @@ class RunRecord:
         return LifeNumbers(generations(self.source, self.owned_by(role)) if again else [0])
 
     def owned_by(self, role: str) -> list[str]:
-        """Return the tables that a process writes."""
-        return [table for table in self.tables if OWNER[table] == role]
+        """Return the tables with the inputs of a process's machine."""
+        found = [table for table in self.tables if OWNER[table] == role]
+        return [table for table in found if table not in CLOCK_TABLES]
 
     def restarted(self) -> str | None:
         """A role whose process was restarted; None if there is none."""

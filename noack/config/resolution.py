@@ -171,6 +171,7 @@ def tables_of(resolved: Scenario) -> Mapping[str, np.dtype[np.void]]:
         disturbed_input="input" in disturbed, disturbed_state="state" in disturbed,
         outputs=0 if resolved.observer is None else resolved.message_sizes.outputs,
         inputs_reported=resolved.message_sizes.inputs_reported,
+        clocks=resolved.clocks is not None,
     )  # fmt: skip
 
 

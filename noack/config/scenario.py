@@ -19,6 +19,7 @@ from noack.config.sections.network_section import NetworkSection
 from noack.config.sections.plant_section import PlantSection
 from noack.config.sections.run_sections import (
     CertificateSection,
+    ClocksSection,
     PortsSection,
     RealtimeSection,
     RecoverySection,
@@ -62,6 +63,8 @@ class Scenario(ScenarioSection):
     network: NetworkSection
     controller: AnyController = LinearFeedbackSettings()
     certificate: CertificateSection = CertificateSection()
+    clocks: ClocksSection | None = None
+    """The clocks of a run on several hosts. Without it, claims assume one clock."""
     recovery: RecoverySection = RecoverySection()
     changes: Annotated[tuple[ScheduledChange, ...], Field(max_length=MOST_CHANGES)] = ()
     """Changes of settings during the run, in the order of time."""

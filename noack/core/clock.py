@@ -37,3 +37,23 @@ class RunClock:
         """Return the wall seconds until simulated time ``t_ns``; negative if it is in the past."""
         wall_ns = self._monotonic_ns() - self.epoch_ns
         return (t_ns / self.speed - wall_ns) * 1e-9
+
+
+class SlewedRunClock(RunClock):
+    """Simulated time tied to a clock that may be faster than that which measures waits.
+
+    ``fastest`` is the largest rate of ``monotonic_ns`` relative to this machine's monotonic clock.
+    """
+
+    def __init__(
+        self, epoch_ns: int, speed: float, monotonic_ns: Callable[[], int], fastest: float
+    ) -> None:
+        super().__init__(epoch_ns, speed, monotonic_ns)
+        if not fastest >= 1:
+            raise ValueError(f"the largest rate must be at least 1, not {fastest}")
+        self._fastest = fastest
+
+    def wall_s_until(self, t_ns: int) -> float:
+        """Return a wait that ends at ``t_ns`` or a little earlier, at any rate of the clock."""
+        wall_s = super().wall_s_until(t_ns)
+        return wall_s / self._fastest if wall_s > 0 else wall_s

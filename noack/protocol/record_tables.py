@@ -39,6 +39,9 @@ PACKET_HEAD_BYTES = 32
 LOOP = "loop"
 """First column of the tables that the processes of several loops send: the number of the loop."""
 
+LOST_NS = -1
+"""Stands for a bound that is lost, in the column of the bounds of a clock's error."""
+
 NO_SEQUENCE = -1  # stands for "none" in a column of sequence numbers
 
 
@@ -90,6 +93,7 @@ class RecordShape:
     outputs: int = 0
     """Measured outputs from which an observer estimates the state; 0 without an observer."""
     inputs_reported: int = 0  # numbers of a measurement that are inputs
+    clocks: bool = False  # whether the bounds of the clocks' errors are recorded
 
 
 class Column(NamedTuple):
@@ -148,6 +152,24 @@ _CHANGE = (
            "it was received too late"),
     _bytes("change", CHANGE_BYTES, "the settings by their keys, as JSON, padded with zero bytes"),
 )  # fmt: skip
+
+
+def clock_table(role: str) -> str:
+    """Return the name of the table about a process's clock."""
+    return f"{role}_clock"
+
+
+def _clock(role: str) -> Table:
+    return Table(clock_table(role), role, f"comparison of the {role}'s clock with the "
+        "coordinator's, with `[clocks]` only; `input` numbers these rows, `sequence` counts the "
+        "exchanges; the bound holds from `t_ns` to `now_ns`", (
+        Column("own_ns", "ns", "reading of the own monotonic clock"),
+        Column("offset_ns", "ns", "applied offset: the process's time minus `own_ns`; 0 on the "
+               "coordinator's host"),
+        Column("error_ns", "ns", "bound of the difference between the process's time and the "
+               f"coordinator's; {LOST_NS}: lost"),
+    ), lambda shape: shape.clocks)  # fmt: skip
+
 
 TABLES = (
     Table(PLANT_STEP, "plant", "step of the plant", (
@@ -234,10 +256,15 @@ TABLES = (
         _state("x_s_before", "the model before the reset"),
         _state("x_s", "the model after the reset"),
     ), lambda shape: shape.acknowledged),
+    *map(_clock, ("plant", "sensor", "netem", "controller")),
 )  # fmt: skip
 
 OWNER: Mapping[str, str] = {table.name: table.owner for table in TABLES}
 """The process that fills each table."""
+
+
+CLOCK_TABLES = tuple(table.name for table in TABLES if table.name == clock_table(table.owner))
+"""Tables of what the processes, not their machines, record: they are no input of a machine."""
 
 
 def tables(n: int, m: int, **more: int) -> Mapping[str, np.dtype[np.void]]:

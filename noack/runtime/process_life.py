@@ -10,20 +10,18 @@ import signal
 import socket
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing, suppress
+from contextlib import closing
 from functools import cached_property
 from itertools import chain, repeat
-from pathlib import Path
 from typing import Any, Protocol, TypeVar, cast
 
 from noack.config.loops import loops_of, phases_ns
 from noack.config.parameter_changes import ReconfigurableMachine
 from noack.config.resolution import tables_of
-from noack.core.clock import NS_PER_S, RunClock
-from noack.core.errors import CallerError, MachineError, NoackError, PeerError, one_line
-from noack.core.file_access import write_whole
+from noack.core.clock import NS_PER_S, RunClock, SlewedRunClock
+from noack.core.errors import CallerError, NoackError, PeerError, one_line
 from noack.protocol.machine_interface import BEGINNING, RESTART, Machine, Notice, Record, Start
-from noack.protocol.record_tables import OWNER
+from noack.protocol.record_tables import OWNER, clock_table
 from noack.protocol.topology import (
     CHANGEABLE,
     LOOP_ROLES,
@@ -31,21 +29,18 @@ from noack.protocol.topology import (
     WITH_DEADLINES,
 )
 from noack.runtime.address import Address
+from noack.runtime.clock_record import ClockRecord
 from noack.runtime.command_line import print_to_stderr
 from noack.runtime.control_messages import Admission, ControlMessage, RunStart, parse_message
-from noack.runtime.control_plane import ControlPlane, ParameterUpdates, run_name
+from noack.runtime.control_plane import ControlPlane, ParameterUpdates
 from noack.runtime.fleet.fleet_socket import FLEET_BUFFER_BYTES
 from noack.runtime.join_ticket import Ticket
 from noack.runtime.life_cycle import AWAY_S, HORIZON, LAUNCHER_GONE, Event, LifeCycle, Side, State
 from noack.runtime.peer_sockets import enlarge_buffer
 from noack.runtime.real_time_loop import Channel, run_loop
 from noack.runtime.real_time_settings import realtime
-from noack.runtime.record_handover import (
-    RUN_NAME_FILE,
-    OwnSpool,
-    deliver_report,
-    persisted_rows,
-)
+from noack.runtime.record_handover import OwnSpool, deliver_report, own_spool, persisted_rows
+from noack.runtime.reference_clock import ReferenceClock, reads_other_clock, reference_clock
 from noack.runtime.rehearsal import Rehearsal
 from noack.runtime.signals import Signals
 from noack.runtime.telemetry import TelemetryBuffer
@@ -88,6 +83,7 @@ class RunProcess:
         self.phases_ns = phases_ns(ticket.scenario)
         """When each loop begins."""
         self.plane = plane
+        self._reference: ReferenceClock | None = None
         self.life = LifeCycle(role, Side.PROCESS)
         self.updates = ParameterUpdates(plane)
         self._signals = signals
@@ -99,6 +95,7 @@ class RunProcess:
         """Of a restarted process: how the one before it ended."""
         self.report: dict[str, Any] = {}
         self.rehearsal: Rehearsal | None = None
+        self._clock_record: ClockRecord | None = None
 
     def request_admission(self) -> None:
         """Ask the coordinator for admission to the run.
@@ -117,11 +114,18 @@ class RunProcess:
         """Wait at the start barrier; return all addresses. Sets the common epoch.
 
         ``address`` is None for the recorder, which is not in the loop. Raise PeerError if the run
-        never started.
+        never started, or if the coordinator's clock is another one and remains unknown.
         """
+        self._reference = reference_clock(self.ticket)
+        if self._reference is not None:
+            self._reference.wait_until_known(lambda: self.stopping)
         self.life.apply(Event.JOIN)
         begin = self._request("join", {"address": address}, RunStart, _JOIN_TIMEOUT_S)
-        self.clock = RunClock(begin["epoch_ns"], self.scenario.speed)
+        epoch_ns, speed = begin["epoch_ns"], self.scenario.speed
+        self.clock = RunClock(epoch_ns, speed)
+        if (reference := self._reference) is not None:
+            fastest = 1 + reference.slew_ppb * 1e-9
+            self.clock = SlewedRunClock(epoch_ns, speed, reference.monotonic_ns, fastest)
         addresses: Mapping[str, Address] = begin["addresses"]
         self.updates.extend(begin.get("changes", ()))
         if not addresses.keys() >= set(LOOP_ROLES):
@@ -138,13 +142,22 @@ class RunProcess:
         """Send the coordinator a request of this process; return the answer's fields."""
         request = {"pid": os.getpid(), "instance": self.plane.instance, **more}
         try:
-            message = self.plane.request(
-                what, request, timeout_s=timeout_s, give_up=lambda: self.stopping
-            )
+            message = self.plane.request(what, request, timeout_s=timeout_s, give_up=self._gives_up)
         except PeerError as error:
             # The reason to stop explains more than a missing answer.
             raise PeerError(self.life.reason) if self.life.reason else error from None
         return parse_message(answer, message)
+
+    def _gives_up(self) -> bool:
+        """Whether to wait no longer; compares the clocks meanwhile."""
+        if self.life.state is State.AT_BARRIER and self._reference is not None:
+            self._reference.poll()
+        return self.stopping
+
+    @property
+    def follows_reference(self) -> bool:
+        """Whether the coordinator's clock is another one, so that compiled code cannot read it."""
+        return reads_other_clock(self.ticket)
 
     @property
     def loop_count(self) -> int | None:
@@ -193,17 +206,16 @@ class RunProcess:
                     "generation": self.start.generation,
                     "instance": self.plane.instance,
                     "reached_ns": reached_ns,
+                    **({} if self._clock_record is None else self._clock_record.summary()),
                 }
                 channel.close()
+                if self._reference is not None:
+                    self._reference.close()
                 self._hand_over(telemetry)
 
     @cached_property
     def _spool(self) -> OwnSpool:
-        run_dir = Path(self.ticket.run_dir)
-        if self.ticket.remote is not None:
-            with suppress(MachineError):  # another process writes it, too
-                write_whole(run_dir / RUN_NAME_FILE, run_name(self.ticket.run_id))
-        return OwnSpool(run_dir, self.role, self.plane.instance)
+        return own_spool(self.ticket, self.role, self.plane.instance)
 
     def _telemetry(self) -> TelemetryBuffer:
         tables = tables_of(self.scenario)
@@ -219,6 +231,11 @@ class RunProcess:
 
     def _drive(self, machine: Machine[T], channel: Channel[T], telemetry: TelemetryBuffer) -> int:
         """Run the loop; return the simulated time up to which the machine has done its work."""
+        has_table = clock_table(self.role) in tables_of(self.scenario)
+        if has_table or self._reference is not None:
+            self._clock_record = ClockRecord(
+                self.role, self.start, self.clock, self._reference, has_table=has_table
+            )
         changeable = cast(ReconfigurableMachine[T], machine) if self.role in CHANGEABLE else None
         limits = chain([None], repeat(_CHANGES_AT_ONCE))  # before the first step: all of them
         late_ns = run_loop(
@@ -233,7 +250,7 @@ class RunProcess:
             spin_us=self.scenario.realtime.spin_us,
             gather_ns=self._gather_ns,
             rehearsal=self.rehearsal,
-            news=lambda now_ns: self._announce(changeable, now_ns, next(limits)),
+            news=lambda now_ns: self._news(changeable, now_ns, next(limits)),
         )
         reached_ns = self.clock.now_ns() - late_ns
         if late_ns and not self.stopping:
@@ -299,6 +316,14 @@ class RunProcess:
         if waiting and self.plane.coordinator_gone(for_s=AWAY_S):
             return "lost the connection to the run's coordinator"
         return None
+
+    def _news(
+        self, machine: ReconfigurableMachine[Any] | None, now_ns: int, at_most: int | None
+    ) -> Sequence[Record | Notice]:
+        outputs = self._announce(machine, now_ns, at_most)
+        if self._clock_record is None:
+            return outputs
+        return [*outputs, *self._clock_record.news(now_ns)]
 
     def _announce(
         self, machine: ReconfigurableMachine[Any] | None, now_ns: int, at_most: int | None

@@ -10,8 +10,8 @@ NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
 MOST_LOOPS = 65_535
 """Largest number of loops in a run: datagrams carry the loop's number in 16 bits."""
 SHARED = (
-    "horizon_s", "speed", "start_within_s", "network", "certificate", "recovery", "changes",
-    "ports", "realtime", "loops",
+    "horizon_s", "speed", "start_within_s", "network", "certificate", "clocks", "recovery",
+    "changes", "ports", "realtime", "loops",
 )  # fmt: skip
 """Keys of a scenario that all its loops share."""
 

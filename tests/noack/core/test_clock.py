@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from noack.core.clock import RunClock
+from noack.core.clock import RunClock, SlewedRunClock
 
 EPOCH_NS = 123_456_789_012_345
 speeds = st.sampled_from([0.01, 0.5, 1.0, 2.0, 3.0, 10.0, 1000.0])
@@ -45,3 +45,23 @@ def test_the_computed_wait_ends_at_the_deadline(speed: float, wall_ns: int, t_ns
 def test_a_speed_that_is_not_positive_is_refused(speed: float) -> None:
     with pytest.raises(ValueError, match="speed must be positive"):
         RunClock(EPOCH_NS, speed)
+
+
+@given(speeds, st.integers(0, 10**12), st.integers(0, 10**13), st.floats(1, 1.2), st.floats(0.8, 1))
+def test_a_wait_on_a_slewed_clock_is_never_too_long(
+    speed: float, wall_ns: int, t_ns: int, fastest: float, share: float
+) -> None:
+    readings = [EPOCH_NS + wall_ns]
+    clock = SlewedRunClock(EPOCH_NS, speed, lambda: readings[-1], fastest)
+    assert clock.now_ns() == clock_at(speed, wall_ns).now_ns()
+    direct_s, wait_s = clock_at(speed, wall_ns).wall_s_until(t_ns), clock.wall_s_until(t_ns)
+    assert wait_s <= direct_s if direct_s > 0 else wait_s == direct_s
+    if wait_s > 0:
+        readings.append(readings[0] + int(wait_s * 1e9 * fastest * share))
+        # The rounding of times of up to 10¹⁵ ns, as above.
+        assert clock.now_ns() <= t_ns + 2 + speed
+
+
+def test_a_rate_below_that_of_waits_is_refused() -> None:
+    with pytest.raises(ValueError, match="largest rate must be at least 1"):
+        SlewedRunClock(EPOCH_NS, 1.0, lambda: 0, 0.9)

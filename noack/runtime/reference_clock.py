@@ -1,0 +1,183 @@
+"""The coordinator's clock, as a process on another host knows it: an estimate with a bound."""
+
+import select
+from collections.abc import Callable
+from typing import NamedTuple
+
+from noack.config.sections.run_sections import ClocksSection
+from noack.core.clock import NS_PER_S
+from noack.core.clock_offset import ClockOffset, Restart, RestartCause
+from noack.core.errors import PeerError
+from noack.core.slewed_clock import SLEW_PPB, SlewedClock
+from noack.runtime.address import Address, text_of
+from noack.runtime.arrival_times import HostClocks
+from noack.runtime.host_clock import clock_identity
+from noack.runtime.join_ticket import Ticket
+from noack.runtime.time_exchange import TimeClient
+
+LOST_AFTER_NS = 500_000_000
+"""Without an answer of the reference for this time, the bound counts as lost."""
+_LEAST_EXCHANGES = 8
+"""Before a process joins: the first exchanges are slow, since the code is not in the caches."""
+_WAIT_S = 10.0
+_POLL_S = 0.005
+_PPB_PER_PPM = 1000
+_NS_PER_US = 1000
+_PPB = 10**9
+_CAUSES = {
+    RestartCause.CONTRADICTION: "the exchanges contradict each other or the assumed rate",
+    RestartCause.OTHER_CLOCK: "the reference has another clock than before",
+}
+
+
+class ClockReport(NamedTuple):
+    """The bound of a clock's error since the report before; times are of the own clock.
+
+    After a restart of the bound it is from the time since when the bound may have been wrong.
+    """
+
+    since_ns: int
+    now_ns: int
+    offset_ns: int
+    """Applied offset: time of the reference minus own clock."""
+    error_ns: int | None
+    """Largest difference to the reference from ``since_ns`` to ``now_ns``; None: it is lost."""
+    exchanges: int = 0
+    lost: str | None = None
+    """Why it is lost."""
+
+
+class ReferenceClock:
+    """Follows the coordinator's clock; its time never runs backward and is never set.
+
+    Args:
+        reference: where the coordinator's host answers requests for the time.
+        key: the run's key.
+        settings: the assumed rate and the largest error.
+        clocks: the clocks of this host.
+
+    Raises:
+        CallerError: the address cannot be used.
+    """
+
+    def __init__(
+        self,
+        reference: Address,
+        key: bytes,
+        settings: ClocksSection,
+        clocks: HostClocks | None = None,
+    ) -> None:
+        self._clocks = HostClocks() if clocks is None else clocks
+        self._where = text_of(reference)
+        self._largest_ns = round(settings.largest_error_us * _NS_PER_US)
+        self._offset = ClockOffset(round(settings.relative_rate_ppm * _PPB_PER_PPM))
+        self._client = TimeClient(reference, key, self._offset, clocks=self._clocks)
+        self._slewed: SlewedClock | None = None
+        self.slew_ppb = max(SLEW_PPB, 2 * self._offset.rate_ppb)
+        self._accepted = 0
+        self._answered_ns = self._since_ns = self._clocks.monotonic_ns()
+        self._error_ns: int | None = None
+        """Bound of the error just after the poll before."""
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._client.close()
+
+    def wait_until_known(
+        self, give_up: Callable[[], bool] = lambda: False, wait_s: float = _WAIT_S
+    ) -> None:
+        """Exchange times until the error is small enough to begin.
+
+        Raises:
+            PeerError: it is not after ``wait_s``, or ``give_up`` is true.
+        """
+        until_ns = self._clocks.monotonic_ns() + round(wait_s * NS_PER_S)
+        while True:
+            self._client.poll()
+            now_ns = self._clocks.monotonic_ns()
+            interval = self._offset.interval(now_ns)
+            enough = self._client.accepted >= _LEAST_EXCHANGES
+            if interval is not None and enough and interval.error_ns <= self._largest_ns:
+                self._slewed = SlewedClock(self._offset, now_ns, self.slew_ppb)
+                self._error_ns = self._slewed.error_ns(now_ns)
+                self._answered_ns, self._since_ns = now_ns, now_ns
+                self._accepted = self._client.accepted
+                return
+            if give_up() or now_ns > until_ns:
+                found = (
+                    f"no answer from {self._where}" if interval is None
+                    else f"known within {interval.error_ns / _NS_PER_US:.0f} µs, "
+                    f"{self._largest_ns / _NS_PER_US:g} µs allowed"
+                )  # fmt: skip
+                raise PeerError(f"cannot compare this host's clock with the coordinator's: {found}")
+            select.select([self._client], (), (), _POLL_S)
+
+    def monotonic_ns(self) -> int:
+        """Return the estimate of the coordinator's monotonic clock; it never decreases."""
+        assert self._slewed is not None
+        return self._slewed.now_ns(self._clocks.monotonic_ns())
+
+    def poll(self) -> ClockReport:
+        """Exchange times; return the bound since the report before. Call it every 50 ms."""
+        slewed, before_ns = self._slewed, self._clocks.monotonic_ns()
+        assert slewed is not None
+        error_ns = slewed.error_ns(before_ns)
+        restarts = self._client.poll()
+        now_ns = self._clocks.monotonic_ns()
+        if error_ns is not None:
+            # Both rates together change the error during the poll.
+            rate_ppb = self._offset.rate_ppb + self.slew_ppb
+            error_ns += -(-rate_ppb * (now_ns - before_ns) // _PPB) + 1
+        largest_ns = None if error_ns is None or self._error_ns is None else (
+            max(self._error_ns, error_ns)
+        )  # fmt: skip
+        slewed.follow(now_ns)
+        self._error_ns = slewed.error_ns(now_ns)
+        if self._client.accepted > self._accepted:
+            self._accepted, self._answered_ns = self._client.accepted, now_ns
+        lost = self._why_lost(restarts, now_ns)
+        since_ns = min([self._since_ns, *(one.since_ns for one in restarts)])
+        self._since_ns = now_ns
+        return ClockReport(
+            since_ns, now_ns, slewed.now_ns(now_ns) - now_ns,
+            None if lost else largest_ns, self._offset.exchanges, lost,
+        )  # fmt: skip
+
+    def counts(self) -> dict[str, object]:
+        """Return how many exchanges succeeded, and how often the bound began again."""
+        client = self._client
+        return {
+            "exchanges": self._offset.exchanges,
+            "restarts": self._offset.restarts,
+            "rejected": dict(client.rejected),
+            "send_errors": dict(client.send_errors),
+        }
+
+    def _why_lost(self, restarts: list[Restart], now_ns: int) -> str | None:
+        if restarts:
+            return _CAUSES[restarts[0].cause]
+        if now_ns - self._answered_ns > LOST_AFTER_NS:
+            return f"no answer from {self._where} for {LOST_AFTER_NS / NS_PER_S:g} s"
+        return None
+
+
+def reads_other_clock(ticket: Ticket) -> bool:
+    """Whether this process's monotonic clock is not that of the run's coordinator."""
+    return ticket.clock != clock_identity()
+
+
+def reference_clock(ticket: Ticket) -> ReferenceClock | None:
+    """Return the clock of the run's coordinator; None if this process reads that clock itself.
+
+    Raises:
+        PeerError: it is another clock, and nobody answers requests for its time.
+    """
+    if not reads_other_clock(ticket):
+        return None
+    if ticket.time_reference is None:
+        raise PeerError(
+            "this process and the run's coordinator have different clocks, and the coordinator's "
+            "host answers no requests for the time; it does with `noack record --listen`"
+        )
+    settings = ticket.scenario.clocks or ClocksSection()
+    return ReferenceClock(ticket.time_reference, ticket.key, settings)
