@@ -6,7 +6,7 @@ import ipaddress
 import socket
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -42,11 +42,10 @@ def listen_address(text: str) -> Address:
     Raises:
         CallerError: it is not an address at which others can reach this host.
     """
-    try:
-        ipaddress.ip_address(text.strip("[]"))
-        text = f"[{text.strip('[]')}]:0" if ":" in text else f"{text}:0"
-    except ValueError:
-        pass
+    with suppress(ValueError):  # an IPv6 address without brackets
+        text = f"[{ipaddress.IPv6Address(text)}]"
+    if text.endswith("]") or ":" not in text:
+        text += ":0"
     host, port = parse_address(text, "--listen")
     found = ipaddress.ip_address(host.partition("%")[0])
     if found.is_unspecified or found.is_multicast or found.is_link_local:

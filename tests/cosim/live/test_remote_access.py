@@ -31,6 +31,18 @@ def test_an_address_that_others_cannot_reach_is_refused(text: str) -> None:
         listen_address(text)
 
 
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("host.invalid", "--listen: host.invalid: no such host"),
+        ("192.0.2.1:port", "--listen: expected HOST:PORT"),
+    ],
+)
+def test_what_is_no_address_is_named(text: str, reason: str) -> None:
+    with pytest.raises(CallerError, match=reason):
+        listen_address(text)
+
+
 def test_one_loop_records_the_bounds_of_its_clocks() -> None:
     one = load(Path("scenarios/lane_following.toml"))
     assert with_clocks(one).clocks == ClocksSection()
