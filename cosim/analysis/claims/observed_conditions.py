@@ -213,14 +213,16 @@ class ObservedConditions(NamedTuple):
 
     def summary(self) -> dict[str, float | None]:
         """The largest value of each condition."""
-        known = [self.clocks[cause] for cause in map(clock_cause, LOOP_ROLES) if self.clocks]
+        clocks = [
+            self.clocks[cause].largest() for cause in map(clock_cause, LOOP_ROLES) if self.clocks
+        ]
         return {
             DROPOUTS: self.losses.consecutive(0.0).largest(),
             "sampling_s": self.sampling.largest(),
             "delay_s": self.delay.largest(),
             "hold_s": self.hold.largest(),
             "start_s": self.start_s if np.isfinite(self.start_s) else None,
-            "clock_error_s": max(filter(None, map(SampledSeries.largest, known)), default=None),
+            "clock_error_s": max((one for one in clocks if one is not None), default=None),
         }
 
 
