@@ -33,6 +33,7 @@ from noack.core.errors import ExitStatus, NeverStartedError, NoackError
 from noack.protocol.topology import PLANT, RECORDER, ROLES
 from noack.runtime import run_registry
 from noack.runtime.address import Address, text_of
+from noack.runtime.control_plane import run_name
 from noack.runtime.join_ticket import Ticket, new_ticket, published
 from noack.runtime.life_cycle import HORIZON
 from noack.runtime.signals import Signals
@@ -103,8 +104,8 @@ def launch(
         compile_for(scenario, spawn)
         run_dir = new_run_dir(runs, resolved.name)
         resolved = write_scenario(resolved, run_dir)
-        write_environment(run_dir, "live")
         ticket = new_ticket(resolved, run_dir.resolve(), launched=True)
+        write_environment(run_dir, "live", run_name(ticket.run_id))
         children = ChildProcesses(ticket, run_dir, spawn, server)
         signals = stack.enter_context(Signals().handled())
         stack.enter_context(active_run(run_dir))

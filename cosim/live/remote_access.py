@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cosim.live.coordinator import AdmissionPass, Coordinator
+from noack.config.scenario import Scenario
+from noack.config.sections.run_sections import ClocksSection
 from noack.core.errors import CallerError, why
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.address import Address, family_of, parse_address, text_of
@@ -53,6 +55,13 @@ def listen_address(text: str) -> Address:
             "give one of `ip address`"
         )
     return host, port
+
+
+def with_clocks(scenario: Scenario) -> Scenario:
+    """Return a scenario whose run on several hosts records the bounds of its clocks' errors."""
+    if scenario.clocks is not None or scenario.loops is not None:
+        return scenario
+    return scenario.model_copy(update={"clocks": ClocksSection()})
 
 
 def _listen(address: Address) -> socket.socket:

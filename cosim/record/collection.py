@@ -8,10 +8,12 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from cosim.record.run_directory import ENVIRONMENT_FILE, read_object
 from noack.core.errors import CallerError, MachineError, PeerError, why
+from noack.runtime.record_handover import RUN_NAME_FILE
 from noack.runtime.spool import SPOOL
 
 
@@ -24,7 +26,7 @@ def collect(run_dir: Path, source: str) -> int:
         The number of files.
 
     Raises:
-        CallerError: nothing of a run is there.
+        CallerError: nothing of this run is there.
         PeerError: the host cannot be reached.
         MachineError: a file cannot be copied.
     """
@@ -32,6 +34,8 @@ def collect(run_dir: Path, source: str) -> int:
         found = sorted(path for path in (folder / SPOOL).glob("*.*") if path.is_file())
         if not found:
             raise CallerError(f"{source}: nothing was kept there (no files in {SPOOL}/)")
+        if _run_name(folder) != read_object(run_dir / ENVIRONMENT_FILE).get("run_name"):
+            raise CallerError(f"{source}: it was kept of another run than {run_dir}")
         try:
             (run_dir / SPOOL).mkdir(exist_ok=True)
             for path in found:
@@ -39,6 +43,12 @@ def collect(run_dir: Path, source: str) -> int:
         except OSError as error:
             raise MachineError(f"{run_dir / SPOOL}: cannot be written: {why(error)}") from None
     return len(found)
+
+
+def _run_name(folder: Path) -> str:
+    with suppress(OSError, UnicodeDecodeError):
+        return (folder / RUN_NAME_FILE).read_text(encoding="ascii")
+    return ""
 
 
 @contextmanager
@@ -50,7 +60,7 @@ def _reachable(source: str) -> Iterator[Path]:
         return
     with tempfile.TemporaryDirectory() as folder:
         # A file name may begin with a dash, and a host name must not be taken for an option.
-        command = ["scp", "-q", "-r", "--", f"{host}:{path}/{SPOOL}", folder]
+        command = ["scp", "-q", "-r", "--", f"{host}:{path}", f"{folder}/kept"]
         try:
             subprocess.run(command, check=True, capture_output=True, text=True)
         except FileNotFoundError:
@@ -60,4 +70,4 @@ def _reachable(source: str) -> Iterator[Path]:
         except subprocess.CalledProcessError as error:
             reason = (error.stderr.strip().splitlines() or ["scp failed"])[-1]
             raise PeerError(f"{source}: {reason}") from None
-        yield Path(folder)
+        yield Path(folder) / "kept"

@@ -34,9 +34,10 @@ def environment(kind: Kind) -> dict[str, Any]:
     }
 
 
-def write_environment(run_dir: Path, kind: Kind) -> None:
-    """Write ``environment.json`` into a run directory."""
-    write_whole(run_dir / ENVIRONMENT_FILE, json.dumps(environment(kind), indent=2))
+def write_environment(run_dir: Path, kind: Kind, run_name: str | None = None) -> None:
+    """Write ``environment.json`` into a run directory; ``run_name`` is a live run's."""
+    content = environment(kind) | ({} if run_name is None else {"run_name": run_name})
+    write_whole(run_dir / ENVIRONMENT_FILE, json.dumps(content, indent=2))
 
 
 def kind_of(run_dir: Path) -> Kind:

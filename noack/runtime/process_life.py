@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from functools import cached_property
 from itertools import chain, repeat
-from pathlib import Path
 from typing import Any, Protocol, TypeVar, cast
 
 from noack.config.loops import loops_of, phases_ns
@@ -40,7 +39,7 @@ from noack.runtime.life_cycle import AWAY_S, HORIZON, LAUNCHER_GONE, Event, Life
 from noack.runtime.peer_sockets import enlarge_buffer
 from noack.runtime.real_time_loop import Channel, run_loop
 from noack.runtime.real_time_settings import realtime
-from noack.runtime.record_handover import OwnSpool, deliver_report, persisted_rows
+from noack.runtime.record_handover import OwnSpool, deliver_report, own_spool, persisted_rows
 from noack.runtime.reference_clock import ReferenceClock, reads_other_clock, reference_clock
 from noack.runtime.rehearsal import Rehearsal
 from noack.runtime.signals import Signals
@@ -216,10 +215,7 @@ class RunProcess:
 
     @cached_property
     def _spool(self) -> OwnSpool:
-        run_dir = Path(self.ticket.run_dir)
-        if self.ticket.remote is not None:
-            run_dir.mkdir(parents=True, exist_ok=True)
-        return OwnSpool(run_dir, self.role, self.plane.instance)
+        return own_spool(self.ticket, self.role, self.plane.instance)
 
     def _telemetry(self) -> TelemetryBuffer:
         tables = tables_of(self.scenario)

@@ -2,18 +2,23 @@
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 
-from noack.core.errors import PeerError
+from noack.core.errors import MachineError, PeerError
+from noack.core.file_access import write_whole
 from noack.runtime.control_messages import MissingRows, PersistedAck, parse_message
-from noack.runtime.control_plane import ControlPlane
+from noack.runtime.control_plane import ControlPlane, run_name
+from noack.runtime.join_ticket import Ticket
 from noack.runtime.log_lines import NOTICES, notice_number, notices_of
 from noack.runtime.spool import SPOOL, SpoolWriter
 from noack.runtime.telemetry import TelemetryBuffer, first_row
 
 KEPT_REPORT = "report"
 """Name of a final report in the spool, in place of a table's."""
+RUN_NAME_FILE = "run_name.txt"
+"""In the folder of what a process on another host keeps: of which run it is."""
 _REPORT_TIMEOUT_S = 5.0
 _REPORT_ATTEMPTS = 3
 
@@ -80,3 +85,15 @@ class OwnSpool:
         """Write the final report; raise MachineError if it cannot be written."""
         text = json.dumps({**report, "process": self._role})
         self._files.append(KEPT_REPORT, 0, text.encode())
+
+
+def own_spool(ticket: Ticket, role: str, writer: str) -> OwnSpool:
+    """Return the spool of a process, which the recorder reads.
+
+    On another host its folder is made here, with the run's name.
+    """
+    run_dir = Path(ticket.run_dir)
+    if ticket.remote is not None:
+        with suppress(MachineError):  # another process may write it, too
+            write_whole(run_dir / RUN_NAME_FILE, run_name(ticket.run_id))
+    return OwnSpool(run_dir, role, writer)

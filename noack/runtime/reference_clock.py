@@ -170,7 +170,8 @@ def reference_clock(ticket: Ticket) -> ReferenceClock | None:
     """Return the clock of the run's coordinator; None if this process reads that clock itself.
 
     Raises:
-        PeerError: it is another clock, and nobody answers requests for its time.
+        PeerError: it is another clock, and nobody answers requests for its time, or the run has
+            several loops.
     """
     if not reads_other_clock(ticket):
         return None
@@ -178,6 +179,11 @@ def reference_clock(ticket: Ticket) -> ReferenceClock | None:
         raise PeerError(
             "this process and the run's coordinator have different clocks, and the coordinator's "
             "host answers no requests for the time; it does with `noack record --listen`"
+        )
+    if ticket.scenario.loops is not None:
+        raise PeerError(
+            "this process and the run's coordinator have different clocks; a run of several loops "
+            "needs hosts with one clock, since it records no bound of their offset"
         )
     settings = ticket.scenario.clocks or ClocksSection()
     return ReferenceClock(ticket.time_reference, ticket.key, settings)

@@ -4,11 +4,13 @@ import argparse
 import sys
 import tempfile
 from collections import Counter
+from contextlib import ExitStack
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks._two_hosts import two_hosts
 from noack.protocol.topology import LOOP_ROLES, RECEIVES, sender_to
 from tests.attacks.attacked import Attacked, attack, may_forge_addresses
 from tests.attacks.checks import CHECKS
@@ -41,6 +43,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--number", type=int, default=1_000_000, help="datagrams to each port")
     parser.add_argument("--rate", type=float, default=4000.0, help="of them a second")
+    parser.add_argument("--hosts", action="store_true", help="across two network namespaces")
     options = parser.parse_args()
     forge = may_forge_addresses()
     minutes = options.number / options.rate / 60
@@ -49,8 +52,9 @@ def main() -> int:
         f"{'also' if forge else 'not'} with forged addresses ...",
         file=sys.stderr,
     )
-    with tempfile.TemporaryDirectory(prefix="noack-attack-") as folder:
-        run = attack(Path(folder), options.number, options.rate, forge_addresses=forge)
+    with tempfile.TemporaryDirectory(prefix="noack-attack-") as folder, ExitStack() as stack:
+        hosts = stack.enter_context(two_hosts()) if options.hosts else None
+        run = attack(Path(folder), options.number, options.rate, forge_addresses=forge, hosts=hosts)
     console = Console()
     if not console.is_terminal:
         console.width = _WIDTH

@@ -16,6 +16,7 @@ from typing import Any, Self
 
 import psutil
 
+from benchmarks._two_hosts import TwoHosts
 from benchmarks.soak.watch import udp_port
 from cosim.record.run_record import RunRecord, load_record
 from noack.config.resolution import loop_of
@@ -27,11 +28,14 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import LOOP_ROLES, RECEIVES, sender_to
 from noack.protocol.wire_format import Flow
+from noack.runtime.address import LOOPBACK
 from noack.runtime.join_ticket import Ticket, loads
 from tests.attacks.kinds import Target
 from tests.attacks.sender import Plan, Sent, carry_out
 
 PATIENCE_S = 300.0
+AWAY = "controller"
+"""The process on the second host."""
 _ATTEMPTS = 3
 
 
@@ -77,13 +81,21 @@ def may_forge_addresses() -> bool:
 class Run:
     """An active run, started one process at a time; the context's end kills what remains."""
 
-    def __init__(self, folder: Path, *arguments: str) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, hosts: TwoHosts | None, *arguments: str) -> None:
+        self._folder, self._hosts = folder, hosts
+        invitation = str(folder / "invitation.json")
+        listen = () if hosts is None else ("--listen", _addresses(hosts)[0])
+        free_ports = ("--set", "ports={}") if hosts is None else ()
         self._recording = self._start(
-            "record", "lane_following", "--runs", str(folder / "runs"), "--no-report",
-            "--set", "ports={}", *arguments,
+            0, "record", "lane_following", "--runs", str(folder / "runs"), "--no-report",
+            *free_ports, *listen, "--invitation", invitation, *arguments,
         )  # fmt: skip
-        self.processes = {role: self._start(role) for role in LOOP_ROLES}
+        self.processes = {
+            role: self._start(1, role, "--invitation", invitation)
+            if hosts is not None and role == AWAY
+            else self._start(0, role)
+            for role in LOOP_ROLES
+        }
 
     def __enter__(self) -> Self:
         return self
@@ -93,9 +105,10 @@ class Run:
             process.kill()
             process.communicate()
 
-    def _start(self, *command: str) -> "subprocess.Popen[str]":
+    def _start(self, host: int, *command: str) -> "subprocess.Popen[str]":
+        words = [sys.executable, "-m", "cosim.cli", *command, "--json"]
         return subprocess.Popen(
-            [sys.executable, "-m", "cosim.cli", *command, "--json"], text=True,
+            words if self._hosts is None else self._hosts.inside(host, *words), text=True,
             env=os.environ | {"XDG_RUNTIME_DIR": str(self._folder)},
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         )  # fmt: skip
@@ -108,13 +121,17 @@ class Run:
             spooled = run_dir / "spool" / f"{table}.recorder"
             self._wait(lambda spooled=spooled: spooled.exists() and spooled.stat().st_size > 0)
         ports = {
-            role: udp_port(psutil.Process(process.pid)) for role, process in self.processes.items()
+            role: getattr(ticket.scenario.ports, role) or udp_port(psutil.Process(process.pid))
+            for role, process in self.processes.items()
         }
         loop = loop_of(ticket.scenario)
+        one_host = self._hosts is None
+        home, away = (LOOPBACK, LOOPBACK) if self._hosts is None else _addresses(self._hosts)
         return [
             Target(
                 role, ports[role], ports[sender_to(role, flow)], flow,
                 loop.m if flow is Flow.ACTUATION else loop.n, ticket.run_id, ticket.key,
+                away if role == AWAY else home, one_host or sender_to(role, flow) == AWAY,
             )
             for role, flow in RECEIVES.items()
         ]  # fmt: skip
@@ -142,7 +159,13 @@ class Run:
 
 
 def attack(
-    folder: Path, per_port: int, rate_hz: float, *, forge_addresses: bool, speed: float = 1.0
+    folder: Path,
+    per_port: int,
+    rate_hz: float,
+    *,
+    forge_addresses: bool,
+    speed: float = 1.0,
+    hosts: TwoHosts | None = None,
 ) -> Attacked:
     """Attack all four ports of a run of the paper's example while it runs.
 
@@ -154,6 +177,7 @@ def attack(
         rate_hz: datagrams per second to each port.
         forge_addresses: whether to send from the peers' addresses, too.
         speed: the speed of the run relative to real time.
+        hosts: the controller and the attacker are on the second one; None: all are on this one.
     """
     sending_s = per_port / rate_hz
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
@@ -162,34 +186,40 @@ def attack(
             (folder / str(attempt)).mkdir()
             horizon_s = 3**attempt * speed * (1.5 * sending_s + 7.0)
             options = ("--set", f"speed={speed}", "--set", f"horizon_s={horizon_s:.0f}")
-            with Run(folder / str(attempt), *options) as run:
+            with Run(folder / str(attempt), hosts, *options) as run:
                 targets = run.targets()
                 until_s = time.monotonic() + 1.5 * sending_s + 3.0
-                plan = Plan(targets, per_port, rate_hz, forge_addresses, until_s)
+                namespace = None if hosts is None else hosts.names[1]
+                plan = Plan(targets, per_port, rate_hz, forge_addresses, until_s, namespace)
                 sent = pool.submit(carry_out, plan).result()
-                all_received = have_read(targets)
+                all_received = have_read(targets, run.processes)
                 attacked = run.finish(sent)
             if all_received:
                 break
     return attacked
 
 
-def have_read(targets: list[Target]) -> bool:
+def have_read(targets: list[Target], processes: Mapping[str, "subprocess.Popen[str]"]) -> bool:
     """Wait until the processes have read what was sent; whether none has ended before."""
-    ports = {target.port for target in targets}
     while True:
-        waiting_bytes = unread_bytes()
-        if not ports <= waiting_bytes.keys():
+        try:
+            waiting_bytes = [unread_bytes(processes[one.role].pid)[one.port] for one in targets]
+        except (FileNotFoundError, KeyError):
             return False
-        if not any(waiting_bytes[port] for port in ports):
+        if not any(waiting_bytes):
             return True
         time.sleep(0.02)
 
 
-def unread_bytes() -> Counter[int]:
-    """Return the bytes that wait in the UDP sockets of each local port, from Linux's table."""
-    found: Counter[int] = Counter()
-    for line in Path("/proc/net/udp").read_text().splitlines()[1:]:
+def unread_bytes(pid: int) -> dict[int, int]:
+    """Return the bytes that wait in the UDP sockets of a process's host, by port."""
+    found: dict[int, int] = {}
+    for line in Path(f"/proc/{pid}/net/udp").read_text().splitlines()[1:]:
         _, local, _, _, queues, *_ = line.split()
-        found[int(local.rpartition(":")[2], 16)] += int(queues.rpartition(":")[2], 16)
+        port, waiting_bytes = (int(word.rpartition(":")[2], 16) for word in (local, queues))
+        found[port] = found.get(port, 0) + waiting_bytes
     return found
+
+
+def _addresses(hosts: TwoHosts) -> tuple[str, str]:
+    return hosts.addresses[0][0], hosts.addresses[1][0]

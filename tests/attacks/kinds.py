@@ -19,6 +19,7 @@ from noack.protocol.wire_format import (
     Message,
     Rejection,
 )
+from noack.runtime.address import LOOPBACK
 
 FUTURE = 2**40
 """A sequence number that no run reaches: greater than every accepted number."""
@@ -38,6 +39,9 @@ class Target(NamedTuple):
     dimension: int
     run_id: int
     key: bytes
+    host: str = LOOPBACK
+    is_forgeable: bool = True
+    """Whether a raw socket of the attacker sends from its peer's host."""
 
 
 Make = Callable[[Target, random.Random], bytes]

@@ -1,5 +1,6 @@
 """The attacker: sends each kind of datagram to each port in turn, at a steady rate."""
 
+import ctypes
 import random
 import socket
 import struct
@@ -7,14 +8,15 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
-from noack.runtime.address import LOOPBACK
 from tests.attacks.kinds import FROM_ANYWHERE, FROM_THE_PEER, Expected, Target
 
 STRANGER, PEER = "stranger", "forged address"
 _LONGEST_BURST_S = 0.02
 _DISTINCT = 5000
 """Number of distinct datagrams per kind, sender and port; making them takes time."""
+_CLONE_NEWNET = 0x40000000
 _UDP_HEADER = struct.Struct("!HHHH")
 
 Sent = Counter[tuple[str, str, str, str]]
@@ -32,6 +34,8 @@ class Plan:
     forge_addresses: bool
     until_s: float
     """Latest end on the monotonic clock, even if datagrams are left."""
+    namespace: str | None = None
+    """Network namespace of the attacker."""
 
 
 class _Sender:
@@ -44,12 +48,12 @@ class _Sender:
 
     def send(self, target: Target, sender: str, number: int, data: bytes) -> None:
         if sender == STRANGER:
-            self._plain[number % 4].sendto(data, (LOOPBACK, target.port))
+            self._plain[number % 4].sendto(data, (target.host, target.port))
             return
         assert self._raw is not None
         size = _UDP_HEADER.size + len(data)
         header = _UDP_HEADER.pack(target.peer_port, target.port, size, 0)
-        self._raw.sendto(header + data, (LOOPBACK, target.port))
+        self._raw.sendto(header + data, (target.host, target.port))
 
 
 class _Arm:
@@ -74,7 +78,8 @@ class _Arm:
 
 def _arms(target: Target, forge_addresses: bool, draw: random.Random) -> list[_Arm]:
     arms = [_Arm(target, STRANGER, kind, draw) for kind in FROM_ANYWHERE]
-    if forge_addresses and target.role != "netem":  # the emulator accepts the sensor's address
+    # The emulator accepts the sensor's address.
+    if forge_addresses and target.is_forgeable and target.role != "netem":
         arms += [_Arm(target, PEER, kind, draw) for kind in FROM_THE_PEER]
     return arms
 
@@ -93,8 +98,17 @@ def _paced(count: int, rate_hz: float, until_s: float) -> Iterator[int]:
         due_s += 1 / rate_hz
 
 
+def _enter(namespace: str) -> None:
+    """Move this process to a network namespace."""
+    with Path(f"/var/run/netns/{namespace}").open() as file:
+        if ctypes.CDLL(None, use_errno=True).setns(file.fileno(), _CLONE_NEWNET):
+            raise OSError(ctypes.get_errno(), "setns failed")
+
+
 def carry_out(plan: Plan) -> Sent:
     """Attack; return the numbers of datagrams."""
+    if plan.namespace is not None:
+        _enter(plan.namespace)
     draw, sender, sent = random.Random(1), _Sender(plan.forge_addresses), Sent()
     every = [_arms(target, plan.forge_addresses, draw) for target in plan.targets]
     for number in _paced(plan.per_port, plan.rate_hz, plan.until_s):

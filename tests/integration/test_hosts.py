@@ -200,8 +200,13 @@ def test_what_is_no_kept_folder_is_refused(start: Start, tmp_path: Path) -> None
     for process in [start(0, role) for role in LOOP_ROLES]:
         ended(process)
     ended(recording)
+    foreign = tmp_path / "foreign"
+    (foreign / "spool").mkdir(parents=True)
+    (foreign / "spool" / "plant_step.one").write_bytes(b"rows")
+    (foreign / "run_name.txt").write_text("0123456789abcdef")
     for source, reason in [
         (str(tmp_path), f"{tmp_path}: nothing was kept there (no files in spool/)"),
+        (str(foreign), f"{foreign}: it was kept of another run than "),
         ("nohost.invalid:kept", "nohost.invalid:kept: "),
     ]:
         collecting = start(0, "collect", str(tmp_path / "runs" / "latest"), source)

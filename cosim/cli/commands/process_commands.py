@@ -2,12 +2,15 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from cosim.cli import command as cli
 from cosim.cli.execute_run import RunOutput, run_processes
+
+if TYPE_CHECKING:
+    from noack.config.scenario import Scenario
 
 InvitationOption = Annotated[
     Path | None,
@@ -76,13 +79,18 @@ def record(
 
     output, listening = RunOutput(report, verbose, json), None
     if listen is not None:
-        from cosim.live.remote_access import Listening, listen_address
+        from cosim.live.remote_access import Listening, listen_address, with_clocks
 
         role = None if invite is Invited.ALL else invite.value
         address = listen_address(listen)
         listening = Listening(address, invitation, role, 60 * valid_minutes)
+
+    def load() -> "Scenario":
+        loaded = cli.load_scenario(scenario, settings)
+        return loaded if listening is None else with_clocks(loaded)
+
     return run_processes(
-        lambda: cli.load_scenario(scenario, settings), runs, output,
+        load, runs, output,
         spawn=(RECORDER,), session=session, live=live, server=context.obj,
         listening=listening,
     )  # fmt: skip
