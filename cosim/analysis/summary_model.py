@@ -245,6 +245,7 @@ class ConditionsPart(SummaryPart):
     delay_s: Real
     hold_s: Real
     start_s: Real
+    clock_error_s: Real = None
 
 
 class ChangePart(SummaryPart):

@@ -157,9 +157,17 @@ def _record(summary: Summary) -> Iterator[tuple[str, str]]:
         yield "claims checked until", seconds(until_s)
     yield "missing samples", str(summary["missing_samples"])
     yield "lost elsewhere (kernel)", str(summary["unintended_losses"])
+    yield from _clocks(summary)
     for one in summary["restarts"]:
         yield f"{one['process']} was restarted", away(one)
     yield from changes_in(summary)
+
+
+def _clocks(summary: Summary) -> Iterator[tuple[str, str]]:
+    """Yield the largest bound of a clock's error, if it is recorded."""
+    error_s = (summary.get("conditions") or {}).get("clock_error_s")
+    if error_s is not None:
+        yield "largest bound of a clock's error", seconds(error_s)
 
 
 def _lateness(summary: Summary) -> Iterator[tuple[str, str]]:

@@ -31,6 +31,7 @@ from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Vector, row_norms
 from noack.protocol.record_tables import (
+    CLOCK_TABLES,
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
     NETEM_PACKET,
@@ -195,7 +196,7 @@ def _part_of(
             part = part[:0]
         elif table in (SENSOR_MEASUREMENT, PLANT_STEP, CONTROLLER_STEP):
             part = part[part["t_ns"] >= origin_ns]
-        elif table == NETEM_PACKET:
+        elif table == NETEM_PACKET or table in CLOCK_TABLES:
             part = part[part["now_ns"] >= origin_ns]
         elif table == CONTROLLER_DELIVERY and sequence is not None:
             part = part[part["sequence"] >= sequence]
@@ -304,6 +305,10 @@ def up_to_common_end(record: RunRecord) -> RunRecord:
         found = (rows["input"][rows[column] > end_ns] for rows in record.source.batches(pace))
         first = next(filter(len, found), None)
         before[role] = int(np.iinfo(np.int64).max if first is None else first[0])
-    return record.derived(
-        record.scenario, lambda table, rows: rows[rows["input"] < before[OWNER[table]]]
-    )
+
+    def derive(table: str, rows: Rows) -> Rows:
+        if table in CLOCK_TABLES:  # their rows have numbers of their own
+            return rows[rows["t_ns"] <= end_ns]
+        return rows[rows["input"] < before[OWNER[table]]]
+
+    return record.derived(record.scenario, derive)

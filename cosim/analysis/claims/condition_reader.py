@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from cosim.analysis.claims.clock_errors import Clocks
 from cosim.analysis.claims.input_origins import (
     NEVER,
     NO_TIMES,
@@ -32,10 +33,12 @@ from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import (
+    CLOCK_TABLES,
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
     NETEM_PACKET,
     NO_SEQUENCE,
+    OWNER,
     PLANT_ACTUATION,
     PLANT_STEP,
     SENSOR_MEASUREMENT,
@@ -53,7 +56,8 @@ def read_conditions(record: RunRecord) -> ObservedConditions:
     """Read the conditions from the record of a run; missing updates and inputs count as late."""
     reader = ConditionReader(record.scenario)
     parts: list[ObservedConditions] = []
-    for i, part in enumerate(record.slices(*READ)):
+    read = [table for table in (*READ, *CLOCK_TABLES) if table in record.tables]
+    for i, part in enumerate(record.slices(*read)):
         if i:
             parts.append(combined([reader.observed()]))
         for table, rows in part.items():
@@ -78,11 +82,14 @@ class ConditionReader:
             CONTROLLER_DELIVERY: self._ticks.deliveries,
             NETEM_PACKET: self._updates.packets,
         }
+        self._clocks = None if scenario.clocks is None else Clocks(scenario.clocks)
 
     def take(self, table: str, rows: Rows) -> None:
         """Add rows of a table, in their order."""
         if len(rows) and table in self._takes:
             self._takes[table](rows)
+        elif len(rows) and self._clocks is not None and table in CLOCK_TABLES:
+            self._clocks.add(OWNER[table], rows)
 
     def observed(self) -> ObservedConditions:
         """Return the conditions that were determined since the last call.
@@ -119,6 +126,7 @@ class ConditionReader:
         return ObservedConditions(
             losses, self._measurements.gaps(end_ns), delay, hold, start_s, watchdog, safe_input,
             self._measurements.restarts(), self._timeout_s,
+            **({} if self._clocks is None else self._clocks.observed()),
         )  # fmt: skip
 
 

@@ -1,6 +1,7 @@
 """The conditions under which a run took place, in the plant's time."""
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 
 from noack.config.scenario import Scenario
 from noack.impairments.loss_guarantee import LongestBurst, LossRule
+from noack.protocol.topology import LOOP_ROLES
 from noack.theory.certificate_terms import NetworkConditions
 from noack.theory.run_conditions import ideal_conditions
 
@@ -23,6 +25,18 @@ class VoidFrom(NamedTuple):
     why: str
 
 
+def clock_cause(role: str) -> str:
+    """Return the name of the assumption that the error of a process's clock is small."""
+    return f"{role} clock"
+
+
+def lost_cause(role: str) -> str:
+    """Return the name of the assumption that the error of a process's clock is bounded."""
+    return f"{role} clock lost"
+
+
+CLOCK_CAUSES = tuple(cause(role) for role in LOOP_ROLES for cause in (clock_cause, lost_cause))
+"""The assumptions about clocks, on which all claims depend; see ``docs/derivations.md``."""
 CAUSES = {
     "sampling": "no measurement for {:.4g} s, {:.4g} s allowed",
     "delay": "an update took effect after {:.4g} s, {:.4g} s allowed",
@@ -32,6 +46,16 @@ CAUSES = {
     "{:.4g} s allowed",
     "safe input": "the controller had no state and sent its safe input, largest entry {:.4g}",
     "restart": "the sensor was restarted: its first transmission is no event of the trigger",
+    **{
+        clock_cause(
+            role
+        ): f"the clock of {role} may have been off by {{:.4g}} s, {{:.4g}} s allowed"
+        for role in LOOP_ROLES
+    },
+    **{
+        lost_cause(role): f"the bound of the error of {role}'s clock was lost"
+        for role in LOOP_ROLES
+    },
 }
 """The assumptions about the schedule, each with the message of a violation: worst value and limit.
 
@@ -56,6 +80,11 @@ class SampledSeries(NamedTuple):
         if not len(beyond):
             return None
         return float(self.t_s[beyond[0]]), float(self.value.max())
+
+    def in_order(self) -> "SampledSeries":
+        """Return the values in the order of time."""
+        order = np.argsort(self.t_s, kind="stable")
+        return SampledSeries(self.t_s[order], self.value[order])
 
     def peaks(self, since_s: float = 0.0) -> "SampledSeries":
         """Return the values that exceed all values before; those from ``since_s`` on start anew.
@@ -131,6 +160,10 @@ class ObservedConditions(NamedTuple):
     """Generation of every restarted sensor, at its first measurement."""
     timeout_s: float
     """Age at which the watchdog acts."""
+    clocks: Mapping[str, SampledSeries] = MappingProxyType({})
+    """By ``CLOCK_CAUSES``: the bound of the error of a clock, and the times when it was lost; only
+    with ``[clocks]``."""
+    largest_clock_error_s: float = np.inf
 
     def violations(
         self,
@@ -162,6 +195,9 @@ class ObservedConditions(NamedTuple):
             "safe input": (self.safe_input, -1.0),  # every value is a violation
             "restart": (self.restarts, 0.0),
         }
+        for cause, series in self.clocks.items():
+            lost = cause.endswith("lost")  # every value is a violation
+            every[cause] = (series, -1.0 if lost else self.largest_clock_error_s)
         for cause, (series, limit) in every.items():
             if (excess := series.excess(limit)) is not None:
                 first_s, worst = excess
@@ -177,12 +213,16 @@ class ObservedConditions(NamedTuple):
 
     def summary(self) -> dict[str, float | None]:
         """The largest value of each condition."""
+        clocks = [
+            self.clocks[cause].largest() for cause in map(clock_cause, LOOP_ROLES) if self.clocks
+        ]
         return {
             DROPOUTS: self.losses.consecutive(0.0).largest(),
             "sampling_s": self.sampling.largest(),
             "delay_s": self.delay.largest(),
             "hold_s": self.hold.largest(),
             "start_s": self.start_s if np.isfinite(self.start_s) else None,
+            "clock_error_s": max((one for one in clocks if one is not None), default=None),
         }
 
 
@@ -202,6 +242,10 @@ def combined(parts: Sequence[ObservedConditions]) -> ObservedConditions:
         watchdog=SampledSeries(*joined(one.watchdog for one in parts)).peaks(),
         safe_input=SampledSeries(*joined(one.safe_input for one in parts)).peaks(last.start_s),
         restarts=SampledSeries(*joined(one.restarts for one in parts)),
+        clocks={
+            cause: SampledSeries(*joined(one.clocks[cause] for one in parts)).in_order().peaks()
+            for cause in last.clocks
+        },
     )
 
 
@@ -213,13 +257,13 @@ def earliest(found: Iterable[VoidFrom | None]) -> VoidFrom | None:
 def causes_of(scenario: Scenario) -> Collection[str]:
     """The assumptions that claims about a resolved scenario need.
 
-    Certificates need all of them. (I1) needs the measurements only. There are no claims about the
-    acknowledgement baseline.
+    Certificates need all of them. (I1) needs the measurements, and all claims need the clocks.
+    There are no claims about the acknowledgement baseline.
     """
     if scenario.protocol.acknowledges:
         return ()
     if not scenario.coverage.is_certifiable:
-        return ("sampling",)
+        return ("sampling", *CLOCK_CAUSES)
     return (*guarantee_causes(scenario), *CAUSES)
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from cosim.analysis.claims.condition_reader import read_conditions
 from cosim.analysis.claims.observed_conditions import (
+    CLOCK_CAUSES,
     AssumptionViolation,
     ObservedConditions,
     Reals,
@@ -221,9 +222,12 @@ class RunEvidence:
 
     @cached_property
     def first_gap(self) -> VoidFrom | None:
-        """The time from which the record is incomplete and no claim can be checked."""
+        """The time from which no claim can be checked.
+
+        The record is incomplete, or the error of a process's clock is not bounded as required.
+        """
         limit = _ANY._replace(sampling_s=self._schedule.sampling_s)
-        found = [self.observed.first_violation(limit, ("sampling",))]
+        found = [self.observed.first_violation(limit, ("sampling", *CLOCK_CAUSES))]
         whole = self.part.whole or self.record
         for role in LOOP_ROLES:
             gaps_ns = filter(None, (life.hole_ns for life in whole.lives(role)))

@@ -13,7 +13,7 @@ import numpy as np
 from cosim.analysis.replay.machine_replay import MachineReplay, sent_messages
 from cosim.analysis.replay.recorded_inputs import received_vectors
 from cosim.analysis.replay.replay_result import MessagesReplay, difference, first_entry
-from cosim.record.record_source import Slice
+from cosim.record.record_source import Rows, Slice
 from cosim.record.run_record import RunRecord
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -131,6 +131,7 @@ class _Hop:
         self._sent = sent_messages([])
         """Messages that may still be received, in order of their numbers."""
         self._survivors: set[int] = set()
+        self._waiting: Rows | None = None
         self._newest = -1
         self._received = self._read = 0
         self._encoder: Encoder | None = None
@@ -140,14 +141,31 @@ class _Hop:
         self._first: dict[str, _Difference] = {}
 
     def take(self, part: Slice, survivors: list[tuple[int, Header | None]]) -> None:
-        """Compare the messages received in a part with those sent up to its end."""
-        rows = part[self._table]
+        """Add the messages sent in a part, and compare those received in the part before.
+
+        By its receiver's clock, a message may be received before it was sent by its sender's, if
+        they are on different hosts, and so in the part before.
+        """
+        for messages in self._sender.sent_in(self._flow):
+            self._add(messages)
+        if self._was_forwarded:
+            self._survivors |= {
+                header.sequence
+                for flow, header in survivors
+                if flow == self._direction and header is not None
+            }
+        self._compare_waiting()
+        self._waiting = part[self._table]
+
+    def _compare_waiting(self) -> None:
+        """Compare the messages received in the part before."""
+        rows, self._waiting = self._waiting, None
+        if rows is None:
+            return
         self._rows, self._at = rows, np.arange(len(rows))
         if self._selects:
             self._at = np.flatnonzero(rows["flow"] == self._direction)
             self._rows = rows[self._at]
-        for messages in self._sender.sent_in(self._flow):
-            self._add(messages)
         if self._table == NETEM_PACKET:
             self._compare_heads()
             if not self._selects:
@@ -155,11 +173,6 @@ class _Hop:
         else:
             self._compare_vectors()
         if self._was_forwarded:
-            self._survivors |= {
-                header.sequence
-                for flow, header in survivors
-                if flow == self._direction and header is not None
-            }
             self._compare_with_survivors()
         self._received += len(self._rows)
         self._read += len(rows)
@@ -169,7 +182,8 @@ class _Hop:
         self._survivors = {k for k in self._survivors if k >= self._newest}
 
     def result(self, *, network_is_whole: bool) -> MessagesReplay:
-        """Return the first difference of all messages."""
+        """Return the first difference of all messages, after the last part."""
+        self._compare_waiting()
         counts = {_SENT: self._sender.whole, _FORWARDED: network_is_whole}
         kinds = [kind for kind in (_CONTENT, _SENT, _FORWARDED) if counts.get(kind, True)]
         firsts = [self._first[kind] for kind in kinds if kind in self._first]

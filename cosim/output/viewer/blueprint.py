@@ -18,6 +18,7 @@ Entities of the recording, all on the timeline ``t`` (simulated time since the r
 ``reception/stem``        the stems of both
 ``drop``                  0 at every lost update
 ``lateness/<process>``    lateness in microseconds
+``clock/<process>``       bound of the error of a process's clock in microseconds
 ``log``                   text
 ``picture/…``             the plant, animated (``cosim/output/viewer/pictures/``)
 ``network/…``             the loop's processes, and packets in flight
@@ -82,6 +83,11 @@ def lateness_path(process: str) -> str:
     return f"lateness/{rr.escape_entity_path_part(process)}"
 
 
+def clock_path(process: str) -> str:
+    """Return the entity of the bound of a clock's error; the process's name is escaped."""
+    return f"clock/{rr.escape_entity_path_part(process)}"
+
+
 def styles(
     state_names: Sequence[str], input_names: Sequence[str], processes: Sequence[str]
 ) -> dict[str, rr.SeriesLines | rr.SeriesPoints]:
@@ -119,14 +125,24 @@ def styles(
     found[RECEPTION] = _mark("received", CONTROLLER, "circle", 4.0)
     found[FORCED] = _mark("received (forced)", FORCED_COLOUR, "diamond", 6.0)
     found[DROP] = _mark("lost", LOST, "cross", 5.0)
-    for i, process in enumerate(processes):
-        found[lateness_path(process)] = rr.SeriesLines(
+    return found | {lateness_path(one): line for one, line in _of_processes(processes).items()}
+
+
+def clock_styles(processes: Sequence[str]) -> dict[str, rr.SeriesLines]:
+    """Return name, colour and width of the bounds of the clocks' errors, by entity."""
+    return {clock_path(one): line for one, line in _of_processes(processes).items()}
+
+
+def _of_processes(processes: Sequence[str]) -> dict[str, rr.SeriesLines]:
+    return {
+        process: rr.SeriesLines(
             names=process,
             colors=PROCESSES.get(process, SERIES[i % len(SERIES)]),
             widths=1.5,
             aggregation_policy="Max",
         )
-    return found
+        for i, process in enumerate(processes)
+    }
 
 
 def _stem(name: str, colour: Colour) -> rr.SeriesLines:
@@ -150,9 +166,12 @@ def layout(
     *,
     picture: Picture | None = None,
     diagram: NetworkDiagram | None = None,
+    clocks: bool = False,
 ) -> rrb.Blueprint:
     """Lay out the panels of a run; see :func:`panels`."""
-    shown = panels(state_names, input_names, processes, picture=picture, diagram=diagram)
+    shown = panels(
+        state_names, input_names, processes, picture=picture, diagram=diagram, clocks=clocks
+    )
     return over_time(shown, horizon_s)
 
 
@@ -172,12 +191,14 @@ def panels(
     *,
     picture: Picture | None = None,
     diagram: NetworkDiagram | None = None,
+    clocks: bool = False,
 ) -> rrb.Container:
     """Lay out the panels: picture, packets and texts on the left, curves on the right.
 
-    Plots have no legends, which would cover data; instead, a panel explains the colours.
+    With ``clocks`` the bounds of the clocks' errors are among the texts. Plots have no legends,
+    which would cover data; instead, a panel explains the colours.
     """
-    texts = _texts(input_names, lateness=bool(processes))
+    texts = _texts(input_names, lateness=bool(processes), clocks=clocks)
     drawings = [] if picture is None else [panel(picture)]
     drawings += [] if diagram is None else [diagram.panel()]
     if drawings:
@@ -230,12 +251,13 @@ def _inputs() -> rrb.View:
     return plot("Control input u", INPUT)
 
 
-def _texts(input_names: Sequence[str], *, lateness: bool) -> rrb.Container:
-    """Return the tabs: the colour key, the text about the run, lateness, the log."""
+def _texts(input_names: Sequence[str], *, lateness: bool, clocks: bool) -> rrb.Container:
+    """Return the tabs: the colour key, the text about the run, lateness, clocks, the log."""
     return rrb.Tabs(
         ColourKey(input_names).panel(),
         rrb.TextDocumentView(origin=ABOUT, name="About this run"),
         *([plot("Lateness [µs]", "lateness", ["$origin/**"])] if lateness else []),
+        *([plot("Clock error [µs]", "clock", ["$origin/**"])] if clocks else []),
         log_view(),
     )
 

@@ -47,6 +47,7 @@ class RunView(RecordingFile):
         diagram: diagram of the network, if there is one.
         live: live viewer, which shows the file while it is written.
         indexed: see :class:`RecordingFile`.
+        clocks: whether the bounds of the clocks' errors are shown.
 
     Raises:
         ViewError: the file cannot be created.
@@ -67,12 +68,14 @@ class RunView(RecordingFile):
         diagram: NetworkDiagram | None = None,
         live: LiveView | None = None,
         indexed: bool = True,
+        clocks: bool = False,
     ) -> None:
         names = (state_names, input_names, processes)
-        layout = bp.layout(*names, horizon_s, picture=picture, diagram=diagram)
+        layout = bp.layout(*names, horizon_s, picture=picture, diagram=diagram, clocks=clocks)
         super().__init__(path, run_id, layout, indexed=indexed)
         self._live = live
-        self.describe(title, self._begin(about, *names, picture, diagram))
+        static = self._begin(about, *names, picture, diagram)
+        self.describe(title, static | (bp.clock_styles(processes) if clocks else {}))
         if live is not None:
             live.show(path)
 
@@ -198,6 +201,11 @@ class RunView(RecordingFile):
         """Add a process's lateness in µs (k,) at times (k,), if it is shown."""
         if process in self._lateness:
             self.send(self._lateness[process], t_ns, lateness_us)
+
+    def clock_errors(self, process: str, t_ns: Nanoseconds, error_us: Floats) -> None:
+        """Add bounds of the error of a process's clock in µs (k,) at times (k,); NaN: lost."""
+        if process in self._lateness:
+            self.send(bp.clock_path(process), t_ns, error_us)
 
     def close(self) -> None:
         """Write the waiting data and the file's footer; a second call does nothing.

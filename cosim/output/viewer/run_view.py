@@ -51,6 +51,7 @@ def open_view(
         if at_once and is_long(scenario)
         else NetworkDiagram(*scenario.network.flows[1:]),
         live=live,
+        clocks=scenario.clocks is not None and kind == "live",
         indexed=at_once or scenario.horizon_s <= _INDEXED_S * scenario.speed,
     )
 

@@ -28,11 +28,14 @@ from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import row_norms
 from noack.protocol.record_tables import (
+    CLOCK_TABLES,
     CONTROLLER_DELIVERY,
     CONTROLLER_SETTING,
     CONTROLLER_STEP,
+    LOST_NS,
     NETEM_PACKET,
     NO_SEQUENCE,
+    OWNER,
     PLANT_STEP,
     SENSOR_MEASUREMENT,
     Fate,
@@ -89,8 +92,11 @@ class ViewFeed:
         self._loop = loop_of(scenario)
         self._view = view
         # Other tables are not shown.
-        self._pending: dict[str, list[Rows]] = {table: [] for table in SHOWN}
         self._types = tables_of(scenario)
+        self._clock_tables = [table for table in CLOCK_TABLES if table in self._types]
+        self._pending: dict[str, list[Rows]] = {
+            table: [] for table in (*SHOWN, *self._clock_tables)
+        }
         self._track: ControllerTrack = initial_track(scenario)
         self._undrawn: list[Rows] = []
         self._forced: set[int] = set()
@@ -148,7 +154,15 @@ class ViewFeed:
             self._steps = np.concatenate([self._steps, taken])
         self._lateness("plant", taken)
         self._measurements(self._take(SENSOR_MEASUREMENT, until_ns), reach_ns)
+        for table in self._clock_tables:
+            self._clock_errors(table, self._take(table, None))
         self._view.flush()
+
+    def _clock_errors(self, table: str, rows: Rows) -> None:
+        if len(rows):
+            error_us = np.where(rows["error_ns"] == LOST_NS, np.nan, rows["error_ns"] * 1e-3)
+            keep = self._kept(rows["now_ns"], error_us)
+            self._view.clock_errors(OWNER[table], rows["now_ns"][keep], error_us[keep])
 
     def _take(self, table: str, until_ns: int | None) -> Rows:
         waiting = self._pending[table]

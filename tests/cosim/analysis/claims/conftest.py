@@ -63,7 +63,7 @@ def make() -> Make:
         }  # fmt: skip
         for section, values in changes.items():
             inner = isinstance(values, dict)
-            content[section] = content[section] | values if inner else values
+            content[section] = content.get(section, {}) | values if inner else values
         return resolve(validate(content, "test"))
 
     return scenario

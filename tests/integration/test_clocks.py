@@ -1,0 +1,196 @@
+"""Runs whose processes have different monotonic clocks, in time namespaces: offsets are known."""
+
+import json
+import os
+import select
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cosim.record.run_record import RunRecord, load_record
+from noack.core.clock import NS_PER_S
+from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER
+from noack.protocol.topology import LOOP_ROLES
+from tests.integration import conftest as live
+
+HORIZON_S = 3.0
+ROOMY = "clocks.largest_error_us=1000000"
+"""A busy machine gives wide bounds."""
+
+
+def _other_clock(ahead_s: int) -> list[str]:
+    return ["unshare", "--time", f"--monotonic={ahead_s}", "--fork", "--kill-child"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _may_set_clocks() -> None:
+    if sys.platform != "linux" or os.geteuid() != 0:
+        pytest.skip("only root can make time namespaces")
+    if subprocess.run([*_other_clock(1), "true"], capture_output=True, check=False).returncode:
+        pytest.skip("no time namespaces here")
+
+
+class Forwarder:
+    """Passes the datagrams of one client to a port and back, while it is open."""
+
+    def __init__(self, port: int) -> None:
+        self._to = ("127.0.0.1", port)
+        self._inside, self._outside = (
+            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)
+        )
+        for one in (self._inside, self._outside):
+            one.bind(("127.0.0.1", 0))
+        self.port = int(self._inside.getsockname()[1])
+        self._client: tuple[str, int] | None = None
+        self.is_open, self._stop = True, False
+
+    def work(self) -> None:
+        while not self._stop:
+            for one in select.select([self._inside, self._outside], (), (), 0.05)[0]:
+                data, source = one.recvfrom(2048)
+                if one is self._inside:
+                    self._client = source
+                target = self._to if one is self._inside else self._client
+                if self.is_open and target is not None:
+                    (self._outside if one is self._inside else self._inside).sendto(data, target)
+
+    @contextmanager
+    def working(self) -> Iterator["Forwarder"]:
+        thread = threading.Thread(target=self.work)
+        thread.start()
+        try:
+            yield self
+        finally:
+            self._stop = True
+            thread.join()
+            self._inside.close()
+            self._outside.close()
+
+
+class Run:
+    """A run whose processes are started by hand, some of them with another clock."""
+
+    def __init__(self, stack: ExitStack, folder: Path, *settings: str) -> None:
+        self._stack, self._folder = stack, folder
+        self.recording = self._start(
+            [], "record", "lane_following", "--listen", "127.0.0.1", "--json", *live.BARE,
+            *live.AT_RATE, *live.settings(horizon_s=HORIZON_S), *settings,
+        )  # fmt: skip
+        self.invitation = folder / "invitation.json"
+        live.wait_for(lambda: self.invitation.exists() or self.recording.poll() is not None)
+        assert self.recording.poll() is None, self.recording.communicate()
+
+    def _start(self, before: list[str], *arguments: str) -> subprocess.Popen[str]:
+        environment = os.environ | {"XDG_RUNTIME_DIR": str(self._folder)}
+        process = subprocess.Popen(
+            [*before, *live.noack_command(*arguments)], cwd=self._folder, env=environment,
+            text=True, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        )  # fmt: skip
+        self._stack.callback(process.communicate)
+        self._stack.callback(process.kill)
+        return process
+
+    def join(self, role: str, ahead_s: int = 0) -> subprocess.Popen[str]:
+        if not ahead_s:
+            return self._start([], role, "--json")
+        invited = ("--invitation", str(self.invitation), "--json")
+        return self._start(_other_clock(ahead_s), role, *invited)
+
+    def forwarder(self) -> Forwarder:
+        """Change the invitation, so that requests for the time pass a forwarder."""
+        content = json.loads(self.invitation.read_text())
+        found = Forwarder(content["time_reference"][1])
+        self._stack.enter_context(found.working())
+        content["time_reference"][1] = found.port
+        self.invitation.write_text(json.dumps(content))
+        return found
+
+    def finished(self) -> tuple[dict[str, object], RunRecord]:
+        stdout, stderr = self.recording.communicate(timeout=live.PATIENCE_S)
+        assert self.recording.returncode == 0, stderr
+        return json.loads(stdout), load_record((self._folder / "runs" / "latest").resolve())
+
+
+@pytest.fixture
+def stack() -> Iterator[ExitStack]:
+    with ExitStack() as entered:
+        yield entered
+
+
+@pytest.mark.parametrize(
+    ("away", "ahead_s"), [(("netem", "controller"), 1), (("plant", "sensor"), -1)]
+)
+def test_processes_with_other_clocks_carry_a_run(
+    stack: ExitStack, tmp_path: Path, away: tuple[str, ...], ahead_s: int
+) -> None:
+    run = Run(stack, tmp_path, "--set", ROOMY)
+    processes = [run.join(role, ahead_s if role in away else 0) for role in LOOP_ROLES]
+    for process in processes:
+        _, stderr = process.communicate(timeout=live.PATIENCE_S)
+        assert process.returncode == 0, stderr
+    summary, record = run.finished()
+    assert summary["missing_samples"] == summary["unintended_losses"] == 0
+    assert summary["replay"]["bit_exact"]  # type: ignore[index]
+    assert len(record["plant_step"]) == HORIZON_S * live.RATE_HZ + 1
+    for table in ("plant_step", "controller_step"):  # nobody begins before the common epoch
+        assert (record[table]["now_ns"] >= record[table]["t_ns"]).all()
+    for table in CLOCK_TABLES:
+        rows, true_ns = record[table], -ahead_s * NS_PER_S * (OWNER[table] in away)
+        assert len(rows) > 0
+        known = rows[rows["error_ns"] != LOST_NS]
+        assert (np.abs(known["offset_ns"] - true_ns) <= known["error_ns"]).all()
+        assert (np.diff(rows["now_ns"]) >= 0).all()
+        assert (rows["error_ns"] > 0).all() == (OWNER[table] in away)
+    (largest_s,) = {summary["conditions"]["clock_error_s"]}  # type: ignore[index]
+    assert 0 < largest_s < 1
+
+
+def test_a_lost_bound_voids_all_claims_within_a_second(stack: ExitStack, tmp_path: Path) -> None:
+    run = Run(stack, tmp_path, "--set", ROOMY)
+    way = run.forwarder()
+    for role in LOOP_ROLES:
+        run.join(role, 1 if role == "controller" else 0)
+    spooled = tmp_path / "runs" / "latest" / "spool" / "controller_clock.recorder"
+    live.wait_for(lambda: spooled.exists() and spooled.stat().st_size > 0)
+    way.is_open = False
+    summary, record = run.finished()
+    rows = record["controller_clock"]
+    answered_ns = int(rows["now_ns"][np.searchsorted(rows["sequence"], rows["sequence"][-1])])
+    lost = rows[rows["error_ns"] == LOST_NS]
+    assert 0 <= lost["t_ns"][0] - answered_ns <= NS_PER_S
+    since_s = lost["t_ns"][0] / NS_PER_S
+    claims = summary["claims"]
+    assert isinstance(claims, list)
+    assert "held" not in {claim["verdict"] for claim in claims}
+    why = "the bound of the error of controller's clock was lost"
+    void = [claim for claim in claims if why in claim["why"]]
+    assert {claim["source"] for claim in void} >= {"(I1)"}
+    assert {claim["since_s"] for claim in void if claim["source"] == "(I1)"} == {since_s}
+    assert "controller clock lost" in {
+        one["cause"]
+        for one in summary["assumption_violations"]  # type: ignore[attr-defined]
+    }
+    texts = [one["text"] for one in record.notices if one["process"] == "controller"]
+    assert any(
+        text.startswith("the bound of its clock's error is lost: no answer") for text in texts
+    )
+
+
+def test_without_a_reference_a_process_with_another_clock_does_not_join(
+    stack: ExitStack, tmp_path: Path
+) -> None:
+    run = Run(stack, tmp_path)
+    content = json.loads(run.invitation.read_text())
+    run.invitation.write_text(json.dumps(content | {"time_reference": None}))
+    process = run.join("controller", 1)
+    _, stderr = process.communicate(timeout=live.PATIENCE_S)
+    assert process.returncode == 1
+    assert stderr.startswith("noack controller: this process and the run's coordinator have differ")
+    assert len(stderr.splitlines()) == 1
