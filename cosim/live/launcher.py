@@ -28,7 +28,6 @@ from cosim.record.run_directory import active_run, new_run_dir, point_to_latest,
 from cosim.record.run_ending import EndingFile, RunEnding
 from noack.config.resolution import resolved_loops, tables_of
 from noack.config.scenario import Scenario
-from noack.config.sections.run_sections import ClocksSection
 from noack.core.errors import ExitStatus, NeverStartedError, NoackError
 from noack.protocol.topology import PLANT, RECORDER, ROLES
 from noack.runtime import run_registry

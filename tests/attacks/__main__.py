@@ -55,15 +55,17 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="noack-attack-") as folder, ExitStack() as stack:
         hosts = stack.enter_context(two_hosts()) if options.hosts else None
         run = attack(Path(folder), options.number, options.rate, forge_addresses=forge, hosts=hosts)
-    console = Console()
-    if not console.is_terminal:
-        console.width = _WIDTH
-    console.print(table_of(run))
-    held = sum(claim["verdict"] == "held" for claim in run.summary["claims"])
-    print(f"claims: {held} of {len(run.summary['claims'])} held, the others void with their reason")
-    late = {role: run.summary["lateness_us"][role]["p99"] for role in LOOP_ROLES}
-    print("lateness p99:", ", ".join(f"{role} {us:.0f} µs" for role, us in late.items()))
-    wrong = [f"{name}: {line}" for name, check in CHECKS.items() for line in check(run)]
+        # The record is read from the folder.
+        console = Console()
+        if not console.is_terminal:
+            console.width = _WIDTH
+        console.print(table_of(run))
+        held = sum(claim["verdict"] == "held" for claim in run.summary["claims"])
+        number = len(run.summary["claims"])
+        print(f"claims: {held} of {number} held, the others void with their reason")
+        late = {role: run.summary["lateness_us"][role]["p99"] for role in LOOP_ROLES}
+        print("lateness p99:", ", ".join(f"{role} {us:.0f} µs" for role, us in late.items()))
+        wrong = [f"{name}: {line}" for name, check in CHECKS.items() for line in check(run)]
     for line in wrong:
         print(line, file=sys.stderr)
     return 1 if wrong else 0

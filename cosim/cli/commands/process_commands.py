@@ -2,15 +2,12 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from cosim.cli import command as cli
 from cosim.cli.execute_run import RunOutput, run_processes
-
-if TYPE_CHECKING:
-    from noack.config.scenario import Scenario
 
 InvitationOption = Annotated[
     Path | None,
@@ -79,7 +76,7 @@ def record(
 
     output, listening = RunOutput(report, verbose, json), None
     if listen is not None:
-        from cosim.live.remote_access import Listening, listen_address, with_clocks
+        from cosim.live.remote_access import Listening, listen_address
 
         role = None if invite is Invited.ALL else invite.value
         address = listen_address(listen)
