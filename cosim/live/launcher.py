@@ -88,8 +88,8 @@ def launch(
         NeverStartedError: the run ended before all processes were ready.
     """
     began_ns = time.monotonic_ns()
-    if listening is not None and scenario.clocks is None and scenario.loops is None:
-        scenario = scenario.model_copy(update={"clocks": ClocksSection()})
+    if listening is not None:
+        scenario = with_clocks(scenario)
     with contextlib.ExitStack() as stack:
         server = server or stack.enter_context(fork_server())
         loops = resolved_loops(scenario)

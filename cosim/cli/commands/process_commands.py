@@ -82,12 +82,8 @@ def record(
         address = listen_address(listen)
         listening = Listening(address, invitation, role, 60 * valid_minutes)
 
-    def load() -> "Scenario":
-        loaded = cli.load_scenario(scenario, settings)
-        return loaded if listening is None else with_clocks(loaded)
-
     return run_processes(
-        load, runs, output,
+        lambda: cli.load_scenario(scenario, settings), runs, output,
         spawn=(RECORDER,), session=session, live=live, server=context.obj,
         listening=listening,
     )  # fmt: skip
