@@ -175,6 +175,11 @@ def reference_clock(ticket: Ticket) -> ReferenceClock | None:
     """
     if not reads_other_clock(ticket):
         return None
+    if ticket.scenario.loops is not None:
+        raise PeerError(
+            "this process and the run's coordinator have different clocks; a run of several loops "
+            "needs hosts with one clock"
+        )
     if ticket.time_reference is None:
         raise PeerError(
             "this process and the run's coordinator have different clocks, and the coordinator's "
