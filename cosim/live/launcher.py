@@ -28,7 +28,6 @@ from cosim.record.run_directory import active_run, new_run_dir, point_to_latest,
 from cosim.record.run_ending import EndingFile, RunEnding
 from noack.config.resolution import resolved_loops, tables_of
 from noack.config.scenario import Scenario
-from noack.config.sections.run_sections import ClocksSection
 from noack.core.errors import ExitStatus, NeverStartedError, NoackError
 from noack.protocol.topology import PLANT, RECORDER, ROLES
 from noack.runtime import run_registry
@@ -82,15 +81,13 @@ def launch(
         live: show the run in a viewer while it runs.
         watcher: callbacks.
         server: starts the processes; by default a new one.
-        listening: how processes on other hosts join; the bounds of their clocks are recorded.
+        listening: how processes on other hosts join.
 
     Raises:
         CallerError, MachineError: the run could not be prepared.
         NeverStartedError: the run ended before all processes were ready.
     """
     began_ns = time.monotonic_ns()
-    if listening is not None and scenario.clocks is None and scenario.loops is None:
-        scenario = scenario.model_copy(update={"clocks": ClocksSection()})
     with contextlib.ExitStack() as stack:
         server = server or stack.enter_context(fork_server())
         loops = resolved_loops(scenario)
