@@ -81,7 +81,7 @@ def launch(
         live: show the run in a viewer while it runs.
         watcher: callbacks.
         server: starts the processes; by default a new one.
-        listening: how processes on other hosts join; the bounds of their clocks are recorded.
+        listening: how processes on other hosts join.
 
     Raises:
         CallerError, MachineError: the run could not be prepared.

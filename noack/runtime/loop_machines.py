@@ -33,7 +33,7 @@ def run_machines(process: RunProcess, new_machine: NewMachine, compiled: FleetRo
         compiled: the machines of many loops as compiled code.
     """
     fleet = None
-    if not (process.start.is_restart or process.follows_reference):
+    if not process.start.is_restart:
         ticket = process.ticket
         fleet = fleet_of(compiled, process.role, process.scenario, ticket.run_id, ticket.key)
     if fleet is not None:

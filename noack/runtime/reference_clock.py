@@ -175,15 +175,15 @@ def reference_clock(ticket: Ticket) -> ReferenceClock | None:
     """
     if not reads_other_clock(ticket):
         return None
+    if ticket.scenario.loops is not None:
+        raise PeerError(
+            "this process and the run's coordinator have different clocks; a run of several loops "
+            "needs hosts with one clock"
+        )
     if ticket.time_reference is None:
         raise PeerError(
             "this process and the run's coordinator have different clocks, and the coordinator's "
             "host answers no requests for the time; it does with `noack record --listen`"
-        )
-    if ticket.scenario.loops is not None:
-        raise PeerError(
-            "this process and the run's coordinator have different clocks; a run of several loops "
-            "needs hosts with one clock, since it records no bound of their offset"
         )
     settings = ticket.scenario.clocks or ClocksSection()
     return ReferenceClock(ticket.time_reference, ticket.key, settings)

@@ -61,7 +61,7 @@ Times = NDArray[np.int64]
 Reals = NDArray[np.float64]
 
 
-_WARNINGS = ("failed", "violation", "void", "diverges", "watchdog")
+_WARNINGS = ("failed", "violation", "void", "diverges", "watchdog", "clock lost")
 
 
 def log_level(notice: Mapping[str, Any]) -> str:

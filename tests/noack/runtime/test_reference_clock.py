@@ -3,10 +3,13 @@
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 from benchmarks._driven_clocks import DrivenClocks
+from noack.config.scenario_file import validate
 from noack.config.sections.run_sections import ClocksSection
 from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import PeerError
@@ -14,7 +17,13 @@ from noack.protocol.machine_interface import BEGINNING, Notice, Record
 from noack.protocol.record_tables import LOST_NS
 from noack.runtime.arrival_times import HostClocks
 from noack.runtime.clock_record import FOUND, LOST, ClockRecord
-from noack.runtime.reference_clock import LOST_AFTER_NS, ClockReport, ReferenceClock
+from noack.runtime.join_ticket import new_ticket
+from noack.runtime.reference_clock import (
+    LOST_AFTER_NS,
+    ClockReport,
+    ReferenceClock,
+    reference_clock,
+)
 from noack.runtime.time_exchange import TimeReference, answering
 
 KEY = bytes(range(32))
@@ -191,3 +200,11 @@ def test_the_coordinators_own_clock_has_no_error() -> None:
         assert one.row[0] == number
         assert one.row[-2:] == (0, 0)
     assert record.summary() == {}
+
+
+def test_a_process_with_another_clock_does_not_join_several_loops(content: dict[str, Any]) -> None:
+    scenario = validate(content | {"loops": [{"name": "one", "count": 2}]}, "small")
+    ticket = new_ticket(scenario, Path("run"), launched=False)
+    assert reference_clock(ticket) is None
+    with pytest.raises(PeerError, match="several loops needs hosts with one clock"):
+        reference_clock(ticket.model_copy(update={"clock": "another"}))
