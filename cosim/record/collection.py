@@ -13,8 +13,7 @@ from pathlib import Path
 
 from cosim.record.run_directory import ENVIRONMENT_FILE, read_object
 from noack.core.errors import CallerError, MachineError, PeerError, why
-from noack.runtime.record_handover import RUN_NAME_FILE
-from noack.runtime.spool import SPOOL
+from noack.runtime.spool import RUN_NAME_FILE, SPOOL
 
 
 def collect(run_dir: Path, source: str) -> int:

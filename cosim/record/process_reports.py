@@ -14,8 +14,7 @@ from noack.core.file_access import write_whole
 from noack.protocol.record_tables import OWNER
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.control_messages import ProcessReport, parse_message
-from noack.runtime.record_handover import KEPT_REPORT
-from noack.runtime.spool import SPOOL, read_chunks
+from noack.runtime.spool import KEPT_REPORT, SPOOL, read_chunks
 
 _EARLIER = "earlier"
 

@@ -12,13 +12,9 @@ from noack.runtime.control_messages import MissingRows, PersistedAck, parse_mess
 from noack.runtime.control_plane import ControlPlane, run_name
 from noack.runtime.join_ticket import Ticket
 from noack.runtime.log_lines import NOTICES, notice_number, notices_of
-from noack.runtime.spool import SPOOL, SpoolWriter
+from noack.runtime.spool import KEPT_REPORT, RUN_NAME_FILE, SPOOL, SpoolWriter
 from noack.runtime.telemetry import TelemetryBuffer, first_row
 
-KEPT_REPORT = "report"
-"""Name of a final report in the spool, in place of a table's."""
-RUN_NAME_FILE = "run_name.txt"
-"""In the folder of what a process on another host keeps: of which run it is."""
 _REPORT_TIMEOUT_S = 5.0
 _REPORT_ATTEMPTS = 3
 

@@ -15,6 +15,10 @@ from typing import BinaryIO, NamedTuple
 from noack.core.errors import MachineError, why
 
 SPOOL = "spool"  # the spool's folder in the run directory
+KEPT_REPORT = "report"
+"""Name of a process's final report in the spool, in place of a table's."""
+RUN_NAME_FILE = "run_name.txt"
+"""In the folder of what a process on another host keeps: of which run it is."""
 _CHUNK = struct.Struct("<QQ")
 _READ_BYTES = 256 * 1024
 
