@@ -349,8 +349,8 @@ class RunProcess:
         self._spool.keep_report(self.report)
         if self.ticket.remote is not None:
             print_to_stderr(
-                f"noack {self.role}: the recorder is out of reach; its newest rows are kept in "
-                f"{self.ticket.run_dir} (there: `noack collect RUN HOST:{self.ticket.run_dir}`)"
+                f"noack {self.role}: cannot reach the recorder; the newest rows are kept in "
+                f"{self.ticket.run_dir} until `noack collect` on the recorder's host"
             )
 
 
