@@ -23,7 +23,7 @@ from noack.runtime.join_ticket import RemoteAccess, Ticket, new_admission_pass
 from noack.runtime.time_exchange import TimeReference, answering
 from noack.runtime.zenoh_session import socket_path
 
-_BACKLOG = 512
+_BACKLOG = 4096
 
 
 class Listening(NamedTuple):
