@@ -10,7 +10,7 @@ import shutil
 import signal
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,8 +31,9 @@ from noack.config.scenario import Scenario
 from noack.core.errors import ExitStatus, NeverStartedError, NoackError
 from noack.protocol.topology import PLANT, RECORDER, ROLES
 from noack.runtime import run_registry
-from noack.runtime.address import Address, text_of
+from noack.runtime.address import text_of
 from noack.runtime.control_plane import run_name
+from noack.runtime.invitation import invitation_file
 from noack.runtime.join_ticket import Ticket, new_ticket, published
 from noack.runtime.life_cycle import HORIZON
 from noack.runtime.signals import Signals
@@ -113,12 +114,16 @@ def launch(
         coordinator = Coordinator(ticket, spawn)
         stack.callback(coordinator.close)
         watcher = watcher or Watcher()
-        if listening is not None:
-            ticket = ticket.model_copy(update={"host": listening.address[0]})
-            invited = _opened(stack, listening, ticket, coordinator)
-            watcher.listening(text_of(invited), listening)
-        if session is not None:
-            _publish_session(stack, ticket, session)
+        with _no_directory_if_refused(run_dir):
+            if listening is not None:
+                ticket = ticket.model_copy(update={"host": listening.address[0]})
+                opened = stack.enter_context(open_to_hosts(listening, ticket, coordinator))
+            if session is not None:
+                by_hand = ticket.model_copy(update={"launched": False})
+                stack.enter_context(published(by_hand, session))
+            if listening is not None:  # last: it replaces the invitation of an earlier run
+                stack.enter_context(invitation_file(listening.invitation, opened.invited))
+                watcher.listening(text_of(opened.address), listening)
         stack.enter_context(children.started(live=live))
         run = _Run(ticket, run_dir, coordinator, children, watcher)
         status, reason = run.watch(signals, ending.store)
@@ -129,32 +134,13 @@ def launch(
     return RunEnding(run_dir, ticket.run_id, status, reason, startup_s)
 
 
-def _opened(
-    stack: contextlib.ExitStack, listening: Listening, ticket: Ticket, coordinator: Coordinator
-) -> Address:
-    """Open the run to other hosts; refused, leave no run directory.
-
-    Raises:
-        CallerError: the address cannot be used, or the invitation cannot be written.
-    """
+@contextlib.contextmanager
+def _no_directory_if_refused(run_dir: Path) -> Iterator[None]:
+    """Remove the run directory if an error says that the run cannot be joined as was asked for."""
     try:
-        return stack.enter_context(open_to_hosts(listening, ticket, coordinator))
+        yield
     except NoackError:
-        shutil.rmtree(ticket.run_dir, ignore_errors=True)
-        raise
-
-
-def _publish_session(stack: contextlib.ExitStack, ticket: Ticket, session: str) -> None:
-    """Publish the ticket for processes started by hand; refused, leave no run directory.
-
-    Raises:
-        CallerError: another run is open in the session.
-        MachineError: the ticket cannot be written.
-    """
-    try:
-        stack.enter_context(published(ticket.model_copy(update={"launched": False}), session))
-    except NoackError:
-        shutil.rmtree(ticket.run_dir, ignore_errors=True)
+        shutil.rmtree(run_dir, ignore_errors=True)
         raise
 
 

@@ -1,4 +1,4 @@
-"""Opens a run to other hosts: TLS listener, invitation, and answers to questions about the time."""
+"""Opens a run to other hosts: TLS listener, and answers to questions about the time."""
 
 import asyncio
 import datetime
@@ -13,17 +13,24 @@ from typing import NamedTuple
 from cosim.live.coordinator import AdmissionPass, Coordinator
 from noack.config.scenario import Scenario
 from noack.config.sections.run_sections import ClocksSection
-from noack.core.errors import CallerError, why
+from noack.core.errors import CallerError, PeerError, why
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.address import Address, family_of, parse_address, text_of
 from noack.runtime.connection_forwarder import forwarding
 from noack.runtime.control_plane import RUNS, run_name
-from noack.runtime.invitation import write_invitation
+from noack.runtime.invitation import own_host
 from noack.runtime.join_ticket import RemoteAccess, Ticket, new_admission_pass
 from noack.runtime.time_exchange import TimeReference, answering
 from noack.runtime.zenoh_session import socket_path
 
 _BACKLOG = 4096
+
+
+class OpenedRun(NamedTuple):
+    """Where a run listens, with its port, and the ticket for those who are invited."""
+
+    address: Address
+    invited: Ticket
 
 
 class Listening(NamedTuple):
@@ -46,9 +53,12 @@ def listen_address(text: str) -> Address:
         text = f"[{ipaddress.IPv6Address(text)}]"
     if text.endswith("]") or ":" not in text:
         text += ":0"
+    if text.startswith(":") or not text:
+        raise CallerError("--listen: expected an address of this host")
     host, port = parse_address(text, "--listen")
     found = ipaddress.ip_address(host.partition("%")[0])
-    if found.is_unspecified or found.is_multicast or found.is_link_local:
+    mapped = isinstance(found, ipaddress.IPv6Address) and found.ipv4_mapped is not None
+    if found.is_unspecified or found.is_multicast or found.is_link_local or mapped:
         raise CallerError(
             f"--listen: {host} is not an address at which other hosts can reach this one; "
             "give one of `ip address`"
@@ -69,22 +79,22 @@ def _listen(address: Address) -> socket.socket:
     try:
         endpoint.bind(address)
         endpoint.listen(_BACKLOG)
-    except OSError as error:
+        own_host(endpoint.getsockname()[:2])  # refuses a broadcast address
+    except (OSError, PeerError) as error:
         endpoint.close()
-        raise CallerError(f"cannot listen on {text_of(address)}: {why(error)}") from None
+        reason = why(error) if isinstance(error, OSError) else error
+        raise CallerError(f"cannot listen on {text_of(address)}: {reason}") from None
     return endpoint
 
 
 @contextmanager
 def open_to_hosts(
     listening: Listening, ticket: Ticket, coordinator: Coordinator
-) -> Iterator[Address]:
-    """Listen for processes of other hosts meanwhile, and write their invitation.
-
-    Gives the address, with its port.
+) -> Iterator[OpenedRun]:
+    """Listen for processes of other hosts meanwhile, and answer questions about the time.
 
     Raises:
-        CallerError: the address cannot be used, or the invitation cannot be written.
+        CallerError: the address cannot be used.
     """
     from cosim.live.tls_keys import coordinator_context, new_tls_keys
 
@@ -113,6 +123,4 @@ def open_to_hosts(
             "launched": False, "admission_pass": shown, "remote": remote,
             "time_reference": times.address,
         }  # fmt: skip
-        write_invitation(listening.invitation, ticket.model_copy(update=invited))
-        stack.callback(listening.invitation.unlink, missing_ok=True)
-        yield host, port
+        yield OpenedRun((host, port), ticket.model_copy(update=invited))
