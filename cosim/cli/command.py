@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from cosim.live.fork_server import ForkServer
+    from cosim.output.result_tables import ResultTable
     from noack.config.scenario import Scenario
 
 _TOUR = (
@@ -149,6 +150,14 @@ FormatOption = Annotated[
         help="Write each figure as a file, too; pdf and pgf have the fonts of LaTeX.",
     ),
 ]
+TablesOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--tables",
+        metavar="FOLDER",
+        help="Write the tables into this folder, as LaTeX (booktabs) and as CSV.",
+    ),
+]
 VerboseOption = Annotated[
     bool, typer.Option("--verbose", help="Print all tables: timing, assumptions, each claim.")
 ]
@@ -251,6 +260,16 @@ def console() -> "Console":
     from rich.console import Console
 
     return Console()
+
+
+def write_tables(tables: "Iterable[ResultTable]", folder: Path | None, *, json: bool) -> None:
+    """Write the tables of ``--tables``, if it is given; print the paths, unless with ``--json``."""
+    if folder is not None:
+        from cosim.output.result_tables import save_tables
+
+        written = save_tables(tables, folder)
+        if not json:
+            print(*written, sep="\n")
 
 
 def print_json(document: object) -> None:

@@ -28,24 +28,52 @@ _WORDS = {
 _ACCENTS = {"\u0302": r"\hat", "\u0304": r"\bar", "\u0332": r"\underline", "\u0303": r"\tilde",
             "\u0307": r"\dot"}  # fmt: skip
 _LATIN = range(0xC0, 0x180)  # letters that LaTeX's own UTF-8 input knows
-_EXPONENT = re.compile(r"(?<![\w.])([-−]?\d+(?:\.\d+)?)e([-+]?)0*(\d+)(?!\w)")
+_TYPESET = re.compile(
+    r"(?<![\w.])(?P<mantissa>[-−]?\d+(?:\.\d+)?)e(?P<power>[-+]?\d{1,3})(?!\w)"
+    r"|(?<=\w)[_^]\("
+    r"|(?<=(?<!\w)[A-Za-z])_(?P<letter>[A-Za-z0-9])(?!\w)"
+)
+_DEEPEST, _LONGEST_SCRIPT = 4, 200
 _UNESCAPED_DOLLAR = re.compile(r"(?<!\\)\$")
 
 
-def latex_text(text: str) -> str:
+def latex_text(text: str, depth: int = 0) -> str:
     """Return a text for LaTeX: special characters escaped, symbols as mathematics.
 
-    A number with an exponent, as 1.2e-05, becomes 1.2 × 10⁻⁵. A character that pdfLaTeX does not
-    have becomes a question mark.
+    A number with an exponent, as 1.2e-05, becomes 1.2 × 10⁻⁵; e_c gets a subscript, e^(−αt) a
+    superscript. A character that pdfLaTeX does not have becomes a question mark.
     """
     parts, end = [], 0
-    for found in _EXPONENT.finditer(text):
-        sign = "-" if found[2] == "-" else ""
-        mantissa = found[1].replace("−", "-")
-        parts.append(_plain(text[end : found.start()]))
-        parts.append(rf"\ensuremath{{{mantissa}\times10^{{{sign}{found[3]}}}}}")
-        end = found.end()
+    for found in _TYPESET.finditer(text):
+        if found.start() < end:  # inside a superscript
+            continue
+        begin, until = found.span("letter")
+        rest = until
+        if found["power"]:
+            mantissa = found["mantissa"].replace("−", "-")
+            power = found["power"].removeprefix("+")
+            typeset, rest = rf"\ensuremath{{{mantissa}\times10^{{{int(power)}}}}}", found.end()
+        else:
+            if found["letter"] is None:
+                begin = found.end()
+                if depth == _DEEPEST or (until := _closing(text, begin)) < 0:
+                    continue
+                rest = until + 1
+            command = "superscript" if text[found.start()] == "^" else "subscript"
+            typeset = rf"\text{command}{{{latex_text(text[begin:until], depth + 1)}}}"
+        parts += [_plain(text[end : found.start()]), typeset]
+        end = rest
     return "".join(parts) + _plain(text[end:])
+
+
+def _closing(text: str, begin: int) -> int:
+    """Return the place of the parenthesis that closes the one before ``begin``, or −1."""
+    depth = 1
+    for place in range(begin, min(len(text), begin + _LONGEST_SCRIPT)):
+        depth += {"(": 1, ")": -1}.get(text[place], 0)
+        if not depth:
+            return place
+    return -1
 
 
 def latex_label(text: str) -> str:
@@ -91,6 +119,8 @@ def _character(one: str) -> str:
         return rf"\ensuremath{{{_SYMBOLS[base]}}}"
     if base in _WORDS:
         return _WORDS[base]
+    if ord(base) > _LATIN.stop and len(parts := unicodedata.normalize("NFD", base)) > 1:
+        return _character(parts)
     if (base.isascii() and base.isprintable()) or ord(base) in _LATIN:
         return base
     return "?"

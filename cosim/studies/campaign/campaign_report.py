@@ -15,6 +15,7 @@ from rich.table import Table
 from cosim.output.figure_format import FigureFormat
 from cosim.output.report.figure_files import inline, save_figures
 from cosim.output.report.report_page import templates
+from cosim.output.result_tables import ResultTable
 from cosim.studies.campaign.campaign_figures import figures
 from cosim.studies.campaign.campaign_summary import CampaignSummary, GridPointResult
 from cosim.studies.campaign.chunk_store import RUNS, Store
@@ -59,6 +60,20 @@ def write_report(
             store.folder / PAGE, figure_format,
         ),
     ]  # fmt: skip
+
+
+def campaign_tables(summary: CampaignSummary) -> Iterator[ResultTable]:
+    """Yield the means of all grid points, and their paired differences to the reference."""
+    campaign = summary.campaign
+    headings = [axis.called for axis in campaign.axes]
+    headings += [METRICS[name].heading for name in campaign.metrics.shown]
+    tables = [("campaign", f"{summary.draws:,} draws; mean ± half-width", _rows(summary))]
+    if campaign.compare is not None:
+        what = f"paired difference to {_reference(summary)}"
+        tables.append(("differences", what, _differences(summary)))
+    for name, what, rows in tables:
+        cells = [(*row.labels, *row.cells) for row in rows]
+        yield ResultTable(name, f"{campaign.name}: {what}", headings, cells)
 
 
 def page(summary: CampaignSummary, store: Store, base: Mapping[str, Any]) -> str:

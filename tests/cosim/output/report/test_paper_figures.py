@@ -51,7 +51,7 @@ def test_texts_have_the_fonts_of_latex_only_while_a_figure_is_saved(tmp_path: Pa
 def test_a_pgf_picture_has_escaped_texts_and_no_commands_of_matplotlibs(tmp_path: Path) -> None:
     save_figure(figure_of(HOSTILE), tmp_path / "a.pgf")
     text = (tmp_path / "a.pgf").read_text()
-    assert r"50 \% of A\_1 \& \{x\} \#1 \textasciicircum{}2" in text
+    assert r"50 \% of A\textsubscript{1} \& \{x\} \#1 \textasciicircum{}2" in text
     assert r"\textbackslash{}input\{/etc/passwd\}" in text
     assert r"\ensuremath{\|}x\ensuremath{\|} ?" in text
     assert "mathdefault" not in text
