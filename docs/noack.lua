@@ -1,10 +1,10 @@
--- Wireshark dissector of noack's wire format, version 1 (docs/wire.md).
+-- Wireshark dissector of noack's wire format, versions 1 and 2 (docs/wire.md).
 --
 --   wireshark -X lua_script:docs/noack.lua -r capture.pcapng
 --
 -- It finds the datagrams by their form, whatever their ports, and verifies no tag: it has no key.
 
-local MAGIC, VERSION = "NA", 1
+local MAGIC, VERSION, ENCRYPTED_VERSION = "NA", 1, 2
 local HEADER_BYTES, TAG_BYTES = 32, 16
 local MAX_DIMENSION = 64
 local FLOWS = { [1] = "measurement", [2] = "update", [3] = "actuation", [4] = "acknowledgement" }
@@ -23,6 +23,7 @@ local f = {
     sequence = ProtoField.uint64("noack.sequence", "Sequence number"),
     t_ns = ProtoField.int64("noack.t_ns", "Event time (ns)"),
     vector = ProtoField.double("noack.vector", "Vector"),
+    encrypted = ProtoField.bytes("noack.encrypted", "Encrypted vector"),
     tag = ProtoField.bytes("noack.tag", "Tag"),
 }
 noack.fields = f
@@ -82,7 +83,7 @@ function noack.dissector(tvb, pinfo, tree)
     pinfo.cols.info = info
     root:append_text(", " .. info)
 
-    if version ~= VERSION then
+    if version ~= VERSION and version ~= ENCRYPTED_VERSION then
         version_item:add_proto_expert_info(e.version)
     end
     if not FLOWS[flow] then
@@ -93,12 +94,20 @@ function noack.dissector(tvb, pinfo, tree)
         return tvb:len()
     end
     -- A capture may hold less than there was.
-    for offset = HEADER_BYTES, HEADER_BYTES + 8 * (dimension - 1), 8 do
+    local whole = tvb:len() == datagram_bytes(dimension)
+    local first_readable = HEADER_BYTES
+    if version == ENCRYPTED_VERSION then
+        first_readable = datagram_bytes(dimension)  -- nothing
+        if whole and dimension > 0 then
+            root:add(f.encrypted, tvb(HEADER_BYTES, 8 * dimension))
+        end
+    end
+    for offset = first_readable, HEADER_BYTES + 8 * (dimension - 1), 8 do
         if tvb:len() >= offset + 8 then
             root:add_le(f.vector, tvb(offset, 8))
         end
     end
-    if tvb:len() == datagram_bytes(dimension) then
+    if whole then
         root:add(f.tag, tvb(HEADER_BYTES + 8 * dimension, TAG_BYTES))
     end
     return tvb:len()
@@ -109,7 +118,9 @@ local function heuristic(tvb, pinfo, tree)
     if tvb:len() < HEADER_BYTES or tvb(0, 2):string() ~= MAGIC then
         return false
     end
-    local known = tvb(2, 1):uint() == VERSION and FLOWS[tvb(3, 1):uint()] ~= nil
+    local version = tvb(2, 1):uint()
+    local known = (version == VERSION or version == ENCRYPTED_VERSION)
+        and FLOWS[tvb(3, 1):uint()] ~= nil
     local sized = tvb:reported_len() == datagram_bytes(tvb(4, 2):le_uint())
     if not (known or sized) then
         return false

@@ -15,6 +15,7 @@ import typer
 
 from cosim.cli import commands, completion
 from cosim.cli.program import NAME, Program, be_patient
+from cosim.output.figure_format import FigureFormat
 from cosim.record.run_directory import DEFAULT_RUNS as DEFAULT_RUNS
 from cosim.shipped_files import find_shipped
 from noack.core.errors import ExitStatus, NoackError, why
@@ -139,6 +140,13 @@ ReportOption = Annotated[
     typer.Option(
         "--report/--no-report",
         help="Write report.html, which takes some seconds; `noack report` writes it later.",
+    ),
+]
+FormatOption = Annotated[
+    FigureFormat | None,
+    typer.Option(
+        "--format",
+        help="Write each figure as a file, too; pdf and pgf have the fonts of LaTeX.",
     ),
 ]
 VerboseOption = Annotated[

@@ -13,7 +13,7 @@ from noack.protocol.record_tables import (
     direction_of,
     effective,
 )
-from noack.protocol.wire_format import FLOW_OFFSET, VERSION, Flow, read_header
+from noack.protocol.wire_format import FLOW_OFFSET, VERSIONS, Flow, read_header
 
 
 class PacketOutcome(NamedTuple):
@@ -102,7 +102,7 @@ def updates_in(
     marks = octets[:, FLOW_OFFSET]
     for i in np.flatnonzero(marks == flow).tolist():
         header = read_header(heads[i].tobytes())
-        if header is None or (header.version, header.flow) != (VERSION, flow):
+        if header is None or header.version not in VERSIONS or header.flow != flow:
             continue
         if header.sequence < 2**63 and header.t_ns >= 0:  # others do not fit the record's columns
             indices.append(i)

@@ -25,6 +25,7 @@ from noack.config.parameter_changes import (
 )
 from noack.config.resolution import tables_of
 from noack.config.scenario import Scenario
+from noack.protocol.datagram_seal import KEY_BYTES
 from noack.protocol.fleet import FleetDecoder
 from noack.protocol.machine_interface import Machine, Notice, Record
 from noack.protocol.record_tables import (
@@ -43,7 +44,7 @@ from noack.protocol.topology import (
     RECORDER,
     receiver_of,
 )
-from noack.protocol.wire_format import KEY_BYTES, Decoder, Encoder, Flow, Message, loop_number
+from noack.protocol.wire_format import Decoder, Encoder, Flow, Message, loop_number
 from noack.runtime.life_cycle import HORIZON
 from plant_server.plant import plant_of
 from sensor_node.sensor import sensor_of

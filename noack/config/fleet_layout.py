@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from noack.config.parameter_changes import ChangeSchedule
 from noack.config.scenario import Scenario
 from noack.core.model_arrays import Transitions
+from noack.protocol.datagram_seal import TAG_BYTES
 from noack.protocol.machine_interface import Notice
-from noack.protocol.wire_format import HEADER_BYTES, MAX_DIMENSION, TAG_BYTES
+from noack.protocol.wire_format import HEADER_BYTES, MAX_DIMENSION
 
 SENDS = 1
 """A message was written."""

@@ -23,7 +23,8 @@ import struct
 from enum import IntEnum
 from typing import NamedTuple
 
-from noack.protocol.wire_format import TAG_BYTES, TIMES_NS, Rejection, Tagger
+from noack.protocol.datagram_seal import TAG_BYTES, Tagger
+from noack.protocol.wire_format import TIMES_NS, Rejection
 
 MAGIC = b"NC"
 VERSION = 1

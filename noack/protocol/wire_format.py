@@ -2,27 +2,25 @@
 
 Only the acknowledgement baseline (``network.protocol = "ack"``) acknowledges messages.
 
-Layout, version 1, little endian (``docs/wire.md`` has test vectors)::
+Layout, little endian (``docs/wire.md`` has test vectors)::
 
     offset  size  field
          0     2  magic, the bytes "NA"
-         2     1  version, 1
+         2     1  version: 1, or 2 of an encrypted datagram
          3     1  flow: 1 measurement, 2 update, 3 actuation, 4 acknowledgement
          4     2  dimension n of the vector, 1 to 64; 0 of an acknowledgement
          6     2  number of the loop, unsigned, 0 to 65,534; 0 in a run of one loop
          8     8  run id, unsigned
         16     8  sequence number, unsigned, from 0 within a flow; what is acknowledged
         24     8  event time, signed, nanoseconds of simulated time since the run's epoch
-        32    8n  vector, float64
-     32+8n    16  tag: keyed BLAKE2b over all that precedes it, under the run's key
+        32    8n  vector, float64; of version 2 encrypted
+     32+8n    16  tag over all that precedes it, under the run's key
 
 The tag covers flow, loop, run and sequence number, so that no datagram passes for one of another
-flow or loop.
-Content is read only after the tag was verified.
+flow or loop. Content is read only after the tag was verified. Tag and encryption are in
+:mod:`noack.protocol.datagram_seal`.
 """
 
-import hashlib
-import hmac
 import math
 import struct
 from enum import IntEnum, StrEnum
@@ -31,13 +29,13 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.linear_systems import Vector
+from noack.protocol.datagram_seal import TAG_BYTES, AuthenticatedSeal, EncryptedSeal, seal_of
 
 MAGIC = b"NA"
-VERSION = 1
+VERSION = AuthenticatedSeal.version
+VERSIONS = VERSION, EncryptedSeal.version
 MAX_DIMENSION = 64
 MAX_LOOPS = 65_535
-KEY_BYTES = 32
-TAG_BYTES = 16
 SEQUENCES, TIMES_NS = 2**63, 2**62
 """Upper limits of sequence numbers and times: they fit the record's columns, and sums of times do
 too. At 100,000 messages a second, 2⁶³ take three million years."""
@@ -125,27 +123,12 @@ def loop_number(datagram: bytes) -> int | None:
     return datagram[6] | datagram[7] << 8 if len(datagram) >= HEADER_BYTES else None
 
 
-class Tagger:
-    """Computes the tag of a datagram's content under one key; keying is done once."""
-
-    def __init__(self, key: bytes) -> None:
-        if len(key) != KEY_BYTES:
-            raise ValueError(f"the run's key has {KEY_BYTES} bytes, not {len(key)}")
-        self._keyed = hashlib.blake2b(key=key, digest_size=TAG_BYTES)
-
-    def __call__(self, content: bytes) -> bytes:
-        """Return the tag."""
-        state = self._keyed.copy()
-        state.update(content)
-        return state.digest()
-
-
 class Encoder:
     """Turns messages into datagrams of one run, under its secret key of 32 bytes."""
 
-    def __init__(self, run_id: int, key: bytes) -> None:
+    def __init__(self, run_id: int, key: bytes, *, encrypted: bool = False) -> None:
         self._run_id = run_id
-        self._tag = Tagger(key)
+        self._seal = seal_of(key, encrypted=encrypted)
 
     def encode(self, message: Message) -> bytes:
         """Return the datagram of a message; raise ValueError if a value does not fit."""
@@ -160,13 +143,12 @@ class Encoder:
             )
         try:
             header = _HEADER.pack(
-                MAGIC, VERSION, message.flow, vector.size, message.loop,
+                MAGIC, self._seal.version, message.flow, vector.size, message.loop,
                 self._run_id, message.sequence, message.t_ns,
             )  # fmt: skip
         except struct.error as error:
             raise ValueError(f"a number does not fit its field: {error}") from None
-        content = header + vector.tobytes()
-        return content + self._tag(content)
+        return self._seal.close(header, vector.tobytes())
 
 
 class Decoder:
@@ -185,6 +167,7 @@ class Decoder:
         *,
         not_before_ns: int = 0,
         loop: int = 0,
+        encrypted: bool = False,
     ) -> None:
         self._flow = flow
         self._loop = loop
@@ -192,7 +175,7 @@ class Decoder:
         self._dimension = dimension
         self._vector = struct.Struct(f"<{dimension}d")
         self._run_id = run_id
-        self._tag = Tagger(key)
+        self._seal = seal_of(key, encrypted=encrypted)
         self._newest = -1
         self._not_before_ns = not_before_ns
         self.accepted = 0
@@ -223,7 +206,7 @@ class Decoder:
         magic, version, flow, dimension, loop, run_id, sequence, t_ns = _HEADER.unpack_from(
             datagram
         )
-        if magic != MAGIC or version != VERSION:
+        if magic != MAGIC or version != self._seal.version:
             return Rejection.VERSION
         if len(datagram) != self._size_bytes or dimension != self._dimension:
             return Rejection.LENGTH
@@ -233,7 +216,8 @@ class Decoder:
             return Rejection.FLOW
         if loop != self._loop:
             return Rejection.LOOP
-        if not hmac.compare_digest(self._tag(datagram[:-TAG_BYTES]), datagram[-TAG_BYTES:]):
+        vector = self._seal.open(datagram, HEADER_BYTES)
+        if vector is None:
             return Rejection.TAG
         if not from_peer:
             return Rejection.SOURCE
@@ -241,7 +225,7 @@ class Decoder:
             return Rejection.RANGE
         if sequence <= self._newest or t_ns < self._not_before_ns:
             return Rejection.STALE
-        entries = self._vector.unpack_from(datagram, HEADER_BYTES)
+        entries = self._vector.unpack(vector)
         if not all(map(math.isfinite, entries)):
             return Rejection.NOT_FINITE
         return Message(self._flow, sequence, t_ns, np.array(entries), loop)

@@ -18,7 +18,7 @@ from noack.config.scenario import Scenario
 from noack.config.validation_messages import brief
 from noack.core.errors import CallerError, PeerError
 from noack.impairments.kept_loss import found_probabilities, remember
-from noack.protocol.wire_format import KEY_BYTES
+from noack.protocol.datagram_seal import KEY_BYTES
 from noack.runtime.address import LOOPBACK
 from noack.runtime.control_messages import SocketAddress
 from noack.runtime.host_clock import clock_identity

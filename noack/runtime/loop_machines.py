@@ -1,5 +1,6 @@
 """The machines of a process: that of one loop, those of several, or compiled ones of many."""
 
+import secrets
 import socket
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
@@ -8,6 +9,7 @@ from functools import partial
 from noack.config.fleet_layout import FleetRole
 from noack.config.resolution import resolved_loops
 from noack.config.scenario import Scenario
+from noack.protocol.datagram_seal import KEY_BYTES
 from noack.protocol.fleet import Fleet, FleetDecoder
 from noack.protocol.machine_interface import Machine, Start
 from noack.protocol.topology import ENDS, RECEIVES, SENDS, receiver_of, sender_to
@@ -102,32 +104,44 @@ class _Loops:
         )
 
     def rehearsal(self, endpoint: socket.socket) -> Rehearsal:
-        """Return a rehearsal of the first loop's machine; its messages come back to it."""
+        """Return a rehearsal of the first loop's machine; its messages come back to it.
+
+        They are made under a key of their own: they have sequence numbers of the run's messages.
+        """
         receives, sends = RECEIVES[self._process.role], SENDS[self._process.role]
         own: Address = endpoint.getsockname()
+        key = secrets.token_bytes(KEY_BYTES)
         copy = MessageSocket(
-            endpoint, self._decoder(receives, 1), self._encoder(), sends,
+            endpoint, self._decoder(receives, 1, key=key), self._encoder(key), sends,
             source=own, destination=own,
         )  # fmt: skip
         entries = self.scenarios[0].message_sizes.entries(receives)
-        return Rehearsal(self.machine(1), copy, self._encoder(), receives, entries)
+        return Rehearsal(self.machine(1), copy, self._encoder(key), receives, entries)
 
-    def _encoder(self) -> Encoder:
-        return Encoder(self._process.ticket.run_id, self._process.ticket.key)
+    def _encoder(self, key: bytes | None = None) -> Encoder:
+        ticket, encrypted = self._process.ticket, self._process.scenario.network.encrypted
+        return Encoder(ticket.run_id, key or ticket.key, encrypted=encrypted)
 
     def _decoder(
-        self, flow: Flow, most: int | None = None, *, not_before_ns: int = 0
+        self,
+        flow: Flow,
+        most: int | None = None,
+        *,
+        key: bytes | None = None,
+        not_before_ns: int = 0,
     ) -> Decoder | FleetDecoder:
         """Return the decoder of a flow of all loops, or of the first ones."""
         ticket, phases_ns = self._process.ticket, self._process.phases_ns[:most]
+        encrypted = self._process.scenario.network.encrypted
         decoders = [
             Decoder(
                 flow,
                 0 if flow == Flow.ACKNOWLEDGEMENT else loop.message_sizes.entries(flow),
                 ticket.run_id,
-                ticket.key,
+                key or ticket.key,
                 not_before_ns=not_before_ns - phase_ns,
                 loop=number,
+                encrypted=encrypted,
             )
             for number, (loop, phase_ns) in enumerate(zip(self.scenarios, phases_ns, strict=False))
         ]

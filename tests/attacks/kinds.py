@@ -9,10 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from noack.protocol.datagram_seal import KEY_BYTES, TAG_BYTES
 from noack.protocol.wire_format import (
     HEADER_BYTES,
-    KEY_BYTES,
-    TAG_BYTES,
     Decoder,
     Encoder,
     Flow,

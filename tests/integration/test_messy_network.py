@@ -1,4 +1,4 @@
-"""A live run with impairments of updates and of acknowledgements, over real UDP."""
+"""A live, encrypted run with impairments of updates and of acknowledgements, over real UDP."""
 
 import json
 
@@ -44,6 +44,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
         "speed": 2.0,
         "trigger__beta": 0.001,  # an event at almost every measurement
         "network__mansd": MANSD,
+        "network__encrypted": True,
         "network__loss__probability": 0.1,
         "network__protocol": "ack",
         "network__acknowledgements__timeout_s": 0.02,
@@ -93,6 +94,11 @@ def test_acknowledgements_are_counted_by_outcome(finished: Finished, record: Run
     expected = record[CONTROLLER_DELIVERY]["sequence"]
     assert [head.sequence for head in heads] == expected.tolist()
     assert set(answers["size_bytes"].tolist()) == {48}
+
+
+def test_every_datagram_is_encrypted(record: RunRecord) -> None:
+    heads = record[NETEM_PACKET]["head"]
+    assert {read_header(head.tobytes()).version for head in heads} == {2}
 
 
 def test_each_process_receives_from_its_senders_only(finished: Finished) -> None:

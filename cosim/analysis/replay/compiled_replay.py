@@ -6,7 +6,7 @@ from controller_node.controller_arrays import CONTROLLER_FLEET
 from noack.config.fleet_layout import FleetRole
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
-from noack.protocol.wire_format import KEY_BYTES
+from noack.protocol.datagram_seal import KEY_BYTES
 from noack.runtime.fleet.compiled_driver import kept_replay
 from noack.runtime.fleet.compiled_fleet import CompiledFleet
 from noack.runtime.fleet.fleet_replay import FleetReplay

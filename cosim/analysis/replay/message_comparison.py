@@ -15,6 +15,7 @@ from cosim.analysis.replay.recorded_inputs import received_vectors
 from cosim.analysis.replay.replay_result import MessagesReplay, difference, first_entry
 from cosim.record.record_source import Rows, Slice
 from cosim.record.run_record import RunRecord
+from noack.protocol.datagram_seal import KEY_BYTES, EncryptedSeal
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     NETEM_PACKET,
@@ -26,7 +27,7 @@ from noack.protocol.record_tables import (
     direction_of,
 )
 from noack.protocol.topology import ENDS
-from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Header, Message, read_header
+from noack.protocol.wire_format import Encoder, Flow, Header, Message, read_header
 from noack.runtime.fleet.fleet_replay import SentMessages
 
 _RECEIVED = {
@@ -236,9 +237,11 @@ class _Hop:
         heads, sizes = self._rows["head"].tolist(), self._rows["size_bytes"].tolist()
         headers = [read_header(head) for head in heads]
         # The run number is random and recorded only here.
-        ids = Counter(header.run_id for header in headers if header is not None)
-        if self._encoder is None and ids:
-            self._encoder = Encoder(ids.most_common(1)[0][0], bytes(KEY_BYTES))
+        kinds = Counter((header.run_id, header.version) for header in headers if header is not None)
+        if self._encoder is None and kinds:
+            run_id, version = kinds.most_common(1)[0][0]
+            encrypted = version == EncryptedSeal.version
+            self._encoder = Encoder(run_id, bytes(KEY_BYTES), encrypted=encrypted)
         encoder = self._encoder or Encoder(0, bytes(KEY_BYTES))
         for row, (head, size, header) in enumerate(zip(heads, sizes, headers, strict=True)):
             sequence = -1 if header is None else header.sequence

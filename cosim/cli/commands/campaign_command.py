@@ -42,6 +42,7 @@ def campaign(
     workers: Workers = None,
     scheduler: Scheduler = None,
     out: Out = None,
+    figure_format: cli.FormatOption = None,
     json: cli.JsonOption = False,
 ) -> int:
     """Run a scenario over a grid of settings, with many random draws at each point.
@@ -61,7 +62,7 @@ def campaign(
     plan = load(path)
     folder = out or cli.DEFAULT_RUNS / "campaigns" / plan.name
     summary, _, made, files = execute_campaign(
-        console, plan, path, start, folder=folder, draws=draws
+        console, plan, path, start, folder=folder, draws=draws, figure_format=figure_format
     )
     if json:
         cli.print_json(summary.document() | {"made": made, "files": [str(file) for file in files]})

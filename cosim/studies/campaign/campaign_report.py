@@ -12,7 +12,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cosim.output.report.figure_files import inline
+from cosim.output.figure_format import FigureFormat
+from cosim.output.report.figure_files import inline, save_figures
 from cosim.output.report.report_page import templates
 from cosim.studies.campaign.campaign_figures import figures
 from cosim.studies.campaign.campaign_summary import CampaignSummary, GridPointResult
@@ -37,8 +38,13 @@ class SummaryRow(NamedTuple):
     cells: Sequence[str]
 
 
-def write_report(summary: CampaignSummary, store: Store, base: Mapping[str, Any]) -> list[Path]:
-    """Write page and summary; return their paths and the path of the runs.
+def write_report(
+    summary: CampaignSummary,
+    store: Store,
+    base: Mapping[str, Any],
+    figure_format: FigureFormat | None = None,
+) -> list[Path]:
+    """Write page, summary and figures; return their paths and the path of the runs.
 
     Raises:
         MachineError: they cannot be written.
@@ -48,7 +54,11 @@ def write_report(summary: CampaignSummary, store: Store, base: Mapping[str, Any]
         write_whole(store.folder / PAGE, page(summary, store, base)),
         write_whole(store.folder / SUMMARY, document + b"\n"),
         store.folder / RUNS,
-    ]
+        *save_figures(
+            ((name, figure) for name, figure, _ in figures(summary, store)),
+            store.folder / PAGE, figure_format,
+        ),
+    ]  # fmt: skip
 
 
 def page(summary: CampaignSummary, store: Store, base: Mapping[str, Any]) -> str:

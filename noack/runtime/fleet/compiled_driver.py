@@ -19,7 +19,8 @@ _MODULES = (
 )  # fmt: skip
 _SOURCES = (
     "noack.runtime.native.object_code", "noack.runtime.native.socket_structs", __name__,
-    "noack.runtime.fleet.driver_layout", "noack.protocol.wire_format",
+    "noack.runtime.fleet.driver_layout", "noack.protocol.datagram_seal",
+    "noack.protocol.wire_format",
 )  # fmt: skip
 _OPTIONS: dict[str, Any] = {**CALLED_BY_CODE, "_nrt": False, "forceinline": True}
 _CALLED: dict[str, Any] = {**CALLED_BY_CODE, "_nrt": False}

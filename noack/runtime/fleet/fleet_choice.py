@@ -8,7 +8,7 @@ from noack.config.runtime_parameters import is_of_network_alone
 from noack.config.scenario import Scenario
 from noack.core.code_cache import while_compiling
 from noack.core.errors import CallerError
-from noack.protocol.wire_format import KEY_BYTES
+from noack.protocol.datagram_seal import KEY_BYTES
 from noack.runtime.command_line import print_to_stderr
 from noack.runtime.fleet.compiled_driver import (
     compiled_driver,
@@ -28,8 +28,15 @@ _ABOUT_S = 25.0
 
 
 def may_be_compiled(run: Scenario) -> bool:
-    """Whether the machines may be compiled; of such a run only the network can be changed."""
-    if run.loops is None or not all(is_of_network_alone(one.set) for one in run.changes):
+    """Whether the machines may be compiled; of such a run only the network can be changed.
+
+    Compiled machines do not encrypt.
+    """
+    if (
+        run.loops is None
+        or run.network.encrypted
+        or not all(is_of_network_alone(one.set) for one in run.changes)
+    ):
         return False
     return sum(section.count for section in run.loops) >= _FEWEST_LOOPS
 
@@ -40,7 +47,8 @@ def fleet_of(
     """Return the compiled machines of a role; None if the single machines are to be used.
 
     They are used for few loops, for loops with something that has no compiled form, if more than
-    the network changes during the run, and if the code is not in the cache.
+    the network changes during the run, if the datagrams are encrypted, and if the
+    code is not in the cache.
     """
     driver = kept_driver(role)
     if driver is None or not may_be_compiled(run):

@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.config.fleet_layout import HEADER_WORDS
+from noack.protocol.datagram_seal import KEY_BYTES, TAG_BYTES
 from noack.protocol.wire_format import (
     HEADER_BYTES,
-    KEY_BYTES,
     MAGIC,
     SEQUENCES,
-    TAG_BYTES,
     TIMES_NS,
     VERSION,
     Rejection,

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.protocol.wire_format import HEADER_BYTES, TAG_BYTES, Encoder, Flow, Message
+from noack.protocol.datagram_seal import TAG_BYTES
+from noack.protocol.wire_format import HEADER_BYTES, Encoder, Flow, Message
 from tests.netem.capture.batches import file_of
 from tests.netem.capture.conftest import Tshark
 from tests.netem.capture.reader import read
@@ -106,6 +107,22 @@ def test_every_field_is_shown(dissect: Dissect) -> None:
             assert math.isclose(float(entry["show"]), number, rel_tol=1e-14)
 
 
+def test_an_encrypted_vector_is_shown_as_bytes(dissect: Dissect) -> None:
+    encoder = Encoder(RUN, bytes(32), encrypted=True)
+    messages = [
+        Message(Flow.UPDATE, 3, 0, np.array([1.0, -2.0])),
+        Message(Flow.ACKNOWLEDGEMENT, 3, 0, np.zeros(0)),
+    ]
+    datagrams = [encoder.encode(message) for message in messages]
+    for fields, data in zip(dissect(*datagrams), datagrams, strict=True):
+        assert shown(fields, "version") == "2"
+        assert "noack.version.unknown" not in fields
+        assert "noack.vector" not in fields
+        hidden = [field["value"] for field in fields.get("noack.encrypted", [])]
+        assert "".join(hidden) == data[HEADER_BYTES:-TAG_BYTES].hex()
+        assert fields["noack.tag"][0]["value"] == data[-TAG_BYTES:].hex()
+
+
 INFO = [
     (Flow.UPDATE, 17, 1_234_000_000, "update #17 t=1.234 s"),
     (Flow.MEASUREMENT, 0, 0, "measurement #0 t=0 s"),
@@ -151,7 +168,7 @@ def with_byte(offset: int, value: int) -> bytes:
 
 DAMAGED = [
     (WHOLE, []),
-    (with_byte(2, 2), ["noack.version.unknown"]),
+    (with_byte(2, 3), ["noack.version.unknown"]),
     (with_byte(3, 9), ["noack.flow.unknown"]),
     *(
         (payload, ["noack.length.wrong"])

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 from hypothesis import example, given
 from hypothesis import strategies as st
 
@@ -51,8 +52,8 @@ def datagram(
     t_ns: int = 0,
     key: bytes = KEY,
 ) -> bytes:
-    """A datagram by the table of ``docs/wire.md``, with a valid tag under ``key``."""
-    content = b"".join(
+    """A datagram by the tables of ``docs/wire.md``, with a valid tag under ``key``."""
+    header = b"".join(
         [
             magic,
             version.to_bytes(1, "little"),
@@ -62,14 +63,21 @@ def datagram(
             run_id.to_bytes(8, "little"),
             sequence.to_bytes(8, "little"),
             t_ns.to_bytes(8, "little", signed=True),
-            *(struct.pack("<d", value) for value in values),
         ]
     )
+    vector = b"".join(struct.pack("<d", value) for value in values)
+    if version == 2:
+        nonce = struct.pack("<BBHQ", flow, 0, loop, sequence)
+        own_key = hashlib.blake2b(b"noack datagrams", key=key, digest_size=32).digest()
+        return header + ChaCha20Poly1305(own_key).encrypt(nonce, vector, header)
+    content = header + vector
     return content + hashlib.blake2b(content, key=key, digest_size=16).digest()
 
 
-def new_decoder(flow: int = 2, dimension: int = 3, run_id: int = RUN) -> Decoder:
-    return Decoder(Flow(flow), dimension, run_id, KEY)
+def new_decoder(
+    flow: int = 2, dimension: int = 3, run_id: int = RUN, *, encrypted: bool = False
+) -> Decoder:
+    return Decoder(Flow(flow), dimension, run_id, KEY, encrypted=encrypted)
 
 
 def assert_rejected(
@@ -84,6 +92,7 @@ def assert_rejected(
 
 
 class Vector(NamedTuple):
+    version: int
     flow: str
     loop: int
     run_id: int
@@ -99,7 +108,8 @@ def published_vector(block: str) -> Vector:
     values = [float(value) for value in fields["vector"].split() if value != "none"]
     data = bytes.fromhex(fields["datagram"])
     loop = int(fields.get("loop", "0"))
-    return Vector(fields["flow"].strip(), loop, run_id, sequence, t_ns, values, data)
+    version = int(fields.get("version", "1"))
+    return Vector(version, fields["flow"].strip(), loop, run_id, sequence, t_ns, values, data)
 
 
 VECTORS = [published_vector(block) for block in re.findall(r"```vector\n(.*?)```", PAGE, re.DOTALL)]
@@ -111,20 +121,28 @@ def test_the_page_has_a_vector_for_every_flow_and_names_its_key() -> None:
     assert f"The key of all vectors is `{KEY.hex()}`" in PAGE
 
 
-@pytest.mark.parametrize("vector", VECTORS, ids=lambda v: f"{v.flow}-{v.loop}-{v.sequence}")
+@pytest.mark.parametrize(
+    "vector", VECTORS, ids=lambda v: f"v{v.version}-{v.flow}-{v.loop}-{v.sequence}"
+)
 def test_published_vectors_hold_in_both_directions(vector: Vector) -> None:
-    flow, loop, run_id, sequence, t_ns, values, data = vector
+    version, flow, loop, run_id, sequence, t_ns, values, data = vector
     by_hand = datagram(
-        values, flow=FLOWS[flow], loop=loop, run_id=run_id, sequence=sequence, t_ns=t_ns
-    )
+        values, version=version, flow=FLOWS[flow], loop=loop, run_id=run_id, sequence=sequence,
+        t_ns=t_ns,
+    )  # fmt: skip
+    encrypted = version == 2
     assert by_hand.hex() == data.hex()
     message = Message(Flow(FLOWS[flow]), sequence, t_ns, np.array(values), loop)
-    assert Encoder(run_id, KEY).encode(message).hex() == data.hex()
-    decoded = Decoder(Flow(FLOWS[flow]), len(values), run_id, KEY, loop=loop).decode(data)
+    assert Encoder(run_id, KEY, encrypted=encrypted).encode(message).hex() == data.hex()
+    decoder = Decoder(
+        Flow(FLOWS[flow]), len(values), run_id, KEY, loop=loop, encrypted=encrypted
+    )  # fmt: skip
+    decoded = decoder.decode(data)
     assert decoded is not None
     assert decoded[:3] == message[:3]
     assert decoded.vector.tobytes() == struct.pack(f"<{len(values)}d", *values)
-    assert read_header(data) == Header(1, FLOWS[flow], len(values), loop, run_id, sequence, t_ns)
+    header = Header(version, FLOWS[flow], len(values), loop, run_id, sequence, t_ns)
+    assert read_header(data) == header
     assert read_header(data[:31]) is read_header(b"x" + data) is None
 
 
@@ -135,15 +153,20 @@ def test_the_page_gives_the_reasons_in_the_order_of_the_tests() -> None:
     assert {reason for _, reason in listed} == {reason.value for reason in Rejection}
 
 
-@given(flows, run_ids, sequences, times_ns, vectors)
-@example(Flow.UPDATE, 0, 0, 0, [-0.0, 5e-324, -2.2250738585072014e-308, 1.7976931348623157e308])
+@given(flows, run_ids, sequences, times_ns, vectors, st.booleans())
+@example(
+    Flow.UPDATE, 0, 0, 0, [-0.0, 5e-324, -2.2250738585072014e-308, 1.7976931348623157e308], False
+)  # fmt: skip
 def test_encoded_messages_decode_unchanged(
-    flow: Flow, run_id: int, sequence: int, t_ns: int, values: list[float]
+    flow: Flow, run_id: int, sequence: int, t_ns: int, values: list[float], encrypted: bool
 ) -> None:
     values = [] if flow is Flow.ACKNOWLEDGEMENT else values
-    data = Encoder(run_id, KEY).encode(Message(flow, sequence, t_ns, np.array(values)))
-    assert data == datagram(values, flow=flow, run_id=run_id, sequence=sequence, t_ns=t_ns)
-    decoder = Decoder(flow, len(values), run_id, KEY)
+    encoder = Encoder(run_id, KEY, encrypted=encrypted)
+    data = encoder.encode(Message(flow, sequence, t_ns, np.array(values)))
+    assert data == datagram(
+        values, version=1 + encrypted, flow=flow, run_id=run_id, sequence=sequence, t_ns=t_ns
+    )
+    decoder = Decoder(flow, len(values), run_id, KEY, encrypted=encrypted)
     message = decoder.decode(data)
     assert message is not None
     assert message[:3] == (flow, sequence, t_ns)
@@ -168,16 +191,48 @@ def reason_by_offset(offset: int) -> Rejection:
     return Rejection.TAG  # sequence number, time, vector, and the tag itself
 
 
-@given(vectors, sequences, times_ns)
-def test_any_flipped_bit_is_rejected(values: list[float], sequence: int, t_ns: int) -> None:
-    decoder = new_decoder(dimension=len(values))
-    data = datagram(values, sequence=sequence, t_ns=t_ns)
+@given(vectors, sequences, times_ns, st.booleans())
+def test_any_flipped_bit_is_rejected(
+    values: list[float], sequence: int, t_ns: int, encrypted: bool
+) -> None:
+    decoder = new_decoder(dimension=len(values), encrypted=encrypted)
+    data = datagram(values, version=1 + encrypted, sequence=sequence, t_ns=t_ns)
     stride = 1 if len(values) <= 3 else 13  # some bits of the longer ones
     for bit in range(0, 8 * len(data), stride):
         damaged = bytearray(data)
         damaged[bit // 8] ^= 1 << bit % 8
         assert_rejected(decoder, bytes(damaged), reason_by_offset(bit // 8))
     assert decoder.decode(data) is not None
+
+
+@given(vectors, st.booleans())
+def test_a_run_accepts_one_version_only(values: list[float], encrypted: bool) -> None:
+    """Nobody makes an encrypted run accept what is readable, nor the reverse."""
+    decoder = new_decoder(dimension=len(values), encrypted=encrypted)
+    other = datagram(values, version=2 - encrypted)
+    assert_rejected(decoder, other, Rejection.VERSION)
+    renamed = other[:2] + bytes([1 + encrypted]) + other[3:]
+    assert_rejected(decoder, renamed, Rejection.TAG)
+
+
+@given(vectors, sequences, st.sampled_from([1, 2, 3]), st.integers(0, 65_534))
+def test_encrypted_datagrams_show_nothing_of_the_vector(
+    values: list[float], sequence: int, flow: int, loop: int
+) -> None:
+    """Messages with the same vector and another number, flow or loop have unrelated bytes."""
+    vector = np.array(values)
+    encoder = Encoder(RUN, KEY, encrypted=True)
+    first = Message(Flow(flow), sequence, 0, vector, loop)
+    others = [
+        first._replace(sequence=sequence ^ 1),
+        first._replace(flow=Flow(flow % 3 + 1)),
+        first._replace(loop=loop ^ 1),
+    ]
+    seen = [encoder.encode(message)[32:] for message in (first, *others)]
+    assert len(set(seen)) == len(seen)
+    assert all(vector.tobytes() not in ciphertext for ciphertext in seen)
+    readable = Encoder(RUN, KEY).encode(first)
+    assert len(seen[0]) == len(readable[32:])
 
 
 @given(vectors, vectors)
