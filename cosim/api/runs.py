@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from cosim.output.report.run_figures import RunFigure
     from cosim.record.run_record import RunRecord
     from cosim.studies.comparison.run_comparison import RunComparison
+    from cosim.studies.reproduction.run_repetition import Repetition
 
 Folder = str | PathLike[str]
 
@@ -205,6 +206,18 @@ class Run:
 
         return run_report(self.directory, again=True)
 
+    def archive(self, path: Folder) -> Path:
+        """Write the run as one file, which :func:`noack.reproduce` repeats; return its path.
+
+        Raises:
+            NoackError: the file cannot be written.
+        """
+        from cosim.studies.reproduction.run_archive import write_archive
+
+        self.summary  # noqa: B018  # of a temporary run, it is computed now
+        write_archive(self.directory, Path(path))
+        return Path(path)
+
     def replay(self) -> "Replay":
         """Feed every machine its recorded inputs again and compare the outputs bit for bit.
 
@@ -353,6 +366,27 @@ def open_run(directory: Folder = "runs/latest") -> Run:
         raise CallerError(f"{path}: not a run directory (no {SCENARIO_FILE})")
     outcome = reopen(path.resolve())
     return Run(outcome.run_dir, lambda: outcome)
+
+
+def reproduce(path: Folder, *, run_code: bool = False) -> "Repetition":
+    """Repeat an archived run, and compare it bit for bit.
+
+    Args:
+        path: an archive, written by :meth:`Run.archive` or ``noack archive``.
+        run_code: run the code that the archive contains, if its plant, trigger or controller is a
+            Python class or an FMU.
+
+    Returns:
+        The result: ``bit_exact``; ``differences``, the first one of the run and of each loop;
+        ``changes`` of versions and machine since the archived run; ``numbers`` that differ.
+
+    Raises:
+        NoackError: the file is not such an archive, is damaged, or contains code without
+            ``run_code``.
+    """
+    from cosim.studies.reproduction.run_repetition import repeat_archive
+
+    return repeat_archive(Path(path), run_code=run_code)
 
 
 def compare(*runs: Run | Folder) -> "RunComparison":
