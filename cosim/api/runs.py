@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from cosim.api.scenarios import Source, load
 from cosim.output.row_display import as_html, as_text
 from cosim.record.loops_run import loop_directories
-from cosim.record.run_directory import RECORD, SCENARIO_FILE, chosen_run
+from cosim.record.run_directory import RECORD, REPORT_FILE, SCENARIO_FILE, chosen_run
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError, ExitStatus
 
@@ -167,19 +167,33 @@ class Run:
         Raises:
             NoackError: the run has no such figure.
         """
-        from cosim.output.report.run_figures import BOUNDED, pictures
+        from cosim.output.report.run_figures import BOUNDED
 
-        known: Mapping[str, Callable[[], RunFigure]]
-        if self._record.is_network:
-            from cosim.output.report.loops_page import loops_pictures
-
-            drawn = loops_pictures(self._record, self.directory, self.summary)
-            known = {name: partial(drawn.__getitem__, name) for name in drawn}
-        else:
-            known = pictures(self._record, self._envelopes if figure in BOUNDED else ())
+        known = self._pictures(bounded=figure in BOUNDED)
         if figure not in known:
             raise CallerError(f'"{figure}": no such figure of this run; it has {", ".join(known)}')
         return known[figure]().figure
+
+    def save_figures(self, format: str = "pdf") -> list[Path]:  # noqa: A002
+        """Write all figures of the report into ``report-figures`` in the run directory.
+
+        Args:
+            format: svg, png, pdf or pgf; pdf and pgf have the fonts of LaTeX, which need not be
+                installed.
+
+        Returns:
+            The paths.
+
+        Raises:
+            NoackError: there is no such format, or a file cannot be written.
+        """
+        from cosim.output.figure_format import FigureFormat
+        from cosim.output.report.figure_files import save_figures
+
+        if format not in [*FigureFormat]:
+            raise CallerError(f'"{format}": a figure is saved as {", ".join(FigureFormat)}')
+        found = ((name, draw().figure) for name, draw in self._pictures(bounded=True).items())
+        return save_figures(found, self.directory / REPORT_FILE, FigureFormat(format))
 
     def report(self) -> Path:
         """Write ``report.html``, a page with all figures, into the run directory; return its path.
@@ -213,6 +227,17 @@ class Run:
         from cosim.analysis.fidelity import compute_fidelity
 
         return compute_fidelity(self._record_of_loop)
+
+    def _pictures(self, *, bounded: bool) -> "Mapping[str, Callable[[], RunFigure]]":
+        """Return functions that draw the figures, by name; ``bounded`` with certified bounds."""
+        if self._record.is_network:
+            from cosim.output.report.loops_page import loops_pictures
+
+            drawn = loops_pictures(self._record, self.directory, self.summary)
+            return {name: partial(drawn.__getitem__, name) for name in drawn}
+        from cosim.output.report.run_figures import pictures
+
+        return pictures(self._record, self._envelopes if bounded else ())
 
     @cached_property
     def _outcome(self) -> "Outcome":
