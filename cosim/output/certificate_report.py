@@ -9,6 +9,7 @@ from rich.table import Table
 from cosim.output.all_certificates import SCHEDULE, Certificates
 from cosim.output.assumptions_table import print_assumptions
 from cosim.output.certificate_rows import constant_rows, plants_of
+from cosim.output.result_tables import ResultTable
 from cosim.output.unlimited_losses_report import print_unlimited
 from noack.core.number_format import duration
 from noack.theory.assumptions import assumptions
@@ -158,3 +159,12 @@ def _limit(value_s: float) -> str:
     if value_s <= 0:
         return "none"
     return "any" if value_s >= MOST_S else duration(value_s)
+
+
+def certificate_tables(found: Certificates) -> Iterator[ResultTable]:
+    """Yield the certified constants, and the largest certified times of the schedule."""
+    title, headings, rows = constant_table(found)
+    yield ResultTable("certificates", title, headings, rows)
+    if any(certificate.constants for _, certificate in found):
+        caption = f"{found.scenario.name}: largest certified values of the {SCHEDULE}"
+        yield ResultTable("limits", caption, LIMIT_HEADINGS, [*limit_rows(found)])

@@ -6,6 +6,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cosim.analysis.margin_search import MarginResult
+from cosim.output.result_tables import ResultTable
 
 _STYLES = {"stable": "green", "destabilised": "red", "undecided": "yellow"}
 
@@ -49,3 +50,9 @@ def print_margin(console: Console, margin: MarginResult) -> None:
     if not margin.is_periodic:
         note += " In brackets: the time to the next update."
     console.print(f"[dim]{note}[/]")
+
+
+def margin_tables(margin: MarginResult) -> Iterator[ResultTable]:
+    """Yield the bounds of the growth for each M."""
+    rows = [*margin_rows(margin)]
+    yield ResultTable("margin", margin_title(margin), MARGIN_HEADINGS, rows)

@@ -1,14 +1,10 @@
-"""The tables of a run's summary, of certificates and of a margin, for papers."""
+"""The tables of a run's summary, for papers."""
 
 from collections.abc import Iterator
 
 from cosim.analysis.loops_summary import has_loops
-from cosim.analysis.margin_search import MarginResult
 from cosim.analysis.run_summary import Summary
-from cosim.output.all_certificates import SCHEDULE, Certificates
-from cosim.output.certificate_report import LIMIT_HEADINGS, constant_table, limit_rows
 from cosim.output.loops_tables import HEADINGS, loop_row, network_rows
-from cosim.output.margin_report import MARGIN_HEADINGS, margin_rows, margin_title
 from cosim.output.result_tables import KEY_VALUE, ResultTable
 from cosim.output.run_tables import (
     TIMING_HEADINGS,
@@ -36,18 +32,3 @@ def summary_tables(summary: Summary) -> Iterator[ResultTable]:
     if summary["lateness_us"]:
         caption = f"timing in µs of wall time: {title}"
         yield ResultTable("timing", caption, ("", *TIMING_HEADINGS), [*timing_rows(summary)])
-
-
-def certificate_tables(found: Certificates) -> Iterator[ResultTable]:
-    """Yield the certified constants, and the largest certified times of the schedule."""
-    title, headings, rows = constant_table(found)
-    yield ResultTable("certificates", title, headings, rows)
-    if any(certificate.constants for _, certificate in found):
-        caption = f"{found.scenario.name}: largest certified values of the {SCHEDULE}"
-        yield ResultTable("limits", caption, LIMIT_HEADINGS, [*limit_rows(found)])
-
-
-def margin_tables(margin: MarginResult) -> Iterator[ResultTable]:
-    """Yield the bounds of the growth for each M."""
-    rows = [*margin_rows(margin)]
-    yield ResultTable("margin", margin_title(margin), MARGIN_HEADINGS, rows)

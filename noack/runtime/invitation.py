@@ -7,6 +7,7 @@ can take part in the run, so it is for its owner only.
 import os
 import socket
 import stat
+import sys
 from contextlib import suppress
 from pathlib import Path
 
@@ -33,6 +34,10 @@ def write_invitation(path: Path, ticket: Ticket) -> None:
         raise CallerError(f"{path}: the invitation cannot be written: {why(error)}") from None
 
 
+STANDARD_INPUT = Path("-")
+"""An invitation by this name is read from standard input."""
+
+
 def read_invitation(path: Path, runs: Path) -> Ticket:
     """Return the ticket of an invitation, as this host uses it.
 
@@ -43,18 +48,7 @@ def read_invitation(path: Path, runs: Path) -> Ticket:
         CallerError: it cannot be read, other users can read it, or it is no invitation.
         PeerError: there is no route to the coordinator.
     """
-    try:
-        with path.open(encoding="utf-8") as file:
-            status = os.fstat(file.fileno())
-            if status.st_uid != os.getuid() or stat.S_IMODE(status.st_mode) & 0o077:
-                raise CallerError(
-                    f"{path}: it has secret keys, but other users can read or change it; "
-                    f"make it yours alone: chmod 600 {path}"
-                )
-            text = file.read()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = why(error) if isinstance(error, OSError) else "it is no text"
-        raise CallerError(f"{path}: the invitation cannot be read: {reason}") from None
+    text = _text_of(path)
     try:
         ticket = loads(text)
     except CallerError as error:
@@ -64,6 +58,23 @@ def read_invitation(path: Path, runs: Path) -> Ticket:
     run_dir = runs.resolve() / Path(ticket.run_dir).name
     host = own_host((ticket.remote.host, ticket.remote.port))
     return ticket.model_copy(update={"host": host, "run_dir": str(run_dir)})
+
+
+def _text_of(path: Path) -> str:
+    try:
+        if path == STANDARD_INPUT:
+            return sys.stdin.read()
+        with path.open(encoding="utf-8") as file:
+            status = os.fstat(file.fileno())
+            if status.st_uid != os.getuid() or stat.S_IMODE(status.st_mode) & 0o077:
+                raise CallerError(
+                    f"{path}: it has secret keys, but other users can read or change it; "
+                    f"make it yours alone: chmod 600 {path}"
+                )
+            return file.read()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = why(error) if isinstance(error, OSError) else "it is no text"
+        raise CallerError(f"{path}: the invitation cannot be read: {reason}") from None
 
 
 def own_host(other: Address) -> str:

@@ -39,8 +39,7 @@ def certify(
     Exit status 1: nothing can be certified.
     """
     from cosim.output.all_certificates import certificates_of
-    from cosim.output.certificate_report import print_certificates
-    from cosim.output.run_result_tables import certificate_tables
+    from cosim.output.certificate_report import certificate_tables, print_certificates
 
     loaded = cli.load_scenario(scenario, settings)
     if weight == "chosen":
