@@ -148,6 +148,8 @@ lock: setup-dev ## Update the pinned dependencies
 		--no-header pyproject.toml --extra vehicle --group build -o requirements.lock
 	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 		--no-header pyproject.toml --group build --group dev --group docs -c requirements.lock -o requirements-dev.lock
+	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
+		--no-header pyproject.toml --extra lab -c requirements-dev.lock -o requirements-lab.lock
 
 dist: setup-dev ## Build the sdist, and the wheel from it, into dist/
 	@rm -rf dist

@@ -10,7 +10,7 @@ PAGES = (
     "README.md", "docs/record.md", "docs/scenarios.md", "docs/paper.md", "docs/netem.md",
     "docs/netem-programs.md", "docs/campaigns.md", "docs/design.md", "docs/plants.md",
     "docs/library.md", "docs/command-line.md", "docs/howto.md", "docs/guarantees.md",
-    "docs/benchmarks.md", "docs/measure.md", "docs/capacity.md",
+    "docs/benchmarks.md", "docs/measure.md", "docs/capacity.md", "docs/papers.md",
 )  # fmt: skip
 
 

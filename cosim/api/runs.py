@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from cosim.api.scenarios import Source, load
 from cosim.output.row_display import as_html, as_text
 from cosim.record.loops_run import loop_directories
-from cosim.record.run_directory import RECORD, SCENARIO_FILE, chosen_run
+from cosim.record.run_directory import RECORD, REPORT_FILE, SCENARIO_FILE, chosen_run
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError, ExitStatus
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from cosim.output.report.run_figures import RunFigure
     from cosim.record.run_record import RunRecord
     from cosim.studies.comparison.run_comparison import RunComparison
+    from cosim.studies.reproduction.run_repetition import Repetition
 
 Folder = str | PathLike[str]
 
@@ -167,19 +168,33 @@ class Run:
         Raises:
             NoackError: the run has no such figure.
         """
-        from cosim.output.report.run_figures import BOUNDED, pictures
+        from cosim.output.report.run_figures import BOUNDED
 
-        known: Mapping[str, Callable[[], RunFigure]]
-        if self._record.is_network:
-            from cosim.output.report.loops_page import loops_pictures
-
-            drawn = loops_pictures(self._record, self.directory, self.summary)
-            known = {name: partial(drawn.__getitem__, name) for name in drawn}
-        else:
-            known = pictures(self._record, self._envelopes if figure in BOUNDED else ())
+        known = self._pictures(bounded=figure in BOUNDED)
         if figure not in known:
             raise CallerError(f'"{figure}": no such figure of this run; it has {", ".join(known)}')
         return known[figure]().figure
+
+    def save_figures(self, format: str = "pdf") -> list[Path]:  # noqa: A002
+        """Write all figures of the report into ``report-figures`` in the run directory.
+
+        Args:
+            format: svg, png, pdf or pgf; pdf and pgf have the fonts of LaTeX, which need not be
+                installed.
+
+        Returns:
+            The paths.
+
+        Raises:
+            NoackError: there is no such format, or a file cannot be written.
+        """
+        from cosim.output.figure_format import FigureFormat
+        from cosim.output.report.figure_files import save_figures
+
+        if format not in [*FigureFormat]:
+            raise CallerError(f'"{format}": a figure is saved as {", ".join(FigureFormat)}')
+        found = ((name, draw().figure) for name, draw in self._pictures(bounded=True).items())
+        return save_figures(found, self.directory / REPORT_FILE, FigureFormat(format))
 
     def report(self) -> Path:
         """Write ``report.html``, a page with all figures, into the run directory; return its path.
@@ -190,6 +205,18 @@ class Run:
         from cosim.live.finalize import run_report
 
         return run_report(self.directory, again=True)
+
+    def archive(self, path: Folder) -> Path:
+        """Write the run as one file, which :func:`noack.reproduce` repeats; return its path.
+
+        Raises:
+            NoackError: the file cannot be written.
+        """
+        from cosim.studies.reproduction.run_archive import write_archive
+
+        self.summary  # noqa: B018  # of a temporary run, it is computed now
+        write_archive(self.directory, Path(path))
+        return Path(path)
 
     def replay(self) -> "Replay":
         """Feed every machine its recorded inputs again and compare the outputs bit for bit.
@@ -213,6 +240,17 @@ class Run:
         from cosim.analysis.fidelity import compute_fidelity
 
         return compute_fidelity(self._record_of_loop)
+
+    def _pictures(self, *, bounded: bool) -> "Mapping[str, Callable[[], RunFigure]]":
+        """Return functions that draw the figures, by name; ``bounded`` with certified bounds."""
+        if self._record.is_network:
+            from cosim.output.report.loops_page import loops_pictures
+
+            drawn = loops_pictures(self._record, self.directory, self.summary)
+            return {name: partial(drawn.__getitem__, name) for name in drawn}
+        from cosim.output.report.run_figures import pictures
+
+        return pictures(self._record, self._envelopes if bounded else ())
 
     @cached_property
     def _outcome(self) -> "Outcome":
@@ -328,6 +366,27 @@ def open_run(directory: Folder = "runs/latest") -> Run:
         raise CallerError(f"{path}: not a run directory (no {SCENARIO_FILE})")
     outcome = reopen(path.resolve())
     return Run(outcome.run_dir, lambda: outcome)
+
+
+def reproduce(path: Folder, *, run_code: bool = False) -> "Repetition":
+    """Repeat an archived run, and compare it bit for bit.
+
+    Args:
+        path: an archive, written by :meth:`Run.archive` or ``noack archive``.
+        run_code: run the code that the archive contains, if its plant, trigger or controller is a
+            Python class or an FMU.
+
+    Returns:
+        The result: ``bit_exact``; ``differences``, the first one of the run and of each loop;
+        ``changes`` of versions and machine since the archived run; ``numbers`` that differ.
+
+    Raises:
+        NoackError: the file is not such an archive, is damaged, or contains code without
+            ``run_code``.
+    """
+    from cosim.studies.reproduction.run_repetition import repeat_archive
+
+    return repeat_archive(Path(path), run_code=run_code)
 
 
 def compare(*runs: Run | Folder) -> "RunComparison":

@@ -15,6 +15,7 @@ import typer
 
 from cosim.cli import commands, completion
 from cosim.cli.program import NAME, Program, be_patient
+from cosim.output.figure_format import FigureFormat
 from cosim.record.run_directory import DEFAULT_RUNS as DEFAULT_RUNS
 from cosim.shipped_files import find_shipped
 from noack.core.errors import ExitStatus, NoackError, why
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from cosim.live.fork_server import ForkServer
+    from cosim.output.result_tables import ResultTable
     from noack.config.scenario import Scenario
 
 _TOUR = (
@@ -141,6 +143,21 @@ ReportOption = Annotated[
         help="Write report.html, which takes some seconds; `noack report` writes it later.",
     ),
 ]
+FormatOption = Annotated[
+    FigureFormat | None,
+    typer.Option(
+        "--format",
+        help="Write each figure as a file, too; pdf and pgf have the fonts of LaTeX.",
+    ),
+]
+TablesOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--tables",
+        metavar="FOLDER",
+        help="Write the tables into this folder, as LaTeX (booktabs) and as CSV.",
+    ),
+]
 VerboseOption = Annotated[
     bool, typer.Option("--verbose", help="Print all tables: timing, assumptions, each claim.")
 ]
@@ -243,6 +260,16 @@ def console() -> "Console":
     from rich.console import Console
 
     return Console()
+
+
+def write_tables(tables: "Iterable[ResultTable]", folder: Path | None, *, json: bool) -> None:
+    """Write the tables of ``--tables``, if it is given; print the paths, unless with ``--json``."""
+    if folder is not None:
+        from cosim.output.result_tables import save_tables
+
+        written = save_tables(tables, folder)
+        if not json:
+            print(*written, sep="\n")
 
 
 def print_json(document: object) -> None:

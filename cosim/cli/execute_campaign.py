@@ -12,6 +12,7 @@ from noack.core.errors import CallerError
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from cosim.output.figure_format import FigureFormat
     from cosim.studies.campaign.campaign_file import Campaign
     from cosim.studies.campaign.campaign_summary import CampaignSummary
     from cosim.studies.campaign.chunk_store import Store
@@ -51,7 +52,7 @@ def worker_pool(workers: int | None, scheduler: str | None = None) -> Callable[[
 
 def execute_campaign(
     console: "Console", plan: "Campaign", path: Path, start: Callable[[Any], Any], *,
-    folder: Path, draws: int | None = None,
+    folder: Path, draws: int | None = None, figure_format: "FigureFormat | None" = None,
 ) -> FinishedCampaign:  # fmt: skip
     """Run or continue a campaign; write its page.
 
@@ -62,6 +63,7 @@ def execute_campaign(
         start: starts the workers, see :func:`worker_pool`.
         folder: of the campaign.
         draws: number of draws; the campaign's by default.
+        figure_format: write each figure as a file, too.
     """
     from cosim.live.progress import runs_bar
     from cosim.studies.campaign.campaign_grid import base_of, grid
@@ -82,5 +84,5 @@ def execute_campaign(
             made = run_campaign(store, runner, progress)
         with console.status("summarising"):
             summary = summarise(plan, store)
-            files = write_report(summary, store, base)
+            files = write_report(summary, store, base, figure_format)
     return FinishedCampaign(summary, store, made, files)

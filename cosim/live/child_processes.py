@@ -1,4 +1,7 @@
-"""The processes that a launcher starts: start, exit status, reason of a failure, end."""
+"""The processes that a launcher starts: start, exit status, reason of a failure, end.
+
+They run on this host, or over ssh on others.
+"""
 
 import contextlib
 import os
@@ -10,6 +13,7 @@ from pathlib import Path
 from typing import IO
 
 from cosim.live.fork_server import ENVIRONMENT, ForkedProcess, ForkServer
+from cosim.live.remote_hosts import SSH_FAILED, RemoteStart, start_over_ssh
 from noack.core.errors import ExitStatus, MachineError
 from noack.core.python_process import python_command
 from noack.protocol.topology import RECORDER
@@ -23,6 +27,9 @@ MODULES = {
     "controller": "controller_node.__main__",
 }
 
+_NOT_EXECUTABLE, _NOT_FOUND = 126, 127
+"""Exit statuses of a shell."""
+
 Failure = tuple[ExitStatus, str]
 """Exit status and reason."""
 
@@ -32,13 +39,21 @@ Child = ForkedProcess | subprocess.Popen[str]
 class ChildProcesses:
     """The launched processes of a run, by role.
 
-    Each receives the ticket on its standard input, which stays open as a lifeline.
+    Each receives the ticket on its standard input, which stays open as a lifeline. One on another
+    host receives an invitation and has no lifeline, because it outlives a broken connection.
     """
 
     def __init__(
-        self, ticket: Ticket, run_dir: Path, roles: Sequence[str], server: ForkServer | None = None
+        self,
+        ticket: Ticket,
+        run_dir: Path,
+        roles: Sequence[str],
+        server: ForkServer | None = None,
+        remote: RemoteStart | None = None,
     ) -> None:
         self._server = server
+        self._invitation = "" if remote is None else remote.invitation
+        self._hosts = {} if remote is None else remote.hosts
         self._ticket = ticket
         self._run_dir = run_dir
         self._roles = [role for role in MODULES if role in roles]
@@ -81,6 +96,12 @@ class ChildProcesses:
         child = self._children.get(role)
         return child is not None and child.poll() in (ExitStatus.FAILED, ExitStatus.CALLER)
 
+    def is_dead(self, role: str) -> bool:
+        """Whether a launched process runs no more; behind a broken ssh it may still run."""
+        child = self._children.get(role)
+        code = None if child is None else child.poll()
+        return code is not None and not (role in self._hosts and code == SSH_FAILED)
+
     def failures(self, reported: Callable[[str], str | None]) -> dict[str, Failure]:
         """How launched processes failed, by role."""
         codes = {role: child.poll() for role, child in self._children.items()}
@@ -90,6 +111,8 @@ class ChildProcesses:
         arguments = ["--live"] if role == RECORDER and live else []
         try:
             with (self._run_dir / "logs" / f"{role}.log").open("a") as log:
+                if role in self._hosts:
+                    return start_over_ssh(role, self._hosts[role], self._invitation, log)
                 child = self._start_python(role, arguments, log)
         except OSError as error:
             raise MachineError(f"{role} cannot be started: {error}") from None
@@ -113,6 +136,8 @@ class ChildProcesses:
         )
 
     def _failure(self, role: str, code: int, reported: Callable[[str], str | None]) -> Failure:
+        if role in self._hosts and (why := self._remote_failure(role, code)) is not None:
+            return ExitStatus.FAILED, why
         if code < 0:
             return ExitStatus.FAILED, f"{role} died: killed by {signal_name(-code)}"
         if code in (ExitStatus.INTERRUPTED, ExitStatus.TERMINATED):
@@ -123,6 +148,16 @@ class ChildProcesses:
         logged = next((one.removeprefix(own) for one in lines[::-1] if one.startswith(own)), None)
         why = logged or reported(role) or "".join(lines[-1:]) or f"exit status {code}"
         return ExitStatus(code) if known else ExitStatus.FAILED, f"{role}: {why}"
+
+    def _remote_failure(self, role: str, code: int) -> str | None:
+        """Why a process did not run on another host, or is out of reach; None if it ran."""
+        newest = "".join(self._log_lines(role)[-1:])
+        where = f"{role} on {self._hosts[role].ssh}"
+        if code == SSH_FAILED:
+            return f"{where}: {newest or 'the connection by ssh broke'}"
+        if code in (_NOT_EXECUTABLE, _NOT_FOUND):
+            return f"{where}: {newest}; say in the file of hosts how noack is called: command"
+        return None
 
     def _log_lines(self, role: str) -> list[str]:
         log = self._run_dir / "logs" / f"{role}.log"

@@ -21,6 +21,7 @@ from cosim.live.coordinator import Coordinator
 from cosim.live.disk_space import require_disk_space
 from cosim.live.fork_server import ForkServer, fork_server
 from cosim.live.remote_access import Listening, open_to_hosts, with_clocks
+from cosim.live.remote_hosts import RemoteStart
 from cosim.live.restart_policy import RestartPolicy
 from cosim.live.start_limit import DEFAULT_S, StartLimit
 from cosim.record.environment import write_environment
@@ -82,7 +83,7 @@ def launch(
         live: show the run in a viewer while it runs.
         watcher: callbacks.
         server: starts the processes; by default a new one.
-        listening: how processes on other hosts join.
+        listening: how processes on other hosts join, and which of ``spawn`` run there.
 
     Raises:
         CallerError, MachineError: the run could not be prepared.
@@ -101,29 +102,33 @@ def launch(
             # Compile now: the start barrier has a time limit.
             for system in {repr(loop.plant.system): loop.plant.system for loop in loops}.values():
                 system.prepare()
-        compile_for(scenario, spawn)
+        away = {} if listening is None else listening.hosts
+        here = [role for role in spawn if role not in away]
+        compile_for(scenario, here)
         run_dir = new_run_dir(runs, resolved.name)
         resolved = write_scenario(resolved, run_dir)
         ticket = new_ticket(resolved, run_dir.resolve(), launched=True)
         write_environment(run_dir, "live", run_name(ticket.run_id))
-        children = ChildProcesses(ticket, run_dir, spawn, server)
         signals = stack.enter_context(Signals().handled())
         stack.enter_context(active_run(run_dir))
         ending = stack.enter_context(EndingFile(run_dir))
         _publish_run(stack, ticket, session)  # first: its file leads to a killed run's socket
-        coordinator = Coordinator(ticket, spawn)
+        coordinator = Coordinator(ticket, here)
         stack.callback(coordinator.close)
-        watcher = watcher or Watcher()
+        watcher, remote = watcher or Watcher(), None
         with _no_directory_if_refused(run_dir):
             if listening is not None:
                 ticket = ticket.model_copy(update={"host": listening.address[0]})
                 opened = stack.enter_context(open_to_hosts(listening, ticket, coordinator))
+                remote = RemoteStart(away, opened.invitation.model_dump_json())
             if session is not None:
                 by_hand = ticket.model_copy(update={"launched": False})
                 stack.enter_context(published(by_hand, session))
-            if listening is not None:  # last: it replaces the invitation of an earlier run
-                stack.enter_context(invitation_file(listening.invitation, opened.invited))
+            if listening is not None:
+                if listening.invitation is not None:  # last: it replaces that of an earlier run
+                    stack.enter_context(invitation_file(listening.invitation, opened.invitation))
                 watcher.listening(text_of(opened.address), listening)
+        children = ChildProcesses(ticket, run_dir, spawn, server, remote)
         stack.enter_context(children.started(live=live))
         run = _Run(ticket, run_dir, coordinator, children, watcher)
         status, reason = run.watch(signals, ending.store)

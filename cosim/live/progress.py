@@ -67,6 +67,12 @@ class _RunProgress:
 
     def listening(self, address: str, how: "Listening") -> None:
         """Say how processes on other hosts join."""
+        if how.invitation is None:
+            places = (f"{role} on {host.ssh}" for role, host in how.hosts.items())
+            self._print(
+                f"listening on {escape(address)} (TCP); by ssh: {escape(', '.join(places))}"
+            )
+            return
         role = how.role or "plant|sensor|netem|controller"
         self._print(
             f"listening on {escape(address)} (TCP); {escape(str(how.invitation))} has the secret "

@@ -1,16 +1,18 @@
-"""Opens a run to other hosts: TLS listener, and answers to questions about the time."""
+"""Opens a run to other hosts: TLS listener, invitation, and answers to questions about the time."""
 
 import asyncio
 import datetime
 import ipaddress
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 from cosim.live.coordinator import AdmissionPass, Coordinator
+from cosim.live.remote_hosts import Host, load_hosts
 from noack.config.scenario import Scenario
 from noack.config.sections.run_sections import ClocksSection
 from noack.core.errors import CallerError, PeerError, why
@@ -26,24 +28,37 @@ from noack.runtime.zenoh_session import socket_path
 _BACKLOG = 4096
 
 
-class OpenedRun(NamedTuple):
-    """Where a run listens, with its port, and the ticket for those who are invited."""
-
-    address: Address
-    invited: Ticket
-
-
 class Listening(NamedTuple):
     """Where a run listens, and whom it invites."""
 
     address: Address
-    invitation: Path
-    role: str | None
+    invitation: Path | None = None
+    """Where the invitation is written; None: it is in no file."""
+    role: str | None = None
     """The one role that the invitation is for; None for all."""
-    valid_s: float
+    valid_s: float = 3600.0
+    hosts: Mapping[str, Host] = MappingProxyType({})
+    """Where the launcher starts processes, by role."""
 
 
-def listen_address(text: str) -> Address:
+class Opened(NamedTuple):
+    """A run that is open to other hosts."""
+
+    address: Address
+    invitation: Ticket
+
+
+def listening_for(path: Path) -> Listening:
+    """Return how processes join that the launcher starts on the hosts of a file.
+
+    Raises:
+        CallerError: the file is wrong, or others cannot reach this host at its address.
+    """
+    hosts = load_hosts(path)
+    return Listening(listen_address(hosts.listen, f"{path}: listen"), hosts=hosts.by_role)
+
+
+def listen_address(text: str, option: str = "--listen") -> Address:
     """Parse an address of this host: ``192.0.2.1``, ``192.0.2.1:7000``, ``2001:db8::1``.
 
     Raises:
@@ -54,13 +69,13 @@ def listen_address(text: str) -> Address:
     if text.endswith("]") or ":" not in text:
         text += ":0"
     if text.startswith(":") or not text:
-        raise CallerError("--listen: expected an address of this host")
-    host, port = parse_address(text, "--listen")
+        raise CallerError(f"{option}: expected an address of this host")
+    host, port = parse_address(text, option)
     found = ipaddress.ip_address(host.partition("%")[0])
     mapped = isinstance(found, ipaddress.IPv6Address) and found.ipv4_mapped is not None
     if found.is_unspecified or found.is_multicast or found.is_link_local or mapped:
         raise CallerError(
-            f"--listen: {host} is not an address at which other hosts can reach this one; "
+            f"{option}: {host} is not an address at which other hosts can reach this one; "
             "give one of `ip address`"
         )
     return host, port
@@ -90,8 +105,8 @@ def _listen(address: Address) -> socket.socket:
 @contextmanager
 def open_to_hosts(
     listening: Listening, ticket: Ticket, coordinator: Coordinator
-) -> Iterator[OpenedRun]:
-    """Listen for processes of other hosts meanwhile, and answer questions about the time.
+) -> Iterator[Opened]:
+    """Listen for processes of other hosts meanwhile, and make their invitation.
 
     Raises:
         CallerError: the address cannot be used.
@@ -123,4 +138,4 @@ def open_to_hosts(
             "launched": False, "admission_pass": shown, "remote": remote,
             "time_reference": times.address,
         }  # fmt: skip
-        yield OpenedRun((host, port), ticket.model_copy(update=invited))
+        yield Opened((host, port), ticket.model_copy(update=invited))

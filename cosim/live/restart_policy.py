@@ -75,7 +75,7 @@ class RestartPolicy:
                 return status, why
             self._failed[role] = _Failed((status, why), time.monotonic() + within_s)
             launched = role in self._children
-            self._coordinator.allow_restart(role, why, dead=launched)
+            self._coordinator.allow_restart(role, why, dead=self._children.is_dead(role))
             self._on_failure(why, self._t_s(), None if launched else role)
             if launched:
                 try:

@@ -9,6 +9,7 @@ from rich.table import Table
 from cosim.output.all_certificates import SCHEDULE, Certificates
 from cosim.output.assumptions_table import print_assumptions
 from cosim.output.certificate_rows import constant_rows, plants_of
+from cosim.output.result_tables import ResultTable
 from cosim.output.unlimited_losses_report import print_unlimited
 from noack.core.number_format import duration
 from noack.theory.assumptions import assumptions
@@ -77,24 +78,35 @@ def _stability_in_words(found: Certificates) -> Iterator[str]:
     yield f"Exactly, but without lateness: {text}; noack margin finds the limits."
 
 
-def _print_constants(console: Console, found: Certificates) -> None:
+def constant_table(found: Certificates) -> tuple[str, list[str], list[tuple[str, ...]]]:
+    """Return title, headings and rows of the table of constants."""
     trigger = found.scenario.trigger
     norm = "‖W·‖" if trigger.weight is not None else "‖·‖"
     guarantee = next(iter(found))[1].conditions.guarantee  # its longest burst counts all rules
-    table = Table(
-        title=f"{found.scenario.name}: certified bounds, "
+    title = (
+        f"{found.scenario.name}: certified bounds, "
         f"{guarantee.meaning}; event: {trigger.description}; norm {norm}"
     )
-    table.add_column("")
-    for under, certificate in found:
-        table.add_column(f"{under},\n{plants_of(certificate)}", justify="right")
+    headings = ["", *(f"{under},\n{plants_of(certificate)}" for under, certificate in found)]
     printed = found.theorem_2 is not None
-    if printed:
-        table.add_column("paper's\nTheorem 2", justify="right")
+    headings += ["paper's\nTheorem 2"] if printed else []
     certificates, rate = [one for _, one in found], trigger.threshold_decay_per_s
-    for label, values, of_theorem in constant_rows(certificates, found.theorem_2, rate):
-        table.add_row(label, *values, *([of_theorem] if printed else []))
+    rows = [
+        (label, *values, *([of_theorem] if printed else []))
+        for label, values, of_theorem in constant_rows(certificates, found.theorem_2, rate)
+    ]
+    return title, headings, rows
+
+
+def _print_constants(console: Console, found: Certificates) -> None:
+    title, headings, rows = constant_table(found)
+    table = Table(title=title)
+    for heading in headings:
+        table.add_column(heading, justify="right" if heading else "left")
+    for row in rows:
+        table.add_row(*row)
     console.print(table)
+    certificates = [one for _, one in found]
     if any(one.constants for one in certificates):
         console.print(
             "[dim]Each bound of a norm is multiplied by e^(−rate·t). paper: no sampling, no delay, "
@@ -120,16 +132,26 @@ def _print_constants(console: Console, found: Certificates) -> None:
             console.print(
                 f"[yellow]void[/] ({under}, {certificate.scope}): {escape(certificate.void)}"
             )
-    if found.weight is None and trigger.policy == "decaying" and any(c.void for c in certificates):
+    policy = found.scenario.trigger.policy
+    if found.weight is None and policy == "decaying" and any(c.void for c in certificates):
         console.print("--weight chosen searches for a norm in which more is certified")
+
+
+LIMIT_HEADINGS = ("", "sampling period", "delay of updates", "age of inputs")
+
+
+def limit_rows(found: Certificates) -> Iterator[tuple[str, ...]]:
+    """Yield the rows of the table of limits."""
+    for scope, limits in found.limits_by_scope.items():
+        yield scope, *map(_limit, limits)
 
 
 def _print_limits(console: Console, found: Certificates) -> None:
     table = Table(title="schedule: largest certified value of each quantity, the others unchanged")
-    for heading in ("", "sampling period", "delay of updates", "age of inputs"):
+    for heading in LIMIT_HEADINGS:
         table.add_column(heading, justify="right" if heading else "left")
-    for scope, limits in found.limits_by_scope.items():
-        table.add_row(scope, *map(_limit, limits))
+    for row in limit_rows(found):
+        table.add_row(*row)
     console.print(table)
 
 
@@ -137,3 +159,12 @@ def _limit(value_s: float) -> str:
     if value_s <= 0:
         return "none"
     return "any" if value_s >= MOST_S else duration(value_s)
+
+
+def certificate_tables(found: Certificates) -> Iterator[ResultTable]:
+    """Yield the certified constants, and the largest certified times of the schedule."""
+    title, headings, rows = constant_table(found)
+    yield ResultTable("certificates", title, headings, rows)
+    if any(certificate.constants for _, certificate in found):
+        caption = f"{found.scenario.name}: largest certified values of the {SCHEDULE}"
+        yield ResultTable("limits", caption, LIMIT_HEADINGS, [*limit_rows(found)])

@@ -1,7 +1,7 @@
 """Tables of a run: key numbers, timing, claims."""
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 from rich.console import Console
 from rich.markup import escape
@@ -17,6 +17,7 @@ from noack.core.number_format import NONE, number, ratio, seconds, whole
 
 Numbers = tuple[tuple[str, str], ...]
 """Quantities and their values, as text."""
+Claims = Sequence[dict[str, Any]]
 _QUANTILES = ("p50", "p99", "p999", "max")
 TIMING_HEADINGS = ("p50", "p99", "p99.9", "max", "count", "missed")
 
@@ -35,13 +36,17 @@ def print_details(console: Console, summary: Summary) -> None:
     print_claims(console, summary)
 
 
-def number_table(summary: Summary, rows: Numbers) -> Table:
-    """Return a run's numbers as a table; its title names scenario, mode and cap."""
+def run_title(summary: Summary) -> str:
+    """Return the title of a run's tables: scenario, mode and cap."""
     mode = "model-based" if summary["mode"] == "model" else "zero-order hold"
     kind = "" if summary["kind"] == "live" else f", {summary['kind']}"
     further = "".join(f", {constraint}" for constraint in summary.get("constraints", ()))
-    title = f"{summary['scenario']}, {mode}, M − 1 = {summary['mansd']}{further}{kind}"
-    table = Table(title=escape(title))
+    return f"{summary['scenario']}, {mode}, M − 1 = {summary['mansd']}{further}{kind}"
+
+
+def number_table(summary: Summary, rows: Numbers) -> Table:
+    """Return a run's numbers as a table; its title names scenario, mode and cap."""
+    table = Table(title=escape(run_title(summary)))
     table.add_column("quantity")
     table.add_column("value", justify="right")
     for row in rows:
@@ -237,18 +242,10 @@ def print_claims(console: Console, summary: Summary) -> None:
     if not claims:
         return
     table = Table(title="claims checked against this run")
-    parts = any(map(interval_of, claims))
-    for heading in ("source", "claim", *(["interval"] if parts else []), "share used", "verdict"):
+    for heading in claim_headings(claims):
         table.add_column(heading, justify="right" if heading == "share used" else "left")
-    for claim in claims:
-        since = "" if claim["since_s"] is None else f" since {claim['since_s']:.3f} s"
-        table.add_row(
-            escape(claim["source"]),
-            escape(claim["bound"]),
-            *([interval_of(claim)] if parts else []),
-            NONE if claim["ratio"] is None else f"{100 * claim['ratio']:.3g} %",
-            Text(claim["verdict"] + since, _CLAIM_COLOURS[claim["verdict"]]),
-        )
+    for (*cells, verdict), colour in claim_rows(claims):
+        table.add_row(*map(escape, cells), Text(verdict, colour))
     console.print(table)
     if any(claim["ratio"] is not None for claim in claims):
         console.print(
@@ -263,6 +260,34 @@ def print_claims(console: Console, summary: Summary) -> None:
     for (verdict, why), of in sources.items():
         text = f"{verdict}: {'; '.join(dict.fromkeys(of))}: {why}"
         console.print(text, highlight=False, markup=False)
+
+
+class ClaimRow(NamedTuple):
+    """A row of the table of claims."""
+
+    cells: tuple[str, ...]
+    colour: str
+    """Of the verdict."""
+
+
+def claim_headings(claims: Claims) -> tuple[str, ...]:
+    """Return the headings of the table of claims; the interval only if claims have one."""
+    interval = ["interval"] if any(map(interval_of, claims)) else []
+    return "source", "claim", *interval, "share used", "verdict"
+
+
+def claim_rows(claims: Claims) -> Iterator[ClaimRow]:
+    """Yield the rows of the table of claims."""
+    has_interval = "interval" in claim_headings(claims)
+    for claim in claims:
+        since = "" if claim["since_s"] is None else f" since {claim['since_s']:.3f} s"
+        cells = (
+            claim["source"], claim["bound"],
+            *([interval_of(claim)] if has_interval else []),
+            NONE if claim["ratio"] is None else f"{100 * claim['ratio']:.3g} %",
+            claim["verdict"] + since,
+        )  # fmt: skip
+        yield ClaimRow(cells, _CLAIM_COLOURS[claim["verdict"]])
 
 
 _CLAIM_COLOURS = {

@@ -7,6 +7,7 @@ can take part in the run, so it is for its owner only.
 import os
 import socket
 import stat
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -16,8 +17,10 @@ from noack.core.file_access import open_regular, read_regular
 from noack.runtime.address import Address, family_of, text_of
 from noack.runtime.join_ticket import Ticket, loads
 
+STANDARD_INPUT = Path("-")
+"""An invitation by this name is read from standard input."""
 _MOST_BYTES = 64 * 2**20
-"""Of an invitation; that of the largest scenario has a few MiB."""
+"""Of an invitation: more than any scenario needs."""
 
 
 @contextmanager
@@ -72,18 +75,7 @@ def read_invitation(path: Path, runs: Path) -> Ticket:
         CallerError: it cannot be read, other users can read it, or it is no invitation.
         PeerError: there is no route to the coordinator.
     """
-    try:
-        with open_regular(path) as file:
-            status = os.fstat(file.fileno())
-            if status.st_uid != os.getuid() or stat.S_IMODE(status.st_mode) & 0o077:
-                raise CallerError(
-                    f"{path}: it has secret keys, but other users can read or change it; "
-                    f"make it yours alone: chmod 600 {path}"
-                )
-            content = file.read(_MOST_BYTES + 1)
-    except (OSError, ValueError) as error:
-        reason = why(error) if isinstance(error, OSError) else error
-        raise CallerError(f"{path}: the invitation cannot be read: {reason}") from None
+    content = _bytes_of(path)
     try:
         ticket = loads(_text(content))
     except CallerError as error:
@@ -96,6 +88,23 @@ def read_invitation(path: Path, runs: Path) -> Ticket:
     run_dir = runs.resolve() / name
     host = own_host((ticket.remote.host, ticket.remote.port))
     return ticket.model_copy(update={"host": host, "run_dir": str(run_dir)})
+
+
+def _bytes_of(path: Path) -> bytes:
+    try:
+        if path == STANDARD_INPUT:
+            return sys.stdin.buffer.read(_MOST_BYTES + 1)
+        with open_regular(path) as file:
+            status = os.fstat(file.fileno())
+            if status.st_uid != os.getuid() or stat.S_IMODE(status.st_mode) & 0o077:
+                raise CallerError(
+                    f"{path}: it has secret keys, but other users can read or change it; "
+                    f"make it yours alone: chmod 600 {path}"
+                )
+            return file.read(_MOST_BYTES + 1)
+    except (OSError, ValueError) as error:
+        reason = why(error) if isinstance(error, OSError) else error
+        raise CallerError(f"{path}: the invitation cannot be read: {reason}") from None
 
 
 def _text(content: bytes) -> str:

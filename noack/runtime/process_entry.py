@@ -15,7 +15,7 @@ from setproctitle import setproctitle
 from noack.core.errors import ExitStatus, NoackError, NoAnswerError, PeerError
 from noack.runtime.command_line import TICKET_ON_STDIN, Parser, failed
 from noack.runtime.control_plane import ControlPlane
-from noack.runtime.invitation import read_invitation
+from noack.runtime.invitation import STANDARD_INPUT, read_invitation
 from noack.runtime.join_ticket import DEFAULT_SESSION, Ticket, loads, wait_for_ticket
 from noack.runtime.life_cycle import HORIZON, Event
 from noack.runtime.process_life import RunProcess, lifeline_cut
@@ -138,7 +138,8 @@ def _ticket(role: str, session: str, signals: Signals) -> Ticket:
 
 def _invited(role: str, invitation: Path, runs: Path, signals: Signals) -> Ticket:
     """Wait for an invitation and return its ticket; raise CallerError or PeerError without one."""
-    if not invitation.exists() and invitation.parent.is_dir():
+    from_a_file = invitation != STANDARD_INPUT
+    if from_a_file and not invitation.exists() and invitation.parent.is_dir():
         print(f"noack {role}: waiting for {invitation}; Ctrl-C ends", file=sys.stderr)
         deadline_s = time.monotonic() + _TICKET_TIMEOUT_S
         while not invitation.exists() and time.monotonic() < deadline_s:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, spectral_abscissa
-from noack.core.matrix_functions import solve_lyapunov
+from noack.core.lyapunov_equation import solve_lyapunov
 
 Stack = NDArray[np.float64]
 

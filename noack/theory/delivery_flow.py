@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
-from noack.core.matrix_functions import exponential
+from noack.core.matrix_exponential import exponential
 from noack.theory.contraction import (
     Stack,
     largest_eigenvalues,

@@ -21,7 +21,7 @@ import numpy as np
 
 from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
-from noack.core.matrix_functions import solve_lyapunov
+from noack.core.lyapunov_equation import solve_lyapunov
 from noack.theory.contraction import Stack
 from noack.theory.delivery_flow import ROUNDING, DeliveryFlow, Reach, Starts
 from noack.theory.error_gains import Output

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 import time
@@ -37,11 +38,13 @@ def start(hosts: TwoHosts, tmp_path: Path) -> Iterator[Start]:
     """Start a command of noack on a host, with a runtime directory of the host's own."""
     with ExitStack() as stack:
 
-        def begin(host: int, *arguments: str) -> subprocess.Popen[str]:
+        def begin(host: int, *arguments: str, path: Path | None = None) -> subprocess.Popen[str]:
             runtime = tmp_path / f"host {host}"
             runtime.mkdir(exist_ok=True)
             command = hosts.inside(host, *live.noack_command(*arguments))
             environment = os.environ | {"XDG_RUNTIME_DIR": str(runtime)}
+            if path is not None:
+                environment["PATH"] = f"{path}:{environment['PATH']}"
             return stack.enter_context(_started(command, tmp_path, environment))
 
         yield begin
@@ -223,3 +226,72 @@ def test_what_is_no_kept_folder_is_refused(start: Start, tmp_path: Path) -> None
         assert collecting.returncode in (1, 2)
         assert stderr.startswith(f"noack: {reason}")
         assert len(stderr.splitlines()) == 1
+
+
+@pytest.fixture
+def ssh(hosts: TwoHosts, tmp_path: Path) -> Path:
+    """A folder with a command ssh that knows one host, `robot`, which is the second one."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    inside = shlex.join(hosts.inside(1))
+    runtime = tmp_path / "host 1"
+    runtime.mkdir()
+    script = folder / "ssh"
+    script.write_text(
+        "#!/bin/sh\n"
+        'while [ "$1" != -- ]; do shift; done\n'
+        '[ "$2" = robot ] || { echo "ssh: Could not resolve hostname $2" >&2; exit 255; }\n'
+        "shift 2\n"
+        f"cd {shlex.quote(str(runtime))}\n"
+        f'XDG_RUNTIME_DIR=$PWD exec {inside} sh -c "$*"\n'
+    )
+    script.chmod(0o755)
+    return folder
+
+
+def hosts_file(folder: Path, address: str, ssh: str = "robot", command: str = "") -> str:
+    """Write a file that places network and controller on another host."""
+    command = command or shlex.join(live.noack_command())
+    place = f"{{ ssh = '{ssh}', command = '{command}' }}"
+    path = folder / "hosts.toml"
+    path.write_text(f"listen = '{address}'\nnetem = {place}\ncontroller = {place}\n")
+    return str(path)
+
+
+def test_a_run_starts_its_processes_on_another_host(
+    start: Start, hosts: TwoHosts, tmp_path: Path, ssh: Path
+) -> None:
+    (own, _), (other, _) = hosts.addresses
+    run = start(
+        0, "run", "lane_following", "--hosts", hosts_file(tmp_path, own), "--json", *live.BARE,
+        *live.AT_RATE, *live.settings(horizon_s=3.0, network__encrypted=True), path=ssh,
+    )  # fmt: skip
+    stdout, stderr = ended(run)
+    assert run.returncode == 0, stderr
+    summary = json.loads(stdout)
+    assert summary["missing_samples"] == 0
+    assert summary["replay"]["bit_exact"]
+    run_dir = (tmp_path / "runs" / "latest").resolve()
+    reports = json.loads((run_dir / "reports.json").read_text())
+    places = {role: reports[role]["channel"]["local"].rpartition(":")[0] for role in LOOP_ROLES}
+    assert places == {"plant": own, "sensor": own, "netem": other, "controller": other}
+    assert "netem on robot, controller on robot" in stderr
+    assert not list(tmp_path.rglob("invitation*"))  # the keys were in no file
+
+
+@pytest.mark.parametrize(
+    ("ssh_host", "command", "line"),
+    [
+        ("nowhere", "", "netem on nowhere: ssh: Could not resolve hostname nowhere"),
+        ("robot", "/missing/noack", "say in the file of hosts how noack is called: command"),
+    ],
+)
+def test_a_process_that_does_not_start_on_its_host_ends_the_run(
+    start: Start, hosts: TwoHosts, tmp_path: Path, ssh: Path, ssh_host: str, command: str, line: str
+) -> None:
+    file = hosts_file(tmp_path, hosts.addresses[0][0], ssh_host, command)
+    run = start(0, "run", "lane_following", "--hosts", file, *live.BARE, path=ssh)
+    _, stderr = ended(run)
+    assert run.returncode == 1
+    assert line in stderr.splitlines()[-1]
+    assert "Traceback" not in stderr

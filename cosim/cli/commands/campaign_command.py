@@ -42,6 +42,8 @@ def campaign(
     workers: Workers = None,
     scheduler: Scheduler = None,
     out: Out = None,
+    figure_format: cli.FormatOption = None,
+    tables: cli.TablesOption = None,
     json: cli.JsonOption = False,
 ) -> int:
     """Run a scenario over a grid of settings, with many random draws at each point.
@@ -53,7 +55,7 @@ def campaign(
     from cosim.live.progress import PatientConsole
     from cosim.shipped_files import find_shipped
     from cosim.studies.campaign.campaign_file import load
-    from cosim.studies.campaign.campaign_report import print_summary
+    from cosim.studies.campaign.campaign_report import campaign_tables, print_summary
 
     start = worker_pool(workers, scheduler)
     console = PatientConsole(stderr=True)
@@ -61,7 +63,7 @@ def campaign(
     plan = load(path)
     folder = out or cli.DEFAULT_RUNS / "campaigns" / plan.name
     summary, _, made, files = execute_campaign(
-        console, plan, path, start, folder=folder, draws=draws
+        console, plan, path, start, folder=folder, draws=draws, figure_format=figure_format
     )
     if json:
         cli.print_json(summary.document() | {"made": made, "files": [str(file) for file in files]})
@@ -69,4 +71,5 @@ def campaign(
         print_summary(cli.console(), summary)
         for written in files:
             print(written)
+    cli.write_tables(campaign_tables(summary), tables, json=json)
     return ExitStatus.FAILED if summary.breaches else ExitStatus.OK

@@ -92,6 +92,7 @@ def capacity(
     workers: Workers = None,
     settings: cli.SetOption = None,
     out: Out = None,
+    figure_format: cli.FormatOption = None,
     json: cli.JsonOption = False,
 ) -> int:
     """How many loops a link carries, until guarantee, deadline or cost is exceeded.
@@ -122,7 +123,7 @@ def capacity(
     result = capacity_page.CapacityResult(
         plan, done.summary, capacities(done.summary, done.store), points
     )
-    files = [*capacity_page.write(result, folder), *done.files]
+    files = [*capacity_page.write(result, folder, figure_format), *done.files]
     if json:
         cli.print_json(result.document() | {"made": done.made, "files": [str(f) for f in files]})
     else:

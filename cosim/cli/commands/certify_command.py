@@ -31,6 +31,7 @@ def certify(
             max=1000,
         ),
     ] = None,
+    tables: cli.TablesOption = None,
     json: cli.JsonOption = False,
 ) -> int:
     """Compute the bounds that are guaranteed for a scenario, and their conditions.
@@ -38,7 +39,7 @@ def certify(
     Exit status 1: nothing can be certified.
     """
     from cosim.output.all_certificates import certificates_of
-    from cosim.output.certificate_report import print_certificates
+    from cosim.output.certificate_report import certificate_tables, print_certificates
 
     loaded = cli.load_scenario(scenario, settings)
     if weight == "chosen":
@@ -52,5 +53,6 @@ def certify(
         cli.print_json(found.to_json())
     else:
         print_certificates(cli.console(), found)
+    cli.write_tables(certificate_tables(found), tables, json=json)
     certified = any(certificate.constants for _, certificate in found)
     return ExitStatus.OK if certified else ExitStatus.FAILED

@@ -30,7 +30,10 @@ def compare(
     *,
     out: Annotated[
         Path,
-        typer.Option("--out", help="File of the overlay: a page (.html) or a figure (.svg, .png)."),
+        typer.Option(
+            "--out",
+            help="File of the overlay: a page (.html), or a figure (.svg, .png, .pdf, .pgf).",
+        ),
     ] = cli.DEFAULT_RUNS / "comparison.html",
     json: cli.JsonOption = False,
 ) -> int:

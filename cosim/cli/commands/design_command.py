@@ -83,6 +83,7 @@ def design(
     settings: cli.SetOption = None,
     out: Out = None,
     page: Page = None,
+    figure_format: cli.FormatOption = None,
     json: cli.JsonOption = False,
 ) -> int:
     """Choose α, β and the norm: the fewest transmissions that meet your limits.
@@ -105,9 +106,8 @@ def design(
         families = families_of(loaded, norms, _regulator(loaded, gain, Q, R), progress)
     with work_bar("trying candidates") as progress:
         found = designed(families, limits, draws=draws, seed=seed, progress=progress)
-    written = [
-        write_whole(page or cli.DEFAULT_RUNS / "design" / f"{loaded.name}.html", pages.page(found))
-    ]
+    path = page or cli.DEFAULT_RUNS / "design" / f"{loaded.name}.html"
+    written = pages.write_page(found, path, figure_format)
     if out is not None and found.feasible:
         written.append(write_whole(out, dumps(found.scenario)))
     if json:

@@ -22,7 +22,10 @@ def fidelity(
     loop: cli.LoopOption = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", help="Write a figure of the differences over time (.svg, .png)."),
+        typer.Option(
+            "--out",
+            help="Write a figure of the differences over time (.svg, .png, .pdf, .pgf).",
+        ),
     ] = None,
     json: cli.JsonOption = False,
 ) -> int:

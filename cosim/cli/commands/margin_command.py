@@ -30,6 +30,7 @@ def margin(
         bool, typer.Option("--play", help="Play the destabilising pattern in a live run.")
     ] = False,
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
+    tables: cli.TablesOption = None,
     json: cli.JsonOption = False,
 ) -> int:
     """Find the largest M for which a loop is stable under every loss pattern.
@@ -41,7 +42,7 @@ def margin(
     """
     from cosim.analysis.margin_search import find_margin
     from cosim.live.progress import PatientConsole
-    from cosim.output.margin_report import print_margin
+    from cosim.output.margin_report import margin_tables, print_margin
     from noack.config.resolution import resolve
 
     if play and json:
@@ -56,6 +57,7 @@ def margin(
         cli.print_json(found.to_json())
     else:
         print_margin(cli.console(), found)
+    cli.write_tables(margin_tables(found), tables, json=json)
     if not play:
         return ExitStatus.OK if found.stable_m else ExitStatus.FAILED
     if found.destabilised is None:

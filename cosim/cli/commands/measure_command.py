@@ -45,6 +45,7 @@ def measure(
     for_scenario: given.ForScenario = None,
     settings: cli.SetOption = None,
     out: given.Page = None,
+    figure_format: cli.FormatOption = None,
     write: given.NetworkFile = None,
     form: given.Form = given.NetworkForm.TRACE,
     json: cli.JsonOption = False,
@@ -63,7 +64,7 @@ def measure(
     scenario = None if for_scenario is None else cli.load_scenario(for_scenario, settings)
     if form is given.NetworkForm.MODEL and write is None:
         raise CallerError("--as model: is the form of --write; give its FILE.toml")
-    request = OutputRequest(out, write, form.value, scenario)
+    request = OutputRequest(out, figure_format, write, form.value, scenario)
     live = LiveOptions(rate, duration, size, round_trip, silence, save, options.deadline_s)
     how = SourceOptions(
         None if clocks is None else clocks is given.ClockRelation.DIFFERENT,

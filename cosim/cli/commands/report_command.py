@@ -11,6 +11,7 @@ from noack.core.errors import ExitStatus
 
 @cli.command(cli.RUNS, 90, [
     ("noack report", "the report of the last run"),
+    ("noack report --format pdf", "with its figures for a paper"),
     ("noack report runs/latest --json", "print the path as JSON"),
 ])  # fmt: skip
 def report(
@@ -21,14 +22,19 @@ def report(
     again: Annotated[
         bool, typer.Option("--again", help="Write the report again, even if there is one.")
     ] = False,
+    figure_format: cli.FormatOption = None,
     json: cli.JsonOption = False,
 ) -> int:
     """Print the path of a run's report (one HTML page with all figures); write it if missing."""
+    from cosim.api.runs import open_run
     from cosim.live.finalize import run_report
 
-    path = run_report(chosen_run(run_dir, runs, loop), again=again)
+    chosen = chosen_run(run_dir, runs, loop)
+    path = run_report(chosen, again=again)
+    figures = [] if figure_format is None else open_run(chosen).save_figures(figure_format)
     if json:
-        cli.print_json({"report": str(path)})
+        written = {"figures": [str(one) for one in figures]} if figures else {}
+        cli.print_json({"report": str(path)} | written)
     else:
-        print(path)
+        print(path, *figures, sep="\n")
     return ExitStatus.OK

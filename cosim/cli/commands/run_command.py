@@ -1,5 +1,8 @@
 """``noack run``: a live run."""
 
+from pathlib import Path
+from typing import Annotated
+
 import typer
 
 from cosim.cli import command as cli
@@ -10,6 +13,7 @@ from cosim.cli.execute_run import RunOutput, run_processes
     ("noack run lane_following", "the paper's example, 20 s"),
     ("noack run unstable_pendulum --set horizon_s=5 --live", "5 s, with the live viewer"),
     ("noack run lane_following --set network.mansd=9 --json", "M − 1 = 9; print JSON"),
+    ("noack run lane_following --hosts hosts.toml", "some processes on other hosts, over ssh"),
 ])  # fmt: skip
 def run(
     context: typer.Context,
@@ -18,13 +22,21 @@ def run(
     settings: cli.SetOption = None,
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
     live: cli.LiveOption = False,
+    hosts: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="TOML file that places processes on other hosts."),
+    ] = None,
     report: cli.ReportOption = True,
     verbose: cli.VerboseOption = False,
     json: cli.JsonOption = False,
 ) -> int:
     """Run a scenario live: start all processes and record everything."""
-    output = RunOutput(report, verbose, json)
+    output, listening = RunOutput(report, verbose, json), None
+    if hosts is not None:
+        from cosim.live.remote_access import listening_for
+
+        listening = listening_for(hosts)
     return run_processes(
         lambda: cli.load_scenario(scenario, settings), runs, output,
-        live=live, server=context.obj,
+        live=live, server=context.obj, listening=listening,
     )  # fmt: skip

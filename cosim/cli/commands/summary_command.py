@@ -8,6 +8,7 @@ from noack.core.errors import ExitStatus
 @cli.command(cli.RUNS, 50, [
     ("noack summary", "the last run"),
     ("noack summary --verbose", "with timing, assumptions and each claim"),
+    ("noack summary --tables tables", "its tables for a paper, as LaTeX and CSV"),
     ("noack summary runs/latest --json", "all numbers, as JSON"),
 ])  # fmt: skip
 def summary(
@@ -16,6 +17,7 @@ def summary(
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
     loop: cli.LoopOption = None,
     verbose: cli.VerboseOption = False,
+    tables: cli.TablesOption = None,
     json: cli.JsonOption = False,
 ) -> int:
     """Show a run's summary; finalise an interrupted run first.
@@ -23,6 +25,7 @@ def summary(
     Exit status 0: the summary was shown, also that of a failed run.
     """
     from cosim.live.finalize import reopen
+    from cosim.output.run_result_tables import summary_tables
     from cosim.output.run_verdict import print_outcome
 
     outcome = reopen(chosen_run(run_dir, runs, loop))
@@ -30,4 +33,5 @@ def summary(
         cli.print_json(outcome.summary)
     else:
         print_outcome(cli.console(), outcome, verbose=verbose)
+    cli.write_tables(summary_tables(outcome.summary), tables, json=json)
     return ExitStatus.OK

@@ -4,17 +4,20 @@ import base64
 import io
 import re
 import xml.etree.ElementTree as ET
+from collections.abc import Iterable
 from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from cosim.output.report.figure_style import GRID, INK, PAPER, settings
+from cosim.output.figure_format import FigureFormat
+from cosim.output.report.figure_style import GRID, INK, PAPER, paper_fonts, settings
 from noack.core.errors import CallerError
 from noack.core.file_access import write_whole
 
 _UNDATED: dict[str, dict[str, str | None]] = {
     "svg": {"Date": None, "Creator": None, "Format": None, "Type": None},
     "png": {"Software": None},
+    "pdf": {"Creator": None, "Producer": None, "CreationDate": None},
 }
 _HEAVY_CHARACTERS = 400_000
 _REFERENCE = re.compile(r"(?<=#)[^)]+")
@@ -22,16 +25,53 @@ _TAIL = re.compile(r"(\.\d\d)\d+")
 _BY_PAGE = {INK: "var(--ink)", GRID: "var(--grid)", PAPER: "var(--paper)"}
 
 
+FIGURE_SUFFIXES = tuple(f".{one}" for one in FigureFormat)
+
+
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure as SVG or PNG, by the file's ending; the same figure gives the same bytes.
+    """Write a figure in the format of the file's ending; the same figure gives the same bytes.
+
+    The images of a PGF picture are written beside it.
 
     Raises:
-        CallerError: another ending.
+        CallerError: another ending than .svg, .png, .pdf or .pgf.
         MachineError: the file cannot be written.
     """
-    if path.suffix not in (".svg", ".png"):
-        raise CallerError(f"{path}: a figure is saved as .svg or .png")
-    write_whole(path, _drawn(figure, path.suffix.removeprefix(".")))
+    if path.suffix not in FIGURE_SUFFIXES:
+        raise CallerError(f"{path}: a figure is saved as {', '.join(FIGURE_SUFFIXES)}")
+    kind = FigureFormat(path.suffix.removeprefix("."))
+    if kind is FigureFormat.PGF:
+        from cosim.output.report.pgf_picture import pgf_picture
+
+        with paper_fonts(figure):
+            code, images = pgf_picture(figure, path.stem)
+        for name, content in images.items():
+            write_whole(path.with_name(name), content)
+        write_whole(path, code)
+    elif kind is FigureFormat.PDF:
+        with paper_fonts(figure):
+            content = _saved(figure, kind)
+        write_whole(path, content)
+    else:
+        write_whole(path, _drawn(figure, kind))
+
+
+def save_figures(
+    figures: Iterable[tuple[str, Figure]], page: Path, kind: FigureFormat | None
+) -> list[Path]:
+    """Write the figures of a page, given with their names, into ``PAGE-figures`` beside it.
+
+    Returns:
+        The written files; none without a format.
+
+    Raises:
+        MachineError: a file cannot be written.
+    """
+    written: list[Path] = []
+    for name, figure in figures if kind is not None else ():
+        written.append(page.with_name(f"{page.stem}-figures") / f"{name}.{kind}")
+        save_figure(figure, written[-1])
+    return written
 
 
 def inline(figure: Figure, name: str, description: str) -> str:
@@ -51,9 +91,13 @@ def inline(figure: Figure, name: str, description: str) -> str:
 
 
 def _drawn(figure: Figure, kind: str) -> bytes:
-    buffer = io.BytesIO()
     with settings():
-        figure.savefig(buffer, format=kind, metadata=_UNDATED[kind])
+        return _saved(figure, kind)
+
+
+def _saved(figure: Figure, kind: str) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=kind, metadata=_UNDATED[kind])
     return buffer.getvalue()
 
 

@@ -5,13 +5,15 @@ This module does not use pyplot, and does not change matplotlib's global setting
 
 import functools
 import io
+import logging
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, ParamSpec
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from cosim.output.palette import Colour
 
@@ -65,15 +67,47 @@ _SETTINGS: dict[Any, Any] = {
 }
 
 
+_PAPER_SETTINGS: dict[Any, Any] = {
+    "font.family": ["cmr10", "DejaVu Serif"],  # the second one has what the first one lacks
+    "mathtext.fontset": "cm",
+    "pdf.fonttype": 42,  # publishers refuse fonts of type 3
+    "pgf.rcfonts": False,  # the document's own
+}
+_BOLD = ["cmb10", "DejaVu Serif"]
+
+
 @contextmanager
-def settings() -> Iterator[None]:
+def settings(extra: Mapping[Any, Any] | None = None) -> Iterator[None]:
     """Apply only these settings within the context, regardless of the user's matplotlibrc."""
     with mpl.rc_context(), warnings.catch_warnings():
         mpl.rcdefaults()
-        mpl.rcParams.update(_SETTINGS)
+        mpl.rcParams.update(_SETTINGS | dict(extra or {}))
         # A name may use characters that the font lacks; they are drawn as boxes, without a warning.
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         yield
+
+
+@contextmanager
+def paper_fonts(figure: Figure) -> Iterator[None]:
+    """Give a figure the fonts of LaTeX within the context, in which it is saved."""
+    log = logging.getLogger("fontTools")  # warns of the dates in these fonts
+    level = log.level
+    with settings(_PAPER_SETTINGS):
+        log.setLevel(logging.ERROR)
+        _set_fonts(figure, _PAPER_SETTINGS)
+        try:
+            yield
+        finally:
+            _set_fonts(figure, _SETTINGS)
+            log.setLevel(level)
+
+
+def _set_fonts(figure: Figure, wanted: Mapping[Any, Any]) -> None:
+    """Set the fonts of all texts; matplotlib reads the settings when it makes a text only."""
+    for text in figure.findobj(Text):
+        is_paper = wanted is _PAPER_SETTINGS and text.get_fontweight() == "bold"
+        text.set_fontfamily(_BOLD if is_paper else wanted["font.family"])
+        text.set_math_fontfamily(wanted["mathtext.fontset"])
 
 
 class NotebookFigure(Figure):

@@ -80,9 +80,9 @@ class LossTable(NamedTuple):
 
 
 class EventLog(NamedTuple):
-    """The events of a run, up to the length of the arrays."""
+    """The events of all runs: a row per run, up to the length of the rows."""
 
-    event_s: Array
+    event_s: Any
     delivered: Any
 
 

@@ -145,9 +145,23 @@ def run_events(setting: Setting, population: Population) -> Events:
     """Run one draw and return its events; raises the errors of :func:`run_batch`."""
     if len(population.A) != 1:
         raise ValueError(f"one run is wanted, not {len(population.A)}")
+    _, (events,) = run_with_events(setting, population)
+    return events
+
+
+def run_with_events(
+    setting: Setting, population: Population
+) -> tuple[NDArray[np.void], list[Events]]:
+    """Run every draw; return its row, as :func:`run_batch` does, and its events.
+
+    The memory for the events is 9 bytes times ``setting.most_events`` for each draw.
+    """
     rows, log = _run(setting, population, setting.most_events)
-    events = int(rows["transmissions"][0])
-    return Events(log.event_s[:events], log.delivered[:events])
+    counts = rows["transmissions"].tolist()
+    return rows, [
+        Events(log.event_s[run, :events], log.delivered[run, :events])
+        for run, events in enumerate(counts)
+    ]
 
 
 def _run(setting: Setting, population: Population, room: int) -> tuple[NDArray[np.void], Any]:
@@ -196,7 +210,8 @@ def _run(setting: Setting, population: Population, room: int) -> tuple[NDArray[n
         **{name: np.empty(terms * max(n, m)) for name in states},
     )
     rows = np.zeros(len(population.A), ROW)
-    log = batch_data.EventLog(np.empty(room), np.empty(room, np.bool_))
+    shape = (len(population.A), room)
+    log = batch_data.EventLog(np.empty(shape), np.empty(shape, np.bool_))
     batch = batch_data.Batch(
         vector_lanes.width(n), vector_lanes.width(m), system, draws, _network(setting.link), space,
         log,

@@ -177,7 +177,7 @@ def follow(batch: Batch, squares: QuadraticCurves | None, run: int, row: Any) ->
             if row.transmissions >= system.most_events or t_s <= last_s:
                 status = TOO_MANY_EVENTS
                 break
-            agree = count_event(batch, row, state, t_s, last_s)
+            agree = count_event(batch, run, row, state, t_s, last_s)
             first_s = t_s if row.transmissions == 1 else first_s
             last_s, fresh, state = t_s, True, updated(state, agree, nothing)
         if t_s >= system.horizon_s:
@@ -289,12 +289,12 @@ def finish_row(row: Any, status: int, t_s: float, span_s: float, above: bool, no
     row.status = status
 
 
-def count_event(batch: Batch, row: Any, state: Models, t_s: float, last_s: float) -> bool:
+def count_event(batch: Batch, run: int, row: Any, state: Models, t_s: float, last_s: float) -> bool:
     """Count an event; return whether its update arrives."""
     delivered, log = arrives(batch.network), batch.log
-    if row.transmissions < len(log.event_s):
-        log.event_s[row.transmissions] = t_s
-        log.delivered[row.transmissions] = delivered
+    if row.transmissions < log.event_s.shape[1]:
+        log.event_s[run, row.transmissions] = t_s
+        log.delivered[run, row.transmissions] = delivered
     if row.transmissions > 0:
         row.inter_event_min_s = min(row.inter_event_min_s, t_s - last_s)
     elif t_s == 0.0 and not delivered:

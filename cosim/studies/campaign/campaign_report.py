@@ -12,8 +12,10 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cosim.output.report.figure_files import inline
+from cosim.output.figure_format import FigureFormat
+from cosim.output.report.figure_files import inline, save_figures
 from cosim.output.report.report_page import templates
+from cosim.output.result_tables import ResultTable
 from cosim.studies.campaign.campaign_figures import figures
 from cosim.studies.campaign.campaign_summary import CampaignSummary, GridPointResult
 from cosim.studies.campaign.chunk_store import RUNS, Store
@@ -37,8 +39,13 @@ class SummaryRow(NamedTuple):
     cells: Sequence[str]
 
 
-def write_report(summary: CampaignSummary, store: Store, base: Mapping[str, Any]) -> list[Path]:
-    """Write page and summary; return their paths and the path of the runs.
+def write_report(
+    summary: CampaignSummary,
+    store: Store,
+    base: Mapping[str, Any],
+    figure_format: FigureFormat | None = None,
+) -> list[Path]:
+    """Write page, summary and figures; return their paths and the path of the runs.
 
     Raises:
         MachineError: they cannot be written.
@@ -48,7 +55,25 @@ def write_report(summary: CampaignSummary, store: Store, base: Mapping[str, Any]
         write_whole(store.folder / PAGE, page(summary, store, base)),
         write_whole(store.folder / SUMMARY, document + b"\n"),
         store.folder / RUNS,
-    ]
+        *save_figures(
+            ((name, figure) for name, figure, _ in figures(summary, store)),
+            store.folder / PAGE, figure_format,
+        ),
+    ]  # fmt: skip
+
+
+def campaign_tables(summary: CampaignSummary) -> Iterator[ResultTable]:
+    """Yield the means of all grid points, and their paired differences to the reference."""
+    campaign = summary.campaign
+    headings = [axis.called for axis in campaign.axes]
+    headings += [METRICS[name].heading for name in campaign.metrics.shown]
+    tables = [("campaign", f"{summary.draws:,} draws; mean ± half-width", _rows(summary))]
+    if campaign.compare is not None:
+        what = f"paired difference to {_reference(summary)}"
+        tables.append(("differences", what, _differences(summary)))
+    for name, what, rows in tables:
+        cells = [(*row.labels, *row.cells) for row in rows]
+        yield ResultTable(name, f"{campaign.name}: {what}", headings, cells)
 
 
 def page(summary: CampaignSummary, store: Store, base: Mapping[str, Any]) -> str:

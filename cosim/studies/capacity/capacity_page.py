@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cosim.output import palette
+from cosim.output.figure_format import FigureFormat
 from cosim.output.report.figure_files import inline, save_figure
 from cosim.output.report.figure_style import printed
 from cosim.output.report.report_page import templates
@@ -71,7 +72,9 @@ class CapacityResult(NamedTuple):
         }  # fmt: skip
 
 
-def write(result: CapacityResult, folder: Path) -> list[Path]:
+def write(
+    result: CapacityResult, folder: Path, figure_format: FigureFormat | None = None
+) -> list[Path]:
     """Write page, JSON and figures; return their paths.
 
     Raises:
@@ -83,7 +86,7 @@ def write(result: CapacityResult, folder: Path) -> list[Path]:
         write_whole(folder / RESULTS, document + b"\n"),
     ]
     for name, figure, _ in figures(result):
-        written.append(folder / f"{name}.svg")
+        written.append(folder / f"{name}.{figure_format or FigureFormat.SVG}")
         save_figure(figure, written[-1])
     return written
 

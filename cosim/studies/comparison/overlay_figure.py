@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from cosim.output import palette
 from cosim.output.report import axes as draw
-from cosim.output.report.figure_files import inline, save_figure
+from cosim.output.report.figure_files import FIGURE_SUFFIXES, inline, save_figure
 from cosim.output.report.figure_style import NotebookFigure, printed, styled
 from cosim.output.report.report_page import templates
 from cosim.record.align import AlignedRun, align_tables
@@ -113,8 +113,9 @@ def _events(axes: Axes, runs: Sequence[ComparedRun]) -> None:
 
 def write_overlay(comparison: RunComparison, path: Path) -> None:
     """Write the overlay of runs to a page or a figure; see :meth:`RunComparison.save`."""
-    if path.suffix not in (".html", ".svg", ".png"):
-        raise CallerError(f"{path}: a comparison is written as .html, .svg or .png")
+    if path.suffix not in (".html", *FIGURE_SUFFIXES):
+        known = ", ".join(FIGURE_SUFFIXES)
+        raise CallerError(f"{path}: a comparison is written as .html, {known}")
     figure = overlay_figure(comparison.runs)
     if path.suffix == ".html":
         markup = Markup(inline(figure, "overlay", _DESCRIPTION))

@@ -105,7 +105,7 @@ class RunComparison:
         return overlay_figure(self.runs)
 
     def save(self, path: Path) -> None:
-        """Write the overlay as a page (``.html``), or the figure alone (``.svg``, ``.png``).
+        """Write the overlay as a page (``.html``), or the figure alone (``.svg``, ``.pdf``, …).
 
         Raises:
             CallerError: the name has another ending.

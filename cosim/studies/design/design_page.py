@@ -12,12 +12,14 @@ from rich.console import Console
 from rich.table import Table
 
 from cosim.output import palette
+from cosim.output.figure_format import FigureFormat
 from cosim.output.report.axes import finish, legend, logarithmic, plain, single
-from cosim.output.report.figure_files import inline
+from cosim.output.report.figure_files import inline, save_figures
 from cosim.output.report.figure_style import printed, styled
 from cosim.output.report.report_page import templates
 from cosim.studies.design.design_result import WORDS, DesignResult, certified, seconds
 from noack.config.scenario_file import dumps
+from noack.core.file_access import write_whole
 from noack.core.number_format import plus_minus
 
 _CAPTION = (
@@ -29,6 +31,18 @@ _HEIGHT_IN = 3.8
 _MARKERS = "os^Dv<>PX"
 _MOST_ROWS = 20
 HEADINGS = ("transmissions", "settling time", "α [1/s]", "β", "weight", "gain")
+
+
+def write_page(
+    found: DesignResult, path: Path, figure_format: FigureFormat | None = None
+) -> list[Path]:
+    """Write page and figure; return the files.
+
+    Raises:
+        MachineError: they cannot be written.
+    """
+    figures = ((name, draw(found)) for name, draw in (("trade-off", trade_off),))
+    return [write_whole(path, page(found)), *save_figures(figures, path, figure_format)]
 
 
 def page(found: DesignResult) -> str:

@@ -171,7 +171,7 @@ def test_a_non_finite_input_is_not_applied(content: dict[str, Any]) -> None:
 
 def test_a_model_that_overflows_in_one_step_is_refused(content: dict[str, Any]) -> None:
     with pytest.raises(CallerError, match="take one step to infinity"):
-        simulate(scenario(content, **plant([[-1.0]], [[1.0]], [[-1e308]])))
+        simulate(scenario(content, **plant([[-1.0]], [[1.0]], [[1e308]])))
 
 
 @pytest.mark.parametrize(

@@ -92,6 +92,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 MORE = {
+    "archive": (),
     "check": (),
     "schema": (),
     "summary": (),
@@ -129,7 +130,7 @@ def test_examples_work(example: str, folder: Path, monkeypatch: pytest.MonkeyPat
 def test_only_long_and_live_commands_have_no_example_that_is_run() -> None:
     assert set(OURS) - MORE.keys() == {
         "campaign", "capacity", "collect", "compare", "controller", "demo", "design", "doctor",
-        "paper", "plant", "record", "run", "sensor", "set", "view",
+        "paper", "plant", "record", "reproduce", "run", "sensor", "set", "view",
     }  # fmt: skip
 
 

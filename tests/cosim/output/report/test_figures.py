@@ -241,7 +241,7 @@ def test_the_distribution_of_lateness_is_exact_at_its_ends() -> None:
     assert len(share) < 300
 
 
-@pytest.mark.parametrize("ending", ["svg", "png"])
+@pytest.mark.parametrize("ending", ["svg", "png", "pdf", "pgf"])
 def test_the_same_figure_gives_the_same_bytes(tmp_path: Path, ending: str) -> None:
     path, found, t_s = tmp_path / f"figure.{ending}", set(), np.arange(1.0, 5.0)
     for own in ({}, {"lines.linewidth": 9, "axes.titlepad": 40, "svg.hashsalt": "other"}):
@@ -254,8 +254,8 @@ def test_the_same_figure_gives_the_same_bytes(tmp_path: Path, ending: str) -> No
 
 
 def test_another_file_extension_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(CallerError, match=r"figure\.pdf: a figure is saved as \.svg or \.png"):
-        save_figure(Figure(), tmp_path / "figure.pdf")
+    with pytest.raises(CallerError, match=r"figure\.eps: a figure is saved as \.svg, \.png, \.pdf"):
+        save_figure(Figure(), tmp_path / "figure.eps")
 
 
 def test_drawing_does_not_change_matplotlibs_settings() -> None:

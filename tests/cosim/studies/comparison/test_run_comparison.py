@@ -138,8 +138,8 @@ def test_runs_that_cannot_be_compared_give_one_line(runs: list[Path], tmp_path: 
         (runs[0],): "noack: give 2 to 7 run directories to compare, not 1; `noack fidelity` "
         "compares one with the ideal loop\n",
         (runs[0], tmp_path): f"noack: {tmp_path}: not a run directory (no scenario.toml)\n",
-        (*runs, "--out", tmp_path / "a.pdf"): f"noack: {tmp_path / 'a.pdf'}: a comparison is "
-        "written as .html, .svg or .png\n",
+        (*runs, "--out", tmp_path / "a.eps"): f"noack: {tmp_path / 'a.eps'}: a comparison is "
+        "written as .html, .svg, .png, .pdf, .pgf\n",
     }
     for words, said in mistakes.items():
         done = compare(*words)

@@ -1,0 +1,210 @@
+"""The sliders and choices of a scenario: which settings can be dragged, and within which range."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from cosim.lab.draft import Draft
+from noack.config.feature_kinds import POLICIES
+from noack.config.runtime_parameters import trigger_parameters
+from noack.config.scenario import Scenario
+
+_STEPS = 200
+_DECADE = 10.0
+_MOST_LOSSES = 20
+_MOST_WINDOW = 40
+_MOST_CORRELATION = 0.99
+_SEEDS = 200
+_LOSSES: Mapping[str, Mapping[str, Any]] = {
+    "bernoulli": {"probability": 0.5},
+    "gilbert_elliott": {"mean_loss": 0.5, "mean_burst": 3.0},
+    "worst_case": {},
+    "lossless": {},
+}
+"""The loss models that are offered, with their first settings."""
+_WINDOW: Mapping[str, Any] = {"kind": "at_most", "losses": 5, "window": 10}
+
+
+@dataclass(frozen=True)
+class Slider:
+    """A number that can be dragged."""
+
+    key: str
+    label: str
+    value: float
+    low: float
+    high: float
+    step: float
+    """Step of the value; of its decimal logarithm if ``logarithmic``."""
+    whole: bool = False
+    logarithmic: bool = False
+    live: bool = False
+    """Whether a running loop can change it."""
+
+    @property
+    def position(self) -> float:
+        """The place of the value on the slider."""
+        return self.place(self.value)
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """The places of both ends."""
+        return self.place(self.low), self.place(self.high)
+
+    def place(self, value: float) -> float:
+        """Return the place of a value on the slider."""
+        value = min(max(value, self.low), self.high)
+        return math.log10(value) if self.logarithmic else value
+
+    def value_at(self, place: float) -> float | int:
+        """Return the value at a place, with three significant digits."""
+        value = 10.0**place if self.logarithmic else place
+        value = min(max(value, self.low), self.high)
+        return round(value) if self.whole else float(f"{value:.3g}")
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A setting with a few values."""
+
+    key: str
+    label: str
+    value: str
+    options: Mapping[str, str]
+    """By value: its text."""
+
+
+@dataclass(frozen=True)
+class Controls:
+    """What can be dragged and chosen for a scenario."""
+
+    choices: tuple[Choice, ...]
+    sliders: tuple[Slider, ...]
+
+
+_GREEK = {"alpha_per_s": "α, decay of the threshold [1/s]", "beta": "β, threshold at the start",
+          "floor": "ε, smallest threshold", "period_s": "period [s]"}  # fmt: skip
+
+
+def controls_of(draft: Draft) -> Controls:
+    """Return the controls of a draft; ranges depend on the base, so that dragging keeps them.
+
+    Raises:
+        DraftError: the draft is not valid.
+    """
+    scenario = draft.scenario
+    base = Draft(draft.base, draft.folder, draft.base_text, draft.base_text).scenario
+    sliders = (
+        *_loss_sliders(scenario),
+        *_guarantee_sliders(scenario),
+        *_trigger_sliders(scenario, base),
+        Slider("seeds.loss", "seed of the losses", _seed(scenario.seeds.loss), 0, _SEEDS, 1,
+               whole=True),
+        Slider("seeds.plant", "seed of the plant", _seed(scenario.seeds.plant), 0, _SEEDS, 1,
+               whole=True),
+        _decades("horizon_s", "horizon [s]", scenario.horizon_s, base.horizon_s, live=False),
+    )  # fmt: skip
+    return Controls(_choices(scenario), sliders)
+
+
+def _choices(scenario: Scenario) -> tuple[Choice, ...]:
+    modes = {"model": "model", "zoh": "zero-order hold"}
+    policies = {name: name.replace("_", " ") for name in POLICIES if name != "python"}
+    losses = {name: name.replace("_", " ") for name in _LOSSES}
+    policy, loss = scenario.trigger.policy, scenario.network.loss.model
+    constraints = scenario.network.constraints
+    kind = "" if not constraints else _WINDOW["kind"] if _is_window(scenario) else "own"
+    limits = {"": "M alone", str(_WINDOW["kind"]): "M and (m, K)"}
+    return (
+        Choice("mode", "mode", scenario.mode, modes),
+        Choice("trigger", "trigger policy", policy, policies | {policy: policy}),
+        Choice("network.loss", "loss model", loss, losses | {loss: loss}),
+        Choice("network.constraints", "limit of the losses", str(kind),
+               limits | ({"own": "as given"} if kind == "own" else {})),
+    )  # fmt: skip
+
+
+def _is_window(scenario: Scenario) -> bool:
+    """Whether the only further constraint is at most m losses in any K packets."""
+    return [one.kind for one in scenario.network.constraints] == [_WINDOW["kind"]]
+
+
+def chosen(draft: Draft, key: str, value: str) -> Draft:
+    """Return the draft with another choice; tables take the example of their kind."""
+    if key == "trigger":
+        n = draft.scenario.model.dimensions[0]
+        example: Any = POLICIES[value].example(n)
+        return draft.with_value(key, example.model_dump(mode="json", exclude_none=True))
+    if key == "network.loss":
+        return draft.with_value(key, {"model": value, **_LOSSES.get(value, {})})
+    if key == "network.constraints":
+        return draft.with_value(key, [_WINDOW] if value == _WINDOW["kind"] else [])
+    return draft.with_value(key, value)
+
+
+def _loss_sliders(scenario: Scenario) -> list[Slider]:
+    loss = scenario.network.loss
+    found = []
+    for name, value in loss.model_dump(mode="json", exclude_none=True).items():
+        if isinstance(value, bool) or not isinstance(value, float):
+            continue
+        if 0 <= value <= 1:
+            label = "loss probability" if name == "probability" else f"loss: {_words(name)}"
+            high = _MOST_CORRELATION if name == "correlation" else 1.0
+            found.append(Slider(f"network.loss.{name}", label, value, 0.0, high, 0.01, live=True))
+        elif value > 0:
+            found.append(_decades(f"network.loss.{name}", f"loss: {_words(name)}", value, value))
+    return found
+
+
+def _guarantee_sliders(scenario: Scenario) -> list[Slider]:
+    mansd = Slider(
+        "network.mansd", "maximum consecutive losses (M − 1)", scenario.network.mansd, 0,
+        max(_MOST_LOSSES, scenario.network.mansd), 1, whole=True, live=True,
+    )  # fmt: skip
+    if not _is_window(scenario):
+        return [mansd]
+    window = scenario.network.constraints[0].model_dump()
+    losses, packets = window["losses"], window["window"]
+    return [
+        mansd,
+        Slider("network.constraints.0.losses", f"m: losses in any {packets} packets", losses, 0,
+               packets - 1, 1, whole=True),
+        Slider("network.constraints.0.window", f"K: packets with at most {losses} losses",
+               packets, losses + 1, max(_MOST_WINDOW, packets), 1, whole=True),
+    ]  # fmt: skip
+
+
+def _trigger_sliders(scenario: Scenario, base: Scenario) -> list[Slider]:
+    trigger, usual = scenario.trigger, base.trigger
+    found = []
+    for key in trigger_parameters(trigger):
+        name = key.removeprefix("trigger.")
+        value = getattr(trigger, name)
+        like = getattr(usual, name, None) if usual.policy == trigger.policy else None
+        if isinstance(value, int | float) and value > 0:
+            label = _GREEK.get(name, f"trigger: {_words(name)}")
+            found.append(_decades(key, label, float(value), float(like or value)))
+    return found
+
+
+def _decades(key: str, label: str, value: float, middle: float, *, live: bool = True) -> Slider:
+    """Return a slider over two decades around a value."""
+    low, high = middle / _DECADE, middle * _DECADE
+    step = math.log10(high / low) / _STEPS
+    return Slider(
+        key, label, value, min(low, value), max(high, value), step, logarithmic=True, live=live
+    )
+
+
+def _words(name: str) -> str:
+    for unit in ("per_s", "s", "hz"):
+        if name.endswith(f"_{unit}"):
+            shown = unit.replace("per_s", "1/s").replace("hz", "Hz")
+            return f"{name.removesuffix(f'_{unit}').replace('_', ' ')} [{shown}]"
+    return name.replace("_", " ")
+
+
+def _seed(seed: int) -> int:
+    return min(seed, _SEEDS)

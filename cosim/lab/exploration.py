@@ -1,0 +1,145 @@
+"""One run of a scenario as the page draws it: trajectories, events, errors and key numbers.
+
+The run is exact, in continuous time, where the exact simulation covers the scenario. It takes some
+milliseconds. Otherwise the machines run in virtual time, which takes about a second.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.simulation.continuous.continuous_loop import LoopState
+from cosim.simulation.continuous.continuous_report import run_continuous, summary
+from cosim.simulation.continuous.continuous_run import ContinuousRun
+from noack.config.resolution import loop_of, policy_of, resolve
+from noack.config.scenario import Scenario
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix, Vector
+from noack.core.number_format import number
+from noack.trigger.decaying import DecayingTrigger
+
+POINTS = 400
+"""Number of evenly spaced times; each event adds the times just before and after it."""
+_MOST_EVENT_POINTS = 600
+"""With more events, only the evenly spaced times are drawn."""
+
+EXACT, SAMPLED = "exact", "sampled"
+
+Numbers = tuple[tuple[str, str], ...]
+"""Key numbers: label and value."""
+
+
+@dataclass(frozen=True)
+class Exploration:
+    """A run with N times, n states and k events, of which each has one update."""
+
+    scenario: Scenario
+    """The resolved scenario."""
+    kind: str
+    """EXACT or SAMPLED."""
+    t_s: Vector
+    """Times in ascending order, (N,); an event's time occurs twice, before and after its reset."""
+    x: Matrix
+    """Plant, (N, n)."""
+    x_s: Matrix
+    """The sensor's model, (N, n)."""
+    x_c: Matrix
+    """The controller's model, (N, n)."""
+    e_s_norm: Vector
+    """‖x_s − x‖ in the trigger's norm, (N,)."""
+    e_c_norm: Vector
+    """‖x_c − x‖ in the trigger's norm, (N,)."""
+    threshold: Vector | None
+    """The trigger's threshold, (N,); None for triggers whose threshold is no function of time."""
+    event_s: Vector
+    """Times of the events, (k,)."""
+    delivered: NDArray[np.bool_]
+    """Whether each update was delivered, (k,)."""
+    diverged_at_s: float | None
+    numbers: Numbers
+
+    @property
+    def x_norm(self) -> Vector:
+        """‖x‖, (N,)."""
+        norms: Vector = np.linalg.norm(self.x, axis=1)
+        return norms
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the n states."""
+        return loop_of(self.scenario).state_names
+
+
+def why_not_exact(scenario: Scenario) -> str | None:
+    """Return why the exact simulation does not cover a scenario; None if it does."""
+    try:
+        scenario.coverage.require_unchanging()
+        scenario.coverage.require_exact()
+    except CallerError as error:
+        return str(error)
+    return None
+
+
+def explore(scenario: Scenario) -> Exploration:
+    """Run a scenario exactly.
+
+    Raises:
+        CallerError: exact simulation does not cover the scenario, or the events accumulate.
+    """
+    resolved = resolve(scenario)
+    return _of_exact(run_continuous(resolved), resolved)
+
+
+@np.errstate(all="ignore")  # a run may diverge
+def _of_exact(run: ContinuousRun, resolved: Scenario) -> Exploration:
+    even = run.at(np.linspace(0.0, run.reached_s, POINTS))
+    parts = [(even.t_s, even.x, even.e_s, even.e_c)]
+    if 0 < len(run.before) <= _MOST_EVENT_POINTS:  # before, after, then the even times
+        parts = [_stacked(run.before), _stacked(run.after), *parts]
+    t_s, x, e_s, e_c = (np.concatenate(column) for column in zip(*parts, strict=True))
+    order = np.argsort(t_s, kind="stable")
+    t_s, x, e_s, e_c = t_s[order], x[order], e_s[order], e_c[order]
+    facts = summary(run, resolved)
+    return Exploration(
+        resolved, EXACT, t_s, x, x + e_s, x + e_c, run.system.norms(e_s), run.system.norms(e_c),
+        threshold_at(resolved, t_s), run.event_s, run.delivered, facts["diverged_at_s"],
+        key_numbers(facts),
+    )  # fmt: skip
+
+
+def _stacked(states: tuple[LoopState, ...]) -> tuple[Vector, Matrix, Matrix, Matrix]:
+    t_s, x, e_s, e_c = zip(*states, strict=True)
+    return np.array(t_s), np.array(x), np.array(e_s), np.array(e_c)
+
+
+def threshold_at(resolved: Scenario, t_s: Vector) -> Vector | None:
+    """Return the trigger's threshold at times (k,), if it is a function of time."""
+    trigger = policy_of(resolved)
+    if not isinstance(trigger, DecayingTrigger):
+        return None
+    decaying: Vector = trigger.beta * np.exp(-trigger.alpha_per_s * t_s)
+    return np.maximum(decaying, trigger.floor)
+
+
+def key_numbers(facts: dict[str, object]) -> Numbers:
+    """Return the key numbers of a summary, which has the keys of ``summary.json``."""
+
+    def text(key: str, unit: str = "") -> str:
+        value = facts.get(key)
+        return "–" if value is None else number(float(str(value)), 4) + unit
+
+    events, lost = int(str(facts["events"])), int(str(facts["drops"]))
+    share = f" ({100 * lost / events:.0f} %)" if events else ""
+    diverged = facts.get("diverged_at_s")
+    ended = "reached the horizon" if diverged is None else f"diverged at {text('diverged_at_s')} s"
+    return (
+        ("run", ended),
+        ("transmissions", text("events")),
+        ("delivered", text("deliveries")),
+        ("lost", text("drops") + share),
+        ("longest loss burst", text("longest_loss_burst")),
+        ("shortest inter-event time", text("inter_event_min_s", " s")),
+        ("‖x‖ at the start", text("initial_state_norm")),
+        ("‖x‖ at the end", text("final_state_norm")),
+    )

@@ -1,0 +1,122 @@
+"""What is guaranteed for a scenario, as the page shows it: certificate and margin."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cosim.analysis.margin_search import find_margin
+from cosim.output.certificate_rows import constant_rows
+from noack.config.resolution import resolve
+from noack.config.scenario import Scenario
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Vector
+from noack.core.number_format import number
+from noack.theory.assumptions import AssumptionStatus
+from noack.theory.certified_bounds import OWN_PLANT, ScenarioCertificate
+from noack.theory.run_conditions import nominal_conditions
+from noack.theory.scenario_certificates import own_plant
+from noack.theory.setpoint_shift import about_setpoint, void_at_setpoint
+
+CERTIFIED, VOID, NOT_COVERED = "certified", "no certificate", "not covered"
+_POINTS = 121
+
+
+@dataclass(frozen=True)
+class Guarantee:
+    """The certificate of a scenario's plant under its own schedule, at N times."""
+
+    verdict: str
+    """CERTIFIED, VOID or NOT_COVERED."""
+    reason: str
+    """One sentence: what is guaranteed, or why nothing is."""
+    rows: tuple[tuple[str, str], ...]
+    """Constants: label and value."""
+    assumptions: tuple[tuple[str, str, str], ...]
+    """Verdict, what is assumed, and why."""
+    t_s: Vector
+    e_s: Vector
+    """Bound of ‖e_s‖; NaN without a certificate."""
+    e_c: Vector
+    x: Vector
+
+
+@dataclass(frozen=True)
+class Margin:
+    """For which M the loop is stable under every loss pattern."""
+
+    verdict: str
+    """In words."""
+    rows: tuple[tuple[str, str, str], ...]
+    """M, growth of the worst pattern, verdict."""
+    defined: bool
+    """Whether the loop has a margin: its trigger has a longest time between events."""
+
+
+def certify(scenario: Scenario) -> Guarantee:
+    """Certify a scenario's own plant; a scenario that is not covered is no error.
+
+    Raises:
+        NoackError: the scenario is wrong.
+    """
+    resolved = resolve(scenario)
+    t_s = np.linspace(0.0, resolved.horizon_s, _POINTS)
+    nothing = np.full(_POINTS, np.nan)
+    try:
+        certificate = _certificate(resolved)
+    except CallerError as error:
+        return Guarantee(NOT_COVERED, str(error), (), (), t_s, nothing, nothing, nothing)
+    assumptions = tuple(
+        (str(one.verdict), one.what, one.why)
+        for one in certificate.assumptions
+        if one.verdict != AssumptionStatus.HOLDS
+    )
+    with np.errstate(all="ignore"):
+        return Guarantee(
+            VOID if certificate.constants is None else CERTIFIED,
+            _reason(certificate),
+            tuple((label, values[0]) for label, values, _ in constant_rows([certificate], None, 0)),
+            assumptions,
+            t_s,
+            certificate.sensor_error(t_s),
+            certificate.controller_error(t_s),
+            certificate.state(t_s),
+        )
+
+
+def _certificate(resolved: Scenario) -> ScenarioCertificate:
+    resolved.coverage.require_constant()
+    resolved.coverage.require_certifiable()
+    if (void := void_at_setpoint(resolved).get(OWN_PLANT)) is not None:
+        raise CallerError(f"controller.setpoint: {void}")
+    shifted = about_setpoint(resolved)
+    late = resolved.certificate.late_periods
+    return own_plant(shifted).certificate(nominal_conditions(shifted, late))
+
+
+def _reason(certificate: ScenarioCertificate) -> str:
+    found = certificate.constants
+    if found is None:
+        return certificate.void or "no bounds were found"
+    if found.rate_per_s > 0:
+        rate = number(found.rate_per_s)
+        return f"every loss pattern allowed by M: all errors decay at the rate {rate} /s"
+    return "every loss pattern allowed by M: all errors stay bounded"
+
+
+def margin_of(scenario: Scenario) -> Margin:
+    """Find the largest M for which the loop is stable; this may take seconds.
+
+    Raises:
+        NoackError: the scenario is wrong.
+    """
+    resolved = resolve(scenario)
+    try:
+        found = find_margin(resolved, accuracy=1e-3, with_period=False)
+    except CallerError as error:
+        return Margin(str(error), (), defined=False)
+    rows = tuple(
+        (str(cap.m), f"{number(cap.found.lower, 5)} – {number(cap.found.upper, 5)}",
+         cap.found.verdict)
+        for cap in found.caps
+    )  # fmt: skip
+    return Margin(found.verdict, rows, defined=True)

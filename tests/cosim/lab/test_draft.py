@@ -1,0 +1,138 @@
+"""The edited scenario: comments are kept, mistakes have their key, the address repeats it."""
+
+from pathlib import Path
+from urllib.parse import quote
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cosim.lab.controls import chosen, controls_of
+from cosim.lab.draft import (
+    DraftError,
+    Mistake,
+    draft_of_query,
+    known_scenarios,
+    open_draft,
+)
+from cosim.lab.toml_edit import value_text, with_value
+from cosim.shipped_files import shipped_names
+from noack.config import toml_file
+from noack.config.scenario_file import put
+from noack.core.errors import CallerError
+
+LANE = {"lane_following": "lane_following"}
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("network.loss.probability", 0.95),
+        ("network.mansd", 9),
+        ("trigger.beta", 0.125),
+        ("trigger.floor", 0.01),
+        ("horizon_s", 33.0),
+        ("mode", "zoh"),
+        ("seeds.loss", 12),
+        ("network.loss", {"model": "gilbert_elliott", "mean_loss": 0.5, "mean_burst": 3.0}),
+        ("trigger", {"policy": "periodic", "period_s": 1.0}),
+    ],
+)
+def test_a_changed_value_keeps_the_comments(key: str, value: object) -> None:
+    before = open_draft("lane_following")
+    after = before.with_value(key, value)
+    assert after.value(key) == value
+    assert "# M - 1: at most four consecutive losses" in after.text
+    assert toml_file.parsed(after.text, "") == after.content
+    assert after.scenario != before.scenario
+
+
+@given(value=st.one_of(st.floats(0.01, 1.0), st.integers(0, 10**6), st.booleans(), st.text()))
+@pytest.mark.parametrize("key", ["a", "t.a", "t.inner.b", "t.new", "new.table.c"])
+def test_any_value_at_any_place_is_read_back(key: str, value: object) -> None:
+    text = 'a = 1 # "a" = 2\n[t]\na = "x # y" # a = 3\ninner = { a = [1, 2], b = 2.5 }\n'
+    content = toml_file.parsed(text, "")
+    changed = toml_file.parsed(with_value(text, content, key, value), "")
+    put(content, key, value, key)
+    assert changed == content
+
+
+def test_values_are_written_on_one_line() -> None:
+    written = value_text({"a": [1, 2.5], "b": "x", "c": {"d": True}})
+    assert written == '{ a = [1, 2.5], b = "x", c = { d = true } }'
+
+
+def test_mistakes_are_shown_at_their_keys() -> None:
+    draft = open_draft("lane_following")
+    wrong = draft.with_value("network.loss.probability", 2.0).with_value("trigger.beta", -1.0)
+    with pytest.raises(DraftError) as error:
+        _ = wrong.scenario
+    assert [one.key for one in error.value.mistakes] == ["trigger.beta", "network.loss.probability"]
+    with pytest.raises(DraftError) as error:
+        _ = draft.with_text("name = ").scenario
+    assert error.value.mistakes[0].key == ""
+    assert "not valid TOML" in error.value.mistakes[0].text
+    assert Mistake("", "x").text == "x"
+
+
+@pytest.mark.parametrize("name", shipped_names("scenarios"))
+def test_every_scenario_has_controls_and_an_address(name: str) -> None:
+    draft = open_draft(name)
+    controls = controls_of(draft)
+    assert draft.query() == f"scenario={name}"
+    for slider in controls.sliders:
+        low, high = slider.ends
+        assert low <= slider.position <= high
+        moved = draft.with_value(slider.key, slider.value_at((low + high) / 2))
+        again = draft_of_query(moved.query(), name, {name: name})
+        assert again.content == moved.content
+
+
+def test_every_choice_gives_a_valid_scenario() -> None:
+    draft = open_draft("lane_following")
+    for choice in controls_of(draft).choices:
+        for value in choice.options:
+            other = chosen(draft, choice.key, value)
+            assert {one.key: one.value for one in controls_of(other).choices}[choice.key] == value
+            again = draft_of_query(other.query(), "lane_following", LANE)
+            assert again.scenario == other.scenario
+
+
+def test_a_slider_covers_two_decades_and_rounds() -> None:
+    sliders = {one.key: one for one in controls_of(open_draft("lane_following")).sliders}
+    beta = sliders["trigger.beta"]
+    assert (beta.low, beta.high) == (0.05, 5.0)
+    assert beta.value_at(beta.position) == 0.5
+    assert beta.value_at(99.0) == 5.0
+    assert sliders["network.mansd"].value_at(3.7) == 4
+
+
+def test_the_window_of_losses_can_be_dragged() -> None:
+    draft = chosen(open_draft("lane_following"), "network.constraints", "at_most")
+    keys = [one.key for one in controls_of(draft).sliders]
+    assert "network.constraints.0.losses" in keys
+    moved = draft.with_value("network.constraints.0.window", 12)
+    assert moved.scenario.network.constraints[0].model_dump()["window"] == 12
+
+
+def test_an_address_cannot_name_code_or_foreign_files(tmp_path: Path) -> None:
+    code = quote('{ kind = "python", file = "evil.py", name = "Evil" }')
+    with pytest.raises(CallerError, match="files to execute"):
+        draft_of_query(f"plant.system={code}", "lane_following", LANE)
+    with pytest.raises(CallerError, match="opens shipped scenarios"):
+        draft_of_query("scenario=/etc/passwd", "lane_following", LANE)
+    with pytest.raises(CallerError, match="too long"):
+        draft_of_query("a=" + "1" * 20_000, "lane_following", LANE)
+    with pytest.raises(CallerError):
+        draft_of_query("a.b=[", "lane_following", LANE)
+    assert draft_of_query("", "lane_following", LANE).base == "lane_following"
+
+
+def test_the_scenarios_of_a_folder_are_offered(tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text(open_draft("lane_following").text)
+    (tmp_path / "other.toml").write_text("a = 1")
+    (tmp_path / "broken.toml").write_text("a = ")
+    known = known_scenarios(tmp_path, "lane_following")
+    assert "mine.toml" in known
+    assert not {"other.toml", "broken.toml"} & known.keys()
+    assert open_draft(known["mine.toml"]).scenario.name == "lane_following"

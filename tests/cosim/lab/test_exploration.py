@@ -1,0 +1,126 @@
+"""What the lab page draws, compared with the simulators that it is computed from."""
+
+import math
+
+import numpy as np
+import pytest
+
+import noack
+from cosim.lab import ensemble, exploration, run_exploration
+from cosim.lab import scenario_guarantee as guarantee
+from cosim.simulation.continuous.continuous_report import run_continuous
+from cosim.studies.campaign.random_draws import drawn_scenario
+from noack.config.resolution import resolve
+from noack.core.errors import CallerError
+
+
+def test_a_run_is_drawn_as_simulated_with_both_sides_of_each_event() -> None:
+    scenario = noack.load("lane_following")
+    run = run_continuous(resolve(scenario))
+    found = exploration.explore(scenario)
+    assert found.kind == exploration.EXACT
+    assert (np.diff(found.t_s) >= 0).all()
+    assert found.event_s.tolist() == run.event_s.tolist()
+    assert found.delivered.tolist() == run.delivered.tolist()
+    for before, after in zip(run.before, run.after, strict=True):
+        first = int(np.searchsorted(found.t_s, before.t_s))
+        np.testing.assert_array_equal(found.x[first], before.x)
+        assert found.e_s_norm[first] == pytest.approx(np.linalg.norm(before.e_s))
+        assert found.e_c_norm[first + 1] == pytest.approx(np.linalg.norm(after.e_c))
+        assert found.e_s_norm[first + 1] == 0.0
+
+
+def test_the_sensor_error_stays_at_or_below_its_threshold() -> None:
+    found = exploration.explore(noack.load("lane_following"))
+    assert found.threshold is not None
+    # Event 0 is at t = 0, before the models know the state.
+    assert (found.e_s_norm <= found.threshold * (1 + 1e-9)).all()
+
+
+def test_a_run_that_diverges_is_drawn_up_to_that_time() -> None:
+    scenario = noack.load("lane_following", {
+        "mode": "zoh", "network.mansd": 20, "network.loss": {"model": "worst_case"},
+        "trigger": {"policy": "periodic", "period_s": 1.0}, "horizon_s": 2000.0,
+    })  # fmt: skip
+    found = exploration.explore(scenario)
+    assert found.diverged_at_s is not None
+    assert found.t_s[-1] <= 2000.0
+    assert found.numbers[0][1].startswith("diverged at")
+
+
+def test_a_scenario_without_exact_simulation_is_refused_with_the_reason() -> None:
+    scenario = noack.load("lane_vehicle")
+    reason = exploration.why_not_exact(scenario)
+    assert reason is not None
+    with pytest.raises(CallerError, match="plant is not linear"):
+        exploration.explore(scenario)
+    assert exploration.why_not_exact(noack.load("lane_following")) is None
+
+
+def test_a_simulated_run_is_drawn_with_its_events() -> None:
+    scenario = noack.load("double_integrator", {"horizon_s": 3.0, "observer": {
+        "kind": "luenberger", "gain": [[40.0, 0.0], [0.0, 40.0]],
+    }})  # fmt: skip
+    assert exploration.why_not_exact(scenario) is not None
+    found = run_exploration.simulate_sampled(scenario)
+    assert found.kind == exploration.SAMPLED
+    assert len(found.t_s) == len(found.x) == len(found.e_c_norm)
+    assert len(found.event_s) == len(found.delivered) > 0
+
+
+@pytest.mark.parametrize("name", ["lane_following", "double_integrator"])
+def test_trajectories_of_an_ensemble_are_those_of_the_exact_simulator(name: str) -> None:
+    scenario = noack.load(name, {"network.initial_sync": "known_state"})
+    draws, t_s = 3, np.linspace(0.0, scenario.horizon_s, 41)
+    setting = ensemble.setting_of(resolve(scenario))
+    population = ensemble.box_of(scenario).population(7, range(draws))
+    _, events = ensemble.run_with_events(setting, population)
+    z = ensemble.trajectories(setting, population, events, t_s)
+    for draw in range(draws):
+        exact = run_continuous(drawn_scenario(scenario, 7, draw)).at(t_s)
+        wanted = np.hstack([exact.x, exact.e_s, exact.e_c])
+        np.testing.assert_allclose(z[draw], wanted, rtol=1e-6, atol=1e-8)
+
+
+def test_the_bands_contain_the_draws() -> None:
+    scenario = noack.load("lane_following")
+    found = ensemble.explore_ensemble(scenario, draws=40)
+    assert found.draws == 40
+    assert (found.diverged, found.failed) == (0, 0)
+    for band in (*found.states, found.x_norm, found.e_c_norm):
+        assert (band.low <= band.middle).all()
+        assert (band.middle <= band.high).all()
+    x0 = resolve(scenario).plant.initial_state
+    assert [band.middle[0] for band in found.states] == pytest.approx(list(x0))
+
+
+def test_draws_that_diverge_are_counted_and_widen_the_band() -> None:
+    scenario = noack.load("lane_following", {
+        "mode": "zoh", "network.mansd": 20, "network.loss": {"model": "worst_case"},
+        "trigger": {"policy": "periodic", "period_s": 1.0}, "horizon_s": 3000.0,
+    })  # fmt: skip
+    found = ensemble.explore_ensemble(scenario, draws=8)
+    assert found.diverged == 8
+    assert not math.isfinite(found.x_norm.high[-1])
+
+
+def test_a_certificate_has_bounds_over_time_or_a_reason() -> None:
+    certified = guarantee.certify(noack.load("lane_weighted"))
+    assert certified.verdict == guarantee.CERTIFIED
+    assert np.isfinite(certified.e_c).all()
+    assert dict(certified.rows)["loop gain (< 1)"]
+    run = exploration.explore(noack.load("lane_weighted"))
+    bound = np.interp(run.t_s, certified.t_s, certified.e_c)
+    assert (run.e_c_norm <= bound * 1.01).all()
+    missing = guarantee.certify(noack.load("lane_vehicle"))
+    assert missing.verdict == guarantee.NOT_COVERED
+    assert "not linear" in missing.reason
+    assert np.isnan(missing.e_c).all()
+
+
+def test_a_margin_is_given_for_time_triggered_loops_only() -> None:
+    found = guarantee.margin_of(noack.load("lane_periodic"))
+    assert found.defined
+    assert "stable for every pattern with M ≤ 6" in found.verdict
+    assert [row[0] for row in found.rows] == [str(m) for m in range(1, 8)]
+    assert not guarantee.margin_of(noack.load("lane_following")).defined

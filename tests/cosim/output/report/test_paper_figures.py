@@ -1,0 +1,94 @@
+"""Figures for papers: PDF and PGF with the fonts of LaTeX, written without a LaTeX."""
+
+import re
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+from typer.testing import CliRunner
+
+import noack
+from cosim.cli import app
+from cosim.output.figure_format import FigureFormat
+from cosim.output.report.figure_files import save_figure, save_figures
+from cosim.output.report.figure_style import settings
+from noack.core.errors import CallerError
+from tests.cosim.output.latex import compiled
+
+HOSTILE = r"50 % of A_1 & {x} #1 ^2 ~ \input{/etc/passwd} <M − 1> ‖x‖ 漢"
+IMAGE = "loops-img0.png"
+
+
+def figure_of(title: str, *, image: bool = False) -> Figure:
+    with settings():
+        figure = Figure(figsize=(4, 3))
+        axes = figure.subplots()
+        axes.set(title=title.replace("$", r"\$"), xlabel=r"norm $\|e_c\|$", yscale="log")
+        axes.plot(np.arange(1, 9), 10.0 ** -np.arange(1, 9))
+        if image:
+            axes.imshow(np.arange(6.0).reshape(2, 3), extent=(1, 8, 1e-8, 1), aspect="auto")
+    return figure
+
+
+def test_texts_have_the_fonts_of_latex_only_while_a_figure_is_saved(tmp_path: Path) -> None:
+    figure = figure_of("title")
+    save_figure(figure, tmp_path / "before.svg")
+    before = dict(mpl.rcParams)
+    for kind in ("pdf", "pgf"):
+        save_figure(figure, tmp_path / f"a.{kind}")
+    save_figure(figure, tmp_path / "after.svg")
+    assert (tmp_path / "after.svg").read_bytes() == (tmp_path / "before.svg").read_bytes()
+    assert dict(mpl.rcParams) == before
+    assert {text.get_fontfamily()[0] for text in figure.findobj(Text)} == {"sans-serif"}
+    pdf = (tmp_path / "a.pdf").read_bytes()
+    assert b"Cmr10" in pdf
+    assert b"/Type3" not in pdf.replace(b" ", b"")  # refused by publishers
+
+
+def test_a_pgf_picture_has_escaped_texts_and_no_commands_of_matplotlibs(tmp_path: Path) -> None:
+    save_figure(figure_of(HOSTILE), tmp_path / "a.pgf")
+    text = (tmp_path / "a.pgf").read_text()
+    assert r"50 \% of A\textsubscript{1} \& \{x\} \#1 \textasciicircum{}2" in text
+    assert r"\textbackslash{}input\{/etc/passwd\}" in text
+    assert r"\ensuremath{\|}x\ensuremath{\|} ?" in text
+    assert "mathdefault" not in text
+    assert re.search(r"\$\\mathrm\{10\^\{.*?\}\}\$", text)
+
+
+def test_an_image_is_beside_its_pgf_picture(tmp_path: Path) -> None:
+    save_figure(figure_of("map", image=True), tmp_path / "loops.pgf")
+    assert (tmp_path / IMAGE).read_bytes().startswith(b"\x89PNG")
+    assert f"{{{IMAGE}}}" in (tmp_path / "loops.pgf").read_text()
+
+
+def test_pgf_pictures_compile(tmp_path: Path) -> None:
+    save_figure(figure_of(HOSTILE), tmp_path / "a.pgf")
+    save_figure(figure_of("map", image=True), tmp_path / "loops.pgf")
+    body = r"\resizebox{\linewidth}{!}{\input{a.pgf}}\input{loops.pgf}"
+    assert compiled(body, ("pgf",), tmp_path).read_bytes().startswith(b"%PDF")
+
+
+def test_nothing_is_drawn_without_a_format(tmp_path: Path) -> None:
+    def drawn() -> Figure:
+        raise AssertionError
+
+    assert save_figures(((name, drawn()) for name in "a"), tmp_path / "p.html", None) == []
+    two = ((name, figure_of(name)) for name in "ab")
+    found = save_figures(two, tmp_path / "p.html", FigureFormat.PDF)
+    assert found == [tmp_path / "p-figures/a.pdf", tmp_path / "p-figures/b.pdf"]
+
+
+def test_the_figures_of_a_report_are_written(tmp_path: Path) -> None:
+    run = noack.simulate(noack.load("lane_following", {"horizon_s": 1.0}), runs=tmp_path)
+    words = ["report", str(run.directory), "--format", "pgf", "--json"]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    names = sorted(path.name for path in (run.directory / "report-figures").iterdir())
+    assert names == [
+        "errors.pgf", "input.pgf", "inter-event.pgf", "losses.pgf", "state-norm.pgf", "states.pgf",
+    ]  # fmt: skip
+    with pytest.raises(CallerError, match='"eps": a figure is saved as svg, png, pdf, pgf'):
+        run.save_figures("eps")

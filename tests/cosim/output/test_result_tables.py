@@ -1,0 +1,92 @@
+"""Tables for papers: LaTeX that compiles, CSV that reads back, units in the heads."""
+
+import csv
+import io
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+import noack
+from cosim.cli import app
+from cosim.output.latex_text import latex_text
+from cosim.output.result_tables import KEY_VALUE, ResultTable, as_csv, as_latex, save_tables
+from cosim.output.run_result_tables import summary_tables
+from tests.cosim.output.latex import compiled
+
+HOSTILE = r"50 % of A_1 & {x} #1 ^2 ~ \input{/etc/passwd} <M − 1> ‖x̂‖ ᾱ 漢 é $x$ | "
+
+
+def rows_of(path: Path) -> list[list[str]]:
+    return list(csv.reader(io.StringIO(path.read_text())))
+
+
+@pytest.mark.parametrize(("text", "latex"), [
+    ("a_b & 5 %", r"a\textsubscript{b} \& 5 \%"),
+    ("my_name", r"my\_name"),
+    ("1.2e-05", r"\ensuremath{1.2\times10^{-5}}"),
+    ("e^(−a(t))", r"e\textsuperscript{\ensuremath{-}a(t)}"),
+    ("e^(open", r"e\textasciicircum{}(open"),
+    ("x̂ Â β̃ ᾱ", r"\ensuremath{\hat{x}} Â \ensuremath{\tilde{\beta}} \ensuremath{\bar{\alpha}}"),
+    ("\\漢\n--x", r"\textbackslash{}? {-}{-}x"),
+])  # fmt: skip
+def test_a_text_is_escaped(text: str, latex: str) -> None:
+    assert latex_text(text) == latex
+
+
+def test_units_move_to_the_heads_and_numbers_are_aligned() -> None:
+    table = ResultTable("t", "c", ("", "time", "mixed"), [
+        ("a", "0.5 s", "1 s"), ("b", "12 s", "2 ms"), ("c", "−1.25 s", "-"),
+    ])  # fmt: skip
+    text = as_latex(table)
+    assert r"\begin{tabular}{@{}lrr@{}}" in text
+    assert r" & time [s] & mixed \\" in text
+    assert r"a & 0.5\phantom{0} & 1 s \\" in text
+    assert r"b & 12\phantom{.00} & 2 ms \\" in text
+    assert r"c & \ensuremath{-}1.25 & -- \\" in text
+    assert as_csv(table) == ",time [s],mixed\na,0.5,1 s\nb,12,2 ms\nc,-1.25,\n"
+    rows = ResultTable("t", "c", KEY_VALUE, [("delay", "3 ms"), ("lost", "3 (60 %)")])
+    assert as_csv(rows) == "quantity,value\ndelay [ms],3\nlost,3 (60 %)\n"
+
+
+def test_tables_of_a_run_compile_and_have_its_numbers(tmp_path: Path) -> None:
+    run = noack.simulate(noack.load("lane_following", {"horizon_s": 5.0}))
+    tables = [*summary_tables(run.summary), ResultTable("h", HOSTILE, ("", HOSTILE), [
+        (HOSTILE, "1.5"), ("", HOSTILE),
+    ]), ResultTable("empty", "", KEY_VALUE, [])]  # fmt: skip
+    written = save_tables(tables, tmp_path)
+    numbers = dict(rows_of(tmp_path / "numbers.csv"))
+    assert numbers["transmissions"] == str(run.summary["events"])
+    shortest_s = float(numbers["shortest inter-event time [s]"])
+    assert shortest_s == pytest.approx(run.summary["inter_event_min_s"], abs=5e-4)
+    assert len(rows_of(tmp_path / "claims.csv")) == 1 + len(run.claims)
+    names = [path.name for path in written if path.suffix == ".tex"]
+    body = "\n\n".join(rf"\input{{{name}}}" for name in names)
+    assert compiled(body, ("booktabs",), tmp_path).exists()
+
+
+@pytest.mark.parametrize(("words", "names"), [
+    (("certify", "lane_following"), ["certificates", "limits"]),
+    (("margin", "lane_periodic", "--most", "2", "--no-period"), ["margin"]),
+    (("campaign", "mb_vs_zoh", "--draws", "2", "--workers", "1"), ["campaign", "differences"]),
+])  # fmt: skip
+def test_commands_write_their_tables(
+    words: tuple[str, ...], names: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(app, [*words, "--tables", "tables"])
+    assert done.exit_code == 0, done.output
+    found = sorted(path.name for path in (tmp_path / "tables").iterdir())
+    assert found == [f"{name}.{ending}" for name in names for ending in ("csv", "tex")]
+    assert f"tables/{names[0]}.tex" in done.stdout
+    first = rows_of(tmp_path / "tables" / f"{names[0]}.csv")
+    assert len({len(row) for row in first}) == 1
+    body = "\n\n".join(rf"\input{{tables/{name}.tex}}" for name in names)
+    compiled(body, ("booktabs",), tmp_path)
+
+
+def test_the_tables_of_several_loops_are_written(tmp_path: Path) -> None:
+    run = noack.simulate(noack.load("shared_bottleneck", {"horizon_s": 1.0}))
+    save_tables(summary_tables(run.summary), tmp_path)
+    rows = rows_of(tmp_path / "loops.csv")
+    assert [row[0] for row in rows[1:]] == [loop["name"] for loop in run.summary["loops"]]
