@@ -120,7 +120,7 @@ class Run:
         Raises:
             NoackError: there is no such table, or its file is damaged.
         """
-        from cosim.api.data_frames import with_seconds
+        from cosim.record.data_frames import with_seconds
         from cosim.record.table_files import read_table
 
         if name not in self.tables:
@@ -139,7 +139,7 @@ class Run:
             value after a reset. x_c is NaN at times without controller records. x is the state that
             the sensor uses; with noise or an observer it differs from the plant's state.
         """
-        from cosim.api.data_frames import samples
+        from cosim.record.data_frames import samples
 
         return samples(self._record_of_loop)
 
@@ -153,7 +153,7 @@ class Run:
             in_flight at the end, or none, if it did not reach the network; ``received``, whether
             the controller processed it.
         """
-        from cosim.api.data_frames import events
+        from cosim.record.data_frames import events
 
         return events(self._record_of_loop)
 
@@ -205,6 +205,21 @@ class Run:
         from cosim.live.finalize import run_report
 
         return run_report(self.directory, again=True)
+
+    def export(self, path: Folder) -> list[Path]:
+        """Write the run for other programs; return the written files.
+
+        Args:
+            path: ``.mat`` for MATLAB and Octave, ``.mcap`` for Foxglove; without an ending, a
+                folder of CSV files.
+
+        Raises:
+            NoackError: the path has another ending, or a file cannot be written.
+        """
+        from cosim.output.export.export_formats import export_run
+
+        self.summary  # noqa: B018  # of a temporary run, it is computed now
+        return export_run(self.directory, Path(path))
 
     def archive(self, path: Folder) -> Path:
         """Write the run as one file, which :func:`noack.reproduce` repeats; return its path.

@@ -94,6 +94,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 MORE = {
     "archive": (),
     "check": (),
+    "export": (),
     "schema": (),
     "summary": (),
     "replay": (),
@@ -155,6 +156,7 @@ def test_every_command_has_a_json_option(command: str) -> None:
 
 OF_THEIR_OWN = {
     "--draws": "at each grid point, in all, to choose by",
+    "--format": "of figures, or of an export",
     "--invitation": "the file to write, or to join by",
     "--listen": "where probes arrive, or where processes of other hosts join",
     "--out": "a folder of results, or a scenario file",
