@@ -136,6 +136,7 @@ class _Forwarder:
     async def _forward(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Copy both directions until one ends."""
         inner_reader, inner_writer = await self._target()
+        inner_writer.transport.set_write_buffer_limits(0)  # at the end, nothing waits to be written
         copies = [
             self._loop.create_task(_copy(reader, inner_writer)),
             self._loop.create_task(_copy(inner_reader, writer)),
@@ -149,7 +150,6 @@ class _Forwarder:
 
 
 async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    writer.transport.set_write_buffer_limits(0)  # at the end, nothing waits to be written
     with suppress(OSError):
         while data := await reader.read(_READ_BYTES):
             writer.write(data)
