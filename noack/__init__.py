@@ -28,6 +28,6 @@ else:
 
 __all__ = [
     "Certificates", "Measurement", "NoackError", "Run", "Scenario", "__version__", "certify",
-    "compare", "from_system", "load", "margin", "measure", "open_run", "run", "simulate",
-    "with_settings",
+    "compare", "from_system", "load", "margin", "measure", "open_run", "reproduce", "run",
+    "simulate", "with_settings",
 ]  # fmt: skip

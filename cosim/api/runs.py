@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from cosim.output.report.run_figures import RunFigure
     from cosim.record.run_record import RunRecord
     from cosim.studies.comparison.run_comparison import RunComparison
+    from cosim.studies.reproduction.run_repetition import Repetition
 
 Folder = str | PathLike[str]
 
@@ -119,7 +120,7 @@ class Run:
         Raises:
             NoackError: there is no such table, or its file is damaged.
         """
-        from cosim.api.data_frames import with_seconds
+        from cosim.record.data_frames import with_seconds
         from cosim.record.table_files import read_table
 
         if name not in self.tables:
@@ -138,7 +139,7 @@ class Run:
             value after a reset. x_c is NaN at times without controller records. x is the state that
             the sensor uses; with noise or an observer it differs from the plant's state.
         """
-        from cosim.api.data_frames import samples
+        from cosim.record.data_frames import samples
 
         return samples(self._record_of_loop)
 
@@ -152,7 +153,7 @@ class Run:
             in_flight at the end, or none, if it did not reach the network; ``received``, whether
             the controller processed it.
         """
-        from cosim.api.data_frames import events
+        from cosim.record.data_frames import events
 
         return events(self._record_of_loop)
 
@@ -204,6 +205,33 @@ class Run:
         from cosim.live.finalize import run_report
 
         return run_report(self.directory, again=True)
+
+    def export(self, path: Folder) -> list[Path]:
+        """Write the run for other programs; return the written files.
+
+        Args:
+            path: ``.mat`` for MATLAB and Octave, ``.mcap`` for Foxglove; without an ending, a
+                folder of CSV files.
+
+        Raises:
+            NoackError: the path has another ending, or a file cannot be written.
+        """
+        from cosim.output.export.export_formats import export_run
+
+        self.summary  # noqa: B018  # of a temporary run, it is computed now
+        return export_run(self.directory, Path(path))
+
+    def archive(self, path: Folder) -> Path:
+        """Write the run as one file, which :func:`noack.reproduce` repeats; return its path.
+
+        Raises:
+            NoackError: the file cannot be written.
+        """
+        from cosim.studies.reproduction.run_archive import write_archive
+
+        self.summary  # noqa: B018  # of a temporary run, it is computed now
+        write_archive(self.directory, Path(path))
+        return Path(path)
 
     def replay(self) -> "Replay":
         """Feed every machine its recorded inputs again and compare the outputs bit for bit.
@@ -353,6 +381,27 @@ def open_run(directory: Folder = "runs/latest") -> Run:
         raise CallerError(f"{path}: not a run directory (no {SCENARIO_FILE})")
     outcome = reopen(path.resolve())
     return Run(outcome.run_dir, lambda: outcome)
+
+
+def reproduce(path: Folder, *, run_code: bool = False) -> "Repetition":
+    """Repeat an archived run, and compare it bit for bit.
+
+    Args:
+        path: an archive, written by :meth:`Run.archive` or ``noack archive``.
+        run_code: run the code that the archive contains, if its plant, trigger or controller is a
+            Python class or an FMU.
+
+    Returns:
+        The result: ``bit_exact``; ``differences``, the first one of the run and of each loop;
+        ``changes`` of versions and machine since the archived run; ``numbers`` that differ.
+
+    Raises:
+        NoackError: the file is not such an archive, is damaged, or contains code without
+            ``run_code``.
+    """
+    from cosim.studies.reproduction.run_repetition import repeat_archive
+
+    return repeat_archive(Path(path), run_code=run_code)
 
 
 def compare(*runs: Run | Folder) -> "RunComparison":

@@ -38,6 +38,8 @@ _EXTRAS = {
     "fmi": 'plants of kind "fmu"',
     "vehicle": 'plants of kind "vehicle"',
     "cluster": "`noack campaign --scheduler`",
+    "mcap": "`noack export --format mcap`",
+    "metrics": "`--metrics`",
 }
 
 

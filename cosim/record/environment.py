@@ -3,6 +3,7 @@
 import json
 import platform
 import sys
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -48,12 +49,21 @@ def kind_of(run_dir: Path) -> Kind:
 
 def changed_since(run_dir: Path) -> list[str]:
     """Return the changes since the run that may affect its arithmetic, in words."""
+    return _changes(run_dir, ("python", "machine", "processor"), _ARITHMETIC)
+
+
+def all_changes_since(run_dir: Path) -> list[str]:
+    """Return all changes of versions and machine since the run, in words."""
+    return _changes(run_dir, ("python", "system", "machine", "processor", "cores"), _PACKAGES)
+
+
+def _changes(run_dir: Path, keys: Sequence[str], names: Sequence[str]) -> list[str]:
     then, now = read_object(run_dir / ENVIRONMENT_FILE), environment("live")
     packages = then.get("packages")
     packages = packages if isinstance(packages, dict) else {}
     pairs = [
-        *((key, then.get(key), now[key]) for key in ("python", "machine", "processor")),
-        *((name, packages.get(name), now["packages"][name]) for name in _ARITHMETIC),
+        *((key, then.get(key), now[key]) for key in keys),
+        *((name, packages.get(name), now["packages"][name]) for name in names),
     ]
     return [f"{name} was {old}, is {new}" for name, old, new in pairs if old != new]
 

@@ -1,5 +1,6 @@
 """``noack certify``: bounds that hold for every pattern of losses."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -32,6 +33,10 @@ def certify(
         ),
     ] = None,
     tables: cli.TablesOption = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Write the certificates for MATLAB and Octave (.mat)."),
+    ] = None,
     json: cli.JsonOption = False,
 ) -> int:
     """Compute the bounds that are guaranteed for a scenario, and their conditions.
@@ -54,5 +59,9 @@ def certify(
     else:
         print_certificates(cli.console(), found)
     cli.write_tables(certificate_tables(found), tables, json=json)
+    if out is not None:
+        from cosim.output.export.mat_export import save_mat
+
+        save_mat(found.to_json(), out)
     certified = any(certificate.constants for _, certificate in found)
     return ExitStatus.OK if certified else ExitStatus.FAILED

@@ -24,6 +24,7 @@ def completed(line: str) -> list[str]:
 
 @pytest.mark.parametrize(("line", "offered"), [
     ("noack ca", ["campaign", "capacity"]),
+    ("noack rep", ["replay", "report", "reproduce"]),
     ("noack certify lane_f", ["lane_following"]),
     ("noack doctor quad", ["quadrotor_hover"]),
     ("noack campaign mb", ["mb_vs_zoh"]),

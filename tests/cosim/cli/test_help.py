@@ -92,7 +92,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 MORE = {
+    "archive": (),
     "check": (),
+    "export": (),
     "schema": (),
     "summary": (),
     "replay": (),
@@ -129,7 +131,7 @@ def test_examples_work(example: str, folder: Path, monkeypatch: pytest.MonkeyPat
 def test_only_long_and_live_commands_have_no_example_that_is_run() -> None:
     assert set(OURS) - MORE.keys() == {
         "campaign", "capacity", "collect", "compare", "controller", "demo", "design", "doctor",
-        "paper", "plant", "record", "run", "sensor", "set", "view",
+        "paper", "plant", "record", "reproduce", "run", "sensor", "set", "view",
     }  # fmt: skip
 
 
@@ -154,6 +156,7 @@ def test_every_command_has_a_json_option(command: str) -> None:
 
 OF_THEIR_OWN = {
     "--draws": "at each grid point, in all, to choose by",
+    "--format": "of figures, or of an export",
     "--invitation": "the file to write, or to join by",
     "--listen": "where probes arrive, or where processes of other hosts join",
     "--out": "a folder of results, or a scenario file",

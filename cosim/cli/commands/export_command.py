@@ -1,0 +1,47 @@
+"""``noack export``: a run for other programs."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cosim.cli import command as cli
+from cosim.output.export.export_formats import ExportFormat
+from cosim.record.run_directory import chosen_run
+from noack.core.errors import ExitStatus
+
+
+@cli.command(cli.RUNS, 96, [
+    ("noack export --format mat", "the last run for MATLAB and Octave"),
+    ("noack export --format mcap --out run.mcap", "for Foxglove and PlotJuggler"),
+    ("noack export runs/latest --format csv --json", "a folder of CSV files"),
+])  # fmt: skip
+def export(
+    run_dir: cli.RunArgument = None,
+    *,
+    file_format: Annotated[
+        ExportFormat, typer.Option("--format", help="Format of the file, or of the folder's files.")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="File, or folder of CSV; RUN.mat and so on by default."),
+    ] = None,
+    runs: cli.RunsOption = cli.DEFAULT_RUNS,
+    loop: cli.LoopOption = None,
+    json: cli.JsonOption = False,
+) -> int:
+    """Export a run for other programs: its tables, its summary and its certificates."""
+    from cosim.live.finalize import reopen
+    from cosim.live.progress import PatientConsole
+    from cosim.output.export.export_formats import export_run
+
+    chosen = chosen_run(run_dir, runs, loop)
+    reopen(chosen)
+    path = out or Path(f"{chosen.resolve().name}{file_format.suffix}")
+    with PatientConsole(stderr=True).status("exporting"):
+        written = export_run(chosen, path, file_format)
+    if json:
+        cli.print_json({"files": [str(one) for one in written]})
+    else:
+        print(*written, sep="\n")
+    return ExitStatus.OK

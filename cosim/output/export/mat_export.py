@@ -1,0 +1,134 @@
+"""A run, or certificates, as a file of MATLAB and Octave (``.mat``, version 5)."""
+
+import io
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cosim.output.all_certificates import certificates_of
+from cosim.output.export.exported_run import ExportedRun
+from cosim.record.data_frames import events, samples
+from cosim.record.record_source import Rows
+from noack.config.scenario import Scenario
+from noack.core.errors import CallerError, MachineError
+from noack.core.file_access import write_whole
+
+_LONGEST_NAME = 63
+_INVALID = re.compile(r"\W", re.ASCII)
+
+
+def write_mat(run: ExportedRun, path: Path) -> list[Path]:
+    """Write a run: its tables, samples, events, summary, scenario and certificates, as structures.
+
+    Raises:
+        MachineError: the file cannot be written, or a variable is larger than the format allows.
+    """
+    return save_mat(_content(run), path)
+
+
+def save_mat(content: Mapping[str, Any], path: Path) -> list[Path]:
+    """Write a document of JSON, or arrays, as variables; return the path.
+
+    Raises:
+        MachineError: the file cannot be written, or a variable is larger than the format allows.
+    """
+    from scipy.io import savemat
+
+    buffer = io.BytesIO()
+    try:
+        file: Any = buffer  # SciPy's types know names of files only
+        savemat(file, _structure(content), long_field_names=True, oned_as="column")
+    except (ValueError, OverflowError, TypeError) as error:
+        raise MachineError(f"{path}: not possible as a .mat file of version 5: {error}") from None
+    header = b"MATLAB 5.0 MAT-file, written by noack".ljust(116)  # without a date
+    return [write_whole(path, header + buffer.getvalue()[len(header) :])]
+
+
+def _content(run: ExportedRun) -> dict[str, Any]:
+    record = run.record
+    found: dict[str, Any] = {table: _columns(record[table]) for table in record.tables}
+    found["summary"] = run.summary
+    found["scenario"] = record.scenario.model_dump(mode="json", exclude_none=True)
+    found["environment"] = run.environment
+    if record.is_network:
+        found["loops"] = {loop.name: _content(loop) for loop in run.loops()}
+        return found
+    for name, table in (("samples", samples(record)), ("events", events(record))):
+        found[name] = {column: _array(table[column].to_numpy()) for column in table.column_names}
+    loop = record.loop
+    found["loop"] = {
+        "A": loop.A, "B": loop.B, "K": loop.K, "A_model": loop.A_model, "B_model": loop.B_model,
+        "state_names": list(loop.state_names), "input_names": list(loop.input_names),
+    }  # fmt: skip
+    if not run.name:  # of many loops they would take minutes
+        found["certificates"] = _certificates(record.scenario)
+    return found
+
+
+def _certificates(scenario: Scenario) -> dict[str, Any]:
+    """Return the certificates of a scenario, or the reason why there are none."""
+    try:
+        return certificates_of(scenario).to_json()
+    except CallerError as error:
+        return {"none": str(error)}
+
+
+def _columns(rows: Rows) -> dict[str, Any]:
+    """Return the columns of a table: (k, 1), vectors (k, n), bytes (k, width)."""
+    found: dict[str, Any] = {}
+    for name in rows.dtype.names or ():
+        column = rows[name]
+        if column.dtype.kind == "V":
+            column = np.frombuffer(column.tobytes(), np.uint8).reshape(len(rows), column.itemsize)
+        found[name] = column
+    return found
+
+
+def _array(values: Any) -> Any:
+    return values.astype(object) if values.dtype.kind in "OU" else values
+
+
+def _structure(value: Any) -> Any:
+    """Return a value as :func:`scipy.io.savemat` takes it; None is an empty array."""
+    if isinstance(value, Mapping):
+        found: dict[str, Any] = {}
+        for key, entry in value.items():
+            found[_free_name(_name(key), found)] = _structure(entry)
+        return found
+    if value is None:
+        return np.zeros((0, 0))
+    if isinstance(value, list | tuple):
+        return _array_or_cells(value)
+    return value
+
+
+def _array_or_cells(values: list[Any] | tuple[Any, ...]) -> Any:
+    """Return numbers as an array; anything else as a cell array."""
+    numeric = [isinstance(one, int | float) and not isinstance(one, bool) for one in values]
+    if values and all(numeric):
+        return np.array(values, dtype=np.float64)
+    if values and all(isinstance(one, list | tuple) and one for one in values):
+        rows = [_array_or_cells(one) for one in values]
+        if all(row.dtype == np.float64 and row.shape == rows[0].shape for row in rows):
+            return np.array(rows)
+    cells = np.empty((len(values), 1), dtype=object)
+    for i, one in enumerate(values):
+        cells[i, 0] = _structure(one)
+    return cells
+
+
+def _name(key: str) -> str:
+    """Return a key as a name of MATLAB: letters, digits and _, beginning with a letter."""
+    name = _INVALID.sub("_", str(key))
+    return (name if name[:1].isalpha() else f"f_{name}")[:_LONGEST_NAME]
+
+
+def _free_name(name: str, taken: Mapping[str, Any]) -> str:
+    number, free = 1, name
+    while free in taken:
+        number += 1
+        free = f"{name[: _LONGEST_NAME - 4]}_{number}"
+    return free

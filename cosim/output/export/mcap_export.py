@@ -1,0 +1,167 @@
+"""A run as MCAP: one channel per table, messages as JSON with a JSON Schema.
+
+Foxglove, PlotJuggler and the libraries of MCAP read it. The log time of a message is the actual
+time of its row, its publish time the nominal one, both in simulated nanoseconds since the run's
+epoch.
+"""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydantic_core import to_json
+
+from cosim.output.export.exported_run import ExportedRun
+from cosim.output.export.mcap_schemas import (
+    ERRORS,
+    ERRORS_SCHEMA,
+    LOG,
+    LOG_SCHEMA,
+    schema_of,
+    topic_of,
+)
+from cosim.record.align import aligned_parts
+from cosim.record.record_source import Rows
+from cosim.record.run_directory import SCENARIO_FILE, SUMMARY_FILE
+from noack.core.clock import NS_PER_S
+from noack.core.errors import CallerError, MachineError, why
+from noack.protocol.record_tables import OWNER
+
+if TYPE_CHECKING:
+    from mcap.writer import Writer
+
+_LEVELS = {"info": 2, "restart": 3, "warning": 3, "error": 4}
+"""Numbers of the levels of foxglove.Log."""
+_CHUNK_BYTES = 2**20
+Message = tuple[int, int, int, bytes]
+"""Log time, publish time, sequence, and content."""
+
+
+def write_mcap(run: ExportedRun, path: Path) -> list[Path]:
+    """Write a run as MCAP; the loops of a run of several have their names before their topics.
+
+    Raises:
+        CallerError: the package mcap is not installed.
+        MachineError: the file cannot be written.
+    """
+    try:
+        from mcap.writer import CompressionType, Writer
+    except ImportError:
+        raise CallerError(
+            "MCAP needs the package mcap, which is not installed; pip install 'noack[mcap]'"
+        ) from None
+    scratch = path.with_name(f".{path.name}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with scratch.open("wb") as file:
+            writer = Writer(file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
+            writer.start(profile="", library="noack")
+            _write(writer, run)
+            writer.finish()  # type: ignore[no-untyped-call]
+        scratch.replace(path)
+    except OSError as error:
+        scratch.unlink(missing_ok=True)
+        raise MachineError(f"{path}: cannot be written: {why(error)}") from None
+    return [path]
+
+
+def _write(writer: "Writer", run: ExportedRun) -> None:
+    record = run.record
+    writer.add_metadata(
+        "noack",
+        {"scenario": record.scenario.name, "kind": record.kind,
+         "started": str(run.environment.get("started", "")),
+         "time": "simulated nanoseconds since the epoch of the run"},
+    )  # fmt: skip
+    for name, media in ((SCENARIO_FILE, "application/toml"), (SUMMARY_FILE, "application/json")):
+        if (run.directory / name).is_file():
+            writer.add_attachment(0, 0, name, media, (run.directory / name).read_bytes())
+    _write_log(writer, run)
+    _write_tables(writer, run, [*record.tables])
+    for loop in run.loops():
+        own = [table for table in loop.record.tables if OWNER[table] != "netem"]
+        _write_tables(writer, loop, own)
+    for one in [*run.loops()] or [run]:
+        _write_errors(writer, one)
+
+
+def _channel(writer: "Writer", run: ExportedRun, topic: str, schema: dict[str, Any]) -> int:
+    prefix = f"/{run.name}" if run.name else ""
+    schema_id = writer.register_schema(schema["title"], "jsonschema", to_json(schema))
+    names = {}
+    if not run.record.is_network:
+        loop = run.record.loop
+        names = {"states": ", ".join(loop.state_names), "inputs": ", ".join(loop.input_names)}
+    return writer.register_channel(f"{prefix}{topic}", "json", schema_id, names)
+
+
+def _write_tables(writer: "Writer", run: ExportedRun, tables: list[str]) -> None:
+    """Write the rows of some tables in the order of their log time."""
+    record = run.record
+    channels = {
+        table: _channel(writer, run, topic_of(table), schema_of(table, record.tables[table]))
+        for table in tables
+    }
+    for part in record.slices(*tables):
+        merged = [
+            (*message[:2], channels[table], *message[2:])
+            for table in tables
+            for message in _messages(part[table], run.phase_ns)
+        ]
+        merged.sort(key=lambda message: message[0])
+        for log_ns, publish_ns, channel, sequence, content in merged:
+            writer.add_message(channel, log_ns, content, publish_ns, sequence)
+
+
+def _messages(rows: Rows, phase_ns: int) -> Iterator[Message]:
+    """Yield the rows of a table; their times are those of the run."""
+    names = rows.dtype.names or ()
+    columns = {name: _values(name, rows[name]) for name in names}
+    for i in range(len(rows)):
+        content = {name: column(i) for name, column in columns.items()}
+        times = (max(int(rows[name][i]) + phase_ns, 0) for name in ("now_ns", "t_ns"))
+        sequence = int(rows["sequence"][i]) & 0xFFFF_FFFF  # MCAP's has 32 bits
+        yield (*times, sequence, to_json(content, inf_nan_mode="null"))  # type: ignore[misc]
+
+
+def _values(name: str, column: Rows) -> Callable[[int], Any]:
+    if column.dtype.kind != "V":
+        values = column.tolist()
+        return lambda i: values[i]
+    if name == "change":
+        return lambda i: column[i].tobytes().rstrip(b"\0").decode(errors="replace")
+    return lambda i: column[i].tobytes().hex()
+
+
+def _write_log(writer: "Writer", run: ExportedRun) -> None:
+    """Write the lines of the run's log as foxglove.Log."""
+    if not run.record.notices:
+        return
+    channel = _channel(writer, run, LOG, LOG_SCHEMA)
+    for number, notice in enumerate(run.record.notices):
+        t_ns = max(int(notice["t_ns"]), 0)
+        content = {
+            "timestamp": {"sec": t_ns // NS_PER_S, "nsec": t_ns % NS_PER_S},
+            "level": _LEVELS.get(notice["level"], 0),
+            "message": notice["text"],
+            "name": notice["process"],
+            "file": "",
+            "line": 0,
+        }
+        writer.add_message(channel, t_ns, to_json(content), t_ns, number)
+
+
+@np.errstate(all="ignore")  # a run may diverge
+def _write_errors(writer: "Writer", run: ExportedRun) -> None:
+    """Write the norms of the errors at each measurement."""
+    channel, number = _channel(writer, run, ERRORS, ERRORS_SCHEMA), 0
+    for part in aligned_parts(run.record):
+        aligned = part.aligned
+        columns = (aligned.e_s_norm, aligned.threshold, aligned.e_c_norm)
+        for t_ns, *norms in zip(aligned.t_ns.tolist(), *(c.tolist() for c in columns), strict=True):
+            keys = ("t_ns", "e_s_norm", "threshold", "e_c_norm")
+            content = to_json(dict(zip(keys, (t_ns, *norms), strict=True)), inf_nan_mode="null")
+            at_ns = t_ns + run.phase_ns
+            writer.add_message(channel, at_ns, content, at_ns, number & 0xFFFF_FFFF)
+            number += 1

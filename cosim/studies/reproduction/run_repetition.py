@@ -1,0 +1,203 @@
+"""The repetition of an archived run, and what differs."""
+
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cosim.analysis.loops_summary import has_loops
+from cosim.analysis.replay import replay
+from cosim.analysis.replay.replay_result import difference, rows_differ
+from cosim.analysis.summary_model import ReplayDifference
+from cosim.live.finalize import finalize, reopen
+from cosim.live.simulated_run import simulate_run
+from cosim.output.loops_tables import network_rows
+from cosim.record.environment import Kind, all_changes_since
+from cosim.record.loops_run import loop_directories
+from cosim.record.record_source import Slice
+from cosim.record.run_directory import SCENARIO_FILE
+from cosim.record.run_record import RunRecord, load_record
+from cosim.studies.comparison.run_comparison import compare_runs
+from cosim.studies.reproduction.run_archive import outside_files, unpack
+from noack.config.loops import loops_of
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import MOST_RECORDED_BYTES, load
+from noack.core.errors import CallerError, MachineError, why
+from noack.settings.named_file import file_tables
+
+
+class Repetition(NamedTuple):
+    """The repetition of an archived run."""
+
+    scenario: str
+    kind: Kind
+    """Of the archived run. A live one is replayed; its simulation is shown beside it."""
+    compared: int
+    """Rows of a simulated run, inputs of a live one, that were compared bit for bit."""
+    differences: Sequence[str]
+    """The first difference of the run and of each of its loops, with table, row, column, values."""
+    gaps: Sequence[str]
+    """Parts of a live run's record that are missing."""
+    changes: Sequence[str]
+    """Versions and machine that differ from those of the archived run."""
+    numbers: Sequence[tuple[str, ...]]
+    """Key numbers that differ: name, archived, repeated; of a live run, those of its simulation."""
+
+    @property
+    def bit_exact(self) -> bool:
+        """Whether something was compared, and nothing differs in any bit."""
+        return bool(self.compared) and not self.differences
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the result for programs."""
+        found = self._asdict() | {"numbers": [list(row) for row in self.numbers]}
+        return {"bit_exact": self.bit_exact, **found}
+
+
+def repeat_archive(path: Path, *, run_code: bool = False, into: Path | None = None) -> Repetition:
+    """Unpack an archive, repeat its run, and compare.
+
+    Args:
+        path: the archive.
+        run_code: whether to execute the files of plants, triggers and controllers that it contains.
+        into: folder, new or empty, for the unpacked run and its repetition; else they are deleted.
+
+    Raises:
+        CallerError: the file is not an archive, is damaged, or contains code without ``run_code``.
+        MachineError: a folder cannot be written.
+    """
+    with _folder(into) as folder:
+        archived = folder / "archived"
+        manifest = unpack(path, archived)
+        scenario = _scenario(path, archived, run_code=run_code)
+        ending = simulate_run(scenario, folder / "repeated", view=False)
+        finalize(ending, report=False)
+        pairs = list(zip(*(_directories(one) for one in (archived, ending.run_dir)), strict=True))
+        compare = _replayed if manifest.kind == "live" else _repeated
+        found = [compare(*pair) for pair in pairs]
+        return Repetition(
+            scenario=manifest.scenario,
+            kind=manifest.kind,
+            compared=sum(one.compared for one in found),
+            differences=[text for one in found for text in one.differences],
+            gaps=[text for one in found for text in one.gaps],
+            changes=all_changes_since(archived),
+            numbers=_numbers(archived, ending.run_dir),
+        )
+
+
+class _Compared(NamedTuple):
+    compared: int
+    differences: Sequence[str]
+    gaps: Sequence[str]
+
+
+@contextmanager
+def _folder(into: Path | None) -> Iterator[Path]:
+    if into is None:
+        temporary = Path(tempfile.mkdtemp(prefix="noack-"))
+        try:
+            yield temporary
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+        return
+    try:
+        into.mkdir(parents=True, exist_ok=True)
+        if any(into.iterdir()):
+            raise CallerError(f"--into {into}: the folder is not empty")
+    except OSError as error:
+        raise MachineError(f"{into}: {why(error)}") from None
+    yield into
+
+
+def _scenario(path: Path, archived: Path, *, run_code: bool) -> Scenario:
+    """Load the scenario of an unpacked archive; refuse code that is not wanted, or elsewhere."""
+    if not (archived / SCENARIO_FILE).is_file():
+        raise CallerError(f"{path}: not an archive of a run: has no {SCENARIO_FILE}")
+    scenario = load(archived / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
+    if (outside := outside_files(scenario, archived)) is not None:
+        raise CallerError(f"{path}: its scenario names {outside}, which is not in the archive")
+    for one in (scenario, *loops_of(scenario)):
+        for place, table in file_tables(one):
+            if not run_code:
+                name = Path(table.file or "").name
+                raise CallerError(
+                    f"{path}: contains code ({place}: {name}), which would be run with your "
+                    "permissions; --run-code runs it"
+                )
+    return scenario
+
+
+def _directories(run_dir: Path) -> list[tuple[str, Path]]:
+    """Return the run directory and those of its loops, each with a name."""
+    scenario = load_record(run_dir, network=True).scenario
+    loops = [] if scenario.loops is None else loop_directories(run_dir, scenario)
+    return [("", run_dir), *((f"loop {one.name}: ", one) for one in loops)]
+
+
+def _replayed(archived: tuple[str, Path], _: tuple[str, Path]) -> _Compared:
+    name, run_dir = archived
+    found = replay(load_record(run_dir, network=True))
+    first = found.first_difference
+    gaps = [f"{name}{gap}" for gap in found.gaps]
+    return _Compared(found.inputs, [] if first is None else [f"{name}{first}"], gaps)
+
+
+def _repeated(archived: tuple[str, Path], repeated: tuple[str, Path]) -> _Compared:
+    name = archived[0]
+    records = [load_record(run_dir, network=True) for _, run_dir in (archived, repeated)]
+    first = first_difference(*records)
+    count = sum(records[0].count(table) for table in records[0].tables)
+    return _Compared(count, [] if first is None else [f"{name}{first}"], [])
+
+
+def first_difference(one: RunRecord, other: RunRecord) -> ReplayDifference | None:
+    """Return the first difference between the tables of two records, bit for bit."""
+    before = dict.fromkeys(one.tables, 0)
+    nothing: Slice = {}
+    for recorded, again in zip_longest(one.slices(), other.slices(), fillvalue=nothing):
+        found = [
+            different
+            for table in one.tables
+            if (different := _in_table(table, before[table], recorded, again)) is not None
+        ]
+        if found:
+            return min(found, key=lambda each: each.now_ns)
+        for table in one.tables:
+            before[table] += len(recorded[table])
+    return None
+
+
+def _in_table(table: str, before: int, recorded: Slice, again: Slice) -> ReplayDifference | None:
+    rows, others = (part.get(table, np.zeros(0)) for part in (recorded, again))
+    if rows.tobytes() == others.tobytes():
+        return None
+    for i, (row, other) in enumerate(zip(rows, others, strict=False)):
+        if row.tobytes() != other.tobytes():
+            return rows_differ(table, before + i, row, other)
+    common, longer = min(len(rows), len(others)), max(rows, others, key=len)
+    what = "the row is missing in the " + ("repetition" if len(rows) > common else "archive")
+    return difference(table, before + common, int(longer[common]["now_ns"]), what)
+
+
+def _numbers(archived: Path, repeated: Path) -> list[tuple[str, ...]]:
+    """Return the key numbers that differ, as text."""
+    summaries = [reopen(one).summary for one in (archived, repeated)]
+    if all(map(has_loops, summaries)):
+        first, second = (dict(network_rows(one)) for one in summaries)
+        rows = [(name, value, second.get(name, "-")) for name, value in first.items()]
+        return [row for row in rows if row[1] != row[2]]
+    return [
+        (one.name, *map(_cell, one.values))
+        for one in compare_runs([archived, repeated]).numbers
+        if one.values[0] != one.values[1] and one.values != (None, 0.0)  # a distance of 0
+    ]
+
+
+def _cell(value: float | None) -> str:
+    return "-" if value is None else f"{value:.6g}"

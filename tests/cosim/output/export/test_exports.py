@@ -1,0 +1,182 @@
+"""Exports of a run, read back by the readers of other programs and compared with the record."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pyarrow as pa
+import pytest
+from mcap.reader import make_reader
+from pyarrow import csv
+from scipy.io import loadmat
+from typer.testing import CliRunner
+
+import noack
+from cosim.cli import app
+from cosim.output.export.mat_export import save_mat
+from noack.core.errors import CallerError
+
+SCENARIO: dict[str, Any] = {
+    "horizon_s": 1.0, "changes": [{"at_s": 0.5, "set": {"trigger.beta": 0.05}}],
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> noack.Run:
+    folder = tmp_path_factory.mktemp("runs")
+    return noack.simulate(noack.load("lane_following", SCENARIO), runs=folder)
+
+
+@pytest.fixture(scope="module")
+def loops(tmp_path_factory: pytest.TempPathFactory) -> noack.Run:
+    folder = tmp_path_factory.mktemp("loops")
+    return noack.simulate(noack.load("shared_bottleneck", {"horizon_s": 0.4}), runs=folder)
+
+
+def vector(table: pa.Table, name: str) -> np.ndarray:
+    names = [one for one in table.column_names if one.startswith(f"{name}_")]
+    return np.column_stack([table[one].to_numpy() for one in names])
+
+
+def messages(path: Path) -> dict[str, list[tuple[int, int, dict[str, Any]]]]:
+    """Log time, publish time and content of the messages by topic, each valid by its schema."""
+    found: dict[str, list[tuple[int, int, dict[str, Any]]]] = {}
+    with path.open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            assert schema is not None
+            assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
+            content = json.loads(message.data)
+            if not found.setdefault(channel.topic, []):
+                jsonschema.validate(content, json.loads(schema.data))
+            found[channel.topic].append((message.log_time, message.publish_time, content))
+    return found
+
+
+def test_a_mat_file_has_the_record(run: noack.Run, tmp_path: Path) -> None:
+    path = tmp_path / "run.mat"
+    assert run.export(path) == [path]
+    found = loadmat(path, simplify_cells=True)
+    for name in run.tables:
+        table = run.table(name)
+        if table.num_rows:
+            assert np.array_equal(np.ravel(found[name]["t_ns"]), table["t_ns"].to_numpy())
+    steps = run.table("plant_step")
+    assert found["plant_step"]["x"].tobytes() == vector(steps, "x").tobytes()
+    assert found["plant_step"]["t_ns"].dtype == np.int64
+    assert np.array_equal(found["samples"]["e_c_norm"], run.samples()["e_c_norm"], equal_nan=True)
+    assert list(np.atleast_1d(found["events"]["fate"])) == run.events()["fate"].to_pylist()
+    assert found["summary"]["events"] == run.summary["events"]
+    assert found["loop"]["A"].shape == (4, 4)
+    assert found["certificates"]["none"].startswith("changes: needs settings that stay the same")
+    assert run.export(path)[0].read_bytes() == path.read_bytes()
+
+
+def test_a_mat_file_has_the_certificates(tmp_path: Path) -> None:
+    run = noack.simulate(noack.load("lane_following", {"horizon_s": 0.1}))
+    found = loadmat(run.export(tmp_path / "run.mat")[0], simplify_cells=True)["certificates"]
+    document = noack.certify(run.scenario).to_json()
+    for one, other in zip(found["certificates"], document["certificates"], strict=True):
+        assert one["constants"]["state"] == other["constants"]["state"]
+
+
+def test_certificates_are_written_as_mat(tmp_path: Path) -> None:
+    path = tmp_path / "c.mat"
+    done = CliRunner().invoke(app, ["certify", "lane_following", "--out", str(path)])
+    assert done.exit_code == 0
+    document = noack.certify("lane_following").to_json()
+    found = loadmat(path, simplify_cells=True)
+    assert found["paper"]["theorem_2"]["delta"] == document["paper"]["theorem_2"]["delta"]
+
+
+def test_any_document_becomes_structures(tmp_path: Path) -> None:
+    content = {
+        "a b": None, "a_b": [1, 2.5], "1": [[1, 2], [3, 4]], "_x": ["p", "", None], "n" * 80: True,
+        "mixed": [[1, 2], [3]], "empty": [], "objects": [{"k": 1}, {"k": "x"}], "text": "‖x‖ é",
+    }  # fmt: skip
+    save_mat(content, tmp_path / "d.mat")
+    found = loadmat(tmp_path / "d.mat", simplify_cells=True)
+    assert found["a_b"].size == 0
+    assert found["a_b_2"].tolist() == [1, 2.5]
+    assert found["f_1"].tolist() == [[1, 2], [3, 4]]
+    assert found["objects"][1]["k"] == "x"
+    assert found["text"] == "‖x‖ é"
+    assert found["n" * 63] == 1
+
+
+def test_an_mcap_file_has_the_record(run: noack.Run, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    run.export(path)
+    found = messages(path)
+    for name in run.tables:
+        owner, _, rest = name.partition("_")
+        assert len(found.get(f"/{owner}/{rest}", ())) == run.table(name).num_rows
+    steps = run.table("plant_step")
+    x = np.array([content["x"] for *_, content in found["/plant/step"]])
+    assert x.tobytes() == vector(steps, "x").tobytes()
+    assert [log for log, *_ in found["/plant/step"]] == steps["now_ns"].to_pylist()
+    assert [publish for _, publish, _ in found["/plant/step"]] == steps["t_ns"].to_pylist()
+    (change,) = [content["change"] for *_, content in found["/sensor/setting"]]
+    assert json.loads(change)
+    head = run.table("netem_packet")["head"][0].as_py().hex()
+    assert found["/netem/packet"][0][2]["head"] == head
+    samples = run.samples().to_pylist()
+    for (log_ns, _, content), row in zip(found["/loop/errors"], samples, strict=True):
+        assert (log_ns, content["e_s_norm"]) == (row["t_ns"], row["e_s_norm"])
+        assert content["e_c_norm"] == (None if np.isnan(row["e_c_norm"]) else row["e_c_norm"])
+
+
+def test_an_mcap_file_has_metadata_and_attachments(run: noack.Run, tmp_path: Path) -> None:
+    run.export(tmp_path / "run.mcap")
+    with (tmp_path / "run.mcap").open("rb") as file:
+        reader = make_reader(file)
+        (metadata,) = reader.iter_metadata()
+        assert metadata.metadata["scenario"] == "lane_following"
+        kept = {one.name: one.data for one in reader.iter_attachments()}
+        assert kept["scenario.toml"] == (run.directory / "scenario.toml").read_bytes()
+        summary = reader.get_summary()
+    assert summary is not None
+    topics = {one.topic: one.metadata for one in summary.channels.values()}
+    assert topics["/plant/step"]["states"] == ", ".join(run.scenario.model.state_names or ())
+
+
+def test_several_loops_have_their_names(loops: noack.Run, tmp_path: Path) -> None:
+    found = messages(loops.export(tmp_path / "a.mcap")[0])
+    name, loop = list(loops.loops.items())[-1]
+    steps = loop.table("plant_step")["now_ns"].to_pylist()
+    place = json.loads((loop.directory / "loop.json").read_text())
+    times = [log - place["phase_ns"] for log, *_ in found[f"/{name}/plant/step"]]
+    assert place["phase_ns"] > 0
+    assert times == steps
+    assert len(found["/netem/packet"]) == loops.table("netem_packet").num_rows
+    mat = loadmat(loops.export(tmp_path / "a.mat")[0], simplify_cells=True)
+    assert mat["loops"][name.replace("-", "_")]["plant_step"]["now_ns"].tolist() == steps
+    files = loops.export(tmp_path / "csv")
+    assert tmp_path / f"csv/{name}/plant_step.csv" in files
+
+
+def test_csv_files_have_the_tables(run: noack.Run, tmp_path: Path) -> None:
+    words = ["export", str(run.directory), "--format", "csv", "--out", str(tmp_path / "csv")]
+    done = CliRunner().invoke(app, [*words, "--json"])
+    assert done.exit_code == 0, done.output
+    names = {Path(file).stem for file in json.loads(done.stdout)["files"]}
+    assert names == {*run.tables, "samples", "events"}
+    found = csv.read_csv(tmp_path / "csv/plant_step.csv")
+    assert found.equals(run.table("plant_step"))
+
+
+def test_another_ending_is_refused(run: noack.Run, tmp_path: Path) -> None:
+    with pytest.raises(CallerError, match=r"run\.xls: an export is written to a folder, \.mat or"):
+        run.export(tmp_path / "run.xls")
+    words = ["export", str(run.directory), "--format", "mat", "--out", str(tmp_path / "run.mcap")]
+    done = CliRunner().invoke(app, words)
+    assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
+
+
+def test_a_missing_package_is_named(
+    run: noack.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "mcap.writer", None)
+    with pytest.raises(CallerError, match=r"pip install 'noack\[mcap\]'"):
+        run.export(tmp_path / "run.mcap")

@@ -1,0 +1,227 @@
+"""Archives of runs: the same bytes, a bit-exact repetition, and one line for a hostile file."""
+
+import hashlib
+import json
+import shutil
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+import noack
+from cosim.cli import app
+from cosim.studies.reproduction.run_archive import MANIFEST, write_archive
+from noack.core.errors import CallerError
+
+PLANT = """\
+class Lag:
+    states = ("x", "v")
+    inputs = ("u",)
+
+    def __init__(self, *arguments, **settings):
+        pass
+
+    def derivative(self, t_s, x, u):
+        return (x[1], u[0])
+"""
+Files = dict[str, bytes]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> noack.Run:
+    folder = tmp_path_factory.mktemp("runs")
+    return noack.simulate(noack.load("lane_following", {"horizon_s": 3.0}), runs=folder)
+
+
+@pytest.fixture(scope="module")
+def archive(run: noack.Run) -> Path:
+    return run.archive(run.directory.parent / "a.noack.zip")
+
+
+def files_of(archive: Path) -> Files:
+    with zipfile.ZipFile(archive) as file:
+        return {name: file.read(name) for name in file.namelist()}
+
+
+def write(path: Path, files: Files, *, kind: int = zipfile.ZIP_STORED) -> Path:
+    with zipfile.ZipFile(path, "w", kind) as file:
+        for name, content in files.items():
+            file.writestr(name, content)
+    return path
+
+
+def checked(files: Files) -> Files:
+    """The files with a manifest that fits them."""
+    found = json.loads(files[MANIFEST])
+    found["files"] = {
+        name: {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+        for name, content in files.items()
+        if name != MANIFEST
+    }
+    return files | {MANIFEST: json.dumps(found).encode()}
+
+
+def test_the_same_run_gives_the_same_bytes(run: noack.Run, archive: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "elsewhere"
+    shutil.copytree(run.directory, copy)
+    (copy / "notes.txt").write_text("mine")
+    write_archive(copy, tmp_path / "b.noack.zip")
+    assert (tmp_path / "b.noack.zip").read_bytes() == archive.read_bytes()
+    assert {"scenario.toml", "environment.json", "summary.json"} < files_of(archive).keys()
+
+
+def test_a_simulated_run_is_repeated_bit_for_bit(archive: Path, run: noack.Run) -> None:
+    found = noack.reproduce(archive)
+    assert found.bit_exact
+    assert (found.differences, found.changes, found.numbers) == ([], [], [])
+    assert found.compared == sum(run.table(name).num_rows for name in run.tables)
+
+
+def test_several_loops_are_repeated_bit_for_bit(tmp_path: Path) -> None:
+    loops = noack.simulate(noack.load("shared_bottleneck", {"horizon_s": 0.5}))
+    found = noack.reproduce(loops.archive(tmp_path / "a.zip"))
+    assert found.bit_exact
+    rows = sum(loops.table(name).num_rows for name in loops.tables)
+    for one in loops.loops.values():
+        rows += sum(one.table(name).num_rows for name in one.tables)
+    assert found.compared == rows
+
+
+def test_a_live_run_is_replayed_beside_a_simulation(tmp_path: Path) -> None:
+    live = noack.run(noack.load("lane_following", {"horizon_s": 0.5, "ports": {}}))
+    found = noack.reproduce(live.archive(tmp_path / "a.zip"))
+    assert (found.kind, found.compared) == ("live", live.replay().inputs)
+    assert found.bit_exact
+
+
+def test_what_differs_is_named(archive: Path, tmp_path: Path) -> None:
+    files = files_of(archive)
+    scenario = files["scenario.toml"].replace(b"beta = 0.5", b"beta = 0.25")
+    environment = json.loads(files["environment.json"])
+    environment["packages"]["numpy"] = "1.0"
+    changed = {"scenario.toml": scenario, "environment.json": json.dumps(environment).encode()}
+    path = write(tmp_path / "b.zip", checked(files | changed))
+    words = ["reproduce", str(path), "--into", str(tmp_path / "i")]
+    done = CliRunner().invoke(app, [*words, "--json"])
+    assert done.exit_code == 1, done.output
+    found = json.loads(done.stdout)
+    assert not found["bit_exact"]
+    assert "sensor_measurement row 0, threshold: the row differs" in found["differences"][0]
+    assert found["changes"][0].startswith("numpy was 1.0, is ")
+    assert "transmissions" in [row[0] for row in found["numbers"]]
+    assert (tmp_path / "i/archived/summary.json").is_file()
+    done = CliRunner().invoke(app, words)
+    assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
+    done = CliRunner().invoke(app, ["reproduce", str(path)])
+    assert "not reproduced" in done.stdout
+
+
+def compressed(files: Files, path: Path) -> Path:
+    return write(path, files, kind=zipfile.ZIP_DEFLATED)
+
+
+def overlapping(files: Files, path: Path) -> Path:
+    """A second entry in the directory of the file, with the content of the first."""
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("scenario.toml", files["scenario.toml"] * 100)
+        for name in ("summary.json", "reports.json"):
+            info = zipfile.ZipInfo(name)
+            first = file.filelist[0]
+            info.file_size, info.compress_size = first.file_size, first.compress_size
+            info.header_offset, info.CRC = first.header_offset, first.CRC
+            file.filelist.append(info)
+    return path
+
+
+def damaged(files: Files, path: Path) -> Path:
+    """A byte of an entry is another one, and the CRC of ZIP fits."""
+    content = bytearray(files["summary.json"])
+    content[10] ^= 1
+    return write(path, files | {"summary.json": bytes(content)})
+
+
+def cut(files: Files, path: Path) -> Path:
+    whole = write(path, files).read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    return path
+
+
+def twice(files: Files, path: Path) -> Path:
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("summary.json", files["summary.json"])
+        with pytest.warns(UserWarning, match="Duplicate"):
+            file.writestr("summary.json", files["summary.json"])
+    return path
+
+
+def renamed(name: str) -> Callable[[Files, Path], Path]:
+    return lambda files, path: write(path, checked(files | {name: b"x"}))
+
+
+def with_manifest(content: bytes) -> Callable[[Files, Path], Path]:
+    return lambda files, path: write(path, files | {MANIFEST: content})
+
+
+HOSTILE: dict[str, tuple[Callable[[Files, Path], Path], str]] = {
+    "traversal": (renamed("../../evil"), "not the name of a file in a run directory"),
+    "inner traversal": (renamed("record/../../evil"), "not the name of a file"),
+    "absolute": (renamed("/etc/evil"), "not the name of a file in a run directory"),
+    "drive": (renamed("C:\\evil"), "not the name of a file in a run directory"),
+    "control characters": (renamed("record/\x1b[31m"), "not the name of a file"),
+    "deep": (renamed("record/a/b"), "an archive has no such file"),
+    "other folder": (renamed(".git/config"), "an archive has no such file"),
+    "compressed": (compressed, "is compressed; noack's archives are not"),
+    "overlapping": (overlapping, "its entries overlap"),
+    "damaged": (damaged, "summary.json: is damaged: its SHA-256 is not that of archive.json"),
+    "cut": (cut, "not an archive of a run: File is not a zip file"),
+    "twice": (twice, "summary.json: is there twice"),
+    "extra file": (
+        lambda files, path: write(path, files | {"record/more": b""}), "do not have the same files"
+    ),
+    "no manifest": (
+        lambda files, path: write(path, {"summary.json": b"{}"}), "has no archive.json"
+    ),
+    "no scenario": (
+        lambda files, path: write(
+            path, checked({name: files[name] for name in (MANIFEST, "summary.json")})
+        ),
+        "has no scenario.toml",
+    ),
+    "manifest is no JSON": (with_manifest(b"\xff"), "archive.json: content: Invalid JSON"),
+    "another format": (with_manifest(b'{"format": "2"}'), "archive.json: format: Input should be"),
+    "deep JSON": (with_manifest(b"[" * 100_000), "archive.json: content: Invalid JSON"),
+    "no file": (lambda files, path: path, "No such file or directory"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_a_hostile_archive_gives_one_line(case: str, archive: Path, tmp_path: Path) -> None:
+    make, message = HOSTILE[case]
+    path = make(files_of(archive), tmp_path / "b.zip")
+    done = CliRunner().invoke(app, ["reproduce", str(path), "--into", str(tmp_path / "into")])
+    assert done.exit_code == 2, done.output
+    assert done.stderr.startswith(f"noack: {path}: ")
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not list(tmp_path.rglob("evil"))
+
+
+def test_code_runs_only_on_request_and_only_from_the_archive(tmp_path: Path) -> None:
+    (tmp_path / "lag.py").write_text(PLANT)
+    scenario = noack.load("double_integrator").model_dump(mode="json", exclude_none=True)
+    scenario["plant"].pop("draw")
+    scenario["plant"]["system"] = {
+        "kind": "python", "file": str(tmp_path / "lag.py"), "name": "Lag"
+    }  # fmt: skip
+    path = noack.simulate(noack.load(scenario, {"horizon_s": 0.2})).archive(tmp_path / "a.zip")
+    (tmp_path / "lag.py").rename(tmp_path / "moved.py")
+    with pytest.raises(CallerError, match=r"contains code \(plant\.system: lag\.py\).*--run-code"):
+        noack.reproduce(path)
+    assert noack.reproduce(path, run_code=True).bit_exact
+    files = files_of(path)
+    elsewhere = files["scenario.toml"].replace(b"plant/lag.py", bytes(tmp_path / "moved.py"))
+    path = write(path, checked(files | {"scenario.toml": elsewhere}))
+    with pytest.raises(CallerError, match=r"names .*moved\.py, which is not in the archive"):
+        noack.reproduce(path, run_code=True)
