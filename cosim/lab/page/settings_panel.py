@@ -62,9 +62,8 @@ class SettingsPanel:
                 ui.label(one.text).classes("text-negative text-xs")
         wrong = {one.key for one in mistakes}
         for key, (_, _, shown) in self._sliders.items():
-            shown.classes(
-                **({"add": "text-negative"} if key in wrong else {"remove": "text-negative"})
-            )
+            change = "add" if key in wrong else "remove"
+            shown.classes(**{change: "text-negative"})
 
     def _build(self) -> None:
         try:

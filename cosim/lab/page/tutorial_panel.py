@@ -20,24 +20,24 @@ STEPS = (
     Step(
         "What is an event?",
         "The sensor runs a model x_s of the plant and knows the plant's state x. It transmits only "
-        "when its error ‖x_s − x‖ exceeds the threshold βe^(−αt). Each point in the lowest panel is "
-        "a transmission.",
+        "when its error ‖x_s − x‖ exceeds the threshold βe^(−αt). Each point in the lowest panel "
+        "is a transmission.",
         "lane_following", {"network.loss": {"model": "lossless"}},
         "Drag β: a larger threshold gives fewer events and larger errors.",
     ),
     Step(
         "What does a loss do?",
         "The controller runs the same model x_c, but it learns only from packets that arrive. "
-        "Nobody acknowledges anything, so the sensor does not know what was lost. A cross is a lost "
-        "packet; after it ‖e_c‖ stays large until the next packet arrives.",
+        "Nobody acknowledges anything, so the sensor does not know what was lost. A cross is a "
+        "lost packet; after it ‖e_c‖ stays large until the next packet arrives.",
         "lane_following", {"network.loss": {"model": "bernoulli", "probability": 0.5}},
         "Drag the loss probability from 0 to 1.",
     ),
     Step(
         "What is guaranteed?",
         "The network loses at most M − 1 packets in a row. Then the certificate bounds every run: "
-        "‖e_c‖ ≤ Δβe^(−αt), and no two events are closer than δ. The green curves are these bounds; "
-        "they hold for every loss pattern, not only for this one.",
+        "‖e_c‖ ≤ Δβe^(−αt), and no two events are closer than δ. The green curves are these "
+        "bounds; they hold for every loss pattern, not only for this one.",
         "lane_weighted", {},
         "Drag M − 1: the bound grows, the run changes little.",
     ),
@@ -50,9 +50,9 @@ STEPS = (
     ),
     Step(
         "Your own plant under 80 % loss",
-        "Replace the matrices under “all settings (TOML)” with those of your plant: [model] has A, B "
-        "and the gain. Then run it live: five processes exchange real UDP packets, and the claims are "
-        "judged while they run.",
+        "Replace the matrices under “all settings (TOML)” with those of your plant: [model] has A, "
+        "B and the gain. Then run it live: five processes exchange real UDP packets, and the "
+        "claims are judged while they run.",
         "double_integrator",
         {"network.loss": {"model": "bernoulli", "probability": 0.8}},
         "Drag M − 1, then press “run live”.",
