@@ -10,7 +10,7 @@ import shutil
 import signal
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from cosim.live.compilation import compile_for
 from cosim.live.coordinator import Coordinator
 from cosim.live.disk_space import require_disk_space
 from cosim.live.fork_server import ForkServer, fork_server
-from cosim.live.remote_access import Listening, Opened, open_to_hosts, with_clocks
+from cosim.live.remote_access import Listening, open_to_hosts, with_clocks
 from cosim.live.remote_hosts import RemoteStart
 from cosim.live.restart_policy import RestartPolicy
 from cosim.live.start_limit import DEFAULT_S, StartLimit
@@ -34,6 +34,7 @@ from noack.protocol.topology import PLANT, RECORDER, ROLES
 from noack.runtime import run_registry
 from noack.runtime.address import text_of
 from noack.runtime.control_plane import run_name
+from noack.runtime.invitation import invitation_file
 from noack.runtime.join_ticket import Ticket, new_ticket, published
 from noack.runtime.life_cycle import HORIZON
 from noack.runtime.signals import Signals
@@ -132,13 +133,18 @@ def launch(
         coordinator = Coordinator(ticket, here)
         stack.callback(coordinator.close)
         watcher, remote = watcher or Watcher(), None
-        if listening is not None:
-            ticket = ticket.model_copy(update={"host": listening.address[0]})
-            opened = _opened(stack, listening, ticket, coordinator)
-            watcher.listening(text_of(opened.address), listening)
-            remote = RemoteStart(away, opened.invitation.model_dump_json())
-        if session is not None:
-            _publish_session(stack, ticket, session)
+        with _no_directory_if_refused(run_dir):
+            if listening is not None:
+                ticket = ticket.model_copy(update={"host": listening.address[0]})
+                opened = stack.enter_context(open_to_hosts(listening, ticket, coordinator))
+                remote = RemoteStart(away, opened.invitation.model_dump_json())
+            if session is not None:
+                by_hand = ticket.model_copy(update={"launched": False})
+                stack.enter_context(published(by_hand, session))
+            if listening is not None:
+                if listening.invitation is not None:  # last: it replaces that of an earlier run
+                    stack.enter_context(invitation_file(listening.invitation, opened.invitation))
+                watcher.listening(text_of(opened.address), listening)
         children = ChildProcesses(ticket, run_dir, spawn, server, remote)
         stack.enter_context(children.started(live=live))
         run = _Run(ticket, run_dir, coordinator, children, watcher)
@@ -150,32 +156,13 @@ def launch(
     return RunEnding(run_dir, ticket.run_id, status, reason, startup_s)
 
 
-def _opened(
-    stack: contextlib.ExitStack, listening: Listening, ticket: Ticket, coordinator: Coordinator
-) -> Opened:
-    """Open the run to other hosts; refused, leave no run directory.
-
-    Raises:
-        CallerError: the address cannot be used, or the invitation cannot be written.
-    """
+@contextlib.contextmanager
+def _no_directory_if_refused(run_dir: Path) -> Iterator[None]:
+    """Remove the run directory if an error says that the run cannot be joined as was asked for."""
     try:
-        return stack.enter_context(open_to_hosts(listening, ticket, coordinator))
+        yield
     except NoackError:
-        shutil.rmtree(ticket.run_dir, ignore_errors=True)
-        raise
-
-
-def _publish_session(stack: contextlib.ExitStack, ticket: Ticket, session: str) -> None:
-    """Publish the ticket for processes started by hand; refused, leave no run directory.
-
-    Raises:
-        CallerError: another run is open in the session.
-        MachineError: the ticket cannot be written.
-    """
-    try:
-        stack.enter_context(published(ticket.model_copy(update={"launched": False}), session))
-    except NoackError:
-        shutil.rmtree(ticket.run_dir, ignore_errors=True)
+        shutil.rmtree(run_dir, ignore_errors=True)
         raise
 
 

@@ -15,17 +15,17 @@ from cosim.live.coordinator import AdmissionPass, Coordinator
 from cosim.live.remote_hosts import Host, load_hosts
 from noack.config.scenario import Scenario
 from noack.config.sections.run_sections import ClocksSection
-from noack.core.errors import CallerError, why
+from noack.core.errors import CallerError, PeerError, why
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.address import Address, family_of, parse_address, text_of
 from noack.runtime.connection_forwarder import forwarding
 from noack.runtime.control_plane import RUNS, run_name
-from noack.runtime.invitation import write_invitation
+from noack.runtime.invitation import own_host
 from noack.runtime.join_ticket import RemoteAccess, Ticket, new_admission_pass
 from noack.runtime.time_exchange import TimeReference, answering
 from noack.runtime.zenoh_session import socket_path
 
-_BACKLOG = 512
+_BACKLOG = 4096
 
 
 class Listening(NamedTuple):
@@ -68,9 +68,12 @@ def listen_address(text: str, option: str = "--listen") -> Address:
         text = f"[{ipaddress.IPv6Address(text)}]"
     if text.endswith("]") or ":" not in text:
         text += ":0"
+    if text.startswith(":") or not text:
+        raise CallerError(f"{option}: expected an address of this host")
     host, port = parse_address(text, option)
     found = ipaddress.ip_address(host.partition("%")[0])
-    if found.is_unspecified or found.is_multicast or found.is_link_local:
+    mapped = isinstance(found, ipaddress.IPv6Address) and found.ipv4_mapped is not None
+    if found.is_unspecified or found.is_multicast or found.is_link_local or mapped:
         raise CallerError(
             f"{option}: {host} is not an address at which other hosts can reach this one; "
             "give one of `ip address`"
@@ -91,9 +94,11 @@ def _listen(address: Address) -> socket.socket:
     try:
         endpoint.bind(address)
         endpoint.listen(_BACKLOG)
-    except OSError as error:
+        own_host(endpoint.getsockname()[:2])  # refuses a broadcast address
+    except (OSError, PeerError) as error:
         endpoint.close()
-        raise CallerError(f"cannot listen on {text_of(address)}: {why(error)}") from None
+        reason = why(error) if isinstance(error, OSError) else error
+        raise CallerError(f"cannot listen on {text_of(address)}: {reason}") from None
     return endpoint
 
 
@@ -104,7 +109,7 @@ def open_to_hosts(
     """Listen for processes of other hosts meanwhile, and make their invitation.
 
     Raises:
-        CallerError: the address cannot be used, or the invitation cannot be written.
+        CallerError: the address cannot be used.
     """
     from cosim.live.tls_keys import coordinator_context, new_tls_keys
 
@@ -133,8 +138,4 @@ def open_to_hosts(
             "launched": False, "admission_pass": shown, "remote": remote,
             "time_reference": times.address,
         }  # fmt: skip
-        invitation = ticket.model_copy(update=invited)
-        if listening.invitation is not None:
-            write_invitation(listening.invitation, invitation)
-            stack.callback(listening.invitation.unlink, missing_ok=True)
-        yield Opened((host, port), invitation)
+        yield Opened((host, port), ticket.model_copy(update=invited))

@@ -1,20 +1,25 @@
 """Forwards the bytes of accepted connections to another socket, on a thread; with TLS or without.
 
-The newest connections have priority: when too many handshakes are unfinished, the oldest is ended.
-So connections that stay half open keep nobody out. Without a valid certificate a connection gets
-no byte further than the handshake.
+When too many handshakes are unfinished, the oldest one is ended of the host that has the most. So
+connections that stay half open keep nobody out, least of all other hosts. Without a valid
+certificate a connection gets no byte further than the handshake.
 """
 
 import asyncio
 import socket
 import ssl
 import threading
+from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 
 _HANDSHAKE_S = 5.0
 _MOST_HANDSHAKES = 128
 _MOST_CONNECTIONS = 64
+_MOST_AT_ONCE = 64
+"""Connections accepted before others are served. To end one that was not served yet costs little,
+so that the kernel's queue empties also in a flood."""
 _READ_BYTES = 1 << 16
 _NO_DESCRIPTOR_PAUSE_S = 0.05
 
@@ -51,15 +56,16 @@ class _Forwarder:
     ) -> None:
         self._listening, self._target, self._context = listening, target, context
         self._loop = asyncio.new_event_loop()
-        self._handshakes: dict[asyncio.Task[None], None] = {}
-        """Connections whose handshake is not finished, the oldest first."""
+        self._handshakes: dict[asyncio.Task[None], str] = {}
+        """Hosts of the connections whose handshake is not finished, the oldest first."""
         self._connections: set[asyncio.Task[None]] = set()
 
     def run(self) -> None:
         """Accept connections until :meth:`stop`."""
         asyncio.set_event_loop(self._loop)
-        with suppress(asyncio.CancelledError):
-            self._loop.run_until_complete(self._accept())
+        self._loop.add_reader(self._listening, self._accept)
+        self._loop.run_forever()
+        self._loop.remove_reader(self._listening)
         left = asyncio.all_tasks(self._loop)
         for task in left:
             task.cancel()
@@ -69,36 +75,47 @@ class _Forwarder:
 
     def stop(self) -> None:
         """End :meth:`run`, from another thread."""
+        self._loop.call_soon_threadsafe(self._loop.stop)
 
-        def cancel() -> None:
-            for task in asyncio.all_tasks(self._loop):
-                task.cancel()
-
-        self._loop.call_soon_threadsafe(cancel)
-
-    async def _accept(self) -> None:
-        while True:
+    def _accept(self) -> None:
+        """Accept the waiting connections."""
+        for _ in range(_MOST_AT_ONCE):
             try:
-                connection, _ = await self._loop.sock_accept(self._listening)
+                connection, source = self._listening.accept()
+            except BlockingIOError:
+                return
             except OSError:  # its other end has gone, or there are no descriptors left
-                await asyncio.sleep(_NO_DESCRIPTOR_PAUSE_S)
-                continue
+                self._loop.remove_reader(self._listening)
+                self._loop.call_later(
+                    _NO_DESCRIPTOR_PAUSE_S, self._loop.add_reader, self._listening, self._accept
+                )
+                return
             if len(self._handshakes) >= _MOST_HANDSHAKES:
-                oldest = next(iter(self._handshakes))
-                del self._handshakes[oldest]
-                oldest.cancel()
-            self._loop.create_task(self._serve(connection)).add_done_callback(self._forget)
+                self._end_one()
+            task = self._loop.create_task(self._serve(connection))
+            self._handshakes[task] = source[0]
+            # Closes the connection if the task ends before it begins.
+            task.add_done_callback(partial(self._forget, connection))
 
-    def _forget(self, task: asyncio.Task[None]) -> None:
+    def _end_one(self) -> None:
+        """End the oldest handshake of the host that has the most."""
+        crowd = Counter(self._handshakes.values()).most_common(1)[0][0]
+        oldest = next(task for task, host in self._handshakes.items() if host == crowd)
+        del self._handshakes[oldest]
+        oldest.cancel()
+
+    def _forget(self, accepted: socket.socket, task: asyncio.Task[None]) -> None:
+        accepted.close()
         self._handshakes.pop(task, None)
         self._connections.discard(task)
         if not task.cancelled():
             task.exception()  # what failed concerns this connection only
 
-    async def _serve(self, connection: socket.socket) -> None:
+    async def _serve(self, accepted: socket.socket) -> None:
         task = asyncio.current_task()
         assert task is not None
-        self._handshakes[task] = None
+        connection = socket.socket(fileno=accepted.detach())
+        connection.setblocking(False)
         reader = asyncio.StreamReader()
         protocol = asyncio.StreamReaderProtocol(reader)
         transport, _ = await self._loop.connect_accepted_socket(
@@ -119,6 +136,7 @@ class _Forwarder:
     async def _forward(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Copy both directions until one ends."""
         inner_reader, inner_writer = await self._target()
+        inner_writer.transport.set_write_buffer_limits(0)  # at the end, nothing waits to be written
         copies = [
             self._loop.create_task(_copy(reader, inner_writer)),
             self._loop.create_task(_copy(inner_reader, writer)),

@@ -37,9 +37,8 @@ def _require_number(host: str) -> str:
     return host
 
 
-SocketAddress = tuple[
-    Annotated[str, AfterValidator(_require_number)], Annotated[int, Field(ge=1, le=65_535)]
-]
+NumericHost = Annotated[str, AfterValidator(_require_number)]
+SocketAddress = tuple[NumericHost, Annotated[int, Field(ge=1, le=65_535)]]
 """Numeric host and port."""
 
 

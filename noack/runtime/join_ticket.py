@@ -20,7 +20,7 @@ from noack.core.errors import CallerError, PeerError
 from noack.impairments.kept_loss import found_probabilities, remember
 from noack.protocol.datagram_seal import KEY_BYTES
 from noack.runtime.address import LOOPBACK
-from noack.runtime.control_messages import SocketAddress
+from noack.runtime.control_messages import NumericHost, SocketAddress
 from noack.runtime.host_clock import clock_identity
 from noack.runtime.lock_file import live_lock_file, lock_file
 from noack.runtime.private_folder import private_folder, require_name
@@ -32,7 +32,7 @@ DEFAULT_SESSION = "default"
 class RemoteAccess(ScenarioSection):
     """How a process on another host reaches the coordinator: by TLS, with keys made for the run."""
 
-    host: str
+    host: NumericHost
     port: Annotated[int, Field(ge=1, le=65_535)]
     authority: str  # certificates, and the key of this one, as PEM text
     certificate: str

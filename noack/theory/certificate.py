@@ -23,7 +23,7 @@ from noack.theory.certificate_terms import (
 )
 from noack.theory.error_gains import ErrorGains, Output
 from noack.theory.error_growth import LONGEST_S, TriggerBound
-from noack.theory.error_inequalities import ErrorInequalities
+from noack.theory.error_inequalities import ErrorInequalities, ErrorWay
 from noack.theory.kernel_bounds import NotDecayingError
 from noack.theory.plant_gains import PlantGains
 from noack.theory.sharpened_bounds import InvariantEllipsoids, SharpenedBounds
@@ -123,9 +123,10 @@ def solve_sum(
     """Return the constants of several parts, whose bounds hold when they are added.
 
     All inequalities are linear in functions of time, for given events. So the causes may be
-    divided: what decays is one part, what persists another one. The threshold is at least the sum
-    of the parts' ``reached``, so the next event needs one part that reaches its own. The
-    ``earlier_error`` is that of the first part.
+    divided: what decays is one part, what persists another one. All parts bound e_c in the same
+    way, since the sum of solutions of different inequalities bounds nothing. The threshold is at
+    least the sum of the parts' ``reached``, so the next event needs one part that reaches its own.
+    The ``earlier_error`` is that of the first part.
 
     Raises: as :func:`solve`.
     """
@@ -137,7 +138,8 @@ def solve_sum(
             step.use_windows()
 
     def constants(spacing_s: float, inter_event_s: float | None) -> list[Constants]:
-        return [step.constants(spacing_s, inter_event_s) for step in steps]
+        found, _ = _smallest(steps, spacing_s)
+        return [one._replace(inter_event_s=inter_event_s) for one in found]
 
     apart_s = max(part.bound.apart_s for part in parts)
     least_s = max(conditions.spacing_s, apart_s)
@@ -155,12 +157,13 @@ def solve_sum(
             break
         found_s = math.inf
         try:
-            for step in reversed(steps):  # what persists usually comes first
-                found_s = min(found_s, step.inter_event_s(spacing_s))
-                if found_s <= least_s:
-                    break
+            found, way = _smallest(steps, spacing_s)
         except VoidError:
             break
+        for step, one in zip(reversed(steps), reversed(found), strict=True):
+            found_s = min(found_s, step.inter_event_s(one, way))
+            if found_s <= least_s:  # often by what persists, which is the last part
+                break
         if found_s >= spacing_s:
             return constants(spacing_s, spacing_s)
         # Iterate from above to the largest spacing that is consistent with itself.
@@ -168,3 +171,23 @@ def solve_sum(
     if void is not None:
         raise void
     return constants(least_s, least_s or None)
+
+
+def _smallest(
+    steps: Sequence[ErrorInequalities], spacing_s: float
+) -> tuple[list[Constants], ErrorWay]:
+    """Return the constants of all parts with the way to bound e_c that bounds x tighter.
+
+    Raises:
+        VoidError: no loop gain is below 1.
+    """
+    found, void = list[tuple[list[Constants], ErrorWay]](), VoidError("")
+    for way in ErrorWay:
+        if all(way in step.ways for step in steps):
+            try:
+                found.append(([step.constants(spacing_s, way) for step in steps], way))
+            except VoidError as error:
+                void = min(void, error, key=lambda one: one.loop_gain)
+    if not found:
+        raise void
+    return min(found, key=lambda one: sum(constants.state for constants in one[0]))

@@ -18,6 +18,7 @@ if the loop gain is below 1.
 
 import math
 from collections.abc import Mapping, Sequence
+from enum import Enum
 from functools import cached_property
 from types import MappingProxyType
 from typing import NamedTuple
@@ -33,6 +34,13 @@ from noack.theory.nonnegative_system import Solution, solve_inequalities
 from noack.theory.plant_gains import Coefficients
 
 _SIGNALS = 6
+
+
+class ErrorWay(Enum):
+    """How e_c is bounded. Bounds of several parts may be added only if they use the same way."""
+
+    MISSING = "by e_s and by the errors of all missing events"
+    DRIFTING = "by its value d ago, and by what has driven it since"
 
 
 class ErrorInequalities:
@@ -56,30 +64,29 @@ class ErrorInequalities:
         if self._error.decays:
             self._lost = LossAccumulation(self._plant, self._conditions.delay_s)
 
-    def constants(self, spacing_s: float, inter_event_s: float | None) -> Constants:
-        """Return all constants, given inter-event times of at least ``spacing_s``."""
-        return self._best(spacing_s)[0]._replace(inter_event_s=inter_event_s)
+    @property
+    def ways(self) -> Sequence[ErrorWay]:
+        """The ways in which e_c can be bounded."""
+        if self._conditions.delay_s > 0 and self._error.decays:
+            return [*ErrorWay]
+        return [ErrorWay.MISSING]
 
-    def _best(self, spacing_s: float) -> tuple[Constants, float]:
-        """Return the tighter constants of both bounds of e_c, and D_K's part of the present e_s."""
-        error, events = self._error, self._missing(spacing_s)
-        bounds = [_ErrorBound(
+    def constants(self, spacing_s: float, way: ErrorWay) -> Constants:
+        """Return all constants but δ, given inter-event times of at least ``spacing_s``.
+
+        Raises:
+            VoidError: the loop gain is not below 1.
+        """
+        events = self._missing(spacing_s)
+        if way is ErrorWay.DRIFTING:
+            return self._constants(self._drifting(spacing_s), events, spacing_s)
+        error = self._error
+        bound = _ErrorBound(
             {output: error.now(output) for output in error.outputs},
             {output: self._missing_gain(output, events, spacing_s) for output in error.outputs},
             self._missing_gain(Output.GAIN, events - self._conditions.dropouts, spacing_s),
-            error.now(Output.GAIN),
-        )]  # fmt: skip
-        if self._conditions.delay_s > 0 and error.decays:
-            bounds.append(self._drifting(spacing_s))
-        found, void = [], VoidError("")
-        for bound in bounds:
-            try:
-                found.append((self._constants(bound, events, spacing_s), bound.own))
-            except VoidError as error_:
-                void = min(void, error_, key=lambda one: one.loop_gain)
-        if not found:
-            raise void
-        return min(found, key=lambda one: one[0].state)
+        )
+        return self._constants(bound, events, spacing_s)
 
     def _drifting(self, spacing_s: float) -> "_ErrorBound":
         """Return the bound of e_c by its value d ago, and by what has driven it since.
@@ -90,7 +97,6 @@ class ErrorInequalities:
         return _ErrorBound(
             {output: kernel.sup() for output, kernel in kernels.items()},
             {output: error.missing(output, dropouts, spacing_s) for output in kernels},
-            0.0,
             0.0,
             self._drift,
         )
@@ -220,9 +226,10 @@ class ErrorInequalities:
             found[output] = min(found[output], together)
         return found
 
-    def inter_event_s(self, spacing_s: float) -> float:
-        """Return the time that ‖e_s‖_W needs to the next event, given the spacing before it."""
-        found, own = self._best(spacing_s)
+    def inter_event_s(self, found: Constants, way: ErrorWay) -> float:
+        """Return the time that ‖e_s‖_W needs to the next event, given the constants until then."""
+        # The part of D_K that is the e_s of now.
+        own = 0.0 if way is ErrorWay.DRIFTING else self._error.now(Output.GAIN)
         sensor_error = found.overshoot * self.unit - found.estimation_error
         others = found.input_error - own * sensor_error
         estimation = found.estimation_error
@@ -263,8 +270,6 @@ class _ErrorBound(NamedTuple):
     """The gain of the events that are missing then."""
     in_flight: float
     """The part of missing_K that is not lost."""
-    own: float
-    """The part of present_K that is the e_s of now."""
     drift: Mapping[Output, tuple[float, float, float]] = MappingProxyType({})
     """The gains of what has driven e_c since then; none without a delay."""
 

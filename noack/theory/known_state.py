@@ -13,6 +13,7 @@ scaled by e^{αt}. From d after the event until the next one, j is the number of
 newest one that the controller has received. All integrals are tabulated once for a certificate.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -58,53 +59,45 @@ class KnownStatePart:
         decayed = np.exp(-self.constants.rate_per_s * t_s)
         return np.asarray(np.maximum(decayed, self.floor_share))
 
-    @cached_property
-    def controller_errors(self) -> Vector:
-        """Scaled bounds of ‖e_c‖_W by the number of missing events; the last holds for any."""
+    @property
+    def controller_errors(self) -> tuple[Vector, float]:
+        """Scaled bounds of ‖e_c‖_W by the number of missing events, and one for any number."""
         found = self.constants
-        return self._by_missing(Output.WEIGHTED, self._event_error, found.delta * self.unit)
+        return self._by_missing(Output.WEIGHTED, self._event_error), found.delta * self.unit
 
-    @cached_property
-    def input_errors(self) -> Vector:
-        """Scaled bounds of ‖u − Kx‖ by the number of missing events; the last holds for any."""
+    @property
+    def input_errors(self) -> tuple[Vector, float]:
+        """Scaled bounds of ‖u − Kx‖ by the number of missing events, and one for any number."""
         found = self.constants
-        largest = max(found.input_error, found.start_error)
-        return self._by_missing(Output.GAIN, found.received_input_error, largest)
+        by_missing = self._by_missing(Output.GAIN, found.received_input_error)
+        return by_missing, max(found.input_error, found.start_error)
 
     @property
     def _event_error(self) -> float:
         """β̃ + η, the largest x_s − x̂ at an event, scaled."""
         return self.constants.overshoot * self.unit
 
-    def _by_missing(self, output: Output, none: float, largest: float) -> Vector:
+    def _by_missing(self, output: Output, none: float) -> Vector:
         """Return none + Σ_{i<j} sup_{τ≥iδ} ‖C e^{(H+αI)τ} W^{−1}‖ (β̃ + η) for each j."""
         error, most = self.plant.error, self.constants.missing_events
-        found = np.array([none])
-        if error.decays:
-            ages_s = (self.constants.inter_event_s or 0.0) * np.arange(most, dtype=np.float64)
-            found = none + np.append(0.0, np.cumsum(error.kernels[output].sups(ages_s))) * (
-                self._event_error
-            )
-        return np.asarray(np.minimum(np.append(found, largest), largest))
+        if not error.decays:
+            return np.array([none])
+        ages_s = (self.constants.inter_event_s or 0.0) * np.arange(most, dtype=np.float64)
+        sums = np.append(0.0, np.cumsum(error.kernels[output].sups(ages_s)))
+        return np.asarray(none + sums * self._event_error)
 
-    def deviation(self, age_s: Vector, missing: Counts, delay_s: float) -> Vector:
+    def deviation(
+        self, input_errors: Vector, age_s: Vector, missing: Counts, delay_s: float
+    ) -> Vector:
         """Return the scaled bound of the deviation from the prediction, (k,)."""
-        known, forced = self._of(self.input_errors, missing), self._forced
+        known, forced = _entries(input_errors, missing), self._forced
         whole = integral_until(forced, age_s)
         # In the time d after the event, updates before it may be in flight.
         latest = np.minimum(age_s, delay_s) * forced.sups(np.maximum(age_s - delay_s, 0.0))
-        found = known * whole + (self.input_errors[-1] - known) * np.minimum(latest, whole)
+        found = known * whole + (input_errors[-1] - known) * np.minimum(latest, whole)
         if self.constants.estimation_error:
             found = found + self.constants.estimation_error * self._estimated.sups(age_s)
         return np.asarray(found)
-
-    def controller_error(self, missing: Counts) -> Vector:
-        """Return the scaled bound of ‖e_c‖_W, (k,)."""
-        return self._of(self.controller_errors, missing)
-
-    @staticmethod
-    def _of(table: Vector, missing: Counts) -> Vector:
-        return np.asarray(table[np.clip(missing, 0, len(table) - 1)])
 
 
 @dataclass(frozen=True)
@@ -128,7 +121,8 @@ class KnownStateBounds:
             missing: number of events after the newest one that the controller has received, (k,).
         """
         each = [
-            part.level(t_s) * part.deviation(age_s, missing, self.delay_s) for part in self.parts
+            part.level(t_s) * part.deviation(errors, age_s, missing, self.delay_s)
+            for part, errors in zip(self.parts, self._input_errors, strict=True)
         ]
         found = np.asarray(sum(each) + self._disturbed(age_s))
         if self.other is None:
@@ -137,10 +131,22 @@ class KnownStateBounds:
 
     def controller_error(self, t_s: Vector, missing: Counts) -> Vector:
         """Bound ‖e_c‖_W at times t, (k,), given the numbers of missing events."""
-        found = np.asarray(sum(p.level(t_s) * p.controller_error(missing) for p in self.parts))
+        each = [
+            part.level(t_s) * _entries(errors, missing)
+            for part, errors in zip(self.parts, self._controller_errors, strict=True)
+        ]
+        found = np.asarray(sum(each))
         if self.other is None:
             return found
         return np.asarray(np.minimum(found, self.other.controller_error(t_s, missing)))
+
+    @cached_property
+    def _controller_errors(self) -> list[Vector]:
+        return _together([part.controller_errors for part in self.parts])
+
+    @cached_property
+    def _input_errors(self) -> list[Vector]:
+        return _together([part.input_errors for part in self.parts])
 
     def _disturbed(self, age_s: Vector) -> Vector:
         if not self.disturbances.size:
@@ -159,6 +165,24 @@ class KnownStateBounds:
             total += response(unscaled, column[:, None]).through(identity).integral()
         sums = np.append(0.0, np.cumsum(followed.areas_of_columns(identity)))
         return followed.edges_s, np.append(sums, max(total, float(sums[-1])))
+
+
+def _together(parts: Sequence[tuple[Vector, float]]) -> list[Vector]:
+    """Return each part's bounds by the number of missing events; the last holds for any number.
+
+    For each number all parts take the bound that is made for it, or all the one for any number:
+    bounds of parts may be added only if they bound the signal in the same way.
+    """
+    count = min(len(by_missing) for by_missing, _ in parts)
+    is_smaller = np.all([by_missing[:count] <= most for by_missing, most in parts], axis=0)
+    return [
+        np.append(np.where(is_smaller, by_missing[:count], most), most)
+        for by_missing, most in parts
+    ]
+
+
+def _entries(table: Vector, missing: Counts) -> Vector:
+    return np.asarray(table[np.clip(missing, 0, len(table) - 1)])
 
 
 def integral_until(kernel: KernelBounds, age_s: Vector) -> Vector:

@@ -132,11 +132,20 @@ def test_without_an_invitation_nothing_is_reached(start: Start, tmp_path: Path) 
     assert other.poll() is None
 
 
+def test_a_refused_run_leaves_the_invitation_of_another(start: Start, tmp_path: Path) -> None:
+    record(start, tmp_path, "10.83.3.1")
+    known = (tmp_path / "invitation.json").read_text()
+    refused = start(0, "record", "lane_following", "--listen", "10.83.3.1", *live.BARE)
+    assert "another run is open in it" in ended(refused)[1]
+    assert (tmp_path / "invitation.json").read_text() == known
+
+
 @pytest.mark.parametrize(
     ("address", "reason"),
     [
         ("0.0.0.0", "--listen: 0.0.0.0 is not an address at which other hosts can reach this one"),
         ("10.83.3.77", "cannot listen on 10.83.3.77:0: Cannot assign requested address"),
+        ("10.83.3.255", "cannot listen on 10.83.3.255:0: cannot reach 10.83.3.255:"),
         ("nonsense:port", "--listen: expected HOST:PORT"),
     ],
 )

@@ -25,7 +25,9 @@ def test_an_address_may_lack_its_port(text: str, address: tuple[str, int]) -> No
     assert listen_address(text) == address
 
 
-@pytest.mark.parametrize("text", ["0.0.0.0", "::", "224.0.0.1", "fe80::1", "169.254.1.1:7400"])
+@pytest.mark.parametrize(
+    "text", ["0.0.0.0", "::", "224.0.0.1", "fe80::1", "169.254.1.1:7400", "::ffff:1.2.3.4"]
+)
 def test_an_address_that_others_cannot_reach_is_refused(text: str) -> None:
     with pytest.raises(CallerError, match="not an address at which other hosts can reach this one"):
         listen_address(text)
@@ -34,6 +36,8 @@ def test_an_address_that_others_cannot_reach_is_refused(text: str) -> None:
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
+        ("", "--listen: expected an address of this host"),
+        (":7400", "--listen: expected an address of this host"),
         ("host.invalid", "--listen: host.invalid: no such host"),
         ("192.0.2.1:port", "--listen: expected HOST:PORT"),
     ],

@@ -4,6 +4,7 @@ import asyncio
 import socket
 import ssl
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
@@ -42,14 +43,19 @@ def echo() -> Iterator[socket.socket]:
             yield outer
 
 
-def connected(address: tuple[str, int], keys: TlsKeys, own: KeyPair | None) -> ssl.SSLSocket:
+def connected(
+    address: tuple[str, int],
+    keys: TlsKeys,
+    own: KeyPair | None,
+    plain: socket.socket | None = None,
+) -> ssl.SSLSocket:
     context = ssl.create_default_context(cadata=keys.authority)
     if own is not None:
         with tempfile.TemporaryDirectory() as folder:
             (path := Path(folder) / "own.pem").write_text(own.private_key + own.certificate)
             context.load_cert_chain(path)
     with ExitStack() as stack:
-        plain = stack.enter_context(socket.create_connection(address, timeout=60))
+        plain = stack.enter_context(plain or socket.create_connection(address, timeout=60))
         connection = context.wrap_socket(plain, server_hostname="127.0.0.1")
         stack.pop_all()
     return connection
@@ -76,6 +82,21 @@ def test_bytes_pass_beside_a_crowd_of_half_open_connections() -> None:
             assert echoed(connection, MESSAGE[:1000]) == MESSAGE[:1000]
 
 
+def test_a_crowd_of_one_host_does_not_end_the_handshake_of_another() -> None:
+    with echo() as listening, ExitStack() as stack:
+        address = listening.getsockname()
+
+        def begun(host: str) -> socket.socket:
+            one = socket.create_connection(address, timeout=60, source_address=(host, 0))
+            return stack.enter_context(closing(one))
+
+        first = begun("127.0.0.3")
+        crowd = [begun("127.0.0.2") for _ in range(300)]
+        assert crowd[100].recv(1) == b""  # so many were ended
+        with connected(address, KEYS, KEYS.joining, first) as connection:
+            assert echoed(connection, MESSAGE[:1000]) == MESSAGE[:1000]
+
+
 def test_a_long_message_passes_unchanged() -> None:
     with echo() as listening, connected(listening.getsockname(), KEYS, KEYS.joining) as connection:
         for at in range(0, len(MESSAGE), 32_000):
@@ -98,3 +119,24 @@ def test_without_a_certificate_of_the_run_nothing_passes(own: KeyPair | None) ->
 def test_a_coordinator_of_another_run_is_refused() -> None:
     with echo() as listening, pytest.raises(ssl.SSLCertVerificationError):
         connected(listening.getsockname(), new_tls_keys("127.0.0.1"), KEYS.joining)
+
+
+def test_what_was_sent_before_the_end_arrives_at_a_slow_target() -> None:
+    near, far = socket.socketpair()
+
+    async def slow() -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        return await asyncio.open_connection(sock=near)
+
+    with (
+        socket.create_server(("127.0.0.1", 0)) as listening,
+        forwarding(listening, slow),
+        closing(far),
+    ):
+        far.settimeout(60)
+        with socket.create_connection(listening.getsockname(), timeout=60) as connection:
+            connection.sendall(MESSAGE)
+        found = b""
+        while part := far.recv(4096):
+            found += part
+            time.sleep(0.001)
+        assert found == MESSAGE

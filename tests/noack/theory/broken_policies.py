@@ -1,15 +1,16 @@
 """Certificates of policies that leave out one part of what the trigger does."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 from unittest.mock import patch
 
 from noack.config.scenario import Scenario
-from noack.theory import scenario_certificates
-from noack.theory.certificate_terms import NetworkConditions
+from noack.theory import certificate, scenario_certificates
+from noack.theory.certificate_terms import Constants, NetworkConditions
 from noack.theory.certified_bounds import ScenarioCertificate
 from noack.theory.error_growth import TriggerBound
+from noack.theory.error_inequalities import ErrorInequalities, ErrorWay
 from noack.theory.scenario_certificates import certify, trigger_bounds
 from noack.theory.trigger_bounds import TriggerBounds
 from noack.trigger.error_promise import ErrorPromise
@@ -77,6 +78,21 @@ def without_one_loss(resolved: Scenario, conditions: Conditions) -> ScenarioCert
     return certify(resolved, conditions._replace(dropouts=conditions.dropouts - 1))
 
 
+def with_own_ways(resolved: Scenario, conditions: Conditions) -> ScenarioCertificate:
+    """Each part bounds e_c in the way that is tighter for it, and the bounds are added."""
+
+    true = certificate._smallest
+
+    def smallest(
+        steps: Sequence[ErrorInequalities], spacing_s: float
+    ) -> tuple[list[Constants], ErrorWay]:
+        found = [true([step], spacing_s) for step in steps]
+        return [constants for (constants,), _ in found], found[0][1]
+
+    with patch.object(certificate, "_smallest", smallest):
+        return certify(resolved, conditions)
+
+
 INSTANT = {"delay_steps": 0, "hold_steps": 0, "known_start": True, "window": (1, 1), "recovery": 0}
 FAR = {"n": 1, "m": 1, "mismatch": 0.5, "step_share": 0.01, "sample_steps": 1, **INSTANT}
 
@@ -85,6 +101,10 @@ BROKEN_POLICIES: dict[str, tuple[str, Callable[[Scenario, Conditions], Any], dic
         f"{kind}, one loss less": (kind, without_one_loss, {**FAR, "mansd": 1, "beta": 0.01})
         for kind in ("absolute", "mixed", "quadratic", "deadline", "self_triggered")
     },
+    "absolute, each part its own bound of e_c": (
+        "absolute", with_own_ways,
+        {**FAR, "mansd": 0, "beta": 0.01, "delay_steps": 4, "step_share": 0.002},
+    ),
     "relative, no share": ("relative", with_trigger(NoShares), {**FAR, "mansd": 0}),
     "mixed, no share": ("mixed", with_trigger(NoShares), {**FAR, "mansd": 0, "beta": 0.01}),
     "quadratic, no cross term": (
