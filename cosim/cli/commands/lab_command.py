@@ -1,5 +1,6 @@
 """``noack lab``: a page for trying settings, running live and opening runs."""
 
+import sys
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
@@ -26,6 +27,7 @@ def lab(
     browser: Annotated[
         bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")
     ] = True,
+    json: cli.JsonOption = False,
 ) -> int:
     """Open a page in the browser: drag settings, watch the loop, run it live.
 
@@ -49,5 +51,13 @@ def lab(
     _ = draft.scenario  # report mistakes here
     query = draft.query() if settings else ""
     options = LabOptions(scenario, query, Path.cwd(), runs, port, browser)
-    serve(options, lambda address: print(f"noack lab: {address}  (Ctrl-C ends)", flush=True))
+
+    def announce(address: str) -> None:
+        if json:
+            cli.print_json({"address": address})
+        else:
+            print(f"noack lab: {address}  (Ctrl-C ends)")
+        sys.stdout.flush()  # somebody waits for it
+
+    serve(options, announce)
     return ExitStatus.OK

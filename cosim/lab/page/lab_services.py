@@ -32,7 +32,9 @@ class LabServices:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        for worker in multiprocessing.active_children():  # it may compute for seconds
+            worker.kill()
+        self._pool.shutdown(wait=True, cancel_futures=True)
         if self.live is not None:
             self.live.stop()
 

@@ -39,7 +39,7 @@ def opened(directory: Path) -> Opened:
         text = io.StringIO()
         figure.savefig(text, format="svg")
         figures.append((name, text.getvalue()))
-    claims = [(str(one["verdict"]), str(one["claim"])) for one in run.claims]
+    claims = [(str(one["verdict"]), f"{one['what']} ({one['source']})") for one in run.claims]
     return Opened(run_facts(run), claims, figures)
 
 
