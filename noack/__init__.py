@@ -27,7 +27,7 @@ else:
 
 
 __all__ = [
-    "Certificates", "Measurement", "NoackError", "Run", "Scenario", "__version__", "certify",
-    "compare", "from_system", "load", "margin", "measure", "open_run", "reproduce", "run",
-    "simulate", "with_settings",
+    "CampaignResult", "Certificates", "Measurement", "NoackError", "Run", "Scenario",
+    "__version__", "campaign", "certify", "compare", "from_system", "load", "margin", "measure",
+    "open_run", "reproduce", "run", "simulate", "with_settings",
 ]  # fmt: skip

@@ -6,6 +6,8 @@ function imports these modules when it is first called.
 
 from importlib.metadata import version
 
+from cosim.api.campaigns import CampaignResult as CampaignResult
+from cosim.api.campaigns import campaign as campaign
 from cosim.api.certificates import certify as certify
 from cosim.api.certificates import margin as margin
 from cosim.api.measurements import measure as measure

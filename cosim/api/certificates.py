@@ -10,6 +10,13 @@ from noack.theory.joint_spectral_radius import ACCURACY
 def certify(scenario: Source, *, weight: str = "given", late: int | None = None) -> Certificates:
     """Return the certificates of a scenario, with their constants and conditions.
 
+    >>> import noack
+    >>> found = noack.certify("lane_following")
+    >>> found.schedule.constants is None  # there is one
+    False
+    >>> print(f"no two events closer than {1e3 * found.schedule.inter_event_s:.0f} ms")
+    no two events closer than 8 ms
+
     Args:
         scenario: a scenario, or a source that :func:`noack.load` accepts.
         weight: W of the trigger's norm: ``given`` by the scenario, ``identity``, or ``chosen`` so
@@ -29,6 +36,10 @@ def margin(
     scenario: Source, *, most_m: int = MOST_M, accuracy: float = ACCURACY, period: bool = True
 ) -> MarginResult:
     """Return the largest M for which a loop is stable under every loss pattern.
+
+    >>> import noack
+    >>> noack.margin("lane_periodic", most_m=3, period=False).stable_m
+    3
 
     Args:
         scenario: a scenario whose trigger has a longest time between two events, as ``periodic``

@@ -17,6 +17,11 @@ def measure(
 ) -> Measurement:
     """Measure a network from a packet trace, as ``noack measure`` does.
 
+    >>> import noack
+    >>> found = noack.measure("rural_n8_10kmh", deadline_s=0.1)
+    >>> found.longest_loss_burst >= 1
+    True
+
     Args:
         sources: a file, the name of a shipped trace, or files that belong together.
         deadline_s: a packet that takes longer counts as lost.

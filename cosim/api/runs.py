@@ -311,6 +311,13 @@ def _reopen_loop(folder: Path, _: Run) -> "Outcome":
 def simulate(scenario: Source, *, runs: Folder | None = None) -> Run:
     """Run a scenario in virtual time: the same machines and losses, no sockets, never late.
 
+    >>> import noack
+    >>> run = noack.simulate(noack.load("lane_following", {"horizon_s": 4.0}))
+    >>> run.ok, run.replay().bit_exact
+    (True, True)
+    >>> run.events().column_names
+    ['event', 't_s', 't_ns', 'interval_s', 'fate', 'received']
+
     Args:
         scenario: a scenario, or a source that :func:`noack.load` accepts.
         runs: folder for the run directory. Without it, the run is in a temporary folder and has no

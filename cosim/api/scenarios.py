@@ -29,6 +29,11 @@ _LOSS_PROBABILITY = 0.5
 def load(source: Source, settings: Mapping[str, Any] | None = None) -> Scenario:
     """Load a scenario.
 
+    >>> import noack
+    >>> scenario = noack.load("lane_following", {"network.mansd": 2})
+    >>> scenario.network.mansd, scenario.trigger.beta
+    (2, 0.5)
+
     Args:
         source: the name of a shipped scenario (``"lane_following"``); or the path of a scenario
             file; or its content as a table, ``{"name": ..., "model": {...}, ...}``. Relative file
@@ -48,6 +53,11 @@ def load(source: Source, settings: Mapping[str, Any] | None = None) -> Scenario:
 
 def with_settings(scenario: Scenario, settings: Mapping[str, Any]) -> Scenario:
     """Return the scenario with other settings; the given scenario is not changed.
+
+    >>> import noack
+    >>> scenario = noack.load("lane_following")
+    >>> noack.with_settings(scenario, {"trigger.beta": 0.3}).trigger.beta
+    0.3
 
     Args:
         scenario: as loaded, or of a run.

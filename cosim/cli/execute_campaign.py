@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,8 +14,7 @@ if TYPE_CHECKING:
 
     from cosim.output.figure_format import FigureFormat
     from cosim.studies.campaign.campaign_file import Campaign
-    from cosim.studies.campaign.campaign_summary import CampaignSummary
-    from cosim.studies.campaign.chunk_store import Store
+    from cosim.studies.campaign.finished_campaign import FinishedCampaign
 
 _PER_CORE = 4
 """Maximum worker processes per core; more gain nothing, and use memory."""
@@ -23,17 +22,6 @@ _PER_CORE = 4
 Workers = Annotated[
     int | None, typer.Option(help="Worker processes; one per core by default.", min=1)
 ]
-
-
-class FinishedCampaign(NamedTuple):
-    """A campaign without missing runs."""
-
-    summary: "CampaignSummary"
-    store: "Store"
-    made: int
-    """Number of runs that were computed now."""
-    files: list[Path]
-    """The written files."""
 
 
 def worker_pool(workers: int | None, scheduler: str | None = None) -> Callable[[Any], Any]:
@@ -53,7 +41,7 @@ def worker_pool(workers: int | None, scheduler: str | None = None) -> Callable[[
 def execute_campaign(
     console: "Console", plan: "Campaign", path: Path, start: Callable[[Any], Any], *,
     folder: Path, draws: int | None = None, figure_format: "FigureFormat | None" = None,
-) -> FinishedCampaign:  # fmt: skip
+) -> "FinishedCampaign":  # fmt: skip
     """Run or continue a campaign; write its page.
 
     Args:
@@ -66,23 +54,12 @@ def execute_campaign(
         figure_format: write each figure as a file, too.
     """
     from cosim.live.progress import runs_bar
-    from cosim.studies.campaign.campaign_grid import base_of, grid
-    from cosim.studies.campaign.campaign_report import write_report
-    from cosim.studies.campaign.campaign_run import run_campaign, terminations_raised
-    from cosim.studies.campaign.campaign_summary import summarise
-    from cosim.studies.campaign.chunk_store import Store, opened
+    from cosim.studies.campaign.finished_campaign import finish_campaign
 
     def say(line: str) -> None:
         console.print(f"noack: {line}", highlight=False, markup=False, soft_wrap=True)
 
-    with console.status("preparing the grid"):
-        points = grid(plan, path)
-    _, base = base_of(plan, path)
-    store = Store(folder, points, draws or plan.draws, plan.chunk)
-    with terminations_raised(), opened(plan, base, store):
-        with start(say) as runner, runs_bar(console) as progress:
-            made = run_campaign(store, runner, progress)
-        with console.status("summarising"):
-            summary = summarise(plan, store)
-            files = write_report(summary, store, base, figure_format)
-    return FinishedCampaign(summary, store, made, files)
+    return finish_campaign(
+        plan, path, folder, lambda: start(say), draws=draws, figure_format=figure_format,
+        show=console.status, bar=runs_bar(console),
+    )  # fmt: skip

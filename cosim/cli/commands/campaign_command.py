@@ -62,7 +62,7 @@ def campaign(
     path = find_shipped(file, "campaigns")
     plan = load(path)
     folder = out or cli.DEFAULT_RUNS / "campaigns" / plan.name
-    summary, _, made, files = execute_campaign(
+    summary, _, _, made, files = execute_campaign(
         console, plan, path, start, folder=folder, draws=draws, figure_format=figure_format
     )
     if json:

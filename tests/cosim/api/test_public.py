@@ -38,7 +38,8 @@ def test_the_public_names_are_the_documented_ones() -> None:
     assert {name.removeprefix("noack.") for name in documented("Names")} == set(noack.__all__)
 
 
-def test_the_members_of_runs_and_certificates_are_the_documented_ones() -> None:
+def test_the_members_of_results_are_the_documented_ones() -> None:
+    assert documented("Campaigns") == members(noack.CampaignResult)
     assert documented("Runs") == members(noack.Run)
     assert documented("Certificates") == members(noack.Certificates)
 
@@ -52,7 +53,7 @@ def test_every_public_name_has_a_docstring(name: str) -> None:
         assert {"Args:", "Raises:"} <= set(text.split())
         for parameter in inspect.signature(found).parameters:
             assert f"    {parameter}: " in text, parameter
-    if found in (noack.Run, noack.Certificates):
+    if found in (noack.CampaignResult, noack.Run, noack.Certificates):
         for member in vars(found).values():
             target = member.fget if isinstance(member, property) else member
             if inspect.isfunction(target) and not target.__name__.startswith("_"):
