@@ -61,13 +61,21 @@ class OwnSpool:
         run_dir: the run's directory.
         role: the process.
         writer: names its files.
+        kept_of: on another host than the recorder's, the run's name; the folder is made there with
+            the first rows.
     """
 
-    def __init__(self, run_dir: Path, role: str, writer: str) -> None:
+    def __init__(
+        self, run_dir: Path, role: str, writer: str, *, kept_of: str | None = None
+    ) -> None:
         self._folder, self._role, self._writer = run_dir / SPOOL, role, writer
+        self._kept_of = kept_of
 
     @cached_property
     def _files(self) -> SpoolWriter:
+        if self._kept_of is not None:
+            with suppress(MachineError):  # another process may write it, too
+                write_whole(self._folder.parent / RUN_NAME_FILE, self._kept_of)
         return SpoolWriter(self._folder, self._writer)
 
     def append(self, table: str, header: bytes, payload: bytes) -> None:
@@ -84,12 +92,6 @@ class OwnSpool:
 
 
 def own_spool(ticket: Ticket, role: str, writer: str) -> OwnSpool:
-    """Return the spool of a process, which the recorder reads.
-
-    On another host its folder is made here, with the run's name.
-    """
-    run_dir = Path(ticket.run_dir)
-    if ticket.remote is not None:
-        with suppress(MachineError):  # another process may write it, too
-            write_whole(run_dir / RUN_NAME_FILE, run_name(ticket.run_id))
-    return OwnSpool(run_dir, role, writer)
+    """Return the spool of a process, which the recorder reads."""
+    kept_of = None if ticket.remote is None else run_name(ticket.run_id)
+    return OwnSpool(Path(ticket.run_dir), role, writer, kept_of=kept_of)

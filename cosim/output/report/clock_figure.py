@@ -1,7 +1,7 @@
 """The figure of the bounds of the clocks' errors, for runs on hosts with different clocks."""
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -72,7 +72,10 @@ def clock_figure(
         keep = one.t_s <= last_s
         t_s, error_us, lost = one.t_s[keep], one.error_us[keep], one.lost[keep]
         # The curves often coincide: the first ones are wider, and stay visible under the last.
-        style = {"color": printed(palette.PROCESSES[process]), "zorder": 2 + 0.1 * i}
+        style: dict[str, Any] = {
+            "color": printed(palette.PROCESSES[process]),
+            "zorder": 2 + 0.1 * i,
+        }
         width = 1.3 + 1.2 * (len(errors) - 1 - i)
         known_us = draw.finite(error_us, positive=True)
         shown += draw.line(axes, t_s, known_us, process, linewidth=width, **style)

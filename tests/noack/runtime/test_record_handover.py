@@ -1,6 +1,7 @@
 """Handing a process's rows over: to a recorder that takes them, one that loses them, and none."""
 
 import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,8 @@ import pytest
 
 from noack.core.errors import NoAnswerError
 from noack.protocol.machine_interface import Record
-from noack.runtime.record_handover import deliver_report
+from noack.runtime.record_handover import OwnSpool, deliver_report
+from noack.runtime.spool import RUN_NAME_FILE, SPOOL
 from noack.runtime.telemetry import ReceivedRows, TelemetryBuffer
 
 ROW = np.dtype([("number", "<i8")])
@@ -36,6 +38,23 @@ class Plane:
             self._rows.add(first, end)
         missing = self._rows.missing(report["rows"]["one"])
         return json.dumps({"rows": {"one": missing} if missing else {}}).encode()
+
+
+@pytest.mark.parametrize("kept_of", [None, "00000000000000ff"])
+def test_the_folder_on_another_host_is_made_with_the_first_rows(
+    tmp_path: Path, kept_of: str | None
+) -> None:
+    """A process that could send everything leaves no folder behind."""
+    run_dir = tmp_path / "runs" / "one"
+    if kept_of is None:
+        run_dir.mkdir(parents=True)
+    spool = OwnSpool(run_dir, "plant", "writer", kept_of=kept_of)
+    assert run_dir.exists() == (kept_of is None)
+    spool.keep_report({"rows": {}})
+    spool._files.close()
+    name = run_dir / RUN_NAME_FILE
+    assert (name.read_text() if name.exists() else None) == kept_of
+    assert len(list((run_dir / SPOOL).iterdir())) == 1
 
 
 @pytest.mark.parametrize(("takes", "stored"), [(1, []), (2, []), (9, [(0, 30)]), (0, None)])
