@@ -8,12 +8,12 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from cosim.record.run_directory import ENVIRONMENT_FILE, read_object
 from noack.core.errors import CallerError, MachineError, PeerError, why
-from noack.runtime.spool import RUN_NAME_FILE, SPOOL
+from noack.runtime.spool import SPOOL, kept_run_name
 
 
 def collect(run_dir: Path, source: str) -> int:
@@ -33,7 +33,7 @@ def collect(run_dir: Path, source: str) -> int:
         found = sorted(path for path in (folder / SPOOL).glob("*.*") if path.is_file())
         if not found:
             raise CallerError(f"{source}: nothing was kept there (no files in {SPOOL}/)")
-        if _run_name(folder) != read_object(run_dir / ENVIRONMENT_FILE).get("run_name"):
+        if kept_run_name(folder) != read_object(run_dir / ENVIRONMENT_FILE).get("run_name"):
             raise CallerError(f"{source}: it was kept of another run than {run_dir}")
         try:
             (run_dir / SPOOL).mkdir(exist_ok=True)
@@ -42,12 +42,6 @@ def collect(run_dir: Path, source: str) -> int:
         except OSError as error:
             raise MachineError(f"{run_dir / SPOOL}: cannot be written: {why(error)}") from None
     return len(found)
-
-
-def _run_name(folder: Path) -> str:
-    with suppress(OSError, UnicodeDecodeError):
-        return (folder / RUN_NAME_FILE).read_text(encoding="ascii")
-    return ""
 
 
 @contextmanager
@@ -67,6 +61,9 @@ def _reachable(source: str) -> Iterator[Path]:
                 f"{source}: no scp here; copy the folder, and give its path here"
             ) from None
         except subprocess.CalledProcessError as error:
-            reason = (error.stderr.strip().splitlines() or ["scp failed"])[-1]
+            lines = error.stderr.strip().splitlines()
+            # ssh's reason is above the last line.
+            reason = [line for line in lines if line != "scp: Connection closed"] or ["scp failed"]
+            reason = reason[-1]
             raise PeerError(f"{source}: {reason}") from None
         yield Path(folder) / "kept"

@@ -72,7 +72,8 @@ def read_invitation(path: Path, runs: Path) -> Ticket:
     that cannot be sent to the recorder stay below ``runs``, in a folder with the run's name.
 
     Raises:
-        CallerError: it cannot be read, other users can read it, or it is no invitation.
+        CallerError: it cannot be read, other users can read it, or it is no invitation; or
+            ``runs`` cannot be written.
         PeerError: there is no route to the coordinator.
     """
     content = _bytes_of(path)
@@ -85,6 +86,7 @@ def read_invitation(path: Path, runs: Path) -> Ticket:
     name = Path(ticket.run_dir).name
     if name in ("", "..") or "\0" in name:
         raise CallerError(f"{path}: not an invitation: its run directory has no name")
+    _require_writable(runs.resolve())
     run_dir = runs.resolve() / name
     host = own_host((ticket.remote.host, ticket.remote.port))
     return ticket.model_copy(update={"host": host, "run_dir": str(run_dir)})
@@ -114,6 +116,17 @@ def _text(content: bytes) -> str:
         return content.decode()
     except UnicodeDecodeError:
         raise CallerError("it is no text") from None
+
+
+def _require_writable(folder: Path) -> None:
+    """Raise CallerError unless a folder can be made or written: rows may have to be kept there."""
+    nearest = folder
+    while not os.access(nearest, os.F_OK) and nearest != nearest.parent:
+        nearest = nearest.parent
+    if not nearest.is_dir():
+        raise CallerError(f"{folder}: rows could not be kept there: {nearest} is no folder")
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        raise CallerError(f"{folder}: rows could not be kept there: {nearest} is not writable")
 
 
 def own_host(other: Address) -> str:

@@ -343,14 +343,15 @@ class RunProcess:
         reachable = self.ended != LAUNCHER_GONE and not self.ended.startswith(RECORDER)
         # All messages to the recorder pass the coordinator.
         reachable = reachable and not self.plane.coordinator_gone()
-        if reachable and deliver_report(self.plane, self.report, telemetry):
-            return
-        telemetry.store_all()
-        self._spool.keep_report(self.report)
-        if self.ticket.remote is not None:
+        delivered = reachable and deliver_report(self.plane, self.report, telemetry)
+        if not delivered:
+            telemetry.store_all()
+            self._spool.keep_report(self.report)
+        if self.ticket.remote is not None and (not delivered or any(telemetry.stored().values())):
+            reason = "the recorder was too slow" if delivered else "cannot reach the recorder"
             print_to_stderr(
-                f"noack {self.role}: cannot reach the recorder; the newest rows are kept in "
-                f"{self.ticket.run_dir} until `noack collect` on the recorder's host"
+                f"noack {self.role}: {reason}; rows are kept in {self._spool.folder} until "
+                "`noack collect` on the recorder's host"
             )
 
 

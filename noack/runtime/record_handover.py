@@ -12,7 +12,13 @@ from noack.runtime.control_messages import MissingRows, PersistedAck, parse_mess
 from noack.runtime.control_plane import ControlPlane, run_name
 from noack.runtime.join_ticket import Ticket
 from noack.runtime.log_lines import NOTICES, notice_number, notices_of
-from noack.runtime.spool import KEPT_REPORT, RUN_NAME_FILE, SPOOL, SpoolWriter
+from noack.runtime.spool import (
+    KEPT_REPORT,
+    RUN_NAME_FILE,
+    SPOOL,
+    SpoolWriter,
+    kept_run_name,
+)
 from noack.runtime.telemetry import TelemetryBuffer, first_row
 
 _REPORT_TIMEOUT_S = 5.0
@@ -55,28 +61,28 @@ def deliver_report(
 
 
 class OwnSpool:
-    """The rows that a process writes to the run's spool itself.
+    """The rows that a process writes to the run's spool itself; its folder is made with the first.
 
     Args:
         run_dir: the run's directory.
         role: the process.
         writer: names its files.
-        kept_of: on another host than the recorder's, the run's name; the folder is made there with
-            the first rows.
+        kept_of: on another host than the recorder's, the name of the run.
     """
 
-    def __init__(
-        self, run_dir: Path, role: str, writer: str, *, kept_of: str | None = None
-    ) -> None:
-        self._folder, self._role, self._writer = run_dir / SPOOL, role, writer
-        self._kept_of = kept_of
+    def __init__(self, run_dir: Path, role: str, writer: str, kept_of: str | None = None) -> None:
+        self._run_dir, self._role, self._writer, self._kept_of = run_dir, role, writer, kept_of
+
+    @cached_property
+    def folder(self) -> Path:
+        """The folder with the spool."""
+        if self._kept_of is None:
+            return self._run_dir
+        return _kept_folder(self._run_dir, self._kept_of)
 
     @cached_property
     def _files(self) -> SpoolWriter:
-        if self._kept_of is not None:
-            with suppress(MachineError):  # another process may write it, too
-                write_whole(self._folder.parent / RUN_NAME_FILE, self._kept_of)
-        return SpoolWriter(self._folder, self._writer)
+        return SpoolWriter(self.folder / SPOOL, self._writer)
 
     def append(self, table: str, header: bytes, payload: bytes) -> None:
         """Write a batch; raise MachineError if it cannot be written."""
@@ -92,6 +98,18 @@ class OwnSpool:
 
 
 def own_spool(ticket: Ticket, role: str, writer: str) -> OwnSpool:
-    """Return the spool of a process, which the recorder reads."""
+    """Return the spool of a process: the recorder reads it, or `noack collect` on another host."""
     kept_of = None if ticket.remote is None else run_name(ticket.run_id)
-    return OwnSpool(Path(ticket.run_dir), role, writer, kept_of=kept_of)
+    return OwnSpool(Path(ticket.run_dir), role, writer, kept_of)
+
+
+def _kept_folder(run_dir: Path, name: str) -> Path:
+    """Make the folder of what is kept of a run, with the run's name in it; return its path.
+
+    Runs of two recorders may have begun in the same second: then their directories have one name.
+    """
+    if kept_run_name(run_dir) not in ("", name):
+        run_dir = run_dir.with_name(f"{run_dir.name}-{name}")
+    with suppress(MachineError):  # another process may write it, too
+        write_whole(run_dir / RUN_NAME_FILE, name)
+    return run_dir

@@ -106,6 +106,13 @@ class Chunk(NamedTuple):
     """Offset of the byte after it."""
 
 
+def kept_run_name(folder: Path) -> str:
+    """Return of which run a folder on another host has rows; empty if none says so."""
+    with contextlib.suppress(OSError, UnicodeDecodeError):
+        return (folder / RUN_NAME_FILE).read_text(encoding="ascii")
+    return ""
+
+
 def spool_files(folder: Path, table: str) -> list[Path]:
     """Return the files of a table, one per writer."""
     return sorted(folder.glob(f"{table}.*"))

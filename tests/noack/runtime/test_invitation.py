@@ -102,6 +102,15 @@ def test_a_spoiled_invitation_is_refused_in_one_line(
     assert "\n" not in str(caught.value)
 
 
+def test_rows_must_have_a_place_before_a_process_joins(tmp_path: Path) -> None:
+    path = tmp_path / "invitation.json"
+    write_invitation(path, INVITED)
+    with pytest.raises(CallerError, match=r"rows could not be kept there: .* is no folder"):
+        read_invitation(path, path / "runs")
+    assert read_invitation(path, tmp_path / "no" / "folder" / "yet").run_dir.endswith("/yet/one")
+    assert not (tmp_path / "no").exists()
+
+
 def test_an_invitation_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     with pytest.raises(CallerError, match="the invitation cannot be written"):
         write_invitation(tmp_path / "no_folder" / "invitation.json", INVITED)

@@ -10,7 +10,7 @@ import pytest
 from noack.core.errors import NoAnswerError
 from noack.protocol.machine_interface import Record
 from noack.runtime.record_handover import OwnSpool, deliver_report
-from noack.runtime.spool import RUN_NAME_FILE, SPOOL
+from noack.runtime.spool import kept_run_name
 from noack.runtime.telemetry import ReceivedRows, TelemetryBuffer
 
 ROW = np.dtype([("number", "<i8")])
@@ -40,23 +40,6 @@ class Plane:
         return json.dumps({"rows": {"one": missing} if missing else {}}).encode()
 
 
-@pytest.mark.parametrize("kept_of", [None, "00000000000000ff"])
-def test_the_folder_on_another_host_is_made_with_the_first_rows(
-    tmp_path: Path, kept_of: str | None
-) -> None:
-    """A process that could send everything leaves no folder behind."""
-    run_dir = tmp_path / "runs" / "one"
-    if kept_of is None:
-        run_dir.mkdir(parents=True)
-    spool = OwnSpool(run_dir, "plant", "writer", kept_of=kept_of)
-    assert run_dir.exists() == (kept_of is None)
-    spool.keep_report({"rows": {}})
-    spool._files.close()
-    name = run_dir / RUN_NAME_FILE
-    assert (name.read_text() if name.exists() else None) == kept_of
-    assert len(list((run_dir / SPOOL).iterdir())) == 1
-
-
 @pytest.mark.parametrize(("takes", "stored"), [(1, []), (2, []), (9, [(0, 30)]), (0, None)])
 def test_rows_that_the_recorder_never_takes_are_stored_and_reported(
     takes: int, stored: list[tuple[int, int]] | None
@@ -75,3 +58,21 @@ def test_rows_that_the_recorder_never_takes_are_stored_and_reported(
         assert plane.reports[-1]["stored"].get("one", []) == stored
         assert len(disk) == len(stored) * 3
         assert len(buffer.stored().get("one", ())) == len(stored)
+
+
+def test_what_two_runs_with_one_directory_keep_stays_apart(tmp_path: Path) -> None:
+    """Runs of two recorders that began in one second, with processes on one host."""
+    header = json.dumps({"first": 0}).encode()
+    one, again, other = (
+        OwnSpool(tmp_path / "run", "sensor", writer, kept_of)
+        for writer, kept_of in [("a", "0001"), ("b", "0001"), ("c", "0002")]
+    )
+    assert not (tmp_path / "run").exists()  # nothing is left of a run that kept nothing
+    for spool in (one, again, other):
+        spool.append("sensor_event", header, b"rows")
+        spool._files.close()
+    assert one.folder == again.folder == tmp_path / "run"
+    assert other.folder == tmp_path / "run-0002"
+    assert [kept_run_name(found) for found in (one.folder, other.folder)] == ["0001", "0002"]
+    assert len(list((one.folder / "spool").iterdir())) == 2
+    assert len(list((other.folder / "spool").iterdir())) == 1
