@@ -136,6 +136,15 @@ LiveOption = Annotated[
         "the address that is printed.",
     ),
 ]
+MetricsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--metrics",
+        metavar="[HOST]:PORT",
+        help="Serve the run's metrics for Prometheus (OpenMetrics) at this address; the loopback "
+        "without a HOST.",
+    ),
+]
 ReportOption = Annotated[
     bool,
     typer.Option(

@@ -1,7 +1,8 @@
 """Functions of all commands that make a run: warnings, the run itself, its verdict."""
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,6 +11,7 @@ from cosim.cli.command import console, print_json
 
 if TYPE_CHECKING:
     from cosim.live.fork_server import ForkServer
+    from cosim.live.launcher import Watcher
     from cosim.live.remote_access import Listening
     from cosim.record.run_ending import RunEnding
     from noack.config.scenario import Scenario
@@ -39,6 +41,7 @@ def run_processes(
     live: bool = False,
     server: "ForkServer | None" = None,
     listening: "Listening | None" = None,
+    metrics: str | None = None,
 ) -> int:
     """Run a scenario live; print its verdict and return the exit status.
 
@@ -51,11 +54,12 @@ def run_processes(
         live: show the run in the viewer.
         server: starts the processes, and ends with the run; by default a new one.
         listening: how processes on other hosts join.
+        metrics: address at which the run's metrics are served.
     """
     from cosim.live.fork_server import fork_server
 
     with fork_server(server) as server:
-        from cosim.live.launcher import launch
+        from cosim.live.launcher import joint_watcher, launch
         from cosim.live.progress import PatientConsole, progress_line
         from noack.protocol.topology import ROLES
 
@@ -63,15 +67,35 @@ def run_processes(
         warn_of_violations(scenario)
         warn_of_other_runs()
         try:
-            with progress_line(PatientConsole(stderr=True), scenario, session) as watcher:
+            with ExitStack() as stack:
+                line = progress_line(PatientConsole(stderr=True), scenario, session)
+                watchers = [stack.enter_context(line)]
+                if metrics is not None:
+                    watchers.append(stack.enter_context(_served_metrics(scenario, metrics)))
                 ending = launch(
                     scenario, runs, spawn=spawn or ROLES, session=session, live=live,
-                    watcher=watcher, server=server, listening=listening,
+                    watcher=joint_watcher(watchers), server=server, listening=listening,
                 )  # fmt: skip
         except OSError:  # a closed terminal must not end the run
             if ending is None:
                 raise
     return finalize_run(ending, output)
+
+
+@contextmanager
+def _served_metrics(scenario: "Scenario", where: str) -> "Iterator[Watcher]":
+    """Serve the metrics of a run within the context; yield what updates them."""
+    from noack.runtime.address import text_of
+    from noack.runtime.command_line import print_to_stderr
+    from noack.runtime.metrics_server import metrics_server, require_package
+
+    require_package()
+    from cosim.live.run_metrics import RunMetrics
+
+    found = RunMetrics(scenario)
+    with metrics_server(where, found.collect) as address:
+        print_to_stderr(f"noack: metrics: http://{text_of(address)}/metrics")
+        yield found.watcher()
 
 
 def warn_of_violations(scenario: "Scenario") -> None:

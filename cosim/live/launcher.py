@@ -11,7 +11,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +60,23 @@ class Watcher:
     failed: Callable[[str, float, str | None], None] = lambda why, t_s, by_hand: None
     restarted: Callable[[str, float], None] = lambda role, t_s: None
     progress: Callable[[dict[str, Any]], None] = lambda progress: None
+
+
+def joint_watcher(watchers: Sequence[Watcher]) -> Watcher:
+    """Return a watcher that calls others in order; after an OSError, no more of that one."""
+    left = list(watchers)
+
+    def call(name: str) -> Callable[..., None]:
+        def each(*arguments: object) -> None:
+            for one in [*left]:
+                try:
+                    getattr(one, name)(*arguments)
+                except OSError:  # nobody reads its output any more
+                    left.remove(one)
+
+        return each
+
+    return Watcher(*(call(field.name) for field in fields(Watcher)))
 
 
 def launch(

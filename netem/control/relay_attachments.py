@@ -18,6 +18,8 @@ from netem.control.statistics_thread import StatisticsThread
 from netem.engine.relay_base import Relay
 from netem.standard_error import say
 from noack.core.errors import CallerError
+from noack.runtime.address import text_of
+from noack.runtime.metrics_server import OPTION, metrics_server, require_package
 
 _VIEW_S = 1.0
 _POLL_S = 0.05
@@ -34,6 +36,8 @@ class Options(NamedTuple):
     """Time between two lines of statistics; None: no lines."""
     stats_file: Path | None = None
     """File for the lines; None: standard output."""
+    metrics: str | None = None
+    """Address of the metrics; None: no metrics."""
     view: bool = False
     """Show live statistics in the terminal."""
 
@@ -54,6 +58,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="print statistics as JSON lines every SECONDS",
     )  # fmt: skip
     group.add_argument("--stats-file", metavar="FILE", help="write these lines to FILE instead")
+    group.add_argument(
+        OPTION, metavar="[HOST]:PORT",
+        help="serve the statistics for Prometheus (OpenMetrics); the loopback without a HOST",
+    )  # fmt: skip
     group.add_argument("--view", action="store_true", help="show live statistics in this terminal")
 
 
@@ -70,7 +78,8 @@ def options_of(parsed: argparse.Namespace) -> Options:
         stats_s = 1.0
     if parsed.view and stats_s is not None and file is None:
         raise CallerError("--view and --stats both use standard output; add --stats-file FILE")
-    return Options(parsed.control, stats_s, Path(file) if file is not None else None, parsed.view)
+    path = Path(file) if file is not None else None
+    return Options(parsed.control, stats_s, path, parsed.metrics, parsed.view)
 
 
 class AttachedRelay(NamedTuple):
@@ -102,6 +111,8 @@ def attached(relay: Relay, options: Options) -> Iterator[AttachedRelay]:
     with ExitStack() as stack:
         if options.stats_s is not None:
             stack.enter_context(_statistics_lines(commands, options.stats_s, options.stats_file))
+        if options.metrics is not None:
+            stack.enter_context(_metrics(commands, options.metrics))
         if options.name is not None:
             stack.enter_context(ControlServer(options.name, commands))
         if options.view:
@@ -114,6 +125,17 @@ def attached(relay: Relay, options: Options) -> Iterator[AttachedRelay]:
         stack.callback(sys.setswitchinterval, sys.getswitchinterval())
         sys.setswitchinterval(_SWITCH_S)
         yield AttachedRelay(commands, screen)
+
+
+@contextmanager
+def _metrics(commands: CommandQueue, where: str) -> Iterator[None]:
+    """Serve metrics within the context."""
+    require_package()
+    from netem.control.emulator_metrics import EmulatorMetrics
+
+    with metrics_server(where, EmulatorMetrics(commands).collect) as address:
+        say(f"metrics: http://{text_of(address)}/metrics")
+        yield
 
 
 @contextmanager

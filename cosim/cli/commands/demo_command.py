@@ -22,6 +22,7 @@ def demo(
     settings: cli.SetOption = None,
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
     live: cli.LiveOption = False,
+    metrics: cli.MetricsOption = None,
     report: cli.ReportOption = True,
     verbose: cli.VerboseOption = False,
     json: cli.JsonOption = False,
@@ -31,5 +32,5 @@ def demo(
     output = RunOutput(report, verbose, json)
     return run_processes(
         lambda: cli.load_scenario("lane_following", wanted), runs, output,
-        live=live, server=context.obj,
+        live=live, server=context.obj, metrics=metrics,
     )  # fmt: skip

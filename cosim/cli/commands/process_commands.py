@@ -50,6 +50,7 @@ def record(
     session: cli.SessionOption = "default",
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
     live: cli.LiveOption = False,
+    metrics: cli.MetricsOption = None,
     listen: Annotated[
         str | None,
         typer.Option(
@@ -85,7 +86,7 @@ def record(
     return run_processes(
         lambda: cli.load_scenario(scenario, settings), runs, output,
         spawn=(RECORDER,), session=session, live=live, server=context.obj,
-        listening=listening,
+        listening=listening, metrics=metrics,
     )  # fmt: skip
 
 

@@ -22,6 +22,7 @@ def run(
     settings: cli.SetOption = None,
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
     live: cli.LiveOption = False,
+    metrics: cli.MetricsOption = None,
     hosts: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="TOML file that places processes on other hosts."),
@@ -38,5 +39,5 @@ def run(
         listening = listening_for(hosts)
     return run_processes(
         lambda: cli.load_scenario(scenario, settings), runs, output,
-        live=live, server=context.obj, listening=listening,
+        live=live, server=context.obj, metrics=metrics, listening=listening,
     )  # fmt: skip

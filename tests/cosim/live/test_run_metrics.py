@@ -1,0 +1,98 @@
+"""The metrics of a live run, read while it goes on."""
+
+import json
+import socket
+import threading
+import time
+import urllib.error
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+import noack
+from cosim.cli import app
+from cosim.live.launcher import Watcher, joint_watcher
+from cosim.live.run_metrics import RunMetrics
+from tests.netem.control.test_emulator_metrics import exposed, values_of
+from tests.noack.runtime.test_metrics_server import read
+
+
+def test_metrics_follow_the_launchers_reports() -> None:
+    found = RunMetrics(noack.load("lane_following"))
+    watcher = found.watcher()
+    values = values_of(exposed(found))
+    assert "noack_run_events_total" not in values
+    assert values["noack_run_loss_burst_limit"] == 4
+    watcher.waiting(["plant", "sensor"])
+    watcher.started(Path("runs/a"))
+    watcher.failed("plant died", 1.0, None)
+    watcher.restarted("plant", 1.5)
+    watcher.progress({
+        "t_s": 2.5, "events": 7, "deliveries": 3, "longest_loss_burst": 4, "x_norm": None,
+        "live": None, "warnings": ["void"], "changes": [],
+    })  # fmt: skip
+    values = values_of(exposed(found))
+    assert values["noack_run_info,lane_following,runs/a"] == 1
+    assert values["noack_run_missing_processes"] == 2
+    assert values["noack_run_restarts_total,plant"] == 1
+    assert values["noack_run_failures_total"] == 1
+    assert values["noack_run_events_total"] == 7
+    assert values["noack_run_simulated_seconds"] == 2.5
+    assert values["noack_run_warnings_total"] == 1
+    assert "noack_run_state_norm" not in values
+
+
+def test_a_watcher_whose_output_is_closed_does_not_stop_the_others() -> None:
+    seen: list[float] = []
+
+    def closed(report: dict[str, float]) -> None:
+        seen.append(-1)
+        raise BrokenPipeError
+
+    joint = joint_watcher([
+        Watcher(progress=closed), Watcher(progress=lambda report: seen.append(report["t_s"]))
+    ])  # fmt: skip
+    joint.progress({"t_s": 1.0})
+    joint.progress({"t_s": 2.0})
+    assert seen == [-1, 1.0, 2.0]
+
+
+def test_a_live_run_serves_its_metrics(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        address = free.getsockname()
+    found: dict[str, float] = {}
+    done = threading.Event()
+
+    def scrape() -> None:
+        while not done.is_set():
+            try:
+                values = values_of(read(address))
+            except (urllib.error.URLError, ConnectionError):
+                time.sleep(0.02)
+                continue
+            found.update(values)
+            time.sleep(0.1)
+
+    reader = threading.Thread(target=scrape)
+    reader.start()
+    words = ["run", "lane_following", "--set", "horizon_s=1", "--set", "ports={}", "--json"]
+    more = ["--no-report", "--runs", str(tmp_path), "--metrics", f":{address[1]}"]
+    try:
+        finished = CliRunner().invoke(app, [*words, *more])
+    finally:
+        done.set()
+        reader.join()
+    assert finished.exit_code == 0, finished.stderr
+    summary = json.loads(finished.stdout)
+    assert 0 < found["noack_run_simulated_seconds"] <= summary["reached_s"]
+    assert found["noack_run_events_total"] <= summary["events"]
+    assert found["noack_run_state_norm"] > 0
+
+
+@pytest.mark.parametrize("where", ["x", "127.0.0.1:1:2"])
+def test_a_wrong_address_starts_no_run(where: str, tmp_path: Path) -> None:
+    words = ["run", "lane_following", "--runs", str(tmp_path), "--metrics", where]
+    done = CliRunner().invoke(app, words)
+    assert (done.exit_code, list(tmp_path.iterdir())) == (2, [])
+    assert done.stderr.splitlines()[-1].startswith("noack: --metrics: expected HOST:PORT")
