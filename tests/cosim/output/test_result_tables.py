@@ -68,7 +68,6 @@ def test_tables_of_a_run_compile_and_have_its_numbers(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("words", "names"), [
     (("certify", "lane_following"), ["certificates", "limits"]),
     (("margin", "lane_periodic", "--most", "2", "--no-period"), ["margin"]),
-    (("campaign", "mb_vs_zoh", "--draws", "2", "--workers", "1"), ["campaign", "differences"]),
 ])  # fmt: skip
 def test_commands_write_their_tables(
     words: tuple[str, ...], names: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

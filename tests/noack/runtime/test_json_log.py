@@ -93,18 +93,6 @@ def test_a_closed_pipe_is_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
         assert log_event("info", "noack", "m")
 
 
-def test_a_run_logs_its_events(tmp_path: Path) -> None:
-    words = ["run", "lane_following", "--set", "horizon_s=0.5", "--set", "ports={}", "--json"]
-    more = ["--no-report", "--runs", str(tmp_path), "--log-format", "jsonl"]
-    done = CliRunner().invoke(app, [*words, *more])
-    assert done.exit_code == 0, done.output
-    found = {one["event"]: one for one in objects(done.stderr) if "event" in one}
-    (run_dir,) = (path for path in tmp_path.iterdir() if not path.is_symlink())
-    assert found["run"]["directory"] == found["end"]["directory"] == str(run_dir)
-    assert (found["end"]["status"], found["end"]["reason"]) == (0, "horizon")
-    assert json.loads(done.stdout)["events"] >= 0
-
-
 def test_a_mistake_is_an_object() -> None:
     done = CliRunner().invoke(app, ["run", "nowhere", "--log-format", "jsonl"])
     (found,) = objects(done.stderr)
