@@ -52,6 +52,7 @@ def record(
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
     live: cli.LiveOption = False,
     metrics: cli.MetricsOption = None,
+    _log_format: cli.LogFormatOption = cli.LogFormat.TEXT,
     listen: Annotated[
         str | None,
         typer.Option(
