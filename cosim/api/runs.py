@@ -162,8 +162,8 @@ class Run:
 
         Args:
             figure: states, errors, state-norm, input or inter-event; for a live run also lateness
-                or latency. Certified bounds are drawn next to the bounded quantity. Of several
-                loops: network, loops or map.
+                or latency, and on hosts with different clocks clocks. Certified bounds are drawn
+                next to the bounded quantity. Of several loops: network, loops or map.
 
         Raises:
             NoackError: the run has no such figure.
