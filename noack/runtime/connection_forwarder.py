@@ -18,9 +18,9 @@ from functools import partial
 _HANDSHAKE_S = 5.0
 _MOST_HANDSHAKES = 128
 _MOST_CONNECTIONS = 64
-_MOST_AT_ONCE = 64
-"""Connections accepted before others are served. To end one that was not served yet costs little,
-so that the kernel's queue empties also in a flood."""
+_MOST_AT_ONCE = 1024
+"""Connections accepted before the accepted ones are served. In a flood most of them are ended
+before they cost a handshake, so that the kernel's queue empties."""
 _READ_BYTES = 1 << 16
 _NO_DESCRIPTOR_PAUSE_S = 0.05
 

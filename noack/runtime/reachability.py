@@ -17,9 +17,7 @@ def why_unreachable(address: Address) -> str:
             "nothing listens there; if `noack record` has ended, copy the invitation of a new one"
         )
     except TimeoutError:
-        return (
-            "no answer; is it the recording host's address, and do firewalls pass TCP to its port?"
-        )
+        return "no answer; is it the recording host's address? Do firewalls pass TCP to this port?"
     except OSError as error:
         return why(error)
     return (

@@ -28,7 +28,7 @@ def test_a_program_with_other_keys(bound: socket.socket) -> None:
 @pytest.mark.parametrize(
     ("error", "text"),
     [
-        (TimeoutError(), "no answer; is it the recording host's address, and do firewalls"),
+        (TimeoutError(), "no answer; is it the recording host's address? Do firewalls"),
         (OSError(113, ""), "No route to host"),
     ],
 )
