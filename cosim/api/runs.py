@@ -196,6 +196,17 @@ class Run:
         found = ((name, draw().figure) for name, draw in self._pictures(bounded=True).items())
         return save_figures(found, self.directory / REPORT_FILE, FigureFormat(format))
 
+    def save_tables(self, folder: Folder) -> list[Path]:
+        """Write the tables of the summary, each as LaTeX (booktabs) and as CSV; return the paths.
+
+        Raises:
+            NoackError: a file cannot be written.
+        """
+        from cosim.output.result_tables import save_tables
+        from cosim.output.run_result_tables import summary_tables
+
+        return save_tables(summary_tables(self.summary), Path(folder))
+
     def report(self) -> Path:
         """Write ``report.html``, a page with all figures, into the run directory; return its path.
 
