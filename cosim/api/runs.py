@@ -162,8 +162,8 @@ class Run:
 
         Args:
             figure: states, errors, state-norm, input or inter-event; for a live run also lateness
-                or latency. Certified bounds are drawn next to the bounded quantity. Of several
-                loops: network, loops or map.
+                or latency, and on hosts with different clocks clocks. Certified bounds are drawn
+                next to the bounded quantity. Of several loops: network, loops or map.
 
         Raises:
             NoackError: the run has no such figure.
@@ -195,6 +195,17 @@ class Run:
             raise CallerError(f'"{format}": a figure is saved as {", ".join(FigureFormat)}')
         found = ((name, draw().figure) for name, draw in self._pictures(bounded=True).items())
         return save_figures(found, self.directory / REPORT_FILE, FigureFormat(format))
+
+    def save_tables(self, folder: Folder) -> list[Path]:
+        """Write the tables of the summary, each as LaTeX (booktabs) and as CSV; return the paths.
+
+        Raises:
+            NoackError: a file cannot be written.
+        """
+        from cosim.output.result_tables import save_tables
+        from cosim.output.run_result_tables import summary_tables
+
+        return save_tables(summary_tables(self.summary), Path(folder))
 
     def report(self) -> Path:
         """Write ``report.html``, a page with all figures, into the run directory; return its path.

@@ -4,6 +4,7 @@ import math
 import pkgutil
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
 from enum import StrEnum
 from functools import wraps
 from importlib import import_module
@@ -21,6 +22,8 @@ from cosim.shipped_files import find_shipped
 from noack.core.errors import ExitStatus, NoackError, why
 from noack.core.python_process import cores as cores
 from noack.runtime.command_line import failed
+from noack.runtime.json_log import LogFormat as LogFormat
+from noack.runtime.json_log import log_format
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -134,6 +137,25 @@ LiveOption = Annotated[
         "--live",
         help="Show the run in the rerun viewer: in a window, or without a display in a browser, at "
         "the address that is printed.",
+    ),
+]
+
+
+def _log_format(context: typer.Context, wanted: LogFormat) -> LogFormat:
+    """Write standard error in this format until the command ends."""
+    stack = ExitStack()
+    stack.enter_context(log_format(wanted))
+    context.find_root().call_on_close(stack.close)
+    return wanted
+
+
+LogFormatOption = Annotated[
+    LogFormat,
+    typer.Option(
+        "--log-format",
+        callback=_log_format,
+        is_eager=True,
+        help="Format of standard error: text, or JSON Lines for log collectors.",
     ),
 ]
 MetricsOption = Annotated[

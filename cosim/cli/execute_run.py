@@ -61,6 +61,7 @@ def run_processes(
     with fork_server(server) as server:
         from cosim.live.launcher import joint_watcher, launch
         from cosim.live.progress import PatientConsole, progress_line
+        from cosim.live.run_log import RunLog
         from noack.protocol.topology import ROLES
 
         scenario, ending = load(), None
@@ -69,7 +70,7 @@ def run_processes(
         try:
             with ExitStack() as stack:
                 line = progress_line(PatientConsole(stderr=True), scenario, session)
-                watchers = [stack.enter_context(line)]
+                watchers = [stack.enter_context(line), RunLog().watcher()]
                 if metrics is not None:
                     watchers.append(stack.enter_context(_served_metrics(scenario, metrics)))
                 ending = launch(
@@ -142,11 +143,13 @@ def finalize_run(ending: "RunEnding", output: RunOutput) -> int:
     """Finish a run's record, print its verdict, and return its exit status."""
     from cosim.live.finalize import finalize
     from cosim.live.progress import PatientConsole
+    from cosim.live.run_log import log_end
     from cosim.output.run_verdict import print_outcome
 
     # This takes minutes for a run of an hour.
     with PatientConsole(stderr=True).status("replaying the run and checking its claims"):
         outcome = finalize(ending, report=output.report)
+    log_end(outcome.status, outcome.reason, outcome.run_dir)
     if output.json:
         print_json(outcome.summary)
     else:

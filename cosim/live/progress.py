@@ -75,9 +75,10 @@ class _RunProgress:
             return
         role = how.role or "plant|sensor|netem|controller"
         self._print(
-            f"listening on {escape(address)} (TCP); {escape(str(how.invitation))} has the secret "
-            f"keys to join for {how.valid_s / 60:g} min: copy it to the other hosts, and there "
-            f"`noack {role} --invitation {escape(how.invitation.name)}`"
+            f"listening on {escape(address)}; copy the invitation to the other hosts, and start "
+            f"processes there within {how.valid_s / 60:g} min; it has secret keys:\n"
+            f"  scp {escape(str(how.invitation))} HOST:\n"
+            f"  noack {role} --invitation {escape(how.invitation.name)}"
         )
 
     @property

@@ -31,7 +31,7 @@ _LATIN = range(0xC0, 0x180)  # letters that LaTeX's own UTF-8 input knows
 _TYPESET = re.compile(
     r"(?<![\w.])(?P<mantissa>[-−]?\d+(?:\.\d+)?)e(?P<power>[-+]?\d{1,3})(?!\w)"
     r"|(?<=\w)[_^]\("
-    r"|(?<=(?<!\w)[A-Za-z])_(?P<letter>[A-Za-z0-9])(?!\w)"
+    r"|(?<=(?<![A-Za-z0-9_])[A-Za-z])_(?P<letter>[A-Za-z0-9])(?!\w)"
 )
 _DEEPEST, _LONGEST_SCRIPT = 4, 200
 _UNESCAPED_DOLLAR = re.compile(r"(?<!\\)\$")

@@ -34,6 +34,11 @@ def remarks(summary: Summary) -> Iterator[Remark]:
     yield from map(Remark, _warnings(summary))
 
 
+def has_clocks(summary: Summary) -> bool:
+    """Whether bounds of clocks' errors are recorded, as of a run on several hosts."""
+    return (summary.get("conditions") or {}).get("clock_error_s") is not None
+
+
 def _warnings(summary: Summary) -> Iterator[str]:
     for one in summary["assumptions"]:
         if one["verdict"] == AssumptionStatus.VIOLATED:
@@ -53,7 +58,11 @@ def _warnings(summary: Summary) -> Iterator[str]:
         yield f"{summary['missing_samples']} samples are missing from the record: {where}"
     if summary["unintended_losses"]:
         where = ", ".join(f"{n} on {leg}" for leg, n in summary["unintended_losses_by_leg"].items())
-        yield f"{summary['unintended_losses']} datagrams were lost elsewhere (kernel): {where}"
+        lost = f"{summary['unintended_losses']} datagrams were lost elsewhere"
+        if has_clocks(summary):
+            yield f"{lost} (kernel, or between the hosts; firewalls must pass the ports): {where}"
+        else:
+            yield f"{lost} (kernel): {where}"
     for one in summary["restarts"]:
         yield f"{one['process']} was restarted, {away(one)}; claims are void from then on"
     for when, what in changes_in(summary):
@@ -64,7 +73,13 @@ def _warnings(summary: Summary) -> Iterator[str]:
     # Claims are void because this machine was late.
     causes = {one["cause"] for one in summary["assumption_violations"]} & {"delay", "hold"}
     if causes and summary["kind"] == "live" and not summary["restarts"]:
+        late = "A host or the network between hosts" if has_clocks(summary) else "This machine"
         yield (
-            "This machine was late, so some claims were not judged to the end. To allow more "
+            f"{late} was late, so some claims were not judged to the end. To allow more "
             "lateness, raise certificate.late_periods."
+        )
+    if has_clocks(summary) and (summary.get("replay") or {}).get("complete") is False:
+        yield (
+            "the record is incomplete. A process that could not reach the recorder prints the "
+            "folder of the rest; add it: noack collect RUN_DIRECTORY HOST:FOLDER"
         )

@@ -20,6 +20,9 @@ KEY_VALUE = ("quantity", "value")
 _MEASURED = re.compile(r"([-−+]?\d[\d.,]*(?:e[-+]?\d+)?) (s|ms|µs|ns|%|/s|Hz|bytes)")
 _NUMBER = re.compile(r"[-−]?\d+(?:\.(\d+))?")
 _NUMERIC = re.compile(r"[-−+]?\d.*|void|never|\(same\)|[-–]")
+_LINES = r"p{0.4\linewidth}"
+"""Kind of a column with lines."""
+_END = r" \tabularnewline"  # \raggedright changes \\
 _BREAK = r" \\ "
 _WIDE = 36
 """Characters from which on a column breaks its lines."""
@@ -57,7 +60,7 @@ def as_latex(table: ResultTable) -> str:
     columns = list(zip(*table.rows, strict=True)) or [()] * len(table.headings)
     kinds = [_kind(column, i) for i, column in enumerate(columns)]
     cells = [
-        _aligned(column) if kind == "r" else [_words(cell) for cell in column]
+        _aligned(column) if kind == "r" else [_words(cell, kind) for cell in column]
         for column, kind in zip(columns, kinds, strict=True)
     ]
     lines = [
@@ -65,9 +68,9 @@ def as_latex(table: ResultTable) -> str:
         r"% needs \usepackage{booktabs}",
         rf"\begin{{tabular}}{{@{{}}{''.join(kinds)}@{{}}}}",
         r"\toprule",
-        " & ".join(_heading(*pair) for pair in zip(table.headings, kinds, strict=True)) + r" \\",
+        " & ".join(_heading(*pair) for pair in zip(table.headings, kinds, strict=True)) + _END,
         r"\midrule",
-        *(" & ".join(row) + r" \\" for row in zip(*cells, strict=True)),
+        *(" & ".join(row) + _END for row in zip(*cells, strict=True)),
         r"\bottomrule",
         r"\end{tabular}",
     ]
@@ -114,7 +117,7 @@ def _kind(column: Sequence[str], place: int) -> str:
     if place and filled and 2 * sum(bool(_NUMERIC.fullmatch(one)) for one in filled) > len(filled):
         return "r"
     longest = max(map(len, column), default=0)
-    return r"p{0.4\linewidth}" if longest > _WIDE and place else "l"
+    return _LINES if longest > _WIDE and place else "l"
 
 
 def _heading(heading: str, kind: str) -> str:
@@ -124,9 +127,11 @@ def _heading(heading: str, kind: str) -> str:
     return rf"\begin{{tabular}}[b]{{@{{}}{kind[0]}@{{}}}}{_BREAK.join(lines)}\end{{tabular}}"
 
 
-def _words(cell: str) -> str:
+def _words(cell: str, kind: str) -> str:
     """Return a text; a row that explains the one above it is indented."""
     indent = r"\quad " if cell.startswith("  ") else ""
+    if kind == _LINES:
+        indent += r"\raggedright "
     return indent + latex_text(cell.strip())
 
 

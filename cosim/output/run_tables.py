@@ -13,7 +13,7 @@ from cosim.analysis.run_summary import Summary
 from cosim.output.assumptions_table import print_assumptions
 from cosim.output.fidelity_table import summary_rows
 from netem.words.words_to_settings import settings_of
-from noack.core.number_format import NONE, number, ratio, seconds, whole
+from noack.core.number_format import NONE, duration, number, ratio, seconds, whole
 
 Numbers = tuple[tuple[str, str], ...]
 """Quantities and their values, as text."""
@@ -67,6 +67,7 @@ def short_numbers(summary: Summary) -> Numbers:
         *_intervals(summary),
         *_norms(summary),
         *_lateness(summary),
+        *_other_clocks(summary),
         *_replay_rows(summary.get("replay")),
         *([next(summary_rows(fidelity))] if compared else ()),
     )
@@ -172,7 +173,13 @@ def _clocks(summary: Summary) -> Iterator[tuple[str, str]]:
     """Yield the largest bound of a clock's error, if it is recorded."""
     error_s = (summary.get("conditions") or {}).get("clock_error_s")
     if error_s is not None:
-        yield "largest bound of a clock's error", seconds(error_s)
+        yield "largest bound of a clock's error", duration(error_s)
+
+
+def _other_clocks(summary: Summary) -> Iterator[tuple[str, str]]:
+    """Yield the same of a run on hosts with different clocks."""
+    if (summary.get("conditions") or {}).get("clock_error_s"):
+        yield from _clocks(summary)
 
 
 def _lateness(summary: Summary) -> Iterator[tuple[str, str]]:

@@ -24,9 +24,11 @@ from netem.engine.relay_interface import DIRECTIONS, Direction, LinkSpec, Tap
 from netem.fates.fate_recorder import FateRecorder
 from netem.fates.fate_replay import read_fates
 from netem.standard_error import say
-from noack.core.errors import CallerError, ExitStatus
+from noack.core.errors import CallerError, ExitStatus, NoackError
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import text_of
+from noack.runtime.command_line import failed
+from noack.runtime.json_log import log_event, log_format
 from noack.runtime.real_time_settings import realtime
 from noack.runtime.signals import Signals
 
@@ -104,13 +106,22 @@ def alone(arguments: Sequence[str]) -> ExitStatus:
         written = emulator_options.specs_of(options, read=False)
         explain(specs, written, as_json=options.json, as_file=options.links is None)
         return ExitStatus.OK
-    totals = relay(specs, options)
+    with log_format(options.log_format):
+        try:
+            totals = relay(specs, options)
+        except NoackError as error:  # reported in the format of the log
+            return failed(str(error), error.exit_status, who="noack netem", as_json=options.json)
+        _report_totals(totals, options)
+    return ExitStatus.UNINTENDED_LOSSES if unintended(totals) else ExitStatus.OK
+
+
+def _report_totals(totals: Statistics, options: argparse.Namespace) -> None:
     if options.json:
         print(json.dumps(totals, indent=2))
-    else:
+    logged = log_event("info", "noack netem", "ended", event="totals", totals=totals)
+    if not (options.json or logged):
         console = Console(stderr=True, highlight=False)
         print_totals(totals, console, predicted=options.replay_fates is None)
-    return ExitStatus.UNINTENDED_LOSSES if unintended(totals) else ExitStatus.OK
 
 
 def relay(specs: Sequence[LinkSpec], options: argparse.Namespace) -> Statistics:

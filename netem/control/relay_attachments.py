@@ -19,6 +19,7 @@ from netem.engine.relay_base import Relay
 from netem.standard_error import say
 from noack.core.errors import CallerError
 from noack.runtime.address import text_of
+from noack.runtime.json_log import LogFormat
 from noack.runtime.metrics_server import OPTION, metrics_server, require_package
 
 _VIEW_S = 1.0
@@ -61,6 +62,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         OPTION, metavar="[HOST]:PORT",
         help="serve the statistics for Prometheus (OpenMetrics); the loopback without a HOST",
+    )  # fmt: skip
+    group.add_argument(
+        "--log-format", choices=[*LogFormat], type=LogFormat, default=LogFormat.TEXT,
+        help="format of standard error: text, or JSON Lines for log collectors (text)",
     )  # fmt: skip
     group.add_argument("--view", action="store_true", help="show live statistics in this terminal")
 

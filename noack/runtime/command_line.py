@@ -7,6 +7,7 @@ from contextlib import suppress
 from typing import NoReturn
 
 from noack.core.errors import CallerError, ExitStatus
+from noack.runtime.json_log import log_event
 
 TICKET_ON_STDIN = "NOACK_TICKET_ON_STDIN"
 """Environment variable of a launched process: its first line of input is its ticket."""
@@ -32,7 +33,8 @@ def failed(message: str, status: ExitStatus, *, who: str, as_json: bool) -> Exit
             reason = {"status": int(status), "reason": message}
             print(json.dumps({"error": message, "exit": reason}, indent=2), flush=True)
     for line in message.splitlines():
-        print_to_stderr(f"{who}: {line}")
+        if not log_event("error", who, line):
+            print_to_stderr(f"{who}: {line}")
     return status
 
 

@@ -2,7 +2,8 @@
 
 When too many handshakes are unfinished, the oldest one is ended of the host that has the most. So
 connections that stay half open keep nobody out, least of all other hosts. Without a valid
-certificate a connection gets no byte further than the handshake.
+certificate a connection gets no byte further than the handshake. When there are too many
+connections with one, the newest is ended of the host that has the most.
 """
 
 import asyncio
@@ -10,16 +11,16 @@ import socket
 import ssl
 import threading
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 
 _HANDSHAKE_S = 5.0
 _MOST_HANDSHAKES = 128
 _MOST_CONNECTIONS = 64
-_MOST_AT_ONCE = 64
-"""Connections accepted before others are served. To end one that was not served yet costs little,
-so that the kernel's queue empties also in a flood."""
+_MOST_AT_ONCE = 1024
+"""Connections accepted before the accepted ones are served. In a flood most of them are ended
+before they cost a handshake, so that the kernel's queue empties."""
 _READ_BYTES = 1 << 16
 _NO_DESCRIPTOR_PAUSE_S = 0.05
 
@@ -58,7 +59,8 @@ class _Forwarder:
         self._loop = asyncio.new_event_loop()
         self._handshakes: dict[asyncio.Task[None], str] = {}
         """Hosts of the connections whose handshake is not finished, the oldest first."""
-        self._connections: set[asyncio.Task[None]] = set()
+        self._connections: dict[asyncio.Task[None], str] = {}
+        """Hosts of the connections that are forwarded, the oldest first."""
 
     def run(self) -> None:
         """Accept connections until :meth:`stop`."""
@@ -91,27 +93,20 @@ class _Forwarder:
                 )
                 return
             if len(self._handshakes) >= _MOST_HANDSHAKES:
-                self._end_one()
-            task = self._loop.create_task(self._serve(connection))
+                _end_one(self._handshakes, self._handshakes)
+            task = self._loop.create_task(self._serve(connection, source[0]))
             self._handshakes[task] = source[0]
             # Closes the connection if the task ends before it begins.
             task.add_done_callback(partial(self._forget, connection))
 
-    def _end_one(self) -> None:
-        """End the oldest handshake of the host that has the most."""
-        crowd = Counter(self._handshakes.values()).most_common(1)[0][0]
-        oldest = next(task for task, host in self._handshakes.items() if host == crowd)
-        del self._handshakes[oldest]
-        oldest.cancel()
-
     def _forget(self, accepted: socket.socket, task: asyncio.Task[None]) -> None:
         accepted.close()
         self._handshakes.pop(task, None)
-        self._connections.discard(task)
+        self._connections.pop(task, None)
         if not task.cancelled():
             task.exception()  # what failed concerns this connection only
 
-    async def _serve(self, accepted: socket.socket) -> None:
+    async def _serve(self, accepted: socket.socket, host: str) -> None:
         task = asyncio.current_task()
         assert task is not None
         connection = socket.socket(fileno=accepted.detach())
@@ -127,9 +122,10 @@ class _Forwarder:
         self._handshakes.pop(task, None)
         writer = asyncio.StreamWriter(transport, protocol, reader, self._loop)
         try:
-            if len(self._connections) < _MOST_CONNECTIONS:
-                self._connections.add(task)
-                await self._forward(reader, writer)
+            self._connections[task] = host
+            if len(self._connections) > _MOST_CONNECTIONS:
+                _end_one(self._connections, reversed(self._connections))
+            await self._forward(reader, writer)
         finally:
             transport.abort()
 
@@ -147,6 +143,14 @@ class _Forwarder:
             for copy in copies:
                 copy.cancel()
             inner_writer.transport.abort()
+
+
+def _end_one(hosts: dict[asyncio.Task[None], str], order: Iterable[asyncio.Task[None]]) -> None:
+    """End the first task in an order of those of the host that has the most; forget it."""
+    crowd = Counter(hosts.values()).most_common(1)[0][0]
+    first = next(task for task in order if hosts[task] == crowd)
+    del hosts[first]
+    first.cancel()
 
 
 async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

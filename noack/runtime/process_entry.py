@@ -13,6 +13,7 @@ from pathlib import Path
 from setproctitle import setproctitle
 
 from noack.core.errors import ExitStatus, NoackError, NoAnswerError, PeerError
+from noack.runtime.address import text_of
 from noack.runtime.command_line import TICKET_ON_STDIN, Parser, failed
 from noack.runtime.control_plane import ControlPlane
 from noack.runtime.invitation import STANDARD_INPUT, read_invitation
@@ -128,7 +129,8 @@ def _ticket(role: str, session: str, signals: Signals) -> Ticket:
         _TICKET_TIMEOUT_S,
         lambda: signals.received is not None,
         lambda path: print(
-            f"noack {role}: waiting for `noack record SCENARIO` (session {session!r}); Ctrl-C ends",
+            f"noack {role}: waiting for `noack record SCENARIO` on this host (session "
+            f"{session!r}); of a run on another host, give its --invitation; Ctrl-C ends",
             file=sys.stderr,
         ),
     )
@@ -146,7 +148,11 @@ def _invited(role: str, invitation: Path, runs: Path, signals: Signals) -> Ticke
             if signals.received is not None:
                 raise PeerError("no invitation")
             time.sleep(_POLL_S)
-    return read_invitation(invitation, runs)
+    ticket = read_invitation(invitation, runs)
+    assert ticket.remote is not None  # else it is no invitation
+    where = text_of((ticket.remote.host, ticket.remote.port))
+    print(f"noack {role}: joining run of {ticket.scenario.name!r} at {where}", file=sys.stderr)
+    return ticket
 
 
 def _admitted(role: str, ticket: Ticket, signals: Signals) -> RunProcess:

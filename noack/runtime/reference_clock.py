@@ -105,7 +105,8 @@ class ReferenceClock:
                 return
             if give_up() or now_ns > until_ns:
                 found = (
-                    f"no answer from {self._where}" if interval is None
+                    f"no answer from {self._where}; do firewalls pass UDP to this port?"
+                    if interval is None
                     else f"known within {interval.error_ns / _NS_PER_US:.0f} µs, "
                     f"{self._largest_ns / _NS_PER_US:g} µs allowed"
                 )  # fmt: skip

@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 from packaging.requirements import Requirement
 
+from cosim.doctor.machine_measures import EXTRAS
 from tests.integration.conftest import EPHEMERAL, PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
@@ -147,7 +148,8 @@ def test_the_sdist_has_the_documentation_and_the_tests(dist: Path) -> None:
     with tarfile.open(sdist) as file:
         names = {name.partition("/")[2] for name in file.getnames()}
     assert {"README.md", "CHANGELOG.md", "LICENSE", "Makefile", "docs/scenarios.md",
-            "requirements.lock", "tests/integration/test_wheel.py"} <= names  # fmt: skip
+            "CITATION.cff", "requirements.lock",
+            "tests/integration/test_wheel.py"} <= names  # fmt: skip
     assert not [name for name in names if name.startswith((".venv", "runs", ".ci"))]
 
 
@@ -164,7 +166,7 @@ def test_the_installed_wheel_runs_without_the_repository(noack: Installed) -> No
 def test_the_doctor_names_missing_extras(noack: Installed) -> None:
     done = noack("doctor", *EPHEMERAL, "--seconds", "0.1", "--json")
     answer = json.loads(done.stdout)
-    assert answer["measured"]["extras"] == {"fmi": False, "vehicle": False, "cluster": False}
+    assert answer["measured"]["extras"] == dict.fromkeys(EXTRAS, False)
     remedies = {one["remedy"] for one in answer["findings"]}
     assert {"`pip install 'noack[fmi]'`", "`pip install 'noack[vehicle]'`"} <= remedies
 
@@ -172,6 +174,8 @@ def test_the_doctor_names_missing_extras(noack: Installed) -> None:
 @pytest.mark.parametrize(("command", "extra"), [
     (("check", "lane_vehicle"), "vehicle"),
     (("campaign", "mb_vs_zoh", "--scheduler", "tcp://127.0.0.1:9"), "cluster"),
+    (("run", "lane_following", "--metrics", ":0"), "metrics"),
+    (("netem", "--listen", "127.0.0.1:0", "--to", "127.0.0.1:9", "--metrics", ":0"), "metrics"),
 ])  # fmt: skip
 def test_a_command_names_its_missing_extra(
     noack: Installed, command: tuple[str, ...], extra: str

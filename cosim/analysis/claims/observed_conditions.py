@@ -62,6 +62,8 @@ CAUSES = {
 The other assumptions are the rules of the guarantee, under their own names; "dropouts" is the limit
 of consecutive losses."""
 DROPOUTS = LongestBurst(0).name
+_NO_INPUT = "the plant applied no input at all, the first within {1:.4g} s required"
+"""In place of a time until the first input, which is the only condition without an upper limit."""
 
 
 class SampledSeries(NamedTuple):
@@ -201,7 +203,7 @@ class ObservedConditions(NamedTuple):
         for cause, (series, limit) in every.items():
             if (excess := series.excess(limit)) is not None:
                 first_s, worst = excess
-                text = CAUSES[cause].format(worst, limit)
+                text = (_NO_INPUT if worst == np.inf else CAUSES[cause]).format(worst, limit)
                 found.append(AssumptionViolation(first_s, cause, worst, text))
         return [one for one in found if causes is None or one.cause in causes]
 

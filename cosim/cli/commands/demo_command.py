@@ -23,6 +23,7 @@ def demo(
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
     live: cli.LiveOption = False,
     metrics: cli.MetricsOption = None,
+    _log_format: cli.LogFormatOption = cli.LogFormat.TEXT,
     report: cli.ReportOption = True,
     verbose: cli.VerboseOption = False,
     json: cli.JsonOption = False,

@@ -8,6 +8,7 @@ import typer
 
 from cosim.cli import command as cli
 from cosim.cli.execute_run import RunOutput, run_processes
+from noack.core.errors import CallerError
 
 InvitationOption = Annotated[
     Path | None,
@@ -51,6 +52,7 @@ def record(
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
     live: cli.LiveOption = False,
     metrics: cli.MetricsOption = None,
+    _log_format: cli.LogFormatOption = cli.LogFormat.TEXT,
     listen: Annotated[
         str | None,
         typer.Option(
@@ -76,7 +78,9 @@ def record(
     from noack.protocol.topology import RECORDER
 
     output, listening = RunOutput(report, verbose, json), None
-    if listen is not None:
+    if listen is None:
+        _require_none_of(context, "invitation", "invite", "valid_minutes")
+    else:
         from cosim.live.remote_access import Listening, listen_address
 
         role = None if invite is Invited.ALL else invite.value
@@ -142,6 +146,15 @@ def netem(context: typer.Context) -> int:
     from netem.__main__ import main
 
     return main(context.args)
+
+
+def _require_none_of(context: typer.Context, *options: str) -> None:
+    """Raise CallerError if one of the options that need ``--listen`` was given."""
+    for option in options:
+        source = context.get_parameter_source(option)
+        if source is not None and source.name == "COMMANDLINE":
+            name = "--" + option.replace("_", "-")
+            raise CallerError(f"{name} needs --listen: processes of this host need no invitation")
 
 
 def _process_arguments(

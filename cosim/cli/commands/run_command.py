@@ -23,6 +23,7 @@ def run(
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
     live: cli.LiveOption = False,
     metrics: cli.MetricsOption = None,
+    _log_format: cli.LogFormatOption = cli.LogFormat.TEXT,
     hosts: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="TOML file that places processes on other hosts."),

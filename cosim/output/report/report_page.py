@@ -23,6 +23,8 @@ from noack.core.file_access import write_whole
 from noack.core.number_format import number, percent
 
 _NONE = "–"
+TIMING_FIGURES = ("lateness", "latency", "clocks")
+"""These have a section of their own, after the signals."""
 _TONES = {
     "held": "good", "holds": "good", GOOD: "good",
     "violated": "bad", BAD: "bad",
@@ -89,6 +91,7 @@ def page(
         key_numbers=key_numbers({**summary, "fidelity": None, "replay": None}),
         parameters=list(_parameters(scenario)),
         figures=figures,
+        timing_figures=TIMING_FIGURES,
         timing=list(timing_rows(content)),
         timing_headings=TIMING_HEADINGS,
         replay=replay,

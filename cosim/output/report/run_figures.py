@@ -1,6 +1,6 @@
 """The figures of a run, drawn from its record."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import Literal, NamedTuple
 
@@ -11,6 +11,7 @@ from cosim.analysis.quantile_sketch import QuantileSketch
 from cosim.analysis.timing_statistics import latency_us, lateness_parts
 from cosim.output.report import signal_figures
 from cosim.output.report.axes import Bound, BoundKind
+from cosim.output.report.clock_figure import ClockErrors, clock_errors, clock_figure
 from cosim.output.report.loss_figure import LossPanel, loss_figure
 from cosim.record.align import AlignedRun, aligned_parts
 from cosim.record.decimate import Reals, decimate, decimate_all
@@ -72,6 +73,8 @@ def pictures(
     }
     if record.kind == "live" if timed is None else timed:
         found |= {"lateness": lambda: _lateness(record), "latency": lambda: _latency(record)}
+    if errors := clock_errors(record):
+        found["clocks"] = lambda: _clocks(record.scenario, errors)
     return found
 
 
@@ -288,6 +291,24 @@ def _latency(record: RunRecord) -> RunFigure:
         signal_figures.latency_figure(_seconds(event_ns), taken_us, record.scenario.horizon_s),
         "Sensor-to-controller latency: wall time from the event to the controller's update.",
         f"Latencies of {len(taken_us)} updates, the longest {_largest(taken_us)} µs.",
+    )
+
+
+def _clocks(scenario: Scenario, errors: Mapping[str, ClockErrors]) -> RunFigure:
+    assert scenario.clocks is not None  # else the record has no tables of clocks
+    largest = ", ".join(
+        f"{process} " + ("never known" if one.largest_us is None else f"{one.largest_us:.3g} µs")
+        for process, one in errors.items()
+    )
+    lost = [process for process, one in errors.items() if one.lost.any()]
+    return RunFigure(
+        "clocks",
+        clock_figure(errors, scenario.clocks.largest_error_us, scenario.horizon_s),
+        "Bound of the difference between a process's time and the recorder's, for the processes "
+        f"on hosts with other clocks. Largest: {largest}. Dashed: the largest bound with which "
+        "claims hold."
+        + (f" Cross: from here on, the bound was lost ({', '.join(lost)})." if lost else ""),
+        f"Bounds of the clocks' errors over time on a logarithmic axis; largest: {largest}.",
     )
 
 

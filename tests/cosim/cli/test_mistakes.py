@@ -30,6 +30,8 @@ MISTAKES = {
     "check lane_following too": "noack: check: got unexpected extra argument(s) (too); "
     "see `noack check --help`",
     "demo --set": "noack: demo: option '--set' requires an argument; see `noack demo --help`",
+    "record lane_following --invite plant": "noack: --invite needs --listen: processes of this "
+    "host need no invitation",
     "netem --lisen :9000": "noack netem: unrecognized arguments: --lisen; see `noack netem --help`",
     "netem --seed many --listen :9000 --to :9001": "noack netem: --seed: invalid int value: "
     "'many'; see `noack netem --help`",

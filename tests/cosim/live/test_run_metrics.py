@@ -15,6 +15,7 @@ from cosim.cli import app
 from cosim.live.launcher import Watcher, joint_watcher
 from cosim.live.run_metrics import RunMetrics
 from tests.netem.control.test_emulator_metrics import exposed, values_of
+from tests.noack.runtime.test_json_log import objects
 from tests.noack.runtime.test_metrics_server import read
 
 
@@ -58,7 +59,7 @@ def test_a_watcher_whose_output_is_closed_does_not_stop_the_others() -> None:
     assert seen == [-1, 1.0, 2.0]
 
 
-def test_a_live_run_serves_its_metrics(tmp_path: Path) -> None:
+def test_a_live_run_serves_its_metrics_and_logs_its_events(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:
         address = free.getsockname()
     found: dict[str, float] = {}
@@ -78,6 +79,7 @@ def test_a_live_run_serves_its_metrics(tmp_path: Path) -> None:
     reader.start()
     words = ["run", "lane_following", "--set", "horizon_s=1", "--set", "ports={}", "--json"]
     more = ["--no-report", "--runs", str(tmp_path), "--metrics", f":{address[1]}"]
+    more += ["--log-format", "jsonl"]
     try:
         finished = CliRunner().invoke(app, [*words, *more])
     finally:
@@ -88,6 +90,11 @@ def test_a_live_run_serves_its_metrics(tmp_path: Path) -> None:
     assert 0 < found["noack_run_simulated_seconds"] <= summary["reached_s"]
     assert found["noack_run_events_total"] <= summary["events"]
     assert found["noack_run_state_norm"] > 0
+    events = {one["event"]: one for one in objects(finished.stderr) if "event" in one}
+    (run_dir,) = (path for path in tmp_path.iterdir() if not path.is_symlink())
+    assert events["run"]["directory"] == events["end"]["directory"] == str(run_dir)
+    assert (events["end"]["status"], events["end"]["reason"]) == (0, "horizon")
+    assert events["progress"]["events"] <= summary["events"]
 
 
 @pytest.mark.parametrize("where", ["x", "127.0.0.1:1:2"])

@@ -117,6 +117,29 @@ def test_an_assumption_that_a_scenario_violates_is_a_warning(tmp_path: Path) -> 
     assert "assumption violated: the trigger is" in text
 
 
+def test_a_run_across_hosts_names_the_firewall_the_network_and_what_to_collect(
+    outcome: Outcome,
+) -> None:
+    late = {"t_s": 1.0, "process": "recorder", "cause": "hold", "what": "an input was old"}
+    found: dict[str, Any] = {
+        "kind": "live", "unintended_losses": 3, "unintended_losses_by_leg": {"actuation": 3},
+        "assumption_violations": [late], "replay": {"complete": False, "bit_exact": None},
+    }  # fmt: skip
+
+    def texts(clock_error_s: float | None) -> str:
+        conditions = {"clock_error_s": clock_error_s}
+        return "\n".join(one.text for one in remarks(outcome.summary | found | {
+            "conditions": conditions,
+        }))  # fmt: skip
+
+    assert "lost elsewhere (kernel, or between the hosts; firewalls must pass" in texts(1e-4)
+    assert "A host or the network between hosts was late" in texts(1e-4)
+    assert "noack collect RUN_DIRECTORY HOST:FOLDER" in texts(1e-4)
+    assert "lost elsewhere (kernel): 3 on actuation" in texts(None)
+    assert "This machine was late" in texts(None)
+    assert "collect" not in texts(None)
+
+
 @pytest.mark.parametrize("scenario", ["four_tank", "lane_acknowledged"])
 def test_the_table_fits_eighty_columns(scenario: str, tmp_path: Path) -> None:
     run = noack.simulate(noack.load(scenario, {"horizon_s": 1.0}), runs=tmp_path)

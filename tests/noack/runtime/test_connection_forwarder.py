@@ -97,6 +97,20 @@ def test_a_crowd_of_one_host_does_not_end_the_handshake_of_another() -> None:
             assert echoed(connection, MESSAGE[:1000]) == MESSAGE[:1000]
 
 
+def test_connections_that_one_host_holds_keep_no_other_host_out() -> None:
+    with echo() as listening, ExitStack() as stack:
+        address = listening.getsockname()
+
+        def held(host: str) -> ssl.SSLSocket:
+            plain = socket.create_connection(address, timeout=60, source_address=(host, 0))
+            return stack.enter_context(connected(address, KEYS, KEYS.joining, plain))
+
+        crowd = [held("127.0.0.2") for _ in range(64)]
+        assert echoed(crowd[-1], b"hello") == b"hello"
+        assert echoed(held("127.0.0.3"), b"hello") == b"hello"
+        assert echoed(crowd[0], b"hello") == b"hello"  # the newest was ended
+
+
 def test_a_long_message_passes_unchanged() -> None:
     with echo() as listening, connected(listening.getsockname(), KEYS, KEYS.joining) as connection:
         for at in range(0, len(MESSAGE), 32_000):

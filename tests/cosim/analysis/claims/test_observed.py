@@ -197,6 +197,14 @@ def test_the_start_is_late_unless_the_initial_state_is_known(make: Make) -> None
     assert why.startswith("the plant applied no input until")
 
 
+def test_a_plant_without_any_input_has_no_time_of_the_first(make: Make) -> None:
+    run = simulate(make())
+    steps = run[PLANT_STEP].copy()
+    steps["actuation"] = NO_SEQUENCE
+    _, why = violation_of(changed(run, {PLANT_STEP: steps}))
+    assert why.startswith("the plant applied no input at all, the first within 0.0")
+
+
 def test_a_late_first_update_violates_only_the_start_condition(make: Make) -> None:
     """The first update is 60 ms late and is applied with the first input."""
     record = simulate(make(trigger={"beta": 0.1}), network_of(lambda n: 0 if n else 60))

@@ -15,6 +15,7 @@ from cosim.analysis.quantile_sketch import QuantileSketch
 from cosim.output import palette
 from cosim.output.report import signal_figures
 from cosim.output.report.axes import Bound, BoundKind
+from cosim.output.report.clock_figure import ClockErrors, clock_figure
 from cosim.output.report.figure_files import inline, save_figure
 from cosim.output.report.figure_style import printed, settings
 from noack.core.errors import CallerError
@@ -69,6 +70,14 @@ def drawn_for(case: str) -> dict[str, Figure]:
             2000.0,
         ),
         "latency": signal_figures.latency_figure(t_s, values(case, k), 1.0),
+        "clocks": clock_figure(
+            {
+                "plant": ClockErrors(t_s, values(case, k)),
+                "sensor": ClockErrors(t_s, np.where(t_s > 1.0, np.nan, values(case, k))),
+            },
+            1000.0,
+            1.0,
+        ),
         "inter": signal_figures.inter_event_figure(event_s, bound, 1.0),
     }
 

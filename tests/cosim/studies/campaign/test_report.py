@@ -158,7 +158,13 @@ def test_the_command_writes_the_reported_files_and_keeps_complete_chunks(
     assert report.pop("made") == 16
     assert all(Path(file).exists() for file in report.pop("files"))
     assert json.loads((tmp_path / "out" / "summary.json").read_text()) == report
-    assert json.loads(run_command(path, "--json").stdout)["made"] == 4 * (7 - 3)
+    done = run_command(path, "--json", "--tables", str(tmp_path / "tables"))
+    assert json.loads(done.stdout)["made"] == 4 * (7 - 3)
+    names = {file.name for file in (tmp_path / "tables").iterdir()}
+    assert names == {"campaign.csv", "campaign.tex", "differences.csv", "differences.tex"}
+    rows = (tmp_path / "tables/campaign.csv").read_text().splitlines()
+    assert len(rows) == 1 + 4
+    assert "transmissions" in rows[0]
 
 
 def test_a_missing_campaign_gives_one_line() -> None:
