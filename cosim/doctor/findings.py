@@ -40,6 +40,7 @@ _EXTRAS = {
     "cluster": "`noack campaign --scheduler`",
     "mcap": "`noack export --format mcap`",
     "metrics": "`--metrics`",
+    "lab": "`noack lab`",
 }
 
 
