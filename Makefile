@@ -28,7 +28,10 @@ help: ## List the targets
 	@printf '\nVariables: SCENARIO=NAME or FILE  CAMPAIGN=NAME or FILE  LIVE=1 (live viewer)  ARGS="--set speed=2"  SESSION=NAME\n'
 
 ##@ Run
-.PHONY: doctor demo demo-zoh run simulate view summary replay fidelity compare report certify adversary paper campaign design
+.PHONY: lab doctor demo demo-zoh run simulate view summary replay fidelity compare report certify adversary paper campaign design
+lab: setup $(VENV)/.installed-lab ## Open the lab page: drag settings, see the loop change, run it live
+	@$(BIN)/noack lab "$(SCENARIO)" $(ARGS)
+
 doctor: setup ## Check this machine for SCENARIO: real-time settings, timers, ports, disk
 	@$(BIN)/noack doctor "$(SCENARIO)" $(ARGS)
 
@@ -175,6 +178,11 @@ $(VENV)/.installed: requirements.lock pyproject.toml | $(VENV)/bin/python
 COMPILED := noack/impairments/*.py noack/impairments/*/*.py netem/*.py netem/rules/*.py netem/engine/*.py netem/engine/pump/*.py netem/capture/*.py
 $(VENV)/.compiled: $(VENV)/.installed $(wildcard $(COMPILED))
 	@$(BIN)/noack netem --compile
+	@touch $@
+
+$(VENV)/.installed-lab: requirements-lab.lock $(VENV)/.installed
+	@echo "installing the lab page ..."
+	@$(PIP) -r requirements-lab.lock
 	@touch $@
 
 $(VENV)/.installed-dev: requirements-dev.lock $(VENV)/.installed

@@ -131,7 +131,7 @@ def test_examples_work(example: str, folder: Path, monkeypatch: pytest.MonkeyPat
 def test_only_long_and_live_commands_have_no_example_that_is_run() -> None:
     assert set(OURS) - MORE.keys() == {
         "campaign", "capacity", "collect", "compare", "controller", "demo", "design", "doctor",
-        "paper", "plant", "record", "reproduce", "run", "sensor", "set", "view",
+        "lab", "paper", "plant", "record", "reproduce", "run", "sensor", "set", "view",
     }  # fmt: skip
 
 

@@ -1,0 +1,46 @@
+"""A live run of the page, as a process of its own: so the page never disturbs the loop.
+
+It writes one JSON object per line on standard output: what happened, with its fields.
+"""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from cosim.live.launcher import Watcher, launch
+from noack.config.scenario_file import load
+from noack.core.errors import ExitStatus, NoackError
+
+
+def main() -> int:
+    """Run the scenario file of the first argument; the second is the folder of the runs."""
+    path, runs = map(Path, sys.argv[1:3])
+    watcher = Watcher(
+        started=lambda run_dir: _say("started", run_dir=str(run_dir)),
+        failed=lambda why, t_s, by_hand: _say("failed", why=why, t_s=t_s),
+        restarted=lambda role, t_s: _say("restarted", role=role, t_s=t_s),
+        progress=lambda report: _say("progress", **report),
+    )
+    try:
+        ending = launch(load(path), runs, live=True, watcher=watcher)
+        _say("finalising", reason=ending.reason)
+        from cosim.live.finalize import finalize
+
+        outcome = finalize(ending, report=False)
+    except NoackError as error:
+        _say("error", text=str(error))
+        return error.exit_status
+    _say(
+        "ended", run_dir=str(outcome.run_dir), reason=outcome.reason,
+        ok=outcome.status is ExitStatus.OK,
+    )  # fmt: skip
+    return outcome.status
+
+
+def _say(what: str, **fields: Any) -> None:
+    print(json.dumps({"what": what, **fields}), flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

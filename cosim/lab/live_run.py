@@ -1,0 +1,172 @@
+"""A live run that the page has started: its process, its progress, what was said about it."""
+
+import asyncio
+import json
+import os
+import re
+import signal
+import tempfile
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from noack.core.python_process import python_command
+from noack.protocol.topology import LOOP_ROLES
+
+_ADDRESS = re.compile(r"http://\S+")
+_MOST_LINES = 200
+_STOP_S = 20.0
+_DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
+_CMDLINE = Path("/proc")
+
+
+@dataclass
+class LiveRun:
+    """The state of a live run; :meth:`follow` keeps it current until the run has ended."""
+
+    horizon_s: float
+    state: str = "starting"
+    """starting, running, finalising, ended or failed."""
+    run_dir: Path | None = None
+    viewer: str | None = None
+    """Address of the rerun viewer."""
+    progress: dict[str, Any] = field(default_factory=dict)
+    lines: list[str] = field(default_factory=list)
+    """What happened, the newest line last."""
+    ok: bool | None = None
+    version: int = 0
+    """Grows with each change."""
+    _process: asyncio.subprocess.Process | None = None
+    _folder: tempfile.TemporaryDirectory[str] | None = None
+
+    @property
+    def is_over(self) -> bool:
+        """Whether it has ended."""
+        return self.state in ("ended", "failed")
+
+    async def start(self, text: str, beside: Path, runs: Path) -> None:
+        """Start the run of a scenario's text; relative file names are relative to ``beside``."""
+        self._folder = tempfile.TemporaryDirectory(prefix="noack-lab-")
+        path = beside / f".lab-{os.getpid()}.toml"
+        if _mentions_files(text):
+            path.write_text(text, encoding="utf-8")
+        else:
+            path = Path(self._folder.name) / "scenario.toml"
+            path.write_text(text, encoding="utf-8")
+        self._written = path
+        environment = {key: value for key, value in os.environ.items() if key not in _DISPLAYS}
+        self._process = await asyncio.create_subprocess_exec(
+            *python_command("-m", "cosim.lab.live_child", str(path), str(runs.absolute())),
+            stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
+            stdin=asyncio.subprocess.DEVNULL, env=environment, start_new_session=True,
+        )  # fmt: skip
+
+    async def follow(self) -> None:
+        """Read what the run says until it has ended."""
+        assert self._process is not None
+        assert self._process.stdout is not None
+        async for line in self._process.stdout:
+            self._take(line.decode(errors="replace").strip())
+            self.version += 1
+        status = await self._process.wait()
+        if not self.is_over:
+            self.state, self.ok = "failed", False
+            self._add(f"the run ended with status {status}")
+        with suppress(OSError):
+            self._written.unlink()
+        if self._folder is not None:
+            self._folder.cleanup()
+        self.version += 1
+
+    def stop(self) -> None:
+        """Ask the run to end; what was recorded is kept."""
+        if self._process is not None and self._process.returncode is None:
+            with suppress(ProcessLookupError):
+                self._process.send_signal(signal.SIGINT)
+
+    async def end(self) -> None:
+        """End the run and wait for it."""
+        self.stop()
+        if self._process is not None and self._process.returncode is None:
+            try:
+                await asyncio.wait_for(self._process.wait(), _STOP_S)
+            except TimeoutError:
+                self._process.kill()
+
+    def kill(self, role: str) -> bool:
+        """Kill a process of the loop, to see what happens; return whether there was one."""
+        if self._process is None or role not in LOOP_ROLES:
+            return False
+        for pid in _descendants(self._process.pid):
+            if _title(pid) == f"noack {role}":
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+                    return True
+        return False
+
+    def _take(self, line: str) -> None:
+        try:
+            said = json.loads(line)
+            what = said.pop("what")
+        except (ValueError, AttributeError, KeyError, TypeError):
+            self._add(line)  # a message of a library, or of the compiler
+            return
+        match what:
+            case "started":
+                self.state, self.run_dir = "running", Path(said["run_dir"])
+                self._add("all processes run")
+            case "progress":
+                self._progress(said)
+            case "failed":
+                self._add(f"{said['why']} at {said['t_s']:.1f} s; it is restarted")
+            case "restarted":
+                self._add(f"{said['role']} runs again at {said['t_s']:.1f} s")
+            case "finalising":
+                self.state = "finalising"
+                self._add(f"ended: {said['reason']}; replaying it and checking its claims")
+            case "ended":
+                self.state, self.ok = "ended", said["ok"]
+                self.run_dir = Path(said["run_dir"])
+            case _:
+                self.state, self.ok = "failed", False
+                self._add(said.get("text", line))
+
+    def _progress(self, report: dict[str, Any]) -> None:
+        for name, words in (("warnings", "{}"), ("changes", "changed: {}")):
+            known = len(self.progress.get(name, []))
+            for text in report.get(name, [])[known:]:
+                self._add(words.format(text))
+        if self.viewer is None and (found := _ADDRESS.search(report.get("live") or "")):
+            self.viewer = found[0]
+        self.progress = report
+
+    def _add(self, line: str) -> None:
+        if line:
+            self.lines = [*self.lines, line][-_MOST_LINES:]
+
+
+def _mentions_files(text: str) -> bool:
+    """Whether a scenario may name files beside it."""
+    return bool(re.search(r"\bfile\b|\.(npz|mat|py|fmu|csv|toml|pcap)", text))
+
+
+def _descendants(pid: int) -> list[int]:
+    """Return the processes below a process."""
+    parents: dict[int, int] = {}
+    for folder in _CMDLINE.iterdir():
+        if folder.name.isdigit():
+            with suppress(OSError, ValueError, IndexError):
+                stat = (folder / "stat").read_text().rpartition(")")[2].split()
+                parents[int(folder.name)] = int(stat[1])
+    found, new = set[int](), {pid}
+    while new:
+        new = {child for child, parent in parents.items() if parent in new} - found
+        found |= new
+    return sorted(found)
+
+
+def _title(pid: int) -> str:
+    with suppress(OSError):
+        return (_CMDLINE / str(pid) / "cmdline").read_bytes().replace(b"\0", b" ").decode().strip()
+    return ""

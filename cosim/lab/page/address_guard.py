@@ -1,0 +1,88 @@
+"""Answers only requests that know the page's secret and come from the page itself.
+
+Every user of the machine can connect to loopback, and so can every page that a browser shows. So
+everything is under a path that begins with a secret. A request with another host name (DNS
+rebinding) or from another origin is refused, also for a WebSocket.
+"""
+
+import re
+import secrets
+from collections.abc import Awaitable, Callable, MutableMapping
+from typing import Any
+
+Scope = MutableMapping[str, Any]
+Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
+Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
+Application = Callable[[Scope, Receive, Send], Awaitable[None]]
+
+_OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?")
+_SECRET_BYTES = 32
+_HEADERS = (
+    (b"referrer-policy", b"no-referrer"),
+    (b"x-frame-options", b"DENY"),
+    (b"x-content-type-options", b"nosniff"),
+    (b"cross-origin-opener-policy", b"same-origin"),
+    (b"cross-origin-resource-policy", b"same-origin"),
+    # The framework compiles its templates in the browser, which needs unsafe-eval.
+    (b"content-security-policy",
+     b"default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; "
+     b"style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; "
+     b"connect-src 'self'; worker-src 'self' blob:; frame-src http://127.0.0.1:* "
+     b"http://localhost:*; frame-ancestors 'none'; base-uri 'self'; form-action 'self'"),
+)  # fmt: skip
+
+
+def new_secret() -> str:
+    """Return a secret for the page's address."""
+    return secrets.token_urlsafe(_SECRET_BYTES)
+
+
+class AddressGuard:
+    """An ASGI application in front of another one, which sees the secret as its root path."""
+
+    def __init__(self, application: Application, secret: str) -> None:
+        self._application = application
+        self._root = f"/{secret}"
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass an admitted request on; refuse another one."""
+        if scope["type"] == "lifespan":
+            await self._application(scope, receive, send)
+            return
+        status = self._refusal(scope)
+        if status is not None:
+            await _refuse(scope, receive, send, status)
+            return
+        await self._application({**scope, "root_path": self._root}, receive, _protected(send))
+
+    def _refusal(self, scope: Scope) -> int | None:
+        """Return the status of the refusal, or None."""
+        headers = [(name, value.decode("latin-1")) for name, value in scope["headers"]]
+        hosts = [value for name, value in headers if name == b"host"]
+        origins = [value for name, value in headers if name == b"origin"]
+        if len(hosts) != 1 or not _OWN_HOST.fullmatch(hosts[0]):
+            return 403
+        if any(origin != f"http://{hosts[0]}" for origin in origins):
+            return 403
+        if scope["type"] == "websocket" and not origins:
+            return 403  # a browser names it; nothing else needs this socket
+        first = "/" + scope["path"].removeprefix("/").partition("/")[0]
+        return None if secrets.compare_digest(first.encode(), self._root.encode()) else 404
+
+
+async def _refuse(scope: Scope, receive: Receive, send: Send, status: int) -> None:
+    if scope["type"] == "websocket":
+        await receive()
+        await send({"type": "websocket.close", "code": 1008})
+        return
+    await send({"type": "http.response.start", "status": status, "headers": []})
+    await send({"type": "http.response.body", "body": b""})
+
+
+def _protected(send: Send) -> Send:
+    async def protected(message: MutableMapping[str, Any]) -> None:
+        if message["type"] == "http.response.start":
+            message["headers"] = [*message.get("headers", ()), *_HEADERS]
+        await send(message)
+
+    return protected

@@ -1,0 +1,122 @@
+"""The figure of the run, its key numbers, and what is guaranteed."""
+
+from typing import Any
+
+from nicegui import ui
+
+from cosim.lab.chart_options import HEIGHT, Shown, data_options, figure_options
+from cosim.lab.page.session import Session
+from cosim.lab.scenario_guarantee import CERTIFIED, Guarantee, Margin
+
+_TONES = {CERTIFIED: "text-positive"}
+
+
+class ExplorePanel:
+    """The panel; :meth:`draw` shows the session's newest results."""
+
+    def __init__(self) -> None:
+        self._shape: tuple[object, ...] = ()
+        self._chart: ui.echart | None = None
+        self._note = ui.label().classes("text-warning text-sm").props("role=status")
+        self._state = ui.row().classes("items-center gap-2")
+        self._area = ui.element("div").classes("w-full")
+        with ui.element("div").classes("w-full lab-facts"):
+            self._numbers = ui.column().classes("gap-0")
+            self._guarantee = ui.column().classes("gap-0")
+
+    async def draw(self, session: Session, *, dark: bool) -> None:
+        """Show what was computed; a redraw of the same figure replaces its data only."""
+        first = session.mistakes[0].text if session.mistakes else ""
+        more = f" (and {len(session.mistakes) - 1} more)" if len(session.mistakes) > 1 else ""
+        self._note.set_text(first + more or session.note)
+        shown = session.shown(dark=dark)
+        if shown is None:
+            return
+        self._choose_state(session)
+        await self._show_figure(shown)
+        self._show_facts(session)
+
+    async def _show_figure(self, shown: Shown) -> None:
+        run = shown.run
+        shape = (shown.state, run.state_names, run.scenario.horizon_s, shown.dark,
+                 shown.reference is None)  # fmt: skip
+        if self._chart is None or shape != self._shape:
+            self._shape = shape
+            self._area.clear()
+            with self._area:
+                self._chart = ui.echart(figure_options(shown)).classes("w-full")
+                self._chart.style(f"height: {HEIGHT}px")
+            return
+        try:
+            # Awaited, so that a slow browser is not sent more than it draws.
+            await self._chart.run_chart_method("setOption", data_options(shown), timeout=2)
+        except TimeoutError:
+            self._shape = ()
+
+    def _choose_state(self, session: Session) -> None:
+        assert session.run is not None
+        names = dict(enumerate(session.run.state_names))
+        self._state.clear()
+        if len(names) < 2:
+            return
+
+        async def chosen(event: Any) -> None:
+            session.state = event.value
+            await session.on_drawn()
+
+        with self._state:
+            ui.select(names, value=session.state, label="state", on_change=chosen).props(
+                "dense options-dense"
+            )
+
+    def _show_facts(self, session: Session) -> None:
+        assert session.run is not None
+        self._numbers.clear()
+        with self._numbers:
+            _heading(f"this run ({session.run.kind})")
+            _rows(session.run.numbers)
+            if (found := session.ensemble) is not None:
+                low, middle, high = found.transmissions
+                _rows([
+                    (f"transmissions of {found.draws} draws", f"{low:g} – {middle:g} – {high:g}"),
+                    ("draws that diverge", str(found.diverged)),
+                ])  # fmt: skip
+        self._guarantee.clear()
+        with self._guarantee:
+            _show_guarantee(session.guarantee)
+            _show_margin(session.margin)
+
+
+def _show_guarantee(found: Guarantee | None) -> None:
+    _heading("certificate")
+    if found is None:
+        ui.label("follows when the sliders rest").classes("text-xs opacity-70")
+        return
+    ui.label(f"{found.verdict}: {found.reason}").classes(
+        f"text-sm {_TONES.get(found.verdict, 'text-warning')}"
+    )
+    _rows(found.rows)
+    for verdict, what, why in found.assumptions:
+        ui.label(f"{verdict}: {what} ({why})").classes("text-xs opacity-80")
+
+
+def _show_margin(found: Margin | None) -> None:
+    if found is None or not found.defined:
+        return
+    _heading("margin")
+    ui.label(found.verdict).classes("text-sm")
+    for m, growth, verdict in found.rows:
+        ui.label(f"M = {m}: growth {growth}, {verdict}").classes("text-xs")
+
+
+def _heading(text: str) -> None:
+    ui.label(text).classes("text-subtitle2 mt-2").props("role=heading aria-level=3")
+
+
+def _rows(rows: Any) -> None:
+    with ui.element("dl").classes("lab-rows text-xs"):
+        for name, value, *_ in rows:
+            with ui.element("dt"):
+                ui.label(name)
+            with ui.element("dd"):
+                ui.label(value).classes("font-mono")

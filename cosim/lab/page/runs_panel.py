@@ -1,0 +1,126 @@
+"""Recorded runs: key numbers, claims and figures; replay and fidelity on request."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from nicegui import ui
+
+from cosim.lab.page.lab_services import LabServices
+from noack.core.errors import NoackError
+
+_FIGURES = ("states", "errors", "state-norm", "input", "inter-event")
+
+
+class Opened(NamedTuple):
+    """What is shown of a run."""
+
+    facts: list[tuple[str, str]]
+    claims: list[tuple[str, str]]
+    """Verdict and claim."""
+    figures: list[tuple[str, str]]
+    """Name and SVG."""
+
+
+def opened(directory: Path) -> Opened:
+    """Read a run; called in the worker process."""
+    import io
+
+    import noack
+    from cosim.api.run_facts import run_facts
+    from cosim.output.report.figure_style import styled
+
+    run = noack.open_run(directory)
+    figures = []
+    for name in _FIGURES:
+        try:
+            figure = styled(run.plot)(name)
+        except NoackError:
+            continue
+        text = io.StringIO()
+        figure.savefig(text, format="svg")
+        figures.append((name, text.getvalue()))
+    claims = [(str(one["verdict"]), f"{one['what']} ({one['source']})") for one in run.claims]
+    return Opened(run_facts(run), claims, figures)
+
+
+def replayed(directory: Path) -> str:
+    """Replay a run; called in the worker process."""
+    import noack
+
+    found = noack.open_run(directory).replay()
+    return "bit-exact" if found.bit_exact else f"differs: {found.first_difference}"
+
+
+def compared(directory: Path) -> str:
+    """Compare a run with the ideal loop; called in the worker process."""
+    import noack
+
+    return str(noack.open_run(directory).fidelity().verdict)
+
+
+class RunsPanel:
+    """The panel."""
+
+    def __init__(self, services: LabServices) -> None:
+        self._services = services
+        with ui.row().classes("items-center gap-2"):
+            self._select = ui.select([], label="run", on_change=self._open).classes("w-72")
+            ui.button(icon="refresh", on_click=self.refresh).props(
+                'flat dense aria-label="look for new runs"'
+            )
+        self._content = ui.column().classes("w-full gap-2")
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Look for new runs."""
+        self._select.set_options(self._services.recorded())
+
+    async def _open(self, event: Any) -> None:
+        if not event.value:
+            return
+        directory = self._services.runs / event.value
+        self._content.clear()
+        with self._content:
+            waiting = ui.spinner(size="lg")
+        try:
+            found = await self._services.compute(opened, directory)
+        except NoackError as error:
+            waiting.delete()
+            with self._content:
+                ui.label(str(error)).classes("text-negative")
+            return
+        self._content.clear()
+        with self._content:
+            self._show(found, directory)
+
+    def _show(self, found: Opened, directory: Path) -> None:
+        with ui.element("dl").classes("lab-rows text-sm"):
+            for name, value in found.facts:
+                with ui.element("dt"):
+                    ui.label(name)
+                with ui.element("dd"):
+                    ui.label(value)
+        with ui.expansion(f"{len(found.claims)} claims").classes("w-full"):
+            for verdict, claim in found.claims:
+                ui.label(f"{verdict}: {claim}").classes("text-xs")
+        with ui.row().classes("items-center gap-2"):
+            for words, function in (("replay", replayed), ("fidelity", compared)):
+                self._on_request(words, function, directory)
+        for name, svg in found.figures:
+            ui.html(svg, sanitize=False).classes("w-full lab-figure").props(
+                f'role=img aria-label="{name}"'
+            )
+
+    def _on_request(self, words: str, function: Any, directory: Path) -> None:
+        answer = ui.label().classes("text-sm")
+
+        async def ask() -> None:
+            button.disable()
+            try:
+                answer.set_text(await self._services.compute(function, directory))
+            except NoackError as error:
+                answer.set_text(str(error))
+            button.enable()
+
+        button = ui.button(words, on_click=ask).props("outline dense")
+        answer.move()

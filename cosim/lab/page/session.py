@@ -1,0 +1,116 @@
+"""What one visitor of the page explores: the edited scenario and what was computed of it."""
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+
+from cosim.lab.chart_options import Shown
+from cosim.lab.draft import Draft, DraftError, Mistake
+from cosim.lab.ensemble import Ensemble, explore_ensemble
+from cosim.lab.exploration import Exploration, explore, why_not_exact
+from cosim.lab.page.lab_services import LabServices
+from cosim.lab.run_exploration import simulate_sampled
+from cosim.lab.scenario_guarantee import Guarantee, Margin, certify, margin_of
+from noack.core.errors import NoackError
+
+_QUIET_S = 0.15
+"""So long after the last change, what takes longer than a redraw is computed."""
+_MARGIN_S = 0.6
+
+
+@dataclass
+class Session:
+    """The state of one page; :meth:`change` is called with each new draft."""
+
+    services: LabServices
+    draft: Draft
+    on_drawn: Callable[[], Awaitable[None]]
+    """Called when there is something new to draw."""
+    run: Exploration | None = None
+    ensemble: Ensemble | None = None
+    guarantee: Guarantee | None = None
+    margin: Margin | None = None
+    reference: Exploration | None = None
+    state: int = 0
+    mistakes: list[Mistake] = field(default_factory=list)
+    note: str = ""
+    """Why there is no run, or what its drawing leaves out."""
+    redraw_ms: float = 0.0
+    _wanted: int = 0
+    _drawn: int = 0
+    _busy: bool = False
+    _later: asyncio.Task[None] | None = None
+
+    async def change(self, draft: Draft) -> None:
+        """Take another draft; of several changes during a redraw only the newest is drawn."""
+        self.draft = draft
+        self._wanted += 1
+        if self._later is not None:
+            self._later.cancel()
+        if self._busy:
+            return
+        self._busy = True
+        try:
+            while self._drawn < self._wanted:
+                self._drawn = self._wanted
+                began_s = time.perf_counter()
+                await self._explore()
+                await self.on_drawn()
+                self.redraw_ms = 1e3 * (time.perf_counter() - began_s)
+        finally:
+            self._busy = False
+        self._later = asyncio.create_task(self._compute_rest(self._wanted))
+
+    def keep(self) -> None:
+        """Keep the run for comparison, or forget the one that was kept."""
+        self.reference = self.run if self.reference is None else None
+
+    def shown(self, *, dark: bool) -> Shown | None:
+        """Return what the figure shows; None without a run."""
+        if self.run is None:
+            return None
+        self.state = min(self.state, self.run.x.shape[1] - 1)
+        return Shown(self.run, self.state, self.ensemble, self.guarantee, self.reference, dark=dark)
+
+    async def _explore(self) -> None:
+        self.ensemble = self.guarantee = self.margin = None
+        self.mistakes, self.note = [], ""
+        try:
+            scenario = self.draft.scenario
+            if scenario.loops is not None:
+                self.run, self.note = None, "a scenario of several loops: run it live"
+                return
+            if (why := why_not_exact(scenario)) is None:
+                self.run = explore(scenario)
+            else:
+                self.note = f"in virtual time, which takes about a second: {why}"
+                self.run = await self.services.compute(simulate_sampled, scenario)
+        except DraftError as error:
+            self.run, self.mistakes = None, error.mistakes
+        except NoackError as error:
+            self.run, self.note = None, str(error)
+
+    async def _compute_rest(self, wanted: int) -> None:
+        """Compute what takes longer, once the settings have rested for a moment."""
+        if self.run is None:
+            return
+        await asyncio.sleep(_QUIET_S)
+        scenario = self.draft.scenario
+        try:
+            guarantee = await self.services.compute(certify, scenario)
+            ensemble = None
+            if why_not_exact(scenario) is None:
+                ensemble = await self.services.compute(explore_ensemble, scenario)
+            if wanted != self._wanted:
+                return
+            self.guarantee, self.ensemble = guarantee, ensemble
+            await self.on_drawn()
+            await asyncio.sleep(_MARGIN_S)
+            margin = await self.services.compute(margin_of, scenario)
+            if wanted == self._wanted:
+                self.margin = margin
+                await self.on_drawn()
+        except NoackError as error:
+            self.note = str(error)
+            await self.on_drawn()

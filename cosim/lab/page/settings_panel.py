@@ -1,0 +1,136 @@
+"""The settings of the loop: choices, sliders, and the scenario's file beside them."""
+
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from nicegui import ui
+from nicegui.elements.mixins.value_element import ValueElement
+
+from cosim.lab.controls import Choice, Slider, chosen, controls_of
+from cosim.lab.draft import Draft, DraftError, Mistake
+from noack.core.errors import NoackError
+from noack.core.number_format import number
+
+Changed = Callable[[Draft, str], Awaitable[None]]
+"""Called with the new draft and the key that changed; an empty key: the whole text."""
+
+
+class FastSlider(ValueElement[float]):
+    """A slider that sends its place up to 60 times a second while it is dragged."""
+
+    def __init__(self, slider: Slider, on_change: Callable[[Any], Any]) -> None:
+        low, high = slider.ends
+        super().__init__(
+            tag="q-slider", value=slider.position, on_value_change=on_change, throttle=1 / 60
+        )
+        self.props["min"], self.props["max"], self.props["step"] = low, high, slider.step
+        self.props["aria-label"] = slider.label
+
+
+class SettingsPanel:
+    """The panel; it shows a draft and passes on each change."""
+
+    def __init__(self, draft: Draft, changed: Changed) -> None:
+        self._draft, self._changed = draft, changed
+        self._quiet = False
+        self._shape: tuple[object, ...] = ()
+        self._sliders: dict[str, tuple[Slider, FastSlider, ui.label]] = {}
+        self._controls = ui.column().classes("w-full gap-1")
+        with ui.expansion("all settings (TOML)").classes("w-full").props("dense"):
+            self._mistakes = ui.column().classes("gap-0 w-full").props("role=status")
+            self._editor = ui.codemirror(
+                draft.text, language="TOML", line_wrapping=False, on_change=self._edited
+            ).classes("w-full h-96 text-xs")
+        self._build()
+
+    def show(self, draft: Draft, *, text: bool = True) -> None:
+        """Show another draft; with ``text`` also in the editor."""
+        self._draft = draft
+        self._quiet = True
+        try:
+            self._build()
+            if text and self._editor.value != draft.text:
+                self._editor.set_value(draft.text)
+        finally:
+            self._quiet = False
+
+    def show_mistakes(self, mistakes: list[Mistake]) -> None:
+        """Show mistakes at the editor and mark the sliders that they are about."""
+        self._mistakes.clear()
+        with self._mistakes:
+            for one in mistakes:
+                ui.label(one.text).classes("text-negative text-xs")
+        wrong = {one.key for one in mistakes}
+        for key, (_, _, shown) in self._sliders.items():
+            change = "add" if key in wrong else "remove"
+            shown.classes(**{change: "text-negative"})
+
+    def _build(self) -> None:
+        try:
+            controls = controls_of(self._draft)
+        except DraftError:
+            return  # the mistakes are shown; the sliders stay
+        shape = (
+            *((one.key, tuple(one.options)) for one in controls.choices),
+            *((one.key, one.ends) for one in controls.sliders),
+        )
+        if shape == self._shape:
+            for slider in controls.sliders:
+                _, element, shown = self._sliders[slider.key]
+                self._sliders[slider.key] = (slider, element, shown)
+                shown.set_text(_text(slider.value))
+                if abs(element.value - slider.position) > slider.step / 2:
+                    element.set_value(slider.position)
+            return
+        self._shape, self._sliders = shape, {}
+        self._controls.clear()
+        with self._controls:
+            for choice in controls.choices:
+                self._add_choice(choice)
+            for slider in controls.sliders:
+                self._add_slider(slider)
+
+    def _add_choice(self, choice: Choice) -> None:
+        async def select(event: Any) -> None:
+            if not self._quiet and event.value != choice.value:
+                await self._apply(lambda draft: chosen(draft, choice.key, event.value), "")
+
+        ui.select(
+            dict(choice.options), value=choice.value, label=choice.label, on_change=select
+        ).classes("w-full").props("dense options-dense")
+
+    def _add_slider(self, slider: Slider) -> None:
+        key = slider.key
+
+        async def moved(event: Any) -> None:
+            current = self._sliders[key][0]
+            value = current.value_at(float(event.value))
+            self._sliders[key][2].set_text(_text(value))
+            if not self._quiet and value != current.value:
+                await self._apply(lambda draft: draft.with_value(key, value), key)
+
+        with ui.row().classes("w-full no-wrap justify-between gap-2 mt-1 text-xs"):
+            ui.label(slider.label)
+            shown = ui.label(_text(slider.value)).classes("font-mono")
+        element = FastSlider(slider, moved).classes("w-full")
+        element.props("dense")
+        self._sliders[key] = (slider, element, shown)
+
+    async def _apply(self, change: Callable[[Draft], Draft], key: str) -> None:
+        try:
+            draft = change(self._draft)
+        except NoackError as error:
+            ui.notify(str(error), type="negative")
+            return
+        self.show(draft)
+        await self._changed(draft, key)
+
+    async def _edited(self, event: Any) -> None:
+        if self._quiet or event.value == self._draft.text:
+            return
+        self.show(self._draft.with_text(event.value), text=False)
+        await self._changed(self._draft, "")
+
+
+def _text(value: float) -> str:
+    return f"{value:g}" if isinstance(value, int) else number(value, 3)

@@ -1,0 +1,70 @@
+"""What the page knows of a live run, from what the run says."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from cosim.lab.live_run import LiveRun
+
+
+def said(run: LiveRun, what: str, **fields: object) -> None:
+    run._take(json.dumps({"what": what, **fields}))
+
+
+REPORT = {
+    "t_s": 1.5, "events": 3, "deliveries": 2, "longest_loss_burst": 1, "x_norm": 0.5,
+    "live": None, "warnings": [], "changes": [],
+}  # fmt: skip
+
+
+def test_the_states_follow_each_other() -> None:
+    run = LiveRun(20.0)
+    assert run.state == "starting"
+    said(run, "started", run_dir="/runs/one")
+    assert (run.state, run.run_dir) == ("running", Path("/runs/one"))
+    said(run, "progress", **REPORT)
+    said(run, "finalising", reason="horizon")
+    assert run.state == "finalising"
+    assert not run.is_over
+    said(run, "ended", run_dir="/runs/one", reason="horizon", ok=True)
+    assert run.is_over
+    assert run.ok
+    assert run.progress["events"] == 3
+
+
+def test_each_warning_and_change_is_a_line_once() -> None:
+    run = LiveRun(20.0)
+    said(run, "progress", **REPORT | {"warnings": ["void from 1 s on"]})
+    said(run, "progress", **REPORT | {"warnings": ["void from 1 s on"], "changes": ["M 3"]})
+    assert run.lines == ["void from 1 s on", "changed: M 3"]
+
+
+def test_the_viewers_address_is_found() -> None:
+    run = LiveRun(20.0)
+    said(run, "progress", **REPORT | {"live": "live view: http://127.0.0.1:1234/secret/"})
+    assert run.viewer == "http://127.0.0.1:1234/secret/"
+
+
+@pytest.mark.parametrize("line", ["", "compiling ...", "{", "[1]", '{"x": 1}', "7"])
+def test_other_output_is_a_line_of_the_log(line: str) -> None:
+    run = LiveRun(20.0)
+    run._take(line)
+    assert run.lines == [line] * bool(line)
+    assert run.state == "starting"
+
+
+def test_an_error_ends_it() -> None:
+    run = LiveRun(20.0)
+    said(run, "error", text="the port is taken")
+    assert run.is_over
+    assert run.ok is False
+    assert run.lines == ["the port is taken"]
+
+
+def test_the_log_is_bounded() -> None:
+    run = LiveRun(20.0)
+    for number in range(1000):
+        run._take(f"line {number}")
+    assert len(run.lines) == 200
+    assert run.lines[-1] == "line 999"
