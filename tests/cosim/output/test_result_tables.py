@@ -86,7 +86,7 @@ def test_commands_write_their_tables(
 
 
 def test_the_tables_of_several_loops_are_written(tmp_path: Path) -> None:
-    run = noack.simulate(noack.load("shared_bottleneck", {"horizon_s": 1.0}))
+    run = noack.simulate(noack.load("shared_bottleneck", {"horizon_s": 0.2}))
     run.save_tables(tmp_path)
     rows = rows_of(tmp_path / "loops.csv")
     assert [row[0] for row in rows[1:]] == [loop["name"] for loop in run.summary["loops"]]

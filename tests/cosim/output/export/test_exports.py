@@ -32,7 +32,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> noack.Run:
 @pytest.fixture(scope="module")
 def loops(tmp_path_factory: pytest.TempPathFactory) -> noack.Run:
     folder = tmp_path_factory.mktemp("loops")
-    return noack.simulate(noack.load("shared_bottleneck", {"horizon_s": 0.4}), runs=folder)
+    return noack.simulate(noack.load("shared_bottleneck", {"horizon_s": 0.2}), runs=folder)
 
 
 def vector(table: pa.Table, name: str) -> np.ndarray:

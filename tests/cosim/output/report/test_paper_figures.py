@@ -82,7 +82,7 @@ def test_nothing_is_drawn_without_a_format(tmp_path: Path) -> None:
 
 
 def test_the_figures_of_a_report_are_written(tmp_path: Path) -> None:
-    run = noack.simulate(noack.load("lane_following", {"horizon_s": 1.0}), runs=tmp_path)
+    run = noack.simulate(noack.load("double_integrator", {"horizon_s": 0.3}), runs=tmp_path)
     words = ["report", str(run.directory), "--format", "pgf", "--json"]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output

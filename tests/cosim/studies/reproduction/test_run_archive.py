@@ -80,7 +80,7 @@ def test_a_simulated_run_is_repeated_bit_for_bit(archive: Path, run: noack.Run) 
 
 
 def test_several_loops_are_repeated_bit_for_bit(tmp_path: Path) -> None:
-    loops = noack.simulate(noack.load("shared_bottleneck", {"horizon_s": 0.5}))
+    loops = noack.simulate(noack.load("shared_bottleneck", {"horizon_s": 0.2}))
     found = noack.reproduce(loops.archive(tmp_path / "a.zip"))
     assert found.bit_exact
     rows = sum(loops.table(name).num_rows for name in loops.tables)
@@ -90,7 +90,7 @@ def test_several_loops_are_repeated_bit_for_bit(tmp_path: Path) -> None:
 
 
 def test_a_live_run_is_replayed_beside_a_simulation(tmp_path: Path) -> None:
-    live = noack.run(noack.load("lane_following", {"horizon_s": 0.5, "ports": {}}))
+    live = noack.run(noack.load("lane_following", {"horizon_s": 0.2, "ports": {}}))
     found = noack.reproduce(live.archive(tmp_path / "a.zip"))
     assert (found.kind, found.compared) == ("live", live.replay().inputs)
     assert found.bit_exact
