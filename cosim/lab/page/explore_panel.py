@@ -1,10 +1,12 @@
 """The figure of the run, its key numbers, and what is guaranteed."""
 
+from collections.abc import Sequence
 from typing import Any
 
 from nicegui import ui
 
 from cosim.lab.chart_options import HEIGHT, Shown, data_options, figure_options
+from cosim.lab.ensemble import DRAWS
 from cosim.lab.page.session import Session
 from cosim.lab.scenario_guarantee import CERTIFIED, Guarantee, Margin
 
@@ -16,12 +18,17 @@ class ExplorePanel:
 
     def __init__(self) -> None:
         self._shape: tuple[object, ...] = ()
+        self._names: dict[int, str] = {}
+        self._guaranteed: tuple[int, int] | None = None
+        """Which guarantee and margin are shown; arrays are not compared."""
         self._chart: ui.echart | None = None
         self._note = ui.label().classes("text-warning text-sm").props("role=status")
         self._state = ui.row().classes("items-center gap-2")
         self._area = ui.element("div").classes("w-full")
         with ui.element("div").classes("w-full lab-facts"):
-            self._numbers = ui.column().classes("gap-0")
+            with ui.column().classes("gap-0"):
+                self._kind = _heading("this run")
+                self._numbers = _Rows()
             self._guarantee = ui.column().classes("gap-0")
 
     async def draw(self, session: Session, *, dark: bool) -> None:
@@ -56,6 +63,9 @@ class ExplorePanel:
     def _choose_state(self, session: Session) -> None:
         assert session.run is not None
         names = dict(enumerate(session.run.state_names))
+        if names == self._names:
+            return
+        self._names = names
         self._state.clear()
         if len(names) < 2:
             return
@@ -65,22 +75,26 @@ class ExplorePanel:
             await session.on_drawn()
 
         with self._state:
-            ui.select(names, value=session.state, label="state", on_change=chosen).props(
-                "dense options-dense"
-            )
+            ui.select(names, value=session.state, label="state", on_change=chosen).classes(
+                "w-24"
+            ).props("dense options-dense")
 
     def _show_facts(self, session: Session) -> None:
-        assert session.run is not None
-        self._numbers.clear()
-        with self._numbers:
-            _heading(f"this run ({session.run.kind})")
-            _rows(session.run.numbers)
-            if (found := session.ensemble) is not None:
-                low, middle, high = found.transmissions
-                _rows([
-                    (f"transmissions of {found.draws} draws", f"{low:g} – {middle:g} – {high:g}"),
-                    ("draws that diverge", str(found.diverged)),
-                ])  # fmt: skip
+        run, found = session.run, session.ensemble
+        assert run is not None
+        self._kind.set_text(f"this run ({run.kind})")
+        low, middle, high = (
+            ("…",) * 3 if found is None else (f"{number:g}" for number in found.transmissions)
+        )
+        diverged = "…" if found is None else f"{found.diverged} of {found.draws}"
+        self._numbers.show([
+            *run.numbers,
+            (f"transmissions of {DRAWS} draws", f"{low} – {middle} – {high}"),
+            ("draws that diverge", diverged),
+        ])  # fmt: skip
+        if self._guaranteed == (shown := (id(session.guarantee), id(session.margin))):
+            return
+        self._guaranteed = shown
         self._guarantee.clear()
         with self._guarantee:
             _show_guarantee(session.guarantee)
@@ -95,7 +109,7 @@ def _show_guarantee(found: Guarantee | None) -> None:
     ui.label(f"{found.verdict}: {found.reason}").classes(
         f"text-sm {_TONES.get(found.verdict, 'text-warning')}"
     )
-    _rows(found.rows)
+    _Rows().show(found.rows)
     for verdict, what, why in found.assumptions:
         ui.label(f"{verdict}: {what} ({why})").classes("text-xs opacity-80")
 
@@ -109,14 +123,30 @@ def _show_margin(found: Margin | None) -> None:
         ui.label(f"M = {m}: growth {growth}, {verdict}").classes("text-xs")
 
 
-def _heading(text: str) -> None:
-    ui.label(text).classes("text-subtitle2 mt-2").props("role=heading aria-level=3")
+def _heading(text: str) -> ui.label:
+    return ui.label(text).classes("text-subtitle2 mt-2").props("role=heading aria-level=3")
 
 
-def _rows(rows: Any) -> None:
-    with ui.element("dl").classes("lab-rows text-xs"):
-        for name, value, *_ in rows:
-            with ui.element("dt"):
-                ui.label(name)
-            with ui.element("dd"):
-                ui.label(value).classes("font-mono")
+class _Rows:
+    """Names with values; while the names stay, only texts change, which is quick."""
+
+    def __init__(self) -> None:
+        self._names: list[str] = []
+        self._values: list[ui.label] = []
+        self._list = ui.element("dl").classes("lab-rows text-xs")
+
+    def show(self, rows: Sequence[tuple[str, str]]) -> None:
+        """Show other rows."""
+        names = [name for name, _ in rows]
+        if names != self._names:
+            self._names, self._values = names, []
+            self._list.clear()
+            with self._list:
+                for name in names:
+                    with ui.element("dt"):
+                        ui.label(name)
+                    with ui.element("dd"):
+                        self._values.append(ui.label().classes("font-mono"))
+        for label, (_, value) in zip(self._values, rows, strict=True):
+            if label.text != value:
+                label.set_text(value)

@@ -34,7 +34,7 @@ class LabServices:
     def __exit__(self, *_: object) -> None:
         for worker in multiprocessing.active_children():  # it may compute for seconds
             worker.kill()
-        self._pool.shutdown(wait=True, cancel_futures=True)
+        self._pool.shutdown(wait=True)
         if self.live is not None:
             self.live.stop()
 
