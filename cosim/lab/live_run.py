@@ -39,6 +39,7 @@ class LiveRun:
     """Grows with each change."""
     _process: asyncio.subprocess.Process | None = None
     _folder: tempfile.TemporaryDirectory[str] | None = None
+    _beside: Path | None = None
 
     @property
     def is_over(self) -> bool:
@@ -48,13 +49,13 @@ class LiveRun:
     async def start(self, text: str, beside: Path, runs: Path) -> None:
         """Start the run of a scenario's text; relative file names are relative to ``beside``."""
         self._folder = tempfile.TemporaryDirectory(prefix="noack-lab-")
-        path = beside / f".lab-{os.getpid()}.toml"
+        path = Path(self._folder.name) / "scenario.toml"
+        path.write_text(text, encoding="utf-8")
         if _mentions_files(text):
-            path.write_text(text, encoding="utf-8")
-        else:
-            path = Path(self._folder.name) / "scenario.toml"
-            path.write_text(text, encoding="utf-8")
-        self._written = path
+            with suppress(OSError):  # a folder that cannot be written
+                other = beside / f".lab-{os.getpid()}.toml"
+                other.write_text(text, encoding="utf-8")
+                path = self._beside = other
         environment = {key: value for key, value in os.environ.items() if key not in _DISPLAYS}
         self._process = await asyncio.create_subprocess_exec(
             *python_command("-m", "cosim.lab.live_child", str(path), str(runs.absolute())),
@@ -73,8 +74,8 @@ class LiveRun:
         if not self.is_over:
             self.state, self.ok = "failed", False
             self._add(f"the run ended with status {status}")
-        with suppress(OSError):
-            self._written.unlink()
+        if self._beside is not None:
+            self._beside.unlink(missing_ok=True)
         if self._folder is not None:
             self._folder.cleanup()
         self.version += 1

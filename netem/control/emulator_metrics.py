@@ -75,7 +75,7 @@ class EmulatorMetrics:
 
 
 def metrics(found: Statistics) -> Iterator[Metric]:
-    """Yield the metrics of a relay's statistics; see ``docs/metrics.md``."""
+    """Yield the metrics of a relay's statistics; ``docs/operations.md`` lists them."""
     yield InfoMetricFamily(_PREFIX, "the emulator", value={"engine": found["engine"]})
     yield GaugeMetricFamily(
         f"{_PREFIX}_elapsed_seconds", "time since the emulator started", found["elapsed_s"]
