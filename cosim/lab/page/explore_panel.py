@@ -35,7 +35,7 @@ class ExplorePanel:
         """Show what was computed; a redraw of the same figure replaces its data only."""
         first = session.mistakes[0].text if session.mistakes else ""
         more = f" (and {len(session.mistakes) - 1} more)" if len(session.mistakes) > 1 else ""
-        self._note.set_text(first + more or session.note)
+        self._note.set_text(first + more or session.warning or session.note)
         shown = session.shown(dark=dark)
         if shown is None:
             return

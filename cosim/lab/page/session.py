@@ -11,7 +11,7 @@ from cosim.lab.ensemble import Ensemble, explore_ensemble
 from cosim.lab.exploration import Exploration, explore, why_not_exact
 from cosim.lab.page.lab_services import LabServices
 from cosim.lab.run_exploration import simulate_sampled
-from cosim.lab.scenario_guarantee import Guarantee, Margin, certify, margin_of
+from cosim.lab.scenario_guarantee import CERTIFIED, Guarantee, Margin, certify, margin_of
 from noack.core.errors import NoackError
 
 _QUIET_S = 0.15
@@ -61,6 +61,24 @@ class Session:
         finally:
             self._busy = False
         self._later = asyncio.create_task(self._compute_rest(self._wanted))
+
+    @property
+    def warning(self) -> str:
+        """In words: whether the loop is unstable, and why nothing is guaranteed."""
+        run, found = self.run, self.guarantee
+        if run is None:
+            return ""
+        parts = []
+        if run.diverged_at_s is not None:
+            parts.append(f"The loop is unstable under these losses: it diverged at "
+                         f"{run.diverged_at_s:.3g} s.")  # fmt: skip
+        elif run.x_norm[-1] > run.x_norm[0]:
+            parts.append("‖x‖ is larger at the end than at the start.")
+        if parts and found is not None and found.verdict != CERTIFIED:
+            parts.append(f"It has no certificate: {found.reason}.")
+        elif parts and found is not None:
+            parts.append("It is certified all the same: the bound allows this.")
+        return " ".join(parts)
 
     def keep(self) -> None:
         """Keep the run for comparison, or forget the one that was kept."""
