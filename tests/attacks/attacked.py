@@ -84,11 +84,14 @@ class Run:
     def __init__(self, folder: Path, hosts: TwoHosts | None, *arguments: str) -> None:
         self._folder, self._hosts = folder, hosts
         invitation = str(folder / "invitation.json")
-        listen = () if hosts is None else ("--listen", _addresses(hosts)[0])
+        listen = (
+            () if hosts is None
+            else ("--listen", _addresses(hosts)[0], "--invitation", invitation)
+        )  # fmt: skip
         free_ports = ("--set", "ports={}") if hosts is None else ()
         self._recording = self._start(
             0, "record", "lane_following", "--runs", str(folder / "runs"), "--no-report",
-            *free_ports, *listen, "--invitation", invitation, *arguments,
+            *free_ports, *listen, *arguments,
         )  # fmt: skip
         self.processes = {
             role: self._start(1, role, "--invitation", invitation)
