@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.lab.ensemble import DRAWS, Ensemble
-from cosim.lab.exploration import Exploration
-from cosim.lab.scenario_guarantee import Guarantee
+from cosim.interactive.ensemble import DRAWS, Ensemble
+from cosim.interactive.exploration import Exploration
+from cosim.interactive.scenario_guarantee import Guarantee
 from cosim.output import palette
 from noack.core.linear_systems import Vector
 

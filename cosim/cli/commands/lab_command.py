@@ -38,7 +38,7 @@ def lab(
             "the page needs the extra `lab`: pip install 'noack[lab]', or `make lab` in the "
             "repository"
         )
-    from cosim.lab.draft import open_draft
+    from cosim.interactive.draft import open_draft
     from cosim.lab.page.lab_server import LabOptions, serve
     from noack.config.scenario_file import value_of
 

@@ -5,10 +5,10 @@ from typing import Any
 
 from nicegui import ui
 
+from cosim.interactive.ensemble import DRAWS
+from cosim.interactive.scenario_guarantee import CERTIFIED, Guarantee, Margin
 from cosim.lab.chart_options import HEIGHT, Shown, data_options, figure_options
-from cosim.lab.ensemble import DRAWS
 from cosim.lab.page.session import Session
-from cosim.lab.scenario_guarantee import CERTIFIED, Guarantee, Margin
 
 _TONES = {CERTIFIED: "text-positive"}
 

@@ -7,7 +7,7 @@ import re
 import numpy as np
 from nicegui import ui
 
-from cosim.lab.exploration import Exploration
+from cosim.interactive.exploration import Exploration
 from cosim.lab.page.lab_services import LabServices
 from cosim.lab.page.session import Session
 from noack.core.errors import NoackError

@@ -5,7 +5,7 @@ from typing import Any
 
 from nicegui import ui
 
-from cosim.lab.draft import Draft, DraftError, draft_of_query, open_draft
+from cosim.interactive.draft import Draft, DraftError, draft_of_query, open_draft
 from cosim.lab.page.explore_panel import ExplorePanel
 from cosim.lab.page.file_menu import FileMenu
 from cosim.lab.page.lab_services import LabServices

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
-from cosim.lab.draft import known_scenarios
+from cosim.interactive.draft import known_scenarios
 from cosim.lab.live_run import LiveRun
 
 T = TypeVar("T")
@@ -80,4 +80,4 @@ def _new_pool() -> ProcessPoolExecutor:
 def _prepare() -> None:
     """Yield to others, and load what is needed, so that the first answer is quick."""
     os.nice(_NICE)
-    from cosim.lab import ensemble, scenario_guarantee  # noqa: F401
+    from cosim.interactive import ensemble, scenario_guarantee  # noqa: F401

@@ -5,8 +5,8 @@ from typing import Any
 
 from nicegui import ui
 
-from cosim.lab.controls import controls_of
-from cosim.lab.draft import Draft, DraftError
+from cosim.interactive.controls import controls_of
+from cosim.interactive.draft import Draft, DraftError
 from cosim.lab.live_run import LiveRun
 from cosim.lab.page.lab_services import LabServices
 from noack.core.errors import NoackError

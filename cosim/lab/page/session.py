@@ -5,13 +5,13 @@ import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 
+from cosim.interactive.draft import Draft, DraftError, Mistake
+from cosim.interactive.ensemble import Ensemble, explore_ensemble
+from cosim.interactive.exploration import Exploration, explore, why_not_exact
+from cosim.interactive.run_exploration import simulate_sampled
+from cosim.interactive.scenario_guarantee import CERTIFIED, Guarantee, Margin, certify, margin_of
 from cosim.lab.chart_options import Shown
-from cosim.lab.draft import Draft, DraftError, Mistake
-from cosim.lab.ensemble import Ensemble, explore_ensemble
-from cosim.lab.exploration import Exploration, explore, why_not_exact
 from cosim.lab.page.lab_services import LabServices
-from cosim.lab.run_exploration import simulate_sampled
-from cosim.lab.scenario_guarantee import CERTIFIED, Guarantee, Margin, certify, margin_of
 from noack.core.errors import NoackError
 
 _QUIET_S = 0.15

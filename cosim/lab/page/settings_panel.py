@@ -6,8 +6,8 @@ from typing import Any
 from nicegui import ui
 from nicegui.elements.mixins.value_element import ValueElement
 
-from cosim.lab.controls import Choice, Slider, chosen, controls_of
-from cosim.lab.draft import Draft, DraftError, Mistake
+from cosim.interactive.controls import Choice, Slider, chosen, controls_of
+from cosim.interactive.draft import Draft, DraftError, Mistake
 from noack.core.errors import NoackError
 from noack.core.number_format import number
 

@@ -7,11 +7,11 @@ from typing import Any, cast
 
 import pytest
 
-from cosim.lab.draft import open_draft
+from cosim.interactive.draft import open_draft
+from cosim.interactive.scenario_guarantee import VOID, Margin
 from cosim.lab.page import session as under_test
 from cosim.lab.page.lab_services import LabServices
 from cosim.lab.page.session import Session
-from cosim.lab.scenario_guarantee import VOID, Margin
 
 
 class Inline:

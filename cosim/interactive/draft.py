@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import parse_qsl, urlencode
 
-from cosim.lab.toml_edit import value_text, with_value
+from cosim.interactive.toml_edit import value_text, with_value
 from cosim.shipped_files import find_shipped, shipped_names, text_of
 from noack.config import toml_file
 from noack.config.scenario import Scenario

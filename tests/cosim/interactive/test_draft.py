@@ -7,15 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosim.lab.controls import chosen, controls_of
-from cosim.lab.draft import (
+from cosim.interactive.controls import chosen, controls_of
+from cosim.interactive.draft import (
     DraftError,
     Mistake,
     draft_of_query,
     known_scenarios,
     open_draft,
 )
-from cosim.lab.toml_edit import value_text, with_value
+from cosim.interactive.toml_edit import value_text, with_value
 from cosim.shipped_files import shipped_names
 from noack.config import toml_file
 from noack.config.scenario_file import put

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import noack
-from cosim.lab import ensemble, exploration, run_exploration
-from cosim.lab import scenario_guarantee as guarantee
+from cosim.interactive import ensemble, exploration, run_exploration
+from cosim.interactive import scenario_guarantee as guarantee
 from cosim.simulation.continuous.continuous_report import run_continuous
 from cosim.studies.campaign.random_draws import drawn_scenario
 from noack.config.resolution import resolve

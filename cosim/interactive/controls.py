@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from cosim.lab.draft import Draft
+from cosim.interactive.draft import Draft
 from noack.config.feature_kinds import POLICIES
 from noack.config.runtime_parameters import trigger_parameters
 from noack.config.scenario import Scenario

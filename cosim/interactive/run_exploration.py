@@ -1,0 +1,52 @@
+"""A run in virtual time, as a page or notebook draws it."""
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from cosim.interactive.exploration import SAMPLED, Exploration, key_numbers, threshold_at
+from cosim.live.finalize import finalize
+from cosim.live.simulated_run import simulate_run
+from cosim.record.data_frames import events, samples
+from cosim.record.decimate import decimate_all
+from cosim.record.run_record import load_record
+from noack.config.scenario import Scenario
+from noack.core.linear_systems import Matrix, Vector
+
+_COLUMNS = 600
+"""Width of the drawn figure; no peak is lost at this width."""
+
+
+def simulate_sampled(scenario: Scenario) -> Exploration:
+    """Run a scenario in virtual time, which takes about a second; decimate its samples.
+
+    Raises:
+        NoackError: the scenario is wrong, or has several loops.
+    """
+    with tempfile.TemporaryDirectory(prefix="noack-") as folder:
+        outcome = finalize(simulate_run(scenario, Path(folder), view=False), report=False)
+        record = load_record(outcome.run_dir)
+        sampled, sent, resolved = samples(record), events(record), record.scenario
+    n = len(resolved.model.state_names or ()) or resolved.model.dimensions[0]
+    t_s = _column(sampled, "t_s")
+    x, x_s, x_c = (_states(sampled, name, n) for name in ("x", "x_s", "x_c"))
+    e_s_norm, e_c_norm = _column(sampled, "e_s_norm"), _column(sampled, "e_c_norm")
+    curves = np.column_stack([x, x_s, x_c, e_s_norm, e_c_norm])
+    kept = decimate_all(t_s, curves, _COLUMNS)
+    threshold = threshold_at(resolved, t_s[kept])
+    return Exploration(
+        resolved, SAMPLED, t_s[kept], x[kept], x_s[kept], x_c[kept], e_s_norm[kept],
+        e_c_norm[kept], threshold, _column(sent, "t_s"),
+        sent["received"].to_numpy(zero_copy_only=False).astype(np.bool_),
+        outcome.summary.get("diverged_at_s"), key_numbers(outcome.summary),
+    )  # fmt: skip
+
+
+def _column(table: pa.Table, name: str) -> Vector:
+    return np.asarray(table[name].to_numpy(), dtype=np.float64)
+
+
+def _states(table: pa.Table, name: str, n: int) -> Matrix:
+    return np.column_stack([_column(table, f"{name}_{i}") for i in range(1, n + 1)])
