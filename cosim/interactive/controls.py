@@ -23,6 +23,12 @@ _LOSSES: Mapping[str, Mapping[str, Any]] = {
     "lossless": {},
 }
 """The loss models that are offered, with their first settings."""
+_LOSS_NAMES = {
+    "bernoulli": "Bernoulli (independent)",
+    "gilbert_elliott": "Gilbert–Elliott (bursts)",
+    "worst_case": "worst case",
+    "lossless": "no losses",
+}
 _WINDOW: Mapping[str, Any] = {"kind": "at_most", "losses": 5, "window": 10}
 
 
@@ -99,9 +105,9 @@ def controls_of(draft: Draft) -> Controls:
         *_loss_sliders(scenario),
         *_guarantee_sliders(scenario),
         *_trigger_sliders(scenario, base),
-        Slider("seeds.loss", "seed of the losses", _seed(scenario.seeds.loss), 0, _SEEDS, 1,
+        Slider("seeds.loss", "random seed of the losses", _seed(scenario.seeds.loss), 0, _SEEDS, 1,
                whole=True),
-        Slider("seeds.plant", "seed of the plant", _seed(scenario.seeds.plant), 0, _SEEDS, 1,
+        Slider("seeds.plant", "random seed of the plant", _seed(scenario.seeds.plant), 0, _SEEDS, 1,
                whole=True),
         _decades("horizon_s", "horizon [s]", scenario.horizon_s, base.horizon_s, live=False),
     )  # fmt: skip
@@ -109,18 +115,18 @@ def controls_of(draft: Draft) -> Controls:
 
 
 def _choices(scenario: Scenario) -> tuple[Choice, ...]:
-    modes = {"model": "model", "zoh": "zero-order hold"}
+    modes = {"model": "model-based", "zoh": "zero-order hold"}
     policies = {name: name.replace("_", " ") for name in POLICIES if name != "python"}
-    losses = {name: name.replace("_", " ") for name in _LOSSES}
     policy, loss = scenario.trigger.policy, scenario.network.loss.model
     constraints = scenario.network.constraints
     kind = "" if not constraints else _WINDOW["kind"] if _is_window(scenario) else "own"
-    limits = {"": "M alone", str(_WINDOW["kind"]): "M and (m, K)"}
+    limits = {"": "M − 1 consecutive", str(_WINDOW["kind"]): "also m in any K packets"}
     return (
-        Choice("mode", "mode", scenario.mode, modes),
-        Choice("trigger", "trigger policy", policy, policies | {policy: policy}),
-        Choice("network.loss", "loss model", loss, losses | {loss: loss}),
-        Choice("network.constraints", "limit of the losses", str(kind),
+        Choice("mode", "mode: input between updates", scenario.mode, modes),
+        Choice("trigger", "trigger policy: when the sensor transmits", policy,
+               {policy: policy.replace("_", " ")} | policies),
+        Choice("network.loss", "loss model", loss, {loss: loss.replace("_", " ")} | _LOSS_NAMES),
+        Choice("network.constraints", "guarantee: most losses", str(kind),
                limits | ({"own": "as given"} if kind == "own" else {})),
     )  # fmt: skip
 

@@ -65,16 +65,18 @@ def certify(scenario: Scenario) -> Guarantee:
         certificate = _certificate(resolved)
     except CallerError as error:
         return Guarantee(NOT_COVERED, str(error), (), (), t_s, nothing, nothing, nothing)
+    reason = _reason(certificate)
     assumptions = tuple(
         (str(one.verdict), one.what, one.why)
         for one in certificate.assumptions
-        if one.verdict != AssumptionStatus.HOLDS
+        if one.verdict != AssumptionStatus.HOLDS and one.why != reason
     )
+    rows = () if certificate.constants is None else constant_rows([certificate], None, 0)
     with np.errstate(all="ignore"):
         return Guarantee(
             VOID if certificate.constants is None else CERTIFIED,
-            _reason(certificate),
-            tuple((label, values[0]) for label, values, _ in constant_rows([certificate], None, 0)),
+            reason,
+            tuple((label, values[0]) for label, values, _ in rows),
             assumptions,
             t_s,
             certificate.sensor_error(t_s),

@@ -22,7 +22,14 @@ _DIGITS = 5
 _SMALLEST = 1e-6
 """Smallest value on a logarithmic axis, as a share of the largest; an error is 0 after a reset."""
 _PANELS = ("state", "errors", "norm", "events")
-_TOP, _GAP, _BOTTOM = 64, 46, 34
+_SHARES = (0.28, 0.28, 0.2, 0.24)
+"""Of the height that titles, legends and times leave."""
+_TICK = (
+    "v => v === 0 || (Math.abs(v) >= 1e-3 && Math.abs(v) < 1e5) ? String(+v.toPrecision(9))"
+    " : (+v.toPrecision(9)).toExponential()"
+)
+"""Text at a value axis in JavaScript: short, so that the panels have equal widths."""
+_TITLE, _LEGEND, _TIMES, _BOTTOM = 22, 24, 24, 38
 HEIGHT = 860
 """Height of the figure in pixels."""
 
@@ -43,12 +50,14 @@ class Shown(NamedTuple):
 def figure_options(shown: Shown) -> Options:
     """Return the options of the whole figure."""
     ink, lines = ("#d5d9e0", "#3a3f47") if shown.dark else ("#30363d", "#dfe3e8")
-    heights = [0.28, 0.28, 0.2, 0.24]
-    room = HEIGHT - _TOP - _BOTTOM - _GAP * (len(_PANELS) - 1)
-    tops, grids = float(_TOP), []
-    for share in heights:
-        grids.append({"left": 62, "right": 16, "top": round(tops), "height": round(room * share)})
-        tops += room * share + _GAP
+    legends = _legends(shown)
+    heads = [_TITLE + _LEGEND * (name in legends) for name in _PANELS]
+    room = HEIGHT - sum(heads) - _TIMES * (len(_PANELS) - 1) - _BOTTOM
+    bottom, grids = float(-_TIMES), []
+    for head, share in zip(heads, _SHARES, strict=True):
+        top = bottom + _TIMES + head
+        bottom = top + room * share
+        grids.append({"left": 54, "right": 16, "top": round(top), "height": round(room * share)})
     text = {"color": ink}
     axis = {"axisLine": {"lineStyle": {"color": ink}}, "axisLabel": text,
             "splitLine": {"lineStyle": {"color": lines}}}  # fmt: skip
@@ -57,25 +66,28 @@ def figure_options(shown: Shown) -> Options:
         "animation": False,
         "textStyle": {"color": ink, "fontFamily": "inherit"},
         "aria": {"enabled": True, "label": {"description": "; ".join(titles)}},
-        "legend": {"type": "scroll", "top": 0, "textStyle": text, "data": list(_legend(shown)),
-                   "pageTextStyle": text},
+        "legend": [{"type": "scroll", "left": 8, "right": 8, "top": grid["top"] - _LEGEND - 3,
+                    "textStyle": text, "pageTextStyle": text, "itemGap": 10, "itemWidth": 20,
+                    "inactiveColor": "#808080", "data": legends[name]}
+                   for name, grid in zip(_PANELS, grids, strict=True) if name in legends],
         "tooltip": {"trigger": "axis", "axisPointer": {"type": "line"}, "confine": True,
                     "transitionDuration": 0, ":valueFormatter":
                     "v => v == null ? '–' : Number(v).toPrecision(4)"},
         "axisPointer": {"link": [{"xAxisIndex": "all"}]},
         "grid": grids,
-        "title": [{"text": title, "left": 12, "top": grid["top"] - 24,
+        "title": [{"text": title, "left": 3, "top": grid["top"] - head - 3,
                    "textStyle": {"fontSize": 13, "fontWeight": "bold", "color": ink}}
-                  for title, grid in zip(titles, grids, strict=True)],
+                  for title, grid, head in zip(titles, grids, heads, strict=True)],
         "xAxis": [{"type": "value", "gridIndex": i, "min": 0,
                    "max": float(shown.run.scenario.horizon_s),
                    "name": "time [s]" if i == len(_PANELS) - 1 else "", "nameLocation": "middle",
                    "nameGap": 22, "nameTextStyle": text, **axis} for i in range(len(_PANELS))],
         "yAxis": [{"type": "log" if name in ("errors", "norm") else "value", "gridIndex": i,
-                   "scale": name == "state", "splitNumber": 4, **axis}
+                   "scale": name == "state", "splitNumber": 4, **axis,
+                   "axisLabel": {**text, ":formatter": _TICK}}
                   for i, name in enumerate(_PANELS)],
         "dataZoom": [{"type": "inside", "xAxisIndex": list(range(len(_PANELS))),
-                      "zoomOnMouseWheel": "shift"}],
+                      "zoomOnMouseWheel": "shift", "preventDefaultMouseMove": False}],
         **data_options(shown),
     }  # fmt: skip
 
@@ -92,7 +104,7 @@ def data_options(shown: Shown) -> Options:
     }
     return {
         "dataset": [{"source": source} for source in sources.values()],
-        "series": [_series(one, list(sources).index(one.source)) for one in _curves(shown)],
+        "series": [_series(one, list(sources).index(one.source)) for one in _curves()],
     }
 
 
@@ -108,28 +120,28 @@ class _Curve(NamedTuple):
 _LINE: Mapping[str, Any] = {"width": 1.8}
 _THIN: Mapping[str, Any] = {"width": 1.2, "type": "dashed"}
 _EDGE: Mapping[str, Any] = {"width": 1, "type": "dotted"}
+_BAND, _KEPT = f"90 % of {DRAWS} draws", "kept settings"
 
 
-def _curves(shown: Shown) -> list[_Curve]:
-    band = f"5–95 % of {DRAWS} draws"
+def _curves() -> list[_Curve]:
     return [
-        _Curve(band, "state", "ensemble", "low", palette.PLANT, {"stack": "band"}),
-        _Curve(band, "state", "ensemble", "width", palette.PLANT, {"stack": "band", "area": True}),
+        _Curve(_BAND, "state", "ensemble", "low", palette.PLANT, {"stack": "band"}),
+        _Curve(_BAND, "state", "ensemble", "width", palette.PLANT, {"stack": "band", "area": True}),
         _Curve("plant x", "state", "run", "x", palette.PLANT, {"width": 3}),
-        _Curve("sensor's model x_s", "state", "run", "x_s", palette.SENSOR, _LINE),
-        _Curve("controller's model x_c", "state", "run", "x_c", palette.CONTROLLER, _LINE),
-        _Curve("kept settings", "state", "reference", "x", palette.FORCED, _THIN),
+        _Curve("sensor x_s", "state", "run", "x_s", palette.SENSOR, _LINE),
+        _Curve("controller x_c", "state", "run", "x_c", palette.CONTROLLER, _LINE),
+        _Curve(_KEPT, "state", "reference", "x", palette.FORCED, _THIN),
         _Curve("threshold", "errors", "run", "threshold", palette.THRESHOLD, _THIN),
         _Curve("‖e_s‖", "errors", "run", "e_s", palette.SENSOR, _LINE),
         _Curve("‖e_c‖", "errors", "run", "e_c", palette.CONTROLLER, _LINE),
         _Curve("certified bound", "errors", "guarantee", "e_c", palette.CERTIFIED, _LINE),
-        _Curve(band, "errors", "ensemble", "e_c_high", palette.PLANT, _EDGE),
-        _Curve("kept settings", "errors", "reference", "e_c", palette.FORCED, _THIN),
+        _Curve(_BAND, "errors", "ensemble", "e_c_high", palette.PLANT, _EDGE),
+        _Curve(_KEPT, "errors", "reference", "e_c", palette.FORCED, _THIN),
         _Curve("‖x‖", "norm", "run", "norm", palette.PLANT, {"width": 3}),
         _Curve("certified bound", "norm", "guarantee", "x", palette.CERTIFIED, _LINE),
-        _Curve(band, "norm", "ensemble", "norm_low", palette.PLANT, _EDGE),
-        _Curve(band, "norm", "ensemble", "norm_high", palette.PLANT, _EDGE),
-        _Curve("kept settings", "norm", "reference", "norm", palette.FORCED, _THIN),
+        _Curve(_BAND, "norm", "ensemble", "norm_low", palette.PLANT, _EDGE),
+        _Curve(_BAND, "norm", "ensemble", "norm_high", palette.PLANT, _EDGE),
+        _Curve(_KEPT, "norm", "reference", "norm", palette.FORCED, _THIN),
         _Curve("delivered", "events", "delivered", "since", palette.CONTROLLER,
                {"symbol": "circle", "size": 8}),
         _Curve("lost", "events", "lost", "since", palette.LOST,
@@ -147,7 +159,7 @@ def _series(curve: _Curve, dataset: int) -> Options:
     }  # fmt: skip
     if "symbol" in style:
         return made | {"type": "scatter", "symbol": style["symbol"], "symbolSize": style["size"]}
-    made |= {"type": "line", "showSymbol": False, "silent": True}
+    made |= {"type": "line", "symbol": "none", "silent": True}
     if "stack" in style:
         area = {"color": colour, "opacity": 0.22} if style.get("area") else {"opacity": 0}
         return made | {"stack": "band", "stackStrategy": "all", "lineStyle": {"width": 0},
@@ -163,10 +175,17 @@ def _titles(shown: Shown) -> Sequence[str]:
     )  # fmt: skip
 
 
-def _legend(shown: Shown) -> Sequence[str]:
-    hidden = {"kept settings"} if shown.reference is None else set()
-    return [name for name in dict.fromkeys(one.name for one in _curves(shown))
-            if name not in hidden]  # fmt: skip
+def _legends(shown: Shown) -> dict[str, list[Options]]:
+    """Return the legends of panels; a name that several panels have is in the first one's only."""
+    known = {_KEPT, "‖x‖"} if shown.reference is None else {"‖x‖"}
+    found: dict[str, list[Options]] = {}
+    for curve in _curves():
+        if curve.name not in known:
+            known.add(curve.name)
+            faint = {"icon": "roundRect", "itemStyle": {"opacity": 0.4}}
+            item = {"name": curve.name} | (faint if curve.name == _BAND else {})
+            found.setdefault(curve.panel, []).append(item)
+    return found
 
 
 def _run_source(shown: Shown) -> Options:

@@ -129,6 +129,7 @@ class LiveRun:
             case "ended":
                 self.state, self.ok = "ended", said["ok"]
                 self.run_dir = Path(said["run_dir"])
+                self._add(f"recorded in {self.run_dir}")
             case _:
                 self.state, self.ok = "failed", False
                 self._add(said.get("text", line))

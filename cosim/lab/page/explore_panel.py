@@ -9,6 +9,7 @@ from cosim.interactive.ensemble import DRAWS
 from cosim.interactive.scenario_guarantee import CERTIFIED, Guarantee, Margin
 from cosim.lab.chart_options import HEIGHT, Shown, data_options, figure_options
 from cosim.lab.page.session import Session
+from noack.core.number_format import number
 
 _TONES = {CERTIFIED: "text-positive"}
 
@@ -22,9 +23,15 @@ class ExplorePanel:
         self._guaranteed: tuple[int, int] | None = None
         """Which guarantee and margin are shown; arrays are not compared."""
         self._chart: ui.echart | None = None
+        self._step = ui.label().classes("text-sm font-bold")
+        self._step.set_visibility(False)
+        with ui.row().classes("w-full items-baseline gap-x-4 gap-y-0 text-sm"):
+            self._summary = ui.label()
+            self._verdict = ui.label()
         self._note = ui.label().classes("text-warning text-sm").props("role=status")
         self._state = ui.row().classes("items-center gap-2")
         self._area = ui.element("div").classes("w-full")
+        self._stale = False
         with ui.element("div").classes("w-full lab-facts"):
             with ui.column().classes("gap-0"):
                 self._kind = _heading("this run")
@@ -35,13 +42,31 @@ class ExplorePanel:
         """Show what was computed; a redraw of the same figure replaces its data only."""
         first = session.mistakes[0].text if session.mistakes else ""
         more = f" (and {len(session.mistakes) - 1} more)" if len(session.mistakes) > 1 else ""
-        self._note.set_text(first + more or session.warning or session.note)
+        note = first + more or session.warning or session.note
         shown = session.shown(dark=dark)
+        self._mark_stale(shown is None)
         if shown is None:
+            old = "" if self._chart is None else ". Below: the settings before"
+            self._note.set_text(note + old)
             return
+        self._note.set_text(note)
         self._choose_state(session)
         await self._show_figure(shown)
-        self._show_facts(session)
+        if not self._area.is_deleted:
+            self._show_facts(session)
+
+    def show_step(self, text: str) -> None:
+        """Show what a step of the tutorial asks for."""
+        self._step.set_text(text)
+        self._step.set_visibility(bool(text))
+
+    def _mark_stale(self, stale: bool) -> None:
+        """Draw the figure faintly while it is not that of the settings."""
+        if stale != self._stale:
+            self._stale = stale
+            self._area.style(f"opacity: {0.4 if stale else 1}")
+            self._summary.set_visibility(not stale)
+            self._verdict.set_visibility(not stale)
 
     async def _show_figure(self, shown: Shown) -> None:
         run = shown.run
@@ -51,7 +76,7 @@ class ExplorePanel:
             self._shape = shape
             self._area.clear()
             with self._area:
-                self._chart = ui.echart(figure_options(shown)).classes("w-full")
+                self._chart = ui.echart(figure_options(shown)).classes("w-full").props("role=img")
                 self._chart.style(f"height: {HEIGHT}px")
             return
         try:
@@ -75,21 +100,23 @@ class ExplorePanel:
             await session.on_drawn()
 
         with self._state:
-            ui.select(names, value=session.state, label="state", on_change=chosen).classes(
-                "w-24"
+            ui.select(names, value=session.state, label="drawn state", on_change=chosen).classes(
+                "w-32"
             ).props("dense options-dense")
 
     def _show_facts(self, session: Session) -> None:
         run, found = session.run, session.ensemble
         assert run is not None
         self._kind.set_text(f"this run ({run.kind})")
-        low, middle, high = (
-            ("…",) * 3 if found is None else (f"{number:g}" for number in found.transmissions)
-        )
-        diverged = "…" if found is None else f"{found.diverged} of {found.draws}"
+        self._show_summary(session, dict(run.numbers))
+        sent, diverged = "…", "…"
+        if found is not None:
+            low, middle, high = found.transmissions
+            sent = f"{low:.0f} to {high:.0f}, median {middle:.0f}"
+            diverged = f"{found.diverged} of {found.draws}"
         self._numbers.show([
             *run.numbers,
-            (f"transmissions of {DRAWS} draws", f"{low} – {middle} – {high}"),
+            (f"transmissions in 90 % of {DRAWS} draws", sent),
             ("draws that diverge", diverged),
         ])  # fmt: skip
         if self._guaranteed == (shown := (id(session.guarantee), id(session.margin))):
@@ -100,18 +127,31 @@ class ExplorePanel:
             _show_guarantee(session.guarantee)
             _show_margin(session.margin)
 
+    def _show_summary(self, session: Session, numbers: dict[str, str]) -> None:
+        """Show above the figure what changes most."""
+        first, last = session.run.x_norm[[0, -1]] if session.run else (0.0, 0.0)
+        self._summary.set_text(
+            f"{numbers.get('transmissions', 0)} transmissions, {numbers.get('lost', 0)} lost; "
+            f"‖x‖ from {number(first, 3)} to {number(last, 3)}"
+        )
+        verdict = session.guarantee.verdict if session.guarantee else "certificate: …"
+        self._verdict.set_text(verdict)
+        self._verdict.classes(
+            replace=_TONES.get(verdict, "text-warning" if session.guarantee else "")
+        )
+
 
 def _show_guarantee(found: Guarantee | None) -> None:
     _heading("certificate")
     if found is None:
-        ui.label("follows when the sliders rest").classes("text-xs opacity-70")
+        ui.label("follows when no setting changes").classes("text-xs")
         return
     ui.label(f"{found.verdict}: {found.reason}").classes(
         f"text-sm {_TONES.get(found.verdict, 'text-warning')}"
     )
     _Rows().show(found.rows)
     for verdict, what, why in found.assumptions:
-        ui.label(f"{verdict}: {what} ({why})").classes("text-xs opacity-80")
+        ui.label(f"{verdict}: {what} ({why})").classes("text-xs")
 
 
 def _show_margin(found: Margin | None) -> None:
@@ -119,6 +159,7 @@ def _show_margin(found: Margin | None) -> None:
         return
     _heading("margin")
     ui.label(found.verdict).classes("text-sm")
+    ui.label("Pattern: D delivered, L lost. Growth of the worst pattern per event; 1 is the limit.")
     for m, growth, verdict in found.rows:
         ui.label(f"M = {m}: growth {growth}, {verdict}").classes("text-xs")
 

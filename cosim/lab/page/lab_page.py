@@ -18,13 +18,29 @@ from noack.core.errors import NoackError
 
 _STYLE = """
 .lab-body { display: grid; grid-template-columns: minmax(260px, 340px) minmax(0, 1fr); gap: 1rem; }
+.lab-settings { position: sticky; top: 56px; align-self: start; padding: 0 10px 1rem; }
+.lab-settings { max-height: calc(100vh - 64px); overflow-y: auto; }
 .lab-facts { display: grid; gap: 1rem; }
 .lab-facts { grid-template-columns: repeat(auto-fit, minmax(260px, 1fr)); }
 .lab-rows { display: grid; grid-template-columns: auto auto; gap: 0 1rem; margin: 0; }
 .lab-rows dd { margin: 0; }
 .lab-viewer { height: 70vh; border: 0; }
 .lab-figure svg { width: 100%; height: auto; max-width: 900px; background: white; }
-@media (max-width: 800px) { .lab-body { grid-template-columns: minmax(0, 1fr); } }
+:focus-visible { outline: 3px solid #c77700 !important; outline-offset: 2px; }
+.q-slider:focus-within, .q-field:focus-within { outline: 3px solid #c77700; outline-offset: 1px; }
+.q-header { background: #1f5f99; }
+.q-header .q-field__label { color: white; opacity: 1; }
+.body--dark .q-btn.bg-primary, .body--dark .q-btn.bg-primary * { color: #08131e !important; }
+.body--dark { --q-primary: #64a8e8 !important; --q-negative: #ff8a80 !important; }
+.body--dark { --q-warning: #ffb74d !important; --q-positive: #7fd39b !important; }
+.body--dark .cm-activeLine { background: transparent !important; }
+.body--dark .cm-gutterElement { color: #b0b0b0 !important; }
+@media (max-width: 800px) {
+  .lab-body { grid-template-columns: minmax(0, 1fr); }
+  .lab-settings { order: 2; top: auto; bottom: 0; z-index: 1; max-height: 38vh; }
+  .lab-settings { border-top: 2px solid var(--q-primary); background: white; }
+  .body--dark .lab-settings { background: #121212; }
+}
 """
 
 
@@ -48,10 +64,11 @@ async def show_page(services: LabServices) -> None:
 
 class _Page:
     def __init__(self, services: LabServices, draft: Draft) -> None:
-        self._services = services
+        self._services, self._client = services, ui.context.client
         self._session = Session(services, draft, self._drawn)
         self._dark = ui.dark_mode(None)
         self._is_dark = False
+        self._client.on_delete(self._session.end)
 
     def build(self) -> None:
         """Build header and panels."""
@@ -70,10 +87,10 @@ class _Page:
                 'flat color=white dense aria-label="dark or light"'
             )
         with ui.element("main").classes("lab-body w-full"):
-            with ui.column().classes("gap-2"):
+            with ui.column().classes("gap-2 lab-settings").props("role=region aria-label=settings"):
                 self._settings = SettingsPanel(self._session.draft, self._changed)
             with ui.column().classes("gap-2 w-full"):
-                with ui.tabs().props("dense align=left no-caps") as tabs:
+                with ui.tabs(on_change=self._show_tab).props("dense align=left no-caps") as tabs:
                     names = ("explore", "run live", "recorded runs", "tutorial")
                     explore, live, runs, tutorial = (ui.tab(name) for name in names)
                 self._tabs, self._explore_tab = tabs, explore
@@ -95,10 +112,17 @@ class _Page:
         self._is_dark = await ui.run_javascript(
             "window.matchMedia('(prefers-color-scheme: dark)').matches"
         )
+        self._settings.show_dark(dark=self._is_dark)
         self._live.take(self._session.draft)
         await self._session.change(self._session.draft)
 
+    def _show_tab(self, event: Any) -> None:
+        if event.value == "recorded runs":
+            self._runs.refresh()
+
     async def _drawn(self) -> None:
+        if self._client.is_deleted:
+            return
         self._settings.show_mistakes(self._session.mistakes)
         await self._explore.draw(self._session, dark=self._is_dark)
 
@@ -136,9 +160,11 @@ class _Page:
             draft = draft.with_value(key, value)
         self._tabs.set_value(self._explore_tab)
         await self._open(draft)
+        self._explore.show_step(step.drag)
 
     async def _open(self, draft: Draft) -> None:
         self._session.reference = None
+        self._explore.show_step("")
         self._session.draft = draft
         self._scenarios.set_value(draft.base)
         self._settings.show(draft)
@@ -153,4 +179,5 @@ class _Page:
     async def _toggle(self) -> None:
         self._is_dark = not self._is_dark
         self._dark.set_value(self._is_dark)
+        self._settings.show_dark(dark=self._is_dark)
         await self._drawn()

@@ -30,10 +30,9 @@ class LivePanel:
             self._stop = ui.button("stop", icon="stop", on_click=self._end).props("outline")
             self._restarts = ui.checkbox("restart killed processes", value=True)
         with ui.row().classes("items-center gap-2 text-sm"):
-            ui.label("kill:")
             self._kill = [
-                ui.button(role, on_click=lambda role=role: self._kill_one(role)).props(
-                    "outline dense size=sm color=negative"
+                ui.button(f"kill {role}", on_click=lambda role=role: self._kill_one(role)).props(
+                    "outline dense size=sm color=negative no-caps"
                 )
                 for role in _KILLABLE
             ]

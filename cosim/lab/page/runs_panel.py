@@ -48,7 +48,11 @@ def replayed(directory: Path) -> str:
     import noack
 
     found = noack.open_run(directory).replay()
-    return "bit-exact" if found.bit_exact else f"differs: {found.first_difference}"
+    return (
+        "bit-exact: the same numbers again"
+        if found.bit_exact
+        else f"differs: {found.first_difference}"
+    )
 
 
 def compared(directory: Path) -> str:
@@ -104,7 +108,10 @@ class RunsPanel:
             for verdict, claim in found.claims:
                 ui.label(f"{verdict}: {claim}").classes("text-xs")
         with ui.row().classes("items-center gap-2"):
-            for words, function in (("replay", replayed), ("fidelity", compared)):
+            for words, function in (
+                ("replay", replayed),
+                ("compare with the ideal loop", compared),
+            ):
                 self._on_request(words, function, directory)
         for name, svg in found.figures:
             ui.html(svg, sanitize=False).classes("w-full lab-figure").props(

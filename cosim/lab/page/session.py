@@ -42,6 +42,11 @@ class Session:
     _busy: bool = False
     _later: asyncio.Task[None] | None = None
 
+    def end(self) -> None:
+        """Compute nothing more: the page was closed."""
+        if self._later is not None:
+            self._later.cancel()
+
     async def change(self, draft: Draft) -> None:
         """Take another draft; of several changes during a redraw only the newest is drawn."""
         self.draft = draft
@@ -76,6 +81,8 @@ class Session:
             parts.append("‖x‖ is larger at the end than at the start.")
         if parts and found is not None and found.verdict != CERTIFIED:
             parts.append(f"It has no certificate: {found.reason}.")
+            if self.margin is not None and self.margin.defined:
+                parts.append(f"Margin: {self.margin.verdict}.")
         elif parts and found is not None:
             parts.append("It is certified all the same: the bound allows this.")
         return " ".join(parts)

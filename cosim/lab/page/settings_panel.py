@@ -11,6 +11,11 @@ from cosim.interactive.draft import Draft, DraftError, Mistake
 from noack.core.errors import NoackError
 from noack.core.number_format import number
 
+_NAME_EDITOR = """() => {
+  for (const text of document.querySelectorAll('.cm-content')) text.ariaLabel = 'scenario as TOML';
+  for (const area of document.querySelectorAll('.cm-scroller')) area.tabIndex = 0;
+}"""
+"""The editor cannot be given these from the server."""
 Changed = Callable[[Draft, str], Awaitable[None]]
 """Called with the new draft and the key that changed; an empty key: the whole text."""
 
@@ -36,11 +41,12 @@ class SettingsPanel:
         self._shape: tuple[object, ...] = ()
         self._sliders: dict[str, tuple[Slider, FastSlider, ui.label]] = {}
         self._controls = ui.column().classes("w-full gap-1")
-        with ui.expansion("all settings (TOML)").classes("w-full").props("dense"):
+        with ui.expansion("all settings (TOML)").classes("w-full").props("dense") as whole:
             self._mistakes = ui.column().classes("gap-0 w-full").props("role=status")
             self._editor = ui.codemirror(
                 draft.text, language="TOML", line_wrapping=False, on_change=self._edited
             ).classes("w-full h-96 text-xs")
+        whole.on("after-show", js_handler=_NAME_EDITOR)
         self._build()
 
     def show(self, draft: Draft, *, text: bool = True) -> None:
@@ -53,6 +59,10 @@ class SettingsPanel:
                 self._editor.set_value(draft.text)
         finally:
             self._quiet = False
+
+    def show_dark(self, *, dark: bool) -> None:
+        """Choose the colours of the editor."""
+        self._editor.set_theme("vscodeDark" if dark else "vscodeLight")
 
     def show_mistakes(self, mistakes: list[Mistake]) -> None:
         """Show mistakes at the editor and mark the sliders that they are about."""

@@ -52,7 +52,7 @@ STEPS = (
             "mode": "zoh", "trigger": {"policy": "periodic", "period_s": 0.1},
             "network.loss": {"model": "worst_case"}, "network.mansd": 0,
         },
-        "Drag M − 1 upwards until the loop diverges; then change the mode to model.",
+        "Drag M − 1 upwards until the loop diverges; then change the mode to model-based.",
     ),
     Step(
         "Your own plant under 80 % loss",

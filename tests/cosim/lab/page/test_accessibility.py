@@ -1,0 +1,62 @@
+"""The page for everyone: names, contrast, keyboard, small screens, in light and dark."""
+
+import json
+from importlib.resources import files
+from typing import Any
+
+import pytest
+
+pytest.importorskip("nicegui", reason="the extra `lab` is not installed")
+pytest.importorskip("axe_core_python", reason="axe-core-python is not installed")
+
+from tests.cosim.lab.page.lab_browser import TEXT, Page
+from tools.screenshot_recording import Browser
+
+TABS = ("explore", "run live", "recorded runs", "tutorial")
+CONTROLS = {"slider", "button", "textbox", "combobox", "tab", "switch", "checkbox", "link"}
+RULES = {"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa"], "iframes": False}
+EDITOR = {"light": "=== 'rgb(255, 255, 255)'", "dark": "!== 'rgb(255, 255, 255)'"}
+
+
+def violations(page: Page) -> list[str]:
+    """Return what axe-core finds, as one line per element."""
+    page.js(files("axe_core_python").joinpath("axe.min.js").read_text("utf-8"))
+    options = json.dumps(RULES)
+    found = page.js(
+        f"axe.run({{exclude: [['iframe']]}}, {options}).then(r => r.violations.flatMap("
+        "v => v.nodes.map(n => v.id + ' ' + n.target + ': ' + n.failureSummary)))"
+    )
+    return [] if found is None else list(found)
+
+
+def nameless(page: Page) -> list[Any]:
+    """Return the controls of the accessibility tree that have no name."""
+    nodes = page.browser.call("Accessibility.getFullAXTree")["nodes"]
+    return [
+        node["role"]["value"]
+        for node in nodes
+        if not node["ignored"]
+        and node["role"]["value"] in CONTROLS
+        and not node.get("name", {}).get("value", "").strip()
+    ]
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", [(1280, 900), (390, 844)])
+def test_controls_have_names_and_text_has_contrast(
+    browser: Browser, address: str, scheme: str, size: tuple[int, int]
+) -> None:
+    page = Page(browser, address, size=size, scheme=scheme)
+    page.js("document.head.insertAdjacentHTML('beforeend', '<style>*{transition:none !important}')")
+    page.js("document.querySelector('.q-expansion-item .q-item').click()")
+    page.wait("!!document.querySelector('.cm-content[aria-label]')")
+    page.wait(
+        f"getComputedStyle(document.querySelector('.cm-editor')).backgroundColor {EDITOR[scheme]}"
+    )
+    page.wait(f"{TEXT}.includes('assumed: ')")
+    for tab in TABS:
+        page.click(tab, ".q-tab")
+        page.wait(f"document.querySelector('.q-tab--active').innerText.trim() === {tab!r}")
+        assert violations(page) == [], tab
+        assert nameless(page) == [], tab
+        assert page.js("document.scrollingElement.scrollWidth <= innerWidth"), tab
