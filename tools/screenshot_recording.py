@@ -69,14 +69,15 @@ class Browser:
         self._in = os.fdopen(from_browser, "rb", buffering=0)
         self._buffer = b""
         self._numbers = itertools.count(1)
-        self._session: str | None = None
+        self.session: str | None = None
+        """The page that commands are for."""
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
         """Send one command and return its result; other messages are skipped."""
         number = next(self._numbers)
         message: dict[str, Any] = {"id": number, "method": method, "params": parameters}
-        if self._session is not None:
-            message["sessionId"] = self._session
+        if self.session is not None:
+            message["sessionId"] = self.session
         self._out.write(json.dumps(message).encode() + b"\0")
         while True:
             answer = self._read()
@@ -90,7 +91,7 @@ class Browser:
         """Open a page in a window of the given size in pixels."""
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
         session = self.call("Target.attachToTarget", targetId=target, flatten=True)
-        self._session = session["sessionId"]
+        self.session = session["sessionId"]
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         self.call("Emulation.setDeviceMetricsOverride", **size)
         self.call("Page.navigate", url=url)

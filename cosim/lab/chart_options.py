@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.interactive.ensemble import DRAWS, Ensemble
+from cosim.interactive.ensemble import Ensemble
 from cosim.interactive.exploration import Exploration
 from cosim.interactive.scenario_guarantee import Guarantee
 from cosim.output import palette
@@ -67,7 +67,7 @@ def figure_options(shown: Shown) -> Options:
         "textStyle": {"color": ink, "fontFamily": "inherit"},
         "aria": {"enabled": True, "label": {"description": "; ".join(titles)}},
         "legend": [{"type": "scroll", "left": 8, "right": 8, "top": grid["top"] - _LEGEND - 3,
-                    "textStyle": text, "pageTextStyle": text, "itemGap": 10, "itemWidth": 20,
+                    "textStyle": text, "pageTextStyle": text, "itemGap": 8, "itemWidth": 12,
                     "inactiveColor": "#808080", "data": legends[name]}
                    for name, grid in zip(_PANELS, grids, strict=True) if name in legends],
         "tooltip": {"trigger": "axis", "axisPointer": {"type": "line"}, "confine": True,
@@ -120,7 +120,7 @@ class _Curve(NamedTuple):
 _LINE: Mapping[str, Any] = {"width": 1.8}
 _THIN: Mapping[str, Any] = {"width": 1.2, "type": "dashed"}
 _EDGE: Mapping[str, Any] = {"width": 1, "type": "dotted"}
-_BAND, _KEPT = f"90 % of {DRAWS} draws", "kept settings"
+_BAND, _KEPT = "90 % of draws", "kept settings"
 
 
 def _curves() -> list[_Curve]:

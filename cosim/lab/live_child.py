@@ -5,6 +5,7 @@ It writes one JSON object per line on standard output: what happened, with its f
 
 import json
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,8 @@ def main() -> int:
 
 
 def _say(what: str, **fields: Any) -> None:
-    print(json.dumps({"what": what, **fields}), flush=True)
+    with suppress(BrokenPipeError):  # the page has ended; the run is recorded all the same
+        print(json.dumps({"what": what, **fields}), flush=True)
 
 
 if __name__ == "__main__":

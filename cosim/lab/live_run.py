@@ -74,11 +74,15 @@ class LiveRun:
         if not self.is_over:
             self.state, self.ok = "failed", False
             self._add(f"the run ended with status {status}")
+        self.remove_copies()
+        self.version += 1
+
+    def remove_copies(self) -> None:
+        """Remove the scenario files that were written for the run, which has read them."""
         if self._beside is not None:
             self._beside.unlink(missing_ok=True)
         if self._folder is not None:
             self._folder.cleanup()
-        self.version += 1
 
     def stop(self) -> None:
         """Ask the run to end; what was recorded is kept."""

@@ -31,6 +31,11 @@ _HEADERS = (
      b"http://localhost:*; frame-ancestors 'none'; base-uri 'self'; form-action 'self'"),
 )  # fmt: skip
 
+_UNKNOWN = (
+    b"noack lab: this is not the address of the page. Each start of noack lab has another address:"
+    b" open the one that its terminal shows. What follows the '?' are the settings; add it there.\n"
+)
+
 
 def new_secret() -> str:
     """Return a secret for the page's address."""
@@ -75,8 +80,9 @@ async def _refuse(scope: Scope, receive: Receive, send: Send, status: int) -> No
         await receive()
         await send({"type": "websocket.close", "code": 1008})
         return
-    await send({"type": "http.response.start", "status": status, "headers": []})
-    await send({"type": "http.response.body", "body": b""})
+    headers = [(b"content-type", b"text/plain"), *_HEADERS]
+    await send({"type": "http.response.start", "status": status, "headers": headers})
+    await send({"type": "http.response.body", "body": _UNKNOWN if status == 404 else b""})
 
 
 def _protected(send: Send) -> Send:

@@ -25,9 +25,11 @@ _STYLE = """
 .lab-rows { display: grid; grid-template-columns: auto auto; gap: 0 1rem; margin: 0; }
 .lab-rows dd { margin: 0; }
 .lab-viewer { height: 70vh; border: 0; }
+.nicegui-error-popup { max-width: 30rem; border: 3px solid var(--q-negative); }
 .lab-figure svg { width: 100%; height: auto; max-width: 900px; background: white; }
-:focus-visible { outline: 3px solid #c77700 !important; outline-offset: 2px; }
-.q-slider:focus-within, .q-field:focus-within { outline: 3px solid #c77700; outline-offset: 1px; }
+:focus-visible, .q-slider:focus-within, .q-field:focus-within {
+  outline: none; box-shadow: 0 0 0 2px white, 0 0 0 5px #c77700 !important;
+}
 .q-header { background: #1f5f99; }
 .q-header .q-field__label { color: white; opacity: 1; }
 .body--dark .q-btn.bg-primary, .body--dark .q-btn.bg-primary * { color: #08131e !important; }
@@ -42,6 +44,15 @@ _STYLE = """
   .body--dark .lab-settings { background: #121212; }
 }
 """
+
+_LOST = """
+const lost = document.getElementById('popup');
+lost.role = 'alert';
+lost.children[0].textContent = 'The page has lost its server.';
+lost.children[1].textContent = 'Has noack lab ended? Start it again and open the address that it '
+    + 'shows. The settings are in the address of this page, after the "?".';
+"""
+"""Words for the framework's notice, which is shown after 2 s without a connection."""
 
 
 async def show_page(services: LabServices) -> None:
@@ -109,6 +120,7 @@ class _Page:
     async def begin(self) -> None:
         """Draw for the first time."""
         await ui.context.client.connected()
+        ui.run_javascript(_LOST)
         self._is_dark = await ui.run_javascript(
             "window.matchMedia('(prefers-color-scheme: dark)').matches"
         )

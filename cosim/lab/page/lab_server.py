@@ -4,6 +4,7 @@ import asyncio
 import socket
 import webbrowser
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -64,7 +65,7 @@ def serve(options: LabOptions, announce: Callable[[str], None]) -> None:
             ws_per_message_deflate=False, timeout_graceful_shutdown=2, server_header=False,
         )  # fmt: skip
         server = _Server(config, lambda: _announced(address, options, announce))
-        with listener:
+        with listener, suppress(KeyboardInterrupt):  # Ctrl-C is how it ends
             asyncio.run(server.serve(sockets=[listener]))
 
 

@@ -37,6 +37,7 @@ class LabServices:
         self._pool.shutdown(wait=True)
         if self.live is not None:
             self.live.stop()
+            self.live.remove_copies()
 
     @property
     def known(self) -> Mapping[str, str]:
@@ -48,12 +49,16 @@ class LabServices:
 
         Raises: what the function raises.
         """
-        loop = asyncio.get_running_loop()
         try:
-            return await loop.run_in_executor(self._pool, function, *arguments)
+            return await self._submit(function, *arguments)
         except BrokenProcessPool:  # killed, perhaps out of memory
             self._pool = _new_pool()
-            return await loop.run_in_executor(self._pool, function, *arguments)
+            return await self._submit(function, *arguments)
+
+    def _submit(self, function: Callable[..., T], *arguments: Any) -> asyncio.Future[T]:
+        # Shielded: Python 3.11 prints a traceback when a pool ends that has cancelled calls.
+        loop = asyncio.get_running_loop()
+        return asyncio.shield(loop.run_in_executor(self._pool, function, *arguments))
 
     async def run_live(self, text: str, horizon_s: float, beside: Path) -> LiveRun:
         """Start a live run, after the end of the one before."""

@@ -1,17 +1,14 @@
 """The page, served for all tests of a file, and a headless browser for each test."""
 
-import json
 import os
 import shutil
-import signal
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.integration import conftest as live
+from tests.cosim.lab.page.lab_browser import Served
 from tools.screenshot_recording import Browser
 
 
@@ -22,15 +19,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def address(folder: Path) -> Iterator[str]:
-    command = live.noack_command("lab", "--no-browser", "--json", "--set", "horizon_s=4")
-    with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True) as server:
-        try:
-            assert server.stdout is not None
-            text = "".join(iter(server.stdout.readline, "}\n")) + "}"
-            yield json.loads(text)["address"]
-        finally:
-            server.send_signal(signal.SIGINT)
-            assert server.wait(timeout=live.PATIENCE_S) in (0, 130)
+    with Served(folder) as server:
+        yield server.address
 
 
 @pytest.fixture

@@ -1,14 +1,47 @@
-"""A tab of a headless browser that shows the page, for the tests."""
+"""The page for the tests: its server, and a tab of a headless browser that shows it."""
 
 import json
+import signal
+import subprocess
 import time
-from typing import Any
+from pathlib import Path
+from typing import Any, Self
 
 from tests.integration import conftest as live
 from tools.screenshot_recording import Browser
 
 SLIDERS = "document.querySelectorAll('.q-slider').length"
 TEXT = "document.body.innerText"
+
+
+class Served:
+    """A server of the page, whose errors are in a file; a context that ends it by Ctrl-C."""
+
+    def __init__(self, folder: Path, *arguments: str) -> None:
+        self.errors = folder / "errors.txt"
+        command = live.noack_command(
+            "lab", "--no-browser", "--json", "--set", "horizon_s=4", *arguments
+        )
+        with self.errors.open("w") as errors:
+            self._process = subprocess.Popen(
+                command, cwd=folder, stdout=subprocess.PIPE, stderr=errors, text=True
+            )
+        assert self._process.stdout is not None
+        text = "".join(iter(self._process.stdout.readline, "}\n")) + "}"
+        self.address: str = json.loads(text)["address"]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.send_signal(signal.SIGINT)
+        try:
+            assert self._process.wait(timeout=live.PATIENCE_S) == 0
+        finally:
+            self._process.kill()
+            assert self._process.stdout is not None
+            self._process.stdout.close()
+        assert self.errors.read_text() == ""
 
 
 class Page:
@@ -26,11 +59,29 @@ class Page:
         browser.open("about:blank", *size)
         preferred = [{"name": "prefers-color-scheme", "value": scheme}]
         browser.call("Emulation.setEmulatedMedia", features=preferred)
-        browser.call("Page.navigate", url=address)
+        browser.call("Emulation.setFocusEmulationEnabled", enabled=True)
+        self._session = browser.session
+        self.go(address)
+
+    def go(self, address: str) -> None:
+        """Open an address and wait until the page can be used."""
+        self.call("Page.navigate", url=address)
         self.wait(f"{SLIDERS} > 5 && {TEXT}.includes('transmissions')")  # it is connected
 
+    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """Send a command to this tab."""
+        self.browser.session = self._session
+        return self.browser.call(method, **parameters)
+
+    def press(self, key: str, code: int) -> None:
+        """Press a key, given by its name and its Windows code."""
+        for kind in ("rawKeyDown", "keyUp"):
+            self.call(
+                "Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code
+            )
+
     def js(self, expression: str) -> Any:
-        found = self.browser.call(
+        found = self.call(
             "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
         )
         return found["result"].get("value")
@@ -59,7 +110,7 @@ class Page:
         x, y, width = self.js(place)
         for kind, share in (("mousePressed", 0.4), ("mouseMoved", 0.45), ("mouseMoved", to),
                             ("mouseReleased", to)):  # fmt: skip
-            self.browser.call(
+            self.call(
                 "Input.dispatchMouseEvent", type=kind, x=x + share * width, y=y, button="left",
                 buttons=1, clickCount=1,
             )  # fmt: skip

@@ -31,7 +31,7 @@ def violations(page: Page) -> list[str]:
 
 def nameless(page: Page) -> list[Any]:
     """Return the controls of the accessibility tree that have no name."""
-    nodes = page.browser.call("Accessibility.getFullAXTree")["nodes"]
+    nodes = page.call("Accessibility.getFullAXTree")["nodes"]
     return [
         node["role"]["value"]
         for node in nodes
@@ -60,3 +60,41 @@ def test_controls_have_names_and_text_has_contrast(
         assert violations(page) == [], tab
         assert nameless(page) == [], tab
         assert page.js("document.scrollingElement.scrollWidth <= innerWidth"), tab
+
+
+FOCUSED = """(() => {
+  const at = document.activeElement, shown = at.closest('.q-slider, .q-field') || at;
+  const seen = [at, shown].some(e => getComputedStyle(e).boxShadow.includes('rgb(199, 119, 0)'));
+  const label = at.closest('label')?.querySelector('.q-field__label')?.innerText;
+  const name = at.closest('.q-slider')?.ariaLabel || at.ariaLabel || label;
+  return [name || at.innerText.split('\\n').pop(), seen, at === document.body];
+})()"""
+
+
+def test_the_keyboard_reaches_and_moves_everything(browser: Browser, address: str) -> None:
+    page = Page(browser, address)
+    reached: list[str] = []
+    for _ in range(60):
+        page.press("Tab", 9)
+        name, seen, outside = page.js(FOCUSED)
+        if outside or name in reached[:1]:
+            break
+        assert seen, name
+        reached.append(name)
+    sliders = page.js("[...document.querySelectorAll('.q-slider')].map(e => e.ariaLabel)")
+    labels = page.js("[...document.querySelectorAll('.q-field__label')].map(e => e.innerText)")
+    assert {*sliders, "scenario", "drawn state", "explore", "files", "dark or light"} <= {*reached}
+    assert {one for one in labels if one != "run"} <= {*reached}
+
+
+def test_arrow_keys_move_a_slider(browser: Browser, address: str) -> None:
+    page = Page(browser, address)
+    before = page.js(f"{TEXT}.match(/[0-9]+ transmissions/)[0]")
+    page.js(
+        "document.querySelector('.q-slider[aria-label=\"loss probability\"] [tabindex]').focus()"
+    )
+    page.press("ArrowLeft", 37)
+    page.wait("location.search.includes('network.loss.probability=0.79')")
+    for _ in range(20):
+        page.press("PageDown", 34)
+    page.wait(f"{TEXT}.match(/[0-9]+ transmissions/)[0] !== {before!r}")
