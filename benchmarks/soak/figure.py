@@ -6,13 +6,11 @@ from benchmarks.soak.flat import warm_up_s
 from benchmarks.soak.result import Result
 from cosim.output import palette
 from cosim.output.report.axes import (
-    BELOW_IN,
-    LEFT_IN,
-    RIGHT_IN,
-    WIDTH_IN,
     finish,
     head_in,
+    layout,
     line,
+    panel_width_in,
     place,
 )
 from cosim.output.report.figure_style import printed, styled
@@ -26,13 +24,13 @@ def memory_figure(result: Result) -> Figure:
     import numpy as np
 
     roles = list(result.watched)
-    head = head_in(())
-    whole_in = head + len(roles) * (_HEIGHT_IN + _GAP_IN) - _GAP_IN + BELOW_IN
-    figure = Figure(figsize=(WIDTH_IN, whole_in))
+    space, head = layout(), head_in(())
+    whole_in = head + len(roles) * (_HEIGHT_IN + _GAP_IN) - _GAP_IN + space.below_in
+    figure = Figure(figsize=(space.width_in, whole_in))
     for i, role in enumerate(roles):
         watched = result.watched[role]
         top_in = head + i * (_HEIGHT_IN + _GAP_IN)
-        axes = place(figure, LEFT_IN, top_in, WIDTH_IN - LEFT_IN - RIGHT_IN, _HEIGHT_IN)
+        axes = place(figure, space.left_in, top_in, panel_width_in(), _HEIGHT_IN)
         at_s = np.array(watched.at_s)
         kib = np.array([sample.uss_kib for sample in watched.samples])
         warm_s = warm_up_s(watched.length_s)

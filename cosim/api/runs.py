@@ -175,26 +175,35 @@ class Run:
             raise CallerError(f'"{figure}": no such figure of this run; it has {", ".join(known)}')
         return known[figure]().figure
 
-    def save_figures(self, format: str = "pdf") -> list[Path]:  # noqa: A002
+    def save_figures(
+        self,
+        format: str = "pdf",  # noqa: A002
+        width: str | float | None = None,
+    ) -> list[Path]:
         """Write all figures of the report into ``report-figures`` in the run directory.
 
         Args:
             format: svg, png, pdf or pgf; pdf and pgf have the fonts of LaTeX, which need not be
                 installed.
+            width: ``"column"`` (3.5 in), ``"page"`` (7.16 in), or inches; by default a column for
+                pdf and pgf, and 10 in for svg and png.
 
         Returns:
             The paths.
 
         Raises:
-            NoackError: there is no such format, or a file cannot be written.
+            NoackError: there is no such format or width, or a file cannot be written.
         """
-        from cosim.output.figure_format import FigureFormat
+        from cosim.output.figure_format import figure_files
         from cosim.output.report.figure_files import save_figures
 
-        if format not in [*FigureFormat]:
-            raise CallerError(f'"{format}": a figure is saved as {", ".join(FigureFormat)}')
-        found = ((name, draw().figure) for name, draw in self._pictures(bounded=True).items())
-        return save_figures(found, self.directory / REPORT_FILE, FigureFormat(format))
+        files = figure_files(format, width)
+
+        def drawn() -> "Iterator[tuple[str, Figure]]":
+            for name, draw in self._pictures(bounded=True).items():
+                yield name, draw().figure
+
+        return save_figures(drawn(), self.directory / REPORT_FILE, files)
 
     def save_tables(self, folder: Folder) -> list[Path]:
         """Write the tables of the summary, each as LaTeX (booktabs) and as CSV; return the paths.

@@ -181,6 +181,15 @@ FormatOption = Annotated[
         help="Write each figure as a file, too; pdf and pgf have the fonts of LaTeX.",
     ),
 ]
+WidthOption = Annotated[
+    str | None,
+    typer.Option(
+        "--width",
+        metavar="column|page|INCHES",
+        help="Width of figures in files: column (3.5 in), page (7.16 in), or inches; by default "
+        "column for pdf and pgf, 10 in for svg and png.",
+    ),
+]
 TablesOption = Annotated[
     Path | None,
     typer.Option(

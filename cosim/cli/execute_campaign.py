@@ -12,7 +12,7 @@ from noack.core.errors import CallerError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from cosim.output.figure_format import FigureFormat
+    from cosim.output.figure_format import FigureFiles
     from cosim.studies.campaign.campaign_file import Campaign
     from cosim.studies.campaign.finished_campaign import FinishedCampaign
 
@@ -40,7 +40,7 @@ def worker_pool(workers: int | None, scheduler: str | None = None) -> Callable[[
 
 def execute_campaign(
     console: "Console", plan: "Campaign", path: Path, start: Callable[[Any], Any], *,
-    folder: Path, draws: int | None = None, figure_format: "FigureFormat | None" = None,
+    folder: Path, draws: int | None = None, figure_files: "FigureFiles | None" = None,
 ) -> "FinishedCampaign":  # fmt: skip
     """Run or continue a campaign; write its page.
 
@@ -51,7 +51,7 @@ def execute_campaign(
         start: starts the workers, see :func:`worker_pool`.
         folder: of the campaign.
         draws: number of draws; the campaign's by default.
-        figure_format: write each figure as a file, too.
+        figure_files: write each figure as a file, too.
     """
     from cosim.live.progress import runs_bar
     from cosim.studies.campaign.finished_campaign import finish_campaign
@@ -60,6 +60,6 @@ def execute_campaign(
         console.print(f"noack: {line}", highlight=False, markup=False, soft_wrap=True)
 
     return finish_campaign(
-        plan, path, folder, lambda: start(say), draws=draws, figure_format=figure_format,
+        plan, path, folder, lambda: start(say), draws=draws, figure_files=figure_files,
         show=console.status, bar=runs_bar(console),
     )  # fmt: skip

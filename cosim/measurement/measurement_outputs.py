@@ -10,7 +10,7 @@ from cosim.live.progress import PatientConsole
 from cosim.measurement.measurement_tables import print_measurement
 from cosim.measurement.network_file import Form, write_network
 from cosim.measurement.network_measurement import Measurement
-from cosim.output.figure_format import FigureFormat
+from cosim.output.figure_format import FigureFiles
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.file_access import require_suffix
@@ -21,8 +21,8 @@ class OutputRequest:
     """What to write besides the tables."""
 
     page: Path | None = None
-    figure_format: FigureFormat | None = None
-    """Format of the figures beside the page."""
+    figure_files: FigureFiles | None = None
+    """Format and width of the figures beside the page."""
     network: Path | None = None
     form: Form = "trace"
     scenario: Scenario | None = None
@@ -30,7 +30,7 @@ class OutputRequest:
 
     def __post_init__(self) -> None:
         """Refuse wrong names before anything is measured."""
-        if self.figure_format is not None and self.page is None:
+        if self.figure_files is not None and self.page is None:
             raise CallerError("--format: the figures are beside the page; give --out FILE.html")
         if self.page is not None:
             require_suffix(self.page, "--out", ".html")
@@ -53,7 +53,7 @@ def report(found: Measurement, request: OutputRequest, console: Console | None) 
     if request.page is not None:
         from cosim.measurement.measurement_page import write_page
 
-        written += write_page(found, void, request.page, request.figure_format)
+        written += write_page(found, void, request.page, request.figure_files)
     if request.network is not None:
         written += write_network(found, request.network, request.form)
     if console is not None:

@@ -1,6 +1,15 @@
-"""The formats of figures; a module of its own, since the command line needs no matplotlib."""
+"""The formats and widths of figures; a module of its own: the command line needs no matplotlib."""
 
 from enum import StrEnum
+from typing import NamedTuple
+
+from noack.core.errors import CallerError
+
+SCREEN_IN = 10.0
+"""Width of a figure on a page of noack, in inches."""
+WIDTHS_IN = {"column": 3.5, "page": 7.16}
+"""Widths in a paper of two columns (IEEE), in inches."""
+_NARROWEST_IN, _WIDEST_IN = 3.0, 20.0
 
 
 class FigureFormat(StrEnum):
@@ -10,3 +19,51 @@ class FigureFormat(StrEnum):
     PNG = "png"
     PDF = "pdf"
     PGF = "pgf"
+
+
+class FigureFiles(NamedTuple):
+    """The files of figures that are written beside a page."""
+
+    kind: FigureFormat
+    width_in: float
+
+
+def figure_files(kind: str | None, width: str | float | None = None) -> FigureFiles | None:
+    """Return format and width of figures; None without a format.
+
+    Raises:
+        CallerError: there is no such format or width, or a width without a format.
+    """
+    if kind is None:
+        if width is not None:
+            raise CallerError("--width: is the width of the figures of --format; give one")
+        return None
+    if kind not in [*FigureFormat]:
+        raise CallerError(f'"{kind}": a figure is saved as {", ".join(FigureFormat)}')
+    return FigureFiles(FigureFormat(kind), figure_width_in(FigureFormat(kind), width))
+
+
+def figure_width_in(kind: FigureFormat, width: str | float | None) -> float:
+    """Return the width of a figure in inches.
+
+    Args:
+        kind: its format; by default the figures of LaTeX are as wide as a column.
+        width: ``column``, ``page`` or inches; None for the default.
+
+    Raises:
+        CallerError: there is no such width.
+    """
+    if width is None:
+        return WIDTHS_IN["column"] if kind in (FigureFormat.PDF, FigureFormat.PGF) else SCREEN_IN
+    if width in WIDTHS_IN:
+        return WIDTHS_IN[str(width)]
+    try:
+        inches = float(width)
+    except ValueError:
+        inches = 0.0
+    if not _NARROWEST_IN <= inches <= _WIDEST_IN:
+        raise CallerError(
+            f"width {width}: expected column, page, or inches from {_NARROWEST_IN:g} to "
+            f"{_WIDEST_IN:g}"
+        )
+    return inches

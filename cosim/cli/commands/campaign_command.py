@@ -43,6 +43,7 @@ def campaign(
     scheduler: Scheduler = None,
     out: Out = None,
     figure_format: cli.FormatOption = None,
+    width: cli.WidthOption = None,
     tables: cli.TablesOption = None,
     json: cli.JsonOption = False,
 ) -> int:
@@ -53,17 +54,19 @@ def campaign(
     Exit status 1: a run exceeded a certified bound.
     """
     from cosim.live.progress import PatientConsole
+    from cosim.output.figure_format import figure_files
     from cosim.shipped_files import find_shipped
     from cosim.studies.campaign.campaign_file import load
     from cosim.studies.campaign.campaign_report import campaign_tables, print_summary
 
     start = worker_pool(workers, scheduler)
+    files_of_figures = figure_files(figure_format, width)
     console = PatientConsole(stderr=True)
     path = find_shipped(file, "campaigns")
     plan = load(path)
     folder = out or cli.DEFAULT_RUNS / "campaigns" / plan.name
     summary, _, _, made, files = execute_campaign(
-        console, plan, path, start, folder=folder, draws=draws, figure_format=figure_format
+        console, plan, path, start, folder=folder, draws=draws, figure_files=files_of_figures
     )
     if json:
         cli.print_json(summary.document() | {"made": made, "files": [str(file) for file in files]})

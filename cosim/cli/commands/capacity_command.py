@@ -93,6 +93,7 @@ def capacity(
     settings: cli.SetOption = None,
     out: Out = None,
     figure_format: cli.FormatOption = None,
+    width: cli.WidthOption = None,
     json: cli.JsonOption = False,
 ) -> int:
     """How many loops a link carries, until guarantee, deadline or cost is exceeded.
@@ -102,10 +103,12 @@ def capacity(
     Exit status 1: a live run failed, or does not agree with the simulation.
     """
     from cosim.live.progress import PatientConsole
+    from cosim.output.figure_format import figure_files
     from cosim.studies.capacity import capacity_live, capacity_page
     from cosim.studies.capacity.capacity_criteria import capacities
 
     start = worker_pool(workers)
+    files_of_figures = figure_files(figure_format, width)
     plan = _plan(
         cli.find_scenario(scenario), settings or [], policy or [], loops=loops, rate_bps=rate_bps,
         period_s=update_period, deadline_s=late_after, amplitude=disturbance, draws=draws,
@@ -123,7 +126,7 @@ def capacity(
     result = capacity_page.CapacityResult(
         plan, done.summary, capacities(done.summary, done.store), points
     )
-    files = [*capacity_page.write(result, folder, figure_format), *done.files]
+    files = [*capacity_page.write(result, folder, files_of_figures), *done.files]
     if json:
         cli.print_json(result.document() | {"made": done.made, "files": [str(f) for f in files]})
     else:

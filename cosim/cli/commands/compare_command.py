@@ -35,6 +35,7 @@ def compare(
             help="File of the overlay: a page (.html), or a figure (.svg, .png, .pdf, .pgf).",
         ),
     ] = cli.DEFAULT_RUNS / "comparison.html",
+    width: cli.WidthOption = None,
     json: cli.JsonOption = False,
 ) -> int:
     """Compare runs: key numbers, settings that differ, curves overlaid."""
@@ -43,7 +44,7 @@ def compare(
 
     with PatientConsole(stderr=True).status("comparing"):
         found = compare_runs(directories)
-        found.save(out)
+        found.save(out, width)
     if json:
         cli.print_json(found.to_json() | {"overlay": str(out)})
         return ExitStatus.OK

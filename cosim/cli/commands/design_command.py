@@ -84,6 +84,7 @@ def design(
     out: Out = None,
     page: Page = None,
     figure_format: cli.FormatOption = None,
+    width: cli.WidthOption = None,
     json: cli.JsonOption = False,
 ) -> int:
     """Choose α, β and the norm: the fewest transmissions that meet your limits.
@@ -91,11 +92,13 @@ def design(
     Exit status 1: no choice meets the limits, or fresh draws do not confirm it.
     """
     from cosim.live.progress import work_bar
+    from cosim.output.figure_format import figure_files
     from cosim.studies.design import design_page as pages
     from cosim.studies.design.design_search import design as designed
     from cosim.studies.design.loop_families import families_of
     from noack.config.scenario_file import dumps
 
+    files_of_figures = figure_files(figure_format, width)
     loaded = cli.load_scenario(scenario, settings)
     loaded.decaying  # noqa: B018 - raises for another policy
     limits = _limits(settling, quantile, settle, bound or [], under)
@@ -107,7 +110,7 @@ def design(
     with work_bar("trying candidates") as progress:
         found = designed(families, limits, draws=draws, seed=seed, progress=progress)
     path = page or cli.DEFAULT_RUNS / "design" / f"{loaded.name}.html"
-    written = pages.write_page(found, path, figure_format)
+    written = pages.write_page(found, path, files_of_figures)
     if out is not None and found.feasible:
         written.append(write_whole(out, dumps(found.scenario)))
     if json:

@@ -27,13 +27,14 @@ def fidelity(
             help="Write a figure of the differences over time (.svg, .png, .pdf, .pgf).",
         ),
     ] = None,
+    width: cli.WidthOption = None,
     json: cli.JsonOption = False,
 ) -> int:
     """Compare a run with the ideal loop in continuous time, effect by effect."""
     from cosim.analysis.fidelity import compute_fidelity
     from cosim.live.progress import PatientConsole
     from cosim.output.fidelity_table import print_fidelity
-    from cosim.output.report.figure_files import save_figure
+    from cosim.output.report.figure_files import save_drawn
     from cosim.output.report.signal_figures import fidelity_figure
     from cosim.record.run_record import load_record
 
@@ -41,7 +42,7 @@ def fidelity(
     with PatientConsole(stderr=True).status("comparing"):
         found = compute_fidelity(load_record(path))
         if out is not None:
-            save_figure(fidelity_figure(found), out)
+            save_drawn(lambda: fidelity_figure(found), out, width)
     if json:
         cli.print_json(found.as_json())
     else:

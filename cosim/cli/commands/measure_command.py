@@ -46,6 +46,7 @@ def measure(
     settings: cli.SetOption = None,
     out: given.Page = None,
     figure_format: cli.FormatOption = None,
+    width: cli.WidthOption = None,
     write: given.NetworkFile = None,
     form: given.Form = given.NetworkForm.TRACE,
     json: cli.JsonOption = False,
@@ -57,6 +58,7 @@ def measure(
     from cosim.measurement.measurement_outputs import OutputRequest, report
     from cosim.measurement.network_measurement import Measurement, MeasurementOptions
     from cosim.measurement.trace_sources import SourceOptions
+    from cosim.output.figure_format import figure_files
 
     options = _options(deadline, share, window, outage)
     if settings and for_scenario is None:
@@ -64,7 +66,8 @@ def measure(
     scenario = None if for_scenario is None else cli.load_scenario(for_scenario, settings)
     if form is given.NetworkForm.MODEL and write is None:
         raise CallerError("--as model: is the form of --write; give its FILE.toml")
-    request = OutputRequest(out, figure_format, write, form.value, scenario)
+    files_of_figures = figure_files(figure_format, width)
+    request = OutputRequest(out, files_of_figures, write, form.value, scenario)
     live = LiveOptions(rate, duration, size, round_trip, silence, save, options.deadline_s)
     how = SourceOptions(
         None if clocks is None else clocks is given.ClockRelation.DIFFERENT,

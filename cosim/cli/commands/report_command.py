@@ -23,15 +23,18 @@ def report(
         bool, typer.Option("--again", help="Write the report again, even if there is one.")
     ] = False,
     figure_format: cli.FormatOption = None,
+    width: cli.WidthOption = None,
     json: cli.JsonOption = False,
 ) -> int:
     """Print the path of a run's report (one HTML page with all figures); write it if missing."""
     from cosim.api.runs import open_run
     from cosim.live.finalize import run_report
+    from cosim.output.figure_format import figure_files
 
     chosen = chosen_run(run_dir, runs, loop)
+    figure_files(figure_format, width)  # refuses a wrong width before anything is drawn
     path = run_report(chosen, again=again)
-    figures = [] if figure_format is None else open_run(chosen).save_figures(figure_format)
+    figures = [] if figure_format is None else open_run(chosen).save_figures(figure_format, width)
     if json:
         written = {"figures": [str(one) for one in figures]} if figures else {}
         cli.print_json({"report": str(path)} | written)

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
@@ -17,6 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 
 from cosim.output import palette
+from cosim.output.report.figure_layout import layout as layout
 from cosim.output.report.figure_style import NotebookFigure, printed
 from cosim.record.decimate import Reals, decimate
 
@@ -40,10 +42,9 @@ Shown = tuple[Artist, str]
 
 TIME = "time t [s]"
 
-WIDTH_IN, LEFT_IN, RIGHT_IN, BELOW_IN = 10.0, 1.15, 0.2, 0.55
-"""Width of a figure; space for labels and ticks at the left, at the right, and below an axes."""
-_ABOVE_IN, _LEGEND_ROW_IN, _TITLE_IN, _HANDLE_IN, _CHARACTER_IN = 0.34, 0.19, 2.3, 0.6, 0.075
-
+_BESIDE_GAP_IN, _UNTITLED_IN = 0.27, 0.08
+_TITLE_CHARACTERS = 31
+"""Room for a title beside a legend."""
 _COLUMNS = 600
 """Pixel columns of a panel, to which lines are reduced."""
 _MARKS, _CROWD = 120, 80
@@ -52,6 +53,8 @@ drawn smaller."""
 _MARKUP = re.compile(r"[$\\{}^_]|(?<=\\)\w+")
 _LARGEST = 1e150
 _LONGEST_NAME = 16
+_CROWDED = 6.0
+"""Ratio of the ends of a logarithmic axis from which it has room for few numbers in a paper."""
 
 _BOUND_STYLES: dict[BoundKind, tuple[palette.Colour, tuple[Any, ...]]] = {
     # There may be several certificates, for different conditions.
@@ -67,10 +70,10 @@ def place(
     figure: Figure, left_in: float, top_in: float, width_in: float, height_in: float, **shared: Any
 ) -> Axes:
     """Add axes; their upper left corner has this distance from the figure's."""
-    whole_in = figure.get_figheight()
+    figure_in, whole_in = figure.get_size_inches()
     bottom_in = whole_in - top_in - height_in
     axes = figure.add_axes(
-        (left_in / WIDTH_IN, bottom_in / whole_in, width_in / WIDTH_IN, height_in / whole_in),
+        (left_in / figure_in, bottom_in / whole_in, width_in / figure_in, height_in / whole_in),
         **shared,
     )
     factor = axes.yaxis.get_offset_text()  # e.g. ×10⁻⁶; above the axes it would overlap the title
@@ -79,48 +82,81 @@ def place(
 
 
 def single(
-    height_in: float, labels: Sequence[str], beside_in: float = 0.0
+    height_in: float, labels: Sequence[str], beside_in: float = 0.0, *, titled: bool = True
 ) -> tuple[Figure, list[Axes]]:
     """Return a figure of one panel, or of two with a common vertical axis.
 
     Args:
-        height_in: height of the axes.
+        height_in: height of the axes in a figure for the screen.
         labels: labels of the first panel's legend, which needs space above it.
-        beside_in: width of the second panel; 0 for none.
+        beside_in: width of the second panel in a figure for the screen; 0 for none.
+        titled: whether the first panel gets a title.
     """
-    width_in = WIDTH_IN - LEFT_IN - RIGHT_IN - (beside_in + 0.25 if beside_in else 0.0)
-    above_in = head_in(labels, width_in)
-    figure = NotebookFigure(figsize=(WIDTH_IN, above_in + height_in + BELOW_IN))
-    axes = [place(figure, LEFT_IN, above_in, width_in, height_in)]
+    space = layout()
+    height_in, beside_in = height_in * space.scale, beside_in * space.beside_scale
+    width_in = panel_width_in() - (beside_in + _BESIDE_GAP_IN if beside_in else 0.0)
+    above_in = head_in(labels, width_in, titled=titled)
+    figure = NotebookFigure(figsize=(space.width_in, above_in + height_in + space.below_in))
+    axes = [place(figure, space.left_in, above_in, width_in, height_in)]
     if beside_in:
-        left_in = WIDTH_IN - RIGHT_IN - beside_in
+        left_in = space.width_in - space.right_in - beside_in
         axes.append(place(figure, left_in, above_in, beside_in, height_in, sharey=axes[0]))
         axes[1].tick_params(labelleft=False, which="both")
     return figure, axes
 
 
-def head_in(labels: Sequence[str], width_in: float = WIDTH_IN - LEFT_IN - RIGHT_IN) -> float:
-    """Return the height of title and legend above axes of this width."""
-    rows = math.ceil(len(labels) / _legend_columns(labels, width_in))
-    return _ABOVE_IN + _LEGEND_ROW_IN * max(rows - 1, 0)
+def panel_width_in() -> float:
+    """Return the width of axes that are as wide as the figure."""
+    space = layout()
+    return space.width_in - space.left_in - space.right_in
 
 
-def _legend_columns(labels: Sequence[str], width_in: float) -> int:
-    """Return the number of legend columns that fit beside the title."""
-    entries_in = [_HANDLE_IN + _CHARACTER_IN * len(_MARKUP.sub("", label)) for label in labels]
+def head_in(labels: Sequence[str], width_in: float | None = None, *, titled: bool = True) -> float:
+    """Return the height of title and legend above axes of this width, by default the whole."""
+    space = layout()
+    title_in = space.above_in if titled or space.beside_title else _UNTITLED_IN
+    return title_in + space.legend_row_in * _legend_rows(labels, width_in)
+
+
+def _legend_rows(labels: Sequence[str], width_in: float | None) -> int:
+    """Return the number of rows of a legend without the one that the title shares."""
+    rows = math.ceil(len(labels) / legend_columns(labels, width_in))
+    return max(rows - 1, 0) if layout().beside_title else rows
+
+
+def legend_columns(labels: Sequence[str], width_in: float | None = None) -> int:
+    """Return the number of legend columns that fit beside the title, or below it.
+
+    Below the title, a legend may be as wide as the figure.
+    """
+    space = layout()
+    character_in = space.character_in
+    entries_in = [space.handle_in + character_in * len(_MARKUP.sub("", one)) for one in labels]
+    room_in = space.width_in - 2 * space.right_in
+    if space.beside_title:
+        width_in = panel_width_in() if width_in is None else width_in
+        room_in = width_in - _TITLE_CHARACTERS * character_in
     for columns in range(len(labels), 1, -1):
         widths_in = [max(column) for column in np.array_split(entries_in, columns)]
-        if sum(widths_in) <= width_in - _TITLE_IN:
+        if sum(widths_in) <= room_in:
             return columns
     return 1
 
 
 def legend(axes: Axes, shown: Sequence[Shown]) -> None:
-    """Put the legend above the axes at the right, where there are no data."""
+    """Put the legend above the axes at the right, where there are no data; the title is set."""
     if shown:
         handles, labels = zip(*shown, strict=True)
-        columns = _legend_columns(labels, axes.get_position().width * WIDTH_IN)
-        axes.legend(handles, labels, loc="lower right", bbox_to_anchor=(1, 1), ncols=columns)
+        space, place = layout(), axes.get_position()
+        width_in = place.width * space.width_in
+        columns, right = legend_columns(labels, width_in), 1.0
+        if not space.beside_title:  # it ends where the figure's axes end
+            right = (1 - space.right_in / space.width_in - place.x0) / place.width
+        axes.legend(handles, labels, loc="lower right", bbox_to_anchor=(right, 1), ncols=columns)
+        if not space.beside_title:
+            rows_pt = 72 * space.legend_row_in * _legend_rows(labels, width_in)
+            pad_pt = rows_pt + mpl.rcParams["axes.titlepad"]
+            axes.set_title(axes.get_title("left"), pad=pad_pt)
 
 
 def finite(values: Reals, *, positive: bool = False) -> Reals:
@@ -238,13 +274,18 @@ class _Numbers(LogFormatter):
     """Writes 0.2 and 200, but 10⁻⁵ as plain text: typeset powers would be slow."""
 
     def __call__(self, x: float, pos: int | None = None) -> str:
-        if not super().__call__(x, pos):
+        if not super().__call__(x, pos) or (self._is_crowded() and f"{x:.0e}"[0] not in "13"):
             return ""
         if 1e-3 <= x < 1e5:
             return f"{x:g}"
         digits, exponent = f"{x:.0e}".split("e")
         power = "10" + str(int(exponent)).translate(_RAISED)
         return power if digits == "1" else f"{digits}·{power}"
+
+    def _is_crowded(self) -> bool:
+        """Whether only 1, 3, 10, 30, … have room: on the horizontal axis of a paper's figure."""
+        low, high = self.axis.get_view_interval()  # type: ignore[union-attr]
+        return layout().is_paper and self.axis.axis_name == "x" and high > _CROWDED * low  # type: ignore[union-attr]
 
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")

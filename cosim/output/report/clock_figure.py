@@ -82,10 +82,12 @@ def clock_figure(
         began = lost & ~np.append(False, lost[:-1])
         lost_us = np.where(began, allowed_us, np.nan)
         draw.marks(axes, t_s, lost_us, size=9.0, marker="x", markeredgewidth=2.0, **style)
+    if all(one.largest_us is None for one in errors.values()):
+        axes.set_ylim(allowed_us / 10, allowed_us * 10)
     limit = axes.axhline(
         allowed_us, color=printed(palette.THRESHOLD), linewidth=1.2, linestyle=(0, (4, 3))
     )
-    draw.legend(axes, [*shown, (limit, _ALLOWED)])
     axes.set(title="Clocks", xlabel=draw.TIME, ylabel="bound of error [wall µs]")
+    draw.legend(axes, [*shown, (limit, _ALLOWED)])
     draw.finish(axes, np.array([0.0, last_s]))
     return figure

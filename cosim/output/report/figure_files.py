@@ -4,12 +4,13 @@ import base64
 import io
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from cosim.output.figure_format import FigureFormat
+from cosim.output.figure_format import FigureFiles, FigureFormat, figure_width_in
+from cosim.output.report.figure_layout import figure_width
 from cosim.output.report.figure_style import GRID, INK, PAPER, paper_fonts, settings
 from noack.core.errors import CallerError
 from noack.core.file_access import write_whole
@@ -37,9 +38,7 @@ def save_figure(figure: Figure, path: Path) -> None:
         CallerError: another ending than .svg, .png, .pdf or .pgf.
         MachineError: the file cannot be written.
     """
-    if path.suffix not in FIGURE_SUFFIXES:
-        raise CallerError(f"{path}: a figure is saved as {', '.join(FIGURE_SUFFIXES)}")
-    kind = FigureFormat(path.suffix.removeprefix("."))
+    kind = _kind_of(path)
     if kind is FigureFormat.PGF:
         from cosim.output.report.pgf_picture import pgf_picture
 
@@ -57,9 +56,14 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 
 def save_figures(
-    figures: Iterable[tuple[str, Figure]], page: Path, kind: FigureFormat | None
+    figures: Iterable[tuple[str, Figure]], page: Path, files: FigureFiles | None
 ) -> list[Path]:
     """Write the figures of a page, given with their names, into ``PAGE-figures`` beside it.
+
+    Args:
+        figures: they are drawn for the width of the files: an iterator that draws them.
+        page: the page.
+        files: their format and width; None to write none.
 
     Returns:
         The written files; none without a format.
@@ -68,10 +72,34 @@ def save_figures(
         MachineError: a file cannot be written.
     """
     written: list[Path] = []
-    for name, figure in figures if kind is not None else ():
-        written.append(page.with_name(f"{page.stem}-figures") / f"{name}.{kind}")
-        save_figure(figure, written[-1])
+    if files is not None:
+        with figure_width(files.width_in):
+            for name, figure in figures:
+                written.append(page.with_name(f"{page.stem}-figures") / f"{name}.{files.kind}")
+                save_figure(figure, written[-1])
     return written
+
+
+def save_drawn(draw: Callable[[], Figure], path: Path, width: str | float | None = None) -> None:
+    """Draw a figure for the width of a file, and write it; see :func:`save_figure`.
+
+    Args:
+        draw: draws the figure.
+        path: of the file.
+        width: ``column``, ``page`` or inches; by default that of the file's format.
+
+    Raises:
+        CallerError: another ending than that of a format, or there is no such width.
+        MachineError: the file cannot be written.
+    """
+    with figure_width(figure_width_in(_kind_of(path), width)):
+        save_figure(draw(), path)
+
+
+def _kind_of(path: Path) -> FigureFormat:
+    if path.suffix not in FIGURE_SUFFIXES:
+        raise CallerError(f"{path}: a figure is saved as {', '.join(FIGURE_SUFFIXES)}")
+    return FigureFormat(path.suffix.removeprefix("."))
 
 
 def inline(figure: Figure, name: str, description: str) -> str:

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from cosim.output.palette import Colour
+from cosim.output.report.figure_layout import fit_to_paper, layout
 
 P = ParamSpec("P")
 Rgb = tuple[float, float, float]
@@ -31,26 +32,22 @@ _SETTINGS: dict[Any, Any] = {
     "axes.facecolor": PAPER,
     "axes.grid": True,
     "axes.labelcolor": INK,
-    "axes.labelsize": 10,
     "axes.linewidth": 0.8,
     "axes.spines.right": False,
     "axes.spines.top": False,
     "axes.titlecolor": INK,
     "axes.titlelocation": "left",
-    "axes.titlesize": 10.5,
     "axes.titleweight": "bold",
     "axes.titley": 1.0,
     "figure.dpi": 100,
     "figure.facecolor": PAPER,
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],
-    "font.size": 10,
     "grid.color": GRID,
     "grid.linewidth": 0.7,
     "legend.borderaxespad": 0.3,
     "legend.borderpad": 0.0,
     "legend.columnspacing": 1.4,
-    "legend.fontsize": 9,
     "legend.frameon": False,
     "legend.labelcolor": INK,
     "lines.linewidth": 1.3,
@@ -61,9 +58,7 @@ _SETTINGS: dict[Any, Any] = {
     "svg.hashsalt": "noack",
     "text.color": INK,
     "xtick.color": INK,
-    "xtick.labelsize": 9,
     "ytick.color": INK,
-    "ytick.labelsize": 9,
 }
 
 
@@ -81,7 +76,7 @@ def settings(extra: Mapping[Any, Any] | None = None) -> Iterator[None]:
     """Apply only these settings within the context, regardless of the user's matplotlibrc."""
     with mpl.rc_context(), warnings.catch_warnings():
         mpl.rcdefaults()
-        mpl.rcParams.update(_SETTINGS | dict(extra or {}))
+        mpl.rcParams.update(_SETTINGS | layout().settings() | dict(extra or {}))
         # A name may use characters that the font lacks; they are drawn as boxes, without a warning.
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         yield
@@ -126,7 +121,9 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
     @functools.wraps(draw)
     def drawn(*arguments: P.args, **options: P.kwargs) -> Figure:
         with settings():
-            return draw(*arguments, **options)
+            figure = draw(*arguments, **options)
+            fit_to_paper(figure)
+            return figure
 
     return drawn
 

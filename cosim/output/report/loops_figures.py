@@ -19,11 +19,13 @@ NAMED = len(palette.SERIES)
 """Up to so many loops have a curve each, in a colour of its own; more are drawn as bands."""
 _PANEL_IN, _BETWEEN_IN = 1.7, 0.35
 _ROW_IN, _LOWEST_IN, _HIGHEST_IN, _BAR_IN = 0.22, 1.2, 4.5, 0.2
+_BAR_ROOM_IN = 4 * _BAR_IN
 _DECADES = 5
 MOST_ROWS = 24
 """Up to so many rows of the map have the names of their loops."""
 _BANDS = ((0, 4, 0.25, "5 to 95 % of the loops"), (1, 3, 0.45, "25 to 75 %"))
 _MEDIAN, _LARGEST = 2, 5
+_MOST, _MEAN = "largest of an interval", "mean"
 
 Reals = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -40,16 +42,16 @@ class QueueLength(NamedTuple):
 @styled
 def network_figure(over_time: LoopsOverTime, names: Sequence[str], queue: QueueLength) -> Figure:
     """Draw the number of datagrams in the network, and the share of each loop of the bytes."""
-    figure, (upper, lower) = _two_panels(_labels(names))
+    figure, (upper, lower) = _two_panels((_MOST, _MEAN), _labels(names))
     t_s = np.asarray((np.arange(len(queue.mean)) + 0.5) * queue.width_s, np.float64)
     network, most = printed(palette.NETWORK), np.asarray(queue.largest, dtype=np.float64)
     upper.fill_between(t_s, most, step="mid", color=network, alpha=0.3, linewidth=0)
-    shown = draw.line(upper, t_s, np.array(queue.mean, np.float64), "mean", color=network)
+    shown = draw.line(upper, t_s, np.array(queue.mean, np.float64), _MEAN, color=network)
     upper.set(title="Datagrams in the network", ylabel="datagrams")
-    draw.legend(upper, [(upper.collections[0], "largest of an interval"), *shown])
+    draw.legend(upper, [(upper.collections[0], _MOST), *shown])
     ends_s, shares = over_time.shares()
-    _curves(lower, ends_s - ends_s[0] / 2, 100 * shares, names)
     lower.set(title="Share of the link", ylabel="%", xlabel=draw.TIME)
+    _curves(lower, ends_s - ends_s[0] / 2, 100 * shares, names)
     for axes in (upper, lower):
         axes.set_ylim(bottom=0)
         draw.finish(axes, over_time.edges_s)
@@ -59,12 +61,12 @@ def network_figure(over_time: LoopsOverTime, names: Sequence[str], queue: QueueL
 @styled
 def norms_figure(over_time: LoopsOverTime, names: Sequence[str], stayed: Bools) -> Figure:
     """Draw ‖e_c‖ and ‖x‖ of all loops on logarithmic axes, whose range is for those that stayed."""
-    figure, panels = _two_panels(_labels(names))
+    figure, panels = _two_panels(_labels(names), _labels(names))
     drawn = ((r"$\|e_c\|$ controller", over_time.errors), (r"$\|x\|$ plant", over_time.states))
     for axes, (label, values) in zip(panels, drawn, strict=True):
         draw.logarithmic(axes, "y")
-        _curves(axes, over_time.middles_s, draw.finite(values, positive=True), names)
         axes.set(title=label)
+        _curves(axes, over_time.middles_s, draw.finite(values, positive=True), names)
         draw.limit_log_axis(axes, _scale(values, stayed), _DECADES)
         draw.finish(axes, over_time.edges_s)
     panels[1].set_xlabel(draw.TIME)
@@ -81,16 +83,19 @@ def error_map(over_time: LoopsOverTime, names: Sequence[str], stayed: Bools) -> 
         stayed: (L,) the loops that did not diverge.
     """
     count = len(names)
-    height_in = min(max(count * _ROW_IN, _LOWEST_IN), _HIGHEST_IN)
-    above_in = draw.head_in([])
-    figure = NotebookFigure(figsize=(draw.WIDTH_IN, above_in + height_in + draw.BELOW_IN))
-    width_in = draw.WIDTH_IN - draw.LEFT_IN - draw.RIGHT_IN - 4 * _BAR_IN
-    axes = draw.place(figure, draw.LEFT_IN, above_in, width_in, height_in)
+    space, above_in = draw.layout(), draw.head_in([])
+    height_in = min(max(count * _ROW_IN, _LOWEST_IN), _HIGHEST_IN) * space.scale
+    figure = NotebookFigure(figsize=(space.width_in, above_in + height_in + space.below_in))
+    shown = [draw.plain(name) for name in names] if count <= MOST_ROWS else []
+    names_in = max(map(len, shown), default=0) * space.character_in + _BAR_IN
+    left_in = max(space.left_in, names_in)
+    width_in = space.width_in - left_in - space.right_in - _BAR_ROOM_IN
+    axes = draw.place(figure, left_in, above_in, width_in, height_in)
     values = draw.finite(over_time.errors, positive=True)
     axes.set(title=r"$\|e_c\|$ of each loop", xlabel=draw.TIME)
     axes.grid(visible=False)
-    if count <= MOST_ROWS:
-        axes.set_yticks(range(count), [draw.plain(name) for name in names])
+    if shown:
+        axes.set_yticks(range(count), shown)
     else:
         axes.set_ylabel("number of the loop")
     if not np.isfinite(values).any():
@@ -105,8 +110,8 @@ def error_map(over_time: LoopsOverTime, names: Sequence[str], stayed: Bools) -> 
         values, aspect="auto", interpolation="nearest", norm=norm, cmap=colormaps["viridis"],
         extent=(0.0, float(over_time.edges_s[-1]), count - 0.5, -0.5),
     )  # fmt: skip
-    left_in = draw.WIDTH_IN - draw.RIGHT_IN - 3 * _BAR_IN
-    bar = draw.place(figure, left_in, above_in, _BAR_IN, height_in)
+    bar_in = space.width_in - space.right_in - 3 * _BAR_IN
+    bar = draw.place(figure, bar_in, above_in, _BAR_IN, height_in)
     figure.colorbar(image, cax=bar, extend="max" if float(np.nanmax(values)) > most else "neither")
     bar.grid(visible=False)
     return figure
@@ -124,13 +129,16 @@ def _labels(names: Sequence[str]) -> list[str]:
     return [draw.plain(name) for name in names] if len(names) <= NAMED else bands
 
 
-def _two_panels(labels: Sequence[str]) -> tuple[Figure, list[Axes]]:
-    above_in = draw.head_in(labels)
-    height_in = 2 * (above_in + _PANEL_IN) + _BETWEEN_IN + draw.BELOW_IN
-    figure = NotebookFigure(figsize=(draw.WIDTH_IN, height_in))
-    width_in = draw.WIDTH_IN - draw.LEFT_IN - draw.RIGHT_IN
-    tops_in = (above_in, 2 * above_in + _PANEL_IN + _BETWEEN_IN)
-    return figure, [draw.place(figure, draw.LEFT_IN, top, width_in, _PANEL_IN) for top in tops_in]
+def _two_panels(*labels: Sequence[str]) -> tuple[Figure, list[Axes]]:
+    """Return a figure of two panels, whose legends have these labels."""
+    space, (upper_in, lower_in) = draw.layout(), map(draw.head_in, labels)
+    panel_in, between_in = _PANEL_IN * space.scale, _BETWEEN_IN * space.scale
+    below_in = upper_in + panel_in + between_in + lower_in
+    height_in = below_in + panel_in + space.below_in
+    figure = NotebookFigure(figsize=(space.width_in, height_in))
+    at_in = ((space.left_in, upper_in), (space.left_in, below_in))
+    width_in = draw.panel_width_in()
+    return figure, [draw.place(figure, *one_in, width_in, panel_in) for one_in in at_in]
 
 
 def _curves(axes: Axes, t_s: Reals, values: Reals, names: Sequence[str]) -> None:

@@ -1,5 +1,6 @@
 """The figure of the losses that occurred, beside what the guarantee allows."""
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -14,7 +15,7 @@ from cosim.output import palette
 from cosim.output.report import axes as draw
 from cosim.output.report.figure_style import NotebookFigure, printed, styled
 
-_HEIGHT_IN, _WIDEST_IN = 1.9, 5.0
+_HEIGHT_IN, _NARROWEST_IN, _WIDEST_IN = 1.9, 2.2, 5.0
 _MOST_LABELS = 12
 _LOST, _LIMIT = printed(palette.LOST), printed(palette.CERTIFIED)
 
@@ -35,13 +36,17 @@ class LossPanel(NamedTuple):
 @styled
 def loss_figure(panels: Sequence[LossPanel]) -> Figure:
     """Draw histograms side by side."""
-    above_in = draw.head_in([])
-    figure = NotebookFigure(figsize=(draw.WIDTH_IN, above_in + _HEIGHT_IN + draw.BELOW_IN))
-    share_in = (draw.WIDTH_IN - draw.RIGHT_IN) / len(panels)
-    width_in = min(share_in - draw.LEFT_IN, _WIDEST_IN)
+    space, above_in = draw.layout(), draw.head_in([])
+    columns = min(len(panels), int(space.width_in / _NARROWEST_IN))
+    rows, height_in = math.ceil(len(panels) / columns), _HEIGHT_IN * space.scale
+    row_in = above_in + height_in + space.below_in
+    figure = NotebookFigure(figsize=(space.width_in, rows * row_in))
+    share_in = (space.width_in - space.right_in) / columns
+    width_in = min(share_in - space.left_in, _WIDEST_IN)
     for place, panel in enumerate(panels):
-        left_in = draw.LEFT_IN + place * share_in
-        _histogram(draw.place(figure, left_in, above_in, width_in, _HEIGHT_IN), panel)
+        row, column = divmod(place, columns)
+        at_in = space.left_in + column * share_in, row * row_in + above_in
+        _histogram(draw.place(figure, *at_in, width_in, height_in), panel)
     return figure
 
 
@@ -57,7 +62,9 @@ def _histogram(axes: Axes, panel: LossPanel) -> None:
     axes.grid(visible=False, axis="x")
     if len(numbers) <= _MOST_LABELS:
         for number, height in zip(numbers, heights, strict=True):
-            axes.text(number, height, f"{height:,}", ha="center", va="bottom", fontsize=9)
+            axes.text(
+                number, height, f"{height:,}", ha="center", va="bottom", size=draw.layout().text_pt
+            )
     limit = numbers[-1] if panel.limit is None and numbers else panel.limit or 0
     low = min([1, *numbers])
     axes.set_xlim(low - 0.6, max([limit, *numbers]) + 0.9)

@@ -15,7 +15,7 @@ from PIL import Image
 from cosim.output.latex_text import latex_label
 
 _HEAD = r"""%% A figure of noack. The document needs \usepackage{{pgf}}; the figure is included by
-%%   \resizebox{{\linewidth}}{{!}}{{\input{{{stem}.pgf}}}}
+%%   \input{{{stem}.pgf}}
 """
 _IMAGE_FOLDER = r"""%% Its images are beside it; from another folder it is included by
 %%   \usepackage{import} and \import{FOLDER/}{FILE.pgf}

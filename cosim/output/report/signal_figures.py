@@ -28,7 +28,12 @@ _PLANT, _SENSOR, _CONTROLLER = map(printed, (palette.PLANT, palette.SENSOR, pale
 _THRESHOLD, _FORCED, _LOST = map(printed, (palette.THRESHOLD, palette.FORCED, palette.LOST))
 _ERRORS = (r"$\|e_c\|$ controller", r"$\|e_s\|$ sensor", "threshold")
 _STATE = r"$\|x\|$ plant"
+_STATES = ("$x$ plant", "$x_s$ sensor", "$x_c$ controller", r"$\hat{x}$ sensor")
+_SENT = ("sent", "sent, lost")
+_RECEIVED = ("received", "received, forced", "lost")
 _PERIOD = "one period"
+_NARROWEST_IN = 1.7
+"""Least width of a state's panel with its labels."""
 _MOST_STATES = 16
 _LONGEST_TITLE = 40
 _DECADES = 6
@@ -71,7 +76,8 @@ def paper_figure(
     """
     n = len(state_names)
     drawn = min(n, _MOST_STATES)
-    figure, panels, above, below = _paper_panels(drawn)
+    labels = _STATES if x_hat is not None else _STATES[:3]
+    figure, panels, above, below = _paper_panels(drawn, labels)
     for i, axes in enumerate(panels):
         known = None if x_hat is None else x_hat[:, i]
         shown = _state(axes, t_s, x[:, i], x_s[:, i], x_c[:, i], known)
@@ -90,30 +96,34 @@ def paper_figure(
     return figure
 
 
-def _paper_panels(states: int) -> tuple[Figure, list[Axes], Axes, Axes]:
+def _paper_panels(states: int, labels: Sequence[str]) -> tuple[Figure, list[Axes], Axes, Axes]:
     """Place the panels of the states, of the broadcasting and of the receiving intervals."""
+    space = draw.layout()
     columns = states if states <= 3 else 2 if states == 4 else 3 if states <= 12 else 4
+    columns = min(columns, int(space.width_in / _NARROWEST_IN))
     rows = math.ceil(states / columns)
-    height_in, interval_in, head = (1.45 if rows <= 2 else 1.15), 1.2, draw.head_in(())
-    width_in = (draw.WIDTH_IN - draw.RIGHT_IN) / columns - draw.LEFT_IN
+    height_in, interval_in = (space.scale * one for one in (1.45 if rows <= 2 else 1.15, 1.2))
+    width_in = (space.width_in - space.right_in) / columns - space.left_in
     # If the last row is not full, the time axes of the row above need room for their numbers.
-    gaps_in = [0.22] * (rows - 2) + [0.22 if states % columns == 0 else draw.BELOW_IN] * (rows > 1)
-    tops_in = [head + i * height_in + sum(gaps_in[:i]) for i in range(rows)]
-    above_in = tops_in[-1] + height_in + draw.BELOW_IN + head
-    below_in = above_in + interval_in + head
-    figure = NotebookFigure(figsize=(draw.WIDTH_IN, below_in + interval_in + draw.BELOW_IN))
+    last_in = space.gap_in if states % columns == 0 else space.below_in
+    gaps_in = [space.gap_in] * (rows - 2) + [last_in] * (rows > 1)
+    head_in = draw.head_in(labels)
+    tops_in = [head_in + i * height_in + sum(gaps_in[:i]) for i in range(rows)]
+    above_in = tops_in[-1] + height_in + space.below_in + draw.head_in(_SENT)
+    below_in = above_in + interval_in + draw.head_in(_RECEIVED)
+    figure = NotebookFigure(figsize=(space.width_in, below_in + interval_in + space.below_in))
     panels = []
     for i in range(states):
         row, column = divmod(i, columns)
-        left_in = draw.LEFT_IN + column * (draw.LEFT_IN + width_in)
+        left_in = space.left_in + column * (space.left_in + width_in)
         axes = draw.place(figure, left_in, tops_in[row], width_in, height_in)
         axes.tick_params(labelbottom=i + columns >= states)
         axes.set_xlabel(draw.TIME if i + columns >= states else "")
         panels.append(axes)
-    whole_in = draw.WIDTH_IN - draw.LEFT_IN - draw.RIGHT_IN
-    above = draw.place(figure, draw.LEFT_IN, above_in, whole_in, interval_in)
+    whole_in = draw.panel_width_in()
+    above = draw.place(figure, space.left_in, above_in, whole_in, interval_in)
     below = draw.place(
-        figure, draw.LEFT_IN, below_in, whole_in, interval_in, sharex=above, sharey=above
+        figure, space.left_in, below_in, whole_in, interval_in, sharex=above, sharey=above
     )
     return figure, panels, above, below
 
@@ -140,11 +150,14 @@ def _heading(figure: Figure, mode: str, title: str, note: str, shown: Sequence[d
     text = ": ".join(filter(None, (head, draw.plain(title, _LONGEST_TITLE)))) + (
         f" ({note})" if note else ""
     )
-    y = 1 - 0.09 / figure.get_figheight()
-    figure.text(draw.LEFT_IN / draw.WIDTH_IN, y, text, weight="bold", size=10.5, va="top")
+    space, height_in = draw.layout(), figure.get_figheight()
+    left, y = space.left_in / space.width_in, 1 - 0.26 * space.above_in / height_in
+    figure.text(left, y, text, weight="bold", size=space.title_pt, va="top")
     handles, labels = zip(*shown, strict=True)
-    corner = (1 - draw.RIGHT_IN / draw.WIDTH_IN, 1 - 0.06 / figure.get_figheight())
-    figure.legend(handles, labels, loc="upper right", bbox_to_anchor=corner, ncols=len(labels))
+    top_in = (0.18 if space.beside_title else 0.9) * space.above_in
+    corner = (1 - space.right_in / space.width_in, 1 - top_in / height_in)
+    columns = len(labels) if space.beside_title else draw.legend_columns(labels)
+    figure.legend(handles, labels, loc="upper right", bbox_to_anchor=corner, ncols=columns)
 
 
 def _broadcasts(axes: Axes, t_s: Reals, dropped: Flags) -> None:
@@ -231,8 +244,8 @@ def _norms(
     figure: Figure, axes: Axes, t_s: Reals, measured: Reals, title: str, shown: list[Any]
 ) -> Figure:
     """Label a figure of norms, and limit its axis: resets fall to rounding errors."""
-    draw.legend(axes, shown)
     axes.set(title=title, xlabel=draw.TIME, ylabel="norm")
+    draw.legend(axes, shown)
     draw.finish(axes, t_s)
     draw.limit_log_axis(axes, measured, _DECADES)
     return figure
@@ -263,8 +276,8 @@ def input_figure(
             "drawstyle": "steps-post",
         }
         shown += draw.line(axes, t_s, draw.finite(u[:, i]), name, **style)
-    draw.legend(axes, shown)
     axes.set(title=title, xlabel=draw.TIME, ylabel="input")
+    draw.legend(axes, shown)
     draw.finish(axes, t_s)
     return figure
 
@@ -292,10 +305,10 @@ def lateness_figure(
     if period_us is not None:
         rule = axes.axvline(period_us, color=_THRESHOLD, linewidth=1.2, linestyle=(0, (4, 3)))
         shown.append((rule, _PERIOD))
-    draw.legend(axes, shown)
     axes.set(
         title="Lateness", xlabel="lateness [wall µs]", ylabel="share of steps at least as late"
     )
+    draw.legend(axes, shown)
     return figure
 
 
@@ -320,9 +333,8 @@ def latency_figure(t_s: Reals, latency_us: Reals, until_s: float | None = None) 
         latency_us: (d,) wall µs from the event to the controller's update.
         until_s: end of the time axis; by default the last event.
     """
-    figure, axes = _over_time(t_s, latency_us, _CONTROLLER, [], until_s)
-    axes.set(title="Sensor-to-controller latency", ylabel="latency [wall µs]")
-    return figure
+    titles = {"title": "Sensor-to-controller latency", "ylabel": "latency [wall µs]"}
+    return _over_time(t_s, latency_us, _CONTROLLER, [], until_s, titles)
 
 
 @styled
@@ -351,9 +363,8 @@ def inter_event_figure(
         until_s: end of the time axis; by default the last event.
     """
     intervals_s = np.diff(broadcast_s)
-    figure, axes = _over_time(broadcast_s[1:], intervals_s, _SENSOR, lower_bounds, until_s)
-    axes.set(title="Inter-event times", ylabel="inter-event time [s]")
-    return figure
+    titles = {"title": "Inter-event times", "ylabel": "inter-event time [s]"}
+    return _over_time(broadcast_s[1:], intervals_s, _SENSOR, lower_bounds, until_s, titles)
 
 
 def _over_time(
@@ -362,7 +373,8 @@ def _over_time(
     colour: Any,
     lower_bounds: Sequence[draw.Bound],
     until_s: float | None,
-) -> tuple[Figure, Axes]:
+    titles: Mapping[str, str],
+) -> Figure:
     """Draw values over time, and their histogram on the same logarithmic axis."""
     values = draw.finite(values, positive=True)
     figure, (axes, beside) = draw.single(2.1, [label for label, *_ in lower_bounds], beside_in=2.0)
@@ -371,6 +383,7 @@ def _over_time(
     draw.marks(
         axes, t_s, values, color=colour, marker="o", markeredgecolor=PAPER, markeredgewidth=0.5
     )
+    axes.set(xlabel=draw.TIME, **titles)
     draw.legend(axes, shown)
     seen = values[np.isfinite(values)]
     if len(seen):
@@ -383,7 +396,6 @@ def _over_time(
     for bound, style in zip(lower_bounds, draw.bound_styles(lower_bounds), strict=True):
         if len(bound.values):
             beside.axhline(float(np.min(bound.values)), **style)
-    axes.set_xlabel(draw.TIME)
     beside.set_xlabel("count")
     beside.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=5))
-    return figure, axes
+    return figure

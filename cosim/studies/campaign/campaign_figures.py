@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from cosim.output import palette
-from cosim.output.report.axes import WIDTH_IN, finish, legend, logarithmic, plain, single
+from cosim.output.report.axes import finish, layout, legend, logarithmic, plain, single
 from cosim.output.report.figure_style import printed, styled
 from cosim.studies.campaign import campaign_file
 from cosim.studies.campaign.campaign_summary import CampaignSummary, GridPointResult, runs_at
@@ -21,7 +21,7 @@ from cosim.studies.campaign.metrics import METRICS, Metric
 from noack.core.linear_systems import Matrix, Vector
 
 _HEIGHT_IN = 3.4
-_MAP_HEIGHT_IN, _MAPS_IN_A_ROW = 2.8, 3
+_MAP_HEIGHT_IN, _MAPS_IN_A_ROW, _NARROWEST_MAP_IN = 2.8, 3, 2.2
 _QUANTILES = 400
 _NARROWEST_IN = 0.42
 """Narrowest cell of a map in which its number is written, in inches."""
@@ -123,9 +123,11 @@ def heat_map_figure(
     Each map has the shape (values of y, values of x); NaN is a missing value. x and y are title and
     labels of the axes.
     """
-    columns = min(len(maps), _MAPS_IN_A_ROW)
+    space, columns = layout(), min(len(maps), _MAPS_IN_A_ROW)
+    columns = min(columns, int(space.width_in / _NARROWEST_MAP_IN))
     rows = -(-len(maps) // columns)
-    figure = Figure(figsize=(WIDTH_IN, rows * _MAP_HEIGHT_IN), layout="constrained")
+    size_in = (space.width_in, rows * _MAP_HEIGHT_IN * space.scale)
+    figure = Figure(figsize=size_in, layout="constrained")
     panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
     known = np.stack(list(maps.values()))
     known = known[np.isfinite(known)]
@@ -134,7 +136,7 @@ def heat_map_figure(
     for i, (title, values) in enumerate(maps.items()):
         axes = panels[i]
         drawn = axes.pcolormesh(np.ma.masked_invalid(values), norm=norm, cmap="viridis")
-        if WIDTH_IN / columns >= _NARROWEST_IN * values.shape[1]:
+        if space.width_in / columns >= _NARROWEST_IN * values.shape[1]:
             _numbers(axes, values, drawn)
         axes.set_xticks(np.arange(len(x[1])) + 0.5, [plain(label) for label in x[1]])
         axes.set_yticks(np.arange(len(y[1])) + 0.5, [plain(label) for label in y[1]])
@@ -251,7 +253,7 @@ def _panel(
     labels: Sequence[str], *, markers: bool = True
 ) -> tuple[Figure, Axes, list[dict[str, Any]]]:
     """Return a figure of one panel with the legend of its series, and the style of each series."""
-    figure, (axes,) = single(_HEIGHT_IN, labels)
+    figure, (axes,) = single(_HEIGHT_IN, labels, titled=False)
     styles = [
         {
             "color": printed(palette.SERIES[i % len(palette.SERIES)]),

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cosim.output.figure_format import FigureFormat
+from cosim.output.figure_format import FigureFiles
 from cosim.output.report.figure_files import inline, save_figures
 from cosim.output.report.report_page import templates
 from cosim.output.result_tables import ResultTable
@@ -43,7 +43,7 @@ def write_report(
     summary: CampaignSummary,
     store: Store,
     base: Mapping[str, Any],
-    figure_format: FigureFormat | None = None,
+    figure_files: FigureFiles | None = None,
 ) -> list[Path]:
     """Write page, summary and figures; return their paths and the path of the runs.
 
@@ -57,7 +57,7 @@ def write_report(
         store.folder / RUNS,
         *save_figures(
             ((name, figure) for name, figure, _ in figures(summary, store)),
-            store.folder / PAGE, figure_format,
+            store.folder / PAGE, figure_files,
         ),
     ]  # fmt: skip
 

@@ -5,7 +5,7 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cosim.output.figure_format import FigureFormat
+from cosim.output.figure_format import FigureFiles
 from cosim.studies.campaign.campaign_file import Campaign
 from cosim.studies.campaign.campaign_grid import base_of, grid
 from cosim.studies.campaign.campaign_report import write_report
@@ -38,7 +38,7 @@ def finish_campaign(
     workers: Callable[[], AbstractContextManager[Runner]],
     *,
     draws: int | None = None,
-    figure_format: FigureFormat | None = None,
+    figure_files: FigureFiles | None = None,
     show: Show = nullcontext,
     bar: AbstractContextManager[Progress | None] | None = None,
 ) -> FinishedCampaign:
@@ -50,7 +50,7 @@ def finish_campaign(
         folder: of the campaign.
         workers: starts the workers.
         draws: number of draws; the campaign's by default.
-        figure_format: write each figure as a file, too.
+        figure_files: write each figure as a file, too.
         show: shows what is done meanwhile.
         bar: shows how many runs are done.
 
@@ -67,5 +67,5 @@ def finish_campaign(
             made = run_campaign(store, runner, progress)
         with show("summarising"):
             summary = summarise(plan, store)
-            files = write_report(summary, store, base, figure_format)
+            files = write_report(summary, store, base, figure_files)
     return FinishedCampaign(summary, store, base, made, files)

@@ -14,8 +14,9 @@ from rich.console import Console
 from rich.table import Table
 
 from cosim.output import palette
-from cosim.output.figure_format import FigureFormat
+from cosim.output.figure_format import SCREEN_IN, FigureFiles, FigureFormat
 from cosim.output.report.figure_files import inline, save_figure
+from cosim.output.report.figure_layout import figure_width
 from cosim.output.report.figure_style import printed
 from cosim.output.report.report_page import templates
 from cosim.studies.campaign.campaign_figures import curve_figure
@@ -73,7 +74,7 @@ class CapacityResult(NamedTuple):
 
 
 def write(
-    result: CapacityResult, folder: Path, figure_format: FigureFormat | None = None
+    result: CapacityResult, folder: Path, figure_files: FigureFiles | None = None
 ) -> list[Path]:
     """Write page, JSON and figures; return their paths.
 
@@ -85,9 +86,11 @@ def write(
         write_whole(folder / PAGE, page(result)),
         write_whole(folder / RESULTS, document + b"\n"),
     ]
-    for name, figure, _ in figures(result):
-        written.append(folder / f"{name}.{figure_format or FigureFormat.SVG}")
-        save_figure(figure, written[-1])
+    files = figure_files or FigureFiles(FigureFormat.SVG, SCREEN_IN)
+    with figure_width(files.width_in):
+        for name, figure, _ in figures(result):
+            written.append(folder / f"{name}.{files.kind}")
+            save_figure(figure, written[-1])
     return written
 
 

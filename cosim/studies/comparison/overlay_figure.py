@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from cosim.output import palette
 from cosim.output.report import axes as draw
-from cosim.output.report.figure_files import FIGURE_SUFFIXES, inline, save_figure
+from cosim.output.report.figure_files import FIGURE_SUFFIXES, inline, save_drawn
 from cosim.output.report.figure_style import NotebookFigure, printed, styled
 from cosim.output.report.report_page import templates
 from cosim.record.align import AlignedRun, align_tables
@@ -40,7 +40,7 @@ def overlay_figure(runs: Sequence[ComparedRun]) -> Figure:
         joined = [align_tables(run.record) for run in runs]
     states = min(runs[0].record.loop.n, _MOST_STATES)
     heights_in = [*[_STATE_IN] * states, _NORM_IN, _NORM_IN, _EVENTS_IN * (len(runs) + 1)]
-    size_in = (draw.WIDTH_IN, sum(heights_in) + _SPACE_IN)
+    size_in = (draw.layout().width_in, draw.layout().scale * (sum(heights_in) + _SPACE_IN))
     figure = NotebookFigure(figsize=size_in, layout="constrained")
     panels = figure.subplots(len(heights_in), sharex=True, height_ratios=heights_in)
     for i, axes in enumerate(panels[:states]):
@@ -111,15 +111,17 @@ def _events(axes: Axes, runs: Sequence[ComparedRun]) -> None:
     draw.legend(axes, shown)
 
 
-def write_overlay(comparison: RunComparison, path: Path) -> None:
+def write_overlay(comparison: RunComparison, path: Path, width: str | float | None = None) -> None:
     """Write the overlay of runs to a page or a figure; see :meth:`RunComparison.save`."""
     if path.suffix not in (".html", *FIGURE_SUFFIXES):
         known = ", ".join(FIGURE_SUFFIXES)
         raise CallerError(f"{path}: a comparison is written as .html, {known}")
-    figure = overlay_figure(comparison.runs)
     if path.suffix == ".html":
+        if width is not None:
+            raise CallerError(f"{path}: a page has its own width; --width is that of a figure")
+        figure = overlay_figure(comparison.runs)
         markup = Markup(inline(figure, "overlay", _DESCRIPTION))
         template = templates(Path(__file__).parent).get_template("overlay.html.jinja")
         write_whole(path, template.render(found=comparison, figure=markup))
     else:
-        save_figure(figure, path)
+        save_drawn(lambda: overlay_figure(comparison.runs), path, width)

@@ -104,16 +104,20 @@ class RunComparison:
 
         return overlay_figure(self.runs)
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path, width: str | float | None = None) -> None:
         """Write the overlay as a page (``.html``), or the figure alone (``.svg``, ``.pdf``, …).
 
+        Args:
+            path: of the file.
+            width: of a figure: ``column``, ``page`` or inches, see ``docs/papers.md``.
+
         Raises:
-            CallerError: the name has another ending.
+            CallerError: the name has another ending, or there is no such width.
             MachineError: the file cannot be written.
         """
         from cosim.studies.comparison.overlay_figure import write_overlay
 
-        write_overlay(self, path)
+        write_overlay(self, path, width)
 
     def to_json(self) -> dict[str, Any]:
         """Return the comparison without the figure, for programs."""

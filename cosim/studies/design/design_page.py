@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cosim.output import palette
-from cosim.output.figure_format import FigureFormat
+from cosim.output.figure_format import FigureFiles
 from cosim.output.report.axes import finish, legend, logarithmic, plain, single
 from cosim.output.report.figure_files import inline, save_figures
 from cosim.output.report.figure_style import printed, styled
@@ -34,7 +34,7 @@ HEADINGS = ("transmissions", "settling time", "α [1/s]", "β", "weight", "gain"
 
 
 def write_page(
-    found: DesignResult, path: Path, figure_format: FigureFormat | None = None
+    found: DesignResult, path: Path, figure_files: FigureFiles | None = None
 ) -> list[Path]:
     """Write page and figure; return the files.
 
@@ -42,7 +42,7 @@ def write_page(
         MachineError: they cannot be written.
     """
     figures = ((name, draw(found)) for name, draw in (("trade-off", trade_off),))
-    return [write_whole(path, page(found)), *save_figures(figures, path, figure_format)]
+    return [write_whole(path, page(found)), *save_figures(figures, path, figure_files)]
 
 
 def page(found: DesignResult) -> str:
@@ -75,7 +75,7 @@ def trade_off(found: DesignResult) -> Figure:
     """Draw all tried candidates, the trade-off curve, the limit and the chosen candidate."""
     names = [f"W {family.name}" for family in found.space.families]
     star_name = "the choice" if found.feasible else "the closest"
-    figure, (axes,) = single(_HEIGHT_IN, [*names, "trade-off", "limit", star_name])
+    figure, (axes,) = single(_HEIGHT_IN, [*names, "trade-off", "limit", star_name], titled=False)
     shown = []
     for i, name in enumerate(names):
         colour, marker = palette.SERIES[i % len(palette.SERIES)], _MARKERS[i % len(_MARKERS)]

@@ -10,7 +10,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from cosim.output import palette
-from cosim.output.report.axes import WIDTH_IN, Shown, finish, logarithmic
+from cosim.output.report.axes import Shown, finish, layout, logarithmic
 from cosim.output.report.figure_style import INK, printed, styled
 from cosim.output.report.signal_figures import paper_figure
 from cosim.simulation.continuous.continuous_run import ContinuousRun
@@ -70,7 +70,7 @@ def _fates(resolved: Scenario, events: int) -> NDArray[np.int64]:
 @styled
 def ensemble_figure(results: Results) -> Figure:
     """Draw the distributions over the draws, and below them both loops of each draw as points."""
-    figure = Figure(figsize=(WIDTH_IN, _HEIGHT_IN), layout="constrained")
+    figure = Figure(figsize=(layout().width_in, _HEIGHT_IN), layout="constrained")
     panels = figure.subplots(2, len(_PANELS), height_ratios=(4, 5))
     shown: list[Shown] = []
     for (above, below), (name, title, unit, logarithm) in zip(panels.T, _PANELS, strict=True):
@@ -84,7 +84,7 @@ def ensemble_figure(results: Results) -> Figure:
     figure.legend(handles, labels, loc="outside upper right", ncols=len(labels))
     figure.suptitle(
         f"{results.count():,} draws, each with MB-ET and ZOH-ET",
-        x=0.005, ha="left", weight="bold", size=10.5,
+        x=0.005, ha="left", weight="bold", size=layout().title_pt,
     )  # fmt: skip
     return figure
 

@@ -1,6 +1,7 @@
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from cosim.output.report import signal_figures
 from cosim.output.report.axes import Bound, BoundKind
 from cosim.output.report.clock_figure import ClockErrors, clock_figure
 from cosim.output.report.figure_files import inline, save_figure
+from cosim.output.report.figure_layout import figure_width
 from cosim.output.report.figure_style import printed, settings
 from noack.core.errors import CallerError
 from tests.cosim.output.report.conftest import HOSTILE
@@ -42,7 +44,10 @@ def drawn_for(case: str) -> dict[str, Figure]:
     t_s = np.arange(k) * 0.002
     e = k // 50
     event_s, lost = np.arange(e) * 0.1, np.arange(e) % 3 > 0
-    bound = [Bound("certified", t_s, 5 * np.exp(-t_s))]
+    bound = [
+        Bound(label, t_s, 5 * np.exp(-t_s))
+        for label in ("certified", "certified for every plant of the uncertainty box")
+    ]
     return {
         "paper": signal_figures.paper_figure(
             mode="zoh",
@@ -104,8 +109,17 @@ def test_every_figure_can_be_saved(tmp_path: Path) -> None:
         assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_nothing_is_cut_off_and_no_texts_overlap(drawn: dict[str, Figure]) -> None:
-    for name, figure in drawn.items():
+@pytest.fixture(
+    scope="module", params=[(case, width_in) for width_in in (3.5, 7.16, 10.0) for case in SIZES]
+)
+def as_wide(request: pytest.FixtureRequest) -> Iterator[dict[str, Figure]]:
+    case, width_in = request.param
+    with figure_width(width_in):
+        yield drawn_for(case)
+
+
+def test_nothing_is_cut_off_and_no_texts_overlap(as_wide: dict[str, Figure]) -> None:
+    for name, figure in as_wide.items():
         with settings():
             figure.draw_without_rendering()
             box, size_in = figure.get_tightbbox(), figure.get_size_inches()

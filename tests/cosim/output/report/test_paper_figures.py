@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 import noack
 from cosim.cli import app
-from cosim.output.figure_format import FigureFormat
+from cosim.output.figure_format import figure_files
 from cosim.output.report.figure_files import save_figure, save_figures
 from cosim.output.report.figure_style import settings
 from noack.core.errors import CallerError
@@ -77,7 +77,7 @@ def test_nothing_is_drawn_without_a_format(tmp_path: Path) -> None:
 
     assert save_figures(((name, drawn()) for name in "a"), tmp_path / "p.html", None) == []
     two = ((name, figure_of(name)) for name in "ab")
-    found = save_figures(two, tmp_path / "p.html", FigureFormat.PDF)
+    found = save_figures(two, tmp_path / "p.html", figure_files("pdf"))
     assert found == [tmp_path / "p-figures/a.pdf", tmp_path / "p-figures/b.pdf"]
 
 
@@ -92,3 +92,32 @@ def test_the_figures_of_a_report_are_written(tmp_path: Path) -> None:
     ]  # fmt: skip
     with pytest.raises(CallerError, match='"eps": a figure is saved as svg, png, pdf, pgf'):
         run.save_figures("eps")
+
+
+def test_figures_are_as_wide_as_a_paper_wants_with_legible_texts(tmp_path: Path) -> None:
+    run = noack.simulate(noack.load("double_integrator", {"horizon_s": 0.3}), runs=tmp_path)
+    for width, points in ((None, 252.0), ("column", 252.0), ("page", 515.52), (5, 360.0)):
+        for path in run.save_figures("pdf", width):
+            box = re.search(rb"/MediaBox \[ ?0 0 ([\d.]+) ", path.read_bytes())
+            assert box is not None
+            assert float(box[1]) == pytest.approx(points, abs=0.01)
+    for path in run.save_figures("pgf"):
+        sizes = re.findall(r"\\fontsize\{([\d.]+)\}", path.read_text())
+        assert {float(size) for size in sizes} == {8.0}, path.name
+    drawn = run.save_figures("svg")
+    assert drawn[0].read_text().count('width="720pt"') == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--width", "column"], "--width: is the width of the figures of --format"),
+        (["--format", "pdf", "--width", "wide"], "width wide: expected column, page, or inches"),
+        (["--format", "pdf", "--width", "0.1"], "width 0.1: expected column, page, or inches"),
+        (["--format", "pdf", "--width", "nan"], "width nan: expected column, page, or inches"),
+    ],
+)
+def test_a_wrong_width_is_refused(words: list[str], message: str) -> None:
+    done = CliRunner().invoke(app, ["campaign", "mb_vs_zoh", *words])
+    assert done.exit_code == 2
+    assert message in done.stderr
