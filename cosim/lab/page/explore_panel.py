@@ -6,8 +6,9 @@ from typing import Any
 from nicegui import ui
 
 from cosim.interactive.ensemble import DRAWS
+from cosim.interactive.figure_curves import Shown
 from cosim.interactive.scenario_guarantee import CERTIFIED, Guarantee, Margin
-from cosim.lab.chart_options import HEIGHT, Shown, data_options, figure_options
+from cosim.lab.chart_options import HEIGHT, data_options, figure_options
 from cosim.lab.page.session import Session
 from noack.core.number_format import number
 

@@ -6,7 +6,7 @@ from typing import Any
 from nicegui import ui
 from nicegui.elements.mixins.value_element import ValueElement
 
-from cosim.interactive.controls import Choice, Slider, chosen, controls_of
+from cosim.interactive.controls import Choice, Slider, chosen, controls_of, dragged
 from cosim.interactive.draft import Draft, DraftError, Mistake
 from noack.core.errors import NoackError
 from noack.core.number_format import number
@@ -117,7 +117,7 @@ class SettingsPanel:
             value = current.value_at(float(event.value))
             self._sliders[key][2].set_text(_text(value))
             if not self._quiet and value != current.value:
-                await self._apply(lambda draft: draft.with_value(key, value), key)
+                await self._apply(lambda draft: dragged(draft, current, value), key)
 
         with ui.row().classes("w-full no-wrap justify-between gap-2 mt-1 text-xs"):
             ui.label(slider.label)
