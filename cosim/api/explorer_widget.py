@@ -1,29 +1,28 @@
 """The explorer of a notebook: sliders and choices beside the figure, by ipywidgets.
 
-While a slider is dragged the run is drawn at once; bands, certificate and margin follow when no
-setting has changed for a moment. Everything is computed in the kernel's own thread.
+While a slider is dragged the run is drawn at once; certificate and bands follow when no setting has
+changed for a moment. The margin takes seconds in the kernel's own thread, so a button asks for it.
 """
 
 import asyncio
 import html
 import io
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import ipywidgets as widgets
 
 from cosim.interactive.controls import Choice, Slider, chosen, controls_of, dragged
+from cosim.interactive.draft import Draft
+from cosim.interactive.draft_results import CERTIFICATE, ENSEMBLE, MARGIN, DraftResults
 from cosim.interactive.exploration_figure import exploration_figure
 from cosim.output.report.figure_style import settings
 from cosim.output.row_display import as_html
 from noack.core.errors import NoackError
 
-if TYPE_CHECKING:
-    from cosim.api.explorer import Explorer
-    from cosim.interactive.draft import Draft
-
 _QUIET_S = 0.3
 """So long after the last change, what takes longer than a redraw is computed."""
+_REST = [CERTIFICATE, ENSEMBLE]
 _DPI = 90
 _QUICK = {"compress_level": 1}
 _WIDE, _SIDE = widgets.Layout(width="98%"), widgets.Layout(width="340px", flex="0 0 auto")
@@ -32,14 +31,14 @@ _WIDE, _SIDE = widgets.Layout(width="98%"), widgets.Layout(width="340px", flex="
 class ExplorerWidget:
     """The widgets of an explorer; ``whole`` is what the notebook shows."""
 
-    def __init__(self, explorer: "Explorer") -> None:
-        self._explorer = explorer
+    def __init__(self, results: DraftResults) -> None:
+        self._results = results
         self._quiet = False
         self._shape: tuple[object, ...] = ()
         self._inputs: dict[str, Any] = {}
         self._known: dict[str, Slider] = {}
         self._later: asyncio.Handle | None = None
-        names = explorer.run.state_names
+        names = results.run.state_names
         self._state = widgets.Dropdown(
             options=[(name, i) for i, name in enumerate(names)], value=len(names) - 1,
             description="drawn state", style={"description_width": "initial"},
@@ -49,11 +48,14 @@ class ExplorerWidget:
         self._message = widgets.HTML()
         self._image = widgets.Image(format="png", layout=widgets.Layout(max_width="100%"))
         self._facts = widgets.HTML()
+        margin = widgets.Button(description="compute the margin", tooltip="takes some seconds")
+        margin.on_click(lambda _: self._compute_rest([MARGIN]))
         side = widgets.VBox([self._controls, self._state], layout=_SIDE)
-        figure = widgets.VBox([self._message, self._image, self._facts],
+        figure = widgets.VBox([self._message, self._image, self._facts, margin],
                               layout=widgets.Layout(flex="1 1 420px", min_width="0"))  # fmt: skip
         self.whole = widgets.HBox([side, figure], layout=widgets.Layout(flex_flow="row wrap"))
         self.show()
+        results.listeners.append(self.show)
 
     def show(self) -> None:
         """Show the explorer's scenario: its controls, the run at once, the rest a moment later."""
@@ -68,9 +70,9 @@ class ExplorerWidget:
         try:
             loop = asyncio.get_running_loop()
         except RuntimeError:  # no kernel: nothing will ever be dragged while this computes
-            self._compute_rest(["certificate", "ensemble", "margin"])
+            self._compute_rest(_REST)
         else:
-            self._schedule(loop, _QUIET_S, ["certificate", "ensemble", "margin"])
+            self._schedule(loop, _QUIET_S, _REST)
 
     def _schedule(self, loop: asyncio.AbstractEventLoop, after_s: float, names: list[str]) -> None:
         """Compute one result after another; a change in between begins anew."""
@@ -85,7 +87,7 @@ class ExplorerWidget:
     def _compute_rest(self, names: list[str]) -> None:
         try:
             for name in names:
-                getattr(self._explorer, name)
+                getattr(self._results, name)
         except NoackError as error:
             self._say(str(error))
             return
@@ -93,21 +95,20 @@ class ExplorerWidget:
 
     def _draw(self) -> None:
         try:
-            run = self._explorer.run
-            self._image.value = _png(self._explorer, self._state.value % run.x.shape[1])
+            states = self._results.run.x.shape[1]
+            self._image.value = _png(self._results, self._state.value % states)
         except NoackError as error:
             self._say(str(error))
             return
-        known = self._explorer.known()
-        self._say(self._explorer.warning if "certificate" in known else "")
-        self._facts.value = as_html(_facts(self._explorer, known))
+        self._say(self._results.warning if CERTIFICATE in self._results.known else "")
+        self._facts.value = as_html(_facts(self._results))
 
     def _say(self, text: str) -> None:
         lines = "<br>".join(map(html.escape, text.splitlines()))
         self._message.value = f'<b style="color: #b3261e">{lines}</b>' if text else ""
 
     def _show_controls(self) -> None:
-        controls = controls_of(self._explorer.draft)
+        controls = controls_of(self._results.draft)
         shape = (
             *((one.key, one.value, tuple(one.options)) for one in controls.choices),
             *((one.key, one.ends) for one in controls.sliders),
@@ -161,33 +162,33 @@ class ExplorerWidget:
         made.observe(moved, "value")
         return made
 
-    def _change(self, change: Callable[["Draft"], "Draft"]) -> None:
+    def _change(self, change: Callable[[Draft], Draft]) -> None:
         if self._quiet:
             return
         try:
-            self._explorer.take(change(self._explorer.draft))
+            self._results.take(change(self._results.draft))
         except NoackError as error:
             self._say(str(error))
 
 
-def _png(explorer: "Explorer", state: int) -> bytes:
+def _png(results: DraftResults, state: int) -> bytes:
     buffer = io.BytesIO()
     with settings():
-        figure = exploration_figure(explorer.shown(state))
+        figure = exploration_figure(results.shown(state))
         figure.savefig(buffer, format="png", dpi=_DPI, pil_kwargs=_QUICK)
     return buffer.getvalue()
 
 
-def _facts(explorer: "Explorer", known: frozenset[str]) -> list[tuple[str, str]]:
-    rows = list(explorer.run.numbers)
-    if "ensemble" in known and explorer.ensemble is not None:
-        rows += explorer.ensemble.numbers
-    if "certificate" in known:
-        found = explorer.certificate
+def _facts(results: DraftResults) -> list[tuple[str, str]]:
+    rows, known = list(results.run.numbers), results.known
+    if ENSEMBLE in known and results.ensemble is not None:
+        rows += results.ensemble.numbers
+    if CERTIFICATE in known:
+        found = results.certificate
         rows += [("certificate", f"{found.verdict}: {found.reason}"), *found.rows]
         rows += [(what, f"{verdict} ({why})") for verdict, what, why in found.assumptions]
-    if "margin" in known and explorer.margin.defined:
-        rows += [("margin", explorer.margin.verdict)]
+    if MARGIN in known:
+        rows += [("margin", results.margin.verdict)]
         rows += [(f"M = {m}", f"growth {growth}, {verdict}")
-                 for m, growth, verdict in explorer.margin.rows]  # fmt: skip
+                 for m, growth, verdict in results.margin.rows]  # fmt: skip
     return rows
