@@ -27,7 +27,7 @@ else:
 
 
 __all__ = [
-    "CampaignResult", "Certificates", "Measurement", "NoackError", "Run", "Scenario",
-    "__version__", "campaign", "certify", "compare", "from_system", "load", "margin", "measure",
-    "open_run", "reproduce", "run", "simulate", "with_settings",
+    "CampaignResult", "Certificates", "Explorer", "Measurement", "NoackError", "Run", "Scenario",
+    "__version__", "campaign", "certify", "compare", "explore", "from_system", "load", "margin",
+    "measure", "open_run", "reproduce", "run", "simulate", "with_settings",
 ]  # fmt: skip

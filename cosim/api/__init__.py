@@ -10,6 +10,8 @@ from cosim.api.campaigns import CampaignResult as CampaignResult
 from cosim.api.campaigns import campaign as campaign
 from cosim.api.certificates import certify as certify
 from cosim.api.certificates import margin as margin
+from cosim.api.explorer import Explorer as Explorer
+from cosim.api.explorer import explore as explore
 from cosim.api.measurements import measure as measure
 from cosim.api.runs import Run as Run
 from cosim.api.runs import compare as compare

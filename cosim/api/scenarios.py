@@ -46,7 +46,7 @@ def load(source: Source, settings: Mapping[str, Any] | None = None) -> Scenario:
     if isinstance(source, Scenario):
         return with_settings(source, settings) if settings else source
     if isinstance(source, Mapping):
-        return _completed(_plain(source), settings, Path("scenario"))
+        return _completed(plain(source), settings, Path("scenario"))
     path = find_shipped(str(source), "scenarios")
     return _completed(toml_file.read(path, Scenario), settings, path)
 
@@ -110,7 +110,7 @@ def from_system(
     A, B = model.matrices
     decay_per_s = -spectral_abscissa(A + B @ np.array(model.gain))
     alpha_per_s = _rounded(_ALPHA_SHARE * decay_per_s)
-    start = _plain(initial_state)
+    start = plain(initial_state)
     norm = (
         float(np.linalg.norm(start)) if _is_vector(start) else 0.0
     )  # the validation reports the mistake
@@ -146,7 +146,7 @@ def _completed(content: dict[str, Any], settings: Mapping[str, Any] | None, path
         if value is None:
             _take_away(content, key)
         else:
-            put(content, key, _plain(value), f"settings: {key}")
+            put(content, key, plain(value), f"settings: {key}")
     return completed(content, path)
 
 
@@ -162,12 +162,12 @@ def _take_away(content: dict[str, Any], key: str) -> None:
         table.pop(last, None)
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Return a value as from a TOML parser: NumPy arrays and numbers become lists and numbers."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(entry) for key, entry in value.items()}
+        return {str(key): plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
+        return [plain(entry) for entry in value]
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     return value

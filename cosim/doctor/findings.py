@@ -41,6 +41,7 @@ _EXTRAS = {
     "mcap": "`noack export --format mcap`",
     "metrics": "`--metrics`",
     "lab": "`noack lab`",
+    "notebook": "sliders of `noack.explore`",
 }
 
 

@@ -45,7 +45,8 @@ from noack.runtime.zenoh_session import answer_to, cause_of, open_session
 T = TypeVar("T")
 
 EXTRAS = {"fmi": "fmpy", "vehicle": "vehiclemodels", "cluster": "distributed",
-          "mcap": "mcap", "metrics": "prometheus_client", "lab": "nicegui"}  # fmt: skip
+          "mcap": "mcap", "metrics": "prometheus_client", "lab": "nicegui",
+          "notebook": "ipywidgets"}  # fmt: skip
 """Extras of noack by name, and one module that each installs."""
 
 _DATAGRAM = bytes(72)

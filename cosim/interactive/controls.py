@@ -5,6 +5,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from cosim.interactive.draft import Draft
 from noack.config.feature_kinds import POLICIES
 from noack.config.runtime_parameters import trigger_parameters
@@ -16,6 +18,7 @@ _MOST_LOSSES = 20
 _MOST_WINDOW = 40
 _MOST_CORRELATION = 0.99
 _SEEDS = 200
+_MOST_MODEL_ERROR = 20.0
 _LOSSES: Mapping[str, Mapping[str, Any]] = {
     "bernoulli": {"probability": 0.5},
     "gilbert_elliott": {"mean_loss": 0.5, "mean_burst": 3.0},
@@ -47,6 +50,8 @@ class Slider:
     logarithmic: bool = False
     live: bool = False
     """Whether a running loop can change it."""
+    scaled: tuple[str, ...] = ()
+    """Matrices that the value multiplies, by key; ``key`` itself is then not in the scenario."""
 
     @property
     def position(self) -> float:
@@ -100,11 +105,12 @@ def controls_of(draft: Draft) -> Controls:
         DraftError: the draft is not valid.
     """
     scenario = draft.scenario
-    base = Draft(draft.base, draft.folder, draft.base_text, draft.base_text).scenario
+    base = _base_of(draft).scenario
     sliders = (
         *_loss_sliders(scenario),
         *_guarantee_sliders(scenario),
         *_trigger_sliders(scenario, base),
+        *_plant_sliders(scenario, base),
         Slider("seeds.loss", "random seed of the losses", _seed(scenario.seeds.loss), 0, _SEEDS, 1,
                whole=True),
         Slider("seeds.plant", "random seed of the plant", _seed(scenario.seeds.plant), 0, _SEEDS, 1,
@@ -147,6 +153,22 @@ def chosen(draft: Draft, key: str, value: str) -> Draft:
     if key == "network.constraints":
         return draft.with_value(key, [_WINDOW] if value == _WINDOW["kind"] else [])
     return draft.with_value(key, value)
+
+
+def dragged(draft: Draft, slider: Slider, value: float) -> Draft:
+    """Return the draft with another value of a slider."""
+    if not slider.scaled:
+        return draft.with_value(slider.key, value)
+    base = _base_of(draft)
+    for key in slider.scaled:
+        matrix = np.array(base.value(key), dtype=np.float64)
+        draft = draft.with_value(key, [[float(f"{value * one:.6g}") for one in row]
+                                       for row in matrix.tolist()])  # fmt: skip
+    return draft
+
+
+def _base_of(draft: Draft) -> Draft:
+    return Draft(draft.base, draft.folder, draft.base_text, draft.base_text)
 
 
 def _loss_sliders(scenario: Scenario) -> list[Slider]:
@@ -193,6 +215,26 @@ def _trigger_sliders(scenario: Scenario, base: Scenario) -> list[Slider]:
             label = _GREEK.get(name, f"trigger: {_words(name)}")
             found.append(_decades(key, label, float(value), float(like or value)))
     return found
+
+
+def _plant_sliders(scenario: Scenario, base: Scenario) -> list[Slider]:
+    """Return the slider of the box around the model from which the plant is drawn."""
+    if scenario.plant.draw not in ("uniform", "vertex"):
+        return []
+    found = {}
+    for name in ("uncertainty_A", "uncertainty_B"):
+        usual = np.array(getattr(base.plant, name) or [[]], dtype=np.float64)
+        now = np.array(getattr(scenario.plant, name) or [[]], dtype=np.float64)
+        if usual.any() and usual.shape == now.shape:
+            place = np.unravel_index(np.argmax(np.abs(usual)), usual.shape)
+            found[f"plant.{name}"] = float(now[place] / usual[place])
+    if not found:
+        return []
+    value = max(found.values())
+    return [
+        Slider("plant.uncertainty", "model error: the plant's box, × the scenario's",
+               round(value, 3), 0.0, max(_MOST_MODEL_ERROR, value), 0.1, scaled=tuple(found)),
+    ]  # fmt: skip
 
 
 def _decades(key: str, label: str, value: float, middle: float, *, live: bool = True) -> Slider:

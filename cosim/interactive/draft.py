@@ -153,6 +153,12 @@ def open_draft(name: str) -> Draft:
     return Draft(name, path.absolute().parent, text, text)
 
 
+def draft_of(scenario: Scenario) -> Draft:
+    """Return a draft that begins with a scenario; relative files are those of this folder."""
+    text = toml_text(scenario.model_dump(mode="json", exclude_none=True))
+    return Draft(scenario.name, Path.cwd(), text, text)
+
+
 def draft_of_query(query: str, default: str, known: Mapping[str, str]) -> Draft:
     """Return the draft of an address's query, as :meth:`Draft.query` writes it.
 

@@ -56,9 +56,21 @@ class Ensemble:
     diverged: int
     """Number of draws that diverged."""
     failed: int
-    """Number of draws with too many events, or whose events could not be resolved."""
+    """Number of draws with too many events, or whose events accumulate; not in the bands."""
     transmissions: tuple[float, float, float]
     """Quantiles LOW, 0.5 and HIGH of the number of transmissions."""
+
+    @property
+    def numbers(self) -> tuple[tuple[str, str], ...]:
+        """Key numbers: label and value."""
+        low, middle, high = self.transmissions
+        sent = f"{low:.0f} to {high:.0f}, median {middle:.0f}" if math.isfinite(low) else "–"
+        left_out = (("draws whose events accumulate, not in the bands", f"{self.failed}"),)
+        return (
+            (f"transmissions in 90 % of {self.draws} draws", sent),
+            ("draws that diverge", f"{self.diverged} of {self.draws}"),
+            *(left_out if self.failed else ()),
+        )
 
 
 def explore_ensemble(scenario: Scenario, draws: int = DRAWS, seed: int = 0) -> Ensemble:

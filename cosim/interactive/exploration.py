@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cosim.simulation.continuous.continuous_loop import LoopState
 from cosim.simulation.continuous.continuous_report import run_continuous, summary
-from cosim.simulation.continuous.continuous_run import ContinuousRun
+from cosim.simulation.continuous.continuous_run import ContinuousRun, TooManyEventsError
 from noack.config.resolution import loop_of, policy_of, resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
@@ -23,6 +23,11 @@ POINTS = 400
 """Number of evenly spaced times; each event adds the times just before and after it."""
 _MOST_EVENT_POINTS = 600
 """With more events, only the evenly spaced times are drawn."""
+
+_MOST_EVENTS = 3000
+"""A run with more events is drawn up to there, so that dragging stays quick."""
+_SHORT = 0.5
+"""Events accumulate if their second half takes less than this share of the time of the first."""
 
 EXACT, SAMPLED = "exact", "sampled"
 
@@ -58,6 +63,8 @@ class Exploration:
     """Whether each update was delivered, (k,)."""
     diverged_at_s: float | None
     numbers: Numbers
+    cut: str = ""
+    """In words, why the run is drawn until its last event only; empty if it is drawn whole."""
 
     @property
     def x_norm(self) -> Vector:
@@ -82,17 +89,31 @@ def why_not_exact(scenario: Scenario) -> str | None:
 
 
 def explore(scenario: Scenario) -> Exploration:
-    """Run a scenario exactly.
+    """Run a scenario exactly, for 3000 events at most.
 
     Raises:
-        CallerError: exact simulation does not cover the scenario, or the events accumulate.
+        CallerError: exact simulation does not cover the scenario.
     """
     resolved = resolve(scenario)
-    return _of_exact(run_continuous(resolved), resolved)
+    try:
+        return _of_exact(run_continuous(resolved, _MOST_EVENTS), resolved, "")
+    except TooManyEventsError as error:
+        if error.run is None or error.run.reached_s <= 0:
+            raise
+        return _of_exact(error.run, resolved, _cut(error.run))
+
+
+def _cut(run: ContinuousRun) -> str:
+    ended = f"{len(run.event_s)} events until {number(run.reached_s, 3)} s"
+    first_s = run.event_s[len(run.event_s) // 2]
+    second_s = run.reached_s - first_s
+    if second_s > _SHORT * first_s:
+        return f"{ended}; the rest is not drawn"
+    return f"the events accumulate: {ended}, half of them in the last {number(second_s, 2)} s"
 
 
 @np.errstate(all="ignore")  # a run may diverge
-def _of_exact(run: ContinuousRun, resolved: Scenario) -> Exploration:
+def _of_exact(run: ContinuousRun, resolved: Scenario, cut: str) -> Exploration:
     even = run.at(np.linspace(0.0, run.reached_s, POINTS))
     parts = [(even.t_s, even.x, even.e_s, even.e_c)]
     if 0 < len(run.before) <= _MOST_EVENT_POINTS:  # before, after, then the even times
@@ -104,7 +125,7 @@ def _of_exact(run: ContinuousRun, resolved: Scenario) -> Exploration:
     return Exploration(
         resolved, EXACT, t_s, x, x + e_s, x + e_c, run.system.norms(e_s), run.system.norms(e_c),
         threshold_at(resolved, t_s), run.event_s, run.delivered, facts["diverged_at_s"],
-        key_numbers(facts),
+        key_numbers(facts, cut), cut,
     )  # fmt: skip
 
 
@@ -122,8 +143,13 @@ def threshold_at(resolved: Scenario, t_s: Vector) -> Vector | None:
     return np.maximum(decaying, trigger.floor)
 
 
-def key_numbers(facts: dict[str, object]) -> Numbers:
-    """Return the key numbers of a summary, which has the keys of ``summary.json``."""
+def key_numbers(facts: dict[str, object], cut: str = "") -> Numbers:
+    """Return the key numbers of a summary, which has the keys of ``summary.json``.
+
+    Args:
+        facts: the summary.
+        cut: see :class:`Exploration`.
+    """
 
     def text(key: str, unit: str = "") -> str:
         value = facts.get(key)
@@ -132,7 +158,9 @@ def key_numbers(facts: dict[str, object]) -> Numbers:
     events, lost = int(str(facts["events"])), int(str(facts["drops"]))
     share = f" ({100 * lost / events:.0f} %)" if events else ""
     diverged = facts.get("diverged_at_s")
-    ended = "reached the horizon" if diverged is None else f"diverged at {text('diverged_at_s')} s"
+    ended = cut or "reached the horizon"
+    if diverged is not None:
+        ended = f"diverged at {text('diverged_at_s')} s"
     return (
         ("run", ended),
         ("transmissions", text("events")),

@@ -6,7 +6,14 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from cosim.interactive.exploration import SAMPLED, Exploration, key_numbers, threshold_at
+from cosim.interactive.exploration import (
+    SAMPLED,
+    Exploration,
+    explore,
+    key_numbers,
+    threshold_at,
+    why_not_exact,
+)
 from cosim.live.finalize import finalize
 from cosim.live.simulated_run import simulate_run
 from cosim.record.data_frames import events, samples
@@ -17,6 +24,15 @@ from noack.core.linear_systems import Matrix, Vector
 
 _COLUMNS = 600
 """Width of the drawn figure; no peak is lost at this width."""
+
+
+def run_of(scenario: Scenario) -> Exploration:
+    """Run a scenario exactly if the exact simulation covers it, else in virtual time.
+
+    Raises:
+        NoackError: the scenario is wrong, or has several loops.
+    """
+    return explore(scenario) if why_not_exact(scenario) is None else simulate_sampled(scenario)
 
 
 def simulate_sampled(scenario: Scenario) -> Exploration:

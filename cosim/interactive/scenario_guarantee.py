@@ -1,10 +1,11 @@
-"""What is guaranteed for a scenario, as the page shows it: certificate and margin."""
+"""What is guaranteed for a scenario: certificate, margin, and a warning in words."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 from cosim.analysis.margin_search import find_margin
+from cosim.interactive.exploration import Exploration
 from cosim.output.certificate_rows import constant_rows
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
@@ -122,3 +123,22 @@ def margin_of(scenario: Scenario) -> Margin:
         for cap in found.caps
     )  # fmt: skip
     return Margin(found.verdict, rows, defined=True)
+
+
+def warning(run: Exploration, guarantee: Guarantee | None, margin: Margin | None) -> str:
+    """Return in words whether a run is unstable, and why nothing is guaranteed; empty if stable."""
+    parts = []
+    if run.diverged_at_s is not None:
+        parts.append(f"The loop is unstable under these losses: it diverged at "
+                     f"{run.diverged_at_s:.3g} s.")  # fmt: skip
+    elif run.x_norm[-1] > run.x_norm[0]:
+        parts.append("‖x‖ is larger at the end than at the start.")
+    if run.cut:
+        parts.append(f"{run.cut[0].upper()}{run.cut[1:]}.")
+    if parts and guarantee is not None and guarantee.verdict != CERTIFIED:
+        parts.append(f"It has no certificate: {guarantee.reason}.")
+        if margin is not None and margin.defined:
+            parts.append(f"Margin: {margin.verdict}.")
+    elif parts and guarantee is not None:
+        parts.append("It is certified all the same: the bound allows this.")
+    return " ".join(parts)

@@ -15,7 +15,7 @@ import tomli_w
 from noack.config.scenario_file import put, toml_text
 
 _HEADER = re.compile(r"^\s*\[([^\[\]]+)\]\s*(?:#.*)?$")
-_VALUE = r"(?:\"[^\"\n]*\"|'[^'\n]*'|\[[^\[\]\n]*\]|[^\s,}#\[{]+)"
+_VALUE = r"(?:\"[^\"\n]*\"|'[^'\n]*'|\[(?:[^\[\]\n]|\[[^\[\]\n]*\])*\]|[^\s,}#\[{]+)"
 
 
 def with_value(text: str, content: Mapping[str, Any], key: str, value: Any) -> str:
@@ -61,8 +61,16 @@ def _candidates(lines: list[str], path: list[str], value: Any) -> Any:
             if re.match(rf"\s*{re.escape(path[depth])}\s*=", lines[i]):
                 line = _replaced(lines[i], path[depth:], value)
                 yield [*lines[:i], line, *lines[i + 1 :]]
+                if depth == len(path) - 1 and isinstance(value, list):
+                    for last in range(i + 1, end):
+                        yield [*lines[:i], *_rows(path[-1], value), *lines[last + 1 :]]
         if depth == len(path) - 1:
             yield [*lines[:begin], f"{path[-1]} = {value_text(value)}", *lines[begin:]]
+
+
+def _rows(key: str, value: list[Any]) -> list[str]:
+    """Return a list, which was on several lines, with an entry on each line."""
+    return [f"{key} = [", *(f"  {value_text(one)}," for one in value), "]"]
 
 
 def _table(lines: list[str], path: list[str]) -> tuple[int | None, int]:

@@ -5,9 +5,9 @@ from typing import Any
 
 from nicegui import ui
 
-from cosim.interactive.ensemble import DRAWS
+from cosim.interactive.figure_curves import Shown
 from cosim.interactive.scenario_guarantee import CERTIFIED, Guarantee, Margin
-from cosim.lab.chart_options import HEIGHT, Shown, data_options, figure_options
+from cosim.lab.chart_options import HEIGHT, data_options, figure_options
 from cosim.lab.page.session import Session
 from noack.core.number_format import number
 
@@ -109,16 +109,7 @@ class ExplorePanel:
         assert run is not None
         self._kind.set_text(f"this run ({run.kind})")
         self._show_summary(session, dict(run.numbers))
-        sent, diverged = "…", "…"
-        if found is not None:
-            low, middle, high = found.transmissions
-            sent = f"{low:.0f} to {high:.0f}, median {middle:.0f}"
-            diverged = f"{found.diverged} of {found.draws}"
-        self._numbers.show([
-            *run.numbers,
-            (f"transmissions in 90 % of {DRAWS} draws", sent),
-            ("draws that diverge", diverged),
-        ])  # fmt: skip
+        self._numbers.show([*run.numbers, *(() if found is None else found.numbers)])
         if self._guaranteed == (shown := (id(session.guarantee), id(session.margin))):
             return
         self._guaranteed = shown

@@ -3,13 +3,18 @@
 import csv
 import io
 import re
+import tempfile
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 from nicegui import ui
 
 from cosim.interactive.exploration import Exploration
+from cosim.interactive.figure_curves import Shown
 from cosim.lab.page.lab_services import LabServices
 from cosim.lab.page.session import Session
+from cosim.output.figure_format import FigureFormat
 from noack.core.errors import NoackError
 from noack.core.file_access import write_whole
 
@@ -26,7 +31,8 @@ class FileMenu:
             ui.menu_item("save as scenario …", self._ask)
             ui.menu_item("copy link to these settings", self._share)
             ui.menu_item("data of the figure (CSV)", self._data)
-            ui.menu_item("figure (SVG)", self._figure)
+            for kind in (FigureFormat.SVG, FigureFormat.PDF):
+                ui.menu_item(f"figure ({kind.upper()})", partial(self._figure, kind))
         with ui.dialog() as self._dialog, ui.card():
             ui.label(f"Save in {services.folder}")
             self._name = ui.input("file name", value="my_loop.toml", validation={
@@ -64,11 +70,11 @@ class FileMenu:
         if self._session.run is not None:
             ui.download(csv_of(self._session.run).encode(), "exploration.csv", "text/csv")
 
-    async def _figure(self) -> None:
-        run = self._session.run
-        if run is not None:
-            svg = await self._services.compute(svg_of, run)
-            ui.download(svg.encode(), "exploration.svg", "image/svg+xml")
+    async def _figure(self, kind: FigureFormat) -> None:
+        shown = self._session.shown(dark=False)
+        if shown is not None:
+            content = await self._services.compute(figure_file, shown, kind)
+            ui.download(content, f"exploration.{kind}")
 
 
 def csv_of(run: Exploration) -> str:
@@ -88,21 +94,12 @@ def csv_of(run: Exploration) -> str:
     return text.getvalue()
 
 
-def svg_of(run: Exploration) -> str:
-    """Return the curves of a run as a figure; called in the worker process."""
-    from matplotlib.figure import Figure
+def figure_file(shown: Shown, kind: FigureFormat) -> bytes:
+    """Return the figure as a file's content; called in the worker process."""
+    from cosim.interactive.exploration_figure import exploration_figure
+    from cosim.output.report.figure_files import save_figure
 
-    figure = Figure(figsize=(7, 6), layout="constrained")
-    states, errors = figure.subplots(2, 1, sharex=True)
-    for i, name in enumerate(run.state_names):
-        states.plot(run.t_s, run.x[:, i], label=name)
-    errors.semilogy(run.t_s, run.e_s_norm, label="‖e_s‖")
-    errors.semilogy(run.t_s, run.e_c_norm, label="‖e_c‖")
-    if run.threshold is not None:
-        errors.semilogy(run.t_s, run.threshold, "--", label="threshold")
-    errors.set_xlabel("time [s]")
-    for axes in (states, errors):
-        axes.legend(fontsize="small")
-    text = io.StringIO()
-    figure.savefig(text, format="svg")
-    return text.getvalue()
+    with tempfile.TemporaryDirectory(prefix="noack-") as folder:
+        path = Path(folder) / f"exploration.{kind}"
+        save_figure(exploration_figure(shown), path)
+        return path.read_bytes()

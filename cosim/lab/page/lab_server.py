@@ -59,6 +59,7 @@ def serve(options: LabOptions, announce: Callable[[str], None]) -> None:
         ui.run_with(
             application, title="noack lab", favicon="🧪", dark=None, message_history_length=0,
             show_welcome_message=False, gzip_middleware_factory=None,
+            reconnect_timeout=_RECONNECT_S,
         )  # fmt: skip
         config = uvicorn.Config(
             AddressGuard(application, secret), log_level="warning", access_log=False,
@@ -67,6 +68,10 @@ def serve(options: LabOptions, announce: Callable[[str], None]) -> None:
         server = _Server(config, lambda: _announced(address, options, announce))
         with listener, suppress(KeyboardInterrupt):  # Ctrl-C is how it ends
             asyncio.run(server.serve(sockets=[listener]))
+
+
+_RECONNECT_S = 60.0
+"""A page that is silent for less than 0.4 of this is not cut off: a busy machine may stall."""
 
 
 class _Server(uvicorn.Server):

@@ -8,9 +8,15 @@ from dataclasses import dataclass, field
 from cosim.interactive.draft import Draft, DraftError, Mistake
 from cosim.interactive.ensemble import Ensemble, explore_ensemble
 from cosim.interactive.exploration import Exploration, explore, why_not_exact
+from cosim.interactive.figure_curves import Shown
 from cosim.interactive.run_exploration import simulate_sampled
-from cosim.interactive.scenario_guarantee import CERTIFIED, Guarantee, Margin, certify, margin_of
-from cosim.lab.chart_options import Shown
+from cosim.interactive.scenario_guarantee import (
+    Guarantee,
+    Margin,
+    certify,
+    margin_of,
+    warning,
+)
 from cosim.lab.page.lab_services import LabServices
 from noack.core.errors import NoackError
 
@@ -70,22 +76,7 @@ class Session:
     @property
     def warning(self) -> str:
         """In words: whether the loop is unstable, and why nothing is guaranteed."""
-        run, found = self.run, self.guarantee
-        if run is None:
-            return ""
-        parts = []
-        if run.diverged_at_s is not None:
-            parts.append(f"The loop is unstable under these losses: it diverged at "
-                         f"{run.diverged_at_s:.3g} s.")  # fmt: skip
-        elif run.x_norm[-1] > run.x_norm[0]:
-            parts.append("‖x‖ is larger at the end than at the start.")
-        if parts and found is not None and found.verdict != CERTIFIED:
-            parts.append(f"It has no certificate: {found.reason}.")
-            if self.margin is not None and self.margin.defined:
-                parts.append(f"Margin: {self.margin.verdict}.")
-        elif parts and found is not None:
-            parts.append("It is certified all the same: the bound allows this.")
-        return " ".join(parts)
+        return "" if self.run is None else warning(self.run, self.guarantee, self.margin)
 
     def keep(self) -> None:
         """Keep the run for comparison, or forget the one that was kept."""

@@ -6,7 +6,7 @@ from typing import Any
 from nicegui import ui
 from nicegui.elements.mixins.value_element import ValueElement
 
-from cosim.interactive.controls import Choice, Slider, chosen, controls_of
+from cosim.interactive.controls import Choice, Slider, chosen, controls_of, dragged
 from cosim.interactive.draft import Draft, DraftError, Mistake
 from noack.core.errors import NoackError
 from noack.core.number_format import number
@@ -22,6 +22,8 @@ Changed = Callable[[Draft, str], Awaitable[None]]
 
 class FastSlider(ValueElement[float]):
     """A slider that sends its place up to 60 times a second while it is dragged."""
+
+    LOOPBACK = False  # a late answer of the server would move it back
 
     def __init__(self, slider: Slider, on_change: Callable[[Any], Any]) -> None:
         low, high = slider.ends
@@ -101,9 +103,10 @@ class SettingsPanel:
                 self._add_slider(slider)
 
     def _add_choice(self, choice: Choice) -> None:
-        async def select(event: Any) -> None:
-            if not self._quiet and event.value != choice.value:
-                await self._apply(lambda draft: chosen(draft, choice.key, event.value), "")
+        def select(event: Any) -> Awaitable[None] | None:
+            if self._quiet or event.value == choice.value:
+                return None
+            return self._apply(lambda draft: chosen(draft, choice.key, event.value), "")
 
         ui.select(
             dict(choice.options), value=choice.value, label=choice.label, on_change=select
@@ -112,12 +115,13 @@ class SettingsPanel:
     def _add_slider(self, slider: Slider) -> None:
         key = slider.key
 
-        async def moved(event: Any) -> None:
+        def moved(event: Any) -> Awaitable[None] | None:
             current = self._sliders[key][0]
             value = current.value_at(float(event.value))
             self._sliders[key][2].set_text(_text(value))
-            if not self._quiet and value != current.value:
-                await self._apply(lambda draft: draft.with_value(key, value), key)
+            if self._quiet or value == current.value:
+                return None
+            return self._apply(lambda draft: dragged(draft, current, value), key)
 
         with ui.row().classes("w-full no-wrap justify-between gap-2 mt-1 text-xs"):
             ui.label(slider.label)
@@ -126,20 +130,21 @@ class SettingsPanel:
         element.props("dense")
         self._sliders[key] = (slider, element, shown)
 
-    async def _apply(self, change: Callable[[Draft], Draft], key: str) -> None:
+    def _apply(self, change: Callable[[Draft], Draft], key: str) -> Awaitable[None] | None:
+        """Show a change at once, before the next event is handled; return what follows from it."""
         try:
             draft = change(self._draft)
         except NoackError as error:
             ui.notify(str(error), type="negative")
-            return
+            return None
         self.show(draft)
-        await self._changed(draft, key)
+        return self._changed(draft, key)
 
-    async def _edited(self, event: Any) -> None:
+    def _edited(self, event: Any) -> Awaitable[None] | None:
         if self._quiet or event.value == self._draft.text:
-            return
+            return None
         self.show(self._draft.with_text(event.value), text=False)
-        await self._changed(self._draft, "")
+        return self._changed(self._draft, "")
 
 
 def _text(value: float) -> str:

@@ -6,7 +6,11 @@ import numpy as np
 
 from cosim.record.divergence import Divergence, divergence
 from cosim.simulation.continuous.continuous_loop import Samples, continuous_loop_of
-from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
+from cosim.simulation.continuous.continuous_run import (
+    MAX_EVENTS,
+    ContinuousRun,
+    simulate_continuous,
+)
 from cosim.simulation.continuous.network_fates import network_fates
 from noack.config.scenario import Scenario
 from noack.core.errors import ExitStatus
@@ -17,17 +21,19 @@ POINTS = 501
 """Number of evenly spaced times at which the document lists the states."""
 
 
-def run_continuous(resolved: Scenario) -> ContinuousRun:
+def run_continuous(resolved: Scenario, max_events: int = MAX_EVENTS) -> ContinuousRun:
     """Run a resolved scenario in exact continuous time, with the losses of its own network.
 
     Raises:
-        CallerError: the events accumulate, or the threshold becomes too small to compute with.
+        TooManyEventsError: more than ``max_events`` events, or two at the same time.
+        CallerError: the threshold becomes too small to compute with.
     """
     return simulate_continuous(
         continuous_loop_of(resolved),
         horizon_s=resolved.horizon_s,
         delivered=network_fates(resolved),
         known_start=resolved.network.initial_sync == "known_state",
+        max_events=max_events,
     )
 
 

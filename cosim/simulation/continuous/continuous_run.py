@@ -18,6 +18,9 @@ MAX_EVENTS = 100_000
 class TooManyEventsError(CallerError):
     """The events accumulate: inter-event times tend to 0."""
 
+    run: "ContinuousRun | None" = None
+    """The run up to its last event; None if the events are not those of one run."""
+
 
 @dataclass(frozen=True)
 class ContinuousRun:
@@ -132,12 +135,27 @@ def simulate_continuous(
         if event is None:
             break
         if len(before) >= max_events or (before and event.t_s <= before[-1].t_s):
-            raise TooManyEventsError(
+            too_many = TooManyEventsError(
                 f"trigger: event {len(before)} at {event.t_s:.9g} s is one too many: the events "
                 "accumulate; a stable loop, a larger threshold or a floor would keep them apart"
             )
+            too_many.run = _finished(system, before[-1].t_s, start, before, after, fates)
+            raise too_many
+    return _finished(system, horizon_s, start, before, after, fates, diverged_at_s)
+
+
+def _finished(
+    system: ContinuousLoop,
+    horizon_s: float,
+    start: LoopState,
+    before: list[LoopState],
+    after: list[LoopState],
+    fates: list[bool],
+    diverged_at_s: float | None = None,
+) -> ContinuousRun:
+    delivered = np.array(fates, bool)
     return ContinuousRun(
-        system, horizon_s, start, tuple(before), tuple(after), np.array(fates, bool), diverged_at_s
+        system, horizon_s, start, tuple(before), tuple(after), delivered, diverged_at_s
     )
 
 

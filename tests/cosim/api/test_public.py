@@ -42,6 +42,7 @@ def test_the_members_of_results_are_the_documented_ones() -> None:
     assert documented("Campaigns") == members(noack.CampaignResult)
     assert documented("Runs") == members(noack.Run)
     assert documented("Certificates") == members(noack.Certificates)
+    assert documented("Exploring a loop") == members(noack.Explorer)
 
 
 @pytest.mark.parametrize("name", sorted(set(noack.__all__) - {"__version__"}))
@@ -53,7 +54,7 @@ def test_every_public_name_has_a_docstring(name: str) -> None:
         assert {"Args:", "Raises:"} <= set(text.split())
         for parameter in inspect.signature(found).parameters:
             assert f"    {parameter}: " in text, parameter
-    if found in (noack.CampaignResult, noack.Run, noack.Certificates):
+    if found in (noack.CampaignResult, noack.Run, noack.Certificates, noack.Explorer):
         for member in vars(found).values():
             target = member.fget if isinstance(member, property) else member
             if inspect.isfunction(target) and not target.__name__.startswith("_"):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosim.interactive.controls import chosen, controls_of
+from cosim.interactive.controls import chosen, controls_of, dragged
 from cosim.interactive.draft import (
     DraftError,
     Mistake,
@@ -36,6 +36,8 @@ LANE = {"lane_following": "lane_following"}
         ("seeds.loss", 12),
         ("network.loss", {"model": "gilbert_elliott", "mean_loss": 0.5, "mean_burst": 3.0}),
         ("trigger", {"policy": "periodic", "period_s": 1.0}),
+        ("plant.uncertainty_A", [[0.5] * 4] * 4),
+        ("plant.uncertainty_B", [[0.5, 0.0]] * 4),
     ],
 )
 def test_a_changed_value_keeps_the_comments(key: str, value: object) -> None:
@@ -45,6 +47,19 @@ def test_a_changed_value_keeps_the_comments(key: str, value: object) -> None:
     assert "# M - 1: at most four consecutive losses" in after.text
     assert toml_file.parsed(after.text, "") == after.content
     assert after.scenario != before.scenario
+
+
+def test_the_model_error_multiplies_both_boxes() -> None:
+    draft = open_draft("lane_following")
+    (slider,) = [one for one in controls_of(draft).sliders if one.scaled]
+    assert slider.value == 1.0
+    wide = dragged(dragged(draft, slider, 3.0), slider, 12.0)
+    assert wide.value("plant.uncertainty_A")[0] == [1.2, 1.2, 0.0, 0.0]
+    assert wide.value("plant.uncertainty_B")[1] == [0.0, 0.6]
+    assert [one.value for one in controls_of(wide).sliders if one.scaled] == [12.0]
+    assert dragged(wide, slider, 1.0).text.count("0.1, 0.1") == 2
+    nominal = draft.with_value("plant.draw", "nominal")
+    assert not any(one.scaled for one in controls_of(nominal).sliders)
 
 
 @given(value=st.one_of(st.floats(0.01, 1.0), st.integers(0, 10**6), st.booleans(), st.text()))

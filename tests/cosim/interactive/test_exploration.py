@@ -48,6 +48,18 @@ def test_a_run_that_diverges_is_drawn_up_to_that_time() -> None:
     assert found.numbers[0][1].startswith("diverged at")
 
 
+def test_a_run_with_very_many_events_is_drawn_until_there() -> None:
+    even = exploration.explore(noack.load("lane_following", {
+        "trigger": {"policy": "periodic", "period_s": 0.002}
+    }))  # fmt: skip
+    assert even.cut == "3000 events until 6 s; the rest is not drawn"
+    assert even.t_s[-1] == even.event_s[-1] == pytest.approx(5.998)
+    assert dict(even.numbers)["run"] == even.cut
+    accumulating = exploration.explore(noack.load("lane_following", {"trigger.alpha_per_s": 2.5}))
+    assert accumulating.cut.startswith("the events accumulate: 3000 events until ")
+    assert accumulating.t_s[-1] < 20.0
+
+
 def test_a_scenario_without_exact_simulation_is_refused_with_the_reason() -> None:
     scenario = noack.load("lane_vehicle")
     reason = exploration.why_not_exact(scenario)

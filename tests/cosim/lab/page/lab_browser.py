@@ -11,6 +11,7 @@ from tests.integration import conftest as live
 from tools.screenshot_recording import Browser
 
 SLIDERS = "document.querySelectorAll('.q-slider').length"
+_TWO_FRAMES = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
 TEXT = "document.body.innerText"
 
 
@@ -114,3 +115,4 @@ class Page:
                 "Input.dispatchMouseEvent", type=kind, x=x + share * width, y=y, button="left",
                 buttons=1, clickCount=1,
             )  # fmt: skip
+            self.js(_TWO_FRAMES)  # the browser joins moves within a frame

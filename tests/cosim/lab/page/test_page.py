@@ -24,6 +24,17 @@ def test_dragging_changes_the_run_and_the_address(browser: Browser, address: str
     other.wait(f"{TEXT}.includes('lost\\n0')")
 
 
+def test_one_slider_makes_the_loop_unstable_and_the_page_says_why(
+    browser: Browser, address: str
+) -> None:
+    page = Page(browser, address.partition("?")[0])
+    page.drag("model error", 1.0)
+    page.wait(f"{TEXT}.includes('The events accumulate: 3000 events until')")
+    page.wait(f"{TEXT}.includes('It has no certificate: the slowest mode grows at')")
+    page.drag("model error", 0.05)
+    page.wait(f"!{TEXT}.includes('accumulate')")
+
+
 def test_a_wrong_address_says_so(browser: Browser, address: str) -> None:
     address = address.partition("?")[0]
     page = Page(browser, f"{address}?scenario=lane_following&trigger.beta=-1")

@@ -1,0 +1,196 @@
+"""A loop whose settings one changes to see what follows, in a program or a notebook."""
+
+from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cosim.api.scenarios import Source, load, plain
+from cosim.output.row_display import as_text
+from noack.core.errors import CallerError, NoackError
+from noack.core.file_access import write_whole
+
+if TYPE_CHECKING:
+    from ipywidgets import Widget
+    from matplotlib.figure import Figure
+
+    from cosim.interactive.draft_results import DraftResults
+    from cosim.interactive.ensemble import Ensemble
+    from cosim.interactive.exploration import Exploration
+    from cosim.interactive.scenario_guarantee import Guarantee, Margin
+    from noack.config.scenario import Scenario
+
+
+class Explorer:
+    """A scenario and what follows from its settings; :func:`noack.explore` returns it.
+
+    Results are computed when they are first asked for, and anew after a change. A notebook shows
+    the explorer as sliders beside the figure.
+    """
+
+    def __init__(self, results: "DraftResults") -> None:
+        self._results = results
+        self._widget: Widget | None = None
+
+    @property
+    def scenario(self) -> "Scenario":
+        """The scenario with its settings, for :func:`noack.simulate` and the other functions."""
+        return self._results.draft.scenario
+
+    @property
+    def toml(self) -> str:
+        """The text of the scenario's file."""
+        return self._results.draft.text
+
+    @property
+    def run(self) -> "Exploration":
+        """The run: times ``t_s`` (N,), states ``x``, ``x_s``, ``x_c`` (N, n), norms, events.
+
+        It is exact, in continuous time, where the exact simulation covers the scenario; else it is
+        simulated in virtual time.
+        """
+        return self._results.run
+
+    @property
+    def numbers(self) -> dict[str, str]:
+        """The key numbers of the run, as texts by their labels."""
+        return dict(self.run.numbers)
+
+    @property
+    def certificate(self) -> "Guarantee":
+        """What is guaranteed: ``verdict``, ``reason``, bounds ``e_s``, ``e_c``, ``x`` at ``t_s``.
+
+        It has the constants as texts; :func:`noack.certify` gives them as numbers.
+        """
+        return self._results.certificate
+
+    @property
+    def ensemble(self) -> "Ensemble | None":
+        """Bands over 200 draws of plant, x(0) and losses; None without exact simulation."""
+        return self._results.ensemble
+
+    @property
+    def margin(self) -> "Margin":
+        """For which M the loop is stable under every loss pattern; this may take seconds."""
+        return self._results.margin
+
+    @property
+    def warning(self) -> str:
+        """In words: whether the loop is unstable, and why nothing is guaranteed; else empty."""
+        _ = self.certificate
+        return self._results.warning
+
+    def set(self, settings: Mapping[str, Any]) -> None:
+        """Change settings; if one is wrong, all stay as they are.
+
+        Args:
+            settings: values by the keys of a scenario file, as for :func:`noack.with_settings`;
+                None restores the default of a key.
+
+        Raises:
+            NoackError: one line per mistake, each with key, value and remedy.
+        """
+        load(self.scenario, settings)  # its messages name the settings
+        draft = self._results.draft
+        for key, value in settings.items():
+            draft = draft.without(key) if value is None else draft.with_value(key, plain(value))
+        self._results.take(draft)
+
+    def figure(self, state: int | str = -1) -> "Figure":
+        """Draw the run with its certificate, and the bands if they were computed.
+
+        Args:
+            state: the state in the first panel, by name or number from 0 on; by default the last.
+
+        Raises:
+            NoackError: there is no such state.
+        """
+        from cosim.interactive.exploration_figure import exploration_figure
+
+        _ = self.certificate
+        return exploration_figure(self._results.shown(self._state(state)))
+
+    def save(self, path: str | PathLike[str]) -> Path:
+        """Write the scenario as TOML, with the comments of the file that it came from.
+
+        Raises:
+            NoackError: the file cannot be written.
+        """
+        write_whole(Path(path), self.toml.encode())
+        return Path(path)
+
+    def widget(self) -> "Widget":
+        """Return sliders and choices beside the figure, as an ``ipywidgets.Widget``.
+
+        Raises:
+            NoackError: ipywidgets is not installed.
+        """
+        if self._widget is None:
+            try:
+                from cosim.api.explorer_widget import ExplorerWidget
+            except ModuleNotFoundError as error:
+                if error.name != "ipywidgets":
+                    raise
+                raise CallerError(
+                    "sliders need ipywidgets: pip install 'noack[notebook]'; set() and figure() "
+                    "work without it"
+                ) from None
+            self._widget = ExplorerWidget(self._results).whole
+        return self._widget
+
+    def _state(self, state: int | str) -> int:
+        names = self.run.state_names
+        if state in names:
+            return names.index(str(state))
+        if isinstance(state, int) and -len(names) <= state < len(names):
+            return state % len(names)
+        raise CallerError(f"state: {state!r}: no such state; there are {', '.join(names)}")
+
+    def __repr__(self) -> str:
+        found = self.certificate
+        rows = [("scenario", self.scenario.name), *self.run.numbers,
+                ("certificate", f"{found.verdict}: {found.reason}")]  # fmt: skip
+        return as_text([*rows, *([("warning", self.warning)] if self.warning else [])])
+
+    def _ipython_display_(self) -> None:
+        from IPython.display import display
+
+        try:
+            display(self.widget())  # type: ignore[no-untyped-call]
+        except NoackError as error:
+            print(f"{self!r}\n{error}")
+
+
+def explore(source: Source, settings: Mapping[str, Any] | None = None) -> Explorer:
+    """Explore a loop: change settings and see what follows, as on the page of ``noack lab``.
+
+    At the end of a notebook's cell the explorer shows sliders beside the figure, which follows
+    while they are dragged (``pip install 'noack[notebook]'``).
+
+    >>> import noack
+    >>> explorer = noack.explore("lane_following")
+    >>> explorer.numbers["transmissions"], explorer.certificate.verdict
+    ('20', 'certified')
+    >>> explorer.set({"network.loss.probability": 0.0, "trigger.beta": 1.0})
+    >>> explorer.numbers["transmissions"]
+    '7'
+    >>> explorer.scenario.trigger.beta
+    1.0
+
+    Args:
+        source: as for :func:`noack.load`.
+        settings: values that replace the source's, as in :func:`noack.with_settings`.
+
+    Raises:
+        NoackError: one line per mistake, each with key, value and remedy; or the scenario has
+            several loops.
+    """
+    from cosim.interactive.draft import draft_of, open_draft
+    from cosim.interactive.draft_results import DraftResults
+
+    scenario = load(source)  # its messages name the source
+    is_name = isinstance(source, str | PathLike)
+    explorer = Explorer(DraftResults(open_draft(str(source)) if is_name else draft_of(scenario)))
+    if settings:
+        explorer.set(settings)
+    return explorer

@@ -1,0 +1,194 @@
+"""The explorer of a notebook: sliders and choices beside the figure, by ipywidgets.
+
+While a slider is dragged the run is drawn at once; certificate and bands follow when no setting has
+changed for a moment. The margin takes seconds in the kernel's own thread, so a button asks for it.
+"""
+
+import asyncio
+import html
+import io
+from collections.abc import Callable
+from typing import Any
+
+import ipywidgets as widgets
+
+from cosim.interactive.controls import Choice, Slider, chosen, controls_of, dragged
+from cosim.interactive.draft import Draft
+from cosim.interactive.draft_results import CERTIFICATE, ENSEMBLE, MARGIN, DraftResults
+from cosim.interactive.exploration_figure import exploration_figure
+from cosim.output.report.figure_style import settings
+from cosim.output.row_display import as_html
+from noack.core.errors import NoackError
+
+_QUIET_S = 0.3
+"""So long after the last change, what takes longer than a redraw is computed."""
+_REST = [CERTIFICATE, ENSEMBLE]
+_DPI = 90
+_QUICK = {"compress_level": 1}
+_WIDE, _SIDE = widgets.Layout(width="98%"), widgets.Layout(width="340px", flex="0 0 auto")
+
+
+class ExplorerWidget:
+    """The widgets of an explorer; ``whole`` is what the notebook shows."""
+
+    def __init__(self, results: DraftResults) -> None:
+        self._results = results
+        self._quiet = False
+        self._shape: tuple[object, ...] = ()
+        self._inputs: dict[str, Any] = {}
+        self._known: dict[str, Slider] = {}
+        self._later: asyncio.Handle | None = None
+        names = results.run.state_names
+        self._state = widgets.Dropdown(
+            options=[(name, i) for i, name in enumerate(names)], value=len(names) - 1,
+            description="drawn state", style={"description_width": "initial"},
+        )  # fmt: skip
+        self._state.observe(lambda _: self._draw(), "value")
+        self._controls = widgets.VBox()
+        self._message = widgets.HTML()
+        self._image = widgets.Image(format="png", layout=widgets.Layout(max_width="100%"))
+        self._facts = widgets.HTML()
+        margin = widgets.Button(description="compute the margin", tooltip="takes some seconds")
+        margin.on_click(lambda _: self._compute_rest([MARGIN]))
+        side = widgets.VBox([self._controls, self._state], layout=_SIDE)
+        figure = widgets.VBox([self._message, self._image, self._facts, margin],
+                              layout=widgets.Layout(flex="1 1 420px", min_width="0"))  # fmt: skip
+        self.whole = widgets.HBox([side, figure], layout=widgets.Layout(flex_flow="row wrap"))
+        self.show()
+        results.listeners.append(self.show)
+
+    def show(self) -> None:
+        """Show the explorer's scenario: its controls, the run at once, the rest a moment later."""
+        self._quiet = True
+        try:
+            self._show_controls()
+        finally:
+            self._quiet = False
+        self._draw()
+        if self._later is not None:
+            self._later.cancel()
+        try:
+            loop = asyncio.get_running_loop()
+        except RuntimeError:  # no kernel: nothing will ever be dragged while this computes
+            self._compute_rest(_REST)
+        else:
+            self._schedule(loop, _QUIET_S, _REST)
+
+    def _schedule(self, loop: asyncio.AbstractEventLoop, after_s: float, names: list[str]) -> None:
+        """Compute one result after another; a change in between begins anew."""
+
+        def compute() -> None:
+            self._compute_rest(names[:1])
+            if names[1:]:
+                self._schedule(loop, 0.0, names[1:])
+
+        self._later = loop.call_later(after_s, compute)
+
+    def _compute_rest(self, names: list[str]) -> None:
+        try:
+            for name in names:
+                getattr(self._results, name)
+        except NoackError as error:
+            self._say(str(error))
+            return
+        self._draw()
+
+    def _draw(self) -> None:
+        try:
+            states = self._results.run.x.shape[1]
+            self._image.value = _png(self._results, self._state.value % states)
+        except NoackError as error:
+            self._say(str(error))
+            return
+        self._say(self._results.warning if CERTIFICATE in self._results.known else "")
+        self._facts.value = as_html(_facts(self._results))
+
+    def _say(self, text: str) -> None:
+        lines = "<br>".join(map(html.escape, text.splitlines()))
+        self._message.value = f'<b style="color: #b3261e">{lines}</b>' if text else ""
+
+    def _show_controls(self) -> None:
+        controls = controls_of(self._results.draft)
+        shape = (
+            *((one.key, one.value, tuple(one.options)) for one in controls.choices),
+            *((one.key, one.ends) for one in controls.sliders),
+        )
+        self._known = {one.key: one for one in controls.sliders}
+        if shape == self._shape:
+            for one in controls.sliders:
+                made = self._inputs[one.key]
+                if abs(one.place(made.value) - one.position) > one.step / 2:
+                    made.value = one.value
+            return
+        self._shape, self._inputs = shape, {}
+        rows: list[widgets.Widget] = [self._choice(one) for one in controls.choices]
+        for one in controls.sliders:
+            self._inputs[one.key] = self._slider(one)
+            rows += [widgets.Label(one.label), self._inputs[one.key]]
+        self._controls.children = rows
+
+    def _choice(self, choice: Choice) -> widgets.Widget:
+        made = widgets.Dropdown(
+            options=[(text, value) for value, text in choice.options.items()], value=choice.value,
+            layout=_WIDE,
+        )  # fmt: skip
+        made.observe(
+            lambda change: self._change(lambda draft: chosen(draft, choice.key, change["new"])),
+            "value",
+        )
+        return widgets.VBox([widgets.Label(choice.label), made], layout=_WIDE)
+
+    def _slider(self, slider: Slider) -> Any:
+        low, high = slider.ends
+        if slider.logarithmic:
+            made = widgets.FloatLogSlider(
+                value=slider.value, min=low, max=high, step=slider.step, readout_format=".3g"
+            )
+        elif slider.whole:
+            made = widgets.IntSlider(value=round(slider.value), min=int(low), max=int(high))
+        else:
+            made = widgets.FloatSlider(
+                value=slider.value, min=low, max=high, step=slider.step, readout_format=".3g"
+            )
+        made.layout = _WIDE
+        key = slider.key
+
+        def moved(change: dict[str, Any]) -> None:
+            now = self._known[key]
+            value = now.value_at(now.place(change["new"]))
+            if value != now.value:
+                self._change(lambda draft: dragged(draft, now, value))
+
+        made.observe(moved, "value")
+        return made
+
+    def _change(self, change: Callable[[Draft], Draft]) -> None:
+        if self._quiet:
+            return
+        try:
+            self._results.take(change(self._results.draft))
+        except NoackError as error:
+            self._say(str(error))
+
+
+def _png(results: DraftResults, state: int) -> bytes:
+    buffer = io.BytesIO()
+    with settings():
+        figure = exploration_figure(results.shown(state))
+        figure.savefig(buffer, format="png", dpi=_DPI, pil_kwargs=_QUICK)
+    return buffer.getvalue()
+
+
+def _facts(results: DraftResults) -> list[tuple[str, str]]:
+    rows, known = list(results.run.numbers), results.known
+    if ENSEMBLE in known and results.ensemble is not None:
+        rows += results.ensemble.numbers
+    if CERTIFICATE in known:
+        found = results.certificate
+        rows += [("certificate", f"{found.verdict}: {found.reason}"), *found.rows]
+        rows += [(what, f"{verdict} ({why})") for verdict, what, why in found.assumptions]
+    if MARGIN in known:
+        rows += [("margin", results.margin.verdict)]
+        rows += [(f"M = {m}", f"growth {growth}, {verdict}")
+                 for m, growth, verdict in results.margin.rows]  # fmt: skip
+    return rows
