@@ -36,14 +36,15 @@ _POINTS_PER_PIXEL = 0.75
 def exploration_figure(shown: Shown) -> Figure:
     """Draw the four panels of a run with all that is known of it."""
     points, named = sources(shown), legends(shown)
+    space = draw.layout()
     head_in = draw.head_in([name for names in named.values() for name in names][:1]) + _GAP_IN
-    height_in = len(PANELS) * head_in + _PANELS_IN + draw.BELOW_IN
-    figure = NotebookFigure(figsize=(draw.WIDTH_IN, height_in))
-    top_in, width_in = 0.0, draw.WIDTH_IN - draw.LEFT_IN - draw.RIGHT_IN
+    height_in = len(PANELS) * head_in + _PANELS_IN + space.below_in
+    figure = NotebookFigure(figsize=(space.width_in, height_in))
+    top_in, width_in = 0.0, draw.panel_width_in()
     first: Axes | None = None
     for (panel, share), title in zip(PANELS.items(), titles(shown), strict=True):
         top_in += head_in
-        axes = draw.place(figure, draw.LEFT_IN, top_in, width_in, share * _PANELS_IN, sharex=first)
+        axes = draw.place(figure, space.left_in, top_in, width_in, share * _PANELS_IN, sharex=first)
         top_in += share * _PANELS_IN
         first = first or axes
         axes.set_title(title)
