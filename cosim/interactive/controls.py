@@ -144,12 +144,8 @@ def _is_window(scenario: Scenario) -> bool:
 
 def chosen(draft: Draft, key: str, value: str) -> Draft:
     """Return the draft with another choice; tables take the example of their kind."""
-    if key == "trigger":
-        n = draft.scenario.model.dimensions[0]
-        example: Any = POLICIES[value].example(n)
-        return draft.with_value(key, example.model_dump(mode="json", exclude_none=True))
-    if key == "network.loss":
-        return draft.with_value(key, {"model": value, **_LOSSES.get(value, {})})
+    if (example := example_of(draft, key, value)) is not None:
+        return draft.with_value(key, example)
     if key == "network.constraints":
         return draft.with_value(key, [_WINDOW] if value == _WINDOW["kind"] else [])
     return draft.with_value(key, value)
@@ -169,6 +165,20 @@ def dragged(draft: Draft, slider: Slider, value: float) -> Draft:
 
 def _base_of(draft: Draft) -> Draft:
     return Draft(draft.base, draft.folder, draft.base_text, draft.base_text)
+
+
+def example_of(draft: Draft, key: str, kind: str) -> dict[str, Any] | None:
+    """Return an example of a table of a kind; None if there is none.
+
+    Raises:
+        DraftError: the draft is not valid, and the example depends on the number of states.
+    """
+    if key == "network.loss" and kind in _LOSSES:
+        return {"model": kind, **_LOSSES[kind]}
+    if key == "trigger":
+        example: Any = POLICIES[kind].example(draft.scenario.model.dimensions[0])
+        return None if example is None else dict(example.model_dump(mode="json", exclude_none=True))
+    return None
 
 
 def _loss_sliders(scenario: Scenario) -> list[Slider]:

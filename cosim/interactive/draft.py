@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import parse_qsl, urlencode
 
-from cosim.interactive.toml_edit import value_text, with_value
+from cosim.interactive.toml_edit import value_text, with_value, without_value
 from cosim.shipped_files import find_shipped, shipped_names, text_of
 from noack.config import toml_file
 from noack.config.scenario import Scenario
@@ -96,7 +96,9 @@ class Draft:
         if not isinstance(table, dict) or last not in table:
             return self
         del table[last]
-        return replace(self, text=toml_text(content))
+        made = replace(self, text=without_value(self.text, content, key))
+        made.__dict__["content"] = content
+        return made
 
     def with_text(self, text: str) -> "Draft":
         """Return the draft with another text."""

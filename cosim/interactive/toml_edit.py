@@ -32,12 +32,30 @@ def with_value(text: str, content: Mapping[str, Any], key: str, value: Any) -> s
     lines = text.splitlines()
     for changed in _candidates(lines, key.split("."), value):
         new = "\n".join(changed) + "\n"
-        try:
-            if tomllib.loads(new) == wanted:
-                return new
-        except tomllib.TOMLDecodeError:
-            continue
+        if _means(new, wanted):
+            return new
     return toml_text(wanted)
+
+
+def without_value(text: str, wanted: Mapping[str, Any], key: str) -> str:
+    """Return the text without a key; ``wanted`` is the content that remains."""
+    lines = text.splitlines()
+    *path, last = key.split(".")
+    begin, end = _table(lines, path)
+    for i in range(begin if begin is not None else end, end):
+        if re.match(rf"\s*{re.escape(last)}\s*=", lines[i]):
+            for after in range(i + 1, end + 1):
+                new = "\n".join([*lines[:i], *lines[after:]]) + "\n"
+                if _means(new, wanted):
+                    return new
+    return toml_text(wanted)
+
+
+def _means(text: str, wanted: Mapping[str, Any]) -> bool:
+    try:
+        return tomllib.loads(text) == wanted
+    except tomllib.TOMLDecodeError:
+        return False
 
 
 def value_text(value: Any) -> str:

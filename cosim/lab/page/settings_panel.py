@@ -8,6 +8,7 @@ from nicegui.elements.mixins.value_element import ValueElement
 
 from cosim.interactive.controls import Choice, Slider, chosen, controls_of, dragged
 from cosim.interactive.draft import Draft, DraftError, Mistake
+from cosim.lab.page.form_panel import FormPanel
 from noack.core.errors import NoackError
 from noack.core.number_format import number
 
@@ -43,6 +44,7 @@ class SettingsPanel:
         self._shape: tuple[object, ...] = ()
         self._sliders: dict[str, tuple[Slider, FastSlider, ui.label]] = {}
         self._controls = ui.column().classes("w-full gap-1")
+        self._form = FormPanel(draft, self._apply)
         with ui.expansion("all settings (TOML)").classes("w-full").props("dense") as whole:
             self._mistakes = ui.column().classes("gap-0 w-full").props("role=status")
             self._editor = ui.codemirror(
@@ -57,6 +59,7 @@ class SettingsPanel:
         self._quiet = True
         try:
             self._build()
+            self._form.show(draft)
             if text and self._editor.value != draft.text:
                 self._editor.set_value(draft.text)
         finally:
@@ -67,7 +70,8 @@ class SettingsPanel:
         self._editor.set_theme("vscodeDark" if dark else "vscodeLight")
 
     def show_mistakes(self, mistakes: list[Mistake]) -> None:
-        """Show mistakes at the editor and mark the sliders that they are about."""
+        """Show mistakes at their fields and above the editor, and mark their sliders."""
+        self._form.show_mistakes(mistakes)
         self._mistakes.clear()
         with self._mistakes:
             for one in mistakes:

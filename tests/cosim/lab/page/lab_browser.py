@@ -101,12 +101,32 @@ class Page:
         self.wait(f"{found}.length > 0")
         self.js(f"{found}.at(-1).click()")
 
+    def unfold(self, title: str) -> None:
+        """Open a part of the settings."""
+        found = (
+            "[...document.querySelectorAll('.q-expansion-item .q-item')].filter(e => "
+            f"e.innerText.replace('keyboard_arrow_down', '').trim() === {json.dumps(title)})"
+        )
+        self.wait(f"{found}.length > 0")
+        self.js(f"{found}[0].click()")
+
+    def fill(self, label: str, text: str) -> None:
+        """Type a text into a field of the form."""
+        found = f"document.querySelector('input[aria-label={json.dumps(label)}]')"
+        self.wait(f"!!{found}")
+        self.js(f"{found}.focus(), {found}.select()")
+        if text:
+            self.call("Input.insertText", text=text)
+        else:
+            self.press("Delete", 46)
+
     def drag(self, label: str, to: float) -> None:
         """Drag the slider with a label to a share of its length."""
         place = (
             f"(() => {{ const s = [...document.querySelectorAll('.q-slider')].find(e => "
             f"e.previousElementSibling.innerText.startsWith({json.dumps(label)})); "
-            "const r = s.getBoundingClientRect(); return [r.x, r.y + r.height / 2, r.width]; })()"
+            "s.scrollIntoView({ block: 'center' }); const r = s.getBoundingClientRect(); "
+            "return [r.x, r.y + r.height / 2, r.width]; })()"
         )
         x, y, width = self.js(place)
         for kind, share in (("mousePressed", 0.4), ("mouseMoved", 0.45), ("mouseMoved", to),

@@ -48,7 +48,8 @@ def test_controls_have_names_and_text_has_contrast(
 ) -> None:
     page = Page(browser, address, size=size, scheme=scheme)
     page.js("document.head.insertAdjacentHTML('beforeend', '<style>*{transition:none !important}')")
-    page.js("document.querySelector('.q-expansion-item .q-item').click()")
+    for part in ("all settings (form)", "trigger", "all settings (TOML)"):
+        page.unfold(part)
     page.wait("!!document.querySelector('.cm-content[aria-label]')")
     page.wait(
         f"getComputedStyle(document.querySelector('.cm-editor')).backgroundColor {EDITOR[scheme]}"
@@ -60,6 +61,9 @@ def test_controls_have_names_and_text_has_contrast(
         assert violations(page) == [], tab
         assert nameless(page) == [], tab
         assert page.js("document.scrollingElement.scrollWidth <= innerWidth"), tab
+    page.fill("beta", "abc")
+    page.wait("!!document.querySelector('.q-field--error')")
+    assert violations(page) == []
 
 
 FOCUSED = """(() => {

@@ -35,6 +35,26 @@ def test_one_slider_makes_the_loop_unstable_and_the_page_says_why(
     page.wait(f"!{TEXT}.includes('accumulate')")
 
 
+def test_a_mistake_in_the_form_is_shown_at_its_field(browser: Browser, address: str) -> None:
+    page = Page(browser, address)
+    page.unfold("all settings (form)")
+    page.unfold("trigger")
+    page.fill("beta", "abc")
+    wrong = "[...document.querySelectorAll('.q-field--error')].map(e => e.innerText).join('|')"
+    page.wait(f"{wrong}.includes('should be a valid number')")
+    assert page.js(f"{wrong}.startsWith('beta')")
+    assert page.js("document.querySelector('input[aria-label=beta]').value") == "abc"
+    page.fill("beta", "0.25")
+    page.wait(f"{wrong} === '' && location.search.includes('trigger.beta=0.25')")
+    page.fill("alpha_per_s", "")
+    page.wait(f"{wrong}.includes('missing')")
+    page.fill("alpha_per_s", "0.2")
+    page.wait(f"{wrong} === '' && location.search.includes('trigger.alpha_per_s=0.2')")
+    # A slider moves the field, too.
+    page.drag("β, threshold at the start", 1.0)
+    page.wait("document.querySelector('input[aria-label=beta]').value === '5.0'")
+
+
 def test_a_wrong_address_says_so(browser: Browser, address: str) -> None:
     address = address.partition("?")[0]
     page = Page(browser, f"{address}?scenario=lane_following&trigger.beta=-1")
