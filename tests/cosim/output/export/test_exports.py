@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 import noack
 from cosim.cli import app
 from cosim.output.export.mat_export import save_mat
+from cosim.output.viewer.rerun_program import start_rerun
 from noack.core.errors import CallerError
 
 SCENARIO: dict[str, Any] = {
@@ -143,6 +144,12 @@ def test_an_mcap_file_has_metadata_and_attachments(run: noack.Run, tmp_path: Pat
     assert summary is not None
     topics = {one.topic: one.metadata for one in summary.channels.values()}
     assert topics["/plant/step"]["states"] == ", ".join(run.scenario.model.state_names or ())
+
+
+def test_rerun_finds_no_fault_in_an_mcap_file(run: noack.Run, tmp_path: Path) -> None:
+    run.export(tmp_path / "run.mcap")
+    program = start_rerun(["mcap", "check", str(tmp_path / "run.mcap")])
+    assert program.wait(timeout=120) == 0
 
 
 def test_several_loops_have_their_names(loops: noack.Run, tmp_path: Path) -> None:
