@@ -29,5 +29,5 @@ else:
 __all__ = [
     "CampaignResult", "Certificates", "Explorer", "Measurement", "NoackError", "Run", "Scenario",
     "__version__", "campaign", "certify", "compare", "explore", "from_system", "load", "margin",
-    "measure", "open_run", "reproduce", "run", "simulate", "with_settings",
+    "measure", "open_run", "reproduce", "run", "save_tables", "simulate", "with_settings",
 ]  # fmt: skip

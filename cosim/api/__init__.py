@@ -13,6 +13,7 @@ from cosim.api.certificates import margin as margin
 from cosim.api.explorer import Explorer as Explorer
 from cosim.api.explorer import explore as explore
 from cosim.api.measurements import measure as measure
+from cosim.api.result_files import save_tables as save_tables
 from cosim.api.runs import Run as Run
 from cosim.api.runs import compare as compare
 from cosim.api.runs import open_run as open_run

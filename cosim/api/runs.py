@@ -206,15 +206,14 @@ class Run:
         return save_figures(drawn(), self.directory / REPORT_FILE, files)
 
     def save_tables(self, folder: Folder) -> list[Path]:
-        """Write the tables of the summary, each as LaTeX (booktabs) and as CSV; return the paths.
+        """Write the tables of the summary: :func:`noack.save_tables` of this run.
 
         Raises:
             NoackError: a file cannot be written.
         """
-        from cosim.output.result_tables import save_tables
-        from cosim.output.run_result_tables import summary_tables
+        from cosim.api.result_files import save_tables
 
-        return save_tables(summary_tables(self.summary), Path(folder))
+        return save_tables(self, folder)
 
     def report(self) -> Path:
         """Write ``report.html``, a page with all figures, into the run directory; return its path.
@@ -226,12 +225,14 @@ class Run:
 
         return run_report(self.directory, again=True)
 
-    def export(self, path: Folder) -> list[Path]:
+    def export(self, path: Folder, *, certificates: bool = True) -> list[Path]:
         """Write the run for other programs; return the written files.
 
         Args:
             path: ``.mat`` for MATLAB and Octave, ``.mcap`` for Foxglove; without an ending, a
                 folder of CSV files.
+            certificates: whether a ``.mat`` file has the certificates of each loop, which take
+                about a second each.
 
         Raises:
             NoackError: the path has another ending, or a file cannot be written.
@@ -239,7 +240,7 @@ class Run:
         from cosim.output.export.export_formats import export_run
 
         self.summary  # noqa: B018  # of a temporary run, it is computed now
-        return export_run(self.directory, Path(path))
+        return export_run(self.directory, Path(path), certificates=certificates)
 
     def archive(self, path: Folder) -> Path:
         """Write the run as one file, which :func:`noack.reproduce` repeats; return its path.

@@ -28,6 +28,12 @@ def export(
     ] = None,
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
     loop: cli.LoopOption = None,
+    certificates: Annotated[
+        bool,
+        typer.Option(
+            help="Certificates of each loop in a file of MATLAB; about a second for each loop."
+        ),
+    ] = True,
     json: cli.JsonOption = False,
 ) -> int:
     """Export a run for other programs: its tables, its summary and its certificates."""
@@ -39,7 +45,7 @@ def export(
     reopen(chosen)
     path = out or Path(f"{chosen.resolve().name}{file_format.suffix}")
     with PatientConsole(stderr=True).status("exporting"):
-        written = export_run(chosen, path, file_format)
+        written = export_run(chosen, path, file_format, certificates=certificates)
     if json:
         cli.print_json({"files": [str(one) for one in written]})
     else:

@@ -19,13 +19,16 @@ class ExportFormat(StrEnum):
         return "" if self is ExportFormat.CSV else f".{self}"
 
 
-def export_run(run_dir: Path, path: Path, kind: ExportFormat | None = None) -> list[Path]:
+def export_run(
+    run_dir: Path, path: Path, kind: ExportFormat | None = None, *, certificates: bool = True
+) -> list[Path]:
     """Export a run; return the written files.
 
     Args:
         run_dir: the run directory, which has a summary.
         path: the file, or for CSV the folder.
         kind: the format; by default that of the path's ending.
+        certificates: whether a file of MATLAB has the certificates of each loop.
 
     Raises:
         CallerError: the ending is not that of a format, it is not a run directory, or the record is
@@ -43,7 +46,7 @@ def export_run(run_dir: Path, path: Path, kind: ExportFormat | None = None) -> l
     if found is ExportFormat.MAT:
         from cosim.output.export.mat_export import write_mat
 
-        return write_mat(run, path)
+        return write_mat(run, path, certificates=certificates)
     if found is ExportFormat.MCAP:
         from cosim.output.export.mcap_export import write_mcap
 

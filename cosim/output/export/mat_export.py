@@ -16,17 +16,17 @@ from noack.config.scenario import Scenario
 from noack.core.errors import CallerError, MachineError
 from noack.core.file_access import write_whole
 
-_LONGEST_NAME = 63
+_LONGEST_NAME = 31  # of the format of version 5
 _INVALID = re.compile(r"\W", re.ASCII)
 
 
-def write_mat(run: ExportedRun, path: Path) -> list[Path]:
+def write_mat(run: ExportedRun, path: Path, *, certificates: bool = True) -> list[Path]:
     """Write a run: its tables, samples, events, summary, scenario and certificates, as structures.
 
     Raises:
         MachineError: the file cannot be written, or a variable is larger than the format allows.
     """
-    return save_mat(_content(run), path)
+    return save_mat(_content(run, certificates=certificates), path)
 
 
 def save_mat(content: Mapping[str, Any], path: Path) -> list[Path]:
@@ -40,21 +40,23 @@ def save_mat(content: Mapping[str, Any], path: Path) -> list[Path]:
     buffer = io.BytesIO()
     try:
         file: Any = buffer  # SciPy's types know names of files only
-        savemat(file, _structure(content), long_field_names=True, oned_as="column")
+        savemat(file, _structure(content), oned_as="column")
     except (ValueError, OverflowError, TypeError) as error:
         raise MachineError(f"{path}: not possible as a .mat file of version 5: {error}") from None
     header = b"MATLAB 5.0 MAT-file, written by noack".ljust(116)  # without a date
     return [write_whole(path, header + buffer.getvalue()[len(header) :])]
 
 
-def _content(run: ExportedRun) -> dict[str, Any]:
+def _content(run: ExportedRun, *, certificates: bool) -> dict[str, Any]:
     record = run.record
     found: dict[str, Any] = {table: _columns(record[table]) for table in record.tables}
     found["summary"] = run.summary
     found["scenario"] = record.scenario.model_dump(mode="json", exclude_none=True)
     found["environment"] = run.environment
     if record.is_network:
-        found["loops"] = {loop.name: _content(loop) for loop in run.loops()}
+        found["loops"] = {
+            loop.name: _content(loop, certificates=certificates) for loop in run.loops()
+        }
         return found
     for name, table in (("samples", samples(record)), ("events", events(record))):
         found[name] = {column: _array(table[column].to_numpy()) for column in table.column_names}
@@ -63,7 +65,7 @@ def _content(run: ExportedRun) -> dict[str, Any]:
         "A": loop.A, "B": loop.B, "K": loop.K, "A_model": loop.A_model, "B_model": loop.B_model,
         "state_names": list(loop.state_names), "input_names": list(loop.input_names),
     }  # fmt: skip
-    if not run.name:  # of many loops they would take minutes
+    if certificates:
         found["certificates"] = _certificates(record.scenario)
     return found
 

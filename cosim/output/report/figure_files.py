@@ -11,7 +11,14 @@ from matplotlib.figure import Figure
 
 from cosim.output.figure_format import FigureFiles, FigureFormat, figure_width_in
 from cosim.output.report.figure_layout import figure_width
-from cosim.output.report.figure_style import GRID, INK, PAPER, paper_fonts, settings
+from cosim.output.report.figure_style import (
+    GRID,
+    INK,
+    PAPER,
+    characters_of_paper_fonts,
+    paper_fonts,
+    settings,
+)
 from noack.core.errors import CallerError
 from noack.core.file_access import write_whole
 
@@ -48,7 +55,7 @@ def save_figure(figure: Figure, path: Path) -> None:
             write_whole(path.with_name(name), content)
         write_whole(path, code)
     elif kind is FigureFormat.PDF:
-        with paper_fonts(figure):
+        with paper_fonts(figure), characters_of_paper_fonts(figure):
             content = _saved(figure, kind)
         write_whole(path, content)
     else:

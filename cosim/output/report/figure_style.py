@@ -6,14 +6,17 @@ This module does not use pyplot, and does not change matplotlib's global setting
 import functools
 import io
 import logging
+import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, ParamSpec
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
 from matplotlib.text import Text
+from matplotlib.ticker import FuncFormatter
 
 from cosim.output.palette import Colour
 from cosim.output.report.figure_layout import fit_to_paper, layout
@@ -68,7 +71,12 @@ _PAPER_SETTINGS: dict[Any, Any] = {
     "pdf.fonttype": 42,  # publishers refuse fonts of type 3
     "pgf.rcfonts": False,  # the document's own
 }
+_DOLLAR = re.compile(r"(?<!\\)\$")
 _BOLD = ["cmb10", "DejaVu Serif"]
+_ELSEWHERE = str.maketrans({
+    "_": r"$\_$", "<": "$<$", ">": "$>$", "|": "$|$", "{": r"$\{$", "}": r"$\}$", '"': "''",
+})  # fmt: skip
+"""Characters at whose places Computer Modern has others; its mathematical fonts have them."""
 
 
 @contextmanager
@@ -95,6 +103,36 @@ def paper_fonts(figure: Figure) -> Iterator[None]:
         finally:
             _set_fonts(figure, _SETTINGS)
             log.setLevel(level)
+
+
+@contextmanager
+def characters_of_paper_fonts(figure: Figure) -> Iterator[None]:
+    """Write the characters that Computer Modern lacks as mathematics within the context."""
+    texts = [(text, text.get_text()) for text in figure.findobj(Text) if isinstance(text, Text)]
+    axes = [axis for one in figure.axes for axis in (one.xaxis, one.yaxis)]
+    named = [one for axis in axes if isinstance(one := axis.get_major_formatter(), FuncFormatter)]
+    labels = [(one, one.func) for one in named]
+    for text, content in texts:
+        text.set_text(_with_mathematics(content))
+    for one, name_of in labels:
+        one.func = partial(_name_with_mathematics, name_of)
+    try:
+        yield
+    finally:
+        for text, content in texts:
+            text.set_text(content)
+        for one, name_of in labels:
+            one.func = name_of
+
+
+def _name_with_mathematics(name_of: Callable[..., str], *tick: Any) -> str:
+    return _with_mathematics(name_of(*tick))
+
+
+def _with_mathematics(text: str) -> str:
+    """Replace characters outside the mathematics of a text, which is between dollars."""
+    parts = _DOLLAR.split(text)
+    return "$".join(part if i % 2 else part.translate(_ELSEWHERE) for i, part in enumerate(parts))
 
 
 def _set_fonts(figure: Figure, wanted: Mapping[Any, Any]) -> None:

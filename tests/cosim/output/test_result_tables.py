@@ -3,6 +3,7 @@
 import csv
 import io
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -12,6 +13,7 @@ from cosim.cli import app
 from cosim.output.latex_text import latex_text
 from cosim.output.result_tables import KEY_VALUE, ResultTable, as_csv, as_latex, save_tables
 from cosim.output.run_result_tables import summary_tables
+from noack.core.errors import CallerError
 from tests.cosim.output.latex import compiled
 
 HOSTILE = r"50 % of A_1 & {x} #1 ^2 ~ \input{/etc/passwd} <M − 1> ‖x̂‖ ᾱ 漢 é $x$ | "
@@ -83,6 +85,31 @@ def test_commands_write_their_tables(
     assert len({len(row) for row in first}) == 1
     body = "\n\n".join(rf"\input{{tables/{name}.tex}}" for name in names)
     compiled(body, ("booktabs",), tmp_path)
+
+
+def test_the_library_writes_the_tables_of_the_command_line(tmp_path: Path) -> None:
+    grid: dict[str, Any] = {
+        "name": "losses", "scenario": "double_integrator", "draws": 2,
+        "settings": {"horizon_s": 1.0},
+        "axes": [{"name": "loss", "key": "network.loss.probability", "values": [0.2, 0.8]}],
+    }  # fmt: skip
+    margin = noack.margin("lane_periodic", most_m=2, period=False)
+    for result, name in (
+        (margin, "margin"), (noack.campaign(grid, workers=1), "campaign"),
+        (noack.certify("lane_following"), "certificates"),
+        (noack.simulate(noack.load("double_integrator", {"horizon_s": 0.1})), "numbers"),
+    ):  # fmt: skip
+        files = noack.save_tables(result, tmp_path / name)
+        assert [file.name for file in files[:2]] == [f"{name}.tex", f"{name}.csv"]
+    done = CliRunner().invoke(
+        app, ["margin", "lane_periodic", "--most", "2", "--no-period", "--tables", str(tmp_path)]
+    )
+    assert done.exit_code == 0, done.output
+    for ending in ("tex", "csv"):
+        own = tmp_path / "margin" / f"margin.{ending}"
+        assert own.read_bytes() == (tmp_path / f"margin.{ending}").read_bytes()
+    with pytest.raises(CallerError, match="str: has no tables"):
+        noack.save_tables("lane_following", tmp_path)  # type: ignore[arg-type]
 
 
 def test_the_tables_of_several_loops_are_written(tmp_path: Path) -> None:

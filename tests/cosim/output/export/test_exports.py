@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 import noack
 from cosim.cli import app
 from cosim.output.export.mat_export import save_mat
+from cosim.output.viewer.rerun_program import start_rerun
 from noack.core.errors import CallerError
 
 SCENARIO: dict[str, Any] = {
@@ -93,6 +94,7 @@ def test_certificates_are_written_as_mat(tmp_path: Path) -> None:
 def test_any_document_becomes_structures(tmp_path: Path) -> None:
     content = {
         "a b": None, "a_b": [1, 2.5], "1": [[1, 2], [3, 4]], "_x": ["p", "", None], "n" * 80: True,
+        "n" * 31 + "x": 2, "n" * 31 + "y": 3,
         "mixed": [[1, 2], [3]], "empty": [], "objects": [{"k": 1}, {"k": "x"}], "text": "‖x‖ é",
     }  # fmt: skip
     save_mat(content, tmp_path / "d.mat")
@@ -102,7 +104,10 @@ def test_any_document_becomes_structures(tmp_path: Path) -> None:
     assert found["f_1"].tolist() == [[1, 2], [3, 4]]
     assert found["objects"][1]["k"] == "x"
     assert found["text"] == "‖x‖ é"
-    assert found["n" * 63] == 1
+    assert found["n" * 31] == 1
+    assert found["n" * 27 + "_2"] == 2
+    assert found["n" * 27 + "_3"] == 3
+    assert max(map(len, found)) <= 31
 
 
 def test_an_mcap_file_has_the_record(run: noack.Run, tmp_path: Path) -> None:
@@ -141,6 +146,12 @@ def test_an_mcap_file_has_metadata_and_attachments(run: noack.Run, tmp_path: Pat
     assert topics["/plant/step"]["states"] == ", ".join(run.scenario.model.state_names or ())
 
 
+def test_rerun_finds_no_fault_in_an_mcap_file(run: noack.Run, tmp_path: Path) -> None:
+    run.export(tmp_path / "run.mcap")
+    program = start_rerun(["mcap", "check", str(tmp_path / "run.mcap")])
+    assert program.wait(timeout=120) == 0
+
+
 def test_several_loops_have_their_names(loops: noack.Run, tmp_path: Path) -> None:
     found = messages(loops.export(tmp_path / "a.mcap")[0])
     name, loop = list(loops.loops.items())[-1]
@@ -150,10 +161,24 @@ def test_several_loops_have_their_names(loops: noack.Run, tmp_path: Path) -> Non
     assert place["phase_ns"] > 0
     assert times == steps
     assert len(found["/netem/packet"]) == loops.table("netem_packet").num_rows
-    mat = loadmat(loops.export(tmp_path / "a.mat")[0], simplify_cells=True)
+    mat = loadmat(loops.export(tmp_path / "a.mat", certificates=False)[0], simplify_cells=True)
     assert mat["loops"][name.replace("-", "_")]["plant_step"]["now_ns"].tolist() == steps
     files = loops.export(tmp_path / "csv")
     assert tmp_path / f"csv/{name}/plant_step.csv" in files
+
+
+def test_each_of_several_loops_has_its_certificates(tmp_path: Path) -> None:
+    names = ["a_pendulum_on_the_left_of_the_hall", "a_pendulum_on_the_left_of_the_house"]
+    settings = {"horizon_s": 0.1, "loops": [{"name": name} for name in names]}
+    run = noack.simulate(noack.load("shared_bottleneck", settings))
+    found = loadmat(run.export(tmp_path / "run.mat")[0], simplify_cells=True)["loops"]
+    assert list(found) == ["a_pendulum_on_the_left_of_the_h", "a_pendulum_on_the_left_of_t_2"]
+    for name, one in zip(names, found.values(), strict=True):
+        assert one["scenario"]["name"] == name
+        (first, *_) = noack.certify(run.loops[name].scenario).to_json()["certificates"]
+        assert one["certificates"]["certificates"][0]["constants"] == first["constants"]
+    bare = run.export(tmp_path / "bare.mat", certificates=False)[0]
+    assert "certificates" not in next(iter(loadmat(bare, simplify_cells=True)["loops"].values()))
 
 
 def test_csv_files_have_the_tables(run: noack.Run, tmp_path: Path) -> None:

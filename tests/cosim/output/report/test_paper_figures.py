@@ -14,7 +14,7 @@ import noack
 from cosim.cli import app
 from cosim.output.figure_format import figure_files
 from cosim.output.report.figure_files import save_figure, save_figures
-from cosim.output.report.figure_style import settings
+from cosim.output.report.figure_style import characters_of_paper_fonts, settings
 from noack.core.errors import CallerError
 from tests.cosim.output.latex import compiled
 
@@ -46,6 +46,24 @@ def test_texts_have_the_fonts_of_latex_only_while_a_figure_is_saved(tmp_path: Pa
     pdf = (tmp_path / "a.pdf").read_bytes()
     assert b"Cmr10" in pdf
     assert b"/Type3" not in pdf.replace(b" ", b"")  # refused by publishers
+
+
+def test_computer_modern_has_other_characters_at_the_place_of_some(tmp_path: Path) -> None:
+    figure = figure_of("lane_following <$x_s$>")
+    figure.axes[0].set_xticks([1.0, 2.0], ["a_b", "c|d"])
+    save_figure(figure, tmp_path / "before.svg")
+    with characters_of_paper_fonts(figure):
+        figure.draw_without_rendering()
+        texts = {text.get_text() for text in figure.findobj(Text)}
+        assert {r"a$\_$b", "c$|$d"} <= texts
+    save_figure(figure, tmp_path / "after.svg")
+    assert (tmp_path / "after.svg").read_bytes() == (tmp_path / "before.svg").read_bytes()
+    for text, written in (("a_b $x_c$ {1}", r"a$\_$b $x_c$ $\{$1$\}$"), (r"5 \$_", r"5 \$$\_$")):
+        figure.axes[0].set_title(text, loc="left")
+        with characters_of_paper_fonts(figure):
+            assert figure.axes[0].get_title("left") == written
+    save_figure(figure, tmp_path / "a.pdf")
+    assert b"Cmtt10" in (tmp_path / "a.pdf").read_bytes()
 
 
 def test_a_pgf_picture_has_escaped_texts_and_no_commands_of_matplotlibs(tmp_path: Path) -> None:
