@@ -132,7 +132,8 @@ def warning(run: Exploration, guarantee: Guarantee | None, margin: Margin | None
         parts.append(f"The loop is unstable under these losses: it diverged at "
                      f"{run.diverged_at_s:.3g} s.")  # fmt: skip
     elif run.x_norm[-1] > run.x_norm[0]:
-        parts.append("‖x‖ is larger at the end than at the start.")
+        first, last = (number(float(run.x_norm[i]), 3) for i in (0, -1))
+        parts.append(f"‖x‖ grows from {first} to {last}.")
     if run.cut:
         parts.append(f"{run.cut[0].upper()}{run.cut[1:]}.")
     if parts and guarantee is not None and guarantee.verdict != CERTIFIED:

@@ -256,7 +256,7 @@ def response(generator: Matrix, D: Matrix) -> ResponseBounds:
     """
     margin = -spectral_abscissa(generator)
     if margin <= 0:
-        raise NotDecayingError(f"the slowest mode grows at {-margin:.3g} /s")
+        raise NotDecayingError(f"a mode of the loop grows at {-margin:.3g} /s")
     decay = decay_of(generator)
     if decay is None:
         raise NotDecayingError("no Lyapunov function of it was found to working precision")

@@ -26,7 +26,10 @@ _STYLE = """
 .lab-rows dd { margin: 0; }
 .lab-viewer { height: 70vh; border: 0; }
 .nicegui-error-popup { max-width: 30rem; border: 3px solid var(--q-negative); }
-.lab-figure svg { width: 100%; height: auto; max-width: 900px; background: white; }
+.lab-figure { --ink: #1b1f24; --grid: #d9dde3; --paper: #ffffff; }
+.body--dark .lab-figure { --ink: #e6eaef; --grid: #3a424d; --paper: #14181d; }
+.lab-figure :is(svg, img) { width: 100%; height: auto; max-width: 900px; }
+.lab-log * { white-space: pre-wrap; overflow-wrap: anywhere; }
 :focus-visible, .q-slider:focus-within, .q-field:focus-within {
   outline: none; box-shadow: 0 0 0 2px white, 0 0 0 5px #c77700 !important;
 }

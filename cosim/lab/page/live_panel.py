@@ -38,7 +38,7 @@ class LivePanel:
             ]
         self._text = ui.label("nothing has run yet").classes("text-sm").props("role=status")
         self._bar = ui.linear_progress(0.0, show_value=False).props("aria-label=progress")
-        self._log = ui.log(max_lines=200).classes("w-full h-40 text-xs")
+        self._log = ui.log(max_lines=200).classes("w-full h-40 text-xs lab-log")
         self._frame = ui.element("div").classes("w-full")
         ui.timer(_POLL_S, self._show)
 

@@ -1,14 +1,22 @@
 """Recorded runs: key numbers, claims and figures; replay and fidelity on request."""
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from nicegui import ui
 
 from cosim.lab.page.lab_services import LabServices
+from cosim.output.figure_format import SCREEN_IN
 from noack.core.errors import NoackError
 
+_COLUMN_IN = 3.5
+"""Width for which figures are laid out on a small screen."""
 _FIGURES = ("states", "errors", "state-norm", "input", "inter-event")
+
+
+NARROW_PX = 800
+"""Widest window whose settings are below the figure."""
 
 
 class Opened(NamedTuple):
@@ -17,28 +25,23 @@ class Opened(NamedTuple):
     facts: list[tuple[str, str]]
     claims: list[tuple[str, str]]
     """Verdict and claim."""
-    figures: list[tuple[str, str]]
-    """Name and SVG."""
+    figures: list[str]
+    """As HTML."""
 
 
-def opened(directory: Path) -> Opened:
-    """Read a run; called in the worker process."""
-    import io
-
+def opened(directory: Path, width_in: float) -> Opened:
+    """Read a run and draw figures of a width; called in the worker process."""
     import noack
     from cosim.api.run_facts import run_facts
-    from cosim.output.report.figure_style import styled
+    from cosim.output.report.figure_files import inline
+    from cosim.output.report.figure_layout import figure_width
 
     run = noack.open_run(directory)
     figures = []
-    for name in _FIGURES:
-        try:
-            figure = styled(run.plot)(name)
-        except NoackError:
-            continue
-        text = io.StringIO()
-        figure.savefig(text, format="svg")
-        figures.append((name, text.getvalue()))
+    with figure_width(width_in):
+        for name in _FIGURES:
+            with suppress(NoackError):
+                figures.append(inline(run.plot(name), f"run-{name}", f"figure: {name}"))
     claims = [(str(one["verdict"]), f"{one['what']} ({one['source']})") for one in run.claims]
     return Opened(run_facts(run), claims, figures)
 
@@ -87,7 +90,10 @@ class RunsPanel:
         with self._content:
             waiting = ui.spinner(size="lg")
         try:
-            found = await self._services.compute(opened, directory)
+            is_narrow = await ui.run_javascript(f"innerWidth <= {NARROW_PX}")
+            found = await self._services.compute(
+                opened, directory, _COLUMN_IN if is_narrow else SCREEN_IN
+            )
         except NoackError as error:
             waiting.delete()
             with self._content:
@@ -113,10 +119,8 @@ class RunsPanel:
                 ("compare with the ideal loop", compared),
             ):
                 self._on_request(words, function, directory)
-        for name, svg in found.figures:
-            ui.html(svg, sanitize=False).classes("w-full lab-figure").props(
-                f'role=img aria-label="{name}"'
-            )
+        for figure in found.figures:
+            ui.html(figure, sanitize=False).classes("w-full lab-figure")
 
     def _on_request(self, words: str, function: Any, directory: Path) -> None:
         answer = ui.label().classes("text-sm")
