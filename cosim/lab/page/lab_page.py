@@ -48,6 +48,7 @@ _STYLE = """
 }
 """
 
+_EXPLORE = "explore"
 _LOST = """
 const lost = document.getElementById('popup');
 lost.role = 'alert';
@@ -82,6 +83,7 @@ class _Page:
         self._session = Session(services, draft, self._drawn)
         self._dark = ui.dark_mode(None)
         self._is_dark = False
+        self._tab, self._is_drawn = _EXPLORE, False
         self._client.on_delete(self._session.end)
 
     def build(self) -> None:
@@ -105,7 +107,7 @@ class _Page:
                 self._settings = SettingsPanel(self._session.draft, self._changed)
             with ui.column().classes("gap-2 w-full"):
                 with ui.tabs(on_change=self._show_tab).props("dense align=left no-caps") as tabs:
-                    names = ("explore", "run live", "recorded runs", "tutorial")
+                    names = (_EXPLORE, "run live", "recorded runs", "tutorial")
                     explore, live, runs, tutorial = (ui.tab(name) for name in names)
                 self._tabs, self._explore_tab = tabs, explore
                 with ui.tab_panels(tabs, value=explore, animated=False, keep_alive=True).classes(
@@ -131,14 +133,20 @@ class _Page:
         self._live.take(self._session.draft)
         await self._session.change(self._session.draft)
 
-    def _show_tab(self, event: Any) -> None:
+    async def _show_tab(self, event: Any) -> None:
+        self._tab = event.value
         if event.value == "recorded runs":
             self._runs.refresh()
+        elif event.value == _EXPLORE and not self._is_drawn:
+            await self._drawn()
 
     async def _drawn(self) -> None:
         if self._client.is_deleted:
             return
         self._settings.show_mistakes(self._session.mistakes)
+        self._is_drawn = self._tab == _EXPLORE
+        if not self._is_drawn:
+            return  # a figure that nobody sees would take time from a running loop
         await self._explore.draw(self._session, dark=self._is_dark)
 
     async def _changed(self, draft: Draft, key: str) -> None:
