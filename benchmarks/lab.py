@@ -1,7 +1,8 @@
 """Lateness of a live run while the lab page is open: it must not disturb the loop.
 
 A run of the paper's example is measured alone; while the page is open in a headless browser; while
-a slider of it moves without pause; and started by the page, which then shows the viewer. Without a graphics card the browser draws by the processor, which is the worst case.
+a slider of it moves without pause; and started by the page, which then shows the viewer. Without a
+graphics card the browser draws by the processor, which is the worst case.
 """
 
 import argparse

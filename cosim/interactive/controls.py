@@ -175,7 +175,7 @@ def example_of(draft: Draft, key: str, kind: str) -> dict[str, Any] | None:
     """
     if key == "network.loss" and kind in _LOSSES:
         return {"model": kind, **_LOSSES[kind]}
-    if key == "trigger":
+    if key == "trigger" and kind in POLICIES:
         example: Any = POLICIES[kind].example(draft.scenario.model.dimensions[0])
         return None if example is None else dict(example.model_dump(mode="json", exclude_none=True))
     return None
