@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 Rows = Sequence[Sequence[str]]
 """The first entry of a row is its name."""
+_CELL = 'style="text-align: left; vertical-align: top; line-height: 1.4"'
+"""At the cells, since the style sheets of notebooks align the text of each cell."""
 
 
 def as_text(rows: Rows) -> str:
@@ -23,8 +25,8 @@ def as_text(rows: Rows) -> str:
 def as_html(rows: Rows) -> str:
     """Return rows as an HTML table."""
     body = "".join(
-        f"<tr><th>{html.escape(name)}</th>"
-        + "".join(f'<td style="text-align: left">{html.escape(entry)}</td>' for entry in entries)
+        f'<tr><th scope="row" {_CELL}>{html.escape(name)}</th>'
+        + "".join(f"<td {_CELL}>{html.escape(entry)}</td>" for entry in entries)
         + "</tr>"
         for name, *entries in rows
     )
