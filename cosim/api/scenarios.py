@@ -143,6 +143,8 @@ def _completed(content: dict[str, Any], settings: Mapping[str, Any] | None, path
             '{"network.loss.probability": 0.8}'
         )
     for key, value in (settings or {}).items():
+        if not isinstance(key, str):
+            raise CallerError(f"settings: {key!r} is no key; keys are texts, 'trigger.beta'")
         if value is None:
             _take_away(content, key)
         else:

@@ -59,9 +59,10 @@ def one_line(error: BaseException) -> str:
     return " ".join(str(error).split())
 
 
-def why(error: OSError) -> str:
+def why(error: OSError | ValueError) -> str:
     """Return the operating system's text of an error, without additions by libraries."""
-    return os.strerror(error.errno) if error.errno else one_line(error)
+    number = error.errno if isinstance(error, OSError) else None
+    return os.strerror(number) if number else one_line(error)
 
 
 def shortened(text: str, longest: int = 80) -> str:

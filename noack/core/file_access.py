@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
-from noack.core.errors import CallerError, MachineError, why
+from noack.core.errors import CallerError, MachineError, printable, why
 
 
 def require_suffix(path: Path, option: str, suffix: str) -> None:
@@ -21,18 +21,20 @@ def write_whole(path: Path, content: str | bytes, *, make_folder: bool = True) -
     """Write a file, or replace it, in one step; return its path.
 
     Text is written as UTF-8. Missing folders are created with ``make_folder``. Raise MachineError
-    if the file cannot be written.
+    if the file cannot be written, or is a folder or a device: a device would be replaced too.
     """
-    scratch = path.with_name(f".{path.name}.partial")
+    scratch = path.parent / f".{path.name}.partial"
     try:
+        if path.exists() and not path.is_file():
+            raise ValueError("not a regular file")
         if make_folder:
             path.parent.mkdir(parents=True, exist_ok=True)
         scratch.write_bytes(content.encode() if isinstance(content, str) else content)
         scratch.replace(path)
-    except OSError as error:
-        with suppress(OSError):
+    except (OSError, ValueError) as error:  # ValueError also: a name that no file can have
+        with suppress(OSError, ValueError):
             scratch.unlink(missing_ok=True)
-        raise MachineError(f"{path}: cannot be written: {why(error)}") from None
+        raise MachineError(printable(f"{path}: cannot be written: {why(error)}")) from None
     return path
 
 

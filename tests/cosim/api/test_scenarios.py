@@ -78,6 +78,12 @@ def test_settings_that_are_no_table_give_one_line() -> None:
         noack.load("lane_following", given)
 
 
+def test_a_key_that_is_no_text_gives_one_line() -> None:
+    given: Any = {3: 1}
+    with pytest.raises(noack.NoackError, match=r"^settings: 3 is no key"):
+        noack.load("lane_following", given)
+
+
 def test_a_system_becomes_a_scenario_with_the_documented_choices() -> None:
     scenario = noack.from_system(SYSTEM, GAIN, [3.0, 4.0])
     decay_per_s = -np.linalg.eigvals(np.add(SYSTEM[0], np.matmul(SYSTEM[1], GAIN))).real.max()

@@ -1,0 +1,34 @@
+"""Files are written whole, or one line says why not; what is no file is left alone."""
+
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from noack.core.errors import MachineError
+from noack.core.file_access import write_whole
+
+
+def test_a_file_is_replaced_and_nothing_else_remains(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "a.txt"
+    write_whole(path, "first")
+    assert write_whole(path, b"second").read_bytes() == b"second"
+    assert [one.name for one in path.parent.iterdir()] == ["a.txt"]
+
+
+def test_a_folder_and_a_fifo_are_not_replaced(tmp_path: Path) -> None:
+    fifo = tmp_path / "fifo"
+    os.mkfifo(fifo)
+    for path in (fifo, tmp_path, Path()):
+        with pytest.raises(MachineError, match="cannot be written: not a regular file"):
+            write_whole(path, "text")
+    assert stat.S_ISFIFO(fifo.stat().st_mode)
+    assert [one.name for one in tmp_path.iterdir()] == ["fifo"]
+
+
+@pytest.mark.parametrize("name", ["a\0b", "n" * 300, "\udcff\0"])
+def test_a_name_that_no_file_can_have_is_reported(tmp_path: Path, name: str) -> None:
+    with pytest.raises(MachineError, match="cannot be written: "):
+        write_whole(tmp_path / name, "text")
+    assert not list(tmp_path.iterdir())
