@@ -2,21 +2,25 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from pydantic.fields import FieldInfo
 
 from cosim.interactive.draft import Draft
 from noack.config.feature_kinds import POLICIES
 from noack.config.runtime_parameters import trigger_parameters
 from noack.config.scenario import Scenario
+from noack.core.clock import NS_PER_S
 
 _STEPS = 200
 _DECADE = 10.0
 _MOST_LOSSES = 20
 _MOST_WINDOW = 40
 _MOST_CORRELATION = 0.99
+_BELOW = 0.99
+"""The largest share of a limit that must not be reached."""
 _SEEDS = 200
 _MOST_MODEL_ERROR = 20.0
 _LOSSES: Mapping[str, Mapping[str, Any]] = {
@@ -47,6 +51,8 @@ class Slider:
     step: float
     """Step of the value; of its decimal logarithm if ``logarithmic``."""
     whole: bool = False
+    multiple_of: float = 0.0
+    """What the value is a whole number of; 0 if any value will do."""
     logarithmic: bool = False
     live: bool = False
     """Whether a running loop can change it."""
@@ -69,9 +75,11 @@ class Slider:
         return math.log10(value) if self.logarithmic else value
 
     def value_at(self, place: float) -> float | int:
-        """Return the value at a place, with three significant digits."""
+        """Return the value at a place; with three significant digits, or a multiple."""
         value = 10.0**place if self.logarithmic else place
         value = min(max(value, self.low), self.high)
+        if self.multiple_of:
+            return float(f"{max(round(value / self.multiple_of), 1) * self.multiple_of:.9g}")
         return round(value) if self.whole else float(f"{value:.3g}")
 
 
@@ -187,7 +195,7 @@ def _loss_sliders(scenario: Scenario) -> list[Slider]:
     for name, value in loss.model_dump(mode="json", exclude_none=True).items():
         if isinstance(value, bool) or not isinstance(value, float):
             continue
-        if 0 <= value <= 1:
+        if 0 <= value <= 1 and _words(name) == name.replace("_", " "):  # it has no unit
             label = "loss probability" if name == "probability" else f"loss: {_words(name)}"
             high = _MOST_CORRELATION if name == "correlation" else 1.0
             found.append(Slider(f"network.loss.{name}", label, value, 0.0, high, 0.01, live=True))
@@ -223,8 +231,18 @@ def _trigger_sliders(scenario: Scenario, base: Scenario) -> list[Slider]:
         like = getattr(usual, name, None) if usual.policy == trigger.policy else None
         if isinstance(value, int | float) and value > 0:
             label = _GREEK.get(name, f"trigger: {_words(name)}")
-            found.append(_decades(key, label, float(value), float(like or value)))
+            slider = _decades(key, label, value, like or value)
+            found.append(_within_field(slider, type(trigger).model_fields[name], scenario))
     return found
+
+
+def _within_field(slider: Slider, field: FieldInfo, scenario: Scenario) -> Slider:
+    """Return the slider with values only that its key can have."""
+    limits = [one.lt for one in field.metadata if hasattr(one, "lt")]
+    most = min([slider.high, *(_BELOW * one for one in limits)])
+    period_s = scenario.timing.measurement_period_ns / NS_PER_S
+    return replace(slider, high=max(most, slider.value),
+                   multiple_of=period_s if slider.key == "trigger.period_s" else 0.0)  # fmt: skip
 
 
 def _plant_sliders(scenario: Scenario, base: Scenario) -> list[Slider]:
@@ -248,12 +266,14 @@ def _plant_sliders(scenario: Scenario, base: Scenario) -> list[Slider]:
 
 
 def _decades(key: str, label: str, value: float, middle: float, *, live: bool = True) -> Slider:
-    """Return a slider over two decades around a value."""
+    """Return a slider over two decades around a value; whole numbers for an integer."""
+    whole = isinstance(value, int)
     low, high = middle / _DECADE, middle * _DECADE
+    if whole:
+        low = max(low, 1.0)
     step = math.log10(high / low) / _STEPS
-    return Slider(
-        key, label, value, min(low, value), max(high, value), step, logarithmic=True, live=live
-    )
+    return Slider(key, label, value, min(low, value), max(high, value), step,
+                  whole=whole, logarithmic=True, live=live)  # fmt: skip
 
 
 def _words(name: str) -> str:
