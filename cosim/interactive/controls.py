@@ -3,10 +3,11 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
-from pydantic.fields import FieldInfo
+from pydantic import BaseModel
 
 from cosim.interactive.draft import Draft
 from noack.config.feature_kinds import POLICIES
@@ -191,16 +192,23 @@ def example_of(draft: Draft, key: str, kind: str) -> dict[str, Any] | None:
 
 def _loss_sliders(scenario: Scenario) -> list[Slider]:
     loss = scenario.network.loss
+    values = loss.model_dump(mode="json", exclude_none=True)
+    if "mean_loss" in values:  # Gilbert's chain: every packet is lost in the bad state only
+        values = {name: values[name] for name in ("mean_loss", "mean_burst")}
     found = []
-    for name, value in loss.model_dump(mode="json", exclude_none=True).items():
+    for name, value in values.items():
+        key, label = f"network.loss.{name}", f"loss: {_words(name)}"
         if isinstance(value, bool) or not isinstance(value, float):
             continue
-        if 0 <= value <= 1 and _words(name) == name.replace("_", " "):  # it has no unit
-            label = "loss probability" if name == "probability" else f"loss: {_words(name)}"
+        if 0 <= value <= 1 and "[" not in label:  # it has no unit
+            label = "loss probability" if name == "probability" else label
             high = _MOST_CORRELATION if name == "correlation" else 1.0
-            found.append(Slider(f"network.loss.{name}", label, value, 0.0, high, 0.01, live=True))
+            slider = Slider(key, label, value, 0.0, high, 0.01, live=True)
         elif value > 0:
-            found.append(_decades(f"network.loss.{name}", f"loss: {_words(name)}", value, value))
+            slider = _decades(key, label, value, value)
+        else:
+            continue
+        found.append(_within_field(slider, type(loss), name))
     return found
 
 
@@ -232,17 +240,31 @@ def _trigger_sliders(scenario: Scenario, base: Scenario) -> list[Slider]:
         if isinstance(value, int | float) and value > 0:
             label = _GREEK.get(name, f"trigger: {_words(name)}")
             slider = _decades(key, label, value, like or value)
-            found.append(_within_field(slider, type(trigger).model_fields[name], scenario))
+            if name == "period_s":
+                period_s = scenario.timing.measurement_period_ns / NS_PER_S
+                slider = replace(slider, multiple_of=period_s)
+            found.append(_within_field(slider, type(trigger), name))
     return found
 
 
-def _within_field(slider: Slider, field: FieldInfo, scenario: Scenario) -> Slider:
+def _within_field(slider: Slider, section: type[BaseModel], name: str) -> Slider:
     """Return the slider with values only that its key can have."""
-    limits = [one.lt for one in field.metadata if hasattr(one, "lt")]
-    most = min([slider.high, *(_BELOW * one for one in limits)])
-    period_s = scenario.timing.measurement_period_ns / NS_PER_S
-    return replace(slider, high=max(most, slider.value),
-                   multiple_of=period_s if slider.key == "trigger.period_s" else 0.0)  # fmt: skip
+    least, most = _limits(section, name)
+    low, high = max(slider.low, least), min(slider.high, most)
+    return replace(slider, low=min(low, slider.value), high=max(high, slider.value))
+
+
+@cache
+def _limits(section: type[BaseModel], name: str) -> tuple[float, float]:
+    """Return the least and the largest number that a key can have, from the JSON schema."""
+    schema = section.model_json_schema()
+    properties = schema.get("$defs", {}).get(section.__name__, schema)["properties"]
+    kinds = properties[name].get("anyOf", [properties[name]])
+    number: Mapping[str, float] = next(
+        (one for one in kinds if one.get("type") in ("number", "integer")), {}
+    )
+    below = _BELOW * number.get("exclusiveMaximum", math.inf)
+    return number.get("minimum", -math.inf), min(number.get("maximum", math.inf), below)
 
 
 def _plant_sliders(scenario: Scenario, base: Scenario) -> list[Slider]:

@@ -113,6 +113,10 @@ def test_every_choice_gives_a_valid_scenario() -> None:
             assert {one.key: one.value for one in controls_of(other).choices}[choice.key] == value
             again = draft_of_query(other.query(), "lane_following", LANE)
             assert again.scenario == other.scenario
+            for slider in controls_of(other).sliders:
+                for place in slider.ends:
+                    if slider.key != "network.loss.mean_loss":  # limited by the mean burst
+                        assert dragged(other, slider, slider.value_at(place)).scenario
 
 
 def test_a_slider_covers_two_decades_and_rounds() -> None:
