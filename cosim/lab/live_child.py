@@ -4,6 +4,7 @@ It writes one JSON object per line on standard output: what happened, with its f
 """
 
 import json
+import signal
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -25,6 +26,7 @@ def main() -> int:
     )
     try:
         ending = launch(load(path), runs, live=True, watcher=watcher)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a stop now must not cost the summary
         _say("finalising", reason=ending.reason)
         from cosim.live.finalize import finalize
 

@@ -91,13 +91,11 @@ class LiveRun:
                 self._process.send_signal(signal.SIGINT)
 
     async def end(self) -> None:
-        """End the run and wait for it."""
+        """Ask the run to end and wait for it; a slow one ends by itself, with its summary."""
         self.stop()
         if self._process is not None and self._process.returncode is None:
-            try:
+            with suppress(TimeoutError):
                 await asyncio.wait_for(self._process.wait(), _STOP_S)
-            except TimeoutError:
-                self._process.kill()
 
     def kill(self, role: str) -> bool:
         """Kill a process of the loop, to see what happens; return whether there was one."""

@@ -1,11 +1,15 @@
 """What the page knows of a live run, from what the run says."""
 
 import json
+import signal
+import subprocess
 from pathlib import Path
 
 import pytest
 
+from cosim.interactive.draft import open_draft
 from cosim.lab.live_run import LiveRun
+from noack.core.python_process import python_command
 
 
 def said(run: LiveRun, what: str, **fields: object) -> None:
@@ -68,3 +72,19 @@ def test_the_log_is_bounded() -> None:
         run._take(f"line {number}")
     assert len(run.lines) == 200
     assert run.lines[-1] == "line 999"
+
+
+def test_a_stop_after_the_loop_ended_keeps_the_summary(tmp_path: Path) -> None:
+    scenario = tmp_path / "one.toml"
+    scenario.write_text(open_draft("double_integrator").with_value("horizon_s", 1.0).text)
+    command = python_command("-m", "cosim.lab.live_child", str(scenario), str(tmp_path / "runs"))
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        told = []
+        for line in process.stdout:
+            told.append(json.loads(line)["what"])
+            if told[-1] == "finalising":
+                process.send_signal(signal.SIGINT)
+    assert told[-2:] == ["finalising", "ended"]
+    (run,) = [path for path in (tmp_path / "runs").iterdir() if not path.is_symlink()]
+    assert (run / "summary.json").exists()
