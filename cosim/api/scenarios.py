@@ -144,7 +144,9 @@ def _completed(content: dict[str, Any], settings: Mapping[str, Any] | None, path
         )
     for key, value in (settings or {}).items():
         if not isinstance(key, str):
-            raise CallerError(f"settings: {key!r} is no key; keys are texts, 'trigger.beta'")
+            raise CallerError(
+                f'settings: {key!r} is not a key; a key is a text such as "trigger.beta"'
+            )
         if value is None:
             _take_away(content, key)
         else:

@@ -19,7 +19,6 @@ _STEPS = 200
 _DECADE = 10.0
 _MOST_LOSSES = 20
 _MOST_WINDOW = 40
-_MOST_CORRELATION = 0.99
 _BELOW = 0.99
 """The largest share of a limit that must not be reached."""
 _SEEDS = 200
@@ -53,7 +52,7 @@ class Slider:
     """Step of the value; of its decimal logarithm if ``logarithmic``."""
     whole: bool = False
     multiple_of: float = 0.0
-    """What the value is a whole number of; 0 if any value will do."""
+    """The value is a multiple of this; 0: any value."""
     logarithmic: bool = False
     live: bool = False
     """Whether a running loop can change it."""
@@ -76,7 +75,7 @@ class Slider:
         return math.log10(value) if self.logarithmic else value
 
     def value_at(self, place: float) -> float | int:
-        """Return the value at a place; with three significant digits, or a multiple."""
+        """Return the value at a place: whole, a multiple, or with three significant digits."""
         value = 10.0**place if self.logarithmic else place
         value = min(max(value, self.low), self.high)
         if self.multiple_of:
@@ -193,17 +192,16 @@ def example_of(draft: Draft, key: str, kind: str) -> dict[str, Any] | None:
 def _loss_sliders(scenario: Scenario) -> list[Slider]:
     loss = scenario.network.loss
     values = loss.model_dump(mode="json", exclude_none=True)
-    if "mean_loss" in values:  # Gilbert's chain: every packet is lost in the bad state only
-        values = {name: values[name] for name in ("mean_loss", "mean_burst")}
+    # The mean loss and burst are those of Gilbert's chain, which loses in the bad state only.
+    fixed = ("loss_in_good", "loss_in_bad") if "mean_loss" in values else ()
     found = []
     for name, value in values.items():
         key, label = f"network.loss.{name}", f"loss: {_words(name)}"
-        if isinstance(value, bool) or not isinstance(value, float):
+        if name in fixed or not isinstance(value, float):
             continue
         if 0 <= value <= 1 and "[" not in label:  # it has no unit
             label = "loss probability" if name == "probability" else label
-            high = _MOST_CORRELATION if name == "correlation" else 1.0
-            slider = Slider(key, label, value, 0.0, high, 0.01, live=True)
+            slider = Slider(key, label, value, 0.0, 1.0, 0.01, live=True)
         elif value > 0:
             slider = _decades(key, label, value, value)
         else:
@@ -290,9 +288,7 @@ def _plant_sliders(scenario: Scenario, base: Scenario) -> list[Slider]:
 def _decades(key: str, label: str, value: float, middle: float, *, live: bool = True) -> Slider:
     """Return a slider over two decades around a value; whole numbers for an integer."""
     whole = isinstance(value, int)
-    low, high = middle / _DECADE, middle * _DECADE
-    if whole:
-        low = max(low, 1.0)
+    low, high = max(middle / _DECADE, 1.0 if whole else 0.0), middle * _DECADE
     step = math.log10(high / low) / _STEPS
     return Slider(key, label, value, min(low, value), max(high, value), step,
                   whole=whole, logarithmic=True, live=live)  # fmt: skip

@@ -91,11 +91,18 @@ class LiveRun:
                 self._process.send_signal(signal.SIGINT)
 
     async def end(self) -> None:
-        """Ask the run to end and wait for it; a slow one ends by itself, with its summary."""
+        """End the run and wait for it.
+
+        A loop that does not end in time is killed. A run that is being checked ends by itself.
+        """
         self.stop()
         if self._process is not None and self._process.returncode is None:
-            with suppress(TimeoutError):
+            try:
                 await asyncio.wait_for(self._process.wait(), _STOP_S)
+            except TimeoutError:
+                if self.state != "finalising":
+                    self._process.kill()
+                await self._process.wait()
 
     def kill(self, role: str) -> bool:
         """Kill a process of the loop, to see what happens; return whether there was one."""

@@ -80,7 +80,7 @@ def test_settings_that_are_no_table_give_one_line() -> None:
 
 def test_a_key_that_is_no_text_gives_one_line() -> None:
     given: Any = {3: 1}
-    with pytest.raises(noack.NoackError, match=r"^settings: 3 is no key"):
+    with pytest.raises(noack.NoackError, match=r"^settings: 3 is not a key"):
         noack.load("lane_following", given)
 
 

@@ -1,13 +1,16 @@
 """What the page knows of a live run, from what the run says."""
 
+import asyncio
 import json
 import signal
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from cosim.interactive.draft import open_draft
+from cosim.lab import live_run
 from cosim.lab.live_run import LiveRun
 from noack.core.python_process import python_command
 
@@ -88,3 +91,35 @@ def test_a_stop_after_the_loop_ended_keeps_the_summary(tmp_path: Path) -> None:
     assert told[-2:] == ["finalising", "ended"]
     (run,) = [path for path in (tmp_path / "runs").iterdir() if not path.is_symlink()]
     assert (run / "summary.json").exists()
+
+
+STUBBORN = """
+import signal, sys
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+print("ready", flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize(("state", "status"), [("running", -signal.SIGKILL), ("finalising", 0)])
+def test_a_loop_that_does_not_end_is_killed_but_not_its_check(
+    state: str, status: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live_run, "_STOP_S", 0.0)
+
+    async def end() -> int | None:
+        run = LiveRun(20.0)
+        run._process = process = await asyncio.create_subprocess_exec(
+            sys.executable, "-c", STUBBORN, stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+        )  # fmt: skip
+        assert process.stdin is not None
+        assert process.stdout is not None
+        await process.stdout.readline()
+        run.state = state
+        if state == "finalising":
+            asyncio.get_running_loop().call_later(0.2, process.stdin.close)
+        await run.end()
+        return process.returncode
+
+    assert asyncio.run(end()) == status
