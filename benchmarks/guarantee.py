@@ -1,8 +1,8 @@
 """The guarantee over very many decisions: violations, realised losses, and cost per decision.
 
-Each combination is decided by the compiled rules, a million datagrams per flow; a check that does
+Each combination is decided by the core, a million datagrams per flow; a check that does
 not know the rules counts violations at the receiver. Costs alternate with those of the
-plain cap that allows as many consecutive losses; the plain cap's, with those of plain Python.
+plain cap that allows as many consecutive losses; the plain cap's, with those of calls from Python.
 """
 
 import argparse
@@ -15,13 +15,10 @@ from numpy.typing import NDArray
 
 from benchmarks._loss_check import Limits, outcomes_of, violations
 from benchmarks._report import Benchmark, Goal, Rounds, Row, say
-from netem.engine.compiled_rules import compile_rule, compiled_program, compiled_state, set_flow
-from netem.engine.many_decisions import admit_many
 from netem.link_machine import Link
-from netem.rule_program import program_of
+from netem.link_state import LinkState
 from netem.words.words_to_settings import settings_of
 from noack.impairments.kept_loss import expected_loss
-from noack.impairments.link_records import PacketDecision, dtype_of
 
 DECISIONS = 100_000_000
 _BATCH = 1_000_000
@@ -42,21 +39,17 @@ class Decider:
     """Decides for a flow after the other, with this time between two datagrams."""
 
     def __init__(self, words: str, spacing_ns: int = 10_000) -> None:
-        plain = program_of(settings_of(words), 7, "relay", "forward")
-        self._admit, self._program = compile_rule(admit_many), compiled_program(plain)
-        self._state, self._flow = compiled_state(plain, 1), 0
-        self._decisions = np.zeros(_BATCH, dtype_of(PacketDecision))
+        self._link, self._flow = LinkState(settings_of(words), 7, "relay", "forward"), 0
         self._sizes, self._rows = np.full(_BATCH, 72), np.zeros(_BATCH, np.int64)
         self._arrivals_ns = np.arange(_BATCH) * spacing_ns
 
     def decide(self, count: int = _BATCH) -> NDArray[Any]:
         """Return the decisions for the first datagrams of the next flow."""
-        set_flow(self._state, 0, self._flow, first_delivered=False)
-        self._state.link["in_flight"] = 0  # type: ignore[index]
+        self._link.start_flow(0, self._flow)
+        self._link.core.in_flight = 0
         self._flow += 1
-        columns = (self._rows, self._sizes, self._arrivals_ns, self._decisions)
-        self._admit(self._program, self._state, *(column[:count] for column in columns))
-        return self._decisions[:count]
+        columns = (self._rows, self._sizes, self._arrivals_ns)
+        return self._link.decide_many(*(column[:count] for column in columns))
 
 
 def check_rows(words: str, limits: Limits, count: int) -> list[Row]:
@@ -83,7 +76,7 @@ def expected_row(words: str, count: int) -> Row:
 
 
 def speed_row(words: str = "loss 50% mansd 4") -> Row:
-    """Return the decisions per second of the compiled rules beside those in plain Python."""
+    """Return the decisions per second of the core, at once beside one by one from Python."""
     say(f"speed of decisions, {words}")
     decider, link, rounds = (
         Decider(words),
@@ -91,18 +84,18 @@ def speed_row(words: str = "loss 50% mansd 4") -> Row:
         Rounds(),
     )
 
-    def decide_plainly() -> None:
+    def decide_one_by_one() -> None:
         for _ in range(_BATCH // 20):
             link.decide(0, 72, 0)
 
-    sides = (("compiled", decider.decide, _BATCH), ("plain Python", decide_plainly, _BATCH // 20))
+    sides = (("core", decider.decide, _BATCH), ("from Python", decide_one_by_one, _BATCH // 20))
     for number in range(-1, 5):
         for side, decide, count in sides:
             begun_s = time.perf_counter()
             decide()
             if number >= 0:
                 rounds.add(side, {"per_s": count / (time.perf_counter() - begun_s)})
-    return rounds.row(f"{words}: decisions", "/s", "per_s", "compiled", "plain Python", paired=True)
+    return rounds.row(f"{words}: decisions", "/s", "per_s", "core", "from Python", paired=True)
 
 
 def plain_cap(words: str) -> str:

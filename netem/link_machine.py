@@ -1,25 +1,19 @@
 """One direction of a link as a state machine: datagrams in, surviving datagrams out, maybe later.
 
-It does not interpret payloads. It runs the rules of :mod:`netem.rules` as plain Python: in a run of
-the loop, in simulation, in replay, and in the relay where the compiled engine is not available.
+It does not interpret payloads. The core decides (native/link.c): in a run of the loop, in
+simulation, in replay, and in the relay.
 """
 
 import heapq
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
-from netem.rule_program import FlowRow, empty_state, new_flow, new_row, program_of
-from netem.rules.link_rules import admit, leave
-from netem.rules.settings_change import carry
+import numpy as np
+
+from netem.link_state import LinkState
 from noack.config.parameter_changes import ChangeSchedule, ParameterChange
 from noack.config.scenario import Scenario
-from noack.impairments.link_records import (
-    NEVER_NS,
-    Counters,
-    FlowState,
-    PacketDecision,
-    RecordedDecision,
-)
+from noack.impairments.link_records import NEVER_NS, Counters, RecordedDecision
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
 from noack.protocol.record_tables import (
@@ -73,7 +67,7 @@ class Link:
         first_number: number of the first input and of the first packet.
         schedule: announced changes of the settings; None: nothing can be announced.
         restarted: the link has replaced another in a run; see
-            :func:`netem.rule_program.new_losses`.
+            :class:`netem.link_state.LinkState`.
     """
 
     def __init__(
@@ -86,17 +80,11 @@ class Link:
         schedule: ChangeSchedule | None = None,
         restarted: bool = False,
     ) -> None:
-        self._settings, self._restarted = settings, restarted
+        self._state = LinkState(settings, seed, *name, decisions=decisions, restarted=restarted)
         self._schedule = schedule
         self._reached_ns = -1
-        self._seed = seed
-        self._name = name
-        self._program = program_of(settings, seed, *name, decisions=decisions)
         self._rows: dict[int, int] = {}
         self._free_rows: list[int] = []
-        self._tables: dict[str, Any] = {name: [] for name in FlowRow._fields}
-        self._state = empty_state(self._program)._replace(**self._tables)
-        self._decision = PacketDecision()
         self._in_flight: list[_InFlight] = []
         self._put_in_flight = 0
         self._inputs = self._first_number = first_number
@@ -107,24 +95,24 @@ class Link:
         return self._state.counters
 
     @property
-    def decision(self) -> PacketDecision:
-        """The decision for the last datagram; overwritten by the next."""
-        return self._decision
+    def decision(self) -> Any:
+        """The decision for the last datagram, a ``noack_decision``; overwritten by the next."""
+        return self._state.decision
 
     @property
     def in_flight(self) -> int:
         """Number of datagrams and copies in flight."""
-        return self._state.link.in_flight
+        return int(self._state.core.in_flight)
 
     @property
     def delays(self) -> bool:
         """Whether datagrams can be delayed."""
-        return self._program.tracks
+        return self._state.tracks
 
-    def flow(self, flow: int) -> FlowState | None:
-        """The state of a flow; None if none of its datagrams has arrived."""
+    def flow(self, flow: int) -> Any:
+        """The state of a flow, a ``noack_flow``; None if none of its datagrams has arrived."""
         row = self._rows.get(flow)
-        return None if row is None else self._state.flows[row]
+        return None if row is None else self._state.flow(row)
 
     def forget(self, flow: int) -> None:
         """Remove a flow that has ended and has no datagram in flight."""
@@ -133,22 +121,12 @@ class Link:
             self._free_rows.append(row)
 
     def change(self, settings: LinkSettings) -> None:
-        """Apply other settings; see :mod:`netem.rules.settings_change`."""
-        old, before = self._program, self._state
-        self._settings = settings
-        self._program = program_of(settings, self._seed, *self._name, tracks=old.tracks)._replace(
-            decisions=old.decisions, decisions_begin=old.decisions_begin
-        )
-        rows = [new_row(self._program, flow) for flow in before.flows]
-        self._tables = {name: [getattr(row, name) for row in rows] for name in FlowRow._fields}
-        self._state = empty_state(self._program)._replace(
-            **self._tables, link=before.link, counters=before.counters
-        )
-        latest_ns = [NEVER_NS] * len(rows)
+        """Apply other settings; see native/link_change.c."""
+        latest_ns = np.full(self._state.rows, NEVER_NS, np.int64)
         for leaving in self._in_flight:
             row = self._rows[leaving.datagram.flow]
             latest_ns[row] = max(latest_ns[row], leaving.release_ns)
-        carry(old, before, self._program, self._state, latest_ns)
+        self._state.change(settings, latest_ns)
 
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
         """Accept a change; it applies from the first datagram that arrives at or after its time T.
@@ -198,23 +176,23 @@ class Link:
     def reach(self, now_ns: int) -> None:
         """Apply the changes that are due before a datagram of this time."""
         if self._schedule is not None:
-            for settings in due_settings(self._schedule, self._settings, now_ns):
+            for settings in due_settings(self._schedule, self._state.settings, now_ns):
                 self.change(settings)
             self._reached_ns = now_ns
 
-    def decide(self, flow: int, size_bytes: int, now_ns: int) -> PacketDecision:
-        """Decide for a flow's next packet; the next call overwrites the decision."""
+    def decide(self, flow: int, size_bytes: int, now_ns: int) -> Any:
+        """Decide for a flow's next packet; the next call overwrites the ``noack_decision``."""
         row = self._rows.get(flow)
         if row is None:
-            row = self._add_flow(flow)
-        admit(self._program, self._state, row, size_bytes, now_ns, self._decision)
-        return self._decision
+            row = self._rows[flow] = self._free_rows.pop() if self._free_rows else len(self._rows)
+            self._state.start_flow(row, flow)
+        return self._state.decide(row, size_bytes, now_ns)
 
     def _release(
         self, message: Datagram, release_ns: int, bit: int, *, copy: bool
     ) -> tuple[Datagram, ...]:
         """Return a datagram that leaves at once, or keep it until it is due."""
-        decision = self._decision
+        decision = self.decision
         counts = bit < 0 and not (copy and decision.bit < 0)
         if bit >= 0:
             message = message._replace(data=flipped(message.data, bit))
@@ -233,16 +211,9 @@ class Link:
 
     def _leave(self, leaving: _InFlight) -> bool:
         row, size_bytes = self._rows[leaving.datagram.flow], len(leaving.datagram.data)
-        return leave(self._state, row, leaving.packet, size_bytes, leaving.delayed, leaving.counts)
-
-    def _add_flow(self, flow: int) -> int:
-        new = new_flow(flow, self._settings.first_delivered)
-        state = new_row(self._program, new, restarted=self._restarted)
-        row = self._free_rows.pop() if self._free_rows else len(self._state.flows)
-        for name, table in self._tables.items():
-            table[row : row + 1] = [getattr(state, name)]
-        self._rows[flow] = row
-        return row
+        return self._state.leave(
+            row, leaving.packet, size_bytes, delayed=leaving.delayed, counts=leaving.counts
+        )
 
 
 def flipped(data: bytes, bit: int) -> bytes:
@@ -274,7 +245,7 @@ def at_start(settings: LinkSettings, name: str, start: Start) -> tuple[LinkSetti
     """Return the settings of a link of a run, and the names of its random streams.
 
     A restarted emulator does not know the losses before. Therefore its first datagrams pass
-    (see :func:`netem.rule_program.new_losses`), and later ones are drawn from other random streams
+    (see :class:`netem.link_state.LinkState`), and later ones are drawn from other random streams
     than before.
     """
     if not start.is_restart:

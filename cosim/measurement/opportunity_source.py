@@ -13,8 +13,7 @@ import numpy as np
 from netem.link_machine import Link
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
-from noack.impairments.delivery_queue import OPPORTUNITY_BYTES
-from noack.impairments.kinds.opportunities import Opportunities
+from noack.impairments.kinds.opportunities import OPPORTUNITY_BYTES, Opportunities
 from noack.impairments.link_records import NEVER_NS
 from noack.impairments.link_settings import LinkSettings
 from noack.traces.packet_trace import LOST_NS, PacketTrace, packet_trace

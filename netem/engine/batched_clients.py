@@ -157,7 +157,7 @@ class ClientTable:
 
     def _set_path(self, row: int, path: Endpoint) -> None:
         memory, place = self._memory.memory, self._memory.first_path + row
-        if self._directions[2 * int(memory.clients["link"][row]) + 1].program.tracks:
+        if self._directions[2 * int(memory.clients["link"][row]) + 1].tracks:
             stamp_arrivals(path)
         self._paths[row] = path
         self._drops[row] = 0

@@ -19,8 +19,7 @@ from netem.engine.pump_memory import PumpMemory
 from netem.engine.relay_base import RARE_PERIOD_NS, REPORTED_FLOWS, Relay
 from netem.engine.relay_interface import DIRECTIONS, DirectionReport, FlowReport, LinkSpec, Tap
 from netem.engine.relay_sockets import stamp_arrivals
-from netem.rules.settings_change import carry
-from noack.impairments.link_records import Counters, PacketDecision, dtype_of
+from noack.core.core_library import dtype_of
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import LOOPBACK
 from noack.runtime.native.socket_structs import packed_name
@@ -57,7 +56,7 @@ class BatchedRelay(Relay):
         self._directions = [
             BatchedDirection(
                 getattr(spec, side), spec.seed, (spec.name, side), 2 * number + reverse, memory,
-                compile_rule(carry), spec.decisions.get(side, ()),
+                spec.decisions.get(side, ()),
             )
             for number, spec in enumerate(self.specs)
             for reverse, side in enumerate(DIRECTIONS)
@@ -67,7 +66,7 @@ class BatchedRelay(Relay):
         )
         for number in range(len(self._directions)):
             self._stamp_arrivals(number)
-        self._decisions = np.zeros(1, dtype_of(PacketDecision))
+        self._decisions = np.zeros(1, dtype_of("noack_decision"))
         self._rarely_ns = 0
 
     def run(self, stop: Callable[[], bool], housekeeping: Callable[[], None]) -> None:
@@ -93,10 +92,9 @@ class BatchedRelay(Relay):
     def call_all(self) -> None:
         """Call every compiled function once, to load it."""
         self._run_pump(_LONG_AGO_NS)
-        memory, direction = self._memory.memory, self._directions[0]
+        memory = self._memory.memory
         compile_rule(insert)(memory.table, memory.clients, 0, memory.in_names[0])
         compile_rule(remove)(memory.table, memory.clients, 0)
-        direction.change(direction.settings, np.full(direction.rows, -1, np.int64))
 
     def _relay_until(self, until_ns: int) -> None:
         pump = self._memory.pump
@@ -125,9 +123,9 @@ class BatchedRelay(Relay):
         memory = self._memory.memory
         return DirectionReport(
             settings=self._directions[direction].settings,
-            counters=Counters(*memory.counters[direction].tolist()),
+            counters=self._directions[direction].counters,
             unintended=self._losses[direction].counts(),
-            in_flight=int(memory.link_states["in_flight"][direction]),
+            in_flight=int(self._directions[direction].core.in_flight),
             flows=self._report_flows(direction),
             delays=memory.delays[direction].copy(),
             lateness=memory.lateness[direction].copy(),
@@ -135,7 +133,7 @@ class BatchedRelay(Relay):
 
     def _report_flows(self, direction: int) -> Sequence[FlowReport]:
         clients = self._memory.memory.clients
-        flows = np.asarray(self._directions[direction].state.flows)
+        flows = self._directions[direction].flows
         rows = self._clients.rows_of(direction // 2)
         packets = flows["packets"][clients["place"][rows]]
         busiest = rows[np.argsort(-packets, kind="stable")[:REPORTED_FLOWS]].tolist()
@@ -168,7 +166,7 @@ class BatchedRelay(Relay):
 
     def _stamp_arrivals(self, direction: int) -> None:
         """Enable arrival timestamps where datagrams are delayed: delays count from the arrival."""
-        if self._directions[direction].program.tracks:
+        if self._directions[direction].tracks:
             self._memory.pump["stamps"] = 1
             self._memory.read_controls()
             if direction % 2 == 0:
@@ -177,8 +175,7 @@ class BatchedRelay(Relay):
                 self._clients.stamp_arrivals(direction // 2)
 
     def _run_pump(self, until_ns: int) -> int:
-        memory, one = self._memory.memory, self._directions[0]
-        return self._run_compiled(memory, one.program, one.state, self._decisions, until_ns)
+        return self._run_compiled(self._memory.memory, self._decisions, until_ns)
 
     def _report_events(self) -> None:
         """Pass the collected events to the taps."""
@@ -213,9 +210,7 @@ def load() -> None:
     """Load or compile the code once, before ports are open: else datagrams would wait for it."""
     nothing = LinkSettings()
     spec = LinkSpec("none", (LOOPBACK, 0), (LOOPBACK, 9), nothing, nothing)
-    kept = (
-        all(is_kept(function) for function in (insert, remove, carry)) and kept_pump() is not None
-    )
+    kept = all(is_kept(function) for function in (insert, remove)) and kept_pump() is not None
     notice = nullcontext() if kept else announced("the relay", prepare(), _COMPILING_S)
     with notice, closing(BatchedRelay([spec])) as relay:
         relay.call_all()

@@ -1,13 +1,12 @@
 """The network of a run as compiled code, which itself waits for, receives and sends datagrams.
 
-It decides as :mod:`netem.link_machine` does, which replays its record: both run the rules of
-:mod:`netem.rules`, and both number the calls of these rules.
+It decides as :mod:`netem.link_machine` does, which replays its record: both call the core
+(native/link.c), and both number these calls.
 """
 
 import ctypes
 import socket
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -19,11 +18,10 @@ from netem.engine.pump.pump_layout import Array
 from netem.engine.pump_memory import PumpMemory
 from netem.engine.relay_sockets import stamp_arrivals
 from netem.link_machine import Datagram, at_start, due_settings, link_name
-from netem.rules.settings_change import carry
 from noack.config.parameter_changes import ChangeSchedule, ParameterChange
 from noack.config.scenario import Scenario
 from noack.core.clock import RunClock
-from noack.impairments.link_records import LinkMemory, LinkProgram, PacketDecision, dtype_of
+from noack.core.core_library import dtype_of
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.machine_interface import Notice, Record, Start
 from noack.protocol.record_tables import (
@@ -79,7 +77,7 @@ class CompiledNetwork:
         for number, (settings, name) in enumerate(links):
             first, names = at_start(settings, name, start)
             direction = BatchedDirection(
-                first, resolved.seeds.loss, names, number, self._memory.memory, _carry,
+                first, resolved.seeds.loss, names, number, self._memory.memory,
                 restarted=start.is_restart,
             )  # fmt: skip
             for loop in range(self._loops):
@@ -87,7 +85,7 @@ class CompiledNetwork:
             self._directions.append(direction)
         self._schedule = ChangeSchedule(resolved, lambda one: one.network.link)
         self._reached_ns = -1
-        self._decisions = np.zeros(1, dtype_of(PacketDecision))
+        self._decisions = np.zeros(1, dtype_of("noack_decision"))
         self._epoll = Epoll()
         pump["epoll"], pump["sleeps"] = self._epoll.fileno(), not self._epoll.waits_by_ns()
 
@@ -175,7 +173,7 @@ class CompiledNetwork:
     @property
     def received(self) -> Sequence[int]:
         """(2,) Datagrams received in each direction, without those of other sources."""
-        return self._memory.memory.counters["received"].tolist()  # type: ignore[no-any-return]
+        return [one.counters.received for one in self._directions]
 
     @property
     def refused(self) -> int:
@@ -200,8 +198,8 @@ class CompiledNetwork:
 
     def _drive(self, until_ns: int) -> int:
         """Run the pump until it returns, and do what it needs; return the reason."""
-        memory, one = self._memory.memory, self._directions[0]
-        reason = self._run_pump(memory, one.program, one.state, self._decisions, until_ns)
+        one = self._directions[0]
+        reason = self._run_pump(self._memory.memory, self._decisions, until_ns)
         if reason == pump_layout.CHANGE_DUE:
             now_ns = int(self._memory.pump["now_ns"])
             for settings in due_settings(self._schedule, one.settings, now_ns):
@@ -235,19 +233,3 @@ class _RowList(list[Record]):
     def extend_table(self, table: str, rows: Array) -> None:
         """Add rows of a table."""
         self.extend(Record(table, row) for row in rows.tolist())
-
-
-def _carry(
-    old: LinkProgram, before: LinkMemory, new: LinkProgram, after: LinkMemory, latest_ns: Array
-) -> None:
-    """Carry the state over without compiled code: there are few flows."""
-    tables = [type(one)._make(map(_as_records, one)) for one in (old, before, new, after)]
-    carry(*tables, latest_ns.tolist())  # type: ignore[call-arg, arg-type]
-
-
-def _as_records(table: Any) -> Any:
-    """Return a table, or a row of one, whose fields are attributes."""
-    if isinstance(table, np.void):
-        return np.asarray(table).reshape(1).view(np.recarray)[0]  # shares its memory
-    named = isinstance(table, np.ndarray) and table.dtype.names
-    return table.view(np.recarray) if named else table

@@ -6,12 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from netem.engine.batched_directions import BatchedDirection
 from netem.engine.compiled_rules import folder, prepare
 from netem.engine.pump_memory import PumpMemory
-from netem.rules.settings_change import carry
-from noack.impairments.link_records import PacketDecision, dtype_of
-from noack.impairments.link_settings import LinkSettings
+from noack.core.core_library import dtype_of
 from noack.runtime.native.object_code import NativeFunction, code_file, load, load_or_compile
 
 _NAME = "run_pump"
@@ -45,7 +42,4 @@ def _file() -> Path | None:
 
 def _examples() -> tuple[Any, ...]:
     """Return arguments of the pump; only their types matter."""
-    memory = PumpMemory(1, segment=False, taps=0).memory
-    direction = BatchedDirection(LinkSettings(), 0, (), 0, memory, carry)
-    decisions = np.zeros(1, dtype_of(PacketDecision))
-    return memory, direction.program, direction.state, decisions, 0
+    return PumpMemory(1, segment=False, taps=0).memory, np.zeros(1, dtype_of("noack_decision")), 0

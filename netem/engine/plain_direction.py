@@ -4,7 +4,7 @@ import ipaddress
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from netem.engine.relay_interface import (
 )
 from netem.link_machine import Datagram, Link
 from netem.relay_events import ADDRESS_BYTES, EVENT
-from noack.impairments.link_records import NEVER_NS, PacketDecision
+from noack.impairments.link_records import NEVER_NS
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.machine_interface import Record
 from noack.protocol.record_tables import NETEM_RELEASE
@@ -57,7 +57,7 @@ class PlainDirection:
 
     def admit(
         self, flow: int, data: bytes, now_ns: int
-    ) -> tuple[PacketDecision, Sequence[ScheduledDeparture]]:
+    ) -> tuple[Any, Sequence[ScheduledDeparture]]:
         """Decide for a datagram; return the departures that are due at once."""
         outputs = self.link.handle(Datagram(flow, data), now_ns)
         datagrams = iter([output for output in outputs if isinstance(output, Datagram)])
@@ -134,9 +134,7 @@ class PlainTaps:
     def __bool__(self) -> bool:
         return bool(self._taps)
 
-    def arrival(
-        self, route: TapRoute, flow: int, data: bytes, decision: PacketDecision, now_ns: int
-    ) -> None:
+    def arrival(self, route: TapRoute, flow: int, data: bytes, decision: Any, now_ns: int) -> None:
         """Report the arrival of a datagram and the decision."""
         event = self._add(route, route.reverse, data, now_ns)
         event["flow"], event["packet"], event["fate"] = flow, decision.packet, decision.fate

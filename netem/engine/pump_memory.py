@@ -10,7 +10,6 @@ from netem.engine.pump import pump_layout
 from netem.engine.pump.pump_layout import Array, Memory
 from netem.engine.relay_base import has_headroom
 from netem.relay_events import EVENT
-from noack.impairments.link_records import Counters, LinkState, dtype_of
 
 _BUFFERS = 64
 _READY = 64
@@ -43,8 +42,6 @@ class PumpMemory:
             clients=np.zeros(_CLIENTS, pump_layout.CLIENT),
             table=np.full(_TABLE_SHARE * _CLIENTS, -1, np.int32),
             directions=np.zeros(directions, pump_layout.DIRECTION),
-            link_states=np.zeros(directions, dtype_of(LinkState)),
-            counters=np.zeros(directions, dtype_of(Counters)),
             delays=np.zeros((directions, BUCKETS), np.int64),
             lateness=np.zeros((directions, BUCKETS), np.int64),
             errors=np.zeros((directions, 256), np.int64),

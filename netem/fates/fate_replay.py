@@ -36,7 +36,7 @@ class Fates(NamedTuple):
 
 
 def read_fates(path: Path, links: Sequence[str] | None = None) -> Fates:
-    """Read a trace, for :func:`netem.rule_program.program_of` and :class:`netem.link_machine.Link`.
+    """Read a trace, for :class:`netem.link_state.LinkState`.
 
     A replaying link repeats the decisions of each flow, packet by packet: the same fate, the same
     flipped bits, and the same delay from arrival. Its guarantee holds even if the datagrams arrive

@@ -9,6 +9,8 @@ import hashlib
 import numpy as np
 from numpy.typing import NDArray
 
+from noack.core.core_library import core, ffi
+
 
 def stream(seed: int, *name: str) -> "np.random.Generator":
     """Return the random stream of this path, e.g. ``("netem", "update", "loss")``, under a seed.
@@ -45,6 +47,15 @@ def normals(seed: int, *name: str, rows: range, width: int) -> NDArray[np.float6
 
     centred = uniforms(seed, *name, rows=rows, width=width) + 2.0**-54
     return np.asarray(ndtri(np.minimum(centred, 1 - 2.0**-53)))
+
+
+def uniform_pair(
+    key0: int, key1: int, flow: int = 0, packet: int = 0, block: int = 0
+) -> tuple[float, float]:
+    """Return two numbers in [0, 1) of a datagram, as the core draws them; see native/random.c."""
+    pair = ffi.new("double[2]")
+    core.noack_uniforms(key0, key1, flow, packet, block, pair)
+    return pair[0], pair[1]
 
 
 def stream_key(seed: int, *name: str) -> tuple[int, int]:

@@ -7,50 +7,14 @@ for every ρ.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import ClassVar, Self
 
-from noack.impairments.feature import StageFeature, StageTables
-from noack.impairments.link_records import RuleStage, StageMemory
+from noack.core.core_library import core
+from noack.impairments.feature import Stage, StageFeature, StageTables
 from noack.impairments.markov_chain import Chain, chance_chain
-from noack.impairments.normal import score
 from noack.impairments.quantities import CORRELATION, PERCENT, brief_percent, percent_text
 from noack.impairments.word_reader import WordReader
 from noack.settings.section import Correlation, Probability
-
-
-@dataclass(slots=True, kw_only=True)
-class ChanceStage(RuleStage):
-    """A probability and a correlation, as numbers."""
-
-    probability: float
-    threshold: float
-    """z with 1 − Φ(z) = probability; infinite if that is 0 or 1."""
-    correlation: float
-    innovation: float
-    """√(1 − correlation²)."""
-    gap: int = 1
-    """Only every ``gap``-th packet can be affected."""
-    scored: int = 0
-    """1: a later delay is correlated with this event."""
-
-
-def latent(correlation: float, innovation: float, memory: StageMemory, u: float) -> float:
-    """Advance a latent process by one packet and return z, standard normal; u is uniform."""
-    z = -score(u)
-    if correlation != 0.0:
-        if memory.phase != 0:
-            z = correlation * memory.score + innovation * z
-        memory.phase = 1
-        memory.score = z
-    return z
-
-
-def happens(stage: ChanceStage, memory: StageMemory, u: float) -> bool:
-    """Whether the event happens to the next packet; ``u`` is a uniform number."""
-    if stage.correlation == 0.0:
-        return u < stage.probability
-    return latent(stage.correlation, stage.innovation, memory, u) > stage.threshold
 
 
 def read_chance(reader: WordReader) -> dict[str, float]:
@@ -73,6 +37,8 @@ class CorrelatedChance(StageFeature):
     correlation: Correlation = 0.0
     """Between successive packets."""
 
+    behaviour: ClassVar[str]
+    """See :class:`noack.impairments.feature.Stage`."""
     action: ClassVar[str] = ""
     """Its action as a Markov chain; see :class:`Chain`; empty: it does not change the loss rate."""
 
@@ -92,15 +58,18 @@ class CorrelatedChance(StageFeature):
         """The explanation of the correlation."""
         return f", correlation {brief_percent(self.correlation)}" if self.correlation else ""
 
-    def stage(self, tables: StageTables) -> ChanceStage:
+    def stage(self, tables: StageTables) -> Stage:
         p = self.probability
-        return ChanceStage(
-            probability=p,
-            threshold=-score(p) if 0 < p < 1 else math.copysign(math.inf, 0.5 - p),
-            correlation=self.correlation,
-            innovation=math.sqrt(1 - self.correlation**2),
-            scored=int(tables.scored),
-        )
+        certain = math.copysign(math.inf, 0.5 - p)
+        numbers = {
+            "probability": p,
+            "threshold": -core.noack_normal_score(p) if 0 < p < 1 else certain,
+            "correlation": self.correlation,
+            "innovation": math.sqrt(1 - self.correlation**2),
+            "gap": 1,
+            "scored": int(tables.scored),
+        }
+        return Stage(self.behaviour, numbers, "chance")
 
     def chains(self) -> Sequence[Chain]:
         if not self.action:

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
-from noack.impairments.link_records import QueueState, RuleStage
 from noack.impairments.loss_guarantee import LossRule
 from noack.impairments.markov_chain import Chain, Pattern
 from noack.impairments.word_reader import WordReader
@@ -34,17 +33,17 @@ class Word(NamedTuple):
     another word has it."""
 
 
-class Behaviour(NamedTuple):
-    """What a feature does to packets."""
+class Stage(NamedTuple):
+    """A feature's settings as numbers, with which the core acts on packets (native/noack.h)."""
 
-    stage: type[RuleStage]
-    """Its settings as numbers."""
-    apply: Callable[..., None]
-    """``apply(packet, stage, memory)`` changes the decision for a packet. It is called for every
-    packet of a flow, lost or not, so that a stage's random draws do not depend on other stages.
-    ``memory`` is the stage's memory of the packet's flow."""
-    queue: type[QueueState] = QueueState
-    """Its state that all flows share."""
+    kind: str
+    """Its behaviour: the name of a file in native/impairments."""
+    numbers: Mapping[str, float]
+    """The fields of its structure."""
+    structure: str = ""
+    """The field of ``noack_stage`` that has this structure; empty: it is ``kind``."""
+    queue_places: int = 0
+    """Maximum number of packets in its queue; 0: no queue."""
 
 
 class StageTables:
@@ -70,9 +69,6 @@ class Feature(ScenarioSection):
     """Base class of all features."""
 
     words: ClassVar[Sequence[Word]] = ()
-    behaviour: ClassVar[Behaviour | None] = None
-    """None: it has no effect by itself."""
-
     tc_missing: ClassVar[str] = ""
     """The feature that ``tc netem`` would need for it; empty if it has it."""
 
@@ -105,15 +101,15 @@ class QueueDiscipline(Feature):
     kind: str
 
     @abstractmethod
-    def queue_stage(self, bottleneck: Mapping[str, int]) -> RuleStage:
-        """Return the settings as numbers, with the fields of a ``BottleneckStage``."""
+    def queue_stage(self, bottleneck: Mapping[str, int], queue_places: int) -> Stage:
+        """Return the settings as numbers, with those of the bottleneck."""
 
 
 class StageFeature(Feature):
     """Base class of the features that are a stage of a link."""
 
     @abstractmethod
-    def stage(self, tables: StageTables) -> RuleStage | None:
+    def stage(self, tables: StageTables) -> Stage | None:
         """Return its settings as numbers; None if they never have an effect.
 
         Raises:
@@ -181,11 +177,6 @@ class Impairment(StageFeature):
     """Whether it changes payloads."""
     delays: ClassVar[bool] = False
     """Whether it may delay packets."""
-
-    @property
-    def rule(self) -> Behaviour | None:
-        """Return its behaviour."""
-        return type(self).behaviour
 
     @property
     def longest_s(self) -> float:

@@ -5,8 +5,8 @@ from typing import Annotated, Literal
 from pydantic import Field, FiniteFloat
 
 from noack.core.clock import NS_PER_S
+from noack.core.random_streams import uniform_pair
 from noack.impairments.feature import StageTables
-from noack.impairments.philox import uniforms
 from noack.impairments.quantities import OWN_TIME_S, time_text
 from noack.impairments.word_reader import WordReader
 from noack.settings.named_file import NamedFile
@@ -48,6 +48,6 @@ def require_inside(offset: float | str, length_ns: int, file: NamedFile | None =
 def offset_ns(offset: float | str, length_ns: int, tables: StageTables) -> int:
     """Return an offset in ns; a random one is uniform over the trace, for all flows the same."""
     if isinstance(offset, str):
-        share, _ = uniforms(*tables.key, 0, 0, 0)
+        share, _ = uniform_pair(*tables.key)
         return int(share * length_ns)
     return round(offset * NS_PER_S)

@@ -7,23 +7,21 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from netem.engine.compiled_rules import compile_rule, compiled_program, compiled_state, set_flow
-from netem.engine.many_decisions import admit_many
-from netem.rule_program import program_of
+from netem.link_state import LinkState
 from netem.words.words_to_settings import settings_of
-from noack.impairments.link_records import LinkMemory, PacketDecision, RecordedDecision, dtype_of
+from noack.impairments.link_records import RecordedDecision
 from noack.impairments.link_settings import LinkSettings
 
 MOST = 1_000_000
 
 
 class Decided(NamedTuple):
-    """The decisions for k datagrams, arrays of shape (k,), and the link's memory."""
+    """The decisions for k datagrams, arrays of shape (k,), and the link."""
 
     decisions: NDArray[Any]
     flows: NDArray[np.int64]
     arrivals_ns: NDArray[np.int64]
-    state: LinkMemory
+    link: LinkState
 
     @property
     def fates(self) -> NDArray[np.int64]:
@@ -41,8 +39,7 @@ Decide = Callable[..., Decided]
 
 @pytest.fixture(scope="session")
 def decide() -> Decide:
-    """Return decisions of the compiled rules; a scalar argument applies to all datagrams."""
-    compiled_admit_many = compile_rule(admit_many)
+    """Return many decisions; a scalar argument applies to all datagrams."""
 
     def run(
         settings: LinkSettings | str,
@@ -56,21 +53,15 @@ def decide() -> Decide:
     ) -> Decided:
         if isinstance(settings, str):
             settings = settings_of(settings).model_copy(update={"limit": MOST})
-        program = program_of(settings, seed, "test", decisions=recorded)
         all_flows = np.array(np.broadcast_to(np.asarray(flows, np.int64), count))
         if arrivals_ns is None:
             arrivals_ns = np.arange(count) * 1_000
         arrivals = np.array(np.broadcast_to(np.asarray(arrivals_ns, np.int64), count))
         sizes = np.array(np.broadcast_to(np.asarray(sizes_bytes, np.int64), count))
-        many = int(all_flows.max(initial=0)) + 1
-        state = compiled_state(program, many)
-        set_flow(state, 0, 0, settings.first_delivered)
-        flows_state, recent_ns = np.asarray(state.flows), np.asarray(state.recent_ns)
-        flows_state[:], recent_ns[:] = flows_state[0], recent_ns[0]
-        flows_state["number"] = np.arange(many)
-        decisions = np.zeros(count, dtype_of(PacketDecision))
-        compiled_admit_many(compiled_program(program), state, all_flows, sizes, arrivals, decisions)
-        return Decided(decisions, all_flows, arrivals, state)
+        link = LinkState(settings, seed, "test", decisions=recorded)
+        for flow in range(int(all_flows.max(initial=0)) + 1):
+            link.start_flow(flow, flow)
+        return Decided(link.decide_many(all_flows, sizes, arrivals), all_flows, arrivals, link)
 
     return run
 

@@ -15,12 +15,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from netem.link_machine import Datagram, Link
-from netem.rule_program import empty_state, new_flow, new_row, program_of
-from netem.rules import guarantee as rule
-from netem.rules.link_rules import settle
+from netem.link_state import LinkState
 from netem.words.words_to_settings import settings_of
+from noack.core.core_library import core, ffi
 from noack.impairments.constraints import guarantee_of
-from noack.impairments.link_records import DELIVERED, DROPPED, PacketDecision, RecordedDecision
+from noack.impairments.link_records import RecordedDecision
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_guarantee import LossAutomaton
 from tests.netem import any_settings
@@ -235,7 +234,7 @@ def test_a_restarted_link_keeps_the_guarantee_behind_any_history(words: str) -> 
     """And no longer than necessary: some history makes each forced datagram necessary."""
     settings = settings_of(f"loss worst first {words}")
     link = Link(settings, 1, "a", restarted=True)
-    lost = [link.decide(0, 100, t_ns).fate == DROPPED for t_ns in range(30)]
+    lost = [link.decide(0, 100, t_ns).fate == core.NOACK_DROPPED for t_ns in range(30)]
     before = [list(one) for one in HISTORIES if is_allowed(one, settings)]
     assert all(is_allowed([*one, *lost], settings) for one in before)
     earlier = lost.index(True) - 1
@@ -263,6 +262,17 @@ def lost_of(releases: Sequence[int | None]) -> list[bool]:
     ]
 
 
+def settle(link: LinkState, packet: int, release_ns: int | None) -> Any:
+    """Settle a packet that leaves at a time, or is dropped (None); return its decision."""
+    fate = core.NOACK_DROPPED if release_ns is None else core.NOACK_DELIVERED
+    never = {"copy_ns": -1, "bit": -1, "copy_bit": -1}
+    decision = ffi.new("noack_decision *", {"fate": fate, "packet": packet, **never})
+    decision.release_ns = -1 if release_ns is None else release_ns
+    core.noack_settle(link.core, 0, decision)
+    link.flow(0).packets += 1
+    return decision
+
+
 @settings(max_examples=200)
 @given(
     st.lists(st.none() | st.integers(0, 12), max_size=24), st.integers(0, 4),
@@ -276,23 +286,19 @@ def test_a_datagram_is_held_back_no_longer_than_necessary(
     And a datagram must pass only if its loss would break the guarantee.
     """
     own = settings_of(f"delay 1s mansd {mansd}").model_copy(update={"constraints": constraints})
-    program = program_of(own, 0, "a")
-    row = new_row(program, new_flow(0, False))
-    state = empty_state(program)._replace(**{name: [one] for name, one in row._asdict().items()})
+    link = LinkState(own, 0, "a")
+    link.start_flow(0, 0)
     releases: list[int | None] = []
     for packet, wish in enumerate(wishes):
         if wish is None:
-            must_pass = rule.must_pass(program, row.flows, row.losses)
+            must_pass = core.noack_must_pass(link.core, 0)
             assert must_pass != is_allowed([*lost_of(releases), True], own)
             wish = 0 if must_pass else None
         if wish is None:
-            settle(program, state, 0, PacketDecision(DROPPED, packet))
-            row.flows.packets += 1
+            settle(link, packet, None)
             releases.append(None)
         else:
-            decision = PacketDecision(DELIVERED, packet, release_ns=wish)
-            settle(program, state, 0, decision)
-            row.flows.packets += 1
+            decision = settle(link, packet, wish)
             alternatives = sorted({wish, *(t for t in releases if t is not None and t > wish)})
             least = next(t for t in alternatives if is_allowed(lost_of([*releases, t]), own))
             assert decision.release_ns == least
@@ -307,38 +313,15 @@ def test_the_link_and_the_rules_of_the_analysis_are_one_guarantee(
 ) -> None:
     """A packet must pass exactly where the automaton of the analysis has no path for a loss."""
     own = settings_of(f"mansd {mansd}").model_copy(update={"constraints": constraints})
-    program = program_of(own, 0, "a")
-    row = new_row(program, new_flow(0, False))
-    state = empty_state(program)._replace(**{name: [one] for name, one in row._asdict().items()})
+    link = LinkState(own, 0, "a")
+    link.start_flow(0, 0)
     automaton, place = LossAutomaton(guarantee_of(mansd, constraints)), np.zeros(1, np.int64)
     for packet, wish in enumerate(wishes):
-        must_pass = rule.must_pass(program, row.flows, row.losses)
+        must_pass = core.noack_must_pass(link.core, 0)
         assert must_pass == (automaton.after_loss(place)[0] < 0)
         lost = wish and not must_pass
         place = automaton.after_loss(place) if lost else automaton.after_delivery(place)
-        fate = DROPPED if lost else DELIVERED
-        settle(program, state, 0, PacketDecision(fate, packet, release_ns=0))
-        row.flows.packets += 1
-
-
-class CountedList(list[int]):
-    """Counts how often an entry is read."""
-
-    reads = 0
-
-    def __getitem__(self, place: Any) -> Any:
-        self.reads += 1
-        return super().__getitem__(place)
-
-
-@pytest.mark.parametrize("words", ["mansd 100000", "mansd 100000 recover 2"])
-def test_a_large_cap_costs_no_more_than_the_packets_that_may_become_stale(words: str) -> None:
-    program = program_of(settings_of(f"delay 1s {words}"), 0, "a")
-    times_ns = CountedList(range(program.mansd + 1))
-    row = new_row(program, new_flow(0, False))
-    packet = len(times_ns)
-    assert rule.hold_back_until(program, row.flows, times_ns, row.losses, packet, packet - 4) >= 0
-    assert times_ns.reads < 20
+        settle(link, packet, None if lost else 0)
 
 
 def test_a_duplicate_is_not_a_second_delivery(decide: Any) -> None:

@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 from cosim.simulation.batch.batch_rule import Rule
 from cosim.simulation.batch.taylor import Array
 from cosim.simulation.batch.vector_lanes import Width
-from noack.impairments.link_records import LinkMemory, LinkProgram
 
 
 class BatchSystem(NamedTuple):
@@ -71,12 +70,12 @@ class BatchMemory(NamedTuple):
 
 
 class LossTable(NamedTuple):
-    """The compiled rules of the link, and their state."""
+    """The link: the core decides for it."""
 
-    program: LinkProgram
-    state: LinkMemory
-    verdicts: Any
-    """One :class:`noack.impairments.link_records.PacketDecision`."""
+    link: int
+    """Address of a ``noack_link`` with one flow."""
+    decisions: Any
+    """(1,) of ``noack_decision``, a buffer."""
 
 
 class EventLog(NamedTuple):

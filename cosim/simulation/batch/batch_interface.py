@@ -16,13 +16,13 @@ from cosim.simulation.continuous.continuous_loop import vanished
 from cosim.simulation.continuous.continuous_run import MAX_EVENTS
 from cosim.simulation.continuous.network_fates import timeless
 from netem.link_machine import UPDATE_LINK
-from netem.rule_program import program_of, stream_names
+from netem.link_state import LinkState, stream_names
 from noack.config.resolution import loop_of, policy_of
 from noack.config.scenario import Scenario
+from noack.core.core_library import address_of, dtype_of
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.random_streams import stream_keys
-from noack.impairments.link_records import PacketDecision, dtype_of
 from noack.impairments.link_settings import LinkSettings
 from noack.trigger import self_triggered_interval
 from noack.trigger.trigger_policy import Policy
@@ -212,23 +212,22 @@ def _run(setting: Setting, population: Population, room: int) -> tuple[NDArray[n
     rows = np.zeros(len(population.A), ROW)
     shape = (len(population.A), room)
     log = batch_data.EventLog(np.empty(shape), np.empty(shape, np.bool_))
+    link, network = _network(setting.link)
     batch = batch_data.Batch(
-        vector_lanes.width(n), vector_lanes.width(m), system, draws, _network(setting.link), space,
-        log,
+        vector_lanes.width(n), vector_lanes.width(m), system, draws, network, space, log,
     )  # fmt: skip
     _compiled()(batch, squares_of(setting.trigger, n), rows)
+    del link  # the compiled code has used its memory
     return rows, log
 
 
-def _network(link: LinkSettings) -> Any:
-    """The link's rules, compiled, with room for one flow."""
+def _network(link: LinkSettings) -> tuple[LinkState, Any]:
+    """Return the link with room for one flow, and what the compiled code has of it."""
     from cosim.simulation.batch.batch_data import LossTable
-    from netem.engine.compiled_rules import compiled_program, compiled_state, set_flow
 
-    program = program_of(link, 0, UPDATE_LINK)
-    state = compiled_state(program, 1)
-    set_flow(state, 0, 0, link.first_delivered)
-    return LossTable(compiled_program(program), state, np.zeros(1, dtype_of(PacketDecision)))
+    state = LinkState(link, 0, UPDATE_LINK)
+    decisions = np.zeros(1, dtype_of("noack_decision"))
+    return state, LossTable(address_of(state.core), decisions)
 
 
 @cache

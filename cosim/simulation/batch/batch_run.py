@@ -35,8 +35,8 @@ from cosim.simulation.batch.quadratic_crossing import (
 )
 from cosim.simulation.batch.taylor import Models, degree_for, driven, powers, reaches, state_at
 from cosim.simulation.batch.vector_lanes import Lanes, dot, filled, load, store, times
-from netem.rules.link_rules import admit
-from noack.impairments.link_records import DELIVERED, FORCED, NEVER_NS
+from noack.core.core_library import core
+from noack.runtime.native.libc_calls import address_of, link_decide, link_renew
 
 _LARGEST = 1e100
 """A state above this norm counts as diverged, as in ``continuous_loop``."""
@@ -57,6 +57,10 @@ class Comparison(NamedTuple):
     """Squared threshold, divided by the square of the scale."""
     auxiliary: float
     """η or the integral, at the start."""
+
+
+DELIVERED: int = core.NOACK_DELIVERED
+FORCED: int = core.NOACK_FORCED
 
 
 class Piece(NamedTuple):
@@ -88,30 +92,14 @@ def run_many(batch: Batch, squares: QuadraticCurves | None, rows: Any) -> None:
 
 def renew(network: LossTable, keys: Any, run: int, first_delivered: bool) -> None:
     """Reset the link to its state before a run's first update, with the run's random streams."""
-    flow = network.state.flows[0]
-    flow.packets = 0
-    flow.consecutive_losses = 0
-    flow.forced_first = 1 if first_delivered else 0
-    flow.first_release_ns = NEVER_NS
-    flow.score = 0.0
-    flow.newest = -1
-    flow.since = 0
-    flow.longest_loss_burst = 0
-    losses = network.state.losses[0]
-    for place in range(len(losses)):
-        losses[place] = 0
-    for stage in range(len(network.program.stages)):
-        network.program.stages[stage].key0 = keys[run, stage, 0]
-        network.program.stages[stage].key1 = keys[run, stage, 1]
-        network.state.memory[0][stage].phase = 0
-        network.state.memory[0][stage].score = 0.0
+    row_bytes = keys.shape[1] * keys.shape[2] * keys.itemsize
+    link_renew(network.link, address_of(keys) + run * row_bytes, first_delivered)
 
 
 def arrives(network: LossTable) -> bool:
     """Return whether the next update arrives."""
-    admit(network.program, network.state, 0, 1, 0, network.verdicts[0])
-    fate = network.verdicts[0].fate
-    return fate in (DELIVERED, FORCED)
+    link_decide(network.link, 0, 1, 0, address_of(network.decisions))
+    return network.decisions[0].fate in (DELIVERED, FORCED)
 
 
 def prepare(batch: Batch, run: int) -> None:
@@ -302,7 +290,7 @@ def count_event(batch: Batch, run: int, row: Any, state: Models, t_s: float, las
     row.transmissions += 1
     if delivered:
         row.deliveries += 1
-    losses = batch.network.state.flows[0].consecutive_losses
+    losses = batch.network.decisions[0].consecutive_losses
     row.longest_loss_burst = max(row.longest_loss_burst, losses)
     return delivered
 

@@ -8,20 +8,18 @@ from typing import Any
 
 from netem.engine.pump.client_table import home_of, key_of
 from netem.engine.pump.pump_layout import Memory
-from noack.impairments.link_records import LinkMemory
-from noack.runtime.native.libc_calls import array_at
+from noack.runtime.native.libc_calls import link_touch
 
 _FEW = 512
 """The data of this number of clients fits into the caches."""
 
 
-def warm_clients(memory: Memory, state_like: LinkMemory) -> None:
+def warm_clients(memory: Memory) -> None:
     """Load the data of the clients of the received batch, if it is from a listening socket."""
     pump = memory.pump[0]
     if len(memory.clients) <= _FEW or pump.batch_socket >= pump.first_path:
         return
     direction: Any = memory.directions[2 * pump.batch_socket]
-    flows = array_at(state_like.flows, direction.flows, direction.rows, 0)
     loaded = 0
     for k in range(pump.batch_next, pump.batch_end):
         loaded += _row_of(memory, k)
@@ -33,8 +31,7 @@ def warm_clients(memory: Memory, state_like: LinkMemory) -> None:
     for k in range(pump.batch_next, pump.batch_end):
         row = _row_of(memory, k)
         if row >= 0:
-            flow = flows[memory.clients[row].place]
-            loaded += flow.number + flow.longest_loss_burst
+            loaded += link_touch(direction.link, memory.clients[row].place)
     pump.loaded = loaded
 
 

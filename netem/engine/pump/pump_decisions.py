@@ -7,12 +7,11 @@ from netem.engine.pump.client_table import find, key_of
 from netem.engine.pump.payload_store import blocks_for, keep, pop, push
 from netem.engine.pump.pump_clock import simulated_ns_of
 from netem.engine.pump.pump_events import has_room, report_arrival
-from netem.engine.pump.pump_layout import Memory
+from netem.engine.pump.pump_layout import Array, Memory
 from netem.engine.pump.pump_records import record_packet, record_release
-from netem.rules.link_rules import admit, leave
-from noack.impairments.link_records import NEVER_NS, LinkMemory, LinkProgram, PacketDecision
+from noack.impairments.link_records import NEVER_NS
 from noack.protocol.wire_format import HEADER_BYTES
-from noack.runtime.native.libc_calls import ENOMEM, array_at
+from noack.runtime.native.libc_calls import ENOMEM, address_of, array_at, link_decide, link_leave
 
 _HEAD_BYTES = 16
 """Header of a control message: length, level and kind."""
@@ -24,7 +23,7 @@ _REFUSED = -2
 _NO_ROOM = -3
 
 
-def release_due(memory: Memory, state_like: LinkMemory, until_ns: int) -> int:
+def release_due(memory: Memory, until_ns: int) -> int:
     """Queue the packets that are due for sending; return CARRY_ON, or which buffer is full."""
     pump = memory.pump[0]
     while pump.heap > 0 and memory.heap[0].release_ns <= until_ns:
@@ -51,29 +50,21 @@ def release_due(memory: Memory, state_like: LinkMemory, until_ns: int) -> int:
         leaving.copy = slot.copy
         leaving.fate = slot.fate
         leaving.counts = slot.counts
-        _line_up(memory, state_like)
+        _line_up(memory)
         if pump.records != 0:
             record_release(memory, pump.leaving - 1, until_ns)
     return layout.CARRY_ON
 
 
-def decide(
-    memory: Memory, program_like: LinkProgram, state_like: LinkMemory, decision: PacketDecision
-) -> int:
+def decide(memory: Memory, decisions: Array) -> int:
     """Decide for the packets received from one socket; return CARRY_ON, or why this ended."""
-    pump = memory.pump[0]
+    pump, decision = memory.pump[0], decisions[0]
     reverse = pump.batch_socket >= pump.first_path
     link = pump.batch_socket
     if reverse:
         link = memory.clients[pump.batch_socket - pump.first_path].link
     number = 2 * link + reverse
     direction = memory.directions[number]
-    program = _program_at(program_like, direction)
-    flows, stages, recent_ns, losses, queues, departures_ns = _arrays_at(state_like, direction)
-    state = LinkMemory(
-        flows, stages, recent_ns, losses, queues, departures_ns,
-        memory.link_states[number], memory.counters[number],
-    )  # fmt: skip
     while pump.batch_next < pump.batch_end:
         header = memory.in_headers[pump.batch_next]
         _read_arrival(memory)
@@ -82,7 +73,7 @@ def decide(
         now_ns = max(pump.now_ns, pump.read_ns)
         if pump.records == 0:
             now_ns = max(pump.now_ns, min(pump.arrival_ns, pump.read_ns))
-        reason = release_due(memory, state_like, now_ns)
+        reason = release_due(memory, now_ns)
         if reason != layout.CARRY_ON:
             return reason
         pump.now_ns = now_ns
@@ -101,50 +92,20 @@ def decide(
         if client_row >= 0:
             client = memory.clients[client_row]
             client.last_ns = now_ns
-            admit(program, state, client.place, size_bytes, now_ns, decision)
+            link_decide(direction.link, client.place, size_bytes, now_ns, address_of(decisions))
             address = memory.in_vectors[pump.batch_next].base
             if pump.taps != 0:
                 report_arrival(memory, number, client_row, address, decision)
             if pump.records != 0:
                 record_packet(memory, number, client_row, address, decision)
             if decision.release_ns != NEVER_NS:
-                _release(memory, state_like, number, client_row, address, decision, 0)
+                _release(memory, number, client_row, address, decision, 0)
             if decision.copy_ns != NEVER_NS:
-                _release(memory, state_like, number, client_row, address, decision, 1)
+                _release(memory, number, client_row, address, decision, 1)
         header.name_bytes = layout.NAME_BYTES
         header.control_bytes = pump.control_bytes
         pump.batch_next += 1
     return layout.CARRY_ON
-
-
-def _program_at(like: LinkProgram, direction: Any) -> LinkProgram:
-    """Return the program of a direction, with the types of ``like``."""
-    return LinkProgram(
-        array_at(like.stages, direction.stages, direction.stages_rows, 0),
-        array_at(like.integers, direction.integers, direction.integers_rows, 0),
-        array_at(like.reals, direction.reals, direction.reals_rows, 0),
-        array_at(like.decisions, direction.decisions, direction.decisions_rows, 0),
-        array_at(
-            like.decisions_begin, direction.decisions_begin, direction.decisions_begin_rows, 0
-        ),
-        array_at(like.windows, direction.windows, direction.windows_rows, 0),
-        direction.recovery,
-        direction.mansd,
-        direction.limit,
-        direction.tracks != 0,
-    )
-
-
-def _arrays_at(like: LinkMemory, direction: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
-    """Return the arrays of a direction's state; compiled code cannot return its records."""
-    return (
-        array_at(like.flows, direction.flows, direction.rows, 0),
-        array_at(like.memory, direction.memory, direction.rows, direction.stages_rows),
-        array_at(like.recent_ns, direction.recent_ns, direction.rows, direction.width),
-        array_at(like.losses, direction.losses, direction.rows, direction.loss_width),
-        array_at(like.queues, direction.queues, direction.stages_rows, 0),
-        array_at(like.departures_ns, direction.departures_ns, direction.departure_rows, 0),
-    )
 
 
 def _client_of(memory: Memory, number: int, size_bytes: int) -> int:
@@ -209,11 +170,10 @@ def _read_arrival(memory: Memory) -> None:
 
 def _release(
     memory: Memory,
-    state_like: LinkMemory,
     direction: int,
     client: int,
     address: int,
-    decision: PacketDecision,
+    decision: Any,
     copy: int,
 ) -> None:
     """Queue a packet or its copy for sending if it leaves now, else store it until it is due."""
@@ -254,23 +214,18 @@ def _release(
     leaving.copy = copy
     leaving.fate = decision.fate
     leaving.counts = counts
-    _line_up(memory, state_like)
+    _line_up(memory)
 
 
-def _line_up(memory: Memory, state_like: LinkMemory) -> None:
+def _line_up(memory: Memory) -> None:
     """Queue the packet in the first free row of ``leaving`` for sending; record its departure."""
     pump = memory.pump[0]
     leaving = memory.leaving[pump.leaving]
     number = leaving.direction
     direction, link = memory.directions[number], number >> 1
-    flows, stages, recent_ns, losses, queues, departures_ns = _arrays_at(state_like, direction)
-    state = LinkMemory(
-        flows, stages, recent_ns, losses, queues, departures_ns,
-        memory.link_states[number], memory.counters[number],
-    )  # fmt: skip
-    leaving.stale = leave(
-        state, memory.clients[leaving.client].place, leaving.packet, leaving.size_bytes,
-        leaving.delayed != 0, leaving.counts != 0,
+    leaving.stale = link_leave(
+        direction.link, memory.clients[leaving.client].place, leaving.packet, leaving.size_bytes,
+        leaving.delayed, leaving.counts,
     )  # fmt: skip
     leaving.error = 0
     pump.leaving += 1

@@ -5,7 +5,7 @@ from typing import Any
 from netem.engine.pump.payload_store import copy_payload
 from netem.engine.pump.pump_layout import CLIENT, DIRECTION, Memory
 from netem.relay_events import EVENT
-from noack.impairments.link_records import NEVER_NS, PacketDecision
+from noack.impairments.link_records import NEVER_NS
 from noack.runtime.native.libc_calls import address_of, array_at, memcpy
 
 _EVENT_BYTES = EVENT.itemsize
@@ -38,7 +38,7 @@ def has_room(memory: Memory, size_bytes: int) -> bool:
 
 
 def report_arrival(
-    memory: Memory, direction: int, client: int, payload: int, decision: PacketDecision
+    memory: Memory, direction: int, client: int, payload: int, decision: Any
 ) -> None:
     """Report the arrival of a datagram, with the address of its payload, and the decision."""
     pump, size_bytes = memory.pump[0], decision.size_bytes

@@ -122,22 +122,10 @@ CLIENT = np.dtype(
         ("local", "u1", (NAME_BYTES,)),  # address of its return path
     ]
 )
-TABLES = ("stages", "integers", "reals", "decisions", "decisions_begin", "windows")
-PER_FLOW = ("flows", "memory", "recent_ns", "losses")
-STATES = (*PER_FLOW, "queues", "departures_ns")
 DIRECTION = np.dtype(
     [
-        *((name, "<i8") for name in TABLES),
-        *((f"{name}_rows", "<i8") for name in TABLES),
-        *((name, "<i8") for name in STATES),
-        ("rows", "<i8"),
-        ("width", "<i8"),  # width of recent_ns
-        ("loss_width", "<i8"),  # width of losses
-        ("departure_rows", "<i8"),
-        ("recovery", "<i8"),
+        ("link", "<i8"),  # address of its ``noack_link``
         ("mansd", "<i8"),
-        ("limit", "<i8"),
-        ("tracks", "<i8"),
         ("keeps", "<i8"),  # 1: datagrams can be delayed
         ("sends", "<i8"),  # OWN_SOCKET, DESTINATION_NAME, CLIENT_NAME or LINK_SOCKET
         ("name_bytes", "<i8"),
@@ -148,7 +136,7 @@ DIRECTION = np.dtype(
         ("port_unreachable", "<i8"),  # forward: ICMP port-unreachable errors
     ]
 )
-"""One direction of a link: addresses and lengths of its program's tables and its state."""
+"""One direction of a link."""
 LEAVING = np.dtype(
     [
         ("address", "<i8"),
@@ -210,8 +198,6 @@ class Memory(NamedTuple):
     clients: Array
     table: Array  # (power of 2,) int32: rows of clients by the hash of their address, -1 for none
     directions: Array  # (2 · links,) Forward and reverse direction of each link
-    link_states: Array  # (2 · links,) :class:`noack.impairments.link_records.LinkState`
-    counters: Array  # (2 · links,) :class:`noack.impairments.link_records.Counters`
     delays: Array  # (2 · links, BUCKETS) Histograms of the time from arrival to departure
     lateness: Array
     errors: Array  # (2 · links, 256) Number of datagrams that could not be sent or stored, by errno

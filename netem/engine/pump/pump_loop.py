@@ -5,9 +5,8 @@ from netem.engine.pump.cache_warming import warm_clients
 from netem.engine.pump.error_queue import take_errors
 from netem.engine.pump.pump_clock import relay_time_ns, wall_ns_of
 from netem.engine.pump.pump_decisions import decide, release_due
-from netem.engine.pump.pump_layout import READY_WORDS, SYS_EPOLL_PWAIT2, Memory
+from netem.engine.pump.pump_layout import READY_WORDS, SYS_EPOLL_PWAIT2, Array, Memory
 from netem.engine.pump.pump_send import send
-from noack.impairments.link_records import LinkMemory, LinkProgram, PacketDecision
 from noack.runtime.native import libc_calls as libc
 
 _HEADER_BYTES = layout.HEADER.itemsize
@@ -21,27 +20,23 @@ _MOST_PUT_OFF_NS = 10_000_000
 
 def run_pump(
     memory: Memory,
-    program_like: LinkProgram,
-    state_like: LinkMemory,
-    decisions: list[PacketDecision],
+    decisions: Array,
     until_ns: int,
 ) -> int:
     """Relay until Python is needed, or until a time since the relay's start; return the reason.
 
     Args:
         memory: the pump's memory.
-        program_like: any program; here and in the other functions, only its types matter.
-        state_like: likewise, any state.
-        decisions: buffer for one decision.
+        decisions: (1,) of ``noack_decision``, a buffer.
         until_ns: latest time to return.
     """
     pump = memory.pump[0]
     while True:
         reason = layout.CARRY_ON
         if pump.batch_next < pump.batch_end:
-            reason = decide(memory, program_like, state_like, decisions[0])
+            reason = decide(memory, decisions)
         if reason == layout.CARRY_ON:
-            reason = release_due(memory, state_like, pump.read_ns)
+            reason = release_due(memory, pump.read_ns)
         all_taken = pump.ready_next >= pump.ready
         if reason != layout.CARRY_ON or all_taken or pump.slots_in - pump.batch_end < _FEW_BUFFERS:
             if pump.leaving > 0:
@@ -65,7 +60,7 @@ def run_pump(
                 return layout.HOUSEKEEPING
         if pump.ready_next < pump.ready:
             _receive(memory)
-            warm_clients(memory, state_like)
+            warm_clients(memory)
 
 
 def _is_soon_due(memory: Memory, until_ns: int) -> bool:

@@ -1,10 +1,11 @@
-"""The rows of a run's record, written where :mod:`netem.rules.link_rules` is called.
+"""The rows of a run's record, written where the core decides (native/link.c).
 
 They are numbered in the order of these calls: a replay calls the rules in the same order.
 """
 
+from typing import Any
+
 from netem.engine.pump.pump_layout import PACKET_ROW, Memory
-from noack.impairments.link_records import PacketDecision
 from noack.protocol.record_tables import PACKET_HEAD_BYTES
 from noack.runtime.native.libc_calls import address_of, array_at, memcpy
 
@@ -13,9 +14,7 @@ _HEAD = PACKET_ROW.fields["head"][1]  # type: ignore[index]
 _HEAD_WORDS = PACKET_HEAD_BYTES // 8
 
 
-def record_packet(
-    memory: Memory, direction: int, client: int, payload: int, decision: PacketDecision
-) -> None:
+def record_packet(memory: Memory, direction: int, client: int, payload: int, decision: Any) -> None:
     """Write the row of a datagram with its payload's address and the decision."""
     pump = memory.pump[0]
     row = memory.packets[pump.packet_rows]

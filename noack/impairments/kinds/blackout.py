@@ -3,7 +3,6 @@
 import re
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, Self
@@ -12,17 +11,9 @@ from pydantic import Field, FiniteFloat, model_validator
 
 from noack.core.clock import NS_PER_S
 from noack.core.errors import shortened
-from noack.impairments.feature import Behaviour, Impairment, StageTables, Table, Word, add_numbers
-from noack.impairments.link_records import (
-    BLACKED_OUT,
-    PacketContext,
-    RuleStage,
-    StageMemory,
-    refuse,
-)
+from noack.impairments.feature import Impairment, Stage, StageTables, Table, Word, add_numbers
 from noack.impairments.markov_chain import Chain, NotPredictableError
 from noack.impairments.quantities import OWN_TIME_S, TIME, time_text
-from noack.impairments.sorted_numbers import first_above
 from noack.impairments.word_reader import WordReader
 from noack.settings.named_file import NamedFile
 
@@ -30,28 +21,6 @@ _EXPECTED = "intervals of time, e.g. 2s-3s,5s-5500ms"
 MOST_INTERVALS = 1_000_000
 MOST_S = 1e9
 _TimeS = Annotated[FiniteFloat, Field(ge=0, le=MOST_S)]
-
-
-@dataclass(slots=True, kw_only=True)
-class BlackoutStage(RuleStage):
-    """Intervals in the program's table of integers: all begins, then all ends, ascending."""
-
-    begin: int
-    end: int
-    period_ns: int
-    """0: the intervals do not repeat."""
-
-
-def apply(packet: PacketContext, stage: BlackoutStage, memory: StageMemory) -> None:
-    """Lose the packet if it arrives during an interval."""
-    decision = packet.decision
-    times_ns, now_ns = packet.program.integers, decision.arrival_ns
-    if stage.period_ns > 0 and now_ns >= 0:
-        now_ns %= stage.period_ns
-    count = (stage.end - stage.begin) // 2
-    place = first_above(times_ns, stage.begin + count, stage.end, now_ns)
-    if place < stage.end and times_ns[place - count] <= now_ns:
-        refuse(decision, BLACKED_OUT)
 
 
 def _read(reader: WordReader) -> Table:
@@ -91,7 +60,6 @@ class Blackout(Impairment):
         Word("outages", "outages outages.txt", _read_outages, grammar="outages FILE [every T]"),
         Word("every", "outages outages.txt every 60s", after="outages FILE"),
     )
-    behaviour: ClassVar = Behaviour(BlackoutStage, apply)
     tc_missing: ClassVar = "blackouts"
 
     @model_validator(mode="after")
@@ -125,13 +93,14 @@ class Blackout(Impairment):
         more = ", ..." if len(self.intervals_s) > 4 else ""
         return f"loses every packet from {', '.join(parts)}{more} after the start{every}"
 
-    def stage(self, tables: StageTables) -> BlackoutStage:
+    def stage(self, tables: StageTables) -> Stage:
         if self.intervals_s is None:
             raise ValueError(f"{self.file}: the intervals have not been read")
         begins_and_ends = zip(*self.intervals_s, strict=True)
         times_ns = [round(t_s * NS_PER_S) for times_s in begins_and_ends for t_s in times_s]
         begin, end = add_numbers(tables.integers, times_ns)
-        return BlackoutStage(begin=begin, end=end, period_ns=round((self.every_s or 0) * NS_PER_S))
+        period_ns = round((self.every_s or 0) * NS_PER_S)
+        return Stage(self.kind, {"begin": begin, "end": end, "period_ns": period_ns})
 
     def chains(self) -> Sequence[Chain]:
         raise NotPredictableError("losses in a blackout depend on when packets arrive")

@@ -7,25 +7,16 @@ the jitter as standard deviation. Empirical ones are interpolated between the ob
 import math
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, Self, get_args
 
 from pydantic import Field, FiniteFloat, model_validator
 
 from noack.core.clock import NS_PER_S
-from noack.impairments.correlated_chance import TC_CORRELATION, latent
+from noack.core.core_library import core, ffi
+from noack.impairments.correlated_chance import TC_CORRELATION
 from noack.impairments.delay_files import read_samples
-from noack.impairments.feature import Behaviour, Impairment, StageTables, Table, Word, add_numbers
-from noack.impairments.link_records import (
-    NEVER_NS,
-    FlowState,
-    PacketContext,
-    RuleStage,
-    StageMemory,
-)
-from noack.impairments.normal import cdf, score
-from noack.impairments.philox import draw
+from noack.impairments.feature import Impairment, Stage, StageTables, Table, Word, add_numbers
 from noack.impairments.quantities import (
     CORRELATION,
     OWN_TIME_S,
@@ -41,87 +32,11 @@ from noack.settings.section import Correlation
 Distribution = Literal["uniform", "normal", "pareto", "paretonormal", "empirical"]
 SHAPES = tuple(shape for shape in get_args(Distribution) if shape != "empirical")
 """Names of distributions; any other word after ``distribution`` is a file's name."""
-UNIFORM, NORMAL, PARETO, PARETONORMAL, EMPIRICAL = range(5)
 MOST_DELAY_S = 3600.0
 """Maximum of a setting: the sum of a few Pareto delays must fit into 64 bits of ns."""
 
-_PARETO_MEAN = 1.5
-_PARETO_DEVIATION = 0.8660254037844386
-"""√(3/4): the Pareto distribution with shape 3 and scale 1 has mean 3/2 and variance 3/4."""
-_MIXED_DEVIATION = 0.937753856873566
-"""Standard deviation of N/4 + 3P/4 with the quantiles N (normal) and P (Pareto) of one uniform
-number: √(5/8 + 3/8 E NP), E NP = 0.678352789549…"""
-_LONGEST_NS = 1e15
-"""11.6 days: limit of the unbounded Pareto distribution, against integer overflow."""
 _NOTEWORTHY = 1e-4
 """Minimum share of delays cut at 0 that is reported; a normal distribution always has some."""
-
-
-@dataclass(slots=True, kw_only=True)
-class DelayStage(RuleStage):
-    """A delay as numbers."""
-
-    constant_ns: float
-    jitter_ns: float
-    shape: int
-    """Place of the distribution in ``Distribution``."""
-    begin: int
-    """Place of an empirical quantile table, in ns, in the program's table of reals."""
-    end: int
-    correlation: float
-    innovation: float
-    loss_correlation: float
-    loss_innovation: float
-
-
-def pareto(u: float) -> float:
-    """Quantile of the Pareto distribution with shape 3, mean 0 and standard deviation 1."""
-    return (math.pow(1.0 - u, -1.0 / 3.0) - _PARETO_MEAN) / _PARETO_DEVIATION
-
-
-def quantile_ns(stage: DelayStage, table_ns: Sequence[float], u: float) -> float:
-    """Quantile of the random part, in ns; ``u`` in [0, 1)."""
-    if stage.shape == NORMAL:
-        return stage.jitter_ns * score(u)
-    if stage.shape == PARETO:
-        return stage.jitter_ns * pareto(u)
-    if stage.shape == PARETONORMAL:
-        return stage.jitter_ns * (0.25 * score(u) + 0.75 * pareto(u)) / _MIXED_DEVIATION
-    if stage.shape == EMPIRICAL:
-        place = u * (stage.end - stage.begin - 1)
-        knot = min(int(place), stage.end - stage.begin - 2)
-        low, high = table_ns[stage.begin + knot], table_ns[stage.begin + knot + 1]
-        return low + (high - low) * (place - knot)
-    return stage.jitter_ns * (2.0 * u - 1.0)
-
-
-def drawn_ns(
-    stage: DelayStage, table_ns: Sequence[float], memory: StageMemory, flow: FlowState, u: float
-) -> int:
-    """Draw a delay, in whole ns; ``u`` is a uniform number.
-
-    A correlated delay is drawn from normal scores, which keeps its distribution: with ρ the
-    correlation with the loss model's score s, z = ρ s + √(1 − ρ²) z', and the delay is the quantile
-    at Φ(z).
-    """
-    if stage.correlation != 0.0 or stage.loss_correlation != 0.0:
-        z = latent(stage.correlation, stage.innovation, memory, u)
-        if stage.loss_correlation != 0.0:
-            z = stage.loss_correlation * flow.score + stage.loss_innovation * z
-        u = min(cdf(z), 0.9999999999999999)
-    return int(min(max(stage.constant_ns + quantile_ns(stage, table_ns, u), 0.0), _LONGEST_NS))
-
-
-def apply(packet: PacketContext, stage: DelayStage, memory: StageMemory) -> None:
-    """Delay the packet and its copy; the copy's delay is drawn as if it were the next packet."""
-    decision = packet.decision
-    u, v = draw(packet, stage, 0)
-    decision.release_ns += drawn_ns(stage, packet.program.reals, memory, packet.flow, u)
-    if decision.copy_ns != NEVER_NS:
-        # The next packet's delay must not depend on the existence of a copy.
-        phase, latest = memory.phase, memory.score
-        decision.copy_ns += drawn_ns(stage, packet.program.reals, memory, packet.flow, v)
-        memory.phase, memory.score = phase, latest
 
 
 def _read(reader: WordReader) -> Table:
@@ -204,7 +119,6 @@ class Delay(Impairment):
         ),
         Word("lossrel", "loss 5% delay 10ms 2ms lossrel 50%", after="delay TIME"),
     )  # fmt: skip
-    behaviour: ClassVar = Behaviour(DelayStage, apply)
     delays: ClassVar = True
 
     @model_validator(mode="after")
@@ -290,33 +204,35 @@ class Delay(Impairment):
         if self.file is not None:
             return 0.0
         tables = StageTables()
-        stage = self.stage(tables)
+        delay = ffi.new("noack_delay *", dict(self.stage(tables).numbers))
+        reals = ffi.new("double[]", tables.reals)
         low, high = 0.0, 1.0
         for _ in range(50):  # quantiles ascend
             middle = (low + high) / 2
-            if stage.constant_ns + quantile_ns(stage, tables.reals, middle) < 0:
+            if delay.constant_ns + core.noack_delay_quantile_ns(delay, reals, middle) < 0:
                 low = middle
             else:
                 high = middle
         return low
 
-    def stage(self, tables: StageTables) -> DelayStage:
+    def stage(self, tables: StageTables) -> Stage:
         if self.file is not None:
             raise ValueError(f"{self.file}: the delays have not been read")
         begin, end = add_numbers(
             tables.reals, sorted(t_s * NS_PER_S for t_s in self.samples_s or ())
         )
-        return DelayStage(
-            constant_ns=float(round(self.delay_s * NS_PER_S)),
-            jitter_ns=self.jitter_s * NS_PER_S,
-            shape=get_args(Distribution).index(self.distribution),
-            begin=begin,
-            end=end,
-            correlation=self.correlation,
-            innovation=math.sqrt(1 - self.correlation**2),
-            loss_correlation=self.loss_correlation,
-            loss_innovation=math.sqrt(1 - self.loss_correlation**2),
-        )
+        numbers = {
+            "constant_ns": round(self.delay_s * NS_PER_S),
+            "jitter_ns": self.jitter_s * NS_PER_S,
+            "shape": getattr(core, f"NOACK_{self.distribution.upper()}"),
+            "begin": begin,
+            "end": end,
+            "correlation": self.correlation,
+            "innovation": math.sqrt(1 - self.correlation**2),
+            "loss_correlation": self.loss_correlation,
+            "loss_innovation": math.sqrt(1 - self.loss_correlation**2),
+        }
+        return Stage(self.kind, numbers)
 
     def without_files(self, folder: Path, place: str) -> Self:
         if self.file is None:

@@ -2,21 +2,10 @@
 
 from typing import ClassVar, Literal
 
-from noack.impairments.correlated_chance import ChanceStage, CorrelatedChance, happens, read_chance
-from noack.impairments.feature import Behaviour, Impairment, Word
-from noack.impairments.link_records import PacketContext, StageMemory
-from noack.impairments.philox import draw
+from noack.impairments.correlated_chance import CorrelatedChance, read_chance
+from noack.impairments.feature import Impairment, Word
 from noack.impairments.quantities import brief_percent
 from noack.settings.section import Probability
-
-
-def apply(packet: PacketContext, stage: ChanceStage, memory: StageMemory) -> None:
-    """Draw whether the packet is duplicated."""
-    decision = packet.decision
-    u, _ = draw(packet, stage, 0)
-    if happens(stage, memory, u):
-        decision.copy_ns = decision.release_ns
-        decision.copy_bit = decision.bit
 
 
 class Duplicate(CorrelatedChance, Impairment):
@@ -29,7 +18,7 @@ class Duplicate(CorrelatedChance, Impairment):
     words: ClassVar = (
         Word("duplicate", "duplicate 1%", read_chance, grammar="duplicate P [CORR]"),
     )
-    behaviour: ClassVar = Behaviour(ChanceStage, apply)
+    behaviour: ClassVar = "duplicate"
     action: ClassVar = "duplicate"
 
     def text(self) -> str:

@@ -4,8 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar, Literal, Self
 
-from noack.impairments.feature import Behaviour, Impairment, StageTables, Table, Word
-from noack.impairments.link_records import RuleStage
+from noack.impairments.feature import Impairment, Stage, StageTables, Table, Word
 from noack.impairments.loss_models import LOSS_MODELS, Loss
 from noack.impairments.markov_chain import Chain, Pattern
 from noack.impairments.word_reader import WordReader
@@ -55,10 +54,6 @@ class LossOf(Impairment):
         ),
     )  # fmt: skip
 
-    @property
-    def rule(self) -> Behaviour | None:
-        return type(self.loss).behaviour
-
     @classmethod
     def examples(cls) -> Sequence[Self]:
         return [cls(loss=loss) for model in LOSS_MODELS for loss in model.examples()]
@@ -69,7 +64,7 @@ class LossOf(Impairment):
     def meaning(self) -> str:
         return self.loss.meaning()
 
-    def stage(self, tables: StageTables) -> RuleStage | None:
+    def stage(self, tables: StageTables) -> Stage | None:
         return self.loss.stage(tables)
 
     def chains(self) -> Sequence[Chain | Pattern]:

@@ -1,4 +1,4 @@
-"""Delivery opportunities from a trace of mahimahi; see :mod:`noack.impairments.delivery_queue`."""
+"""Delivery opportunities from a trace of mahimahi; see native/impairments/opportunities.c."""
 
 import shlex
 from collections.abc import Sequence
@@ -10,23 +10,9 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from noack.core.clock import NS_PER_S
+from noack.core.core_library import core
 from noack.core.errors import shortened
-from noack.impairments.delivery_queue import (
-    OPPORTUNITY_BYTES,
-    OpportunityQueue,
-    OpportunityStage,
-    carry_packet,
-    has_room,
-)
-from noack.impairments.feature import Behaviour, Impairment, StageTables, Table, Word, add_numbers
-from noack.impairments.link_records import (
-    DELIVERED,
-    NEVER_NS,
-    OVERFLOWED,
-    PacketContext,
-    StageMemory,
-    refuse,
-)
+from noack.impairments.feature import Impairment, Stage, StageTables, Table, Word, add_numbers
 from noack.impairments.quantities import COUNT, SIGNED_COUNT, brief_number
 from noack.impairments.trace_offset import (
     LONGEST_NS,
@@ -40,33 +26,13 @@ from noack.impairments.trace_offset import (
 from noack.impairments.word_reader import WordReader
 from noack.settings.named_file import NamedFile
 
+OPPORTUNITY_BYTES: int = core.NOACK_OPPORTUNITY_BYTES
 MOST_TIMES = 2_000_000
 _NS_PER_MS = NS_PER_S // 1000
 _LONGEST_MS = LONGEST_NS // _NS_PER_MS
 _QUEUE = 1000
 _HEADERS_BYTES = 32
 _EXPECTED = "times in ms that do not descend, e.g. 0,1,5"
-
-
-def apply(packet: PacketContext, stage: OpportunityStage, memory: StageMemory) -> None:
-    """Put the packet and then its copy into the queue; ignore a packet that is lost already."""
-    decision = packet.decision
-    if decision.fate != DELIVERED:
-        return
-    queue, ring = packet.state.queues[stage.place], packet.state.departures_ns
-    times_ms = packet.program.integers
-    line_bytes = max(decision.size_bytes + stage.overhead_bytes, 1)
-    if not has_room(stage, queue, ring, line_bytes, decision.release_ns):
-        refuse(decision, OVERFLOWED)
-    if decision.fate == DELIVERED:
-        decision.release_ns = carry_packet(stage, times_ms, queue, ring, line_bytes)
-    if decision.copy_ns != NEVER_NS:
-        if decision.fate == DELIVERED and has_room(
-            stage, queue, ring, line_bytes, decision.copy_ns
-        ):
-            decision.copy_ns = carry_packet(stage, times_ms, queue, ring, line_bytes)
-        else:
-            decision.copy_ns = NEVER_NS
 
 
 def _read(reader: WordReader) -> Table:
@@ -114,7 +80,6 @@ class Opportunities(Impairment):
         Word("bytes", "opportunities trace.up bytes 30000", after="opportunities FILE"),
         Word("from", "opportunities trace.up from random", after="opportunities FILE"),
     )  # fmt: skip
-    behaviour: ClassVar = Behaviour(OpportunityStage, apply, OpportunityQueue)
     delays: ClassVar = True
     tc_missing: ClassVar = "delivery opportunities"
 
@@ -208,18 +173,18 @@ class Opportunities(Impairment):
             "more are dropped"
         )
 
-    def stage(self, tables: StageTables) -> OpportunityStage:
+    def stage(self, tables: StageTables) -> Stage:
         if self.times_ms is None:
             raise ValueError(f"{self.file}: the delivery opportunities have not been read")
         begin, end = add_numbers(tables.integers, self.times_ms)
-        return OpportunityStage(
-            begin=begin,
-            end=end,
-            offset_ns=offset_ns(self.offset_s, self.length_ns, tables),
-            overhead_bytes=self.overhead_bytes,
-            queue_bytes=self.queue_bytes or 0,
-            queue_places=2 * self.queue,
-        )
+        numbers = {
+            "begin": begin,
+            "end": end,
+            "offset_ns": offset_ns(self.offset_s, self.length_ns, tables),
+            "overhead_bytes": self.overhead_bytes,
+            "queue_bytes": self.queue_bytes or 0,
+        }
+        return Stage(self.kind, numbers, queue_places=2 * self.queue)
 
     def without_files(self, folder: Path, place: str) -> Self:
         if self.file is None:

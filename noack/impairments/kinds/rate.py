@@ -8,8 +8,7 @@ from pydantic import Field, model_validator
 
 from noack.impairments.disciplines import DISCIPLINES, Discipline
 from noack.impairments.disciplines.tail_drop import TailDrop
-from noack.impairments.feature import Behaviour, Impairment, StageTables, Table, Word
-from noack.impairments.link_records import RuleStage
+from noack.impairments.feature import Impairment, Stage, StageTables, Table, Word
 from noack.impairments.quantities import COUNT, RATE_BPS, SIGNED_COUNT, rate_text, without_defaults
 from noack.impairments.word_reader import WordReader
 
@@ -93,10 +92,6 @@ class Rate(Impairment):
         return 8 * line_bytes
 
     @property
-    def rule(self) -> Behaviour | None:
-        return type(self.discipline).behaviour
-
-    @property
     def longest_s(self) -> float:
         """Transmission time of a full queue of packets of 1,500 bytes, in seconds."""
         return self.queue * 8 * 1500 / self.rate_bps
@@ -142,14 +137,9 @@ class Rate(Impairment):
             text += f"; in cells of {self.cell_bytes} + {self.cell_overhead_bytes} bytes"
         return text
 
-    def stage(self, tables: StageTables) -> RuleStage:
-        return self.discipline.queue_stage({
-            "rate_bps": self.rate_bps,
-            "queue_places": self.queue,
-            "overhead_bytes": self.overhead_bytes,
-            "cell_bytes": self.cell_bytes,
-            "cell_overhead_bytes": self.cell_overhead_bytes,
-        })  # fmt: skip
+    def stage(self, tables: StageTables) -> Stage:
+        names = ("rate_bps", "overhead_bytes", "cell_bytes", "cell_overhead_bytes")
+        return self.discipline.queue_stage({one: getattr(self, one) for one in names}, self.queue)
 
     def tc_text(self) -> str:
         cells = (self.cell_bytes, self.cell_overhead_bytes)

@@ -5,21 +5,11 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field
 
-from noack.impairments.correlated_chance import ChanceStage, CorrelatedChance, happens, read_chance
-from noack.impairments.feature import Behaviour, Impairment, StageTables, Table, Word
-from noack.impairments.link_records import PacketContext, StageMemory
-from noack.impairments.philox import draw
+from noack.impairments.correlated_chance import CorrelatedChance, read_chance
+from noack.impairments.feature import Impairment, Stage, StageTables, Table, Word
 from noack.impairments.quantities import COUNT, brief_percent
 from noack.impairments.word_reader import WordReader
 from noack.settings.section import Probability
-
-
-def apply(packet: PacketContext, stage: ChanceStage, memory: StageMemory) -> None:
-    """Draw whether a gap-th packet's delay is undone; every packet advances the latent process."""
-    decision = packet.decision
-    u, _ = draw(packet, stage, 0)
-    if happens(stage, memory, u) and (decision.packet + 1) % stage.gap == 0:
-        decision.release_ns = decision.arrival_ns
 
 
 def _read(reader: WordReader) -> Table:
@@ -44,7 +34,8 @@ class Reorder(CorrelatedChance, Impairment):
             "gap", "delay 10ms gap 5", lambda reader: {"gap": reader.value(COUNT)}, grammar="gap N"
         ),
     )
-    behaviour: ClassVar = Behaviour(ChanceStage, apply)
+
+    behaviour: ClassVar = "reorder"
 
     @classmethod
     def examples(cls) -> Sequence[Self]:
@@ -68,10 +59,9 @@ class Reorder(CorrelatedChance, Impairment):
         how = self.correlation_meaning
         return f"sends {which} at once, before those that are delayed{how}"
 
-    def stage(self, tables: StageTables) -> ChanceStage:
+    def stage(self, tables: StageTables) -> Stage:
         stage = super().stage(tables)
-        stage.gap = self.gap
-        return stage
+        return stage._replace(numbers={**stage.numbers, "gap": self.gap})
 
     def tc_lacks(self, before: Sequence[Impairment]) -> str:
         delayed = any(getattr(one, "delay_s", 0) for one in before)

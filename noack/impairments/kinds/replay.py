@@ -1,4 +1,4 @@
-"""Replay of a packet trace; see :mod:`noack.impairments.recorded_delay`."""
+"""Replay of a packet trace; see native/impairments/replay.c."""
 
 import re
 import shlex
@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from noack.core.clock import NS_PER_S
-from noack.impairments.feature import Behaviour, Impairment, StageTables, Table, Word, add_numbers
+from noack.impairments.feature import Impairment, Stage, StageTables, Table, Word, add_numbers
 from noack.impairments.markov_chain import NotPredictableError, Pattern
 from noack.impairments.quantities import (
     OWN_TIME_NS,
@@ -22,7 +22,6 @@ from noack.impairments.quantities import (
     percent_text,
     time_ns_text,
 )
-from noack.impairments.recorded_delay import ReplayStage, apply
 from noack.impairments.trace_offset import (
     LONGEST_NS,
     Offset,
@@ -109,7 +108,6 @@ class Replay(Impairment):
         Word("relative", "replay trace.csv relative", after="replay FILE"),
         Word("once", "replay trace.csv once", after="replay FILE"),
     )  # fmt: skip
-    behaviour: ClassVar = Behaviour(ReplayStage, apply)
     delays: ClassVar = True
     tc_missing: ClassVar = "traces of packets"
 
@@ -207,21 +205,22 @@ class Replay(Impairment):
             f"{what}{offset_meaning(self.offset_s)}{again}"
         )
 
-    def stage(self, tables: StageTables) -> ReplayStage:
+    def stage(self, tables: StageTables) -> Stage:
         if self.sent_ns is None or self.delays_ns is None:
             raise ValueError(f"{self.file}: the trace has not been read")
         times_begin, _ = add_numbers(tables.integers, self.sent_ns)
         begin, end = add_numbers(tables.integers, self._applied_ns())
         first_ns = offset_ns(self.offset_s, self.length_ns, tables)
         by_time = self.by == "time"
-        return ReplayStage(
-            begin=begin,
-            end=end,
-            times_begin=times_begin,
-            offset=first_ns if by_time else bisect_left(self.sent_ns, first_ns),
-            period_ns=self.length_ns if by_time else 0,
-            once=int(not self.repeat),
-        )
+        numbers = {
+            "begin": begin,
+            "end": end,
+            "times_begin": times_begin,
+            "offset": first_ns if by_time else bisect_left(self.sent_ns, first_ns),
+            "period_ns": self.length_ns if by_time else 0,
+            "once": int(not self.repeat),
+        }
+        return Stage(self.kind, numbers)
 
     def _applied_ns(self) -> Sequence[int]:
         """Return the delays as a stage has them: a lost packet has that of its predecessor."""

@@ -3,23 +3,11 @@
 from collections.abc import Sequence
 from typing import Any, ClassVar, Literal, Self
 
-from noack.impairments.correlated_chance import ChanceStage, CorrelatedChance, happens, read_chance
-from noack.impairments.feature import Behaviour, Impairment, LossModel, Word
-from noack.impairments.link_records import DROPPED, PacketContext, StageMemory, refuse
-from noack.impairments.normal import score
-from noack.impairments.philox import draw
+from noack.impairments.correlated_chance import CorrelatedChance, read_chance
+from noack.impairments.feature import Impairment, LossModel, Word
 from noack.impairments.quantities import brief_percent
 from noack.impairments.word_reader import WordReader
 from noack.settings.section import Correlation, Probability
-
-
-def apply(packet: PacketContext, stage: ChanceStage, memory: StageMemory) -> None:
-    """Draw whether the packet is lost; set the score if a delay is correlated with loss."""
-    u, _ = draw(packet, stage, 0)
-    if happens(stage, memory, u):
-        refuse(packet.decision, DROPPED)
-    if stage.scored != 0:
-        packet.flow.score = -score(u) if stage.correlation == 0.0 else memory.score
 
 
 def _read(reader: WordReader) -> dict[str, Any]:
@@ -45,7 +33,7 @@ class BernoulliLoss(CorrelatedChance, LossModel):
         Word("random", "loss 30%", _read, grammar="P [CORR] [keep]"),
         Word("keep", "loss 30% keep mansd 4", after="loss P"),
     )
-    behaviour: ClassVar = Behaviour(ChanceStage, apply)
+    behaviour: ClassVar = "bernoulli"
     action: ClassVar = "lose"
     gives_score: ClassVar = True
 

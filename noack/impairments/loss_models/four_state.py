@@ -4,54 +4,16 @@ It starts in state 1 and advances before each packet. From state 4 it returns to
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import model_validator
 
-from noack.impairments.feature import Behaviour, LossModel, StageTables, Table, Word
-from noack.impairments.link_records import DROPPED, PacketContext, RuleStage, StageMemory, refuse
+from noack.impairments.feature import LossModel, Stage, StageTables, Table, Word
 from noack.impairments.markov_chain import Chain
-from noack.impairments.philox import draw
 from noack.impairments.quantities import PERCENT, brief_percent, percent_text, percents_text
 from noack.impairments.word_reader import WordReader
 from noack.settings.section import Probability
-
-
-@dataclass(slots=True, kw_only=True)
-class FourStateStage(RuleStage):
-    """A Markov chain of four states as numbers."""
-
-    p13: float
-    p31: float
-    p32: float
-    p23: float
-    p14: float
-
-
-def apply(packet: PacketContext, stage: FourStateStage, memory: StageMemory) -> None:
-    """Advance the chain; the packet is lost in states 3 and 4."""
-    u, _ = draw(packet, stage, 0)
-    now = memory.phase + 1
-    if now == 1:
-        if u < stage.p13:
-            now = 3
-        elif u < stage.p13 + stage.p14:
-            now = 4
-    elif now == 2:
-        if u < stage.p23:
-            now = 3
-    elif now == 3:
-        if u < stage.p31:
-            now = 1
-        elif u < stage.p31 + stage.p32:
-            now = 2
-    else:
-        now = 1
-    memory.phase = now - 1
-    if now >= 3:
-        refuse(packet.decision, DROPPED)
 
 
 def _read(reader: WordReader) -> Table:
@@ -87,7 +49,6 @@ class FourStateLoss(LossModel):
     words: ClassVar = (
         Word("state", "loss state 1% 10%", _read, grammar="state P13 [P31 [P32 [P23 [P14]]]]"),
     )
-    behaviour: ClassVar = Behaviour(FourStateStage, apply)
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -116,10 +77,9 @@ class FourStateLoss(LossModel):
             f"{brief_percent(self.p23)}; single losses occur with {brief_percent(self.p14)}"
         )
 
-    def stage(self, tables: StageTables) -> FourStateStage:
-        return FourStateStage(
-            p13=self.p13, p31=self.p31, p32=self.p32, p23=self.p23, p14=self.p14
-        )  # fmt: skip
+    def stage(self, tables: StageTables) -> Stage:
+        names = ("p13", "p31", "p32", "p23", "p14")
+        return Stage(self.model, dict(zip(names, self._shares, strict=True)))
 
     def chains(self) -> Sequence[Chain]:
         moves = np.array([

@@ -11,7 +11,6 @@ bad state concerns all of them at once. Whether a packet is lost is drawn for ea
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
@@ -19,24 +18,14 @@ from pydantic import Field, FiniteFloat, model_validator
 
 from noack.core.clock import NS_PER_S
 from noack.impairments.feature import (
-    Behaviour,
     Impairment,
     LossModel,
+    Stage,
     StageTables,
     Table,
     Word,
 )
-from noack.impairments.link_records import (
-    DROPPED,
-    PacketContext,
-    QueueState,
-    RuleStage,
-    StageMemory,
-    refuse,
-)
 from noack.impairments.markov_chain import Chain, NotPredictableError
-from noack.impairments.normal import score
-from noack.impairments.philox import draw
 from noack.impairments.quantities import (
     NUMBER,
     OWN_TIME_S,
@@ -50,79 +39,6 @@ from noack.impairments.quantities import (
 )
 from noack.impairments.word_reader import WordReader
 from noack.settings.section import Probability
-
-GOOD = 0
-BAD = 1
-
-
-@dataclass(slots=True, kw_only=True)
-class GilbertElliottStage(RuleStage):
-    """A Gilbert–Elliott chain as numbers."""
-
-    good_to_bad: float
-    bad_to_good: float
-    loss_in_good: float
-    loss_in_bad: float
-    share_bad: float
-    """Share of packets in the bad state: p/(p + r)."""
-    scored: int
-    """1: a later delay is correlated with the state."""
-    step_ns: int
-    """Time between changes of the link's state; 0: each flow has its own state."""
-
-
-@dataclass(slots=True)
-class ChannelState(QueueState):
-    """The state of the link that all flows share."""
-
-    phase: int = GOOD
-    step: int = 0
-    """Number of the chain's step in which it was in that state."""
-
-
-def change_state(stage: GilbertElliottStage, channel: ChannelState, now_ns: int, u: float) -> None:
-    """Draw the link's state now, given that at the last packet.
-
-    After k steps the probability of the bad state is s + (b − s) λᵏ with b = 1 if the chain was in
-    the bad state, else 0, s = p/(p + r) and λ = 1 − p − r. The power is computed by squaring, so
-    that plain and compiled code have the same bits.
-    """
-    step = now_ns // stage.step_ns
-    steps = max(step - channel.step, 0)
-    channel.step += steps
-    base, power = 1.0 - stage.good_to_bad - stage.bad_to_good, 1.0
-    while steps > 0:
-        if steps & 1:
-            power *= base
-        base *= base
-        steps >>= 1
-    bad = stage.share_bad
-    before = 1.0 if channel.phase == BAD else 0.0
-    channel.phase = BAD if u < bad + (before - bad) * power else GOOD
-
-
-def apply(packet: PacketContext, stage: GilbertElliottStage, memory: StageMemory) -> None:
-    """Advance the chain, and draw whether the packet is lost.
-
-    If a delay is correlated with loss, the packet gets a score: the scores in the bad state are the
-    highest share p/(p + r) of all scores.
-    """
-    u, v = draw(packet, stage, 0)
-    if stage.step_ns > 0:
-        channel = packet.state.queues[stage.place]
-        change_state(stage, channel, packet.decision.arrival_ns, u)
-        memory.phase = channel.phase
-    elif memory.phase == BAD:
-        if u < stage.bad_to_good:
-            memory.phase = GOOD
-    elif u < stage.good_to_bad:
-        memory.phase = BAD
-    if stage.scored != 0:
-        w, _ = draw(packet, stage, 1)
-        bad = stage.share_bad
-        packet.flow.score = -score(w * bad if memory.phase == BAD else bad + w * (1.0 - bad))
-    if v < (stage.loss_in_bad if memory.phase == BAD else stage.loss_in_good):
-        refuse(packet.decision, DROPPED)
 
 
 def _read_chain(reader: WordReader) -> Table:
@@ -183,7 +99,6 @@ class GilbertElliottLoss(LossModel):
             grammar="gemodel|burst ... common STEP",
         ),
     )
-    behaviour: ClassVar = Behaviour(GilbertElliottStage, apply, ChannelState)
     gives_score: ClassVar = True
 
     @model_validator(mode="after")
@@ -256,17 +171,18 @@ class GilbertElliottLoss(LossModel):
             f"{brief_percent(self.loss_in_good)} in the good state; {bad}{length}"
         )
 
-    def stage(self, tables: StageTables) -> GilbertElliottStage:
+    def stage(self, tables: StageTables) -> Stage:
         p, r = self.transitions
-        return GilbertElliottStage(
-            good_to_bad=p,
-            bad_to_good=r,
-            loss_in_good=self.loss_in_good,
-            loss_in_bad=self.loss_in_bad,
-            share_bad=p / (p + r) if p + r > 0 else 0.0,
-            scored=int(tables.scored),
-            step_ns=round((self.step_s or 0.0) * NS_PER_S),
-        )
+        numbers = {
+            "good_to_bad": p,
+            "bad_to_good": r,
+            "loss_in_good": self.loss_in_good,
+            "loss_in_bad": self.loss_in_bad,
+            "share_bad": p / (p + r) if p + r > 0 else 0.0,
+            "scored": int(tables.scored),
+            "step_ns": round((self.step_s or 0.0) * NS_PER_S),
+        }
+        return Stage(self.model, numbers)
 
     def chains(self) -> Sequence[Chain]:
         if self.step_s is not None:

@@ -2,35 +2,16 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from noack.impairments.feature import Behaviour, LossModel, StageTables, Table, Word
-from noack.impairments.link_records import DROPPED, PacketContext, RuleStage, StageMemory, refuse
+from noack.impairments.feature import LossModel, Stage, StageTables, Table, Word
 from noack.impairments.markov_chain import LONGEST_PATTERN, Pattern, pattern
 from noack.impairments.quantities import COUNT
 from noack.impairments.word_reader import WordReader
 
 _EXPECTED = "losses per packets, e.g. 2/100"
-
-
-@dataclass(slots=True, kw_only=True)
-class PeriodicStage(RuleStage):
-    """A periodic loss as numbers."""
-
-    period: int
-    burst: int
-    first: int
-
-
-def apply(packet: PacketContext, stage: PeriodicStage, memory: StageMemory) -> None:
-    """Lose the packet if its number is one of the lost ones of its period."""
-    decision = packet.decision
-    number = decision.packet - stage.first
-    if number >= 0 and number % stage.period < stage.burst:
-        refuse(decision, DROPPED)
 
 
 def _read(reader: WordReader) -> Table:
@@ -62,7 +43,6 @@ class PeriodicLoss(LossModel):
         ),
         Word("from", "loss periodic 2/100 from 3", after="loss periodic BURST/PERIOD"),
     )  # fmt: skip
-    behaviour: ClassVar = Behaviour(PeriodicStage, apply)
     tc_missing: ClassVar = "losses by the packets' numbers"
 
     @model_validator(mode="after")
@@ -84,8 +64,9 @@ class PeriodicLoss(LossModel):
         first = f", from number {self.first} on" if self.first else ""
         return f"loses {self.burst} consecutive packets of every {self.period} of a flow{first}"
 
-    def stage(self, tables: StageTables) -> PeriodicStage:
-        return PeriodicStage(period=self.period, burst=self.burst, first=self.first)
+    def stage(self, tables: StageTables) -> Stage:
+        numbers = {"period": self.period, "burst": self.burst, "first": self.first}
+        return Stage(self.model, numbers)
 
     def chains(self) -> Sequence[Pattern]:
         lost = range(self.first, self.first + min(self.burst, LONGEST_PATTERN))

@@ -1,41 +1,18 @@
 """Losses given by a list of packet numbers within a flow."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from noack.impairments.feature import Behaviour, LossModel, StageTables, Table, Word, add_numbers
-from noack.impairments.link_records import DROPPED, PacketContext, RuleStage, StageMemory, refuse
+from noack.impairments.feature import LossModel, Stage, StageTables, Table, Word, add_numbers
 from noack.impairments.markov_chain import NotPredictableError, Pattern, pattern
 from noack.impairments.quantities import COUNT
-from noack.impairments.sorted_numbers import first_above
 from noack.impairments.word_reader import WordReader
 
 MAX_SCRIPT = 10_000_000
 _EXPECTED = "the numbers of the lost packets, counted from 0, e.g. 3,4,17; or none"
-
-
-@dataclass(slots=True, kw_only=True)
-class ScriptStage(RuleStage):
-    """A script as numbers: its range in the program's table of integers, which ascend there."""
-
-    period: int
-    """0: the script does not repeat."""
-    begin: int
-    end: int
-
-
-def apply(packet: PacketContext, stage: ScriptStage, memory: StageMemory) -> None:
-    """Lose the packet if its number is in the script."""
-    decision = packet.decision
-    numbers = packet.program.integers
-    wanted = decision.packet % stage.period if stage.period > 0 else decision.packet
-    place = first_above(numbers, stage.begin, stage.end, wanted - 1)
-    if place < stage.end and numbers[place] == wanted:
-        refuse(decision, DROPPED)
 
 
 def _read(reader: WordReader) -> Table:
@@ -58,7 +35,6 @@ class ScriptedLoss(LossModel):
         Word("script", "loss script 3,4,17", _read, grammar="script N,N,... [every N]"),
         Word("every", "loss script 3,4 every 20", after="loss script NUMBERS"),
     )
-    behaviour: ClassVar = Behaviour(ScriptStage, apply)
     tc_missing: ClassVar = "losses by the packets' numbers"
 
     @model_validator(mode="after")
@@ -82,9 +58,9 @@ class ScriptedLoss(LossModel):
         again = f", and again every {self.repeat_every}" if self.repeat_every else ""
         return f"loses the packets {numbers or '(none)'} of each flow{again}"
 
-    def stage(self, tables: StageTables) -> ScriptStage:
+    def stage(self, tables: StageTables) -> Stage:
         begin, end = add_numbers(tables.integers, self.lost)
-        return ScriptStage(period=self.repeat_every, begin=begin, end=end)
+        return Stage(self.model, {"period": self.repeat_every, "begin": begin, "end": end})
 
     def chains(self) -> Sequence[Pattern]:
         if not self.repeat_every:

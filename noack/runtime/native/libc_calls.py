@@ -1,4 +1,4 @@
-"""libc functions for compiled code, and arrays over memory at a given address.
+"""Functions of libc and of the core for compiled code, and arrays over memory at a given address.
 
 All arguments are integers, including addresses. numba can cache calls through symbols, but not
 calls through ctypes pointers.
@@ -30,6 +30,12 @@ ppoll = _function("ppoll", _int, _word, _word, _word, _word)
 recvmmsg = _function("recvmmsg", _int, _int, _word, types.uint32, _int, _word)
 sendmmsg = _function("sendmmsg", _int, _int, _word, types.uint32, _int)
 syscall = _function("syscall", types.int64, *[types.int64] * 7)
+
+# Functions of the core, see native/noack.h.
+link_decide = _function("noack_link_decide", types.none, _word, *[types.int64] * 3, _word)
+link_leave = _function("noack_link_leave", types.int64, _word, *[types.int64] * 5)
+link_renew = _function("noack_link_renew", types.none, _word, _word, types.int64)
+link_touch = _function("noack_link_touch", types.int64, _word, types.int64)
 
 ECONNREFUSED = 111
 ENOMEM = 12

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from noack.core.code_cache import CALLED_BY_CODE, compiling_alone
+from noack.core.core_library import LIBRARY
 from noack.core.file_access import write_whole
 
 
@@ -43,6 +44,7 @@ class NativeFunction:
         head, _, objects = code.partition(b"\n")
         if head[: len(_sum(objects))] != _sum(objects):  # LLVM ends the process at damaged code
             raise ValueError("not the object code of a function")
+        load_core()
         llvm.initialize_native_target()
         llvm.initialize_native_asmprinter()
         machine = llvm.Target.from_default_triple().create_target_machine(jit=True)
@@ -86,6 +88,13 @@ def words_of(argument: Any) -> Iterator[int]:
         yield np.asarray(argument).ctypes.data  # shares its memory
     else:
         yield int(argument)
+
+
+def load_core() -> None:
+    """Let compiled code find the core's functions."""
+    import llvmlite.binding as llvm
+
+    llvm.load_library_permanently(str(LIBRARY))
 
 
 def load_or_compile(

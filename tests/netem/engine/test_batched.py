@@ -125,16 +125,13 @@ def test_memory_is_used_again(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 TINY_PUMP = """
-def run_pump(memory, program_like, state_like, decisions, until_ns):
+def run_pump(memory, decisions, until_ns):
     return 0
 
 def insert(table, clients, row, name):
     pass
 
 def remove(table, clients, row):
-    pass
-
-def carry(old, before, program, state, latest_ns):
     pass
 """
 FIRST_START = """

@@ -1,7 +1,7 @@
 """Drive links with any impairments, and record traces of the packets' fates."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +13,7 @@ from netem.engine.relay_interface import LinkSpec
 from netem.fates.fate_recorder import FateRecorder
 from netem.link_machine import Datagram, Link
 from netem.relay_events import EVENT
-from noack.impairments.link_records import PacketDecision
+from noack.core.core_library import ffi
 from noack.impairments.link_settings import LinkSettings
 
 MAX_GAP_NS = 3_000_000
@@ -48,7 +48,7 @@ def payload(flow: int, packet: int, size_bytes: int) -> bytes:
 class Run:
     """The decisions and departures of a link."""
 
-    decisions: list[PacketDecision] = field(default_factory=list)
+    decisions: list[Any] = field(default_factory=list)
     arrivals: list[tuple[int, int, int]] = field(default_factory=list)
     """Time in ns, flow, size in bytes."""
     departures: list[tuple[int, int, bytes]] = field(default_factory=list)
@@ -87,7 +87,7 @@ def drive(link: Link, came: Sequence[Arrival]) -> Run:
         data = payload(arrival.flow, counts[arrival.flow], arrival.size_bytes)
         counts[arrival.flow] += 1
         leaves(now_ns, link.handle(Datagram(arrival.flow, data), now_ns))
-        run.decisions.append(PacketDecision(**asdict(link.decision)))
+        run.decisions.append(ffi.new("noack_decision *", link.decision[0]))
         run.arrivals.append((now_ns, arrival.flow, arrival.size_bytes))
     release(float("inf"))
     return run

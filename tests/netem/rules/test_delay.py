@@ -10,10 +10,10 @@ import pytest
 from scipy import stats
 from scipy.integrate import quad
 
-from netem.rule_program import program_of
+from netem.link_state import LinkState
 from netem.words.words_to_settings import settings_of
-from noack.impairments.kinds.delay import Delay, drawn_ns, quantile_ns
-from noack.impairments.link_records import FlowState, StageMemory
+from noack.core.core_library import core
+from noack.impairments.kinds.delay import Delay
 from noack.impairments.link_settings import LinkSettings
 
 COUNT = 100_000
@@ -58,9 +58,9 @@ def test_the_mixture_combines_quantiles() -> None:
 
     variance = sum(quad(square_at, a, b, limit=200)[0] for a, b in ((-9, 0), (0, 6), (6, 36)))
     delay = Delay(jitter_s=1e-9, distribution="paretonormal")
-    program = program_of(LinkSettings(impairments=(delay,)), 0, "a")
+    link = LinkState(LinkSettings(impairments=(delay,)), 0, "a").core
     for u in np.linspace(0.001, 0.999, 99).tolist():
-        found = quantile_ns(program.stages[0], program.reals, u)
+        found = core.noack_delay_quantile_ns(link.stages[0].delay, link.reals, u)
         assert found == pytest.approx(mixed(u) / np.sqrt(variance), rel=1e-7, abs=1e-9)
 
 
@@ -142,6 +142,8 @@ def test_a_copy_draws_its_own_delay_and_changes_no_other_delay(decide: Any) -> N
 
 
 def test_the_longest_delay_fits_into_an_integer() -> None:
-    program = program_of(settings_of("delay 3600s 3600s distribution pareto"), 0, "a")
-    flow, u = FlowState(0), 1 - 2**-53
-    assert drawn_ns(program.stages[0], program.reals, StageMemory(), flow, u) == 10**15
+    """Of the largest uniform number, the unbounded distribution is cut at 10¹⁵ ns."""
+    link = LinkState(settings_of("delay 3600s 3600s distribution pareto"), 0, "a").core
+    u = 1 - 2**-53
+    assert core.noack_delay_quantile_ns(link.stages[0].delay, link.reals, u) > 1e15
+    assert link.stages[0].delay.constant_ns == 3600e9

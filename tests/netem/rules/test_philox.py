@@ -9,17 +9,25 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
 
-from noack.impairments.philox import philox, uniforms
+from noack.core.core_library import core, ffi
+from noack.core.random_streams import uniform_pair
 
 ONES = 0xFFFFFFFF
 WORDS = st.integers(0, ONES)
 DRAWS = 2**16
 
 
+def philox(c0: int, c1: int, c2: int, c3: int, k0: int, k1: int) -> tuple[int, ...]:
+    words = ffi.new("int64_t[4]")
+    core.noack_philox([c0, c1, c2, c3], [k0, k1], words)
+    return tuple(words)
+
+
 def drawn(**places: Any) -> NDArray[np.float64]:
     """Return two uniform numbers per (key0, key1, flow, packet, block), (n, 2)."""
     names = ("key0", "key1", "flow", "packet", "block")
-    return np.stack(uniforms(*(np.uint64(places.get(name, 0)) for name in names)), axis=-1)
+    columns = np.broadcast_arrays(*(np.atleast_1d(places.get(name, 0)) for name in names))
+    return np.array([uniform_pair(*row) for row in np.stack(columns, axis=1).tolist()])
 
 
 @pytest.mark.parametrize(
@@ -48,7 +56,7 @@ def test_uniform_numbers_are_the_words_of_the_counter(
 ) -> None:
     a, b, c, d = philox(packet & ONES, packet >> 32, flow, block, key0, key1)
     expected = tuple(((x << 32 | y) >> 11) / 2**53 for x, y in ((a, b), (c, d)))
-    found = uniforms(key0, key1, flow, packet, block)
+    found = uniform_pair(key0, key1, flow, packet, block)
     assert all(0 <= u < 1 and u * 2**53 == int(u * 2**53) for u in found)
     # Upper 27 bits: from the first word; lower 26 bits: the upper bits of the second word.
     for u, (x, y) in zip(found, ((a, b), (c, d)), strict=True):

@@ -9,8 +9,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.rule_program import empty_state, program_of
-from noack.impairments.bottleneck import enters, serve
+from netem.link_state import LinkState
+from noack.core.core_library import core
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.link_settings import LinkSettings
 
@@ -68,15 +68,13 @@ def test_it_is_a_queue(rate: Rate, steps: list[tuple[int, int, bool]]) -> None:
     times = np.cumsum([step[0] for step in steps]).tolist()
     arrivals = [(t, size, forced) for t, (_, size, forced) in zip(times, steps, strict=True)]
     other = Rate(rate_bps=1000, queue=3)  # so that the ring buffer's offset is not 0
-    program = program_of(LinkSettings(impairments=(other, rate)), 0, "a")
-    state = empty_state(program)
+    link = LinkState(LinkSettings(impairments=(other, rate)), 0, "a").core
     found: list[int | None] = []
     for t_ns, size_bytes, forced in arrivals:
-        own = program.stages[1], state.queues[1], state.departures_ns
-        room = enters(*own, t_ns)
-        found.append(serve(*own, size_bytes) if room or forced else None)
+        room = core.noack_queue_enters(link, 1, t_ns)
+        found.append(core.noack_queue_serve(link, 1, size_bytes) if room or forced else None)
     assert found == departures(rate, arrivals)
-    assert state.departures_ns[:3] == [0, 0, 0]
+    assert list(link.departures_ns[0:3]) == [0, 0, 0]
 
 
 def test_a_forced_packet_leaves_after_a_full_queue(decide: Any) -> None:

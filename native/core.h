@@ -1,0 +1,83 @@
+/* What the files of the core share. */
+#ifndef NOACK_CORE_H
+#define NOACK_CORE_H
+
+#include <stdint.h>
+
+#pragma GCC visibility push(default) /* what Python calls; all else is hidden */
+#include "noack.h"
+#pragma GCC visibility pop
+
+#define NS_PER_S INT64_C(1000000000)
+#define LATEST_NS (INT64_C(1) << 61) /* 73 years: packets that must pass may exceed a queue's size */
+
+static inline int64_t max_of(int64_t a, int64_t b) { return a > b ? a : b; }
+static inline int64_t min_of(int64_t a, int64_t b) { return a < b ? a : b; }
+
+/* Division and remainder that round towards minus infinity, as Python's do; b > 0. */
+static inline int64_t floor_div(int64_t a, int64_t b) { return a / b - (a % b < 0); }
+static inline int64_t floor_mod(int64_t a, int64_t b) { return a % b + (a % b < 0 ? b : 0); }
+
+/* A packet for which a link decides, seen by a stage. */
+typedef struct {
+    noack_link *link;
+    noack_flow *flow;
+    noack_decision *decision;
+    int64_t stage; /* its number */
+} packet;
+
+typedef void stage_function(packet *packet, const noack_stage *stage, noack_stage_memory *memory);
+
+/* Stages are called for every packet of a flow, lost or not, so that a stage's random draws do not
+   depend on other stages. */
+stage_function apply_bernoulli, apply_four_state, apply_gilbert_elliott, apply_periodic,
+    apply_scripted, apply_worst_case, apply_codel, apply_tail_drop, apply_blackout, apply_corrupt,
+    apply_delay, apply_duplicate, apply_opportunities, apply_reorder, apply_replay;
+
+/* Lose a packet by DROPPED, OVERFLOWED or BLACKED_OUT, unless it is lost already or must pass. */
+static inline void refuse(noack_decision *decision, int64_t fate) {
+    if (decision->fate != NOACK_DELIVERED)
+        return;
+    if (decision->must_pass)
+        decision->spared = 1;
+    else
+        decision->fate = fate;
+}
+
+/* Two uniform numbers in [0, 1) of a stage for a packet; block numbers the pairs. */
+static inline void draw(
+    const packet *packet, const noack_stage *stage, int64_t block, double uniform[2]) {
+    noack_uniforms(
+        stage->key0, stage->key1, packet->flow->number, packet->decision->packet, block, uniform);
+}
+
+/* The first place in [begin, end) with a number above value; else end. The numbers ascend. */
+static inline int64_t first_above(
+    const int64_t *numbers, int64_t begin, int64_t end, int64_t value) {
+    while (begin < end) {
+        int64_t middle = begin + (end - begin) / 2;
+        if (numbers[middle] <= value)
+            begin = middle + 1;
+        else
+            end = middle;
+    }
+    return begin;
+}
+
+/* chance.c: correlated random events. */
+double latent(double correlation, double innovation, noack_stage_memory *memory, double u);
+int happens(const noack_chance *chance, noack_stage_memory *memory, double u);
+
+/* bottleneck.c: a queue that is served at a rate. */
+int queue_enters(const noack_stage *stage, noack_queue *queue, int64_t *ring_ns, int64_t now_ns);
+int64_t queue_serve(
+    const noack_stage *stage, noack_queue *queue, int64_t *ring_ns, int64_t size_bytes);
+void queue_occupy(
+    const noack_stage *stage, noack_queue *queue, int64_t *ring_ns, int64_t until_ns);
+
+/* guarantee.c */
+int counts_losses(const noack_link *link);
+int64_t make_stale(const noack_link *link, int64_t row, int64_t number, int64_t release_ns);
+void note_outcome(const noack_link *link, int64_t row, int64_t number, int lost);
+
+#endif

@@ -1,0 +1,50 @@
+/* Bursty losses: a two-state Markov chain (Gilbert, 1960; Elliott, 1963), of each flow or, with a
+   step, of the link. */
+#include "../core.h"
+
+enum { GOOD, BAD };
+
+/* Draw the link's state now, given that at the last packet.
+
+   After k steps the probability of the bad state is s + (b - s) lambda^k with b = 1 if the chain was
+   in the bad state, else 0, s = p/(p + r) and lambda = 1 - p - r. The power is computed by squaring,
+   so that every machine has the same bits. */
+static void change_state(
+    const noack_gilbert_elliott *own, noack_queue *channel, int64_t now_ns, double u) {
+    int64_t steps = max_of(floor_div(now_ns, own->step_ns) - channel->step, 0);
+    channel->step += steps;
+    double base = 1.0 - own->good_to_bad - own->bad_to_good, power = 1.0;
+    for (; steps > 0; steps >>= 1) {
+        if (steps & 1)
+            power *= base;
+        base *= base;
+    }
+    double bad = own->share_bad, before = channel->phase == BAD ? 1.0 : 0.0;
+    channel->phase = u < bad + (before - bad) * power ? BAD : GOOD;
+}
+
+/* If a delay is correlated with loss, the packet gets a score: the scores in the bad state are the
+   highest share p/(p + r) of all scores. */
+void apply_gilbert_elliott(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
+    const noack_gilbert_elliott *own = &stage->gilbert_elliott;
+    double uniform[2], other[2];
+    draw(packet, stage, 0, uniform);
+    if (own->step_ns > 0) {
+        noack_queue *channel = &packet->link->queues[packet->stage];
+        change_state(own, channel, packet->decision->arrival_ns, uniform[0]);
+        memory->phase = channel->phase;
+    } else if (memory->phase == BAD) {
+        if (uniform[0] < own->bad_to_good)
+            memory->phase = GOOD;
+    } else if (uniform[0] < own->good_to_bad) {
+        memory->phase = BAD;
+    }
+    if (own->scored) {
+        draw(packet, stage, 1, other);
+        double bad = own->share_bad;
+        packet->flow->score = -noack_normal_score(
+            memory->phase == BAD ? other[0] * bad : bad + other[0] * (1.0 - bad));
+    }
+    if (uniform[1] < (memory->phase == BAD ? own->loss_in_bad : own->loss_in_good))
+        refuse(packet->decision, NOACK_DROPPED);
+}

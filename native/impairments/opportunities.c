@@ -1,0 +1,104 @@
+/* A queue that packets leave at recorded delivery opportunities: the link model of mahimahi.
+
+   An opportunity carries up to 1504 bytes: several small packets, or a part of one, which leaves at
+   the opportunity that carries its last byte. What an empty queue does not use is lost, and so is an
+   opportunity at the very time of an arrival (mahimahi, link_queue.cc: rationalize and
+   use_a_delivery_opportunity). The schedule repeats from its last time on. As in its
+   DroppingPacketQueue, the limits count the packets that no opportunity has begun to carry.
+
+   The times of all departures are known on arrival, as those of a bottleneck are. The queue's ring
+   has two numbers for each waiting packet: when an opportunity begins to carry it, and how many
+   bytes were put into the queue before it. */
+#include "../core.h"
+
+enum { OPPORTUNITY_BYTES = NOACK_OPPORTUNITY_BYTES, NS_PER_MS = 1000000 };
+
+/* The number of the first opportunity after a time, counted over all repetitions. */
+static int64_t opportunity_after(
+    const noack_opportunities *own, const int64_t *times_ms, int64_t now_ns) {
+    int64_t period_ns = times_ms[own->end - 1] * NS_PER_MS;
+    int64_t elapsed_ns = now_ns + own->offset_ns, cycle = floor_div(elapsed_ns, period_ns);
+    elapsed_ns -= cycle * period_ns;
+    int64_t place = first_above(times_ms, own->begin, own->end - 1, elapsed_ns / NS_PER_MS);
+    return cycle * (own->end - own->begin) + place - own->begin;
+}
+
+/* The time of an opportunity. */
+static int64_t opportunity_ns(
+    const noack_opportunities *own, const int64_t *times_ms, int64_t number) {
+    int64_t count = own->end - own->begin;
+    int64_t elapsed_ms = floor_div(number, count) * times_ms[own->end - 1]
+                         + times_ms[own->begin + floor_mod(number, count)];
+    return min_of(elapsed_ms, LATEST_NS / NS_PER_MS) * NS_PER_MS - own->offset_ns;
+}
+
+/* Whether a packet may enter at now_ns; removes packets that are carried until then. */
+static int has_room(
+    const noack_stage *stage, noack_queue *queue, const int64_t *ring, int64_t line_bytes,
+    int64_t now_ns) {
+    int64_t limit_bytes = stage->opportunities.queue_bytes, waiting_bytes = 0;
+    queue->entry_ns = max_of(queue->entry_ns, now_ns);
+    while (queue->count > 0 && ring[stage->queue_begin + queue->head] <= queue->entry_ns) {
+        queue->head = (queue->head + 2) % stage->queue_places;
+        queue->count -= 2;
+    }
+    if (queue->count > 0)
+        waiting_bytes = queue->total_bytes - ring[stage->queue_begin + queue->head + 1];
+    return queue->count < stage->queue_places
+           && (limit_bytes == 0 || waiting_bytes + line_bytes <= limit_bytes);
+}
+
+/* Put a packet into the queue, after has_room; return its departure time. */
+static int64_t carry_packet(
+    const noack_stage *stage, const int64_t *times_ms, noack_queue *queue, int64_t *ring,
+    int64_t line_bytes) {
+    const noack_opportunities *own = &stage->opportunities;
+    int64_t number;
+    if (queue->busy_until_ns <= queue->entry_ns) { /* it is empty, and that opportunity is over */
+        number = opportunity_after(own, times_ms, queue->entry_ns);
+        queue->left_bytes = OPPORTUNITY_BYTES;
+    } else {
+        number = opportunity_after(own, times_ms, queue->busy_until_ns - 1) + queue->used - 1;
+        if (queue->left_bytes == 0) {
+            number++;
+            queue->left_bytes = OPPORTUNITY_BYTES;
+        }
+    }
+    int64_t begin_ns = opportunity_ns(own, times_ms, number);
+    int64_t more =
+        max_of(line_bytes - queue->left_bytes + OPPORTUNITY_BYTES - 1, 0) / OPPORTUNITY_BYTES;
+    number += more;
+    queue->left_bytes += more * OPPORTUNITY_BYTES - line_bytes;
+    queue->busy_until_ns = opportunity_ns(own, times_ms, number);
+    queue->used = number - opportunity_after(own, times_ms, queue->busy_until_ns - 1) + 1;
+    if (queue->count < stage->queue_places) /* a packet that must pass may exceed the size */
+        queue->count += 2;
+    int64_t place = (queue->head + queue->count - 2) % stage->queue_places;
+    ring[stage->queue_begin + place] = begin_ns;
+    ring[stage->queue_begin + place + 1] = queue->total_bytes;
+    queue->total_bytes += line_bytes;
+    return queue->busy_until_ns;
+}
+
+/* Put the packet and then its copy into the queue; ignore a packet that is lost already. */
+void apply_opportunities(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
+    (void)memory;
+    noack_decision *decision = packet->decision;
+    if (decision->fate != NOACK_DELIVERED)
+        return;
+    noack_queue *queue = &packet->link->queues[packet->stage];
+    const int64_t *times_ms = packet->link->integers;
+    int64_t *ring = packet->link->departures_ns;
+    int64_t line_bytes = max_of(decision->size_bytes + stage->opportunities.overhead_bytes, 1);
+    if (!has_room(stage, queue, ring, line_bytes, decision->release_ns))
+        refuse(decision, NOACK_OVERFLOWED);
+    if (decision->fate == NOACK_DELIVERED)
+        decision->release_ns = carry_packet(stage, times_ms, queue, ring, line_bytes);
+    if (decision->copy_ns == NOACK_NEVER_NS)
+        return;
+    if (decision->fate == NOACK_DELIVERED
+        && has_room(stage, queue, ring, line_bytes, decision->copy_ns))
+        decision->copy_ns = carry_packet(stage, times_ms, queue, ring, line_bytes);
+    else
+        decision->copy_ns = NOACK_NEVER_NS;
+}

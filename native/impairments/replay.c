@@ -1,0 +1,61 @@
+/* Replays a packet trace: the recorded loss and delay of each packet.
+
+   By packet, packet k of a flow gets record k. By time, a packet gets the loss of the last record
+   that was sent before it. Its receiving time is interpolated between those of the two records
+   around it, so that a network that keeps the order of the recorded packets keeps the order of all
+   packets. */
+#include "../core.h"
+
+/* change * elapsed / gap for 0 <= elapsed < gap; it ascends with elapsed + result. Whole numbers,
+   without overflow: of gaps beyond 2 s, some low bits are ignored. */
+static int64_t part_of(int64_t change_ns, int64_t elapsed_ns, int64_t gap_ns) {
+    int64_t each = floor_div(change_ns, gap_ns), part = floor_mod(change_ns, gap_ns);
+    int64_t whole_ns = each * elapsed_ns, unit_ns = 1;
+    for (; gap_ns >= INT64_C(2147483648); gap_ns /= 2) {
+        unit_ns *= 2;
+        part /= 2;
+        elapsed_ns /= 2;
+    }
+    return whole_ns + part * elapsed_ns / gap_ns * unit_ns;
+}
+
+/* The delay of a packet by its time in the trace, or -1 - d for a lost packet. */
+static int64_t delay_at(const noack_replay *own, const int64_t *table, int64_t elapsed_ns) {
+    int64_t count = own->end - own->begin;
+    int64_t high =
+        first_above(table, own->times_begin, own->times_begin + count, elapsed_ns)
+        - own->times_begin;
+    int64_t low = max_of(high - 1, 0); /* the last record that is not later */
+    int64_t delay_ns = table[own->begin + low];
+    if (delay_ns < 0 || high == count || table[own->begin + high] < 0)
+        return delay_ns;
+    int64_t sent_ns = table[own->times_begin + low];
+    int64_t gap_ns = table[own->times_begin + high] - sent_ns;
+    return delay_ns
+           + part_of(table[own->begin + high] - delay_ns, elapsed_ns - sent_ns, gap_ns);
+}
+
+/* Lose or delay the packet, and its copy, as recorded. */
+void apply_replay(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
+    (void)memory;
+    const noack_replay *own = &stage->replay;
+    const int64_t *table = packet->link->integers;
+    noack_decision *decision = packet->decision;
+    int64_t delay_ns = 0;
+    if (own->period_ns > 0) {
+        int64_t elapsed_ns = decision->arrival_ns + own->offset;
+        if (!own->once || (0 <= elapsed_ns && elapsed_ns < own->period_ns))
+            delay_ns = delay_at(own, table, floor_mod(elapsed_ns, own->period_ns));
+    } else {
+        int64_t record = decision->packet + own->offset, count = own->end - own->begin;
+        if (!own->once || record < count)
+            delay_ns = table[own->begin + record % count];
+    }
+    if (delay_ns < 0) {
+        refuse(decision, NOACK_DROPPED);
+        delay_ns = -1 - delay_ns;
+    }
+    decision->release_ns += delay_ns;
+    if (decision->copy_ns != NOACK_NEVER_NS)
+        decision->copy_ns += delay_ns;
+}

@@ -1,0 +1,7 @@
+/* The worst case: as many losses as the guarantee allows. */
+#include "../core.h"
+
+void apply_worst_case(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
+    (void)stage, (void)memory;
+    refuse(packet->decision, NOACK_DROPPED);
+}

@@ -1,0 +1,251 @@
+/* One direction of a link: decisions for arriving packets, and accounting of departures. */
+#include <string.h>
+
+#include "core.h"
+
+static stage_function *const APPLY[NOACK_STAGE_KINDS] = {
+    [NOACK_BERNOULLI] = apply_bernoulli,
+    [NOACK_FOUR_STATE] = apply_four_state,
+    [NOACK_GILBERT_ELLIOTT] = apply_gilbert_elliott,
+    [NOACK_PERIODIC] = apply_periodic,
+    [NOACK_SCRIPTED] = apply_scripted,
+    [NOACK_WORST_CASE] = apply_worst_case,
+    [NOACK_CODEL] = apply_codel,
+    [NOACK_TAIL_DROP] = apply_tail_drop,
+    [NOACK_BLACKOUT] = apply_blackout,
+    [NOACK_CORRUPT] = apply_corrupt,
+    [NOACK_DELAY] = apply_delay,
+    [NOACK_DUPLICATE] = apply_duplicate,
+    [NOACK_OPPORTUNITIES] = apply_opportunities,
+    [NOACK_REORDER] = apply_reorder,
+    [NOACK_REPLAY] = apply_replay,
+};
+
+void noack_link_start_flow(
+    noack_link *link, int64_t row, int64_t number, int64_t first_delivered, int64_t restarted) {
+    link->flows[row] = (noack_flow){
+        .number = number,
+        .forced_first = first_delivered != 0,
+        .first_release_ns = NOACK_NEVER_NS,
+        .newest = -1,
+    };
+    memset(
+        link->memory + row * link->stage_count, 0,
+        (size_t)link->stage_count * sizeof *link->memory);
+    for (int64_t i = 0; i < link->recent_width; i++)
+        link->recent_ns[row * link->recent_width + i] = NOACK_NEVER_NS;
+    /* Behind an unknown past, the guarantee counts as many losses directly before the first packet
+       as a window may have. */
+    int64_t assumed = 0;
+    if (restarted) {
+        assumed = link->window_count > 0 ? 0 : 1;
+        for (int64_t i = 0; i < link->window_count; i++)
+            assumed = max_of(assumed, link->windows[i].losses);
+    }
+    for (int64_t i = 0; i < link->loss_width; i++)
+        link->losses[row * link->loss_width + i] =
+            -min_of(floor_mod(-i, link->loss_width), assumed);
+}
+
+void noack_link_renew(noack_link *link, const int64_t *keys, int64_t first_delivered) {
+    noack_link_start_flow(link, 0, 0, first_delivered, 0);
+    for (int64_t i = 0; i < link->stage_count; i++) {
+        link->stages[i].key0 = keys[2 * i];
+        link->stages[i].key1 = keys[2 * i + 1];
+    }
+}
+
+/* Map a bit number to one within a payload; -1 (no bit) stays -1. */
+static int64_t within(int64_t bit, int64_t size_bytes) {
+    return bit < 0 || size_bytes == 0 ? -1 : bit % (size_bytes * 8);
+}
+
+/* Repeat a recorded decision; the guarantee holds nevertheless.
+
+   If packets arrive at other times than in the record, other packets may have to pass or to be held
+   back: a packet that must pass is delivered here, and noack_settle holds packets back. A packet
+   shorter than the recorded one is corrupted in another bit, an empty one in none. */
+static void repeat(const noack_recorded *recorded, noack_decision *decision) {
+    int64_t fate = recorded->fate, now_ns = decision->arrival_ns;
+    decision->bit = within(recorded->bit, decision->size_bytes);
+    decision->copy_bit = within(recorded->copy_bit, decision->size_bytes);
+    decision->release_ns = NOACK_NEVER_NS;
+    decision->spared = fate == NOACK_FORCED;
+    int intact = decision->bit < 0 || (recorded->copy_delay_ns >= 0 && decision->copy_bit < 0);
+    int delivers = fate == NOACK_DELIVERED || fate == NOACK_FORCED;
+    if (decision->must_pass && !(delivers && intact)) {
+        fate = NOACK_FORCED;
+        decision->spared = 1;
+        decision->bit = decision->copy_bit = -1;
+    }
+    decision->fate = fate;
+    if (fate == NOACK_DELIVERED || fate == NOACK_FORCED || fate == NOACK_CORRUPTED) {
+        decision->fate = NOACK_DELIVERED;
+        decision->release_ns = now_ns + max_of(recorded->delay_ns, 0);
+        if (recorded->copy_delay_ns >= 0)
+            decision->copy_ns = max_of(now_ns + recorded->copy_delay_ns, decision->release_ns);
+    }
+}
+
+/* The recorded decision for a packet; NULL: there is none. */
+static const noack_recorded *recorded_for(
+    const noack_link *link, const noack_flow *flow, int64_t packet) {
+    if (flow->number >= link->recorded_flows)
+        return NULL;
+    int64_t place = link->decisions_begin[flow->number] + packet;
+    return place < link->decisions_begin[flow->number + 1] ? &link->decisions[place] : NULL;
+}
+
+/* Drop a delayed packet or its copy if it needs more than the free places in flight. */
+static void keep_limit(int64_t free, noack_decision *decision) {
+    int64_t now_ns = decision->arrival_ns;
+    if (decision->release_ns > now_ns && free <= 0)
+        refuse(decision, NOACK_OVERFLOWED);
+    if (decision->fate != NOACK_DELIVERED) {
+        decision->release_ns = decision->copy_ns = NOACK_NEVER_NS;
+        decision->bit = decision->copy_bit = -1;
+    } else if (decision->copy_ns != NOACK_NEVER_NS && decision->copy_ns < decision->release_ns) {
+        int64_t time_ns = decision->release_ns, bit = decision->bit;
+        decision->release_ns = decision->copy_ns;
+        decision->copy_ns = time_ns;
+        decision->bit = decision->copy_bit;
+        decision->copy_bit = bit;
+    }
+    if (decision->copy_ns > now_ns && free < (decision->release_ns > now_ns ? 2 : 1)) {
+        decision->copy_ns = NOACK_NEVER_NS;
+        decision->copy_bit = -1;
+    }
+}
+
+/* A packet that must pass is exempt from everything that would lose it. */
+void noack_link_decide(
+    noack_link *link, int64_t row, int64_t size_bytes, int64_t now_ns, noack_decision *decision) {
+    noack_flow *flow = &link->flows[row];
+    *decision = (noack_decision){
+        .fate = NOACK_DELIVERED,
+        .packet = flow->packets,
+        .release_ns = now_ns,
+        .copy_ns = NOACK_NEVER_NS,
+        .bit = -1,
+        .copy_bit = -1,
+        .arrival_ns = now_ns,
+        .size_bytes = size_bytes,
+        .must_pass = noack_must_pass(link, row),
+    };
+    flow->packets++;
+    link->counters.received++;
+    link->counters.received_bytes += size_bytes;
+    const noack_recorded *recorded = recorded_for(link, flow, decision->packet);
+    if (recorded != NULL) {
+        repeat(recorded, decision);
+    } else {
+        packet own = {link, flow, decision, 0};
+        noack_stage_memory *memory = link->memory + row * link->stage_count;
+        for (; own.stage < link->stage_count; own.stage++) {
+            const noack_stage *stage = &link->stages[own.stage];
+            APPLY[stage->kind](&own, stage, &memory[own.stage]);
+        }
+        keep_limit(link->limit - link->in_flight, decision);
+    }
+    noack_settle(link, row, decision);
+}
+
+void noack_link_decide_many(
+    noack_link *link, int64_t count, const int64_t *rows, const int64_t *sizes_bytes,
+    const int64_t *arrivals_ns, noack_decision *decisions) {
+    for (int64_t i = 0; i < count; i++)
+        noack_link_decide(link, rows[i], sizes_bytes[i], arrivals_ns[i], &decisions[i]);
+}
+
+/* Hold an intact packet back for the guarantee, from effective_ns on; return when it leaves. */
+static int64_t hold_back(
+    noack_link *link, int64_t row, noack_decision *decision, int64_t effective_ns) {
+    int64_t needed_ns = noack_hold_back_until(link, row, decision->packet, effective_ns);
+    if (needed_ns > effective_ns) {
+        decision->hold_back_ns = needed_ns - effective_ns;
+        if (decision->bit < 0)
+            decision->release_ns = needed_ns;
+        if (decision->copy_ns != NOACK_NEVER_NS)
+            decision->copy_ns = max_of(decision->copy_ns, needed_ns);
+        link->counters.held_back++;
+    }
+    decision->makes_stale = make_stale(link, row, decision->packet, needed_ns);
+    return needed_ns;
+}
+
+static void count(noack_counters *counters, const noack_decision *decision) {
+    int64_t *const of_fate[] = {
+        [NOACK_DELIVERED] = &counters->delivered,   [NOACK_DROPPED] = &counters->dropped,
+        [NOACK_FORCED] = &counters->forced,         [NOACK_CORRUPTED] = &counters->corrupted,
+        [NOACK_OVERFLOWED] = &counters->overflowed, [NOACK_BLACKED_OUT] = &counters->blacked_out,
+    };
+    ++*of_fate[decision->fate];
+    if (decision->copy_ns != NOACK_NEVER_NS)
+        counters->duplicated++;
+}
+
+/* Enforce the guarantee for a packet with known times, count it, complete the decision. */
+void noack_settle(noack_link *link, int64_t row, noack_decision *decision) {
+    noack_flow *flow = &link->flows[row];
+    noack_counters *counters = &link->counters;
+    int64_t number = decision->packet, now_ns = decision->arrival_ns;
+    int64_t effective_ns = NOACK_NEVER_NS;
+    decision->hold_back_ns = decision->makes_stale = 0;
+    if (decision->fate == NOACK_DELIVERED) {
+        if (decision->bit < 0)
+            effective_ns = decision->release_ns;
+        else if (decision->copy_ns != NOACK_NEVER_NS && decision->copy_bit < 0)
+            effective_ns = decision->copy_ns;
+        else
+            decision->fate = NOACK_CORRUPTED;
+    }
+    if (effective_ns != NOACK_NEVER_NS) {
+        if (link->tracks)
+            effective_ns = hold_back(link, row, decision, effective_ns);
+        if (decision->spared)
+            decision->fate = NOACK_FORCED;
+        if (flow->forced_first) {
+            flow->forced_first = 0;
+            flow->first_release_ns = effective_ns;
+        }
+        flow->consecutive_losses = 0;
+    } else {
+        flow->consecutive_losses++;
+        int64_t losses = min_of(flow->consecutive_losses, number + 1 - flow->since);
+        flow->longest_loss_burst = max_of(flow->longest_loss_burst, losses);
+        counters->longest_loss_burst = max_of(counters->longest_loss_burst, losses);
+    }
+    if (link->tracks && link->mansd >= 0)
+        link->recent_ns[row * link->recent_width + (number & (link->recent_width - 1))] =
+            effective_ns;
+    note_outcome(link, row, number, effective_ns == NOACK_NEVER_NS);
+    decision->consecutive_losses = flow->consecutive_losses;
+    count(counters, decision);
+    link->in_flight += (decision->release_ns > now_ns) + (decision->copy_ns > now_ns);
+    counters->most_in_flight = max_of(counters->most_in_flight, link->in_flight);
+}
+
+int64_t noack_link_touch(const noack_link *link, int64_t row) {
+    return link->flows[row].number + link->flows[row].longest_loss_burst;
+}
+
+int64_t noack_link_leave(
+    noack_link *link, int64_t row, int64_t number, int64_t size_bytes, int64_t delayed,
+    int64_t counts) {
+    noack_flow *flow = &link->flows[row];
+    noack_counters *counters = &link->counters;
+    counters->forwarded++;
+    counters->forwarded_bytes += size_bytes;
+    if (delayed)
+        link->in_flight--;
+    int stale = number < flow->newest;
+    if (counts && stale) {
+        counters->delivered_out_of_order++;
+    } else if (counts) {
+        int64_t losses = number - max_of(flow->newest, flow->since - 1) - 1;
+        flow->newest = number;
+        flow->longest_loss_burst = max_of(flow->longest_loss_burst, losses);
+        counters->longest_loss_burst = max_of(counters->longest_loss_burst, losses);
+    }
+    return stale;
+}

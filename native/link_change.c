@@ -1,0 +1,139 @@
+/* A change of settings: transfers a link's state to one with other settings.
+
+   A stage keeps its state if the new settings have a stage of the same kind and random stream; a
+   queue keeps its state under another discipline, too. Flows, counters and packets in flight do not
+   change, except that the count of the longest loss burst starts again, since another guarantee may
+   apply. */
+#include <string.h>
+
+#include "core.h"
+
+/* The place of the stage with this random stream and the same kind, or with a queue; -1: none. */
+static int64_t place_of(const noack_link *link, const noack_stage *stage) {
+    for (int64_t i = 0; i < link->stage_count; i++) {
+        const noack_stage *other = &link->stages[i];
+        int alike = other->kind == stage->kind || (other->queue_places > 0 && stage->queue_places > 0);
+        if (alike && other->key0 == stage->key0 && other->key1 == stage->key1)
+            return i;
+    }
+    return -1;
+}
+
+static int64_t rate_of(const noack_stage *stage) {
+    return stage->kind == NOACK_OPPORTUNITIES ? 0 : stage->bottleneck.rate_bps;
+}
+
+/* Transfer a queue; a shorter one drops the earliest departure times, and is full then. */
+static void change_queue(
+    const noack_link *before, int64_t was, const noack_link *after, int64_t place) {
+    const noack_stage *old = &before->stages[was], *new = &after->stages[place];
+    const noack_queue *queue = &before->queues[was];
+    noack_queue *new_queue = &after->queues[place];
+    int64_t count = min_of(queue->count, new->queue_places);
+    int64_t first = queue->head + queue->count - count;
+    for (int64_t k = 0; k < count; k++)
+        after->departures_ns[new->queue_begin + k] =
+            before->departures_ns[old->queue_begin + (first + k) % old->queue_places];
+    new_queue->head = 0;
+    new_queue->count = count;
+    new_queue->entry_ns = queue->entry_ns;
+    new_queue->busy_until_ns = queue->busy_until_ns;
+    new_queue->carry = rate_of(new) == rate_of(old) ? queue->carry : 0;
+}
+
+static void change_stage(const noack_link *before, const noack_link *after, int64_t place) {
+    const noack_stage *stage = &after->stages[place];
+    int64_t was = place_of(before, stage);
+    if (was < 0)
+        return;
+    int same = stage->kind == before->stages[was].kind;
+    if (same)
+        after->queues[place] = before->queues[was];
+    if (stage->queue_places > 0)
+        change_queue(before, was, after, place);
+    if (same)
+        for (int64_t row = 0; row < before->rows; row++)
+            after->memory[row * after->stage_count + place] =
+                before->memory[row * before->stage_count + was];
+}
+
+/* Transfer the outcomes of the last packets; an unknown outcome counts as a delivery. */
+static void change_losses(const noack_link *before, const noack_link *after, int64_t row) {
+    const noack_flow *flow = &before->flows[row];
+    const int64_t *known = before->losses + row * before->loss_width;
+    const int64_t *times_ns = before->recent_ns + row * before->recent_width;
+    int64_t *losses = after->losses + row * after->loss_width;
+    int64_t packets = flow->packets, mask = after->loss_width - 1, count;
+    int counted = counts_losses(before), listed = before->tracks && before->mansd >= 0;
+    if (counted) {
+        count = before->loss_width - 1;
+        if (count == mask) {
+            memcpy(losses, known, (size_t)after->loss_width * sizeof *losses);
+            return;
+        }
+    } else if (listed) {
+        count = min_of(before->mansd + 1, packets);
+    } else {
+        count = flow->consecutive_losses;
+    }
+    int64_t so_far = 0, known_mask = count;
+    for (int64_t number = packets - min_of(count, mask); number < packets; number++) {
+        int lost = 1;
+        if (counted)
+            lost = known[(number + 1) & known_mask] > known[number & known_mask];
+        else if (listed)
+            lost = times_ns[number & (before->recent_width - 1)] < 0;
+        so_far += lost;
+        losses[(number + 1) & mask] = so_far;
+    }
+}
+
+static int is_same_guarantee(const noack_link *a, const noack_link *b) {
+    if (a->mansd != b->mansd || a->recovery != b->recovery || a->window_count != b->window_count)
+        return 0;
+    for (int64_t i = 0; i < a->window_count; i++)
+        if (a->windows[i].losses != b->windows[i].losses
+            || a->windows[i].packets != b->windows[i].packets)
+            return 0;
+    return 1;
+}
+
+/* Transfer the release times that the guarantee needs. If the guarantee differs (or there is none
+   any more), later packets leave only after the packets that are in flight at the change. */
+static void change_releases(
+    const noack_link *before, const noack_link *after, int64_t row, int64_t latest_ns) {
+    noack_flow *flow = &after->flows[row];
+    int64_t *times_ns = after->recent_ns + row * after->recent_width;
+    const int64_t *older_ns = before->recent_ns + row * before->recent_width;
+    int64_t mask = after->recent_width - 1, width = after->mansd + 1;
+    if (before->tracks) {
+        if (before->mansd >= 0 && after->mansd >= 0) {
+            int64_t kept = min_of(width, before->mansd + 1);
+            for (int64_t number = max_of(flow->packets - kept, 0); number < flow->packets; number++)
+                times_ns[number & mask] = older_ns[number & (before->recent_width - 1)];
+        }
+        if (!is_same_guarantee(before, after))
+            flow->first_release_ns = max_of(flow->first_release_ns, latest_ns);
+    } else if (after->mansd >= 0) {
+        int64_t delivered = flow->packets - 1 - flow->consecutive_losses;
+        if (delivered >= 0 && flow->consecutive_losses < width)
+            times_ns[delivered & mask] = 0;
+    }
+}
+
+void noack_link_change(const noack_link *before, noack_link *after, const int64_t *latest_ns) {
+    for (int64_t place = 0; place < after->stage_count; place++)
+        change_stage(before, after, place);
+    for (int64_t row = 0; row < before->rows; row++) {
+        noack_flow *flow = &after->flows[row];
+        flow->since = flow->packets;
+        flow->longest_loss_burst = 0;
+        if (counts_losses(after))
+            change_losses(before, after, row);
+        if (after->tracks)
+            change_releases(before, after, row, latest_ns[row]);
+    }
+    after->in_flight = before->in_flight;
+    after->counters = before->counters;
+    after->counters.longest_loss_burst = 0;
+}

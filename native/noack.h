@@ -1,0 +1,292 @@
+/* The core's one declaration of every structure and function that Python uses.
+
+   native/build.py gives this file to cffi, and noack/core/core_library.py makes numpy's row types
+   of it. Therefore it has declarations, enumerations and these comments only; every number is an
+   int64_t or a double. Times are integer nanoseconds. Python allocates all memory; the core keeps
+   no state of its own, and calls neither clock nor allocator. */
+
+/* ---- Packets ------------------------------------------------------------------------------- */
+
+enum {
+    NOACK_NEVER_NS = -1,           /* a time that never comes */
+    NOACK_OPPORTUNITY_BYTES = 1504 /* that a delivery opportunity of mahimahi carries */
+};
+
+enum noack_fate { /* noack.protocol.record_tables.Fate */
+    NOACK_DELIVERED,
+    NOACK_DROPPED,
+    NOACK_FORCED,
+    NOACK_CORRUPTED,
+    NOACK_OVERFLOWED,
+    NOACK_BLACKED_OUT
+};
+
+typedef struct { /* the decision for a packet; the stages modify it one after the other */
+    int64_t fate;
+    int64_t packet;             /* its number in its flow */
+    int64_t consecutive_losses; /* consecutive losses up to this packet */
+    int64_t release_ns;         /* departure time; NOACK_NEVER_NS: never */
+    int64_t copy_ns;            /* departure time of its copy; NOACK_NEVER_NS: never */
+    int64_t bit;                /* the bit that is flipped; -1: none */
+    int64_t copy_bit;           /* the bit that is flipped in the copy; -1: none */
+    int64_t hold_back_ns;       /* time for which it is held back for the guarantee */
+    int64_t makes_stale;        /* number of packets that it makes stale */
+    int64_t arrival_ns;
+    int64_t size_bytes; /* of the payload */
+    int64_t must_pass;  /* 1: the guarantee requires its delivery */
+    int64_t spared;     /* 1: it must pass, and a stage would have lost it */
+} noack_decision;
+
+typedef struct { /* a recorded decision, which a flow repeats */
+    int64_t fate;
+    int64_t delay_ns; /* time from arrival to departure; -1: it never left */
+    int64_t copy_delay_ns;
+    int64_t bit;
+    int64_t copy_bit;
+} noack_recorded;
+
+/* ---- Stages: the settings of an impairment as numbers ---------------------------------------- */
+
+enum noack_stage_kind { /* native/impairments has a file for each */
+    NOACK_BERNOULLI,
+    NOACK_FOUR_STATE,
+    NOACK_GILBERT_ELLIOTT,
+    NOACK_PERIODIC,
+    NOACK_SCRIPTED,
+    NOACK_WORST_CASE,
+    NOACK_CODEL,
+    NOACK_TAIL_DROP,
+    NOACK_BLACKOUT,
+    NOACK_CORRUPT,
+    NOACK_DELAY,
+    NOACK_DUPLICATE,
+    NOACK_OPPORTUNITIES,
+    NOACK_REORDER,
+    NOACK_REPLAY,
+    NOACK_STAGE_KINDS
+};
+
+typedef struct { /* an event with a probability, correlated between successive packets */
+    double probability;
+    double threshold; /* z with 1 - Phi(z) = probability; infinite if that is 0 or 1 */
+    double correlation;
+    double innovation; /* sqrt(1 - correlation^2) */
+    int64_t gap;       /* only every gap-th packet can be affected */
+    int64_t scored;    /* 1: a later delay is correlated with this event */
+} noack_chance;
+
+typedef struct {
+    double p13, p31, p32, p23, p14;
+} noack_four_state;
+
+typedef struct {
+    double good_to_bad, bad_to_good;
+    double loss_in_good, loss_in_bad;
+    double share_bad; /* share of packets in the bad state: p/(p + r) */
+    int64_t scored;   /* 1: a later delay is correlated with the state */
+    int64_t step_ns;  /* time between changes of the link's state; 0: each flow has its own */
+} noack_gilbert_elliott;
+
+typedef struct {
+    int64_t period, burst, first;
+} noack_periodic;
+
+typedef struct { /* a script: a range of the table of integers, which ascend there */
+    int64_t period; /* 0: the script does not repeat */
+    int64_t begin, end;
+} noack_scripted;
+
+typedef struct { /* a rate limit; the stage's queue_places is the size of the queue */
+    int64_t rate_bps;
+    int64_t overhead_bytes;
+    int64_t cell_bytes;
+    int64_t cell_overhead_bytes;
+    int64_t target_ns; /* CoDel */
+    int64_t interval_ns;
+    int64_t mtu_ns; /* transmission time of one MTU */
+} noack_bottleneck;
+
+typedef struct { /* a range of the table of integers: all begins, then all ends, ascending */
+    int64_t begin, end;
+    int64_t period_ns; /* 0: the intervals do not repeat */
+} noack_blackout;
+
+enum noack_delay_shape {
+    NOACK_UNIFORM,
+    NOACK_NORMAL,
+    NOACK_PARETO,
+    NOACK_PARETONORMAL,
+    NOACK_EMPIRICAL
+};
+
+typedef struct {
+    double constant_ns, jitter_ns;
+    int64_t shape;
+    int64_t begin, end; /* empirical quantiles in ns, a range of the table of reals */
+    double correlation, innovation;
+    double loss_correlation, loss_innovation;
+} noack_delay;
+
+typedef struct { /* times in ms, a range of the table of integers; they repeat after the last */
+    int64_t begin, end;
+    int64_t offset_ns; /* time in the schedule at time 0 */
+    int64_t overhead_bytes;
+    int64_t queue_bytes; /* 0: no limit in bytes */
+} noack_opportunities;
+
+typedef struct {
+    int64_t begin, end;  /* delays in ns, a range of the table of integers; -1 - d for a lost packet
+                            that takes d if it must pass */
+    int64_t times_begin; /* sending times in ns, which do not descend */
+    int64_t offset;      /* first record; by time, the first time in ns */
+    int64_t period_ns;   /* length of the trace; 0: by packet */
+    int64_t once;
+} noack_replay;
+
+typedef struct {
+    int64_t kind;
+    int64_t key0, key1;   /* key of its random stream: two words of 32 bits */
+    int64_t queue_places; /* places of its ring in departures_ns; 0: no queue */
+    int64_t queue_begin;  /* first of these places */
+    union {
+        noack_chance chance;
+        noack_four_state four_state;
+        noack_gilbert_elliott gilbert_elliott;
+        noack_periodic periodic;
+        noack_scripted scripted;
+        noack_bottleneck bottleneck;
+        noack_blackout blackout;
+        noack_delay delay;
+        noack_opportunities opportunities;
+        noack_replay replay;
+    };
+} noack_stage;
+
+/* ---- State ----------------------------------------------------------------------------------- */
+
+typedef struct { /* a stage's memory of a flow */
+    int64_t phase;
+    double score;
+} noack_stage_memory;
+
+typedef struct { /* a link's state of a flow */
+    int64_t number;             /* never used again on this link; selects its random numbers */
+    int64_t forced_first;       /* 1: the first packet is still to come, and must be delivered */
+    int64_t packets;            /* packets that have arrived */
+    int64_t consecutive_losses; /* up to the last packet */
+    int64_t first_release_ns;   /* departure time of the first packet, if it had to be delivered */
+    double score;               /* normal score of the link's state for the last packet */
+    int64_t newest;             /* greatest number among the packets that have left intact */
+    int64_t since;              /* number of the first packet under the present settings */
+    int64_t longest_loss_burst; /* since then; counts final losses only */
+} noack_flow;
+
+typedef struct { /* a stage's state that all flows share; departure times lie in a ring */
+    int64_t head, count;
+    int64_t entry_ns;
+    int64_t busy_until_ns; /* opportunities: time of the last opportunity that was used */
+    int64_t carry;         /* fraction of a nanosecond, in units of 1/rate_bps */
+    int64_t first_above_ns, drop_next_ns; /* CoDel: the variables of RFC 8289, Section 5 */
+    int64_t drops;                        /* count_ of the RFC */
+    int64_t last_drops, dropping;
+    int64_t dropped_before;    /* 1: the law dropped the previous packet; drop_next_ns is not new */
+    int64_t used, left_bytes;  /* opportunities: which of those at busy_until_ns, from 1; its rest */
+    int64_t total_bytes;       /* all bytes that were put into the queue */
+    int64_t phase, step;       /* Gilbert-Elliott, common to all flows: state, and number of its step */
+} noack_queue;
+
+typedef struct {
+    int64_t received, received_bytes;
+    int64_t delivered, dropped, forced, corrupted, overflowed, blacked_out;
+    int64_t duplicated;
+    int64_t held_back;                  /* for the guarantee */
+    int64_t forwarded, forwarded_bytes; /* packets and copies that have left */
+    int64_t delivered_out_of_order;     /* left after a later one of their flow: stale */
+    int64_t longest_loss_burst;         /* of a flow, under the present settings */
+    int64_t most_in_flight;
+} noack_counters;
+
+typedef struct { /* at most so many losses among any so many consecutive packets of a flow */
+    int64_t losses, packets;
+} noack_window;
+
+typedef struct { /* one direction of a link */
+    /* settings */
+    int64_t stage_count, integer_count, real_count, window_count, decision_count;
+    noack_stage *stages; /* in order of application */
+    int64_t *integers;   /* tables of the stages */
+    double *reals;
+    noack_window *windows; /* further maxima of losses */
+    noack_recorded *decisions; /* recorded decisions, flow by flow */
+    int64_t *decisions_begin;  /* (recorded_flows + 1,) */
+    int64_t recorded_flows;
+    int64_t recovery; /* minimum of consecutive deliveries between two loss bursts; 0: none */
+    int64_t mansd;    /* maximum of consecutive losses, M - 1; -1: none */
+    int64_t limit;    /* maximum number of packets delayed at once */
+    int64_t tracks;   /* 1: packets can be delivered out of order */
+    /* state */
+    int64_t rows;               /* flows that have room */
+    int64_t recent_width;       /* a power of 2, of mansd + 1 at least if it tracks */
+    int64_t loss_width;         /* a power of 2 */
+    int64_t departure_places;
+    noack_flow *flows;          /* (rows,) */
+    noack_stage_memory *memory; /* (rows, stage_count) */
+    int64_t *recent_ns;         /* (rows, recent_width) release times of the last packets */
+    int64_t *losses;            /* (rows, loss_width) numbers of losses so far, S */
+    noack_queue *queues;        /* (stage_count,) */
+    int64_t *departures_ns;     /* (departure_places,) the rings of the queues */
+    int64_t in_flight;          /* delayed packets and copies */
+    noack_counters counters;
+} noack_link;
+
+/* ---- A link ---------------------------------------------------------------------------------- */
+
+/* Return NULL, or what is wrong with the numbers of a link: all that the other functions assume. */
+const char *noack_link_check(const noack_link *link);
+
+/* The same for its recorded decisions, of which there may be millions. */
+const char *noack_recorded_check(const noack_link *link);
+
+/* Begin a flow in a row. restarted: packets of the flow may have been lost before. */
+void noack_link_start_flow(
+    noack_link *link, int64_t row, int64_t number, int64_t first_delivered, int64_t restarted);
+
+/* Decide for a packet that arrives at now_ns; row is that of its flow. */
+void noack_link_decide(
+    noack_link *link, int64_t row, int64_t size_bytes, int64_t now_ns, noack_decision *decision);
+
+/* Decide for count packets, in order of arrival. */
+void noack_link_decide_many(
+    noack_link *link, int64_t count, const int64_t *rows, const int64_t *sizes_bytes,
+    const int64_t *arrivals_ns, noack_decision *decisions);
+
+/* Note that a packet or a copy leaves; return 1 if it is stale. delayed: it was in flight. counts:
+   it is the packet's first intact copy. */
+int64_t noack_link_leave(
+    noack_link *link, int64_t row, int64_t packet, int64_t size_bytes, int64_t delayed,
+    int64_t counts);
+
+/* Load the state of a flow into the processor's caches; return a number that depends on it. */
+int64_t noack_link_touch(const noack_link *link, int64_t row);
+
+/* Transfer the state of a link to one with other settings, which has as many rows and shares the
+   array of flows. latest_ns: (rows,) last departure time of the packets in flight; -1: none. */
+void noack_link_change(const noack_link *before, noack_link *after, const int64_t *latest_ns);
+
+/* Begin the flow of row 0 again, with other keys, (stage_count, 2): another run of a batch. */
+void noack_link_renew(noack_link *link, const int64_t *keys, int64_t first_delivered);
+
+/* ---- Parts of a decision, for predictions and tests ------------------------------------------ */
+
+int64_t noack_must_pass(const noack_link *link, int64_t row);
+int64_t noack_hold_back_until(
+    const noack_link *link, int64_t row, int64_t packet, int64_t desired_ns);
+void noack_settle(noack_link *link, int64_t row, noack_decision *decision);
+int64_t noack_queue_enters(noack_link *link, int64_t stage, int64_t now_ns);
+int64_t noack_queue_serve(noack_link *link, int64_t stage, int64_t size_bytes);
+double noack_delay_quantile_ns(const noack_delay *delay, const double *reals, double u);
+double noack_normal_cdf(double z);
+double noack_normal_score(double u);
+void noack_philox(const int64_t counter[4], const int64_t key[2], int64_t words[4]);
+void noack_uniforms(
+    int64_t key0, int64_t key1, int64_t flow, int64_t packet, int64_t block, double uniform[2]);

@@ -1,0 +1,85 @@
+/* Counter-based random numbers, and the normal distribution. */
+#include <math.h>
+
+#include "core.h"
+
+/* Philox4x32-10 (Salmon, Moraes, Dror & Shaw, SC 2011): four random words of 32 bits for a counter
+   of four words and a key of two. */
+void noack_philox(const int64_t counter[4], const int64_t key[2], int64_t words[4]) {
+    uint32_t c0 = (uint32_t)counter[0], c1 = (uint32_t)counter[1];
+    uint32_t c2 = (uint32_t)counter[2], c3 = (uint32_t)counter[3];
+    uint32_t k0 = (uint32_t)key[0], k1 = (uint32_t)key[1];
+    for (int round = 0; round < 10; round++) {
+        uint64_t p0 = UINT64_C(0xD2511F53) * c0;
+        uint64_t p1 = UINT64_C(0xCD9E8D57) * c2;
+        c0 = (uint32_t)(p1 >> 32) ^ c1 ^ k0;
+        c1 = (uint32_t)p1;
+        c2 = (uint32_t)(p0 >> 32) ^ c3 ^ k1;
+        c3 = (uint32_t)p0;
+        k0 += UINT32_C(0x9E3779B9);
+        k1 += UINT32_C(0xBB67AE85);
+    }
+    words[0] = c0;
+    words[1] = c1;
+    words[2] = c2;
+    words[3] = c3;
+}
+
+/* Two numbers in [0, 1), multiples of 2^-53, of a pair for a datagram. They are a function of the
+   stream's key and of the numbers of flow (below 2^32), packet (below 2^63) and pair: they do not
+   depend on time, on other flows, or on batches. */
+void noack_uniforms(
+    int64_t key0, int64_t key1, int64_t flow, int64_t packet, int64_t block, double uniform[2]) {
+    int64_t counter[4] = {packet & 0xFFFFFFFF, packet >> 32, flow, block};
+    int64_t key[2] = {key0, key1}, words[4];
+    noack_philox(counter, key, words);
+    for (int i = 0; i < 2; i++) {
+        int64_t high = words[2 * i] >> 5, low = words[2 * i + 1] >> 6;
+        uniform[i] = (double)(high * 67108864 + low) * (1.0 / 9007199254740992.0);
+    }
+}
+
+double noack_normal_cdf(double z) { return 0.5 * erfc(-z * 0.7071067811865476); }
+
+/* The z with Phi(z) = u, for u in [0, 1] (Wichura 1988, algorithm AS 241, PPND16). The relative
+   error is below 1e-15; u is limited to a distance of 2^-54 from 0 and 1, half the resolution of a
+   uniform number, so that 0 has a finite score. */
+double noack_normal_score(double u) {
+    double q = u - 0.5, r, z;
+    if (fabs(q) <= 0.425) {
+        r = 0.180625 - q * q;
+        return q
+               * (((((((2509.0809287301226727 * r + 33430.575583588128105) * r
+                       + 67265.770927008700853) * r + 45921.953931549871457) * r
+                     + 13731.693765509461125) * r + 1971.5909503065514427) * r
+                   + 133.14166789178437745) * r + 3.387132872796366608)
+               / (((((((5226.495278852545925 * r + 28729.085735721942674) * r
+                       + 39307.89580009271061) * r + 21213.794301586595867) * r
+                     + 5394.1960214247511077) * r + 687.1870074920579083) * r
+                   + 42.313330701600911252) * r + 1.0);
+    }
+    double tail = fmax(fmin(u, 1.0 - u), 5.551115123125783e-17);
+    r = sqrt(-log(tail));
+    if (r <= 5.0) {
+        r -= 1.6;
+        z = (((((((7.7454501427834140764e-4 * r + 0.0227238449892691845833) * r
+                  + 0.24178072517745061177) * r + 1.27045825245236838258) * r
+                + 3.64784832476320460504) * r + 5.7694972214606914055) * r
+              + 4.6303378461565452959) * r + 1.42343711074968357734)
+            / (((((((1.05075007164441684324e-9 * r + 5.475938084995344946e-4) * r
+                    + 0.0151986665636164571966) * r + 0.14810397642748007459) * r
+                  + 0.68976733498510000455) * r + 1.6763848301838038494) * r
+                + 2.05319162663775882187) * r + 1.0);
+    } else {
+        r -= 5.0;
+        z = (((((((2.01033439929228813265e-7 * r + 2.71155556874348757815e-5) * r
+                  + 0.0012426609473880784386) * r + 0.026532189526576123093) * r
+                + 0.29656057182850489123) * r + 1.7848265399172913358) * r
+              + 5.4637849111641143699) * r + 6.6579046435011037772)
+            / (((((((2.04426310338993978564e-15 * r + 1.4215117583164458887e-7) * r
+                    + 1.8463183175100546818e-5) * r + 7.868691311456132591e-4) * r
+                  + 0.0148753612908506148525) * r + 0.13692988092273580531) * r
+                + 0.59983220655588793769) * r + 1.0);
+    }
+    return q < 0.0 ? -z : z;
+}

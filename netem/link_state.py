@@ -1,0 +1,245 @@
+"""One direction of a link: its settings as numbers and its state, in memory that the core uses.
+
+Random streams are named after the link, the direction and the impairment, with a number if there
+are several of a kind. Hence adding a delay does not change which packets are lost.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import astuple
+from itertools import accumulate
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from noack.core.core_library import core, dtype_of, ffi, pointer_to
+from noack.core.random_streams import stream_key
+from noack.impairments.feature import Stage, StageTables
+from noack.impairments.kept_loss import with_kept_loss
+from noack.impairments.link_records import NEVER_NS, Counters, RecordedDecision
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_guarantee import DeliveriesBetweenBursts, LossesInWindow
+
+Integers = NDArray[np.int64]
+_COUNTED = dtype_of("noack_counters").names or ()
+
+
+class LinkState:
+    """Settings and state of one direction of a link; see native/link.c.
+
+    Args:
+        settings: the settings; they must not name files.
+        seed: seed of its random streams.
+        name: names of the link and the direction.
+        decisions: recorded decisions per flow; each flow repeats them before the settings apply.
+        rows: number of flows that have room; more are added as needed.
+        restarted: packets of its flows may have been lost before. The guarantee then counts as many
+            losses directly before a flow's first packet as a window may have.
+
+    Raises:
+        ValueError: the settings name a file that has not been read, a loss rate cannot be kept, or
+            a recorded decision is wrong.
+
+    >>> link = LinkState(LinkSettings(mansd=4), 1, "update")
+    >>> link.start_flow(0, 0)
+    >>> link.decide(row=0, size_bytes=72, now_ns=1_000_000).release_ns
+    1000000
+    """
+
+    def __init__(
+        self,
+        settings: LinkSettings,
+        seed: int,
+        *name: str,
+        decisions: Sequence[Sequence[RecordedDecision]] = (),
+        rows: int = 1,
+        restarted: bool = False,
+    ) -> None:
+        self.settings = settings
+        self._seed, self._name, self._restarted = seed, name, restarted
+        recorded = [astuple(decision) for flow in decisions for decision in flow]
+        self._decisions = np.array(recorded, dtype_of("noack_recorded"))
+        begins = [*accumulate(map(len, decisions), initial=0)] if decisions else [0]
+        self._decisions_begin = np.array(begins, np.int64)
+        self.flows: NDArray[np.void] = np.zeros(rows, dtype_of("noack_flow"))
+        """(rows,) of ``noack_flow``."""
+        self.decision: Any = ffi.new("noack_decision *")
+        """The decision for the last packet, a ``noack_decision``; overwritten by the next."""
+        self.core: Any = ffi.new("noack_link *")
+        """The link, as the core's functions take it; its address does not change."""
+        self.core[0] = self._filled(settings, rows, tracks=bool(decisions))[0]
+        _require(core.noack_recorded_check(self.core))
+
+    @property
+    def rows(self) -> int:
+        """Number of flows that have room."""
+        return len(self.flows)
+
+    @property
+    def tracks(self) -> bool:
+        """Whether packets can be delivered out of order."""
+        return bool(self.core.tracks)
+
+    @property
+    def counters(self) -> Counters:
+        """The counts so far."""
+        return Counters(*(getattr(self.core.counters, name) for name in _COUNTED))
+
+    def flow(self, row: int) -> Any:
+        """Return the ``noack_flow`` in a row."""
+        return self.core.flows[row]
+
+    def start_flow(self, row: int, number: int) -> None:
+        """Begin a new flow in a free row; make room if necessary."""
+        while row >= self.rows:
+            self._add_rows()
+        first = self.settings.first_delivered
+        core.noack_link_start_flow(self.core, row, number, first, self._restarted)
+
+    def decide(self, row: int, size_bytes: int, now_ns: int) -> Any:
+        """Decide for the next packet of the flow in a row; return :attr:`decision`."""
+        core.noack_link_decide(self.core, row, size_bytes, now_ns, self.decision)
+        return self.decision
+
+    def decide_many(
+        self, rows: Integers, sizes_bytes: Integers, arrivals_ns: Integers
+    ) -> NDArray[np.void]:
+        """Return the decisions for k packets in order of arrival, (k,) of ``noack_decision``.
+
+        Args:
+            rows: (k,) rows of their flows, which have begun.
+            sizes_bytes: (k,)
+            arrivals_ns: (k,)
+        """
+        if len(rows) and not 0 <= rows.min() <= rows.max() < self.rows:
+            raise ValueError("rows: a flow has not begun")
+        decisions = np.zeros(len(rows), dtype_of("noack_decision"))
+        core.noack_link_decide_many(
+            self.core, len(rows), *(pointer_to(one, "int64_t *") for one in
+            (rows, sizes_bytes, arrivals_ns)), pointer_to(decisions, "noack_decision *"),
+        )  # fmt: skip
+        return decisions
+
+    def leave(self, row: int, packet: int, size_bytes: int, *, delayed: bool, counts: bool) -> bool:
+        """Note that a packet, or a copy, actually leaves; return whether it is stale.
+
+        ``delayed``: it was in flight. ``counts``: it is the packet's first intact copy.
+        """
+        return bool(core.noack_link_leave(self.core, row, packet, size_bytes, delayed, counts))
+
+    def change(self, settings: LinkSettings, latest_ns: Integers) -> None:
+        """Apply other settings; see native/link_change.c.
+
+        Args:
+            settings: the new settings.
+            latest_ns: (rows,) last departure time of the packets in flight of each flow; −1: none.
+        """
+        kept = self._memory
+        after = self._filled(settings, self.rows, tracks=self.tracks)
+        core.noack_link_change(self.core, after, pointer_to(latest_ns, "int64_t *"))
+        self.core[0] = after[0]
+        self.settings = settings
+        del kept  # the core has read the earlier state
+
+    def _filled(self, settings: LinkSettings, rows: int, *, tracks: bool) -> Any:
+        """Return a new ``noack_link`` of these settings, which shares the array of flows."""
+        settings = with_kept_loss(settings)
+        tables = StageTables(
+            scored=any(getattr(one, "loss_correlation", 0) != 0 for one in settings.impairments)
+        )
+        named = list(_stages(settings, tables, self._seed, self._name))
+        stages, places = ffi.new("noack_stage[]", max(len(named), 1)), 0
+        for row, (stage, key, _) in zip(stages, named, strict=False):
+            _write_stage(row, stage, key, places)
+            places += stage.queue_places
+        rules = [one.rule for one in settings.constraints]
+        windows = [(one.limit, one.window) for one in rules if isinstance(one, LossesInWindow)]
+        link = ffi.new("noack_link *", {
+            "stages": stages, "stage_count": len(named),
+            "recorded_flows": len(self._decisions_begin) - 1,
+            "recovery": max(
+                (one.deliveries for one in rules if isinstance(one, DeliveriesBetweenBursts)),
+                default=0,
+            ),
+            "mansd": -1 if settings.longest_burst is None else settings.longest_burst,
+            "limit": settings.limit,
+            "tracks": tracks or any(one.delays for one in settings.impairments),
+            "rows": rows, "departure_places": places,
+        })  # fmt: skip
+        link.recent_width = 1 << link.mansd.bit_length() if link.tracks and link.mansd >= 0 else 1
+        link.loss_width = 1
+        if windows or link.recovery:
+            longest = max((packets for _, packets in windows), default=0)
+            link.loss_width = 1 << max(longest + 1, link.mansd + link.recovery + 1).bit_length()
+        tables_of = {
+            "integers": np.array(tables.integers, np.int64),
+            "reals": np.array(tables.reals, np.float64),
+            "windows": np.array(windows, dtype_of("noack_window")),
+            "decisions": self._decisions,
+        }
+        for name, array in tables_of.items():
+            setattr(link, f"{name.removesuffix('s')}_count", len(array))
+        self._memory: dict[str, Any] = {
+            **tables_of,
+            "decisions_begin": self._decisions_begin,
+            "memory": np.zeros((rows, len(named)), dtype_of("noack_stage_memory")),
+            "recent_ns": np.full((rows, link.recent_width), NEVER_NS, np.int64),
+            "losses": np.zeros((rows, link.loss_width), np.int64),
+            "queues": np.zeros(len(named), dtype_of("noack_queue")),
+            "departures_ns": np.zeros(places, np.int64),
+            "flows": self.flows,
+        }
+        self._stages = stages
+        self._point(link)
+        _require(core.noack_link_check(link))
+        return link
+
+    def _point(self, link: Any) -> None:
+        """Write the addresses of all arrays."""
+        for name, array in self._memory.items():
+            setattr(link, name, ffi.cast(ffi.typeof(getattr(link, name)), array.ctypes.data))
+
+    def _add_rows(self) -> None:
+        """Double the number of flows that have room."""
+        for name in ("flows", "memory", "recent_ns", "losses"):
+            old = self._memory[name]
+            self._memory[name] = np.concatenate((old, np.zeros_like(old)))
+        self.flows = self._memory["flows"]
+        self.core.rows = len(self.flows)
+        self._point(self.core)
+
+
+def stream_names(settings: LinkSettings, *name: str) -> list[tuple[str, ...]]:
+    """Return the names of the random streams of a link's stages, in their order."""
+    return [stream for *_, stream in _stages(settings, StageTables(), 0, name)]
+
+
+def _stages(
+    settings: LinkSettings, tables: StageTables, seed: int, name: Sequence[str]
+) -> Iterator[tuple[Stage, tuple[int, int], tuple[str, ...]]]:
+    """Return the stages, each with the key and the name of its random stream."""
+    numbers: Counter[str] = Counter()
+    for impairment in settings.impairments:
+        number = numbers[impairment.kind] + 1
+        own = impairment.kind if number == 1 else f"{impairment.kind} {number}"
+        stream = ("netem", *name, own)
+        tables.key = stream_key(seed, *stream)
+        stage = impairment.stage(tables)
+        if stage is not None:
+            numbers[impairment.kind] = number
+            yield stage, tables.key, stream
+
+
+def _write_stage(row: Any, stage: Stage, key: tuple[int, int], queue_begin: int) -> None:
+    row.kind = getattr(core, f"NOACK_{stage.kind.upper()}")
+    row.key0, row.key1 = key
+    row.queue_places, row.queue_begin = stage.queue_places, queue_begin
+    for field, number in stage.numbers.items():
+        setattr(getattr(row, stage.structure or stage.kind), field, number)
+
+
+def _require(wrong: Any) -> None:
+    """Raise ValueError for what the core found wrong with a link."""
+    if wrong != ffi.NULL:
+        raise ValueError(f"link: {ffi.string(wrong).decode()}")
