@@ -67,7 +67,8 @@ class LinkState:
         self.decision: Any = ffi.new("noack_decision *")
         """The decision for the last packet, a ``noack_decision``; overwritten by the next."""
         self.core: Any = ffi.new("noack_link *")
-        """The link, as the core's functions take it; its address does not change."""
+        """The link, as the core's functions take it; its address does not change. It is valid as
+        long as this object lives."""
         self.core[0] = self._filled(settings, rows, tracks=bool(decisions))[0]
         _require(core.noack_recorded_check(self.core))
 

@@ -230,7 +230,7 @@ def test_datagrams_in_flight_leave_in_the_order_of_time_and_then_of_arrival(
     assert found == sorted(
         expected, key=lambda leaving: leaving[0]
     )  # stable: ties in order of arrival
-    assert link._state.link.in_flight == 0
+    assert link.in_flight == 0
 
 
 def test_an_overdue_datagram_leaves_before_a_later_one() -> None:

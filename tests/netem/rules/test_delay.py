@@ -12,7 +12,7 @@ from scipy.integrate import quad
 
 from netem.link_state import LinkState
 from netem.words.words_to_settings import settings_of
-from noack.core.core_library import core
+from noack.core.core_library import core, ffi
 from noack.impairments.kinds.delay import Delay
 from noack.impairments.link_settings import LinkSettings
 
@@ -58,9 +58,10 @@ def test_the_mixture_combines_quantiles() -> None:
 
     variance = sum(quad(square_at, a, b, limit=200)[0] for a, b in ((-9, 0), (0, 6), (6, 36)))
     delay = Delay(jitter_s=1e-9, distribution="paretonormal")
-    link = LinkState(LinkSettings(impairments=(delay,)), 0, "a").core
+    state = LinkState(LinkSettings(impairments=(delay,)), 0, "a")
+    link = state.core
     for u in np.linspace(0.001, 0.999, 99).tolist():
-        found = core.noack_delay_quantile_ns(link.stages[0].delay, link.reals, u)
+        found = core.noack_delay_quantile_ns(ffi.addressof(link.stages[0], "delay"), link.reals, u)
         assert found == pytest.approx(mixed(u) / np.sqrt(variance), rel=1e-7, abs=1e-9)
 
 
@@ -143,7 +144,10 @@ def test_a_copy_draws_its_own_delay_and_changes_no_other_delay(decide: Any) -> N
 
 def test_the_longest_delay_fits_into_an_integer() -> None:
     """Of the largest uniform number, the unbounded distribution is cut at 10¹⁵ ns."""
-    link = LinkState(settings_of("delay 3600s 3600s distribution pareto"), 0, "a").core
+    state = LinkState(settings_of("delay 3600s 3600s distribution pareto"), 0, "a")
+    link = state.core
     u = 1 - 2**-53
-    assert core.noack_delay_quantile_ns(link.stages[0].delay, link.reals, u) > 1e15
+    assert (
+        core.noack_delay_quantile_ns(ffi.addressof(link.stages[0], "delay"), link.reals, u) > 1e15
+    )
     assert link.stages[0].delay.constant_ns == 3600e9

@@ -68,7 +68,8 @@ def test_it_is_a_queue(rate: Rate, steps: list[tuple[int, int, bool]]) -> None:
     times = np.cumsum([step[0] for step in steps]).tolist()
     arrivals = [(t, size, forced) for t, (_, size, forced) in zip(times, steps, strict=True)]
     other = Rate(rate_bps=1000, queue=3)  # so that the ring buffer's offset is not 0
-    link = LinkState(LinkSettings(impairments=(other, rate)), 0, "a").core
+    state = LinkState(LinkSettings(impairments=(other, rate)), 0, "a")
+    link = state.core
     found: list[int | None] = []
     for t_ns, size_bytes, forced in arrivals:
         room = core.noack_queue_enters(link, 1, t_ns)
