@@ -99,7 +99,7 @@ netem: setup ## The network: loses at most M - 1 consecutive packets
 
 ##@ Work on noack
 .PHONY: setup setup-dev test pytest fuzz attack soak check format bench screenshots schema docs docs-serve lock dist clean
-setup: $(VENV)/.installed $(if $(filter setup,$(MAKECMDGOALS)),$(VENV)/.compiled) ## Create the environment in .venv (the other targets do this if needed)
+setup: $(VENV)/.installed ## Create the environment in .venv (the other targets do this if needed)
 
 setup-dev: $(VENV)/.installed-dev
 
@@ -172,12 +172,6 @@ $(VENV)/.installed: requirements.lock pyproject.toml | $(VENV)/bin/python
 	@echo "installing pinned dependencies ..."
 	@$(PIP) -r requirements.lock
 	@$(EDITABLE)
-	@touch $@
-
-# For `make setup` alone: a run of the loop needs none of it, and the first start would compile it, too.
-COMPILED := noack/impairments/*.py noack/impairments/*/*.py netem/*.py netem/rules/*.py netem/engine/*.py netem/engine/pump/*.py netem/capture/*.py
-$(VENV)/.compiled: $(VENV)/.installed $(wildcard $(COMPILED))
-	@$(BIN)/noack netem --compile
 	@touch $@
 
 $(VENV)/.installed-lab: requirements-lab.lock $(VENV)/.installed

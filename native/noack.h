@@ -290,3 +290,188 @@ double noack_normal_score(double u);
 void noack_philox(const int64_t counter[4], const int64_t key[2], int64_t words[4]);
 void noack_uniforms(
     int64_t key0, int64_t key1, int64_t flow, int64_t packet, int64_t block, double uniform[2]);
+
+/* ---- The relay: waits for, receives, decides, sends ------------------------------------------ */
+
+enum {
+    NOACK_NAME_BYTES = 32,    /* room for a socket address; those of IPv6 have 28 bytes */
+    NOACK_HEAD_BYTES = 32,    /* of a payload, that a record has */
+    NOACK_ERRNOS = 256,
+    NOACK_BLOCK_BYTES = 512,  /* payloads of delayed datagrams are kept in chained blocks */
+    NOACK_CHUNK_BLOCKS = 4096, /* number of blocks per allocation */
+    NOACK_BUCKETS = 1280      /* of a histogram of times */
+};
+
+enum noack_reason { /* why the relay returned; the last two occur within it only */
+    NOACK_HOUSEKEEPING, /* the time for housekeeping has come */
+    NOACK_NEW_CLIENT,   /* the current datagram is from a new client */
+    NOACK_STORE_FULL,   /* there is no room to store the current datagram */
+    NOACK_EVENTS_FULL,  /* a buffer of events or of record rows is full and must be emptied */
+    NOACK_CHANGE_DUE,   /* other settings apply from the current datagram on */
+    NOACK_LEAVING_FULL, /* the list of departures is full and must be sent */
+    NOACK_CARRY_ON
+};
+
+enum noack_sends { /* the socket that sends a direction's datagrams, and their destination */
+    NOACK_OWN_SOCKET,       /* the client's socket, which is connected to the destination */
+    NOACK_DESTINATION_NAME, /* the link's sending socket, not connected, to the destination */
+    NOACK_CLIENT_NAME,      /* the link's listening socket, to the client */
+    NOACK_LINK_SOCKET       /* the link's sending socket, which is connected to the destination */
+};
+
+typedef struct {
+    int32_t fd, error; /* if fd is -1, error is the errno of the failure to open it */
+    int32_t head, tail;
+    int64_t stamp;
+} noack_socket;
+
+typedef struct {
+    int64_t key[4];
+    int64_t last_ns; /* last datagram of the client or of the destination */
+    int64_t number;  /* number of its flows; -1: the row is free */
+    int32_t in_flight;
+    int32_t link;
+    int32_t place; /* row of its flows in the link's two states */
+    int32_t name_bytes;
+    uint8_t name[32];
+    uint8_t local[32]; /* address of its return path */
+} noack_client;
+
+typedef struct { /* one direction of a link in the relay */
+    noack_link *link;
+    int64_t keeps; /* 1: datagrams can be delayed or changed */
+    int64_t sends;
+    int64_t name_bytes;
+    uint8_t name[32];   /* forward: the server's */
+    uint8_t listen[32]; /* the link's address */
+    int64_t full;       /* forward: 1: further clients are refused */
+    int64_t refused;
+    int64_t port_unreachable; /* forward: ICMP port-unreachable errors */
+    int64_t delays[1280];     /* histogram of the time from arrival to departure */
+    int64_t lateness[1280];   /* of the time from a delayed datagram's release time to its departure */
+    int64_t errors[256];      /* datagrams that could not be sent or stored, by errno */
+} noack_direction;
+
+typedef struct { /* a stored datagram */
+    int64_t packet, arrival_ns, bit;
+    int32_t size_bytes;
+    int32_t block; /* first block of the payload */
+    int32_t direction, client;
+    int32_t next; /* next free slot */
+    uint8_t copy, counts, fate, unused;
+} noack_slot;
+
+typedef struct { /* an entry of the heap of delayed datagrams */
+    int64_t release_ns, number, slot;
+} noack_heap_entry;
+
+typedef struct {    /* a datagram that arrives or departs; a tap receives it */
+    int64_t t_ns;   /* Unix time */
+    int64_t flow;   /* number of the flow within the link */
+    int64_t packet; /* number of the datagram within its flow */
+    int64_t consecutive_losses; /* arrival: up to and including this datagram */
+    int64_t mansd;              /* the maximum of consecutive losses (M - 1); -1: none */
+    int64_t delay_ns;      /* arrival: decided delay, -1: never leaves; departure: actual delay */
+    int64_t copy_delay_ns; /* arrival: decided delay of its copy; -1: no copy */
+    int64_t hold_back_ns;  /* arrival: time held back for the guarantee */
+    int64_t bit;           /* the corrupted bit of the payload; -1: none */
+    int64_t copy_bit;      /* arrival: the corrupted bit of its copy; -1: none */
+    uint64_t offset;       /* place of the payload in the batch's data, if a tap needs data */
+    uint32_t size_bytes;   /* of the payload */
+    uint32_t link;         /* number of the link */
+    uint32_t interface; /* 2 link is the link's client side, 2 link + 1 the server side */
+    uint16_t source_port, destination_port;
+    uint8_t source[16]; /* an IPv4 address is in the first 4 bytes */
+    uint8_t destination[16];
+    uint8_t family;    /* 4 or 6: the version of IP */
+    uint8_t departure; /* 0: a datagram arrived here; 1: it or its copy departed here */
+    uint8_t direction; /* 0: forward, from client to server; 1: reverse */
+    uint8_t fate;
+    uint8_t copy;  /* departure: 1 is the duplicate */
+    uint8_t stale; /* departure: a newer datagram of the flow had left before */
+    uint8_t unused[2];
+} noack_event;
+
+typedef struct { /* a row of the record's table netem_packet */
+    int64_t input, sequence, t_ns, now_ns, flow, fate, consecutive_losses;
+    int64_t release_ns, copy_ns, bit, size_bytes;
+    uint8_t head[32];
+} noack_packet_row;
+
+typedef struct { /* a row of the record's table netem_release */
+    int64_t input, sequence, t_ns, now_ns, flow, copy, stale;
+} noack_release_row;
+
+typedef struct { /* times are simulated and count from the relay's start, unless stated otherwise */
+    int64_t links;
+    int64_t epoll;
+    int64_t epoch_ns; /* the monotonic clock at the relay's start */
+    int64_t unix_ns;  /* Unix time at the relay's start */
+    double speed;     /* simulated time per time of the monotonic clock */
+    int64_t now_ns;   /* arrival of the current datagram, or its release time; never decreases */
+    int64_t read_ns;  /* the last reading of the clock; never decreases */
+    int64_t change_ns; /* time from which other settings apply */
+    int64_t spin_ns;   /* time before a departure in which it does not sleep */
+    int64_t segment;   /* 1: send datagrams of equal size as one message */
+    int64_t segment_below; /* the kernel does not segment datagrams of this size */
+    int64_t taps;          /* 0: none; 1: without data; 2: with data */
+    int64_t records;       /* 1: write rows of the record */
+    int64_t loops;         /* of a run: its loops; the rows of their clients begin at 0 */
+    int64_t by_loop;       /* 1: a datagram has its loop's number in its header */
+    int64_t no_loop;       /* datagrams refused because of this number */
+    int64_t inputs;        /* number of the next row of the record */
+    int64_t first_number;  /* number of the first packet in the record */
+    int64_t no_memory;     /* 1: no memory for more delayed datagrams */
+    /* Tables; after the sockets of the links (listening, then sending), those of the clients. */
+    int64_t client_rows, table_places, slot_count, block_count, event_count, data_bytes, row_count;
+    noack_socket *sockets; /* (2 links + client_rows,) */
+    noack_client *clients;
+    int32_t *table; /* (table_places, a power of 2) rows of clients by the hash of their key */
+    noack_direction *directions; /* (2 links,) forward and reverse direction of each link */
+    noack_heap_entry *heap;      /* (slot_count,) */
+    noack_slot *slots;
+    uint8_t **chunks;    /* chunks of blocks */
+    int32_t *block_next; /* (block_count,) */
+    noack_event *events;
+    uint8_t *data; /* payloads of the events */
+    noack_packet_row *packets;
+    noack_release_row *releases;
+    int64_t heap_length, event_length, data_length, packet_rows, release_rows;
+    int64_t put; /* datagrams that have been delayed so far */
+    int64_t free_slot, free_slots, free_block, free_blocks;
+    void *scratch; /* noack_relay_scratch_bytes() bytes, which are 0 at first */
+} noack_relay;
+
+int64_t noack_relay_scratch_bytes(void);
+
+/* Prepare the scratch. */
+void noack_relay_open(noack_relay *relay);
+
+/* Receive the kernel's timestamps of arrivals, too: delays count from the arrival. */
+void noack_relay_read_stamps(noack_relay *relay);
+
+/* Wait for a socket's datagrams, too; return 0 or errno. number is its place in sockets. */
+int64_t noack_relay_watch(noack_relay *relay, int64_t fd, int64_t number);
+
+/* Relay until Python is needed, or until a time; return a noack_reason. */
+int64_t noack_relay_run(noack_relay *relay, int64_t until_ns);
+
+/* Add a datagram as if a socket had just received it; noack_relay_run decides for it. */
+void noack_relay_add_datagram(
+    noack_relay *relay, int64_t socket, const uint8_t name[32], const uint8_t *data,
+    int64_t size_bytes);
+
+/* The sender of the current datagram, and the place of the socket that received it. */
+const uint8_t *noack_relay_sender(const noack_relay *relay);
+int64_t noack_relay_receiver(const noack_relay *relay);
+
+/* Last departure time of each flow's packets in flight, (rows,); the caller fills it with -1. */
+void noack_relay_latest(const noack_relay *relay, int64_t direction, int64_t *latest_ns);
+
+/* The table of clients: find the row of a name (-1: none), insert a row, remove it. */
+int64_t noack_client_find(const noack_relay *relay, const uint8_t name[32], int64_t link);
+void noack_client_insert(noack_relay *relay, int64_t row);
+void noack_client_remove(noack_relay *relay, int64_t row);
+
+/* The bucket of a time in a histogram: 32 for each doubling. */
+int64_t noack_bucket_of(int64_t t_ns);

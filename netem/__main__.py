@@ -12,13 +12,12 @@ from noack.runtime.signals import quiet_interrupt
 
 with quiet_interrupt():
     from netem.duplex_link import network_of
-    from netem.engine.compiled_network import CompiledNetwork
-    from netem.engine.native_pump import NOT_COMPILED, kept_pump
-    from netem.run_relay import CompiledShell, RelayShell
+    from netem.engine.run_network import RunNetwork
+    from netem.run_relay import CoreShell, RelayShell
     from noack.core.errors import ExitStatus, NoackError
     from noack.protocol.topology import ENDS
     from noack.runtime.address import Address
-    from noack.runtime.command_line import Parser, failed, print_to_stderr
+    from noack.runtime.command_line import Parser, failed
     from noack.runtime.peer_sockets import has_peer_sockets
     from noack.runtime.process_entry import add_options, join_run
     from noack.runtime.process_life import RunProcess
@@ -46,26 +45,22 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
 
 
 def _in_a_run(node: RunProcess) -> None:
-    """Relay by compiled code if it is in the cache: a run does not wait for a compilation."""
+    """Relay in the core, which reads this host's clock; with another's clock, from Python."""
     flows, loops = node.scenario.network.flows, node.loop_count
 
     def ways(addresses: Mapping[str, Address]) -> list[tuple[Address, Address]]:
         return [(addresses[ENDS[one].sender], addresses[ENDS[one].receiver]) for one in flows]
 
-    may_compile = has_peer_sockets() and not node.follows_reference
-    pump = kept_pump() if may_compile else None
-    if pump is None:
-        if not node.follows_reference:
-            print_to_stderr(NOT_COMPILED)
+    if node.follows_reference or not has_peer_sockets():
         node.run(
             network_of(node.scenario, node.start, loops=loops or 1),
             lambda endpoint, addresses: RelayShell(endpoint, ways(addresses), loops=loops),
         )
         return
-    network = CompiledNetwork(node.scenario, node.start, pump, loops)
+    network = RunNetwork(node.scenario, node.start, loops)
     node.run(
         network,
-        lambda endpoint, addresses: CompiledShell(
+        lambda endpoint, addresses: CoreShell(
             endpoint, ways(addresses), network=network, clock=node.clock,
             spin_us=node.scenario.realtime.spin_us, loops=loops,
         ),

@@ -10,7 +10,7 @@ import select
 import socket
 from collections.abc import Sequence
 
-from netem.engine.compiled_network import CompiledNetwork
+from netem.engine.run_network import RunNetwork
 from netem.link_machine import Datagram
 from noack.core.clock import RunClock
 from noack.core.errors import PeerError
@@ -32,8 +32,8 @@ class RelayShell(CountingSocket[Datagram]):
     """
 
     most_bytes = MAX_UDP_BYTES
-    engine = "plain"
-    """See :attr:`netem.engine.relay_base.Relay.engine`."""
+    engine = "python"
+    """What waits for the datagrams: the core, or the process's own loop in Python."""
 
     def __init__(
         self,
@@ -70,8 +70,8 @@ class RelayShell(CountingSocket[Datagram]):
         return super().report() | {"rejected": rejected, "engine": self.engine}
 
 
-class CompiledShell(RelayShell):
-    """The channel of a compiled network, which receives the peers' datagrams and sends itself.
+class CoreShell(RelayShell):
+    """The channel of a network in the core, which receives the peers' datagrams and sends itself.
 
     It reads the datagrams of other sources every 50 ms, and passes on those that the peers sent
     before their sockets were open.
@@ -80,14 +80,14 @@ class CompiledShell(RelayShell):
         PeerError: the system refused a peer socket.
     """
 
-    engine = "batched"
+    engine = "core"
 
     def __init__(
         self,
         endpoint: socket.socket,
         ways: Sequence[tuple[Address, Address]],
         *,
-        network: CompiledNetwork,
+        network: RunNetwork,
         clock: RunClock,
         spin_us: float,
         loops: int | None = None,

@@ -4,7 +4,6 @@ import argparse
 import json
 import os
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
@@ -18,8 +17,7 @@ from netem.cli.relay_totals import print_totals
 from netem.control import relay_attachments
 from netem.control.emulator_session import starting
 from netem.control.emulator_statistics import Statistics, statistics, unintended
-from netem.engine.engine_choice import compiled_engine_is_missing, open_relay
-from netem.engine.relay_base import Relay
+from netem.engine.relay import Relay
 from netem.engine.relay_interface import DIRECTIONS, Direction, LinkSpec, Tap
 from netem.fates.fate_recorder import FateRecorder
 from netem.fates.fate_replay import read_fates
@@ -39,11 +37,7 @@ _SPIN_NS = 50_000
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options for running and recording a relay."""
-    group = parser.add_argument_group("engine")
-    group.add_argument(
-        "--engine", choices=("auto", "batched", "plain"), default="auto",
-        help="batched is fast and needs Linux; plain runs everywhere (auto)",
-    )  # fmt: skip
+    group = parser.add_argument_group("relay")
     group.add_argument(
         "--segment", action="store_true",
         help="send consecutive datagrams of equal size in one system call (UDP_SEGMENT)",
@@ -52,9 +46,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--realtime", action="store_true",
         help="request SCHED_FIFO, locked memory and no deep idle states, each where permitted; "
         "poll during the last 50 µs before a delayed datagram is due",
-    )  # fmt: skip
-    group.add_argument(
-        "--compile", action="store_true", help="compile the fast engine for this machine, and exit"
     )  # fmt: skip
     group = parser.add_argument_group("recording")
     group.add_argument(
@@ -72,20 +63,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     relay_attachments.add_options(parser)
 
 
-def compile_all() -> None:
-    """Compile the fast engine and captures, and report the time it took."""
-    if missing := compiled_engine_is_missing():
-        say(f"nothing to compile here: the batched engine {missing}")
-        return
-    began_s = time.monotonic()
-    from netem.capture.pcapng import PcapngSection
-    from netem.engine.batched_engine import load
-
-    load()
-    PcapngSection(())
-    say(f"compiled ({time.monotonic() - began_s:.1f} s)")
-
-
 def alone(arguments: Sequence[str]) -> ExitStatus:
     """Run a stand-alone emulator until Ctrl-C, or explain its settings; print the totals.
 
@@ -98,9 +75,6 @@ def alone(arguments: Sequence[str]) -> ExitStatus:
     parser = emulator_options.parser()
     add_options(parser)
     options = emulator_options.parsed(parser, arguments)
-    if options.compile:
-        compile_all()
-        return ExitStatus.OK
     specs = emulator_options.specs_of(options)
     if options.explain:
         written = emulator_options.specs_of(options, read=False)
@@ -143,9 +117,7 @@ def relay(specs: Sequence[LinkSpec], options: argparse.Namespace) -> Statistics:
                 taps.append(stack.enter_context(_capture(options.capture, specs)))
             if options.record_fates is not None:
                 taps.append(stack.enter_context(FateRecorder(options.record_fates, specs)))
-            opened = open_relay(
-                specs, options.engine, options.segment, taps, _SPIN_NS if options.realtime else 0
-            )
+            opened = Relay(specs, options.segment, taps, _SPIN_NS if options.realtime else 0)
             stack.callback(opened.close)
             # Signals stay handled until all files are complete.
             signals = last.enter_context(Signals().handled())
@@ -199,7 +171,7 @@ def _check_files(options: argparse.Namespace) -> None:
 def _capture(path: str, specs: Sequence[LinkSpec]) -> Iterator[Tap]:
     try:
         from netem.capture.capture_writer import CaptureWriter
-    except ModuleNotFoundError as error:  # the plain engine runs without numba
+    except ModuleNotFoundError as error:  # the emulator runs without numba
         raise CallerError(f"--capture: needs {error.name}, which is not installed") from None
     writer = CaptureWriter(path, specs)
     try:

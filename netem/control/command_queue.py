@@ -13,7 +13,7 @@ from queue import SimpleQueue
 from threading import Lock
 from typing import Any, NamedTuple, TypeVar
 
-from netem.engine.relay_base import Relay
+from netem.engine.relay import Relay
 from netem.engine.relay_interface import DIRECTIONS, Direction, LinkReport
 from netem.words.words_to_settings import text_of
 from noack.core.errors import PeerError
@@ -47,7 +47,6 @@ class AppliedSettings:
 class Snapshot(NamedTuple):
     """The state of a relay at one time."""
 
-    engine: str
     links: Sequence[LinkReport]
     in_force: Mapping[tuple[str, Direction], AppliedSettings]
     elapsed_ns: int
@@ -125,7 +124,6 @@ class CommandQueue:
     def look(self) -> Snapshot:
         """Return the state of the relay, in its thread or after its end."""
         return Snapshot(
-            self._relay.engine,
             self._relay.report(),
             dict(self._in_force),
             time.monotonic_ns() - self._began_ns,

@@ -8,7 +8,6 @@ from prometheus_client import Metric
 from prometheus_client.metrics_core import (
     CounterMetricFamily,
     GaugeMetricFamily,
-    InfoMetricFamily,
 )
 
 from netem.control.command_queue import CommandQueue
@@ -76,7 +75,6 @@ class EmulatorMetrics:
 
 def metrics(found: Statistics) -> Iterator[Metric]:
     """Yield the metrics of a relay's statistics; ``docs/operations.md`` lists them."""
-    yield InfoMetricFamily(_PREFIX, "the emulator", value={"engine": found["engine"]})
     yield GaugeMetricFamily(
         f"{_PREFIX}_elapsed_seconds", "time since the emulator started", found["elapsed_s"]
     )

@@ -135,7 +135,6 @@ class Statistics(TypedDict):
     """Wall time, UTC, ISO 8601."""
     elapsed_s: float
     """Time since the relay started."""
-    engine: str
     links: list[LinkStatistics]
 
 
@@ -147,7 +146,6 @@ def statistics(after: Snapshot, before: Snapshot | None = None) -> Statistics:
     return {
         "time": datetime.fromtimestamp(after.unix_ns / NS_PER_S, UTC).isoformat(),
         "elapsed_s": after.elapsed_ns / NS_PER_S,
-        "engine": after.engine,
         "links": links,
     }
 

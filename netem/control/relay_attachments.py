@@ -15,7 +15,7 @@ from netem.control.control_server import ControlServer
 from netem.control.emulator_statistics import Statistics
 from netem.control.live_screen import Screen
 from netem.control.statistics_thread import StatisticsThread
-from netem.engine.relay_base import Relay
+from netem.engine.relay import Relay
 from netem.standard_error import say
 from noack.core.errors import CallerError
 from noack.runtime.address import text_of

@@ -93,7 +93,7 @@ def render(history: History, title: str, width: int, height: int | None) -> Rend
     if latest is None:
         return Text(f"{title}: waiting for statistics", style="dim")
     heading = Text.assemble(
-        (f" {title}", "bold"), (f"  {elapsed_text(latest['elapsed_s'])}, {latest['engine']}", "dim")
+        (f" {title}", "bold"), (f"  {elapsed_text(latest['elapsed_s'])}", "dim")
     )
     column = (width - _FRAME_WIDTH - _LABEL_WIDTH - 2) // 2
     panels = [_panel(history, link, column) for link in latest["links"]]

@@ -1,7 +1,7 @@
 """A histogram of times: 32 buckets for each doubling, so that a bucket is at most 3 % wide.
 
 It is an array of counts, (BUCKETS,); bucket k counts the times t with lower_ns(k) ≤ t <
-lower_ns(k + 1).
+lower_ns(k + 1). The core counts (native/relay/events.c).
 """
 
 from collections.abc import Sequence
@@ -9,27 +9,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from noack.core.core_library import core
+
 _STEP_BITS = 5
 _STEPS = 1 << _STEP_BITS
-_MOST_BITS = 44
 _JOINED = 8
-BUCKETS = (_MOST_BITS - _STEP_BITS + 1) * _STEPS
+BUCKETS: int = core.NOACK_BUCKETS
 """Number of buckets. The last one also counts all longer times: 4.8 hours and more."""
-
-
-def bucket_of(t_ns: int) -> int:
-    """Return the bucket of a time; times below 0 count as 0."""
-    if t_ns < _STEPS:
-        return max(t_ns, 0)
-    if t_ns >> _MOST_BITS != 0:
-        return BUCKETS - 1
-    octave, rest = 0, t_ns
-    for k in range(6):  # int.bit_length does not compile
-        bits = 32 >> k
-        if rest >> bits != 0:
-            octave, rest = octave + bits, rest >> bits
-    shift = octave - _STEP_BITS
-    return (shift << _STEP_BITS) + (t_ns >> shift)
 
 
 def lower_ns(bucket: int) -> int:

@@ -23,12 +23,15 @@ except ImportError:
 core: Any = ffi.dlopen(str(LIBRARY))
 """The functions and constants of native/noack.h."""
 
-_FORMATS = {"int64_t": "<i8", "double": "<f8"}
+_FORMATS = {
+    "int64_t": "<i8", "int32_t": "<i4", "uint8_t": "u1", "uint16_t": "<u2", "uint32_t": "<u4",
+    "uint64_t": "<u8", "double": "<f8",
+}  # fmt: skip
 
 
 @cache
 def dtype_of(name: str) -> np.dtype[np.void]:
-    """Return the row type of a structure of native/noack.h, of numbers only.
+    """Return the row type of a structure of native/noack.h that has numbers and their arrays only.
 
     >>> dtype_of("noack_window").names
     ('losses', 'packets')
@@ -37,11 +40,17 @@ def dtype_of(name: str) -> np.dtype[np.void]:
     return np.dtype(
         {
             "names": [field for field, _ in kind.fields],
-            "formats": [_FORMATS[of.type.cname] for _, of in kind.fields],
+            "formats": [_format_of(of.type) for _, of in kind.fields],
             "offsets": [of.offset for _, of in kind.fields],
             "itemsize": ffi.sizeof(kind),
         }
     )
+
+
+def _format_of(kind: Any) -> Any:
+    if kind.kind == "array":
+        return _format_of(kind.item), (kind.length,)
+    return _FORMATS[kind.cname]
 
 
 def pointer_to(array: NDArray[Any], kind: str) -> Any:

@@ -245,14 +245,14 @@ def _compiled() -> Any:
         taylor,
         vector_lanes,
     )
-    from netem.engine.compiled_rules import compile_kept, prepare
+    from cosim.simulation.compiled_runs import compile_kept
 
     modules: tuple[ModuleType, ...] = (
         self_triggered_interval, batch_status, vector_lanes, taylor, norm_crossing,
         integral_crossing, level_crossing, batch_rule, batch_data, quadratic_crossing,
         piece_measures, batch_run,
     )  # fmt: skip
-    return compile_kept(batch_run.run_many, prepare("batch", modules))
+    return compile_kept(batch_run.run_many, "batch", modules)
 
 
 def _flat(array: NDArray[Any]) -> NDArray[np.float64]:

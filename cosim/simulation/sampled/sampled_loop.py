@@ -137,14 +137,10 @@ class SampledLoop:
 
 @cache
 def _compiled() -> Any:
-    from netem.engine.compiled_rules import compile_kept, prepare
+    from cosim.simulation.compiled_runs import compile_kept
 
-    return compile_kept(
-        loop_steps.follow,
-        prepare(
-            "sampled", (ordered_arithmetic, trigger_arrays, self_triggered_interval, loop_steps)
-        ),
-    )
+    modules = (ordered_arithmetic, trigger_arrays, self_triggered_interval, loop_steps)
+    return compile_kept(loop_steps.follow, "sampled", modules)
 
 
 def rule_of(rule: TriggerRule) -> Rule:

@@ -1,18 +1,13 @@
-"""Clients of the Linux engine: a row in the pump's memory and a return path for each."""
+"""Clients of a relay: a row in its memory and a return path for each."""
 
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from netem.engine.batched_directions import BatchedDirection
-from netem.engine.compiled_rules import compile_rule
-from netem.engine.epoll_object import Epoll
 from netem.engine.link_listeners import OpenLink
 from netem.engine.link_warnings import LinkWarnings
-from netem.engine.pump.client_table import insert, remove
-from netem.engine.pump_memory import PumpMemory
-from netem.engine.relay_base import STALL_NS
 from netem.engine.relay_interface import Address
+from netem.engine.relay_memory import RelayDirection, RelayMemory, name_array
 from netem.engine.relay_sockets import (
     Endpoint,
     has_data,
@@ -21,9 +16,12 @@ from netem.engine.relay_sockets import (
     stamp_arrivals,
     unpacked_address,
 )
+from noack.core.core_library import core
 from noack.runtime.udp_sockets import drops_of
 
 _QUERIED_AT_ONCE = 64
+_STALL_NS = 1_000_000_000
+"""A relay that has not checked for idle clients for this time was stopped, or got no CPU time."""
 
 
 class ClientTable:
@@ -33,14 +31,12 @@ class ClientTable:
         self,
         links: Sequence[OpenLink],
         warnings: Sequence[LinkWarnings],
-        directions: Sequence[BatchedDirection],
-        memory: PumpMemory,
-        epoll: Epoll,
+        directions: Sequence[RelayDirection],
+        memory: RelayMemory,
     ) -> None:
         self._links, self._warnings, self._directions = links, warnings, directions
-        self._memory, self._epoll = memory, epoll
-        self._insert_compiled, self._remove_compiled = compile_rule(insert), compile_rule(remove)
-        self._free_rows = list(reversed(range(len(memory.memory.clients))))
+        self._memory = memory
+        self._free_rows = list(reversed(range(len(memory.clients))))
         self._free_places: list[list[int]] = [[] for _ in links]
         self._places = [0] * len(links)
         self.ever = [0] * len(links)
@@ -61,13 +57,13 @@ class ClientTable:
         if not warnings.no_descriptor_left(error, present) and warnings.accepts_client(present):
             self._accept(link, name, path, error)
         else:
-            self._memory.memory.directions["full"][2 * link] = 1
+            self._directions[2 * link].row.full = 1
 
     def expire(self, now_ns: int) -> None:
         """Remove the clients that have been idle and have no datagram in flight."""
-        clients = self._memory.memory.clients
-        if now_ns - self._expired_ns > STALL_NS:
-            # The engine was stopped: datagrams that arrived meanwhile have not been read yet.
+        clients = self._memory.clients
+        if now_ns - self._expired_ns > _STALL_NS:
+            # The relay was stopped: datagrams that arrived meanwhile have not been read yet.
             clients["last_ns"] = now_ns
         self._expired_ns = now_ns
         since_ns = now_ns - self._idle_ns[clients["link"]]
@@ -79,8 +75,8 @@ class ClientTable:
 
     def reconnect(self) -> None:
         """Open the return paths again that could not be opened before."""
-        sockets, first = self._memory.memory.sockets, self._memory.first_path
-        clients = self._memory.memory.clients
+        sockets, first = self._memory.sockets, self._memory.first_path
+        clients = self._memory.clients
         for row in np.flatnonzero(sockets["error"][first:]).tolist():
             path, sockets["error"][first + row] = return_path(
                 self._links[clients["link"][row]].server
@@ -105,12 +101,12 @@ class ClientTable:
 
     def rows_of(self, link: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
         """Return the rows of a link's clients."""
-        clients = self._memory.memory.clients
+        clients = self._memory.clients
         return np.flatnonzero((clients["number"] >= 0) & (clients["link"] == link))
 
     def address(self, row: int) -> Address:
         """Return a client's address."""
-        return unpacked_address(self._memory.memory.clients["name"][row].tobytes())
+        return unpacked_address(self._memory.clients["name"][row].tobytes())
 
     def stamp_arrivals(self, link: int) -> None:
         """Enable kernel timestamps for the answers to a link's clients."""
@@ -139,37 +135,35 @@ class ClientTable:
         self.present[link] += 1
         for direction in self._directions[2 * link : 2 * link + 2]:
             direction.start_flow(place, number)
-        memory = self._memory.memory
+        memory = self._memory
         _, name_bytes = packed_name(self._links[link].name)
         local, _ = packed_name(self._links[link].local)
         client = memory.clients[row]
-        client["last_ns"] = self._memory.pump["now_ns"]
+        client["last_ns"] = memory.core.now_ns
         client["number"], client["link"], client["place"] = number, link, place
         client["in_flight"] = 0
         client["name_bytes"] = name_bytes
-        memory.clients["name"][row] = np.frombuffer(name, np.uint8)
-        memory.clients["local"][row] = np.frombuffer(local, np.uint8)
-        self._insert(row)
+        client["name"], client["local"] = name_array(name), name_array(local)
+        core.noack_client_insert(memory.core, row)
         memory.sockets["error"][self._memory.first_path + row] = error
         memory.sockets["fd"][self._memory.first_path + row] = -1
         if path is not None:
             self._set_path(row, path)
 
     def _set_path(self, row: int, path: Endpoint) -> None:
-        memory, place = self._memory.memory, self._memory.first_path + row
+        memory, place = self._memory, self._memory.first_path + row
         if self._directions[2 * int(memory.clients["link"][row]) + 1].tracks:
             stamp_arrivals(path)
         self._paths[row] = path
         self._drops[row] = 0
-        memory.sockets["fd"][place] = path.fileno()
         local, _ = packed_name(path.getsockname())
-        memory.clients["local"][row] = np.frombuffer(local, np.uint8)
-        self._epoll.add(path.fileno(), place)
+        memory.clients["local"][row] = name_array(local)
+        memory.watch(path.fileno(), place)
 
     def _forget(self, row: int) -> None:
-        memory = self._memory.memory
+        memory = self._memory
         link, place = int(memory.clients["link"][row]), int(memory.clients["place"][row])
-        self._remove_compiled(memory.table, memory.clients, row)
+        core.noack_client_remove(memory.core, row)
         if row in self._paths:
             self._query_drops(row)
             del self._drops[row]
@@ -180,25 +174,16 @@ class ClientTable:
         self._free_rows.append(row)
         self._free_places[link].append(place)
         self.present[link] -= 1
-        memory.directions["full"][2 * link] = 0
+        self._directions[2 * link].row.full = 0
         self._warnings[link].client_removed()
 
     def _grow(self) -> None:
-        count = len(self._memory.memory.clients)
+        count = len(self._memory.clients)
         self._memory.add_clients()
-        memory = self._memory.memory
-        for row in np.flatnonzero(memory.clients["number"] >= 0).tolist():
-            self._insert(row)
         self._free_rows.extend(reversed(range(count, 2 * count)))
-
-    def _insert(self, row: int) -> None:
-        memory = self._memory.memory
-        # A writable copy has the array type for which the function was compiled.
-        name = np.frombuffer(memory.clients["name"][row].tobytes(), np.int64).copy()
-        self._insert_compiled(memory.table, memory.clients, row, name)
 
     def _query_drops(self, row: int) -> None:
         drops = drops_of(self._paths[row])
         if drops is not None:
-            self.drops[int(self._memory.memory.clients["link"][row])] += drops - self._drops[row]
+            self.drops[int(self._memory.clients["link"][row])] += drops - self._drops[row]
             self._drops[row] = drops

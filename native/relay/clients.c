@@ -1,0 +1,105 @@
+/* Clients by address: a hash table with open addressing and linear probing. */
+#include "relay.h"
+
+#include <string.h>
+
+enum { IPV4 = AF_INET, FEW = 512 }; /* the data of so few clients fits into the caches */
+
+/* A client's key in four words: family, port, host, scope and link. */
+static void key_of(const uint8_t name[NOACK_NAME_BYTES], int64_t link, int64_t key[4]) {
+    uint64_t words[4];
+    memcpy(words, name, sizeof words);
+    memset(key, 0, 4 * sizeof *key);
+    if ((words[0] & 0xFFFF) == IPV4) {
+        key[0] = (int64_t)words[0];
+        key[3] = link << 32;
+    } else {
+        key[0] = (int64_t)(words[0] & 0xFFFFFFFF); /* without the flow label */
+        key[1] = (int64_t)words[1];
+        key[2] = (int64_t)words[2];
+        key[3] = (int64_t)(words[3] & 0xFFFFFFFF) | link << 32;
+    }
+}
+
+/* The first place in the table for a key: its hash. */
+static int64_t home_of(const noack_relay *relay, const int64_t key[4]) {
+    uint64_t mixed = 0;
+    for (int i = 0; i < 4; i++) {
+        mixed = (mixed ^ (uint64_t)key[i]) * UINT64_C(0x9E3779B97F4A7C15); /* 2^64/phi */
+        mixed ^= mixed >> 29;
+    }
+    return (int64_t)(mixed & (uint64_t)(relay->table_places - 1));
+}
+
+int64_t noack_client_find(
+    const noack_relay *relay, const uint8_t name[NOACK_NAME_BYTES], int64_t link) {
+    int64_t key[4], mask = relay->table_places - 1;
+    key_of(name, link, key);
+    for (int64_t place = home_of(relay, key);; place = (place + 1) & mask) {
+        int64_t row = relay->table[place];
+        if (row < 0 || memcmp(relay->clients[row].key, key, sizeof key) == 0)
+            return row;
+    }
+}
+
+/* The table must have room. */
+void noack_client_insert(noack_relay *relay, int64_t row) {
+    noack_client *client = &relay->clients[row];
+    int64_t mask = relay->table_places - 1;
+    key_of(client->name, client->link, client->key);
+    int64_t place = home_of(relay, client->key);
+    while (relay->table[place] >= 0)
+        place = (place + 1) & mask;
+    relay->table[place] = (int32_t)row;
+}
+
+/* Remove a client from the table, and close the gap. */
+void noack_client_remove(noack_relay *relay, int64_t row) {
+    int32_t *table = relay->table;
+    int64_t mask = relay->table_places - 1, gap = home_of(relay, relay->clients[row].key);
+    while (table[gap] != row)
+        gap = (gap + 1) & mask;
+    for (int64_t place = (gap + 1) & mask; table[place] >= 0; place = (place + 1) & mask) {
+        int64_t home = home_of(relay, relay->clients[table[place]].key);
+        /* An entry may move into the gap unless its home is cyclically after the gap. */
+        if (((place - home) & mask) >= ((place - gap) & mask)) {
+            table[gap] = table[place];
+            gap = place;
+        }
+    }
+    table[gap] = -1;
+}
+
+/* The row that the table has first for the sender of datagram k; -1: none. */
+static int64_t row_of(const noack_relay *relay, int64_t k) {
+    const relay_scratch *own = scratch_of(relay);
+    int64_t key[4];
+    key_of(own->in_names[k], own->batch_socket, key);
+    return relay->table[home_of(relay, key)];
+}
+
+/* Load the data of the clients of the received batch into the caches, if it is from a listening
+   socket. Thousands of clients do not fit into the caches. One datagram after the other would wait
+   for the memory at each of its clients' tables. Here the same loads of all datagrams wait
+   together. */
+void touch_clients(noack_relay *relay) {
+    relay_scratch *own = scratch_of(relay);
+    int64_t first_path = 2 * relay->links, loaded = 0;
+    if (relay->client_rows <= FEW || own->batch_socket >= first_path)
+        return;
+    const noack_link *link = relay->directions[2 * own->batch_socket].link;
+    for (int64_t k = own->batch_next; k < own->batch_end; k++)
+        loaded += row_of(relay, k);
+    for (int64_t k = own->batch_next; k < own->batch_end; k++) {
+        int64_t row = row_of(relay, k);
+        if (row >= 0)
+            loaded += relay->clients[row].key[0] + relay->clients[row].place
+                      + relay->sockets[first_path + row].fd;
+    }
+    for (int64_t k = own->batch_next; k < own->batch_end; k++) {
+        int64_t row = row_of(relay, k);
+        if (row >= 0 && relay->clients[row].link == own->batch_socket)
+            loaded += noack_link_touch(link, relay->clients[row].place);
+    }
+    own->loaded = loaded;
+}

@@ -1,0 +1,386 @@
+/* The relay's loop: wait, receive, decide, send, and release delayed datagrams. */
+#include "relay.h"
+
+#include <errno.h>
+#include <poll.h>
+#include <string.h>
+#include <sys/syscall.h>
+#include <time.h>
+#include <unistd.h>
+
+enum {
+    FEW_BUFFERS = 16,
+    HOUSEKEEPING_NS = 500000, /* housekeeping in Python nearly always takes less time */
+    MOST_PUT_OFF_NS = 10000000,
+    LOOP_OFFSET = 6, /* place of the loop's number in a datagram's header (docs/wire.md) */
+    LOOP_HEADER_BYTES = 32,
+    EPOLL_PWAIT2 = 441 /* on every architecture; libc has the function since glibc 2.35 */
+};
+
+enum { NO_CLIENT = -1, REFUSED = -2, NO_ROOM = -3 };
+
+int64_t noack_relay_scratch_bytes(void) { return (int64_t)sizeof(relay_scratch); }
+
+static void renew_header(noack_relay *relay, int64_t k) {
+    relay_scratch *own = scratch_of(relay);
+    struct msghdr *message = &own->in_headers[k].msg_hdr;
+    message->msg_namelen = NOACK_NAME_BYTES;
+    message->msg_controllen = (size_t)own->control_bytes;
+}
+
+void noack_relay_open(noack_relay *relay) {
+    relay_scratch *own = scratch_of(relay);
+    for (int k = 0; k < BUFFERS; k++) {
+        own->in_vectors[k] = (struct iovec){own->buffers[k], MOST_BYTES};
+        own->in_headers[k].msg_hdr = (struct msghdr){
+            .msg_name = own->in_names[k],
+            .msg_iov = &own->in_vectors[k],
+            .msg_iovlen = 1,
+            .msg_control = &own->in_controls[k],
+        };
+        renew_header(relay, k);
+    }
+    struct timespec at_once = {0, 0};
+    own->sleeps =
+        syscall(EPOLL_PWAIT2, (int)relay->epoll, own->ready, READY, &at_once, NULL, 0) < 0;
+}
+
+void noack_relay_read_stamps(noack_relay *relay) {
+    relay_scratch *own = scratch_of(relay);
+    own->stamps = 1;
+    own->control_bytes = CONTROL_BYTES;
+    for (int64_t k = own->batch_end; k < BUFFERS; k++)
+        renew_header(relay, k);
+}
+
+int64_t noack_relay_watch(noack_relay *relay, int64_t fd, int64_t number) {
+    struct epoll_event event = {.events = EPOLLIN, .data.u64 = (uint64_t)number};
+    return epoll_ctl((int)relay->epoll, EPOLL_CTL_ADD, (int)fd, &event) == 0 ? 0 : errno;
+}
+
+void noack_relay_add_datagram(
+    noack_relay *relay, int64_t socket, const uint8_t name[NOACK_NAME_BYTES], const uint8_t *data,
+    int64_t size_bytes) {
+    relay_scratch *own = scratch_of(relay);
+    size_bytes = min_of(size_bytes, MOST_BYTES);
+    memcpy(own->buffers[0], data, (size_t)size_bytes);
+    memcpy(own->in_names[0], name, NOACK_NAME_BYTES);
+    own->in_headers[0].msg_len = (unsigned)size_bytes;
+    own->in_headers[0].msg_hdr.msg_controllen = 0; /* the arrival is unknown */
+    own->batch_socket = socket;
+    own->batch_next = 0;
+    own->batch_end = 1;
+    own->ready_count = own->ready_next = 0;
+}
+
+const uint8_t *noack_relay_sender(const noack_relay *relay) {
+    return scratch_of(relay)->in_names[scratch_of(relay)->batch_next];
+}
+
+int64_t noack_relay_receiver(const noack_relay *relay) { return scratch_of(relay)->batch_socket; }
+
+/* Queue the datagram in the first free row of leaving for sending; record its departure. */
+static void line_up(noack_relay *relay) {
+    relay_scratch *own = scratch_of(relay);
+    departure *leaving = &own->leaving[own->leaving_count++];
+    noack_direction *direction = &relay->directions[leaving->direction];
+    leaving->stale = (uint8_t)noack_link_leave(
+        direction->link, relay->clients[leaving->client].place, leaving->packet,
+        leaving->size_bytes, leaving->delayed, leaving->counts);
+    leaving->error = 0;
+    own->leaving_bytes += leaving->size_bytes;
+    int64_t link = leaving->direction >> 1;
+    if (direction->sends == NOACK_OWN_SOCKET)
+        leaving->socket = (int32_t)(2 * relay->links + leaving->client);
+    else if (direction->sends == NOACK_CLIENT_NAME)
+        leaving->socket = (int32_t)link;
+    else
+        leaving->socket = (int32_t)(relay->links + link);
+}
+
+/* Queue the datagrams that are due for sending; return CARRY_ON, or which buffer is full. */
+static int64_t release_due(noack_relay *relay, int64_t until_ns) {
+    relay_scratch *own = scratch_of(relay);
+    while (relay->heap_length > 0 && relay->heap[0].release_ns <= until_ns) {
+        noack_heap_entry entry = relay->heap[0];
+        const noack_slot *slot = &relay->slots[entry.slot];
+        if (own->leaving_count == LEAVING)
+            return NOACK_LEAVING_FULL;
+        if (!has_room(relay, slot->size_bytes))
+            return NOACK_EVENTS_FULL;
+        heap_pop(relay);
+        relay->now_ns = max_of(relay->now_ns, entry.release_ns);
+        relay->clients[slot->client].in_flight--;
+        departure *leaving = &own->leaving[own->leaving_count];
+        *leaving = (departure){
+            .packet = slot->packet,
+            .arrival_ns = slot->arrival_ns,
+            .release_ns = entry.release_ns,
+            .bit = slot->bit,
+            .size_bytes = slot->size_bytes,
+            .slot = (int32_t)entry.slot,
+            .direction = slot->direction,
+            .client = slot->client,
+            .delayed = 1,
+            .copy = slot->copy,
+            .fate = slot->fate,
+            .counts = slot->counts,
+        };
+        line_up(relay);
+        if (relay->records)
+            record_release(relay, leaving, until_ns);
+    }
+    return NOACK_CARRY_ON;
+}
+
+/* The row of the datagram's loop; count a datagram of no loop as refused. */
+static int64_t row_of_loop(noack_relay *relay, const uint8_t *data, int64_t size_bytes) {
+    if (size_bytes >= LOOP_HEADER_BYTES) {
+        int64_t loop = data[LOOP_OFFSET] | data[LOOP_OFFSET + 1] << 8;
+        if (loop < relay->loops)
+            return loop;
+    }
+    relay->no_loop++;
+    return REFUSED;
+}
+
+/* The row of the current datagram's client, or why there is none; count a refused datagram.
+
+   A datagram is refused if it and its copy might not fit into the store, if it comes from a client
+   beyond the maximum number, or if it is of no loop of the run. */
+static int64_t client_of(noack_relay *relay, int64_t number, int64_t size_bytes) {
+    relay_scratch *own = scratch_of(relay);
+    noack_direction *direction = &relay->directions[number];
+    const uint8_t *data = own->buffers[own->batch_next];
+    if (direction->keeps
+        && (relay->free_slots < 2 || relay->free_blocks < 2 * blocks_for(size_bytes))) {
+        if (!relay->no_memory)
+            return NO_ROOM;
+        direction->errors[ENOMEM]++;
+        return REFUSED;
+    }
+    int64_t row = own->batch_socket - 2 * relay->links;
+    if (!(number & 1)) {
+        row = noack_client_find(relay, own->in_names[own->batch_next], number >> 1);
+        if (row < 0 && !direction->full)
+            return NO_CLIENT;
+        if (row < 0) {
+            direction->refused++;
+            return REFUSED;
+        }
+    }
+    return relay->by_loop ? row_of_loop(relay, data, size_bytes) : row;
+}
+
+/* Read the arrival time of the current datagram.
+
+   The kernel's timestamps are of the wall clock. One from before the relay's start is ignored: the
+   wall clock was set since. */
+static void read_arrival(noack_relay *relay) {
+    relay_scratch *own = scratch_of(relay);
+    struct msghdr *message = &own->in_headers[own->batch_next].msg_hdr;
+    own->arrival_ns = relay->read_ns;
+    struct cmsghdr *control = CMSG_FIRSTHDR(message);
+    for (; control != NULL; control = CMSG_NXTHDR(message, control)) {
+        if (control->cmsg_level != SOL_SOCKET || control->cmsg_type != SCM_TIMESTAMPNS)
+            continue;
+        struct timespec stamp;
+        memcpy(&stamp, CMSG_DATA(control), sizeof stamp);
+        int64_t stamp_ns = (int64_t)stamp.tv_sec * NS_PER_S + stamp.tv_nsec;
+        int64_t waited_ns = simulated_ns_of(relay, own->real_ns - stamp_ns);
+        if (waited_ns <= relay->read_ns)
+            own->arrival_ns = relay->read_ns - waited_ns;
+    }
+}
+
+/* Queue a datagram or its copy for sending if it leaves now, else store it until it is due. */
+static void release(
+    noack_relay *relay, int64_t direction, int64_t client, const noack_decision *decision,
+    int copy) {
+    relay_scratch *own = scratch_of(relay);
+    const uint8_t *data = own->buffers[own->batch_next];
+    int64_t release_ns = copy ? decision->copy_ns : decision->release_ns;
+    int64_t bit = copy ? decision->copy_bit : decision->bit;
+    int counts = copy ? decision->bit >= 0 && bit < 0 : bit < 0;
+    int delayed = release_ns > relay->now_ns;
+    int64_t number = -1;
+    if (delayed || bit >= 0)
+        number = store_payload(relay, data, decision->size_bytes, bit);
+    if (delayed) {
+        noack_slot *slot = &relay->slots[number];
+        slot->packet = decision->packet;
+        slot->arrival_ns = relay->now_ns;
+        slot->direction = (int32_t)direction;
+        slot->client = (int32_t)client;
+        slot->copy = (uint8_t)copy;
+        slot->counts = (uint8_t)counts;
+        slot->fate = (uint8_t)decision->fate;
+        relay->put++;
+        /* At equal times, datagrams leave in order of direction, then of arrival. */
+        int64_t order = ((direction & 1) << 62) + relay->put;
+        heap_push(relay, (noack_heap_entry){release_ns, order, number});
+        relay->clients[client].in_flight++;
+        return;
+    }
+    own->leaving[own->leaving_count] = (departure){
+        .address = data,
+        .packet = decision->packet,
+        .arrival_ns = relay->now_ns,
+        .release_ns = release_ns,
+        .bit = bit,
+        .size_bytes = (int32_t)decision->size_bytes,
+        .slot = (int32_t)number,
+        .direction = (int32_t)direction,
+        .client = (int32_t)client,
+        .copy = (uint8_t)copy,
+        .fate = (uint8_t)decision->fate,
+        .counts = (uint8_t)counts,
+    };
+    line_up(relay);
+}
+
+/* Decide for the current datagram, of a client. */
+static void decide(noack_relay *relay, int64_t number, int64_t row, int64_t size_bytes) {
+    relay_scratch *own = scratch_of(relay);
+    noack_client *client = &relay->clients[row];
+    const uint8_t *data = own->buffers[own->batch_next];
+    noack_decision decision;
+    client->last_ns = relay->now_ns;
+    noack_link_decide(
+        relay->directions[number].link, client->place, size_bytes, relay->now_ns, &decision);
+    if (relay->taps)
+        report_arrival(relay, number, row, data, &decision);
+    if (relay->records)
+        record_packet(relay, number, row, data, &decision);
+    if (decision.release_ns != NOACK_NEVER_NS)
+        release(relay, number, row, &decision, 0);
+    if (decision.copy_ns != NOACK_NEVER_NS)
+        release(relay, number, row, &decision, 1);
+}
+
+/* Decide for the datagrams received from one socket; return CARRY_ON, or why this ended. */
+static int64_t decide_batch(noack_relay *relay) {
+    relay_scratch *own = scratch_of(relay);
+    int64_t link = own->batch_socket, reverse = link >= 2 * relay->links;
+    if (reverse)
+        link = relay->clients[own->batch_socket - 2 * relay->links].link;
+    for (; own->batch_next < own->batch_end; own->batch_next++) {
+        int64_t size_bytes = own->in_headers[own->batch_next].msg_len;
+        read_arrival(relay);
+        /* Decision times ascend, so that a datagram that is due between two arrivals leaves between
+           them. In a record, the time of the decision is the machine's input. */
+        int64_t now_ns = relay->read_ns;
+        if (!relay->records)
+            now_ns = min_of(own->arrival_ns, relay->read_ns);
+        now_ns = max_of(relay->now_ns, now_ns);
+        int64_t reason = release_due(relay, now_ns);
+        if (reason != NOACK_CARRY_ON)
+            return reason;
+        relay->now_ns = now_ns;
+        if (now_ns >= relay->change_ns)
+            return NOACK_CHANGE_DUE;
+        if (own->leaving_count + 2 > LEAVING)
+            return NOACK_LEAVING_FULL;
+        if (!has_room(relay, size_bytes))
+            return NOACK_EVENTS_FULL;
+        int64_t row = client_of(relay, 2 * link + reverse, size_bytes);
+        if (row == NO_CLIENT)
+            return NOACK_NEW_CLIENT;
+        if (row == NO_ROOM)
+            return NOACK_STORE_FULL;
+        if (row >= 0)
+            decide(relay, 2 * link + reverse, row, size_bytes);
+        renew_header(relay, own->batch_next);
+    }
+    return NOACK_CARRY_ON;
+}
+
+/* Whether to postpone housekeeping because it would make the next delayed datagram late. */
+static int is_soon_due(const noack_relay *relay, int64_t until_ns) {
+    return relay->heap_length > 0
+           && (double)(relay->heap[0].release_ns - relay->read_ns) < HOUSEKEEPING_NS * relay->speed
+           && (double)(relay->read_ns - until_ns) < MOST_PUT_OFF_NS * relay->speed;
+}
+
+/* Wait for a datagram or the next release time; return 0 if a signal interrupted it. */
+static int wait_for_datagrams(noack_relay *relay, int64_t until_ns) {
+    relay_scratch *own = scratch_of(relay);
+    int64_t wait_ns = wall_ns_of(relay, until_ns - relay->read_ns);
+    if (relay->heap_length > 0) {
+        int64_t due_ns = wall_ns_of(relay, relay->heap[0].release_ns - relay->read_ns);
+        wait_ns = max_of(min_of(wait_ns, due_ns - relay->spin_ns), 0);
+    }
+    struct timespec limit = {wait_ns / NS_PER_S, wait_ns % NS_PER_S};
+    long found;
+    if (!own->sleeps) {
+        found = syscall(EPOLL_PWAIT2, (int)relay->epoll, own->ready, READY, &limit, NULL, 0);
+    } else {
+        struct pollfd readable = {.fd = (int)relay->epoll, .events = POLLIN};
+        found = ppoll(&readable, 1, &limit, NULL);
+        if (found > 0)
+            found = epoll_wait((int)relay->epoll, own->ready, READY, 0);
+    }
+    own->ready_count = max_of(found, 0);
+    own->ready_next = 0;
+    if (own->ready_count == 0)
+        relay->read_ns = relay_time_ns(relay);
+    return found >= 0;
+}
+
+/* Receive datagrams from the next socket that is ready, as far as there are buffers. */
+static void receive(noack_relay *relay) {
+    relay_scratch *own = scratch_of(relay);
+    const struct epoll_event *event = &own->ready[own->ready_next++];
+    int64_t socket = (int64_t)event->data.u64, begin = own->batch_end;
+    if (event->events & EPOLLERR)
+        take_errors(relay, socket);
+    int taken = recvmmsg(
+        relay->sockets[socket].fd, &own->in_headers[begin], (unsigned)(BUFFERS - begin),
+        MSG_DONTWAIT, NULL);
+    relay->read_ns = relay_time_ns(relay);
+    if (own->stamps)
+        own->real_ns = clock_ns(CLOCK_REALTIME);
+    if (taken > 0) {
+        own->batch_socket = socket;
+        own->batch_next = begin;
+        own->batch_end = begin + taken;
+    }
+}
+
+int64_t noack_relay_run(noack_relay *relay, int64_t until_ns) {
+    relay_scratch *own = scratch_of(relay);
+    for (;;) {
+        int64_t reason = NOACK_CARRY_ON;
+        if (own->batch_next < own->batch_end)
+            reason = decide_batch(relay);
+        if (reason == NOACK_CARRY_ON)
+            reason = release_due(relay, relay->read_ns);
+        int all_taken = own->ready_next >= own->ready_count;
+        if (reason != NOACK_CARRY_ON || all_taken || BUFFERS - own->batch_end < FEW_BUFFERS) {
+            if (own->leaving_count > 0)
+                send_all(relay);
+            if (reason == NOACK_LEAVING_FULL)
+                continue;
+            if (reason != NOACK_CARRY_ON)
+                return reason;
+            own->batch_next = own->batch_end = 0;
+        }
+        if (all_taken) {
+            relay->read_ns = relay_time_ns(relay);
+            int64_t wait_until_ns = until_ns;
+            if (relay->read_ns >= until_ns) {
+                if (!is_soon_due(relay, until_ns)) {
+                    own->ready_count = own->ready_next = 0;
+                    return NOACK_HOUSEKEEPING;
+                }
+                wait_until_ns = relay->read_ns + (int64_t)(HOUSEKEEPING_NS * relay->speed);
+            }
+            if (!wait_for_datagrams(relay, wait_until_ns))
+                return NOACK_HOUSEKEEPING;
+        }
+        if (own->ready_next < own->ready_count) {
+            receive(relay);
+            touch_clients(relay);
+        }
+    }
+}

@@ -1,0 +1,101 @@
+/* What the files of the relay share. */
+#ifndef NOACK_RELAY_H
+#define NOACK_RELAY_H
+
+#define _GNU_SOURCE
+#include <sys/epoll.h>
+#include <sys/socket.h>
+
+#include "../core.h"
+
+enum {
+    BUFFERS = 64,
+    READY = 64,
+    LEAVING = 128,
+    ERRORS = 16,
+    VECTORS = 1024,      /* maximum number of vectors in one call */
+    MOST_BYTES = 65536,  /* no received datagram is longer */
+    BUFFER_STRIDE = MOST_BYTES + 256, /* the buffers' first bytes are in different cache sets */
+    CONTROL_BYTES = 64,
+    ERROR_CONTROL_BYTES = 128 /* timestamp, error, address of the reporter */
+};
+
+typedef struct { /* a datagram that is about to be sent */
+    const uint8_t *address;
+    int64_t packet, arrival_ns, release_ns, bit;
+    int32_t size_bytes;
+    int32_t slot; /* slot of the payload; -1: it is in a receive buffer */
+    int32_t socket, direction, client, next, error;
+    uint8_t delayed, copy, fate, stale;
+    uint8_t counts; /* 1: it is the first intact copy */
+} departure;
+
+typedef union {
+    struct cmsghdr head;
+    uint8_t bytes[CONTROL_BYTES];
+} control;
+
+typedef union {
+    struct cmsghdr head;
+    uint8_t bytes[ERROR_CONTROL_BYTES];
+} error_control;
+
+typedef struct {
+    struct mmsghdr in_headers[BUFFERS], error_headers[ERRORS], out_headers[LEAVING];
+    struct iovec in_vectors[BUFFERS], out_vectors[VECTORS];
+    uint8_t in_names[BUFFERS][NOACK_NAME_BYTES];
+    control in_controls[BUFFERS], out_controls[LEAVING];
+    error_control error_controls[ERRORS];
+    struct epoll_event ready[READY];
+    departure leaving[LEAVING];
+    int32_t out_first[LEAVING]; /* first datagram of each message */
+    int32_t order[LEAVING];     /* the sockets that have something to send */
+    int64_t ready_count, ready_next;
+    int64_t batch_socket, batch_next, batch_end; /* the receive buffers that are filled */
+    int64_t leaving_count, leaving_bytes;
+    int64_t arrival_ns; /* arrival of the datagram in the current receive buffer */
+    int64_t real_ns;    /* the real-time clock at the last receiving of datagrams */
+    int64_t stamp;
+    int64_t stamps;        /* 1: the kernel adds arrival timestamps */
+    int64_t control_bytes; /* buffer for received control messages; 0: none */
+    int64_t sleeps;        /* 1: there is no epoll_pwait2, so by ppoll and epoll_wait */
+    int64_t loaded;        /* a sum of what was loaded into the caches, so that it is loaded */
+    uint8_t buffers[BUFFERS][BUFFER_STRIDE];
+} relay_scratch;
+
+static inline relay_scratch *scratch_of(const noack_relay *relay) { return relay->scratch; }
+
+/* clock.c: simulated nanoseconds since the relay's start. */
+int64_t clock_ns(int clock);
+int64_t relay_time_ns(const noack_relay *relay);
+int64_t simulated_ns_of(const noack_relay *relay, int64_t wall_ns);
+int64_t wall_ns_of(const noack_relay *relay, int64_t simulated_ns);
+
+/* store.c: delayed datagrams. */
+int64_t blocks_for(int64_t size_bytes);
+uint8_t *block_address(const noack_relay *relay, int64_t block);
+int64_t store_payload(noack_relay *relay, const uint8_t *data, int64_t size_bytes, int64_t bit);
+void copy_payload(const noack_relay *relay, int64_t slot, uint8_t *into);
+void free_payload(noack_relay *relay, int64_t slot);
+void heap_push(noack_relay *relay, noack_heap_entry entry);
+void heap_pop(noack_relay *relay);
+
+/* clients.c */
+void touch_clients(noack_relay *relay);
+
+/* events.c */
+int has_room(const noack_relay *relay, int64_t size_bytes);
+void report_arrival(
+    noack_relay *relay, int64_t direction, int64_t client, const uint8_t *data,
+    const noack_decision *decision);
+void report_departure(noack_relay *relay, const departure *leaving, int64_t now_ns);
+void record_packet(
+    noack_relay *relay, int64_t direction, int64_t client, const uint8_t *data,
+    const noack_decision *decision);
+void record_release(noack_relay *relay, const departure *leaving, int64_t now_ns);
+
+/* send.c */
+void send_all(noack_relay *relay);
+int64_t take_errors(noack_relay *relay, int64_t socket);
+
+#endif

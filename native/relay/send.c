@@ -1,0 +1,297 @@
+/* Sends the queued datagrams: one call per socket, each flow in its order. */
+#include "relay.h"
+
+#include <errno.h>
+#include <linux/errqueue.h>
+#include <netinet/in.h>
+#include <netinet/udp.h>
+#include <poll.h>
+#include <string.h>
+#include <sys/syscall.h>
+#include <time.h>
+#include <unistd.h>
+
+enum {
+    MOST_SEGMENTS = 64,
+    MOST_SEGMENTED_BYTES = 65507,
+    TRIES = 3,
+    /* Maximum number of tries. An ICMP error of an earlier datagram makes one send fail. A send
+       that fails without an ICMP error in the error queue, or this often, is expected to fail
+       again. */
+    MOST_TRIES = 64,
+    /* Maximum time to wait for a full socket. There is no wait for a full queue of the device
+       (ENOBUFS), since it would delay other links. */
+    PATIENCE_NS = 50000000
+};
+
+static int is_icmp(const struct cmsghdr *control, struct sock_extended_err *error) {
+    int is_error = (control->cmsg_level == IPPROTO_IP && control->cmsg_type == IP_RECVERR)
+                   || (control->cmsg_level == IPPROTO_IPV6 && control->cmsg_type == IPV6_RECVERR);
+    if (!is_error || control->cmsg_len < CMSG_LEN(sizeof *error))
+        return 0;
+    memcpy(error, CMSG_DATA(control), sizeof *error);
+    /* Errors of other origins are local; they make the call itself fail. */
+    return error->ee_origin == SO_EE_ORIGIN_ICMP || error->ee_origin == SO_EE_ORIGIN_ICMP6;
+}
+
+/* The errno of a message of the error queue if it comes from ICMP, else 0. */
+static int64_t icmp_error(struct msghdr *message) {
+    struct sock_extended_err error;
+    struct cmsghdr *control = CMSG_FIRSTHDR(message);
+    for (; control != NULL; control = CMSG_NXTHDR(message, control))
+        if (is_icmp(control, &error))
+            return error.ee_errno;
+    return 0;
+}
+
+/* Empty a socket's error queue; return the number of ICMP errors. Port-unreachable errors of the
+   destination are counted.
+
+   With IP_RECVERR, a send to a full device queue fails (ENOBUFS). However, each ICMP error also
+   makes the socket's next call fail once. Therefore the error queue is emptied after a failed call,
+   to find out whether an ICMP error caused the failure. */
+int64_t take_errors(noack_relay *relay, int64_t socket) {
+    relay_scratch *own = scratch_of(relay);
+    int64_t found = 0;
+    int taken = ERRORS, fd = relay->sockets[socket].fd;
+    while (taken == ERRORS) {
+        for (int k = 0; k < ERRORS; k++) {
+            struct msghdr *message = &own->error_headers[k].msg_hdr;
+            *message = (struct msghdr){
+                .msg_control = &own->error_controls[k], .msg_controllen = ERROR_CONTROL_BYTES};
+        }
+        taken = recvmmsg(fd, own->error_headers, ERRORS, MSG_DONTWAIT | MSG_ERRQUEUE, NULL);
+        for (int k = 0; k < taken; k++) {
+            int64_t error = icmp_error(&own->error_headers[k].msg_hdr), link = -1;
+            found += error != 0;
+            if (socket >= 2 * relay->links)
+                link = relay->clients[socket - 2 * relay->links].link;
+            else if (socket >= relay->links)
+                link = socket - relay->links;
+            if (error == ECONNREFUSED && link >= 0)
+                relay->directions[2 * link].port_unreachable++;
+        }
+    }
+    return found;
+}
+
+static int64_t vectors_of(const departure *leaving) {
+    return leaving->slot < 0 ? 1 : blocks_for(leaving->size_bytes);
+}
+
+/* Write the vectors of a datagram's payload; return the next free one. */
+static int64_t add_vectors(const noack_relay *relay, int64_t count, const departure *leaving) {
+    struct iovec *vectors = scratch_of(relay)->out_vectors;
+    if (leaving->slot < 0) {
+        vectors[count] = (struct iovec){(void *)leaving->address, (size_t)leaving->size_bytes};
+        return count + 1;
+    }
+    int64_t block = relay->slots[leaving->slot].block, left_bytes = leaving->size_bytes;
+    for (int64_t k = blocks_for(left_bytes); k > 0; k--) {
+        int64_t length = min_of(left_bytes, NOACK_BLOCK_BYTES);
+        vectors[count++] = (struct iovec){block_address(relay, block), (size_t)length};
+        left_bytes -= length;
+        block = relay->block_next[block];
+    }
+    return count;
+}
+
+/* Whether a datagram may follow others of size_bytes in one message that the kernel segments. */
+static int may_join(
+    const noack_relay *relay, const departure *first, const departure *other, int64_t all_bytes) {
+    int to_client = relay->directions[first->direction].sends == NOACK_CLIENT_NAME;
+    return 0 < other->size_bytes && other->size_bytes <= first->size_bytes
+           && all_bytes + other->size_bytes <= MOST_SEGMENTED_BYTES
+           && other->direction == first->direction
+           && (other->client == first->client || !to_client);
+}
+
+static void write_segment_size(struct msghdr *message, control *room, int64_t size_bytes) {
+    uint16_t size = (uint16_t)size_bytes;
+    message->msg_control = room;
+    message->msg_controllen = CMSG_SPACE(sizeof size);
+    room->head.cmsg_level = IPPROTO_UDP;
+    room->head.cmsg_type = UDP_SEGMENT;
+    room->head.cmsg_len = CMSG_LEN(sizeof size);
+    memcpy(CMSG_DATA(&room->head), &size, sizeof size);
+}
+
+static void write_destination(
+    const noack_relay *relay, struct msghdr *message, const departure *leaving) {
+    noack_direction *direction = &relay->directions[leaving->direction];
+    if (direction->sends == NOACK_CLIENT_NAME) {
+        message->msg_name = relay->clients[leaving->client].name;
+        message->msg_namelen = (socklen_t)relay->clients[leaving->client].name_bytes;
+    } else if (direction->sends == NOACK_DESTINATION_NAME) {
+        message->msg_name = direction->name;
+        message->msg_namelen = (socklen_t)direction->name_bytes;
+    }
+}
+
+/* Fill messages from a datagram on; return their number, and the datagram after them. */
+static int fill(noack_relay *relay, int64_t number, int64_t *following) {
+    relay_scratch *own = scratch_of(relay);
+    int64_t vectors = 0;
+    int headers = 0;
+    while (number >= 0 && headers < LEAVING) {
+        const departure *first = &own->leaving[number];
+        if (vectors + vectors_of(first) > VECTORS)
+            break;
+        struct msghdr *message = &own->out_headers[headers].msg_hdr;
+        *message = (struct msghdr){.msg_iov = own->out_vectors + vectors};
+        own->out_first[headers] = (int32_t)number;
+        int64_t begin = vectors, all_bytes = first->size_bytes, segments = 1;
+        int64_t last_bytes = first->size_bytes;
+        vectors = add_vectors(relay, vectors, first);
+        number = first->next;
+        if (relay->segment && 0 < all_bytes && all_bytes < relay->segment_below) {
+            while (number >= 0 && segments < MOST_SEGMENTS && last_bytes == first->size_bytes) {
+                const departure *other = &own->leaving[number];
+                if (!may_join(relay, first, other, all_bytes)
+                    || vectors + vectors_of(other) > VECTORS)
+                    break;
+                last_bytes = other->size_bytes;
+                vectors = add_vectors(relay, vectors, other);
+                all_bytes += last_bytes;
+                segments++;
+                number = other->next;
+            }
+            if (segments > 1)
+                write_segment_size(message, &own->out_controls[headers], first->size_bytes);
+        }
+        message->msg_iovlen = (size_t)(vectors - begin);
+        write_destination(relay, message, first);
+        headers++;
+    }
+    *following = number;
+    return headers;
+}
+
+/* Wait at most 1 ms until a socket is writable; return the waiting time in ns. */
+static int64_t wait_for_room(int fd) {
+    int64_t begun_ns = clock_ns(CLOCK_MONOTONIC);
+    struct pollfd writable = {.fd = fd, .events = POLLOUT};
+    poll(&writable, 1, 1);
+    return max_of(clock_ns(CLOCK_MONOTONIC) - begun_ns, 1000);
+}
+
+/* Send messages; return the number of those that were sent or failed at once, or -1. */
+static int call_send(int fd, struct mmsghdr *headers, int count) {
+    struct msghdr *message = &headers->msg_hdr;
+    if (count == 1 && message->msg_iovlen == 1 && message->msg_controllen == 0) {
+        /* For a single datagram, sendto is cheaper; libc's own also handles thread cancellation. */
+        long sent = syscall(
+            SYS_sendto, fd, message->msg_iov->iov_base, message->msg_iov->iov_len, MSG_DONTWAIT,
+            message->msg_name, message->msg_namelen);
+        return sent < 0 ? -1 : 1;
+    }
+    return sendmmsg(fd, headers, (unsigned)count, MSG_DONTWAIT);
+}
+
+static void mark_failed(relay_scratch *own, int64_t number, int64_t end, int error) {
+    for (; number != end; number = own->leaving[number].next)
+        own->leaving[number].error = error;
+}
+
+/* Send a number of messages; return the number of messages that were sent or failed.
+
+   If it is smaller than headers, the kernel does not segment the next message: the headers of the
+   remaining datagrams must be filled again. following is the datagram after the last message; -1:
+   none. */
+static int transmit(noack_relay *relay, int64_t socket, int headers, int64_t following) {
+    relay_scratch *own = scratch_of(relay);
+    int fd = relay->sockets[socket].fd, done = 0, tries = 0;
+    int64_t waited_ns = 0;
+    while (done < headers) {
+        int sent = call_send(fd, &own->out_headers[done], headers - done);
+        if (sent > 0) {
+            done += sent;
+            tries = 0;
+            continue;
+        }
+        int error = errno;
+        if (error == EINTR)
+            continue;
+        if (error == EAGAIN && waited_ns < PATIENCE_NS) {
+            waited_ns += wait_for_room(fd);
+            continue;
+        }
+        int64_t number = own->out_first[done];
+        if (error != EAGAIN && error != ENOBUFS) {
+            tries++;
+            if (tries < (take_errors(relay, socket) > 0 ? MOST_TRIES : TRIES))
+                continue;
+            if (own->out_headers[done].msg_hdr.msg_controllen > 0) {
+                relay->segment_below =
+                    min_of(relay->segment_below, own->leaving[number].size_bytes);
+                return done;
+            }
+        }
+        done++;
+        tries = 0;
+        mark_failed(own, number, done < headers ? own->out_first[done] : following, error);
+    }
+    return done;
+}
+
+/* Count a datagram as sent or failed, and free its payload. */
+static void account(noack_relay *relay, const departure *leaving, int64_t now_ns) {
+    noack_direction *direction = &relay->directions[leaving->direction];
+    if (leaving->error == 0) {
+        direction->delays[noack_bucket_of(now_ns - leaving->arrival_ns)]++;
+        if (leaving->delayed)
+            direction->lateness[noack_bucket_of(now_ns - leaving->release_ns)]++;
+        if (relay->taps)
+            report_departure(relay, leaving, now_ns);
+    } else {
+        direction->errors[leaving->error & (NOACK_ERRNOS - 1)]++;
+    }
+    if (leaving->slot >= 0)
+        free_payload(relay, leaving->slot);
+}
+
+/* Link the datagrams of each socket in their order; return the number of sockets. */
+static int64_t sort_by_socket(noack_relay *relay) {
+    relay_scratch *own = scratch_of(relay);
+    int64_t sockets = 0;
+    own->stamp++;
+    for (int32_t number = 0; number < own->leaving_count; number++) {
+        departure *leaving = &own->leaving[number];
+        noack_socket *socket = &relay->sockets[leaving->socket];
+        if (socket->stamp != own->stamp) {
+            socket->stamp = own->stamp;
+            socket->head = number;
+            own->order[sockets++] = leaving->socket;
+        } else {
+            own->leaving[socket->tail].next = number;
+        }
+        socket->tail = number;
+        leaving->next = -1;
+    }
+    return sockets;
+}
+
+void send_all(noack_relay *relay) {
+    relay_scratch *own = scratch_of(relay);
+    int64_t sockets = sort_by_socket(relay);
+    for (int64_t place = 0; place < sockets; place++) {
+        const noack_socket *socket = &relay->sockets[own->order[place]];
+        int64_t number = socket->head, following;
+        while (number >= 0) {
+            int headers = fill(relay, number, &following), done = headers;
+            if (socket->fd >= 0)
+                done = transmit(relay, own->order[place], headers, following);
+            else
+                mark_failed(own, number, following, socket->error);
+            if (done < headers)
+                following = own->out_first[done];
+            int64_t now_ns = relay_time_ns(relay);
+            while (number != following) {
+                account(relay, &own->leaving[number], now_ns);
+                number = own->leaving[number].next;
+            }
+        }
+    }
+    own->leaving_count = 0;
+    own->leaving_bytes = 0;
+}

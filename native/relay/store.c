@@ -1,0 +1,107 @@
+/* Stores delayed datagrams: payloads in chained blocks, and a heap ordered by release time. */
+#include "relay.h"
+
+#include <string.h>
+
+int64_t blocks_for(int64_t size_bytes) {
+    return max_of((size_bytes + NOACK_BLOCK_BYTES - 1) / NOACK_BLOCK_BYTES, 1);
+}
+
+uint8_t *block_address(const noack_relay *relay, int64_t block) {
+    return relay->chunks[block / NOACK_CHUNK_BLOCKS]
+           + block % NOACK_CHUNK_BLOCKS * NOACK_BLOCK_BYTES;
+}
+
+/* Copy a payload into a slot, flip a bit of it (-1: none), and return the slot's number. There must
+   be room. */
+int64_t store_payload(noack_relay *relay, const uint8_t *data, int64_t size_bytes, int64_t bit) {
+    int64_t number = relay->free_slot, count = blocks_for(size_bytes);
+    noack_slot *slot = &relay->slots[number];
+    relay->free_slot = slot->next;
+    relay->free_slots--;
+    slot->size_bytes = (int32_t)size_bytes;
+    slot->bit = bit;
+    slot->block = (int32_t)relay->free_block;
+    int64_t block = slot->block, last = block;
+    for (int64_t begin = 0; begin == 0 || begin < size_bytes; begin += NOACK_BLOCK_BYTES) {
+        int64_t length = min_of(size_bytes - begin, NOACK_BLOCK_BYTES), byte = (bit >> 3) - begin;
+        uint8_t *place = block_address(relay, block);
+        memcpy(place, data + begin, (size_t)length);
+        if (bit >= 0 && 0 <= byte && byte < length)
+            place[byte] ^= (uint8_t)(1 << (bit & 7));
+        last = block;
+        block = relay->block_next[block];
+    }
+    relay->free_block = block;
+    relay->block_next[last] = -1;
+    relay->free_blocks -= count;
+    return number;
+}
+
+void copy_payload(const noack_relay *relay, int64_t slot, uint8_t *into) {
+    int64_t block = relay->slots[slot].block, left_bytes = relay->slots[slot].size_bytes;
+    while (left_bytes > 0) {
+        int64_t length = min_of(left_bytes, NOACK_BLOCK_BYTES);
+        memcpy(into, block_address(relay, block), (size_t)length);
+        into += length;
+        left_bytes -= length;
+        block = relay->block_next[block];
+    }
+}
+
+/* Free a slot and its blocks. */
+void free_payload(noack_relay *relay, int64_t number) {
+    noack_slot *slot = &relay->slots[number];
+    int64_t count = blocks_for(slot->size_bytes), last = slot->block;
+    for (int64_t k = 1; k < count; k++)
+        last = relay->block_next[last];
+    relay->block_next[last] = (int32_t)relay->free_block;
+    relay->free_block = slot->block;
+    relay->free_blocks += count;
+    slot->next = (int32_t)relay->free_slot;
+    relay->free_slot = number;
+    relay->free_slots++;
+}
+
+static int is_before(const noack_heap_entry *a, const noack_heap_entry *b) {
+    return a->release_ns < b->release_ns
+           || (a->release_ns == b->release_ns && a->number < b->number);
+}
+
+void heap_push(noack_relay *relay, noack_heap_entry entry) {
+    noack_heap_entry *heap = relay->heap;
+    int64_t place = relay->heap_length++;
+    while (place > 0 && is_before(&entry, &heap[(place - 1) / 2])) {
+        heap[place] = heap[(place - 1) / 2];
+        place = (place - 1) / 2;
+    }
+    heap[place] = entry;
+}
+
+/* Remove the first entry. */
+void heap_pop(noack_relay *relay) {
+    noack_heap_entry *heap = relay->heap, last = heap[--relay->heap_length];
+    int64_t count = relay->heap_length, place = 0;
+    for (;;) {
+        int64_t below = 2 * place + 1;
+        if (below >= count)
+            break;
+        if (below + 1 < count && is_before(&heap[below + 1], &heap[below]))
+            below++;
+        if (!is_before(&heap[below], &last))
+            break;
+        heap[place] = heap[below];
+        place = below;
+    }
+    heap[place] = last;
+}
+
+void noack_relay_latest(const noack_relay *relay, int64_t direction, int64_t *latest_ns) {
+    for (int64_t i = 0; i < relay->heap_length; i++) {
+        const noack_slot *slot = &relay->slots[relay->heap[i].slot];
+        if (slot->direction == direction) {
+            int64_t place = relay->clients[slot->client].place;
+            latest_ns[place] = max_of(latest_ns[place], relay->heap[i].release_ns);
+        }
+    }
+}
