@@ -8,7 +8,6 @@ import pytest
 
 from cosim.record.packet_outcomes import packet_outcomes
 from cosim.record.run_record import RunRecord, load_record
-from netem.engine.native_pump import compiled_pump
 from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_ACTUATION, PLANT_STEP
 from noack.protocol.wire_format import Flow
@@ -27,7 +26,6 @@ RESTARTED = ("controller", "netem")
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
-    compiled_pump()  # else the run would use the plain engine
     sets = ("horizon_s=4", ACTUATION, "controller.predictions=5", "trigger.beta=0.02")
     options = [word for one in sets for word in ("--set", one)]
     return run_scenario(tmp_path_factory.mktemp("runs"), *AT_RATE, *options)
@@ -45,7 +43,7 @@ def test_the_run_is_complete_and_replayed_bit_for_bit(finished: Finished) -> Non
     assert summary["replay"]["complete"]
     assert summary["unintended_losses"] == summary["missing_samples"] == 0
     reports = json.loads((finished.run_dir / "reports.json").read_text())
-    assert reports["netem"]["channel"]["engine"] == "batched"
+    assert reports["netem"]["channel"]["engine"] == "core"
     roles = {reports[role]["channel"]["local"]: role for role in reports}
     sources = reports["plant"]["channel"]["received_from"]
     assert {roles[source] for source in sources} == {"netem"}

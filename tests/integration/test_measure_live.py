@@ -59,7 +59,7 @@ def emulator(start: Start, to: str, *words: str) -> str:
     host = to.rpartition(":")[0]
     listen = f"{host}:{free_port(host)}"
     process = start(
-        "netem", "--listen", listen, "--to", to, "--engine", "plain", *words
+        "netem", "--listen", listen, "--to", to, *words
     )  # fmt: skip
     line_with(process.stdout, "ready")
     return listen

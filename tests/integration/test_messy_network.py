@@ -8,7 +8,6 @@ import pytest
 from cosim.analysis.replay import replay
 from cosim.record.run_record import RunRecord, load_record
 from netem.duplex_link import network_of
-from netem.engine.native_pump import compiled_pump
 from netem.link_machine import Datagram
 from noack.protocol.machine_interface import Record
 from noack.protocol.record_tables import (
@@ -34,7 +33,6 @@ IMPAIRMENTS = [
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
-    compiled_pump()  # else the run would use the plain engine
     tables = "{" + "}, {".join(
         ", ".join(f"{key} = {json.dumps(value)}" for key, value in one.items())
         for one in IMPAIRMENTS
@@ -108,7 +106,7 @@ def test_each_process_receives_from_its_senders_only(finished: Finished) -> None
         role: {roles[source] for source in report["channel"]["received_from"]}
         for role, report in reports.items()
     }
-    assert reports["netem"]["channel"]["engine"] == "batched"
+    assert reports["netem"]["channel"]["engine"] == "core"
     assert senders == {
         "plant": {"controller"},
         "sensor": {"plant", "netem"},

@@ -100,10 +100,10 @@ def test_the_emulator_relays_any_udp_program(words: str) -> None:
     assert set(forward["unintended"].values()) == {0}
 
 
-def test_the_plain_engine_impairs_each_direction_of_ipv6_by_its_own_words() -> None:
+def test_the_relay_impairs_each_direction_of_ipv6_by_its_own_words() -> None:
     with server(socket.AF_INET6) as (there, to), client(socket.AF_INET6) as here:
         arguments = ["--listen", "[::1]:0", "--to", to, "--reverse", "loss periodic 1/2"]
-        with emulator(*arguments, "--engine", "plain") as (process, [port]):
+        with emulator(*arguments) as (process, [port]):
             here.sendto(b"ask", ("::1", port))
             question, asker = there.recvfrom(100)
             for number in range(6):

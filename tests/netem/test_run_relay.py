@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from netem.duplex_link import network_of
-from netem.engine.compiled_network import CompiledNetwork
-from netem.engine.native_pump import compiled_pump
-from netem.run_relay import CompiledShell, RelayShell
+from netem.engine.run_network import RunNetwork
+from netem.run_relay import CoreShell, RelayShell
 from noack.config.resolution import resolve, tables_of
 from noack.config.scenario_file import load
 from noack.core.clock import RunClock
@@ -36,7 +35,7 @@ SCENARIO = resolve(
 EARLY, LATER, FOREIGN = 3, 700, 5
 
 
-@pytest.mark.parametrize("engine", ["plain", "batched"])
+@pytest.mark.parametrize("engine", ["python", "core"])
 def test_early_and_later_datagrams_are_relayed_and_foreign_ones_counted(engine: str) -> None:
     published: list[tuple[str, bytes]] = []
     tables = {table: dtype for table, dtype in tables_of(SCENARIO).items()
@@ -83,7 +82,7 @@ def test_early_and_later_datagrams_are_relayed_and_foreign_ones_counted(engine: 
         assert counts[table] == (EARLY + LATER) * tables[table].itemsize
 
 
-@pytest.mark.parametrize("engine", ["plain", "batched"])
+@pytest.mark.parametrize("engine", ["python", "core"])
 def test_a_datagram_of_no_loop_of_the_run_is_counted_and_not_relayed(engine: str) -> None:
     def datagram(loop: int, sequence: int) -> bytes:
         message = Message(Flow.UPDATE, sequence, 0, np.zeros(2), loop)
@@ -131,9 +130,9 @@ def opened(
     loops: int | None = None,
 ) -> tuple[Any, Any]:
     ways = [(name_of(sensor), name_of(controller))]
-    if engine == "plain":
+    if engine == "python":
         return network_of(SCENARIO), RelayShell(endpoint, ways, loops=loops)
-    network = CompiledNetwork(SCENARIO, BEGINNING, compiled_pump(), loops)
-    return network, CompiledShell(
+    network = RunNetwork(SCENARIO, BEGINNING, loops)
+    return network, CoreShell(
         endpoint, ways, network=network, clock=clock, spin_us=0.0, loops=loops
     )

@@ -34,7 +34,7 @@ def printed(
         "name": "uplink", "listen": "127.0.0.1:1", "to": "[fd00::1]:2", "clients_ever": 1,
         "refused": 0, "discarded": 0, "port_unreachable": 0, "forward": forward, "reverse": reverse,
     }  # fmt: skip
-    totals: Statistics = {"time": "", "elapsed_s": 1.0, "engine": "plain", "links": [link | more]}
+    totals: Statistics = {"time": "", "elapsed_s": 1.0, "links": [link | more]}
     file = io.StringIO()
     print_totals(totals, Console(file=file, width=80, color_system=None), predicted=predicted)
     return [" ".join(line.split()) for line in file.getvalue().splitlines()]

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from netem.control.command_queue import CommandQueue
 from netem.engine import histogram
-from netem.engine.plain_engine import PlainRelay
-from netem.engine.relay_base import Relay
+from netem.engine.relay import Relay
 from netem.engine.relay_interface import (
     DIRECTIONS,
     Address,
@@ -22,6 +21,7 @@ from netem.engine.relay_interface import (
     LinkSpec,
 )
 from netem.words.words_to_settings import settings_of
+from noack.core.core_library import core
 from noack.impairments.link_records import Counters
 from noack.impairments.link_settings import LinkSettings
 
@@ -35,11 +35,11 @@ def spec_of(name: str) -> LinkSpec:
 
 
 def times(*t_ns: int) -> NDArray[np.int64]:
-    buckets = [histogram.bucket_of(one_ns) for one_ns in t_ns]
+    buckets = [core.noack_bucket_of(one_ns) for one_ns in t_ns]
     return np.bincount(np.array(buckets, np.int64), minlength=histogram.BUCKETS)
 
 
-class FakeRelay(PlainRelay):
+class FakeRelay(Relay):
     """A relay without sockets; a test sets its links and counters."""
 
     def __init__(self, *names: str) -> None:

@@ -3,12 +3,10 @@ import threading
 import pytest
 
 from netem.control.command_queue import CommandQueue
-from netem.engine.plain_direction import PlainDirection
-from netem.link_machine import Datagram
 from netem.words.words_to_settings import settings_of
 from noack.core.errors import CallerError, PeerError
 from noack.impairments.link_records import Counters
-from tests.netem.control.relays import FakeRelay, spec_of
+from tests.netem.control.relays import FakeRelay
 
 
 def test_the_relay_is_accessed_from_its_own_thread_only(
@@ -74,11 +72,3 @@ def test_a_command_to_a_stuck_relay_times_out(
         commands.snapshot()
     commands.run_pending()  # commands that have timed out do not run
     assert relay.threads == set()
-
-
-def test_a_report_of_the_plain_engine_does_not_change_afterwards() -> None:
-    """Rates are differences of two reports."""
-    direction = PlainDirection(spec_of("up"), "forward")
-    before = direction.report((), {}).counters
-    direction.link.handle(Datagram(0, b"x"), 0)
-    assert (before.received, direction.report((), {}).counters.received) == (0, 1)

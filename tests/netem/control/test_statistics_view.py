@@ -60,7 +60,7 @@ def test_a_link_is_shown_with_both_directions() -> None:
     lines = text_of(FakeRelay("up"))
     assert len(lines) <= 24
     assert all(len(line) <= 80 for line in lines)
-    assert lines[0].split() == ["lab", "0:03,", "plain"]
+    assert lines[0].split() == ["lab", "0:03"]
     assert "up  127.0.0.1:5000 → [::1]:6000  1 client" in lines[1]
     assert "loss 10% delay 10ms mansd 2" in lines[3]
     assert "no impairment" in lines[3]

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.engine.engine_choice import Engine, open_relay
-from netem.engine.relay_base import Relay
+from netem.engine.relay import Relay
 from netem.engine.relay_interface import Address, LinkReport, LinkSpec, Tap
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.peer_sockets import enlarge_buffer
@@ -83,10 +82,10 @@ class Running:
 
 @contextmanager
 def running(
-    specs: Sequence[LinkSpec], engine: Engine, *, segment: bool = False, taps: Sequence[Tap] = ()
+    specs: Sequence[LinkSpec], *, segment: bool = False, taps: Sequence[Tap] = ()
 ) -> Iterator[Running]:
     """Yield an open relay; it is closed at the end of the block."""
-    with closing(open_relay(specs, engine, segment, taps)) as relay:
+    with closing(Relay(specs, segment, taps)) as relay:
         yield Running(relay)
 
 

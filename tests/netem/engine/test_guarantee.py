@@ -4,11 +4,9 @@ import hashlib
 from collections import defaultdict
 from collections.abc import Sequence
 
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from netem.engine.engine_choice import Engine
 from noack.impairments.link_settings import LinkSettings
 from tests.netem import any_settings
 from tests.netem.engine.relays import drain, endpoints, link, name_of, running
@@ -39,7 +37,6 @@ def longest_loss_burst(received: Sequence[bytes], sent: int) -> int:
     return max(longest, sent - newest - 1)
 
 
-@pytest.mark.parametrize("engine", ["batched", "plain"])
 @settings(max_examples=20)
 @given(
     forward=any_settings.capped,
@@ -49,7 +46,6 @@ def longest_loss_burst(received: Sequence[bytes], sent: int) -> int:
     segment=st.booleans(),
 )
 def test_the_cap_holds_in_both_directions_for_every_client(
-    engine: Engine,
     forward: LinkSettings,
     reverse: LinkSettings,
     rounds: list[int],
@@ -60,7 +56,7 @@ def test_the_cap_holds_in_both_directions_for_every_client(
     reverse_cap = reverse.mansd or 0
     with endpoints(*["127.0.0.1"] * (CLIENTS + 1)) as (server, *clients):
         spec = link(name_of(server), forward, reverse)
-        with running([spec], engine, segment=segment) as one:
+        with running([spec], segment=segment) as one:
             sent = 0
             for count in rounds:
                 for number in range(sent, sent + count):

@@ -4,25 +4,26 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from netem.engine.histogram import BUCKETS, bucket_of, coarse, lower_ns, quantile_ns
+from netem.engine.histogram import BUCKETS, coarse, lower_ns, quantile_ns
+from noack.core.core_library import core
 
 TIMES = st.lists(st.integers(0, 2**43), min_size=1, max_size=200)
 
 
 def counts_of(times_ns: list[int]) -> NDArray[np.int64]:
-    return np.bincount([bucket_of(t_ns) for t_ns in times_ns], minlength=BUCKETS)
+    return np.bincount([core.noack_bucket_of(t_ns) for t_ns in times_ns], minlength=BUCKETS)
 
 
 @given(st.integers(0, 2**44 - 1))
 def test_a_bucket_holds_its_times_to_three_percent(t_ns: int) -> None:
-    bucket = bucket_of(t_ns)
+    bucket = core.noack_bucket_of(t_ns)
     assert lower_ns(bucket) <= t_ns < lower_ns(bucket + 1)
     assert lower_ns(bucket + 1) - lower_ns(bucket) <= max(1, lower_ns(bucket) / 32)
 
 
 def test_times_out_of_range_use_the_first_or_last_bucket() -> None:
-    assert bucket_of(-5) == 0
-    assert bucket_of(2**60) == BUCKETS - 1
+    assert core.noack_bucket_of(-5) == 0
+    assert core.noack_bucket_of(2**60) == BUCKETS - 1
 
 
 @given(TIMES)

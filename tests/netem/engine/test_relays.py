@@ -1,4 +1,4 @@
-"""The externally visible behaviour of both engines."""
+"""The externally visible behaviour of the relay."""
 
 import errno
 import io
@@ -16,8 +16,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from netem.engine import engine_choice, plain_direction, pump_memory, relay_base
-from netem.engine.engine_choice import Engine, open_relay
+from netem.engine import relay_memory
 from netem.engine.relay_interface import DirectionReport
 from netem.engine.relay_sockets import raise_file_limit
 from netem.words.words_to_settings import settings_of
@@ -36,7 +35,6 @@ from tests.netem.engine.relays import (
     running,
 )
 
-pytestmark = pytest.mark.parametrize("engine", ["batched", "plain"])
 IP_VERSIONS = pytest.mark.parametrize(("here", "there"), [(4, 4), (4, 6), (6, 4), (6, 6)])
 V4 = HOSTS[4]
 UDP_SEGMENT = 103
@@ -54,11 +52,9 @@ def send_numbers(client: socket.socket, to: Any, begin: int, end: int) -> None:
 
 
 @IP_VERSIONS
-def test_both_directions_work_over_both_versions_of_ip(
-    engine: Engine, here: int, there: int
-) -> None:
+def test_both_directions_work_over_both_versions_of_ip(here: int, there: int) -> None:
     with endpoints(HOSTS[there], HOSTS[here], HOSTS[here]) as (server, *clients):
-        with running([link(name_of(server), host=HOSTS[here])], engine) as one:
+        with running([link(name_of(server), host=HOSTS[here])]) as one:
             for client in clients:
                 client.sendto(b"question", one.address())
             for data, source in one.receive(server, 2):
@@ -73,14 +69,12 @@ def test_both_directions_work_over_both_versions_of_ip(
 
 
 @IP_VERSIONS
-def test_a_one_way_link_sends_from_one_port_and_discards_answers(
-    engine: Engine, here: int, there: int
-) -> None:
+def test_a_one_way_link_sends_from_one_port_and_discards_answers(here: int, there: int) -> None:
     """If the relay took an answer for a client's datagram, it would loop to the server forever."""
     tap = KeepAll()
     with endpoints(HOSTS[there], HOSTS[here], HOSTS[here]) as (server, *clients):
         spec = link(name_of(server), host=HOSTS[here], return_path=False)
-        with running([spec], engine, taps=[tap]) as one:
+        with running([spec], taps=[tap]) as one:
             sources = set()
             for client in clients:
                 client.sendto(b"x", one.address())
@@ -101,10 +95,10 @@ def test_a_one_way_link_sends_from_one_port_and_discards_answers(
     assert len(sources) == 1
 
 
-def test_answers_from_another_address_of_the_server_do_not_make_it_a_client(engine: Engine) -> None:
+def test_answers_from_another_address_of_the_server_do_not_make_it_a_client() -> None:
     with endpoints("0.0.0.0", V4) as (server, client):
         spec = link(("127.0.0.2", name_of(server)[1]), return_path=False)
-        with running([spec], engine) as one:
+        with running([spec]) as one:
             client.sendto(b"x", one.address())
             server.sendto(b"answer", one.receive(server)[0][1])
             one.settle(1)
@@ -112,11 +106,11 @@ def test_answers_from_another_address_of_the_server_do_not_make_it_a_client(engi
             assert one.report().clients_ever == 1
 
 
-def test_seven_hundred_clients_keep_their_flows_and_answers_apart(engine: Engine) -> None:
-    """For so many, the compiled engine loads the clients' data before the decisions."""
+def test_seven_hundred_clients_keep_their_flows_and_answers_apart() -> None:
+    """For so many, the relay loads the clients' data before the decisions."""
     with endpoints(V4) as (server,), endpoints(*[V4] * 700) as clients:
         ports = [name_of(client)[1] for client in clients]
-        with running([link(name_of(server), THIRD_LOST)], engine) as one:
+        with running([link(name_of(server), THIRD_LOST)]) as one:
             for number in range(3):
                 for client, port in zip(clients, ports, strict=True):
                     client.sendto(b"%d %d" % (port, number), one.address())
@@ -137,13 +131,13 @@ def test_seven_hundred_clients_keep_their_flows_and_answers_apart(engine: Engine
     assert (report.clients, counters.received, counters.dropped) == (700, 2100, 700)
 
 
-def test_the_same_port_of_two_addresses_is_two_flows_with_a_path_each(engine: Engine) -> None:
+def test_the_same_port_of_two_addresses_is_two_flows_with_a_path_each() -> None:
     with endpoints(V4, "127.0.0.2") as (server, first), ExitStack() as stack:
         second = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
         second.bind(("127.0.0.3", name_of(first)[1]))
         second.setblocking(False)
         clients = {name_of(client): client for client in (first, second)}
-        with running([link(name_of(server))], engine) as one:
+        with running([link(name_of(server))]) as one:
             for client in clients.values():
                 client.sendto(str(name_of(client)).encode(), one.address())
             questions = one.receive(server, 2)
@@ -156,10 +150,10 @@ def test_the_same_port_of_two_addresses_is_two_flows_with_a_path_each(engine: En
     assert len({path for _, path in questions}) == 2
 
 
-def test_only_answers_of_the_server_reach_the_client(engine: Engine) -> None:
+def test_only_answers_of_the_server_reach_the_client() -> None:
     with (
         endpoints(V4, V4, V4) as (server, client, stranger),
-        running([link(name_of(server))], engine) as one,
+        running([link(name_of(server))]) as one,
     ):
         client.sendto(b"question", one.address())
         ((_, path),) = one.receive(server)
@@ -170,12 +164,12 @@ def test_only_answers_of_the_server_reach_the_client(engine: Engine) -> None:
 
 
 def test_an_absent_server_is_reported_and_causes_no_later_loss(
-    engine: Engine, capfd: pytest.CaptureFixture[str]
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     """Each datagram to a closed port causes an ICMP error, which must not fail the next send."""
     with endpoints(V4, V4) as (reserved, client):
         address = name_of(reserved)
-        with running([link(address)], engine) as one:
+        with running([link(address)]) as one:
             reserved.close()
             send_numbers(client, one.address(), 0, 50)
             one.settle(50)
@@ -196,14 +190,14 @@ def test_an_absent_server_is_reported_and_causes_no_later_loss(
 
 
 @pytest.mark.parametrize("delay", ["", "delay 2ms"])
-def test_datagrams_of_any_size_and_their_copies_arrive(engine: Engine, delay: str) -> None:
+def test_datagrams_of_any_size_and_their_copies_arrive(delay: str) -> None:
     forward = settings_of(f"duplicate 100% {delay}")
     reverse = settings_of(f"duplicate 100% {delay} corrupt 100%")
     random = np.random.default_rng(0)
     payloads = [random.bytes(size) for size in (0, 1, 511, 512, 513, 1472, 65_507)]
     with (
         endpoints(V4, V4) as (server, client),
-        running([link(name_of(server), forward, reverse)], engine) as one,
+        running([link(name_of(server), forward, reverse)]) as one,
     ):
         for payload in payloads:
             client.sendto(payload, one.address())
@@ -216,11 +210,11 @@ def test_datagrams_of_any_size_and_their_copies_arrive(engine: Engine, delay: st
                 assert flipped.bit_count() == (1 if payload else 0)
 
 
-def test_a_change_keeps_flows_and_datagrams_in_flight(engine: Engine) -> None:
+def test_a_change_keeps_flows_and_datagrams_in_flight() -> None:
     late, lossy = settings_of("delay 500ms mansd 1"), settings_of("loss worst mansd 1")
     with (
         endpoints(V4, V4) as (server, client),
-        running([link(name_of(server), late)], engine) as one,
+        running([link(name_of(server), late)]) as one,
     ):
         send_numbers(client, one.address(), 0, 4)
         one.until(lambda: one.report().forward.counters.received == 4)
@@ -236,10 +230,10 @@ def test_a_change_keeps_flows_and_datagrams_in_flight(engine: Engine) -> None:
             one.relay.change("another", "reverse", late)
 
 
-def test_idle_clients_are_forgotten_and_come_back_as_new_flows(engine: Engine) -> None:
+def test_idle_clients_are_forgotten_and_come_back_as_new_flows() -> None:
     with (
         endpoints(V4, V4) as (server, client),
-        running([link(name_of(server), THIRD_LOST, idle_s=0.05)], engine) as one,
+        running([link(name_of(server), THIRD_LOST, idle_s=0.05)]) as one,
     ):
         for flow in range(2):
             send_numbers(client, one.address(), 0, 4)
@@ -251,21 +245,21 @@ def test_idle_clients_are_forgotten_and_come_back_as_new_flows(engine: Engine) -
             assert one.report().clients_ever == flow + 1
 
 
-def test_a_client_with_datagrams_in_flight_is_not_idle(engine: Engine) -> None:
+def test_a_client_with_datagrams_in_flight_is_not_idle() -> None:
     with (
         endpoints(V4, V4) as (server, client),
-        running([link(name_of(server), settings_of("delay 600ms"), idle_s=0.01)], engine) as one,
+        running([link(name_of(server), settings_of("delay 600ms"), idle_s=0.01)]) as one,
     ):
         client.sendto(b"late", one.address())
         assert one.receive(server)[0][0] == b"late"
         one.until(lambda: one.report().clients == 0)
 
 
-def test_a_client_with_unread_datagrams_is_not_idle(engine: Engine) -> None:
+def test_a_client_with_unread_datagrams_is_not_idle() -> None:
     """A stall longer than the idle time does not make clients with queued datagrams idle."""
     with (
         endpoints(V4, V4) as (server, client),
-        running([link(name_of(server), settings_of("loss worst mansd 3"), idle_s=0.3)], engine)
+        running([link(name_of(server), settings_of("loss worst mansd 3"), idle_s=0.3)])
         as one,
     ):  # fmt: skip
         client.sendto(b"0", one.address())
@@ -278,11 +272,11 @@ def test_a_client_with_unread_datagrams_is_not_idle(engine: Engine) -> None:
 
 
 def test_more_clients_than_allowed_are_refused_and_counted(
-    engine: Engine, capfd: pytest.CaptureFixture[str]
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     with (
         endpoints(*[V4] * 4) as (server, *clients),
-        running([link(name_of(server), most_clients=2, idle_s=0.3)], engine) as one,
+        running([link(name_of(server), most_clients=2, idle_s=0.3)]) as one,
     ):
         for client in clients * 2:
             client.sendto(b"x", one.address())
@@ -296,11 +290,11 @@ def test_more_clients_than_allowed_are_refused_and_counted(
 
 
 def test_a_lack_of_file_descriptors_is_reported_and_counted(
-    engine: Engine, capfd: pytest.CaptureFixture[str]
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     with (
         endpoints(*[V4] * 13) as (server, *clients),
-        running([link(name_of(server))], engine) as one,
+        running([link(name_of(server))]) as one,
     ):
         soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
         used = max(server.fileno(), *(client.fileno() for client in clients)) + 8
@@ -317,12 +311,12 @@ def test_a_lack_of_file_descriptors_is_reported_and_counted(
 
 @pytest.mark.parametrize("return_path", [True, False])
 def test_send_errors_are_counted_by_reason(
-    engine: Engine, return_path: bool, capfd: pytest.CaptureFixture[str]
+    return_path: bool, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """The kernel refuses broadcasts from a socket without the broadcast option."""
     with endpoints(V4) as (client,):
         spec = link(("255.255.255.255", 9), return_path=return_path)
-        with running([spec], engine) as one:
+        with running([spec]) as one:
             send_numbers(client, one.address(), 0, 10)
             one.settle(10)
             report = one.report()
@@ -331,15 +325,15 @@ def test_send_errors_are_counted_by_reason(
 
 
 def test_datagrams_beyond_the_available_memory_are_dropped_and_counted(
-    engine: Engine, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with (
         endpoints(V4, V4) as (server, client),
-        running([link(name_of(server), settings_of("delay 1000s"))], engine) as one,
+        running([link(name_of(server), settings_of("delay 1000s"))]) as one,
     ):
         client.sendto(b"stored", one.address())
         one.until(lambda: one.report().forward.in_flight == 1)
-        monkeypatch.setattr(relay_base, "_HEADROOM_BYTES", 2**60)
+        monkeypatch.setattr(relay_memory, "_HEADROOM_BYTES", 2**60)
         for _ in range(50):
             client.sendto(bytes(60_000), one.address())
         one.until(lambda: all_of(one.report().forward) == 51)
@@ -360,13 +354,11 @@ def small_buffers(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("version", [4, 6])
 @pytest.mark.usefixtures("small_buffers")
-def test_all_kernel_drops_are_counted(
-    engine: Engine, version: int, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_all_kernel_drops_are_counted(version: int, capfd: pytest.CaptureFixture[str]) -> None:
     host, many = HOSTS[version], 300
     with (
         endpoints(host, host) as (server, client),
-        running([link(name_of(server), host=host)], engine) as one,
+        running([link(name_of(server), host=host)]) as one,
     ):
         send_numbers(client, one.address(), 0, many)
         one.until(lambda: all_of(one.report().forward) == many)
@@ -381,12 +373,12 @@ def test_all_kernel_drops_are_counted(
 
 
 @pytest.mark.usefixtures("small_buffers")
-def test_all_kernel_drops_of_segmented_messages_are_counted(engine: Engine) -> None:
+def test_all_kernel_drops_of_segmented_messages_are_counted() -> None:
     """Each segment counts, although the client sends them in one call."""
     messages, segments, size = 20, 64, 72
     with (
         endpoints(V4, V4) as (server, client),
-        running([link(name_of(server))], engine, segment=True) as one,
+        running([link(name_of(server))], segment=True) as one,
     ):
         client.connect(one.address())
         client.setsockopt(socket.IPPROTO_UDP, UDP_SEGMENT, size)
@@ -397,11 +389,11 @@ def test_all_kernel_drops_of_segmented_messages_are_counted(engine: Engine) -> N
 
 
 @pytest.mark.parametrize("segment", [False, True])
-def test_segments_are_separate_datagrams(engine: Engine, segment: bool) -> None:
+def test_segments_are_separate_datagrams(segment: bool) -> None:
     """The client sends one message, and the kernel cuts it into segments."""
     with (
         endpoints(V4, V4) as (server, client),
-        running([link(name_of(server), THIRD_LOST)], engine, segment=segment) as one,
+        running([link(name_of(server), THIRD_LOST)], segment=segment) as one,
     ):
         client.connect(one.address())
         sent: list[bytes] = []
@@ -417,13 +409,13 @@ def test_segments_are_separate_datagrams(engine: Engine, segment: bool) -> None:
         assert [data for data, _ in drain(server)] == expected
 
 
-def test_links_are_independent(engine: Engine) -> None:
+def test_links_are_independent() -> None:
     with endpoints(V4, V4, V4) as (*servers, client):
         specs = [
             link(name_of(server), HALF_LOST, name=name)
             for server, name in zip(servers, ("one", "other"), strict=True)
         ]
-        with running(specs, engine) as one:
+        with running(specs) as one:
             for spec in specs:
                 send_numbers(client, one.address(spec.name), 0, 200)
             for number in range(2):
@@ -447,14 +439,13 @@ class CountOnly:
         self.bytes += data.size
 
 
-def test_taps_receive_every_event(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_taps_receive_every_event(monkeypatch: pytest.MonkeyPatch) -> None:
     """There are more events than the buffer for events holds."""
-    monkeypatch.setattr(pump_memory, "_EVENTS", 200)
-    monkeypatch.setattr(plain_direction, "_MOST_EVENTS", 20)
+    monkeypatch.setattr(relay_memory, "_EVENTS", 200)
     many, tap = 500, CountOnly()
     with (
         endpoints(V4, V4) as (server, client),
-        running([link(name_of(server), HALF_LOST)], engine, taps=[tap]) as one,
+        running([link(name_of(server), HALF_LOST)], taps=[tap]) as one,
     ):
         send_numbers(client, one.address(), 0, many)
         one.settle(many)
@@ -465,19 +456,6 @@ def test_taps_receive_every_event(engine: Engine, monkeypatch: pytest.MonkeyPatc
     assert report.forward.lateness.sum() == 0
 
 
-def test_the_engine_is_the_one_that_was_asked_for(
-    engine: Engine, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    specs = [link((V4, 9))]
-    with running(specs, engine) as one:
-        assert one.relay.engine == engine
-    monkeypatch.setattr(engine_choice.importlib.util, "find_spec", lambda name: None)
-    with running(specs, "auto") as one:
-        assert one.relay.engine == "plain"
-    with pytest.raises(CallerError, match="needs numba"):
-        open_relay(specs, "batched")
-
-
 class _Broken(io.TextIOBase):
     def write(self, text: str, /) -> int:
         raise BrokenPipeError(errno.EPIPE, "Broken pipe")
@@ -485,11 +463,11 @@ class _Broken(io.TextIOBase):
 
 @pytest.mark.parametrize("stderr", [_Broken(), None])
 def test_the_relay_continues_if_standard_error_is_unusable(
-    engine: Engine, stderr: io.TextIOBase | None, monkeypatch: pytest.MonkeyPatch
+    stderr: io.TextIOBase | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with endpoints(V4, V4, V4) as (server, first, second):
         monkeypatch.setattr(sys, "stderr", stderr)
-        with running([link(name_of(server), most_clients=1)], engine) as one:
+        with running([link(name_of(server), most_clients=1)]) as one:
             first.sendto(b"1", one.address())
             one.settle(1)
             second.sendto(b"refused", one.address())
@@ -498,13 +476,13 @@ def test_the_relay_continues_if_standard_error_is_unusable(
             assert [data for data, _ in one.receive(server, 2)] == [b"1", b"2"]
 
 
-def test_a_change_does_not_interrupt_a_replay(engine: Engine) -> None:
+def test_a_change_does_not_interrupt_a_replay() -> None:
     lost = RecordedDecision(Fate.DROPPED, -1, -1, -1, -1)
     passed = RecordedDecision(Fate.DELIVERED, 0, -1, -1, -1)
     record = [lost, passed, lost, lost, passed, lost]
     with endpoints(V4, V4) as (server, client):
         spec = link(name_of(server), decisions={"forward": [record]})
-        with running([spec], engine) as one:
+        with running([spec]) as one:
             send_numbers(client, one.address(), 0, 3)
             one.settle(3)
             one.relay.change("test", "forward", settings_of("loss worst mansd 3"))
@@ -513,7 +491,7 @@ def test_a_change_does_not_interrupt_a_replay(engine: Engine) -> None:
             assert numbers(drain(server)) == [1, 4, 8]
 
 
-def test_file_descriptors_above_the_limit_of_select_work(engine: Engine) -> None:
+def test_file_descriptors_above_the_limit_of_select_work() -> None:
     raise_file_limit()
     with endpoints(V4, V4) as (server, client), ExitStack() as unused:
         file = unused.enter_context(Path(os.devnull).open())
@@ -521,7 +499,7 @@ def test_file_descriptors_above_the_limit_of_select_work(engine: Engine) -> None
         while (descriptor := os.dup(file.fileno())) < 1024:
             unused.callback(os.close, descriptor)
         unused.callback(os.close, descriptor)
-        os.close(lowest)  # for the engine's selector, which it opens first
-        with running([link(name_of(server))], engine) as one:
+        os.close(lowest)
+        with running([link(name_of(server))]) as one:
             client.sendto(b"hello", one.address())
             assert one.receive(server)[0][0] == b"hello"

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from netem.engine.engine_choice import Engine
 from netem.words.words_to_settings import settings_of
 from noack.impairments.link_settings import read_files
 from noack.traces.packet_trace import PacketTrace
@@ -38,16 +37,13 @@ def bursts(lost: list[bool]) -> list[int]:
     return sorted(len(list(group)) for is_lost, group in groupby(lost) if is_lost)
 
 
-@pytest.mark.parametrize("engine", ["batched", "plain"])
 @pytest.mark.parametrize("family", [4, 6])
-def test_the_histogram_of_consecutive_losses_is_the_traces(
-    engine: Engine, family: int, tmp_path: Path
-) -> None:
+def test_the_histogram_of_consecutive_losses_is_the_traces(family: int, tmp_path: Path) -> None:
     trace = lossy_trace(tmp_path / "trace.csv")
     forward = read_files(settings_of("replay trace.csv"), tmp_path)
     with endpoints(HOSTS[family], HOSTS[family]) as (server, client):
         spec = link(name_of(server), forward, host=HOSTS[family])
-        with running([spec], engine) as one:
+        with running([spec]) as one:
             for number in range(PACKETS):
                 client.sendto(number.to_bytes(4, "big"), one.address())
                 if number % 20 == 19:

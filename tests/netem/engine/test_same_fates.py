@@ -1,15 +1,13 @@
-"""For any settings, both engines treat datagrams as the pure link machine decides."""
+"""For any settings, the relay treats datagrams as the pure link machine decides."""
 
 from collections import defaultdict
 from typing import Any
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from netem.engine.engine_choice import Engine
 from netem.engine.relay_interface import LinkSpec
 from netem.link_machine import Datagram, Link
 from noack.impairments.link_settings import LinkSettings
@@ -51,7 +49,6 @@ def replayed(
     return left
 
 
-@pytest.mark.parametrize("engine", ["batched", "plain"])
 @settings(max_examples=60)
 @given(
     forward=any_settings.harsh,
@@ -60,12 +57,12 @@ def replayed(
     segment=st.booleans(),
 )
 def test_fates_and_order_are_the_machines(
-    engine: Engine, forward: LinkSettings, reverse: LinkSettings, sizes: list[int], segment: bool
+    forward: LinkSettings, reverse: LinkSettings, sizes: list[int], segment: bool
 ) -> None:
     tap = KeepAll()
     with endpoints(*["127.0.0.1"] * (CLIENTS + 1)) as (server, *clients):
         spec = link(name_of(server), forward, reverse)
-        with running([spec], engine, taps=[tap], segment=segment) as one:
+        with running([spec], taps=[tap], segment=segment) as one:
             for k, size in enumerate(sizes):
                 clients[k % CLIENTS].sendto(payload_of(k, size), one.address())
             one.settle(len(sizes))

@@ -87,9 +87,7 @@ def unread(version: int, port: int) -> int:
 
 
 @pytest.mark.usefixtures("_namespaces")
-@pytest.mark.parametrize(
-    ("version", "options"), [(4, ["--segment"]), (6, ["--one-way"]), (4, ["--engine", "plain"])]
-)
+@pytest.mark.parametrize(("version", "options"), [(4, ["--segment"]), (6, ["--one-way"])])
 def test_packets_refused_by_a_full_output_queue_are_counted(
     emulate: Emulate, version: int, options: Sequence[str]
 ) -> None:

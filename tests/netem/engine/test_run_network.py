@@ -13,8 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from netem.duplex_link import network_of
-from netem.engine.compiled_network import CompiledNetwork
-from netem.engine.native_pump import compiled_pump
+from netem.engine.run_network import RunNetwork
 from netem.link_machine import Datagram
 from netem.words.words_to_settings import settings_of
 from noack.config.parameter_changes import ParameterChange
@@ -62,7 +61,7 @@ class Both:
     ) -> None:
         self.loops = loops or 1
         self.plain: Machine[Datagram] = network_of(resolved, start, loops=self.loops)
-        self.compiled: Any = CompiledNetwork(resolved, start, compiled_pump(), loops)
+        self.compiled: Any = RunNetwork(resolved, start, loops)
         sender, sensor, plant, self._controller, *receivers = sockets
         peers = {name_of(sensor): receivers[0], name_of(self._controller): receivers[1]}
         self._other = plant if Flow.ACTUATION in resolved.network.flows else sensor
@@ -255,7 +254,7 @@ def test_arrival_is_when_the_datagram_reached_the_socket(speed: float) -> None:
     resolved = network(LinkSettings(), LinkSettings(), Flow.UPDATE)
     with endpoints(*["127.0.0.1"] * 5) as (sender, sensor, controller, *receivers):
         peers = dict(zip((name_of(sensor), name_of(controller)), receivers, strict=True))
-        with closing(CompiledNetwork(cast(Scenario, resolved), BEGINNING, compiled_pump())) as one:
+        with closing(RunNetwork(cast(Scenario, resolved), BEGINNING)) as one:
             one.open(clock, sender, peers, [name_of(controller)])
             before_ns = clock.now_ns()
             sensor.sendto(b"x", name_of(receivers[0]))
