@@ -20,14 +20,12 @@ class Ours:
         words: the impairments, in tc's words.
         realtime: request real-time settings.
         segment: send successive datagrams of equal size as one message, which the kernel segments.
-        engine: which engine; None for the relay's own choice.
         way_back: keep a return path for each client.
     """
 
     words: str
     realtime: bool = False
     segment: bool = False
-    engine: str | None = None
     reverse: bool = False
 
 
@@ -47,11 +45,9 @@ def command_of(ours: Ours, to: int) -> list[str]:
         "--segment": ours.segment,
         "--one-way": not ours.reverse,
     }
-    engine = [] if ours.engine is None else ["--engine", ours.engine]
     return [
         *(sys.executable, "-m", "netem", "--listen", "127.0.0.1:0", "--to", f"127.0.0.1:{to}"),
         *ours.words.split(),
-        *engine,
         *(flag for flag, wanted in flags.items() if wanted),
         "--json",
     ]

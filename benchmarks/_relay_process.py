@@ -28,7 +28,7 @@ _PROBE = 20_000
 _LOSSY_SLACK = 16
 """With 5 % loss, this number of consecutive losses does not occur within a benchmark."""
 _READY_S = 120.0
-"""Maximum wait for a relay to listen; ours may have to compile its engine first."""
+"""Maximum wait for a relay to listen; a busy machine starts it late."""
 _END_S = 30.0
 _PORT = re.compile(r"^(\d+)$")
 

@@ -1,4 +1,4 @@
-"""CPU time per datagram of a run's emulator with its record: the compiled and the plain one.
+"""CPU time per datagram of a run's emulator with its record: in the core, and driven from Python.
 
 Bursts of datagrams wait at the emulator's socket; it relays them by the lane example's settings.
 The time of its own thread counts: kernel, decisions, rows of the record.
@@ -13,10 +13,9 @@ from contextlib import closing, suppress
 
 from benchmarks._report import Benchmark, Goal, Peer, Row, median, say
 from cosim.cli import find_scenario
-from netem.engine.compiled_network import CompiledNetwork
-from netem.engine.native_pump import compiled_pump
+from netem.engine.run_network import RunNetwork
 from netem.link_machine import update_link_of
-from netem.run_relay import CompiledShell, RelayShell
+from netem.run_relay import CoreShell, RelayShell
 from noack.config.resolution import resolve, tables_of
 from noack.config.scenario_file import load
 from noack.core.clock import RunClock
@@ -44,12 +43,10 @@ class Loop:
                   if OWNER[table] == "netem"}  # fmt: skip
         self.telemetry = TelemetryBuffer(tables, lambda table, header, payload: None)
 
-    def compiled(self) -> tuple[RelayShell, Relay]:
-        """Open the compiled emulator."""
-        network = CompiledNetwork(self.scenario, BEGINNING, compiled_pump())
-        shell = CompiledShell(
-            self.endpoint, self.ways, network=network, clock=self.clock, spin_us=0.0
-        )
+    def core(self) -> tuple[RelayShell, Relay]:
+        """Open the emulator in the core."""
+        network = RunNetwork(self.scenario, BEGINNING)
+        shell = CoreShell(self.endpoint, self.ways, network=network, clock=self.clock, spin_us=0.0)
         shell.tend(0)
 
         def relay(count: int) -> None:
@@ -58,8 +55,8 @@ class Loop:
 
         return shell, relay
 
-    def plain(self) -> tuple[RelayShell, Relay]:
-        """Open the plain emulator, driven as by :mod:`noack.runtime.real_time_loop`."""
+    def python(self) -> tuple[RelayShell, Relay]:
+        """Open the emulator that waits in Python, driven as by :mod:`noack.runtime.real_time_loop`."""
         link, shell = update_link_of(self.scenario), RelayShell(self.endpoint, self.ways)
 
         def relay(count: int) -> None:
@@ -96,9 +93,9 @@ def cpu_us(kind: str) -> float:
 def measure(options: argparse.Namespace) -> list[Row]:
     """Compare both in turn."""
     say("emulator of a run")
-    rounds = [(cpu_us("compiled"), cpu_us("plain")) for _ in range(ROUNDS)]
+    rounds = [(cpu_us("core"), cpu_us("python")) for _ in range(ROUNDS)]
     ours, plain = (median(one) for one in zip(*rounds, strict=True))
-    peer = Peer("the plain emulator", plain)
+    peer = Peer("driven from Python", plain)
     return [Row("datagram, with sockets and record", ours, "µs CPU", peer, Goal("<=", 0.25))]
 
 

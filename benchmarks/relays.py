@@ -20,11 +20,10 @@ from benchmarks._report import Benchmark, Goal, Rounds, Row, say
 
 ROUNDS = 40
 WORDS = "loss 5% mansd 4 seed 7"
-PLAIN, SEGMENTS, SOCKETS = "ours", "ours, segments", "ours, plain sockets"
+PLAIN, SEGMENTS = "ours", "ours, segments"
 OURS = {
     PLAIN: Ours(WORDS),
     SEGMENTS: Ours(WORDS, segment=True),
-    SOCKETS: Ours(WORDS, engine="plain"),
 }
 DIRECT = "direct, no relay"
 RATES = (
@@ -35,14 +34,12 @@ RATES = (
     (PLAIN, "asyncio relay", None),
     (PLAIN, DIRECT, None),
     (SEGMENTS, "C relay, segments", Goal(">=", 0.95)),
-    (SOCKETS, "socat", None),
 )
 COSTS = (
     (PLAIN, "socat"),
     (PLAIN, "C relay"),
     (PLAIN, DIRECT),
     (SEGMENTS, "C relay, segments"),
-    (SOCKETS, "asyncio relay"),
 )
 
 

@@ -147,7 +147,7 @@ def test_a_plant_step_is_compared_with_its_period_and_a_linear_plant() -> None:
         assert share.value == pytest.approx(p99.value / 20)  # per cent of a period of 2 ms
 
 
-@pytest.mark.parametrize("kind", ["compiled", "plain"])
+@pytest.mark.parametrize("kind", ["core", "python"])
 def test_an_emulator_relays_and_records_every_datagram_of_the_bursts(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

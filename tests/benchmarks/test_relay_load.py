@@ -148,9 +148,7 @@ def test_the_asyncio_relay_delays(tools: Built) -> None:
 
 
 def test_the_relays_counters_agree_with_sender_and_sink(tools: Built) -> None:
-    with running(
-        our_relay("ours", Ours("loss 30% mansd 2 seed 3", engine="plain")), tools
-    ) as relay:
+    with running(our_relay("ours", Ours("loss 30% mansd 2 seed 3")), tools) as relay:
         found = relay.ends.burst(relay.pid, 200, slack=2)
         totals = relay.totals()
     assert totals.arrived == 200

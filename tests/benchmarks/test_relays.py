@@ -141,11 +141,11 @@ def test_group_size_and_period_give_the_rate(per_s: float) -> None:
 
 
 def test_the_command_line_of_our_relay() -> None:
-    ours = Ours("loss 5% mansd 4", realtime=True, segment=True, engine="plain")
+    ours = Ours("loss 5% mansd 4", realtime=True, segment=True)
     command = command_of(ours, 9001)
     assert Path(command[0]).name.startswith("python")
     assert " ".join(command[1:]) == (
-        "-m netem --listen 127.0.0.1:0 --to 127.0.0.1:9001 loss 5% mansd 4 --engine plain "
+        "-m netem --listen 127.0.0.1:0 --to 127.0.0.1:9001 loss 5% mansd 4 "
         "--realtime --segment --one-way --json"
     )
     assert "--one-way" not in command_of(Ours("delay 10ms", reverse=True), 9001)
