@@ -56,7 +56,7 @@ class Loop:
         return shell, relay
 
     def python(self) -> tuple[RelayShell, Relay]:
-        """Open the emulator that waits in Python, driven as by :mod:`noack.runtime.real_time_loop`."""
+        """Open the emulator that is driven from Python, as by :mod:`.real_time_loop`."""
         link, shell = update_link_of(self.scenario), RelayShell(self.endpoint, self.ways)
 
         def relay(count: int) -> None:
