@@ -20,7 +20,7 @@ INTO = HERE.parent / "noack" / "core"
 LIBRARY, HEADER = "libnoack.so", "_core_header.py"
 # No contraction of a·b + c: results have the same bits on every processor.
 FLAGS = (
-    "-std=c11", "-O2", "-fPIC", "-shared", "-fvisibility=hidden", "-ffp-contract=off",
+    "-std=c11", "-O3", "-fPIC", "-shared", "-fvisibility=hidden", "-ffp-contract=off",
     "-fno-math-errno", "-Wall", "-Wextra",
 )  # fmt: skip
 SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-g", "-Werror")
