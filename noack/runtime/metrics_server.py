@@ -1,13 +1,15 @@
 """Serves metrics over HTTP, for Prometheus and other readers of OpenMetrics.
 
-The server answers one request at a time in a thread of its own, so that many or slow readers cost
-no more than one. Metrics are computed when they are read.
+Each connection has a thread and a time limit. Of too many connections the oldest is closed, and the
+end of the server closes all: no reader keeps another one, or a run, waiting. Metrics are computed
+when they are read, for one reader at a time.
 """
 
+import socket
 import socketserver
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
 
@@ -20,8 +22,9 @@ if TYPE_CHECKING:
 OPTION = "--metrics"
 _POLL_S = 0.2
 """Time within which the server notices that it should end."""
-_PATIENCE_S = 2.0
-"""Longest wait for the rest of a request, and for the reader of the answer."""
+_CONNECTION_S = 5.0
+"""Time limit of a connection: for the whole request and its answer."""
+_MOST_CONNECTIONS = 16
 
 
 def require_package() -> None:
@@ -35,8 +38,16 @@ def require_package() -> None:
         ) from None
 
 
-class _Server(WSGIServer):
+class _Server(socketserver.ThreadingMixIn, WSGIServer):
     allow_reuse_address = True
+    daemon_threads = True
+    block_on_close = False
+
+    def __init__(self, *arguments: Any) -> None:
+        self._open: dict[socket.socket, threading.Timer] = {}
+        """The connections, the oldest first, each with the timer that ends it."""
+        self._lock = threading.Lock()
+        super().__init__(*arguments)
 
     def server_bind(self) -> None:
         """Bind, without asking a name server for the name of the host."""
@@ -44,13 +55,45 @@ class _Server(WSGIServer):
         self.server_name, self.server_port = self.server_address[:2]  # type: ignore[assignment]
         self.setup_environ()
 
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Serve a connection on a thread, for a limited time."""
+        timer = threading.Timer(_CONNECTION_S, _end, (request,))
+        timer.daemon = True
+        with self._lock:
+            if len(self._open) >= _MOST_CONNECTIONS:
+                oldest = next(iter(self._open))
+                self._open.pop(oldest).cancel()
+                _end(oldest)
+            self._open[request] = timer
+        timer.start()
+        super().process_request(request, client_address)
+
+    def close_request(self, request: Any) -> None:
+        """Close a connection."""
+        with self._lock:
+            timer = self._open.pop(request, None)
+        if timer is not None:
+            timer.cancel()
+        super().close_request(request)
+
+    def server_close(self) -> None:
+        """Stop listening, and end all connections."""
+        super().server_close()
+        with self._lock:
+            for request in self._open:
+                _end(request)
+
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore a reader that has left."""
 
 
-class _Handler(WSGIRequestHandler):
-    timeout = _PATIENCE_S
+def _end(connection: socket.socket) -> None:
+    """End a connection, of which another thread reads or to which it writes."""
+    with suppress(OSError):
+        connection.shutdown(socket.SHUT_RDWR)
 
+
+class _Handler(WSGIRequestHandler):
     def log_message(self, format: str, *arguments: Any) -> None:  # noqa: A002
         """Log nothing."""
 
@@ -61,7 +104,7 @@ def metrics_server(where: str, collect: "Callable[[], Iterable[Metric]]") -> Ite
 
     Args:
         where: ``HOST:PORT``; without a host it is the loopback, port 0 is any free one.
-        collect: returns the metrics; called in the server's thread.
+        collect: returns the metrics; called in threads of the server, one at a time.
 
     Raises:
         CallerError: the address is wrong or in use, or prometheus_client is not installed.
@@ -91,15 +134,16 @@ def metrics_server(where: str, collect: "Callable[[], Iterable[Metric]]") -> Ite
     finally:
         server.shutdown()
         server.server_close()
-        thread.join(_PATIENCE_S)
+        thread.join()
 
 
 class _Collector:
     """A collector of prometheus_client, which computes all metrics when they are read."""
 
     def __init__(self, collect: "Callable[[], Iterable[Metric]]") -> None:
-        self._collect = collect
+        self._collect, self._lock = collect, threading.Lock()
 
     def collect(self) -> "Iterable[Metric]":
         """Return the metrics."""
-        return self._collect()
+        with self._lock:
+            return list(self._collect())
