@@ -411,13 +411,14 @@ def open_run(directory: Folder = "runs/latest") -> Run:
     return Run(outcome.run_dir, lambda: outcome)
 
 
-def reproduce(path: Folder, *, run_code: bool = False) -> "Repetition":
+def reproduce(path: Folder, *, run_code: bool = False, long: bool = False) -> "Repetition":
     """Repeat an archived run, and compare it bit for bit.
 
     Args:
         path: an archive, written by :meth:`Run.archive` or ``noack archive``.
         run_code: run the code that the archive contains, if its plant, trigger or controller is a
             Python class or an FMU.
+        long: repeat a run of more than 20 million steps, too, which takes half an hour or more.
 
     Returns:
         The result: ``bit_exact``; ``differences``, the first one of the run and of each loop;
@@ -425,11 +426,11 @@ def reproduce(path: Folder, *, run_code: bool = False) -> "Repetition":
 
     Raises:
         NoackError: the file is not such an archive, is damaged, or contains code without
-            ``run_code``.
+            ``run_code`` or a long run without ``long``.
     """
     from cosim.studies.reproduction.run_repetition import repeat_archive
 
-    return repeat_archive(Path(path), run_code=run_code)
+    return repeat_archive(Path(path), run_code=run_code, long=long)
 
 
 def compare(*runs: Run | Folder) -> "RunComparison":

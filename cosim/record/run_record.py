@@ -26,10 +26,12 @@ from cosim.record.record_source import (
 )
 from cosim.record.record_source import Rows as Rows
 from cosim.record.run_directory import LOOP_FILE, LOOPS, RECORD, SCENARIO_FILE, read_object
+from noack.config.loops import loop_scenario
 from noack.config.resolution import LoopMatrices, loop_of, network_tables, tables_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, PeerError
+from noack.core.file_access import replacing
 from noack.protocol.machine_interface import RESTART
 from noack.protocol.record_tables import (
     CLOCK_TABLES,
@@ -43,6 +45,10 @@ from noack.protocol.wire_format import MAX_LOOPS
 from noack.runtime.control_messages import LogLine, parse_message
 
 _NOTICES_FILE = "notices.jsonl"
+_ROWS_PER_STEP, _MORE_ROWS = 4, 100_000
+"""A table has at most this number of rows per step of the loops, and more for restarts."""
+_CLOCK_EXCHANGE_NS = 20_000_000
+"""Shortest wall time between two rows of a clock's offset."""
 _COLUMNS = 6_000
 """Columns of a whole run: short runs are not reduced, and figures have far fewer columns."""
 
@@ -212,12 +218,30 @@ def load_record(run_dir: Path, *, network: bool = False) -> RunRecord:
         one = run_dir / LOOPS / scenario.loops[0].names[0]
         raise CallerError(f"{run_dir}: a run of several loops; name one of them, e.g. {one}")
     tables = tables_of(scenario) if scenario.loops is None else network_tables()
-    rows = StoredTables(folder, tables)
+    rows = StoredTables(folder, tables, _ROWS_PER_STEP * steps_of(scenario) + _MORE_ROWS)
     reports, earlier = read_reports(run_dir, rows)
     number = read_object(run_dir / LOOP_FILE).get("number")
     number = number if isinstance(number, int) and 0 <= number < MAX_LOOPS else None
     notices = read_notices(folder)
     return RunRecord(scenario, rows, notices, reports, kind_of(run_dir), earlier, number)
+
+
+def steps_of(scenario: Scenario) -> int:
+    """Return the steps of all loops of a scenario together.
+
+    A step is the shortest period of a loop's processes; a table of a record has at most a few rows
+    for each.
+    """
+    loops = [(1, scenario)]
+    if scenario.loops is not None:
+        loops = [(one.count, loop_scenario(scenario, one)) for one in scenario.loops]
+    exchange_ns = round(scenario.speed * _CLOCK_EXCHANGE_NS)
+    return sum(
+        count * (timing.horizon_ns // min(
+            timing.plant_period_ns, timing.controller_period_ns, max(exchange_ns, 1)
+        ) + 1)
+        for count, timing in ((count, loop.timing) for count, loop in loops)
+    )  # fmt: skip
 
 
 def write_record(record: RunRecord, run_dir: Path) -> None:
@@ -244,10 +268,8 @@ def write_tables(
     folder.mkdir(exist_ok=True)
     for table, batches in tables.items():
         write_table(folder / f"{table}.parquet", batches, types[table], loop)
-    scratch = folder / f"{_NOTICES_FILE}.partial"
-    with scratch.open("w", encoding="utf-8") as file:
-        file.writelines(json.dumps(notice) + "\n" for notice in notices)
-    scratch.replace(folder / _NOTICES_FILE)
+    with replacing(folder / _NOTICES_FILE) as file:
+        file.writelines(json.dumps(notice).encode() + b"\n" for notice in notices)
 
 
 def read_notices(folder: Path) -> list[dict[str, Any]]:

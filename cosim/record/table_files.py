@@ -26,6 +26,7 @@ from cosim.record.record_source import (
 from cosim.record.spool_merge import Segment
 from noack.config.resolution import LoopMatrices
 from noack.core.errors import CallerError, one_line
+from noack.core.file_access import replacing
 from noack.protocol.record_tables import OWNER, entry_names
 
 _GROUP_ROWS = 2 * BATCH_ROWS
@@ -37,13 +38,20 @@ RowType = np.dtype[np.void]
 class StoredTables(RecordSource):
     """The tables of a record in its folder; a table that is read as a whole is kept.
 
+    Args:
+        folder: the folder.
+        types: the types of the tables' rows.
+        most_rows: number of rows that a table can have; a file of a few kilobytes may claim more
+            than fit into memory.
+
     Raises:
-        CallerError: a file cannot be read, or does not have all columns of its type.
+        CallerError: a file cannot be read, has too many rows, or does not have all columns of its
+            type.
     """
 
-    def __init__(self, folder: Path, types: Mapping[str, RowType]) -> None:
+    def __init__(self, folder: Path, types: Mapping[str, RowType], most_rows: int) -> None:
         super().__init__(types)
-        self._folder = folder
+        self._folder, self._most_rows = folder, most_rows
         self._whole: dict[str, Rows] = {}
         self._counts = {table: self._check(table) for table in types}
 
@@ -76,6 +84,11 @@ class StoredTables(RecordSource):
         path = self.path(table)
         with _readable(path), pq.ParquetFile(path) as file:
             schema, metadata = file.schema_arrow, file.metadata
+            if metadata.num_rows > self._most_rows:
+                raise CallerError(
+                    f"{path}: has {metadata.num_rows:,} rows; a run of this scenario has at most "
+                    f"{self._most_rows:,}"
+                )
             _require_columns(path, schema, self.types[table])
             groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
             for column, _ in _columns(self.types[table]):
@@ -157,14 +170,15 @@ def write_table(
         metadata["state_names"] = json.dumps(loop.state_names)
         metadata["input_names"] = json.dumps(loop.input_names)
     schema = pa.schema(list(_columns(dtype))).with_metadata(metadata)
-    scratch = path.with_suffix(".partial")
     # A dictionary, the default, takes twice the time and the space.
     options: dict[str, Any] = {"compression": "zstd", "use_dictionary": False}
     encodings = {name: _ENCODINGS[kind] for name, kind in _columns(dtype) if kind in _ENCODINGS}
-    with pq.ParquetWriter(scratch, schema, column_encoding=encodings, **options) as writer:
+    with (
+        replacing(path) as file,
+        pq.ParquetWriter(file, schema, column_encoding=encodings, **options) as writer,
+    ):
         for rows in _regrouped(batches, dtype):
             writer.write_table(pa.table(_arrays(rows), schema=schema))
-    scratch.replace(path)
 
 
 def _regrouped(batches: Iterable[Rows], dtype: RowType) -> Iterator[Rows]:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from noack.config.mat_file import matrices_as_npz
+from noack.core.file_access import replacing
 from noack.core.linear_systems import Matrix
 from noack.protocol.wire_format import MAX_DIMENSION
 from noack.settings.named_file import NamedFile
@@ -24,6 +25,9 @@ _GAINS = (GAIN, "K")
 _MOST_ENTRIES = MAX_DIMENSION**2
 _MOST_BYTES = 16 * _MOST_ENTRIES + 65_536
 """Largest size of an array within an archive, including its header."""
+_MOST_ARRAYS = 1000
+_DIRECTORY_ENTRY = b"PK\1\2"
+"""Begins each entry of an archive's directory."""
 _NUMBERS = "fiub"
 
 
@@ -125,14 +129,16 @@ def unfit(C: Any, D: Any, dt: Any, n: int) -> str | None:
 
 def write_matrices(path: Path, matrices: Mapping[str, Matrix]) -> None:
     """Write matrices to an ``.npz`` or ``.mat`` file; raise ValueError for another suffix."""
-    if path.suffix == NPZ:
-        np.savez(path, allow_pickle=False, **matrices)
-    elif path.suffix == MAT:
+    if path.suffix not in (NPZ, MAT):
+        raise ValueError(_SUFFIXES)
+    with replacing(path) as file:
+        if path.suffix == NPZ:
+            np.savez(file, allow_pickle=False, **matrices)
+            return
         from scipy.io import savemat  # imported here: it takes time and memory
 
-        savemat(path, dict(matrices))
-    else:
-        raise ValueError(_SUFFIXES)
+        target: Any = file  # SciPy's types know names of files only
+        savemat(target, dict(matrices))
 
 
 _SUFFIXES = f"must end in {NPZ} (NumPy) or {MAT} (MATLAB)"
@@ -142,6 +148,9 @@ def _arrays(file: NamedFile) -> dict[str, Any]:
     if file.path.suffix not in (NPZ, MAT):
         file.wrong(_SUFFIXES)
     content = file.content()
+    arrays = content.count(_DIRECTORY_ENTRY) if file.path.suffix == NPZ else 0
+    if arrays > _MOST_ARRAYS:
+        file.wrong(f"has {arrays:,} arrays; at most {_MOST_ARRAYS:,} are read")
     try:
         if file.path.suffix == MAT:
             content = matrices_as_npz(content, _MOST_ENTRIES)

@@ -2,13 +2,18 @@
 
 import fcntl
 import os
+import secrets
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
 from noack.core.errors import CallerError, MachineError, printable, why
+
+SCRATCH = ".partial"
+"""Suffix of a file that is being written."""
+_NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 def require_suffix(path: Path, option: str, suffix: str) -> None:
@@ -17,23 +22,46 @@ def require_suffix(path: Path, option: str, suffix: str) -> None:
         raise CallerError(f"{option} {path}: the file's name must end in {suffix}")
 
 
+@contextmanager
+def replacing(path: Path) -> Iterator[IO[bytes]]:
+    """Yield a new file, which replaces ``path`` in one step at the end of the context.
+
+    If an exception ends the context, the new file is removed and ``path`` stays. The new file has a
+    random name beside ``path`` and is not a link, whatever other users have made in the folder.
+
+    Raises:
+        OSError: the file cannot be written.
+        ValueError: ``path`` is a folder or a device, which would be replaced too, or no name of a
+            file.
+
+    >>> with replacing(Path("results.csv")) as file:
+    ...     _ = file.write(b"events,20")
+    """
+    if path.exists() and not path.is_file():
+        raise ValueError("not a regular file")
+    scratch = path.parent / f".{secrets.token_hex(8)}{SCRATCH}"
+    descriptor = os.open(scratch, _NEW_FILE, 0o666)
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            yield file
+        scratch.replace(path)
+    except BaseException:
+        scratch.unlink(missing_ok=True)
+        raise
+
+
 def write_whole(path: Path, content: str | bytes, *, make_folder: bool = True) -> Path:
-    """Write a file, or replace it, in one step; return its path.
+    """Write a file, or replace it, in one step; return its path. See :func:`replacing`.
 
     Text is written as UTF-8. Missing folders are created with ``make_folder``. Raise MachineError
-    if the file cannot be written, or is a folder or a device: a device would be replaced too.
+    if the file cannot be written, or is a folder or a device.
     """
-    scratch = path.parent / f".{path.name}.partial"
     try:
-        if path.exists() and not path.is_file():
-            raise ValueError("not a regular file")
         if make_folder:
             path.parent.mkdir(parents=True, exist_ok=True)
-        scratch.write_bytes(content.encode() if isinstance(content, str) else content)
-        scratch.replace(path)
+        with replacing(path) as file:
+            file.write(content.encode() if isinstance(content, str) else content)
     except (OSError, ValueError) as error:  # ValueError also: a name that no file can have
-        with suppress(OSError, ValueError):
-            scratch.unlink(missing_ok=True)
         raise MachineError(printable(f"{path}: cannot be written: {why(error)}")) from None
     return path
 
@@ -80,5 +108,6 @@ def lock(file: int | IO[Any], *, shared: bool = False, wait: bool = False) -> bo
 @contextmanager
 def locked(path: Path, *, shared: bool = False, wait: bool = False) -> Iterator[bool]:
     """Lock a file, which is created if missing, while the context lasts; yields :func:`lock`."""
-    with path.open("a") as file:
+    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK
+    with os.fdopen(os.open(path, flags, 0o666), "rb") as file:
         yield lock(file, shared=shared, wait=wait)

@@ -24,6 +24,10 @@ def reproduce(
             "a Python class or an FMU.",
         ),
     ] = False,
+    long: Annotated[
+        bool,
+        typer.Option("--long", help="Repeat a run of more than 20 million steps, too."),
+    ] = False,
     into: Annotated[
         Path | None,
         typer.Option("--into", help="Keep the archived run and its repetition in this new folder."),
@@ -39,7 +43,7 @@ def reproduce(
     from cosim.studies.reproduction.run_repetition import repeat_archive
 
     with PatientConsole(stderr=True).status("repeating"):
-        found = repeat_archive(file, run_code=run_code, into=into)
+        found = repeat_archive(file, run_code=run_code, long=long, into=into)
     if json:
         cli.print_json(found.to_json())
     else:

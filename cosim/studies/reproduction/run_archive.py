@@ -6,10 +6,10 @@ size and the SHA-256 of every other one.
 """
 
 import hashlib
+import os
 import re
 import zipfile
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import IO, Annotated, Literal
 
@@ -31,7 +31,7 @@ from noack.config.loops import loops_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, MachineError, one_line, printable, why
-from noack.core.file_access import open_regular
+from noack.core.file_access import open_regular, replacing
 from noack.settings.named_file import PLACES, Sha256, file_tables
 
 MANIFEST = "archive.json"
@@ -77,25 +77,20 @@ def write_archive(run_dir: Path, path: Path) -> Manifest:
     scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
     if (outside := outside_files(scenario, run_dir)) is not None:
         raise CallerError(f"{run_dir}: its scenario names {outside}, outside the run directory")
-    scratch = path.with_name(f".{path.name}.partial")
     try:
         names = sorted(_names(run_dir, with_loops=True))
         files = {name: _entry(run_dir / name) for name in names}
         manifest = Manifest(scenario=scenario.name, kind=kind_of(run_dir), files=files)
         path.parent.mkdir(parents=True, exist_ok=True)
-        with zipfile.ZipFile(scratch, "w") as archive:
+        with replacing(path) as file, zipfile.ZipFile(file, "w") as archive:
             content = manifest.model_dump_json(indent=1).encode()
             archive.writestr(_info(MANIFEST, len(content)), content)
             for name, entry in files.items():
                 with open_regular(run_dir / name) as source:
                     _copy_in(source, archive, _info(name, entry.bytes))
-        scratch.replace(path)
     except (OSError, ValueError) as error:
         reason = why(error) if isinstance(error, OSError) else str(error)
         raise MachineError(f"{path}: the archive cannot be written: {reason}") from None
-    finally:
-        with suppress(OSError):
-            scratch.unlink(missing_ok=True)
     return manifest
 
 
@@ -107,8 +102,8 @@ def unpack(path: Path, folder: Path) -> Manifest:
         MachineError: the folder cannot be written.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
-            infos = _checked_entries(path, archive)
+        with open_regular(path) as file, zipfile.ZipFile(file) as archive:
+            infos = _checked_entries(path, archive, os.fstat(file.fileno()).st_size)
             manifest = _manifest(path, archive)
             if missing := sorted(manifest.files.keys() ^ (infos.keys() - {MANIFEST})):
                 raise CallerError(
@@ -165,7 +160,9 @@ def _copy_in(source: IO[bytes], archive: zipfile.ZipFile, info: zipfile.ZipInfo)
             target.write(chunk)
 
 
-def _checked_entries(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+def _checked_entries(
+    path: Path, archive: zipfile.ZipFile, most_bytes: int
+) -> dict[str, zipfile.ZipInfo]:
     """Return the entries by name; refuse what no archive of noack's has."""
     infos = archive.infolist()
     if len(infos) > _MOST_ENTRIES:
@@ -186,7 +183,7 @@ def _checked_entries(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.
         if info.compress_type != zipfile.ZIP_STORED or info.file_size != info.compress_size:
             raise CallerError(f"{path}: {shown}: is compressed; noack's archives are not")
         found[name] = info
-    if sum(info.file_size for info in infos) > path.stat().st_size:
+    if sum(info.file_size for info in infos) > most_bytes:
         raise CallerError(f"{path}: its entries overlap")
     if MANIFEST not in found:
         raise CallerError(f"{path}: not an archive of a run: has no {MANIFEST}")

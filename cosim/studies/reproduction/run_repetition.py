@@ -1,6 +1,5 @@
 """The repetition of an archived run, and what differs."""
 
-import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -17,18 +16,23 @@ from cosim.analysis.summary_model import ReplayDifference
 from cosim.live.finalize import finalize, reopen
 from cosim.live.simulated_run import simulate_run
 from cosim.output.loops_tables import network_rows
-from cosim.record.environment import Kind, all_changes_since
+from cosim.record.environment import Kind, all_changes_since, kind_of
 from cosim.record.loops_run import loop_directories
 from cosim.record.record_source import Slice
 from cosim.record.run_directory import SCENARIO_FILE
-from cosim.record.run_record import RunRecord, load_record
+from cosim.record.run_record import RunRecord, load_record, steps_of
 from cosim.studies.comparison.run_comparison import compare_runs
-from cosim.studies.reproduction.run_archive import outside_files, unpack
+from cosim.studies.reproduction.run_archive import MANIFEST, outside_files, unpack
 from noack.config.loops import loops_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, MachineError, why
+from noack.runtime.signals import exit_on_signals
 from noack.settings.named_file import file_tables
+
+_MOST_STEPS = 20_000_000
+_US_PER_STEP = 100.0
+"""Of simulation, record, summary and comparison together."""
 
 
 class Repetition(NamedTuple):
@@ -59,25 +63,37 @@ class Repetition(NamedTuple):
         return {"bit_exact": self.bit_exact, **found}
 
 
-def repeat_archive(path: Path, *, run_code: bool = False, into: Path | None = None) -> Repetition:
+def repeat_archive(
+    path: Path, *, run_code: bool = False, long: bool = False, into: Path | None = None
+) -> Repetition:
     """Unpack an archive, repeat its run, and compare.
 
     Args:
         path: the archive.
         run_code: whether to execute the files of plants, triggers and controllers that it contains.
+        long: repeat a run of more than 20 million steps, too.
         into: folder, new or empty, for the unpacked run and its repetition; else they are deleted.
 
     Raises:
-        CallerError: the file is not an archive, is damaged, or contains code without ``run_code``.
+        CallerError: the file is not an archive, is damaged, or contains code without ``run_code``
+            or a long run without ``long``.
         MachineError: a folder cannot be written.
     """
     with _folder(into) as folder:
         archived = folder / "archived"
         manifest = unpack(path, archived)
         scenario = _scenario(path, archived, run_code=run_code)
+        if (manifest.scenario, manifest.kind) != (scenario.name, kind_of(archived)):
+            raise CallerError(f"{path}: {MANIFEST} describes another run than the archive contains")
+        if not long:
+            _require_short(path, scenario)
+        try:
+            recorded = _directories(archived)
+        except CallerError as error:
+            raise CallerError(f"{path}: {str(error).removeprefix(f'{archived}/')}") from None
         ending = simulate_run(scenario, folder / "repeated", view=False)
         finalize(ending, report=False)
-        pairs = list(zip(*(_directories(one) for one in (archived, ending.run_dir)), strict=True))
+        pairs = zip(recorded, _directories(ending.run_dir), strict=True)
         compare = _replayed if manifest.kind == "live" else _repeated
         found = [compare(*pair) for pair in pairs]
         return Repetition(
@@ -91,6 +107,16 @@ def repeat_archive(path: Path, *, run_code: bool = False, into: Path | None = No
         )
 
 
+def _require_short(path: Path, scenario: Scenario) -> None:
+    steps = steps_of(scenario)
+    if steps > _MOST_STEPS:
+        hours = steps * _US_PER_STEP * 1e-6 / 3600
+        raise CallerError(
+            f"{path}: its run has {steps:,} steps, and would take about {hours:.1f} hours; "
+            "--long repeats it nevertheless"
+        )
+
+
 class _Compared(NamedTuple):
     compared: int
     differences: Sequence[str]
@@ -100,11 +126,8 @@ class _Compared(NamedTuple):
 @contextmanager
 def _folder(into: Path | None) -> Iterator[Path]:
     if into is None:
-        temporary = Path(tempfile.mkdtemp(prefix="noack-"))
-        try:
-            yield temporary
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
+        with exit_on_signals(), tempfile.TemporaryDirectory(prefix="noack-") as temporary:
+            yield Path(temporary)
         return
     try:
         into.mkdir(parents=True, exist_ok=True)

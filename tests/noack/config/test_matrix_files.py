@@ -1,5 +1,6 @@
 """Matrices from files: the scenario contains their values; invalid files are refused."""
 
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import pytest
 from scipy.io import savemat
 from scipy.sparse import csc_matrix
 
+from noack.config import matrix_files
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import dumps, load
@@ -143,3 +145,14 @@ def test_a_file_on_which_scipy_crashes_is_refused(tmp_path: Path) -> None:
     (tmp_path / "m.mat").write_bytes(content)
     with pytest.raises(CallerError, match=r"is no \.mat file, or a damaged one"):
         scenario(tmp_path, 'file = "m.mat"')
+
+
+def test_a_file_of_very_many_arrays_is_refused_before_any_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with zipfile.ZipFile(tmp_path / "m.npz", "w") as archive:
+        for number in range(1_001):
+            archive.writestr(f"a{number}.npy", b"")
+    monkeypatch.setattr(matrix_files, "_of_npz", lambda content: pytest.fail("it was read"))
+    with pytest.raises(CallerError, match=r"has 1,001 arrays; at most 1,000 are read"):
+        scenario(tmp_path, 'file = "m.npz"')

@@ -2,12 +2,14 @@
 
 import os
 import stat
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from noack.core import file_access
 from noack.core.errors import MachineError
-from noack.core.file_access import write_whole
+from noack.core.file_access import locked, replacing, write_whole
 
 
 def test_a_file_is_replaced_and_nothing_else_remains(tmp_path: Path) -> None:
@@ -32,3 +34,52 @@ def test_a_name_that_no_file_can_have_is_reported(tmp_path: Path, name: str) -> 
     with pytest.raises(MachineError, match="cannot be written: "):
         write_whole(tmp_path / name, "text")
     assert not list(tmp_path.iterdir())
+
+
+def test_nothing_that_another_user_has_made_in_the_folder_is_written_to(tmp_path: Path) -> None:
+    """Whatever has the name of the new file, or stands at the file's name as a link."""
+    (precious := tmp_path / "precious").write_text("secret")
+    (folder := tmp_path / "shared").mkdir()
+    (path := folder / "a.txt").symlink_to(precious)
+    (folder / ".a.txt.partial").symlink_to(precious)
+    write_whole(path, "text")
+    assert (precious.read_text(), path.read_text(), path.is_symlink()) == ("secret", "text", False)
+
+
+@pytest.mark.parametrize("make", [
+    lambda name, target: name.symlink_to(target),
+    lambda name, target: name.hardlink_to(target),
+    lambda name, target: os.mkfifo(name),
+    lambda name, target: name.mkdir(),
+], ids=["link", "hard link", "FIFO", "folder"])  # fmt: skip
+def test_a_guessed_name_is_an_error(
+    make: Callable[[Path, Path], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """If the random name were known, nothing that exists under it would be opened."""
+    (precious := tmp_path / "precious").write_text("secret")
+    monkeypatch.setattr(file_access.secrets, "token_hex", lambda size: "guessed")
+    make(tmp_path / ".guessed.partial", precious)
+    with pytest.raises(MachineError, match="cannot be written: File exists"):
+        write_whole(tmp_path / "a.txt", "text")
+    assert precious.read_text() == "secret"
+
+
+def test_a_failure_keeps_the_old_file_and_leaves_no_new_one(tmp_path: Path) -> None:
+    (path := tmp_path / "a.txt").write_text("old")
+
+    def interrupted() -> None:
+        with replacing(path) as file:
+            file.write(b"half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert path.read_text() == "old"
+    assert [one.name for one in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_a_lock_file_is_not_a_link(tmp_path: Path) -> None:
+    (tmp_path / "lock").symlink_to(tmp_path / "target")
+    with pytest.raises(OSError, match="symbolic links"), locked(tmp_path / "lock"):
+        pass
+    assert not (tmp_path / "target").exists()

@@ -1,19 +1,25 @@
 """Archives of runs: the same bytes, a bit-exact repetition, and one line for a hostile file."""
 
 import hashlib
+import io
 import json
+import os
 import shutil
+import subprocess
+import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
 import noack
 from cosim.cli import app
 from cosim.studies.reproduction.run_archive import MANIFEST, write_archive
-from noack.core.errors import CallerError
+from noack.core.errors import CallerError, ExitStatus
 
 PLANT = """\
 class Lag:
@@ -164,6 +170,40 @@ def with_manifest(content: bytes) -> Callable[[Files, Path], Path]:
     return lambda files, path: write(path, files | {MANIFEST: content})
 
 
+def with_claim(key: str, value: str) -> Callable[[Files, Path], Path]:
+    """Say something else in the manifest than the files do."""
+
+    def make(files: Files, path: Path) -> Path:
+        return write(
+            path,
+            files | {MANIFEST: json.dumps(json.loads(files[MANIFEST]) | {key: value}).encode()},
+        )
+
+    return make
+
+
+def with_rows(files: Files, path: Path) -> Path:
+    """Put five million equal rows, a few kilobytes, in the place of a table."""
+    name, rows = "record/plant_step.parquet", io.BytesIO()
+    table = pq.read_table(io.BytesIO(files[name]))
+    many = pa.table({
+        column.name: pa.repeat(table[column.name][0], 5_000_000) for column in table.schema
+    })  # fmt: skip
+    pq.write_table(many.cast(table.schema), rows, compression="zstd")
+    assert len(rows.getvalue()) < 2_000_000
+    return write(path, checked(files | {name: rows.getvalue()}))
+
+
+def with_horizon(files: Files, path: Path) -> Path:
+    text = files["scenario.toml"].replace(b"horizon_s = 3.0", b"horizon_s = 1e7")
+    return write(path, checked(files | {"scenario.toml": text}))
+
+
+def fifo(files: Files, path: Path) -> Path:
+    os.mkfifo(path)
+    return path
+
+
 HOSTILE: dict[str, tuple[Callable[[Files, Path], Path], str]] = {
     "traversal": (renamed("../../evil"), "not the name of a file in a run directory"),
     "inner traversal": (renamed("record/../../evil"), "not the name of a file"),
@@ -192,6 +232,12 @@ HOSTILE: dict[str, tuple[Callable[[Files, Path], Path], str]] = {
     "manifest is no JSON": (with_manifest(b"\xff"), "archive.json: content: Invalid JSON"),
     "another format": (with_manifest(b'{"format": "2"}'), "archive.json: format: Input should be"),
     "deep JSON": (with_manifest(b"[" * 100_000), "archive.json: content: Invalid JSON"),
+    "another kind": (with_claim("kind", "live"), "describes another run than the archive contains"),
+    "another name": (with_claim("scenario", "\x1b[31mred"), "describes another run"),
+    "rows without end": (with_rows, "plant_step.parquet: has 5,000,000 rows; a run of this"),
+    "a device": (lambda files, path: Path("/dev/zero"), "not a regular file"),
+    "a FIFO": (fifo, "not a regular file"),
+    "a long run": (with_horizon, "would take about 138.9 hours"),
     "no file": (lambda files, path: path, "No such file or directory"),
 }  # fmt: skip
 
@@ -225,3 +271,18 @@ def test_code_runs_only_on_request_and_only_from_the_archive(tmp_path: Path) -> 
     path = write(path, checked(files | {"scenario.toml": elsewhere}))
     with pytest.raises(CallerError, match=r"names .*moved\.py, which is not in the archive"):
         noack.reproduce(path, run_code=True)
+
+
+def test_a_repetition_that_is_terminated_leaves_no_folder(archive: Path, tmp_path: Path) -> None:
+    """The signal comes while the run is repeated."""
+    code = (
+        "import os, signal, sys, tempfile; tempfile.tempdir = sys.argv[2];"
+        "from cosim.studies.reproduction import run_repetition as module;"
+        "module.simulate_run = lambda *_, **__: os.kill(os.getpid(), signal.SIGTERM);"
+        "from pathlib import Path; module.repeat_archive(Path(sys.argv[1]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, archive, tmp_path], capture_output=True, check=False
+    )
+    assert done.returncode == ExitStatus.TERMINATED, done.stderr
+    assert not list(tmp_path.iterdir())
