@@ -19,6 +19,7 @@ MINUTES ?= 10
 N ?= 1000000
 ARGS ?=
 LIVE ?=
+C_FILES := $(wildcard native/*.[ch] native/*/*.[ch])
 override FLAGS := $(if $(filter-out 0 no,$(LIVE)),--live) $(ARGS)
 
 .PHONY: help
@@ -117,15 +118,18 @@ attack: setup-dev ## Send N=1000000 hostile datagrams to each port of a run (5 m
 soak: setup-dev ## Soak test: one hour, then a simulated day at speed 48; MINUTES=5 for a short test
 	$(BIN)/python -m benchmarks.soak $(if $(filter file,$(origin MINUTES)),,--minutes $(MINUTES)) $(ARGS)
 
-check: setup-dev ## Lint, format, strict types, import rules
+check: setup-dev ## Lint, format, strict types, import rules; the core in C without a warning
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/clang-format --dry-run --Werror $(C_FILES)
+	$(BIN)/python native/build.py --check
 
 format: setup-dev ## Format the code
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+	$(BIN)/clang-format -i $(C_FILES)
 
 bench: setup-dev ## Run the benchmarks and print tables
 	$(BIN)/python -m benchmarks $(ARGS)

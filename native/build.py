@@ -28,7 +28,7 @@ NO_COMPILER = 3
 # No contraction of a·b + c: results have the same bits on every processor.
 FLAGS = (
     "-std=c11", "-O2", "-fPIC", "-shared", "-fvisibility=hidden", "-ffp-contract=off",
-    "-fno-math-errno", "-Wall", "-Wextra",
+    "-fno-math-errno", "-Wall", "-Wextra", "-Wconversion",
 )  # fmt: skip
 SANITIZERS = (
     "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all", "-g",
@@ -96,6 +96,7 @@ def build(into: Path = INTO, *more_flags: str) -> bool:
             shutil.rmtree(left)
         with tempfile.TemporaryDirectory(prefix=_SCRATCH, dir=into) as name:
             scratch = Path(name)
+            print("building the core in C ...", flush=True)
             _compile(scratch, more_flags)
             _write_declarations(scratch)
             (scratch / LIBRARY).replace(into / LIBRARY)
@@ -109,7 +110,6 @@ def build(into: Path = INTO, *more_flags: str) -> bool:
 
 def _compile(into: Path, more_flags: tuple[str, ...]) -> None:
     command = compiler()
-    print("building the core in C ...", flush=True)
     digest = into / "sources.c"
     digest.write_text(
         '__attribute__((visibility("default"))) const char *noack_sources(void);\n'
@@ -144,12 +144,19 @@ def main() -> int:
     """Build from the command line; print a line if something is built."""
     parser = argparse.ArgumentParser(description="Build the core in C.")
     parser.add_argument("--into", type=Path, default=INTO, help="folder of the library")
-    parser.add_argument("--sanitized", action="store_true", help="with ASan and UBSan; needs --into")
+    parser.add_argument("--check", action="store_true", help="only look: a warning is an error")
+    parser.add_argument(
+        "--sanitized", action="store_true", help="with ASan and UBSan; needs --into"
+    )
     given = parser.parse_args()
     if given.sanitized and given.into == INTO:
         parser.error("--sanitized: noack cannot load this library; give another folder by --into")
     try:
-        build(given.into, *(SANITIZERS if given.sanitized else ()))
+        if given.check:
+            with tempfile.TemporaryDirectory() as scratch:
+                _compile(Path(scratch), ("-Werror",))
+        else:
+            build(given.into, *(SANITIZERS if given.sanitized else ()))
     except NoCompilerError as error:
         print(error, file=sys.stderr)
         return NO_COMPILER
