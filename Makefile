@@ -19,6 +19,7 @@ MINUTES ?= 10
 N ?= 1000000
 ARGS ?=
 LIVE ?=
+C_FILES := $(wildcard native/*.[ch] native/*/*.[ch])
 override FLAGS := $(if $(filter-out 0 no,$(LIVE)),--live) $(ARGS)
 
 .PHONY: help
@@ -117,15 +118,18 @@ attack: setup-dev ## Send N=1000000 hostile datagrams to each port of a run (5 m
 soak: setup-dev ## Soak test: one hour, then a simulated day at speed 48; MINUTES=5 for a short test
 	$(BIN)/python -m benchmarks.soak $(if $(filter file,$(origin MINUTES)),,--minutes $(MINUTES)) $(ARGS)
 
-check: setup-dev ## Lint, format, strict types, import rules
+check: setup-dev ## Lint, format, strict types, import rules; the core in C without a warning
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/clang-format --dry-run --Werror $(C_FILES)
+	$(BIN)/python native/build.py --check
 
 format: setup-dev ## Format the code
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+	$(BIN)/clang-format -i $(C_FILES)
 
 bench: setup-dev ## Run the benchmarks and print tables
 	$(BIN)/python -m benchmarks $(ARGS)
@@ -153,6 +157,8 @@ lock: setup-dev ## Update the pinned dependencies
 		--no-header pyproject.toml --group build --group dev --group docs -c requirements.lock -o requirements-dev.lock
 	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 		--no-header pyproject.toml --extra lab -c requirements-dev.lock -o requirements-lab.lock
+	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
+		--no-header --group compiler -o requirements-compiler.lock
 
 dist: setup-dev ## Build the sdist, and the wheel from it, into dist/
 	@rm -rf dist
@@ -160,7 +166,8 @@ dist: setup-dev ## Build the sdist, and the wheel from it, into dist/
 	@ls dist/*
 
 clean: ## Remove the environment and caches, not runs/
-	rm -rf $(VENV) site .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) site .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache \
+		noack/core/libnoack.so noack/core/_core_header.py
 
 $(VENV)/bin/python:
 	@test -n "$(PYTHON)" || { echo "noack needs Python >= 3.11; none found (set PYTHON=...)" >&2; exit 2; }
@@ -168,9 +175,18 @@ $(VENV)/bin/python:
 	@$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
 		echo "noack needs Python's venv module (Debian: apt-get install python3-venv)" >&2; exit 2; }
 
-$(VENV)/.installed: requirements.lock pyproject.toml | $(VENV)/bin/python
+$(VENV)/.dependencies: requirements.lock | $(VENV)/bin/python
 	@echo "installing pinned dependencies ..."
 	@$(PIP) -r requirements.lock
+	@touch $@
+
+# It builds if a source has changed, else it does nothing. Exit status 3: there is no C compiler.
+.PHONY: core
+core: $(VENV)/.dependencies
+	@$(BIN)/python native/build.py || { [ $$? = 3 ] && echo "installing ziglang ..." && \
+		$(PIP) -r requirements-compiler.lock && $(BIN)/python native/build.py; }
+
+$(VENV)/.installed: $(VENV)/.dependencies pyproject.toml | core
 	@$(EDITABLE)
 	@touch $@
 

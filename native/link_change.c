@@ -8,11 +8,15 @@
 
 #include "core.h"
 
-/* The place of the stage with this random stream and the same kind, or with a queue; -1: none. */
+static int is_bottleneck(const noack_stage *stage) {
+    return stage->kind == NOACK_CODEL || stage->kind == NOACK_TAIL_DROP;
+}
+
+/* The place of the stage with this random stream and the same kind, or also a bottleneck; -1: none. */
 static int64_t place_of(const noack_link *link, const noack_stage *stage) {
     for (int64_t i = 0; i < link->stage_count; i++) {
         const noack_stage *other = &link->stages[i];
-        int alike = other->kind == stage->kind || (other->queue_places > 0 && stage->queue_places > 0);
+        int alike = other->kind == stage->kind || (is_bottleneck(other) && is_bottleneck(stage));
         if (alike && other->key0 == stage->key0 && other->key1 == stage->key1)
             return i;
     }

@@ -3,8 +3,16 @@
 
 #include "core.h"
 
-enum { MOST_EVER = 1 << 30 };
+/* With these limits no sum and no product of the other files overflows, for packets of at most
+   65,535 bytes that arrive at times from 0 to FAR_NS. */
+enum { MOST_EVER = 1 << 30, MOST_STAGES = 1024, MOST_BYTES = 1 << 16, MOST_CELL_HEADER = 1 << 10 };
+enum { MOST_OPPORTUNITIES_PER_MS = 1 << 20, NS_PER_MS = 1000000 };
 static const int64_t FAR_NS = INT64_C(1) << 61;
+static const int64_t LONGEST_DELAY_NS = INT64_C(1000000000000000); /* 11.6 days, of a stage */
+
+static int is_between(int64_t least, int64_t number, int64_t most) {
+    return least <= number && number <= most;
+}
 
 static int in_range(int64_t begin, int64_t end, int64_t count) {
     return 0 <= begin && begin <= end && end <= count;
@@ -12,46 +20,71 @@ static int in_range(int64_t begin, int64_t end, int64_t count) {
 
 static int is_power_of_2(int64_t number) { return number > 0 && (number & (number - 1)) == 0; }
 
-static const char *check_queue(const noack_link *link, const noack_stage *stage) {
-    if (stage->queue_places <= 0 || stage->queue_places > MOST_EVER)
-        return "a stage's queue has no places";
-    if (!in_range(stage->queue_begin, stage->queue_begin + stage->queue_places,
-                  link->departure_places))
-        return "a stage's queue is outside the table of departures";
-    return NULL;
+/* Whether the numbers in [begin, end) ascend, or are equal, from first to last. */
+static int ascends(
+    const int64_t *numbers, int64_t begin, int64_t end, int64_t first, int64_t last) {
+    for (; begin < end; begin++) {
+        if (!is_between(first, numbers[begin], last))
+            return 0;
+        first = numbers[begin];
+    }
+    return 1;
 }
 
-static const char *check_bottleneck(const noack_link *link, const noack_stage *stage) {
+static const char *check_bottleneck(const noack_stage *stage) {
     const noack_bottleneck *own = &stage->bottleneck;
-    if (own->rate_bps < 1 || own->cell_bytes < 0 || own->cell_overhead_bytes < 0)
-        return "a bottleneck has no rate, or negative cells";
+    if (!is_between(1, own->rate_bps, FAR_NS))
+        return "a bottleneck has no rate";
+    if (!is_between(-MOST_BYTES, own->overhead_bytes, MOST_BYTES)
+        || !is_between(0, own->cell_bytes, MOST_BYTES)
+        || !is_between(0, own->cell_overhead_bytes, MOST_CELL_HEADER))
+        return "a bottleneck has an overhead or cells of more than 65,536 bytes, or below 0";
     if (stage->kind == NOACK_CODEL
-        && (own->target_ns < 0 || own->interval_ns < 1 || own->interval_ns > FAR_NS / 16))
+        && (own->target_ns < 0 || !is_between(1, own->interval_ns, FAR_NS / 16)))
         return "CoDel has no target or interval";
-    return check_queue(link, stage);
+    return stage->queue_places < 1 ? "a bottleneck has no queue" : NULL;
 }
 
 static const char *check_opportunities(const noack_link *link, const noack_stage *stage) {
     const noack_opportunities *own = &stage->opportunities;
-    if (!in_range(own->begin, own->end, link->integer_count) || own->begin == own->end
-        || link->integers[own->end - 1] < 1)
-        return "delivery opportunities are outside the table of integers, or end at 0";
-    if (stage->queue_places % 2 != 0)
+    if (!in_range(own->begin, own->end, link->integer_count) || own->begin == own->end)
+        return "delivery opportunities are outside the table of integers";
+    int64_t last_ms = link->integers[own->end - 1], count = own->end - own->begin;
+    if (last_ms < 1 || !ascends(link->integers, own->begin, own->end, 0, FAR_NS / NS_PER_MS))
+        return "delivery opportunities do not ascend from 0, or end at 0 or after 73 years";
+    if (count / MOST_OPPORTUNITIES_PER_MS >= last_ms)
+        return "there are more than a million delivery opportunities in a millisecond";
+    if (!is_between(0, own->offset_ns, FAR_NS) || !is_between(0, own->queue_bytes, FAR_NS)
+        || !is_between(-MOST_BYTES, own->overhead_bytes, MOST_BYTES))
+        return "delivery opportunities have an offset, overhead or queue out of range";
+    if (stage->queue_places < 2 || stage->queue_places % 2 != 0)
         return "a queue of delivery opportunities needs two numbers for a packet";
-    return check_queue(link, stage);
+    return NULL;
 }
 
 static const char *check_replay(const noack_link *link, const noack_replay *own) {
-    int64_t count = own->end - own->begin;
-    if (!in_range(own->begin, own->end, link->integer_count) || count < 1
-        || !in_range(own->times_begin, own->times_begin + count, link->integer_count))
+    if (!in_range(own->begin, own->end, link->integer_count) || own->begin == own->end)
         return "a trace is outside the table of integers";
-    if (own->offset < 0 || own->period_ns < 0)
-        return "a trace has a negative offset or length";
+    for (int64_t i = own->begin; i < own->end; i++)
+        if (!is_between(-1 - LONGEST_DELAY_NS, link->integers[i], LONGEST_DELAY_NS))
+            return "a recorded delay is longer than 11.6 days";
+    if (!is_between(0, own->offset, FAR_NS) || !is_between(0, own->period_ns, FAR_NS))
+        return "a trace has an offset or length below 0, or of more than 73 years";
+    if (own->period_ns == 0)
+        return NULL;
+    int64_t count = own->end - own->begin, first = own->times_begin;
+    if (first < 0 || first > link->integer_count - count)
+        return "sending times are outside the table of integers";
+    if (link->integers[first] != 0 || !ascends(link->integers, first, first + count, 0, FAR_NS))
+        return "sending times do not ascend from 0";
     return NULL;
 }
 
 static const char *check_stage(const noack_link *link, const noack_stage *stage) {
+    if (!is_between(0, stage->queue_places, MOST_EVER)
+        || (stage->queue_places > 0
+            && !is_between(0, stage->queue_begin, link->departure_places - stage->queue_places)))
+        return "a stage's queue is outside the table of departures";
     switch (stage->kind) {
     case NOACK_BERNOULLI:
     case NOACK_CORRUPT:
@@ -64,7 +97,9 @@ static const char *check_stage(const noack_link *link, const noack_stage *stage)
     case NOACK_GILBERT_ELLIOTT:
         return stage->gilbert_elliott.step_ns < 0 ? "a step is below 0" : NULL;
     case NOACK_PERIODIC:
-        return stage->periodic.period < 1 ? "a period is below 1" : NULL;
+        return stage->periodic.period < 1 || stage->periodic.first < 0
+                   ? "a period is below 1, or begins before the first packet"
+                   : NULL;
     case NOACK_SCRIPTED:
         return in_range(stage->scripted.begin, stage->scripted.end, link->integer_count)
                    ? NULL
@@ -84,7 +119,7 @@ static const char *check_stage(const noack_link *link, const noack_stage *stage)
         return NULL;
     case NOACK_CODEL:
     case NOACK_TAIL_DROP:
-        return check_bottleneck(link, stage);
+        return check_bottleneck(stage);
     case NOACK_OPPORTUNITIES:
         return check_opportunities(link, stage);
     case NOACK_REPLAY:
@@ -96,8 +131,7 @@ static const char *check_stage(const noack_link *link, const noack_stage *stage)
 
 const char *noack_recorded_check(const noack_link *link) {
     for (int64_t i = 0; i < link->recorded_flows; i++)
-        if (!in_range(
-                link->decisions_begin[i], link->decisions_begin[i + 1], link->decision_count))
+        if (!in_range(link->decisions_begin[i], link->decisions_begin[i + 1], link->decision_count))
             return "recorded decisions are outside their table";
     for (int64_t i = 0; i < link->decision_count; i++) {
         const noack_recorded *one = &link->decisions[i];
@@ -110,13 +144,15 @@ const char *noack_recorded_check(const noack_link *link) {
 }
 
 static const char *check_guarantee(const noack_link *link) {
-    if (link->mansd < -1 || link->recovery < 0 || link->limit < 0)
-        return "the guarantee or the limit is negative";
+    if (!is_between(-1, link->mansd, MOST_EVER) || !is_between(0, link->recovery, MOST_EVER)
+        || !is_between(0, link->limit, MOST_EVER))
+        return "the guarantee or the limit is negative, or more than 2^30";
     int64_t longest = 0;
     for (int64_t i = 0; i < link->window_count; i++) {
-        if (link->windows[i].losses < 0 || link->windows[i].packets < 1)
-            return "a window has no packets";
-        longest = max_of(longest, link->windows[i].packets);
+        const noack_window *window = &link->windows[i];
+        if (!is_between(0, window->losses, MOST_EVER) || !is_between(1, window->packets, MOST_EVER))
+            return "a window has no packets, or more than 2^30";
+        longest = max_of(longest, window->packets);
     }
     if (!is_power_of_2(link->recent_width) || !is_power_of_2(link->loss_width))
         return "the width of a ring is no power of 2";
@@ -128,12 +164,22 @@ static const char *check_guarantee(const noack_link *link) {
     return NULL;
 }
 
+static const char *check_lengths(const noack_link *link) {
+    const int64_t lengths[] = {
+        link->rows,         link->stage_count,  link->departure_places, link->integer_count,
+        link->real_count,   link->window_count, link->decision_count,   link->recorded_flows,
+        link->recent_width, link->loss_width,   link->in_flight,
+    };
+    for (size_t i = 0; i < sizeof lengths / sizeof *lengths; i++)
+        if (!is_between(0, lengths[i], MOST_EVER))
+            return "a table has a negative length, or one of more than 2^30";
+    return link->stage_count > MOST_STAGES ? "there are more than 1024 stages" : NULL;
+}
+
 const char *noack_link_check(const noack_link *link) {
-    if (link->rows < 0 || link->stage_count < 0 || link->departure_places < 0
-        || link->integer_count < 0 || link->real_count < 0 || link->window_count < 0
-        || link->decision_count < 0 || link->recorded_flows < 0)
-        return "a table has a negative length";
-    const char *wrong = check_guarantee(link);
+    const char *wrong = check_lengths(link);
+    if (wrong == NULL)
+        wrong = check_guarantee(link);
     for (int64_t i = 0; wrong == NULL && i < link->stage_count; i++)
         wrong = check_stage(link, &link->stages[i]);
     return wrong;

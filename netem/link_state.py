@@ -136,8 +136,12 @@ class LinkState:
             settings: the new settings.
             latest_ns: (rows,) last departure time of the packets in flight of each flow; −1: none.
         """
-        kept = self._memory
-        after = self._filled(settings, self.rows, tracks=self.tracks)
+        kept = self._memory, self._stages
+        try:
+            after = self._filled(settings, self.rows, tracks=self.tracks)
+        except ValueError:  # the link goes on as it was
+            self._memory, self._stages = kept
+            raise
         core.noack_link_change(self.core, after, pointer_to(latest_ns, "int64_t *"))
         self.core[0] = after[0]
         self.settings = settings

@@ -26,9 +26,9 @@ static int64_t opportunity_after(
 /* The time of an opportunity. */
 static int64_t opportunity_ns(
     const noack_opportunities *own, const int64_t *times_ms, int64_t number) {
-    int64_t count = own->end - own->begin;
-    int64_t elapsed_ms = floor_div(number, count) * times_ms[own->end - 1]
-                         + times_ms[own->begin + floor_mod(number, count)];
+    int64_t count = own->end - own->begin, period_ms = times_ms[own->end - 1];
+    int64_t cycle = min_of(floor_div(number, count), LATEST_NS / NS_PER_MS / period_ms + 1);
+    int64_t elapsed_ms = cycle * period_ms + times_ms[own->begin + floor_mod(number, count)];
     return min_of(elapsed_ms, LATEST_NS / NS_PER_MS) * NS_PER_MS - own->offset_ns;
 }
 

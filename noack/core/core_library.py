@@ -13,14 +13,33 @@ from numpy.typing import NDArray
 from noack.core.errors import CallerError
 
 LIBRARY = Path(__file__).with_name("libnoack.so")
-HEADER = LIBRARY.with_name("_core_header.py")
+_REMEDY = "run `make setup` in the repository, or install noack again"
 
 try:
+    from noack.core._core_header import SOURCES
     from noack.core._core_header import ffi as ffi
 except ImportError:
-    raise CallerError("noack's core has not been built; run `make setup` in its folder") from None
+    raise CallerError(f"noack's core in C has not been built; {_REMEDY}") from None
 
-core: Any = ffi.dlopen(str(LIBRARY))
+
+def load_core(path: Path) -> Any:
+    """Return the functions and constants of native/noack.h in a library.
+
+    Raises:
+        CallerError: there is no library that goes with the declarations.
+    """
+    try:
+        library = ffi.dlopen(str(path))
+        built_from = ffi.string(library.noack_sources()).decode()
+    except (OSError, ffi.error) as error:
+        reason = str(error).rpartition("': ")[2]  # begins with the path
+        raise CallerError(f"noack's core in C cannot be loaded: {reason}; {_REMEDY}") from None
+    if built_from != SOURCES:
+        raise CallerError(f"{path}: is not of the same sources as its declarations; {_REMEDY}")
+    return library
+
+
+core: Any = load_core(LIBRARY)
 """The functions and constants of native/noack.h."""
 
 _FORMATS = {

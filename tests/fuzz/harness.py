@@ -4,7 +4,8 @@ Each parser has a module below ``parsers`` with
 
 * ``one_input(data)``, which passes one input to the parser and raises if the parser fails;
 * optionally ``SEEDS``, initial inputs in addition to the kept ones (the default is that of
-  :mod:`tests.fuzz.choices`), and ``WORDS``, from which the fuzzer builds inputs.
+  :mod:`tests.fuzz.choices`), ``WORDS``, from which the fuzzer builds inputs, and ``SANITIZED``: the
+  long run has the core that is built with ASan and UBSan.
 
 ``corpus/NAME.txt`` contains the kept inputs, one per line, escaped as Python escapes bytes.
 """
@@ -47,6 +48,8 @@ class Harness:
     """Initial inputs in addition to the kept ones."""
     words: Sequence[bytes]
     """Words from which the fuzzer builds inputs."""
+    sanitized: bool
+    """Whether the long run has the core with sanitizers."""
 
     def run(self, data: bytes) -> None:
         """Pass one input to the parser.
@@ -66,8 +69,9 @@ def harness(name: str) -> Harness:
     """Return the harness of a parser."""
     module = importlib.import_module(f"tests.fuzz.parsers.{name}")
     return Harness(
-        name, module.one_input, getattr(module, "SEEDS", SEEDS), getattr(module, "WORDS", ())
-    )
+        name, module.one_input, getattr(module, "SEEDS", SEEDS), getattr(module, "WORDS", ()),
+        getattr(module, "SANITIZED", False),
+    )  # fmt: skip
 
 
 def kept(name: str) -> list[bytes]:

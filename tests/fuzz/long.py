@@ -4,12 +4,13 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 from tests.fuzz.harness import FOLDER, harness, kept
+from tests.native import sanitized_core
 
 ROOT = FOLDER.parents[1]
 OUT = ROOT / ".cache" / "fuzz"
@@ -57,12 +58,14 @@ def fuzz(name: str, until: str, out: Path = OUT) -> Result:
     lines = ('"' + "".join(f"\\x{byte:02x}" for byte in word) + '"' for word in under_test.words)
     words.write_text("\n".join(dict.fromkeys(lines)) + "\n", encoding="ascii")
     flags = [str(corpus), until, *_FLAGS, f"-artifact_prefix={folder}/", f"-dict={words}"]
+    child = [sys.executable, "-m", "tests.fuzz.child", name, *flags]
+    environment: Mapping[str, str] = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+    if under_test.sanitized:
+        child, environment = sanitized_core.command(*child[2:])
     with log.open("wb") as file:
         status = subprocess.run(
-            [sys.executable, "-m", "tests.fuzz.child", name, *flags],
-            cwd=ROOT, stdout=file, stderr=file, check=False,
-            env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
-        ).returncode  # fmt: skip
+            child, cwd=ROOT, stdout=file, stderr=file, check=False, env=environment
+        ).returncode
     reports = _STATUS.findall(log.read_bytes())
     executions, _, features = map(int, reports[-1]) if reports else (0, 0, 0)
     return Result(name, executions, features, findings_in(folder), status, log)

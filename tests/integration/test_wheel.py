@@ -15,6 +15,8 @@ from typing import Any
 
 import pytest
 from packaging.requirements import Requirement
+from packaging.tags import sys_tags
+from packaging.utils import parse_wheel_filename
 
 from cosim.doctor.machine_measures import EXTRAS
 from tests.integration.conftest import EPHEMERAL, PATIENCE_S
@@ -143,14 +145,28 @@ def test_the_wheel_contains_the_packages_and_their_data_only(dist: Path) -> None
     assert not [name for name in names if "__pycache__" in name]
 
 
+def test_the_wheel_is_for_this_platform_and_every_python(dist: Path) -> None:
+    (wheel,) = dist.glob("*.whl")
+    *_, tags = parse_wheel_filename(wheel.name)
+    (tag,) = tags
+    assert (tag.interpreter, tag.abi) == ("py3", "none")
+    assert tag in sys_tags()
+
+
 def test_the_sdist_has_the_documentation_and_the_tests(dist: Path) -> None:
     (sdist,) = dist.glob("*.tar.gz")
     with tarfile.open(sdist) as file:
         names = {name.partition("/")[2] for name in file.getnames()}
     assert {"README.md", "CHANGELOG.md", "LICENSE", "Makefile", "docs/scenarios.md",
-            "CITATION.cff", "requirements.lock",
+            "CITATION.cff", "requirements.lock", "native/noack.h", "native/impairments/delay.c",
             "tests/integration/test_wheel.py"} <= names  # fmt: skip
     assert not [name for name in names if name.startswith((".venv", "runs", ".ci"))]
+    assert not [name for name in names if name.endswith((".so", "_core_header.py"))]
+
+
+def test_the_installed_wheel_simulates_with_its_own_core(noack: Installed) -> None:
+    run = noack.json("simulate", "lane_following", "--no-report")
+    assert run["exit"]["status"] == 0
 
 
 def test_the_installed_wheel_runs_without_the_repository(noack: Installed) -> None:

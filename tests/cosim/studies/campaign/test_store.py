@@ -2,8 +2,10 @@
 
 import errno
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import pyarrow.dataset
@@ -13,6 +15,7 @@ from cosim.studies.campaign.campaign_grid import base_of
 from cosim.studies.campaign.campaign_run import run_campaign
 from cosim.studies.campaign.campaign_workers import alone
 from cosim.studies.campaign.chunk_store import Chunk, Store, opened
+from noack.core import file_access
 from noack.core.errors import CallerError, MachineError
 from tests.cosim.studies.campaign.conftest import Few, Write, few_of
 
@@ -70,15 +73,17 @@ def test_a_full_disk_gives_one_line_and_leaves_complete_files_only(
 ) -> None:
     plan, points = campaign
     store = Store(tmp_path / "out", points, plan.draws, plan.chunk)
-    write, paths = Path.write_bytes, []
+    replace, files = file_access.replacing, []
 
-    def fill(path: Path, content: bytes) -> None:
-        paths.append(path)
-        write(path, content[:100] if len(paths) == 5 else content)
-        if len(paths) == 5:
-            raise OSError(errno.ENOSPC, "No space left on device")
+    @contextmanager
+    def fill(path: Path) -> Iterator[IO[bytes]]:
+        files.append(path)
+        with replace(path) as file:
+            yield file
+            if len(files) == 5:
+                raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(Path, "write_bytes", fill)
+    monkeypatch.setattr(file_access, "replacing", fill)
     with pytest.raises(MachineError) as found:
         run_campaign(store, alone)
     assert str(found.value).startswith(f"{store.folder}/runs/")

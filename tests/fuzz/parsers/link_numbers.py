@@ -1,0 +1,165 @@
+"""Numbers of a link: the core refuses them, or acts on them without undefined behaviour.
+
+The long run uses the core that is built with sanitizers (:mod:`tests.native.sanitized_core`).
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from netem.link_state import LinkState
+from noack.core.core_library import core, dtype_of, ffi, pointer_to
+from noack.impairments.constraints import CONSTRAINTS
+from noack.impairments.kinds import IMPAIRMENTS
+from noack.impairments.link_records import NEVER_NS, RecordedDecision
+from noack.impairments.link_settings import LinkSettings
+from tests.fuzz.choices import Choices
+
+SANITIZED = True
+SEEDS = (
+    b"", bytes(range(256)), bytes(range(255, -1, -1)) * 2,
+    *(bytes([*range(at, at + 40)]) * 4 for at in range(0, 200, 11)),
+)  # fmt: skip
+
+IMPAIRED = [
+    one
+    for kind in IMPAIRMENTS
+    for one in kind.examples()
+    if getattr(getattr(one, "loss", one), "file", None) is None
+    and not getattr(getattr(one, "loss", None), "keep", False)
+]
+CONSTRAINED = [one for kind in CONSTRAINTS for one in kind.examples()]
+_RECORDED = (RecordedDecision(0, 10, 20, 3, -1), RecordedDecision(3, 5, -1, 900, 7))
+_FIELDS = [(name, of.type.cname) for name, of in ffi.typeof("noack_link").fields]
+_SCALARS = [name for name, kind in _FIELDS if kind == "int64_t"]
+_COUNTED = ("stages", "integers", "reals", "windows", "decisions")
+"""The tables, of which ``noack_link`` has the length."""
+_MOST = 4096
+LATEST_NS, LARGEST_BYTES = 2**61, 65_535
+"""What the core assumes of packets."""
+
+Words = NDArray[np.int64]
+
+
+def one_input(data: bytes) -> None:
+    """Make two links, decide for packets of the first, and go on with the second."""
+    choices = Choices(data)
+    links = [link for link in (_link(choices), _link(choices)) if link is not None]
+    for number, (link, kept) in enumerate(links):
+        if number == 0:
+            for row in range(link.rows):
+                core.noack_link_start_flow(link, row, row, choices.below(2), choices.below(2))
+        else:
+            before, owner = links[0]
+            if link.rows != before.rows:
+                return
+            link.flows = before.flows
+            latest_ns = np.full(link.rows, NEVER_NS, np.int64)
+            core.noack_link_change(before, link, pointer_to(latest_ns, "int64_t *"))
+            kept |= {"flows": owner["flows"]}
+        if link.rows:
+            _decide(link, choices)
+
+
+def _decide(link: Any, choices: Choices) -> None:
+    """Decide for some packets; let those leave that are not lost."""
+    decision = ffi.new("noack_decision *")
+    now_ns = choices.integer() % LATEST_NS
+    for _ in range(12):
+        row, size = choices.below(256) % link.rows, choices.integer() % (LARGEST_BYTES + 1)
+        core.noack_link_decide(link, row, size, now_ns, decision)
+        assert core.NOACK_DELIVERED <= decision.fate <= core.NOACK_BLACKED_OUT
+        if decision.release_ns != NEVER_NS and choices.flag():
+            delayed = decision.release_ns > now_ns
+            core.noack_link_leave(link, row, decision.packet, size, delayed, decision.bit < 0)
+        step_ns = choices.integer() if choices.below(8) == 1 else choices.below(1 << 16) << 10
+        now_ns = min(now_ns + abs(step_ns), LATEST_NS)
+
+
+def _link(choices: Choices) -> tuple[Any, dict[str, Any]] | None:
+    """Return a link of numbers that the core accepts, and the arrays that it has; or None."""
+    recorded = _RECORDED if choices.below(4) == 1 else ()
+    settings = LinkSettings.model_construct(
+        impairments=tuple(choices.one(IMPAIRED) for _ in range(choices.below(4))),
+        constraints=tuple(choices.one(CONSTRAINED) for _ in range(choices.below(3))),
+        mansd=choices.one((None, 0, 1, 5)),
+    )
+    state = LinkState(settings, 1, "fuzz", decisions=(recorded,), rows=1 + choices.below(3))
+    valid = state.core
+    link = ffi.new("noack_link *", valid[0])
+    tables = {
+        name: np.frombuffer(
+            ffi.buffer(getattr(valid, name), _length(valid, name) * ffi.sizeof(_kind(name))),
+            np.int64,
+        ).copy()
+        for name in (*_COUNTED, "decisions_begin")
+    }
+    keys = tables["stages"].reshape(-1, ffi.sizeof("noack_stage") // 8)[:, 1:3]
+    keys[:] = choices.below(2)  # a change of settings transfers states between equal keys
+    for _ in range(choices.below(6)):
+        number = _integer(choices)
+        place = choices.below(len(tables) + 2)
+        if place < len(tables):
+            words = [*tables.values()][place]
+            if len(words):
+                words[choices.below(1 << 16) % len(words)] = number
+        else:
+            setattr(link, choices.one(_SCALARS), number)
+    kept = _allocate(link, tables)
+    wrong = core.noack_link_check(link)
+    if wrong == ffi.NULL:
+        wrong = core.noack_recorded_check(link)
+    if wrong != ffi.NULL:
+        assert ffi.string(wrong).decode().isprintable()
+        return None
+    return link, kept
+
+
+def _integer(choices: Choices) -> int:
+    """Return 64 bits: of an integer, or of a real number."""
+    if choices.below(4) == 1:
+        return int(np.float64(choices.real()).view(np.int64))
+    return (choices.integer() + 2**63) % 2**64 - 2**63
+
+
+def _kind(name: str) -> Any:
+    return ffi.typeof(getattr(ffi.new("noack_link *"), name)).item
+
+
+def _length(link: Any, name: str) -> int:
+    if name == "decisions_begin":
+        return int(link.recorded_flows) + 1
+    return int(getattr(link, f"{name.removesuffix('s')}_count"))
+
+
+def _allocate(link: Any, tables: dict[str, Words]) -> dict[str, Any]:
+    """Give a link memory of exactly the lengths that it names; shorten those that are too long.
+
+    No check can know how much memory there is.
+    """
+    lengths = [name for name in _SCALARS if name.endswith(("_count", "_flows", "_places", "rows"))]
+    for name in (*lengths, "recent_width", "loss_width"):
+        if getattr(link, name) > _MOST:
+            setattr(link, name, getattr(link, name) % 64)
+    sizes = {name: max(_length(link, name), 0) for name in tables}
+    kept: dict[str, Any] = {
+        name: _resized(words, sizes[name] * ffi.sizeof(_kind(name)) // 8)
+        for name, words in tables.items()
+    }
+    rows, stages = max(link.rows, 0), sizes["stages"]
+    kept |= {
+        "flows": np.zeros(rows, dtype_of("noack_flow")),
+        "memory": np.zeros(rows * stages, dtype_of("noack_stage_memory")),
+        "recent_ns": np.full(rows * max(link.recent_width, 0), NEVER_NS, np.int64),
+        "losses": np.zeros(rows * max(link.loss_width, 0), np.int64),
+        "queues": np.zeros(stages, dtype_of("noack_queue")),
+        "departures_ns": np.zeros(max(link.departure_places, 0), np.int64),
+    }
+    for name, array in kept.items():
+        setattr(link, name, ffi.cast(ffi.typeof(getattr(link, name)), array.ctypes.data))
+    return kept
+
+
+def _resized(words: Words, length: int) -> Words:
+    return np.resize(words, length) if len(words) else np.zeros(length, np.int64)

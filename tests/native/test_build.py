@@ -1,0 +1,113 @@
+"""The build of the core: only if something has changed, whole or not at all, with any compiler."""
+
+import os
+import shutil
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from native.build import HEADER, LIBRARY, NO_COMPILER, is_current
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    """A copy of the folder native."""
+    return Path(shutil.copytree(ROOT / "native", tmp_path / "native"))
+
+
+def build(
+    native: Path, *arguments: str | Path, **environment: str
+) -> subprocess.CompletedProcess[str]:
+    """Build into the folder beside ``native``."""
+    return subprocess.run(
+        [sys.executable, native / "build.py", "--into", native.parent / "core", *arguments],
+        env=os.environ | environment, capture_output=True, text=True, check=False, timeout=200,
+    )  # fmt: skip
+
+
+def files(native: Path) -> dict[str, bytes]:
+    core = native.parent / "core"
+    return {path.name: path.read_bytes() for path in core.iterdir()}
+
+
+@pytest.fixture
+def needs_compiler() -> None:
+    if not any(map(shutil.which, ("cc", "gcc", "clang"))):
+        pytest.skip("there is no C compiler")
+
+
+def test_the_core_of_this_repository_is_that_of_its_sources() -> None:
+    assert is_current(), "run `make setup`"
+
+
+@pytest.mark.usefixtures("needs_compiler")
+def test_it_builds_only_what_has_changed_and_says_so_in_one_line(copy: Path) -> None:
+    first = build(copy)
+    assert (first.returncode, first.stderr) == (0, "")
+    assert len(first.stdout.splitlines()) == 1
+    made = files(copy)
+    assert made.keys() == {LIBRARY, HEADER}
+    again = build(copy)
+    assert (again.returncode, again.stdout, again.stderr) == (0, "", "")
+    (copy.parent / "core" / HEADER).unlink()
+    assert build(copy).stdout == first.stdout
+    assert files(copy) == made
+    with (copy / "core.h").open("a") as file:
+        file.write("/* changed */\n")
+    assert build(copy).stdout == first.stdout
+    assert files(copy)[HEADER] != made[HEADER]
+
+
+@pytest.mark.usefixtures("needs_compiler")
+def test_a_mistake_leaves_the_earlier_core_as_it_was(copy: Path) -> None:
+    build(copy)
+    made = files(copy)
+    with (copy / "link.c").open("a") as file:
+        file.write("int mistake(\n")
+    done = build(copy)
+    assert done.returncode == 1
+    assert "link.c" in done.stderr
+    assert done.stderr.splitlines()[-1].startswith("the core cannot be built")
+    assert files(copy) == made
+
+
+@pytest.mark.usefixtures("needs_compiler")
+def test_what_a_killed_build_has_left_is_removed(copy: Path) -> None:
+    left = copy.parent / "core" / ".building-x"
+    left.mkdir(parents=True)
+    (left / LIBRARY).write_bytes(b"half of")
+    build(copy)
+    assert files(copy).keys() == {LIBRARY, HEADER}
+
+
+@pytest.mark.usefixtures("needs_compiler")
+def test_of_two_builds_at_a_time_one_finds_it_built(copy: Path) -> None:
+    with ThreadPoolExecutor() as pool:
+        done = list(pool.map(build, [copy, copy]))
+    assert [one.returncode for one in done] == [0, 0]
+    assert sorted(len(one.stdout.splitlines()) for one in done) == [0, 1]
+
+
+def test_without_a_compiler_it_says_what_to_install(copy: Path, tmp_path: Path) -> None:
+    done = build(copy, PATH=str(tmp_path), CC="")
+    try:
+        import ziglang  # noqa: F401
+    except ImportError:
+        assert done.returncode == NO_COMPILER
+        (line,) = done.stderr.splitlines()
+        assert "gcc" in line
+        assert "ziglang" in line
+    else:
+        assert done.returncode == 0
+
+
+def test_noacks_own_core_is_never_a_sanitized_one() -> None:
+    command = [sys.executable, ROOT / "native" / "build.py", "--sanitized"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=100)
+    assert done.returncode == 2
+    assert "--into" in done.stderr.splitlines()[-1]

@@ -1,0 +1,82 @@
+"""The loader of the core: row types, pointers, and one line if there is no right library."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from noack.core.core_library import (
+    LIBRARY,
+    address_of,
+    core,
+    dtype_of,
+    ffi,
+    load_core,
+    pointer_to,
+)
+from noack.core.errors import CallerError
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.parametrize("name", [
+    "noack_decision", "noack_recorded", "noack_stage_memory", "noack_flow", "noack_queue",
+    "noack_counters", "noack_window",
+])  # fmt: skip
+def test_a_row_type_has_the_fields_of_its_structure(name: str) -> None:
+    rows = np.zeros(2, dtype_of(name))
+    assert rows.itemsize == ffi.sizeof(name)
+    first = pointer_to(rows, f"{name} *")
+    for number, field in enumerate(rows.dtype.names or ()):
+        setattr(first[1], field, number)
+        assert rows[1][field] == number
+    assert not rows[0].tobytes().strip(b"\0")
+
+
+def test_a_pointer_has_the_address_of_its_array() -> None:
+    numbers = np.arange(6, dtype=np.int64)
+    pointer = pointer_to(numbers, "int64_t *")
+    assert (address_of(pointer), pointer[5]) == (numbers.ctypes.data, 5)
+    with pytest.raises(ValueError, match="contiguous"):
+        pointer_to(numbers[::2], "int64_t *")
+
+
+def test_a_library_of_other_sources_is_refused(tmp_path: Path) -> None:
+    own = ffi.string(core.noack_sources())
+    (tmp_path / "other.so").write_bytes(LIBRARY.read_bytes().replace(own, own[::-1]))
+    with pytest.raises(CallerError, match="not of the same sources") as error:
+        load_core(tmp_path / "other.so")
+    assert "make setup" in str(error.value)
+
+
+@pytest.mark.parametrize("content", [None, b"", b"no library"])
+def test_a_missing_or_broken_library_is_refused_in_one_line(
+    tmp_path: Path, content: bytes | None
+) -> None:
+    path = tmp_path / "libnoack.so"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(CallerError) as error:
+        load_core(path)
+    assert str(path) in str(error.value)
+    assert "make setup" in str(error.value)
+    assert str(error.value).isprintable()
+
+
+@pytest.mark.parametrize("missing", ["libnoack.so", "_core_header.py"])
+def test_a_command_says_so_without_a_traceback(tmp_path: Path, missing: str) -> None:
+    for package in ("noack", "cosim", "netem", "plant_server", "sensor_node", "controller_node"):
+        ignored = shutil.ignore_patterns("__pycache__", missing if package == "noack" else "")
+        shutil.copytree(ROOT / package, tmp_path / package, ignore=ignored)
+    shutil.copytree(ROOT / "scenarios", tmp_path / "scenarios")
+    done = subprocess.run(
+        [sys.executable, "-c", "from cosim.cli import main; main()", "check", "lane_following"],
+        cwd=tmp_path, capture_output=True, text=True, check=False, timeout=100,
+    )  # fmt: skip
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("noack: noack's core in C")
+    assert "make setup" in line

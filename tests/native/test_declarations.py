@@ -1,0 +1,56 @@
+"""native/noack.h and the names that Python has for the same things."""
+
+from dataclasses import fields
+from pathlib import Path
+
+from noack.core.core_library import core, dtype_of, ffi
+from noack.impairments.feature import Stage, StageTables
+from noack.impairments.kinds import IMPAIRMENTS
+from noack.impairments.link_records import Counters, RecordedDecision
+from noack.protocol.record_tables import Fate
+
+ROOT = Path(__file__).parents[2]
+
+
+def constants(name: str) -> dict[str, int]:
+    """Return the constants of an enumeration."""
+    return {word: number for number, word in ffi.typeof(f"enum {name}").elements.items()}
+
+
+def test_fates_have_the_same_numbers() -> None:
+    assert constants("noack_fate") == {f"NOACK_{fate.name}": fate.value for fate in Fate}
+
+
+def test_records_have_the_same_fields_in_the_same_order() -> None:
+    for name, record in (("noack_counters", Counters), ("noack_recorded", RecordedDecision)):
+        assert dtype_of(name).names == tuple(one.name for one in fields(record))
+
+
+def test_each_stage_kind_has_a_file_in_c_and_a_feature_in_python() -> None:
+    kinds = [
+        name.removeprefix("NOACK_").lower()
+        for name, number in constants("noack_stage_kind").items()
+        if number != core.NOACK_STAGE_KINDS
+    ]
+    assert {path.stem for path in (ROOT / "native" / "impairments").glob("*.c")} == set(kinds)
+    made = {stage.kind for stage in stages()}
+    assert made == set(kinds)
+
+
+def stages() -> list[Stage]:
+    """Return the stages of all examples of the features."""
+    found = []
+    for kind in IMPAIRMENTS:
+        for one in kind.examples():
+            if getattr(getattr(one, "loss", one), "file", None) is None:
+                stage = one.stage(StageTables())
+                found += [stage] if stage is not None else []
+    return found
+
+
+def test_stage_numbers_have_the_fields_of_their_structure() -> None:
+    structures = dict(ffi.typeof("noack_stage").fields)
+    for stage in stages():
+        if stage.numbers:
+            structure = structures[stage.structure or stage.kind].type
+            assert stage.numbers.keys() <= dict(structure.fields).keys(), stage.kind
