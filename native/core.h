@@ -9,7 +9,8 @@
 #pragma GCC visibility pop
 
 #define NS_PER_S INT64_C(1000000000)
-#define LATEST_NS (INT64_C(1) << 61) /* 73 years: packets that must pass may exceed a queue's size */
+#define LATEST_NS                                                                                  \
+    (INT64_C(1) << 61) /* 73 years: packets that must pass may exceed a queue's size */
 
 static inline int64_t max_of(int64_t a, int64_t b) { return a > b ? a : b; }
 static inline int64_t min_of(int64_t a, int64_t b) { return a < b ? a : b; }
@@ -72,8 +73,7 @@ int happens(const noack_chance *chance, noack_stage_memory *memory, double u);
 int queue_enters(const noack_stage *stage, noack_queue *queue, int64_t *ring_ns, int64_t now_ns);
 int64_t queue_serve(
     const noack_stage *stage, noack_queue *queue, int64_t *ring_ns, int64_t size_bytes);
-void queue_occupy(
-    const noack_stage *stage, noack_queue *queue, int64_t *ring_ns, int64_t until_ns);
+void queue_occupy(const noack_stage *stage, noack_queue *queue, int64_t *ring_ns, int64_t until_ns);
 
 /* guarantee.c */
 int counts_losses(const noack_link *link);

@@ -20,9 +20,7 @@
 #include "core.h"
 
 /* Whether the guarantee needs S. */
-int counts_losses(const noack_link *link) {
-    return link->window_count > 0 || link->recovery > 0;
-}
+int counts_losses(const noack_link *link) { return link->window_count > 0 || link->recovery > 0; }
 
 /* Whether the flow's next packet has to be delivered. */
 int64_t noack_must_pass(const noack_link *link, int64_t row) {
@@ -45,8 +43,7 @@ int64_t noack_must_pass(const noack_link *link, int64_t row) {
 }
 
 /* The newest effectively delivered packet below end; below oldest: none. */
-static int64_t newest_below(
-    const int64_t *recent_ns, int64_t mask, int64_t oldest, int64_t end) {
+static int64_t newest_below(const int64_t *recent_ns, int64_t mask, int64_t oldest, int64_t end) {
     int64_t number = end - 1;
     while (number >= oldest && recent_ns[number & mask] < 0)
         number--;

@@ -42,6 +42,6 @@ def compile_kept(
             if one.__module__ == module.__name__:
                 register_jitable(**_OPTIONS)(one)
     files = (__file__, *(one.__file__ for one in (calls, *modules)))
-    folder = cache_folder(name, [core_library.HEADER, *(Path(str(one)) for one in files)])
+    folder = cache_folder(name, [core_library.LIBRARY, *(Path(str(one)) for one in files)])
     compiled: Callable[..., Any] = compiler(folder, nogil=True, _nrt=False)(function)
     return compiled

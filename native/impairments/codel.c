@@ -4,12 +4,13 @@
    at a deterministic rate, so that this time, and hence the packet's time in the queue, is known on
    arrival. Therefore the control law is applied on arrival; it sees the same packets in the same
    order with the same times. A packet that it drops keeps its place in the queue until that time.
-   In the RFC, an empty queue resets the law; here the next packet resets it, since it does not wait.
+   In the RFC, an empty queue resets the law; here the next packet resets it, since it does not
+   wait.
 
-   One rule differs. The RFC does not drop a packet if at most one MTU waits behind it when it leaves
-   the queue, which is not known on arrival. Here, a packet is not dropped if at most one MTU is
-   before it when it arrives. The rules differ at the end of a burst: the RFC does not drop its last
-   packets, this implementation may.
+   One rule differs. The RFC does not drop a packet if at most one MTU waits behind it when it
+   leaves the queue, which is not known on arrival. Here, a packet is not dropped if at most one MTU
+   is before it when it arrives. The rules differ at the end of a burst: the RFC does not drop its
+   last packets, this implementation may.
 
    If the law drops a packet that must pass, the packet is served, and the law's state does not
    change: it drops the next packet that need not pass. */

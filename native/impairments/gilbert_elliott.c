@@ -6,9 +6,9 @@ enum { GOOD, BAD };
 
 /* Draw the link's state now, given that at the last packet.
 
-   After k steps the probability of the bad state is s + (b - s) lambda^k with b = 1 if the chain was
-   in the bad state, else 0, s = p/(p + r) and lambda = 1 - p - r. The power is computed by squaring,
-   so that every machine has the same bits. */
+   After k steps the probability of the bad state is s + (b - s) lambda^k with b = 1 if the chain
+   was in the bad state, else 0, s = p/(p + r) and lambda = 1 - p - r. The power is computed by
+   squaring, so that every machine has the same bits. */
 static void change_state(
     const noack_gilbert_elliott *own, noack_queue *channel, int64_t now_ns, double u) {
     int64_t steps = max_of(floor_div(now_ns, own->step_ns) - channel->step, 0);

@@ -1,8 +1,8 @@
 /* A queue that packets leave at recorded delivery opportunities: the link model of mahimahi.
 
    An opportunity carries up to 1504 bytes: several small packets, or a part of one, which leaves at
-   the opportunity that carries its last byte. What an empty queue does not use is lost, and so is an
-   opportunity at the very time of an arrival (mahimahi, link_queue.cc: rationalize and
+   the opportunity that carries its last byte. What an empty queue does not use is lost, and so is
+   an opportunity at the very time of an arrival (mahimahi, link_queue.cc: rationalize and
    use_a_delivery_opportunity). The schedule repeats from its last time on. As in its
    DroppingPacketQueue, the limits count the packets that no opportunity has begun to carry.
 

@@ -22,17 +22,15 @@ static int64_t part_of(int64_t change_ns, int64_t elapsed_ns, int64_t gap_ns) {
 /* The delay of a packet by its time in the trace, or -1 - d for a lost packet. */
 static int64_t delay_at(const noack_replay *own, const int64_t *table, int64_t elapsed_ns) {
     int64_t count = own->end - own->begin;
-    int64_t high =
-        first_above(table, own->times_begin, own->times_begin + count, elapsed_ns)
-        - own->times_begin;
+    int64_t high = first_above(table, own->times_begin, own->times_begin + count, elapsed_ns)
+                   - own->times_begin;
     int64_t low = max_of(high - 1, 0); /* the last record that is not later */
     int64_t delay_ns = table[own->begin + low];
     if (delay_ns < 0 || high == count || table[own->begin + high] < 0)
         return delay_ns;
     int64_t sent_ns = table[own->times_begin + low];
     int64_t gap_ns = table[own->times_begin + high] - sent_ns;
-    return delay_ns
-           + part_of(table[own->begin + high] - delay_ns, elapsed_ns - sent_ns, gap_ns);
+    return delay_ns + part_of(table[own->begin + high] - delay_ns, elapsed_ns - sent_ns, gap_ns);
 }
 
 /* Lose or delay the packet, and its copy, as recorded. */

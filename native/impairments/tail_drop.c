@@ -15,8 +15,7 @@ void apply_tail_drop(packet *packet, const noack_stage *stage, noack_stage_memor
         decision->release_ns = queue_serve(stage, queue, ring_ns, decision->size_bytes);
     if (decision->copy_ns == NOACK_NEVER_NS)
         return;
-    if (decision->fate == NOACK_DELIVERED
-        && queue_enters(stage, queue, ring_ns, decision->copy_ns))
+    if (decision->fate == NOACK_DELIVERED && queue_enters(stage, queue, ring_ns, decision->copy_ns))
         decision->copy_ns = queue_serve(stage, queue, ring_ns, decision->size_bytes);
     else
         decision->copy_ns = NOACK_NEVER_NS;

@@ -13,8 +13,8 @@ enum {
     READY = 64,
     LEAVING = 128,
     ERRORS = 16,
-    VECTORS = 1024,      /* maximum number of vectors in one call */
-    MOST_BYTES = 65536,  /* no received datagram is longer */
+    VECTORS = 1024,                   /* maximum number of vectors in one call */
+    MOST_BYTES = 65536,               /* no received datagram is longer */
     BUFFER_STRIDE = MOST_BYTES + 256, /* the buffers' first bytes are in different cache sets */
     CONTROL_BYTES = 64,
     ERROR_CONTROL_BYTES = 128 /* timestamp, error, address of the reporter */
