@@ -50,7 +50,7 @@ class JointSpectralRadius(NamedTuple):
     cycle: tuple[int, ...]
     """Numbers of the edges of the cycle that attains the lower bound, in their order of time."""
     vertices: int
-    """Number of vertices of the polytopes that prove the upper bound; 0: others do."""
+    """Number of vertices of the polytopes that prove the upper bound; 0: it has another proof."""
 
 
 def joint_spectral_radius(
