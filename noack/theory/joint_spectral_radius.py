@@ -78,14 +78,16 @@ def joint_spectral_radius(
 
 def _connected(system: SwitchedSystem, accuracy: float, most_vertices: int) -> JointSpectralRadius:
     only = only_cycle(system)
-    if only is not None:
-        return JointSpectralRadius(*growth_bounds(system, only), only, 0)
     leaving = Counter(edge.source for edge in system.edges)
-    if not most_vertices or max(leaving.values()) > MOST_LEAVING:
+    if only is None and (not most_vertices or max(leaving.values()) > MOST_LEAVING):
         return _by_quadratic_norms(system, accuracy)
     balanced = system.balanced()
-    cycle = _best_cycle(system, balanced, _SEARCH)
     upper, vertices, searched = math.inf, 0, False
+    if only is None:
+        cycle = _best_cycle(system, balanced, _SEARCH)
+    else:
+        lowers, uppers = zip(*(growth_bounds(one, only) for one in (system, balanced)), strict=True)
+        cycle, upper = Cycle(only if max(lowers) else (), max(lowers)), min(uppers)
     while cycle.growth * (1 + accuracy) < upper and accuracy < _COARSEST:
         growth = max(cycle.growth, _SMALLEST * _largest(balanced)) * (1 + accuracy)
         start = initial_vertices(balanced, cycle, growth)

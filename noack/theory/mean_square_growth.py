@@ -128,7 +128,7 @@ def sure_growth(
         shares = probability ** (weight * counts / 2)
         edges = [Edge(0, 0, exactly(F * share)) for F, share in zip(between, shares, strict=True)]
         T = SwitchedSystem(tuple(edges)).balancing()[0]
-        undone: Matrix = np.linalg.inv(T)
+        undone: Matrix = np.asarray(np.linalg.inv(T), dtype=np.float64)
         maps = T @ np.array(between) @ undone
         first = float(np.linalg.norm(T, 2) * np.linalg.norm(longest @ undone, 2))
         rest = _left_out(maps, likely, probability, first, float(np.linalg.norm(lost, 2)))
