@@ -93,7 +93,7 @@ class MarginResult:
     delay_s: float
     """Delay of an update in the network."""
     caps: tuple[LossCap, ...]
-    """M = 1, 2, … up to the first one that is not proven stable."""
+    """M = 1, 2, … up to the first one that is destabilised, or to the largest one examined."""
     every_m: bool
     """The constraints of the network allow no more losses with a larger M."""
     period: PeriodLimit | None
@@ -121,16 +121,19 @@ class MarginResult:
     @property
     def verdict(self) -> str:
         """The margin in words."""
-        last, most = self.caps[-1], self.stable_m
+        most = self.stable_m
         parts = []
         if most is not None and self.every_m:
             parts = [f"stable for every pattern that the constraints allow, with every M ≥ {most}"]
         elif most is not None:
             parts = [f"stable for every pattern with M ≤ {most}"]
-        if self.destabilised is not None:
+        parts += [
+            f"M = {m} is undecided (growth between {found.lower:.6g} and {found.upper:.6g})"
+            for m, found in self.caps
+            if found.verdict == "undecided" and m > (most or 0)  # of fewer losses all are stable
+        ]
+        if (last := self.destabilised) is not None:
             parts.append(f"this pattern destabilises M = {last.m}: {last.found.text}")
-        elif last.found.verdict == "undecided":
-            parts.append(f"M = {last.m} is undecided")
         return "; ".join(parts)
 
     def __repr__(self) -> str:
@@ -209,7 +212,7 @@ def find_margin(
         progress(f"M = {m}")
         caps.append(LossCap(m, margin.stability(capped(others, m - 1), accuracy)))
         every_m = others.longest_burst is not None and others.longest_burst < m
-        if every_m or caps[-1].found.verdict != "stable":
+        if every_m or caps[-1].found.verdict == "destabilised":
             break
     return MarginResult(
         resolved.name, resolved.mode, network.mansd, network.guarantee.meaning,

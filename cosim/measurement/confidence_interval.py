@@ -97,22 +97,25 @@ def profile_interval(
 def _profile_end(
     function: Callable[[Reals], float], best: Minimum, place: int, outer: float
 ) -> float:
-    others = np.delete(best.at, place)
+    """Return where the profile has lost what an interval allows, or ``outer``.
 
-    def lacking(value: float) -> float:
-        nonlocal others
-        found = minimise(lambda rest: function(np.insert(rest, place, value)), others, abs(outer))
-        others = found.at
-        return found.value - best.value - _ALLOWED
+    The profile at a value is searched for from the minimum at the last step inside the interval.
+    So it is a function of the value alone between two steps, although there may be several local
+    minima, and it has the sign that the steps found at both of them.
+    """
 
-    inside, step = float(best.at[place]), 0.25
+    def profile(value: float, others: Reals) -> Minimum:
+        return minimise(lambda rest: function(np.insert(rest, place, value)), others, abs(outer))
+
+    def lacking(value: float, others: Reals) -> float:
+        return profile(value, others).value - limit
+
+    limit = best.value + _ALLOWED
+    inside, others, step = float(best.at[place]), np.delete(best.at, place), 0.25
     while inside != outer:
-        beyond = inside + np.sign(outer) * min(step, abs(outer - inside))
-        if lacking(beyond) > 0:
-            return (
-                float(brentq(lacking, inside, beyond, xtol=_TOLERANCE))
-                if lacking(inside) < 0
-                else inside
-            )
-        inside, step = beyond, min(2 * step, _LONGEST_STEP)
+        beyond = inside + float(np.sign(outer)) * min(step, abs(outer - inside))
+        following = profile(beyond, others)
+        if following.value > limit:
+            return float(brentq(lacking, inside, beyond, args=(others,), xtol=_TOLERANCE))
+        inside, others, step = beyond, following.at, min(2 * step, _LONGEST_STEP)
     return outer

@@ -50,6 +50,8 @@ def bursts_of(
 ) -> list[Burst]:
     """Return the graph of a guarantee between deliveries; node 0 is that of the first delivery.
 
+    Different states of the automaton after which the same is allowed are one node.
+
     Of edges between the same nodes with the same time, there is the one with the fewest losses.
 
     Raises:
@@ -79,4 +81,30 @@ def bursts_of(
                     "two events"
                 )
             state, losses = int(automaton.after_loss(np.array([state]))[0]), sent
-    return list(found.values())
+    return _merged(list(found.values()))
+
+
+def _merged(bursts: list[Burst]) -> list[Burst]:
+    """Return the graph with one node for all that have the same paths, the lowest of them.
+
+    Nodes are divided as long as edges of one class differ in their losses, times or targets' class.
+    """
+    leaving: dict[int, list[Burst]] = {}
+    for burst in bursts:
+        leaving.setdefault(burst.source, []).append(burst)
+    classes, count = dict.fromkeys(leaving, 0), 0
+    while len(set(classes.values())) > count:
+        count = len(set(classes.values()))
+        seen = {
+            node: frozenset((*one[2:], classes[one.target]) for one in ones)
+            for node, ones in leaving.items()
+        }
+        numbers = {future: number for number, future in enumerate(dict.fromkeys(seen.values()))}
+        classes = {node: numbers[future] for node, future in seen.items()}
+    lowest: dict[int, int] = {}
+    for node in sorted(classes):
+        lowest.setdefault(classes[node], node)
+    return [
+        burst._replace(target=lowest[classes[burst.target]])
+        for node in lowest.values() for burst in leaving[node]
+    ]  # fmt: skip

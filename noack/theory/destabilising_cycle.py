@@ -1,9 +1,11 @@
-"""Lower bounds of the joint spectral radius: cycles, and the spectral radius of their products.
+"""Cycles, and the spectral radius of their products, enclosed.
 
-The search keeps, of all paths of k edges, those with the largest products relative to the bound so
-far; it is a heuristic. The bound of a cycle found is rigorous: for every k, |trace Π^k| ≤ n ρ(Π)^k,
-and by repeated squaring in enclosures k becomes so large that n^(1/k) is 1 to working precision.
-Beforehand, Π is taken to the coordinates of its eigenvectors: there squaring loses no digits.
+The growth of a cycle is a lower bound of the joint spectral radius, and its value if the graph has
+no other cycle. The search keeps, of all paths of k edges, those with the largest products relative
+to the bound so far; it is a heuristic. The bounds of a cycle found are rigorous: for every k,
+|trace Π^k|/n ≤ ρ(Π)^k ≤ ‖Π^k‖, and by repeated squaring in enclosures k becomes so large that the
+k-th roots hardly differ. In the coordinates of its eigenvectors squaring loses fewer digits, and Π
+is nearly a normal matrix, whose eigenvalues move by no more than the difference.
 """
 
 import math
@@ -11,6 +13,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix
 from noack.theory.interval_matrix import IntervalMatrix, exactly, inverse
@@ -33,30 +36,53 @@ class Cycle(NamedTuple):
 NO_CYCLE = Cycle((), 0.0)
 
 
-def spectral_radius_below(product: IntervalMatrix) -> float:
-    """Return a lower bound of the spectral radius of all matrices of an enclosure, (n, n).
+def spectral_radius_bounds(product: IntervalMatrix) -> tuple[float, float]:
+    """Return a lower and an upper bound of the spectral radii of all matrices Π, (n, n).
 
-    It is the k-th root of |trace Π^k|/n, for the best k = 2^j.
+    They are the k-th roots of |trace Π^k|/n and of ‖Π^k‖∞, for the best k = 2^j; or, if the
+    eigenvectors are well-conditioned, those of :func:`_normal_bounds`.
     """
-    bounds = [_trace_bound(product)]
-    basis = _eigenvectors(product.middle)
+    bounds = [_power_bounds(product)]
+    values, vectors = np.linalg.eig(product.middle)
+    # A real basis in which a matrix is nearly block-diagonal.
+    basis = np.ascontiguousarray(np.where(values.imag >= 0, vectors.real, vectors.imag))
     undone = inverse(basis)
     if undone is not None:
-        bounds.append(_trace_bound(undone @ product @ exactly(basis)))
-    return max(bounds)
+        turned = undone @ product @ exactly(basis)
+        bounds += [_power_bounds(turned), _normal_bounds(turned, values)]
+    lower, upper = zip(*bounds, strict=True)
+    return max(lower), min(upper)
 
 
-def _trace_bound(power: IntervalMatrix) -> float:
-    best, exponent = 0.0, 0.0
+def _normal_bounds(matrices: IntervalMatrix, values: NDArray[np.complex128]) -> tuple[float, float]:
+    """Bound the spectral radii of matrices near the normal one with blocks (a, −b; b, a).
+
+    If they differ from it by at most r, their eigenvalues are in the discs of radius r around its
+    n eigenvalues a ± ib, and each connected part of the discs contains one at least (Bauer and
+    Fike, 1960; by continuity). Such a part is at most 2rn wide.
+    """
+    normal = np.diag(values.real)
+    first = np.flatnonzero(values.imag > 0)  # its conjugate follows
+    normal[first, first + 1], normal[first + 1, first] = -values.imag[first], values.imag[first]
+    r = float(np.linalg.norm((matrices - exactly(normal)).magnitude)) * (1 + 1e-12)
+    largest = float(np.abs(values).max())
+    if not r < math.inf:
+        return 0.0, math.inf
+    return max(largest * _SUBTRACTED - 2 * len(values) * r, 0.0), (largest + r) / _SUBTRACTED
+
+
+def _power_bounds(power: IntervalMatrix) -> tuple[float, float]:
+    lower, upper, exponent = 0.0, math.inf, 0.0
     n = len(power.middle)
     for j in range(_SQUARINGS):
+        # Π^(2^j) is the enclosure times 2^exponent.
         trace = abs(math.fsum(np.diag(power.middle)))
         trace = trace * _SUBTRACTED - math.fsum(np.diag(power.radius)) / _SUBTRACTED
+        norm = float(power.magnitude.sum(axis=1).max())
         if trace > 0:
-            # Π^(2^j) is the enclosure times 2^exponent; the logarithms are accurate to 1e-14.
-            logarithm = (math.log2(trace / n) + exponent) / 2**j
-            slack = 1e-15 * (4 + abs(exponent / 2**j) + abs(logarithm))
-            best = max(best, 2 ** (logarithm - slack) * (1 - 4e-16))
+            lower = max(lower, _root(trace / n, exponent, j, -1))
+        if norm < math.inf:
+            upper = min(upper, _root(norm, exponent, j, 1) + _TINY)
         largest = float(np.abs(power.middle).max())
         if not float(power.radius.max()) < largest < math.inf:
             break
@@ -64,14 +90,15 @@ def _trace_bound(power: IntervalMatrix) -> float:
         power = power.scaled(shift)
         exponent = 2 * (exponent - shift)
         power = power @ power
-    return best
+    return lower, upper
 
 
-def _eigenvectors(matrix: Matrix) -> Matrix:
-    """Return a real basis in which a matrix is nearly block-diagonal, as columns."""
-    values, vectors = np.linalg.eig(matrix)
-    basis = np.where(values.imag >= 0, vectors.real, vectors.imag)
-    return np.ascontiguousarray(basis)
+def _root(value: float, exponent: float, j: int, sign: int) -> float:
+    """Bound the 2^j-th root of value · 2^exponent from below (sign −1) or above (sign 1)."""
+    # The logarithms are accurate to 1e-15 of their sizes.
+    logarithm = (math.log2(value) + exponent) / 2**j
+    slack = 1e-15 * (4 + abs(exponent / 2**j) + abs(logarithm))
+    return float(2.0 ** (logarithm + sign * slack) * (1 + sign * 4e-16))
 
 
 class _Path(NamedTuple):
@@ -113,13 +140,28 @@ def find_cycle(system: SwitchedSystem, most_edges: int, beam: int) -> Cycle:
         paths = [_joined(one, step) for one in paths[:beam] for step in leaving[one.target]]
     if not best:
         return NO_CYCLE
-    return Cycle(best, rigorous_growth(system, best))
+    return Cycle(best, growth_bounds(system, best)[0])
 
 
-def rigorous_growth(system: SwitchedSystem, path: Sequence[int]) -> float:
-    """Return a lower bound of the growth of a cycle per unit of time."""
-    radius = spectral_radius_below(system.product(path))
-    return float(radius ** (1 / system.duration(path)) * (1 - 1e-15))
+def growth_bounds(system: SwitchedSystem, path: Sequence[int]) -> tuple[float, float]:
+    """Return a lower and an upper bound of the growth of a cycle per unit of time."""
+    lower, upper = spectral_radius_bounds(system.product(path))
+    share = 1 / system.duration(path)
+    return lower**share * (1 - 1e-15), upper**share * (1 + 1e-15)
+
+
+def only_cycle(system: SwitchedSystem) -> tuple[int, ...] | None:
+    """Return the edges of the only cycle of a graph, in their order of time; None if it has more.
+
+    Every node is left by an edge; if by one only, there is no choice.
+    """
+    leaving = {edge.source: number for number, edge in enumerate(system.edges)}
+    if len(leaving) < len(system.edges):
+        return None
+    path = [0]
+    while system.edges[path[-1]].target != system.edges[0].source:
+        path.append(leaving[system.edges[path[-1]].target])
+    return tuple(path)
 
 
 def _joined(one: _Path, step: _Path) -> _Path:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.linear_systems import Vector
-from noack.theory.destabilising_cycle import Cycle, find_cycle, rigorous_growth
+from noack.theory.destabilising_cycle import Cycle, find_cycle, growth_bounds, only_cycle
 from noack.theory.invariant_polytopes import InvariantPolytopes, initial_vertices
 from noack.theory.quadratic_norms import quadratic_norms, remembering
 from noack.theory.switched_system import Edge, SwitchedSystem, strongly_connected
@@ -50,7 +50,7 @@ class JointSpectralRadius(NamedTuple):
     cycle: tuple[int, ...]
     """Numbers of the edges of the cycle that attains the lower bound, in their order of time."""
     vertices: int
-    """Number of vertices of the polytopes that prove the upper bound; 0: quadratic norms do."""
+    """Number of vertices of the polytopes that prove the upper bound; 0: it has another proof."""
 
 
 def joint_spectral_radius(
@@ -77,12 +77,17 @@ def joint_spectral_radius(
 
 
 def _connected(system: SwitchedSystem, accuracy: float, most_vertices: int) -> JointSpectralRadius:
+    only = only_cycle(system)
     leaving = Counter(edge.source for edge in system.edges)
-    if not most_vertices or max(leaving.values()) > MOST_LEAVING:
+    if only is None and (not most_vertices or max(leaving.values()) > MOST_LEAVING):
         return _by_quadratic_norms(system, accuracy)
     balanced = system.balanced()
-    cycle = _best_cycle(system, balanced, _SEARCH)
     upper, vertices, searched = math.inf, 0, False
+    if only is None:
+        cycle = _best_cycle(system, balanced, _SEARCH)
+    else:
+        lowers, uppers = zip(*(growth_bounds(one, only) for one in (system, balanced)), strict=True)
+        cycle, upper = Cycle(only if max(lowers) else (), max(lowers)), min(uppers)
     while cycle.growth * (1 + accuracy) < upper and accuracy < _COARSEST:
         growth = max(cycle.growth, _SMALLEST * _largest(balanced)) * (1 + accuracy)
         start = initial_vertices(balanced, cycle, growth)
@@ -135,7 +140,7 @@ def _best_cycle(system: SwitchedSystem, balanced: SwitchedSystem, search: _Searc
     if not cycle.path:
         return cycle
     # The original matrices have smaller radii.
-    return cycle._replace(growth=max(cycle.growth, rigorous_growth(system, cycle.path)))
+    return cycle._replace(growth=max(cycle.growth, growth_bounds(system, cycle.path)[0]))
 
 
 def _growth(cycle: Cycle) -> float:

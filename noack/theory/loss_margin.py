@@ -34,7 +34,7 @@ from noack.trigger.trigger_condition import NEVER_NS
 
 _MOST_SLOTS = 100
 _MOST_LIKELY, _LEAST_LIKELY = 0.93, 1e-12
-"""Loss probability up to which almost all runs are examined, and the bursts left out."""
+"""Loss probability up to which almost all runs are examined; rarer bursts are bounded together."""
 _TIMELESS = ("loss", "corrupt", "blackout", "duplicate")
 _FIRST_ACCURACY = 1e-2
 _QUICK_ACCURACY = 3e-2
@@ -53,7 +53,7 @@ class Stability(NamedTuple):
     intervals_s: tuple[float, ...]
     """The time from each update of the pattern to the next one."""
     vertices: int
-    """Number of vertices of the polytopes that prove the upper bound; 0: quadratic norms do."""
+    """Number of vertices of the polytopes that prove the upper bound; 0: it has another proof."""
 
     @property
     def verdict(self) -> str:
@@ -189,7 +189,8 @@ class LossMargin:
         if len(slots) == 1 and losses.is_independent and 0 < p < _MOST_LIKELY:
             bursts = range(math.ceil(math.log(_LEAST_LIKELY) / math.log(p)))
             between = [self._maps(0, burst).middle for burst in bursts]
-            almost_sure = min(mean_square, sure_growth(between, p))
+            longest, lost = self.loop.state_after(0, bursts[-1]), maps[0][1]
+            almost_sure = min(mean_square, sure_growth(between, p, longest, lost))
         return RandomGrowth(mean_square, almost_sure)
 
     def is_stable(self, guarantee: LossGuarantee | None = None) -> Stability:

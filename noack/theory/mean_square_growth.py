@@ -9,6 +9,7 @@ a loss in state j. The second moments X_j = E[z zᵀ; state j] therefore follow
 and E‖z‖² grows exactly like the powers of this operator's spectral radius. Almost surely, ‖z‖ grows
 per period by at most the root of that (Jensen). If the losses are independent, another bound is
 exp((1 − p) E log‖F_k ⋯ F_1‖ / k) in any norm, with the maps F from a delivery to the next one.
+What bursts add that are too long to be listed is bounded by a geometric series.
 """
 
 import math
@@ -108,13 +109,17 @@ def _check(operator: Matrix, bound: float, size: int) -> None:
             raise NotPredictableError("the second moments could not be bounded numerically")
 
 
-def sure_growth(between: Sequence[Matrix], probability: float) -> float:
+def sure_growth(
+    between: Sequence[Matrix], probability: float, longest: Matrix, lost: Matrix
+) -> float:
     """Bound the growth per period of almost all runs with independent losses.
 
     Args:
         between: F_j, the maps from a delivered update to the next one with j losses between them,
-            (N, N) each, for all j below a number whose burst is less likely than 1e-12.
+            (N, N) each, for all j below some number J.
         probability: p.
+        longest: the loop's whole state after J − 1 losses, (S, N); F_{J−1} has some of its rows.
+        lost: the map of this state over a period whose update is lost, (S, S).
     """
     counts = np.arange(len(between))
     likely: Vector = (1 - probability) * np.power(float(probability), counts)
@@ -122,11 +127,26 @@ def sure_growth(between: Sequence[Matrix], probability: float) -> float:
     for weight in _WEIGHTS:
         shares = probability ** (weight * counts / 2)
         edges = [Edge(0, 0, exactly(F * share)) for F, share in zip(between, shares, strict=True)]
-        balanced = SwitchedSystem(tuple(edges)).balanced().edges
-        maps = np.array([edge.matrix.middle for edge in balanced]) / shares[:, None, None]
-        best = min(best, _mean_log_norm(maps, likely))
+        T = SwitchedSystem(tuple(edges)).balancing()[0]
+        undone: Matrix = np.asarray(np.linalg.inv(T), dtype=np.float64)
+        maps = T @ np.array(between) @ undone
+        first = float(np.linalg.norm(T, 2) * np.linalg.norm(longest @ undone, 2))
+        rest = _left_out(maps, likely, probability, first, float(np.linalg.norm(lost, 2)))
+        best = min(best, _mean_log_norm(maps, likely) + rest)
     # A delivery follows the last one after 1/(1 − p) periods on average.
     return math.exp(best * (1 - probability)) * (1 + 1e-9)
+
+
+def _left_out(maps: Stack, likely: Vector, p: float, first: float, lost: float) -> float:
+    """Bound what products with a burst of J = len(maps) losses or more add to the means.
+
+    ‖F_{J+i}‖ is at most first · lost^{i+1}, and log⁺ of a product at most the sum of those of its
+    up to three factors.
+    """
+    share = p ** len(maps)
+    growth = max(math.log(max(lost, 1e-300)), 0.0)
+    long = share * (max(math.log(max(first, 1e-300)), 0.0) + growth / (1 - p))  # E(i + 1)
+    return long + 2 * share * (float(likely @ _log_norms(maps).clip(min=0.0)) + long)
 
 
 def _mean_log_norm(maps: Stack, likely: Vector) -> float:

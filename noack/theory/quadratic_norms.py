@@ -19,7 +19,7 @@ from noack.theory.interval_matrix import IntervalMatrix, exactly, inverse
 from noack.theory.switched_system import Edge, SwitchedSystem
 
 MOST_ENTRIES = 300
-"""Largest number of entries of all T_v; for more, the search takes too long."""
+"""Largest number of entries of all T_v; for more, the search takes too long: they are all equal."""
 _SHARPNESS = (10.0, 100.0, 1000.0, 10000.0)
 _STEPS = 200
 _FIRST_EDGES, _FURTHER_EDGES = 48, 24
@@ -45,10 +45,16 @@ class QuadraticNorms(NamedTuple):
 
 def quadratic_norms(system: SwitchedSystem) -> QuadraticNorms:
     """Return the best norms found, beginning with the Euclidean one."""
+    dimensions = system.dimensions
+    if sum(n * (n + 1) // 2 for n in dimensions.values()) > MOST_ENTRIES:
+        if len(dimensions) > 1 and len(set(dimensions.values())) == 1:
+            common = tuple(edge._replace(source=0, target=0) for edge in system.edges)
+            forms, growths = quadratic_norms(SwitchedSystem(common))
+            return QuadraticNorms(dict.fromkeys(dimensions, forms[0]), growths)
+        search = _Search(system)
+        return QuadraticNorms(search.forms, search.bounds())
     search = _Search(system)
     best = QuadraticNorms(search.forms, search.bounds())
-    if sum(n * (n + 1) // 2 for n in system.dimensions.values()) > MOST_ENTRIES:
-        return best
     numbers = np.unique(np.linspace(0, len(system.edges) - 1, _FIRST_EDGES).astype(np.int64))
     for _ in range(_ATTEMPTS):
         search.improve(numbers)

@@ -64,12 +64,17 @@ class SwitchedSystem:
         return SwitchedSystem(tuple(edges))
 
     def balanced(self) -> "SwitchedSystem":
-        """Return the system in coordinates in which no direction grows much more than others.
+        """Return the system in the coordinates of :meth:`balancing`, or else itself."""
+        return self.in_coordinates(self.balancing()) or self
+
+    def balancing(self) -> dict[int, Matrix]:
+        """Return T for each node; in T x no direction grows much more than others.
 
         The squared length in these coordinates is the fixed point of P ← Σ Mᵀ P M / c over the
-        edges that leave a node, found by iteration. If that fails, the system is returned itself.
+        edges that leave a node, found by iteration. If that fails, T is the identity.
         """
-        forms = {node: np.eye(n) for node, n in self.dimensions.items()}
+        identity = {node: np.eye(n) for node, n in self.dimensions.items()}
+        forms = identity
         for _ in range(_ITERATIONS):
             following = {node: np.zeros_like(form) for node, form in forms.items()}
             for edge in self.edges:
@@ -77,19 +82,18 @@ class SwitchedSystem:
                 following[edge.source] += M.T @ forms[edge.target] @ M
             size = max(float(np.trace(form)) for form in following.values())
             if not 0 < size < np.inf:
-                return self
+                return identity
             forms = {
                 node: form / size + _ROUNDEST * float(np.trace(form)) / size * np.eye(len(form))
                 for node, form in following.items()
             }
         try:
-            roots: dict[int, Matrix] = {
+            return {
                 node: np.asarray(np.linalg.cholesky(form).T, dtype=np.float64)
                 for node, form in forms.items()
             }
         except np.linalg.LinAlgError:
-            return self
-        return self.in_coordinates(roots) or self
+            return identity
 
 
 def strongly_connected(edges: Sequence[Edge]) -> list[SwitchedSystem]:

@@ -86,6 +86,18 @@ class TimeTriggeredLoop:
             slot: number of the first update, modulo the number of slots.
             losses: number of lost updates between the two.
         """
+        return self._after(slot, losses).rows(self._kept).interval()
+
+    def state_after(self, slot: int, losses: int) -> Matrix:
+        """Return (x, x_c, u, w) at the transmission after the losses as a function of z, rounded.
+
+        Args:
+            slot: number of the first update, which is delivered, modulo the number of slots.
+            losses: number of lost updates after it.
+        """
+        return self._after(slot, losses).interval().middle
+
+    def _after(self, slot: int, losses: int) -> FixedPointMatrix:
         period_ns = self.times.period_ns
         states = self._states.setdefault(slot, [])
         while len(states) <= losses:
@@ -94,7 +106,7 @@ class TimeTriggeredLoop:
                 states.append(self._between(from_ns, from_ns + period_ns) @ states[-1])
             else:
                 states.append(self._first_period(from_ns))
-        return states[losses].rows(self._kept).interval()
+        return states[losses]
 
     def period(self, slot: int, delivered: bool) -> Matrix:
         """Return the map of (x, x_c, u, w) from a transmission to the next one, rounded.

@@ -66,6 +66,21 @@ def test_verdicts_agree_with_the_bounds() -> None:
     assert f"M ≤ {found.stable_m}; this pattern destabilises M = {len(growth)}: D" in str(found)
 
 
+def test_an_undecided_m_does_not_end_the_search() -> None:
+    """Without an input, x stays as it is: the growth is 1 for every M."""
+    still = noack.load({
+        "name": "still", "horizon_s": 1.0, "mode": "zoh",
+        "model": {"A": [[0.0]], "B": [[1.0]], "gain": [[0.0]], "allow_unstable": True},
+        "plant": {"initial_state": [1.0], "rate_hz": 50.0}, "controller": {"rate_hz": 50.0},
+        "trigger": {"policy": "periodic", "period_s": 0.1},
+        "network": {"mansd": 2, "loss": {"model": "worst_case"}},
+    })  # fmt: skip
+    found = noack.margin(still, most_m=3, period=False)
+    assert [cap.found.verdict for cap in found.caps] == ["undecided"] * 3
+    assert (found.stable_m, found.destabilised) == (None, None)
+    assert "M = 1 is undecided (growth between 1 and 1); M = 2 is undecided" in found.verdict
+
+
 def test_constraints_that_cap_the_losses_themselves() -> None:
     constraints = [{"kind": "at_most", "losses": 1, "window": 4}]
     settings = {"network.constraints": constraints, "network.mansd": 5}

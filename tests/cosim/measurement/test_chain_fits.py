@@ -101,6 +101,18 @@ def test_intervals_of_the_hidden_chain_cover_its_parameters() -> None:
     assert (abs(np.mean(biases, axis=0)) < 0.2).all()
 
 
+@pytest.mark.parametrize("seed", [105, 112, 119])
+def test_profiles_with_several_valleys_have_ends(seed: int) -> None:
+    """Of 200 random chains, those with which the likelihood's valleys were taken for each other."""
+    rng = np.random.default_rng(seed)
+    p, r = 10 ** rng.uniform(-2.5, -0.3), 10 ** rng.uniform(-1.5, 0)
+    one = ChainRates(p, r, rng.choice([0, rng.uniform(0, 0.2)]), rng.uniform(0.2, 1))
+    fits = ChainFits(loss_bursts(~chain_losses(int(rng.choice([300, 700, 1500])), one, seed)))
+    for estimate in fits.gilbert_elliott.estimates.values():
+        assert estimate is not None
+        assert 0 <= estimate.low <= estimate.value <= estimate.high <= 1
+
+
 def test_the_preferred_model_is_the_true_one() -> None:
     independent = ChainRates(0.5, 0.5, 0.1, 0.1)
     for truth, name in ((independent, "bernoulli"), (GILBERT, "gilbert"),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from noack.core.linear_systems import Matrix
-from noack.theory.destabilising_cycle import spectral_radius_below
+from noack.theory.destabilising_cycle import spectral_radius_bounds
 from noack.theory.interval_matrix import IntervalMatrix, exactly
 from noack.theory.invariant_polytopes import InvariantPolytopes
 from noack.theory.joint_spectral_radius import joint_spectral_radius
@@ -184,13 +184,39 @@ def test_norms_above_holds_for_every_matrix_of_an_enclosure(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_spectral_radius_below_holds_for_every_matrix_of_an_enclosure(seed: int) -> None:
+def test_spectral_radius_bounds_hold_for_every_matrix_of_an_enclosure(seed: int) -> None:
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 7))
     middle = rng.normal(size=(n, n))
-    sharp = spectral_radius_below(exactly(middle))
+    sharp, above = spectral_radius_bounds(exactly(middle))
     assert sharp == pytest.approx(np.abs(np.linalg.eigvals(middle)).max(), rel=1e-8)
+    assert sharp <= above <= sharp * (1 + 1e-9)
     radius = rng.uniform(0, 1e-4, (n, n))
-    below = spectral_radius_below(IntervalMatrix(middle, radius))
+    below, above = spectral_radius_bounds(IntervalMatrix(middle, radius))
     ends = [middle + radius * rng.choice([-1, 1], (n, n)) for _ in range(200)]
-    assert 0.9 * sharp < below <= min(np.abs(np.linalg.eigvals(end)).max() for end in ends)
+    radii = [np.abs(np.linalg.eigvals(end)).max() for end in ends]
+    assert 0.9 * sharp < below <= min(radii)
+    assert max(radii) <= above < 1.1 * sharp
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_graph_with_one_cycle_is_decided(seed: int) -> None:
+    """One matrix, or a ring of up to three, whose spectral radius is 3e-4 below 1, or above it."""
+    rng = np.random.default_rng(seed)
+    length, n, value = int(rng.integers(1, 4)), int(rng.integers(1, 7)), 1 + 3e-4 * (-1) ** seed
+    matrices = rng.normal(size=(length, n, n))
+    Π = np.linalg.multi_dot([np.eye(n), np.eye(n), *matrices[::-1]])
+    matrices *= value / np.abs(np.linalg.eigvals(Π)).max() ** (1 / length)
+    edges = [edge(k, (k + 1) % length, matrix) for k, matrix in enumerate(matrices)]
+    found = joint_spectral_radius(edges)
+    assert found.lower <= found.upper <= found.lower * (1 + 1e-9)
+    assert found.lower == pytest.approx(value, rel=1e-9)
+    assert sorted(found.cycle) == list(range(length))
+
+
+def test_one_cycle_that_forgets_or_has_one_direction() -> None:
+    nilpotent = joint_spectral_radius([edge(0, 0, np.diag([1e-3, 1e3], k=1))])
+    assert (nilpotent.lower, nilpotent.cycle) == (0, ())
+    assert 0 < nilpotent.upper < 1e-9
+    defective = joint_spectral_radius([edge(0, 0, [[0.7, 1e5, 3], [0, 0.7, 1e5], [0, 0, 0.7]])])
+    assert defective.lower <= 0.7 <= defective.upper < 0.7 * (1 + 1e-9)

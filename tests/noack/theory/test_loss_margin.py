@@ -245,6 +245,14 @@ def test_paths_are_the_admissible_patterns(guarantee: LossGuarantee, slots: int)
         assert patterns(0, length) == {one for one in every if one[-1] and allowed(one)}
 
 
+def test_states_of_a_guarantee_with_the_same_future_are_one_node() -> None:
+    """At most 6 in 7 is at most 6 in a row; of 2 in 5, the age of both losses matters."""
+    cap = bursts_of(LossGuarantee((LongestBurst(6),)))
+    assert bursts_of(LossGuarantee((LongestBurst(6), LossesInWindow(6, 7)))) == cap
+    assert len(cap) == 7
+    assert len({one.source for one in bursts_of(LossGuarantee((LossesInWindow(2, 5),)))}) > 1
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

@@ -1,0 +1,35 @@
+"""The rounding of the flow between two deliveries, against arithmetic of 384 binary digits."""
+
+import math
+
+import numpy as np
+from hypothesis import given, settings
+
+from noack.core.clock import NS_PER_S
+from noack.core.linear_systems import Matrix
+from noack.theory.delivery_flow import ROUNDING, DeliveryFlow
+from noack.theory.fixed_point import exponential
+from tests.noack.theory.loops import SEARCH, System, systems
+
+
+def exactly_after(generator: Matrix, t_s: float) -> Matrix:
+    """Return e^{G t}, rounded once; t and G are taken as the numbers that they are."""
+    mantissa, exponent = math.frexp(t_s)
+    scaled = np.ldexp(generator, exponent - 53)
+    return exponential(scaled, round(mantissa * 2**53) * NS_PER_S).interval().middle
+
+
+@settings(SEARCH, max_examples=12)
+@given(systems())
+def test_the_error_of_the_flow_is_far_below_what_its_bounds_are_enlarged_by(
+    system: System,
+) -> None:
+    """It is an estimate, not a proof: 1e-12 of the norm of e^{Fτ}, which is up to 1e6."""
+    flow = DeliveryFlow(system.gains())
+    largest = 0.0
+    for node in np.linspace(1, len(flow.edges_s) - 1, 6).astype(int):
+        exact = exactly_after(flow.generator, float(flow.edges_s[node]))
+        largest = max(largest, float(np.linalg.norm(exact, 2)), 1.0)
+        error = np.linalg.norm(flow.states[node] - exact[:, : flow.n], 2)
+        assert error <= 1e-12 * largest
+    assert ROUNDING - 1 > 1e6 * 1e-12
