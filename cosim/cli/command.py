@@ -110,7 +110,7 @@ SetOption = Annotated[
     typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="Replace a value of the scenario, e.g. trigger.beta=0.3.",
+        help="Replace a value of the scenario, e.g. trigger.beta=0.3, or for short beta=0.3.",
         autocompletion=completion.settings,
     ),
 ]
