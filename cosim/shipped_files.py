@@ -1,15 +1,15 @@
 """Files that come with noack, found by name: scenarios and campaigns."""
 
-import difflib
 import re
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from noack.core.errors import CallerError, shortened
+from noack.core.errors import CallerError, did_you_mean, shortened
 
 KINDS = ("scenarios", "campaigns")
 """Kinds of shipped files, and their folders."""
+
+_LIST = "`noack scenarios` lists the shipped ones"
 
 _SCHEMA = "#:schema"
 """Begins the line that names the schema for editors; a copy does not have it."""
@@ -50,9 +50,9 @@ def find_shipped(name: str, folder: str) -> Path:
         if name in shipped_names(other):
             raise CallerError(f"{name}: a shipped {other.removesuffix('s')}, not a {kind}")
     if path.suffix == ".toml":
-        names = [*sorted(str(one) for one in Path().glob("*.toml")), *names]
-    shown = shortened(name)
-    raise CallerError(f"{shown}: no such file, nor a shipped {kind}; {_hint(name, names)}")
+        names += sorted(str(one) for one in Path().glob("*.toml"))
+    hint = did_you_mean(name, names) or _LIST
+    raise CallerError(f"{shortened(name)}: no such file, nor a shipped {kind}; {hint}")
 
 
 def shipped_names(folder: str) -> list[str]:
@@ -81,12 +81,9 @@ def text_of(name: str) -> str:
             text = "".join(line for line in lines if not line.startswith(_SCHEMA))
             return _FILE.sub(rf'file = "{path.absolute().parent}/\1"', text)
     names = [known for folder in KINDS for known in shipped_names(folder)]
-    raise CallerError(f"{shortened(name)}: not a shipped file; {_hint(name, names)}")
-
-
-def _hint(name: str, names: Sequence[str]) -> str:
-    close = difflib.get_close_matches(name, names, n=1)
-    return f"{f'did you mean {close[0]}? There' if close else 'there'} are {', '.join(names)}"
+    raise CallerError(
+        f"{shortened(name)}: not a shipped file; {did_you_mean(name, names) or _LIST}"
+    )
 
 
 def _path_of(name: str, folder: str) -> Path:

@@ -151,8 +151,34 @@ def test_shipped_scenarios_are_valid_and_named_after_their_file(path: Path) -> N
     assert load(path).name == path.stem
 
 
-def test_links_have_existing_targets() -> None:
-    pages = [*(ROOT / "docs").glob("*.md"), *map(ROOT.joinpath, PAGES), *ROOT.glob("*.md")]
-    for page in set(pages):
-        for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):
-            assert page.parent.joinpath(target).exists(), f"{page.name}: {target}"
+TEXTS = sorted({*(ROOT / "docs").glob("*.md"), *map(ROOT.joinpath, PAGES), *ROOT.glob("*.md")})
+FOLDERS = sorted(path.parent.name for path in ROOT.glob("*/__init__.py"))
+OTHER_FOLDERS = ["benchmarks", "campaigns", "docs", "scenarios", "tests", "tools"]
+
+
+def anchors(page: Path) -> set[str]:
+    """The names that GitHub and the site give to the sections of a page."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", one.lower()).replace(" ", "-") for one in headings}
+
+
+@pytest.mark.parametrize("page", TEXTS, ids=lambda page: page.name)
+def test_links_and_paths_have_existing_targets(page: Path) -> None:
+    text = page.read_text()
+    for target, section in re.findall(r"\]\(([^)#:\s]*)#?([^):\s]*)\)", text):
+        path = page.parent / target if target else page
+        assert path.exists(), f"{page.name}: {target}"
+        if section and path.suffix == ".md":
+            assert section in anchors(path), f"{page.name}: {target}#{section}"
+    folders = "|".join([*FOLDERS, *OTHER_FOLDERS])
+    for named in re.findall(rf"`((?:{folders})/[\w./-]*)`", text):
+        if not re.search(r"\b[A-Z]+\b", named):  # netem/NAME
+            assert (ROOT / named).exists(), f"{page.name}: {named}"
+
+
+def test_the_map_of_the_code_names_existing_files() -> None:
+    files = {path.name for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")}
+    named = set(re.findall(r"`(\w+\.py)`", (ROOT / "ARCHITECTURE.md").read_text()))
+    assert len(named) > 20
+    assert named <= files

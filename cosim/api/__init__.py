@@ -29,3 +29,8 @@ from noack.config.scenario import Scenario as Scenario
 from noack.core.errors import NoackError as NoackError
 
 __version__ = version("noack")
+
+# `help(noack.simulate)` names the module that programs import.
+for _public in list(globals().values()):
+    if getattr(_public, "__module__", "").startswith("cosim."):
+        _public.__module__ = "noack"

@@ -11,10 +11,10 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cosim.output.row_display import Rows, as_html, as_text
 from cosim.shipped_files import find_shipped
 from noack.core.errors import CallerError
 from noack.core.python_process import cores
+from noack.core.row_display import Rows, as_html, as_text
 
 if TYPE_CHECKING:
     import pyarrow as pa

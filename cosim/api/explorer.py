@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cosim.api.scenarios import Source, load, plain
-from cosim.output.row_display import as_text
 from noack.core.errors import CallerError, NoackError
 from noack.core.file_access import write_whole
+from noack.core.row_display import as_text
 
 if TYPE_CHECKING:
     from ipywidgets import Widget
@@ -173,7 +173,7 @@ def explore(source: Source, settings: Mapping[str, Any] | None = None) -> Explor
     ('20', 'certified')
     >>> explorer.set({"network.loss.probability": 0.0, "trigger.beta": 1.0})
     >>> explorer.numbers["transmissions"]
-    '7'
+    '6'
     >>> explorer.scenario.trigger.beta
     1.0
 

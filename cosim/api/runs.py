@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cosim.api.scenarios import Source, load
-from cosim.output.row_display import as_html, as_text
 from cosim.record.loops_run import loop_directories
 from cosim.record.run_directory import RECORD, REPORT_FILE, SCENARIO_FILE, chosen_run
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError, ExitStatus
+from noack.core.row_display import as_html, as_text
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -10,6 +10,7 @@ import numpy as np
 
 from cosim.shipped_files import find_shipped
 from noack.config import toml_file
+from noack.config.runtime_parameters import full_key
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import completed, put
 from noack.config.state_space import matrices_of, model_of
@@ -62,9 +63,9 @@ def with_settings(scenario: Scenario, settings: Mapping[str, Any]) -> Scenario:
     Args:
         scenario: as loaded, or of a run.
         settings: values by the keys of a scenario file, with dots between their parts:
-            ``{"network.loss.probability": 0.8, "trigger.beta": 0.3}``. NumPy arrays are accepted.
-            None restores the default of a key. ``docs/scenarios.md`` documents the keys and their
-            units.
+            ``{"network.loss.probability": 0.8, "trigger.beta": 0.3}``, or by the short names of the
+            runtime parameters, ``loss.p``. NumPy arrays are accepted. None restores the default of
+            a key. ``docs/scenarios.md`` documents the keys and their units.
 
     Raises:
         NoackError: one line per mistake, each with key, value and remedy.
@@ -156,7 +157,7 @@ def _completed(content: dict[str, Any], settings: Mapping[str, Any] | None, path
 
 def _take_away(content: dict[str, Any], key: str) -> None:
     table: Any = content
-    *path, last = key.split(".")
+    *path, last = full_key(key).split(".")
     for part in path:
         if isinstance(table, list) and part.isdecimal():
             table = table[int(part)] if int(part) < len(table) else None

@@ -45,6 +45,7 @@ _TOUR = (
 )
 """A first session: commands and their descriptions."""
 _MOST_COLUMNS = 78
+_INTERRUPTED = "stopped by the user (SIGINT)"
 
 RUNS, THEORY, CAMPAIGNS = "Runs", "Theory", "Campaigns"
 MEASURING = "Real networks"
@@ -110,7 +111,7 @@ SetOption = Annotated[
     typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="Replace a value of the scenario, e.g. trigger.beta=0.3.",
+        help="Replace a value of the scenario, e.g. trigger.beta=0.3, or for short beta=0.3.",
         autocompletion=completion.settings,
     ),
 ]
@@ -228,7 +229,7 @@ def options(
 def command(
     panel: str, place: int, examples: Sequence[tuple[str, str]] = (), **settings: Any
 ) -> Callable[[Callable[..., int]], Callable[..., None]]:
-    """Register a command. Its result is the exit status; an error is printed as one line.
+    """Register a command. Its result is the exit status; an error or Ctrl-C is printed as one line.
 
     Args:
         panel: panel of the help, one of :data:`PANELS`.
@@ -247,6 +248,8 @@ def command(
                     sys.stdout.flush()
             except NoackError as error:
                 status = failed(str(error), error.exit_status, who=NAME, as_json=as_json)
+            except KeyboardInterrupt:  # typer would end the program without a word
+                status = failed(_INTERRUPTED, ExitStatus.INTERRUPTED, who=NAME, as_json=as_json)
             except OSError as error:  # standard output is on a full disk
                 what = (
                     f"cannot write: {why(error)}"
@@ -332,4 +335,4 @@ def run_program(server: "ForkServer | None" = None) -> None:
     try:
         app(prog_name=NAME, obj=server)
     except KeyboardInterrupt:
-        sys.exit(ExitStatus.INTERRUPTED)
+        sys.exit(failed(_INTERRUPTED, ExitStatus.INTERRUPTED, who=NAME, as_json=False))

@@ -1,13 +1,7 @@
 """Shell completion: names of shipped files, run directories, keys of a scenario."""
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
-
 from cosim.record.run_directory import DEFAULT_RUNS, LATEST, SCENARIO_FILE
 from cosim.shipped_files import shipped_names
-
-if TYPE_CHECKING:
-    from pydantic import BaseModel
 
 
 def scenarios(incomplete: str) -> list[str]:
@@ -34,34 +28,18 @@ def run_directories(incomplete: str) -> list[str]:
 
 def settings(incomplete: str) -> list[str]:
     """Return matching keys for ``--set``, each with its =."""
+    from noack.config.runtime_parameters import SHORT
     from noack.config.scenario import Scenario
+    from noack.config.validation_messages import keys
 
-    return _matching(incomplete, [f"{key}=" for key in keys(Scenario)])
+    return _matching(incomplete, [f"{key}=" for key in (*SHORT, *keys(Scenario))])
 
 
 def runtime_parameters(incomplete: str) -> list[str]:
-    """Return matching short names of the runtime parameters."""
+    """Return matching names of the runtime parameters, short and full."""
     from noack.config.runtime_parameters import SHORT
 
-    return _matching(incomplete, list(SHORT))
-
-
-def keys(section: "type[BaseModel]", prefix: str = "") -> list[str]:
-    """Return the keys of a settings file, each once; of a union of tables, the keys of all."""
-    return list(dict.fromkeys(_keys(section, prefix, ())))
-
-
-def _keys(
-    section: "type[BaseModel]", prefix: str, within: "tuple[type[BaseModel], ...]"
-) -> Iterator[str]:
-    from noack.config.validation_messages import sections_of
-
-    for name, field in section.model_fields.items():
-        inner = [one for one in sections_of(field.annotation) if one not in within]
-        for one in inner:  # a trigger may contain another
-            yield from _keys(one, f"{prefix}{name}.", (*within, *inner))
-        if not inner:
-            yield f"{prefix}{name}"
+    return _matching(incomplete, [*SHORT, *SHORT.values()])
 
 
 def _matching(incomplete: str, words: list[str]) -> list[str]:

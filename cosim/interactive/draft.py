@@ -12,6 +12,7 @@ from urllib.parse import parse_qsl, urlencode
 from cosim.interactive.toml_edit import value_text, with_value, without_value
 from cosim.shipped_files import find_shipped, shipped_names, text_of
 from noack.config import toml_file
+from noack.config.runtime_parameters import full_key
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import completed, put, toml_text, value_of
 from noack.core.errors import CallerError, NoackError
@@ -82,7 +83,7 @@ class Draft:
 
     def with_value(self, key: str, value: Any) -> "Draft":
         """Return the draft with another value of a key; comments are kept where possible."""
-        content = copy.deepcopy(self.content)
+        key, content = full_key(key), copy.deepcopy(self.content)
         put(content, key, value, key)
         made = replace(self, text=with_value(self.text, self.content, key, value))
         made.__dict__["content"] = content

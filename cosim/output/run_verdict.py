@@ -23,6 +23,8 @@ from noack.runtime.life_cycle import HORIZON
 GOOD, DOUBTFUL, BAD, NEUTRAL = "green", "yellow", "bold red", ""
 _CLAIMS = {"violated": BAD, "void": DOUBTFUL, "not applicable": NEUTRAL}
 """Styles of verdicts other than "held", the worst first."""
+_NAMED = 3
+"""Largest number of claims of a verdict that are named."""
 
 
 class VerdictLine(NamedTuple):
@@ -71,10 +73,13 @@ def _claims(summary: Summary) -> VerdictLine:
 
 
 def _reason(claims: list[dict[str, str]], name: str) -> str:
-    if name == "not applicable":
-        return " (assumption not met)"
-    why = next((claim["why"] for claim in claims if claim["verdict"] == name and claim["why"]), "")
-    return f" ({why})" if why else ""
+    """Return the first reason of a verdict, in brackets; with it, unless void, which claims."""
+    concerned = [claim for claim in claims if claim["verdict"] == name]
+    why = next((claim["why"] for claim in concerned if claim["why"]), "")
+    what = [] if name == "void" else list(dict.fromkeys(claim["what"] for claim in concerned))
+    more = [f"{len(what) - _NAMED} more"] if len(what) > _NAMED else []
+    which = "; ".join([*what[:_NAMED], *more])
+    return f" ({': '.join(filter(None, (which, why)))})" if which or why else ""
 
 
 def print_outcome(console: Console, outcome: Outcome, *, verbose: bool = False) -> None:

@@ -33,6 +33,7 @@ from noack.impairments.kinds.rate import Rate
 from noack.impairments.loss_guarantee import LossWindow
 from noack.protocol.wire_format import Flow, datagram_bytes
 from noack.trigger.periodic_trigger import PeriodicSettings
+from noack.trigger.trigger_policy import CodedPolicy
 
 
 class Demand(NamedTuple):
@@ -196,8 +197,17 @@ def load_warnings(loads: Sequence[LinkLoad], scenario: Scenario) -> Iterator[str
 
 
 def _demand(loop: Scenario, count: int) -> Demand:
-    rule = policy_of(loop).trigger_rule(loop.model.dimensions[0])
-    measured_ns = loop.timing.measurement_period_ns
+    least_ns, largest_ns = _inter_event_times_ns(loop)
+    size_bytes = datagram_bytes(loop.model.dimensions[0])
+    return Demand(count, size_bytes, least_ns / NS_PER_S, largest_ns / NS_PER_S)
+
+
+def _inter_event_times_ns(loop: Scenario) -> tuple[float, float]:
+    """Return the least and the largest time between two events that the trigger permits."""
+    policy, measured_ns = policy_of(loop), loop.timing.measurement_period_ns
+    if isinstance(policy, CodedPolicy):  # it may transmit at every measurement, or never
+        return measured_ns, math.inf
+    rule = policy.trigger_rule(loop.model.dimensions[0])
     least_ns = max(measured_ns, rule.idle_ns)
     if rule.forecast is not None:
         least_ns = max(least_ns, rule.shortest_ns)
@@ -207,8 +217,7 @@ def _demand(loop: Scenario, count: int) -> Demand:
     largest_ns = math.inf
     if rule.longest_ns < loop.timing.horizon_ns:
         largest_ns = math.ceil(rule.longest_ns / measured_ns) * measured_ns
-    size_bytes = datagram_bytes(loop.model.dimensions[0])
-    return Demand(count, size_bytes, least_ns / NS_PER_S, largest_ns / NS_PER_S)
+    return least_ns, largest_ns
 
 
 def _actuations(loop: Scenario, count: int) -> Demand:

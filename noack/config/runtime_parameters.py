@@ -9,14 +9,16 @@ from collections.abc import Mapping
 from types import NoneType
 from typing import Any, get_args
 
+from noack.config.validation_messages import nearest_key
 from noack.trigger.policy_settings import PolicySettings
 
 LOSS, MANSD, SETPOINT = "network.loss", "network.mansd", "controller.setpoint"
 CONSTRAINTS = "network.constraints"
+_PROBABILITY = f"{LOSS}.probability"
 
 SHORT: Mapping[str, str] = {
     "loss": LOSS,
-    "loss.p": f"{LOSS}.probability",
+    "loss.p": _PROBABILITY,
     "mansd": MANSD,
     "constraints": CONSTRAINTS,
     "beta": "trigger.beta",
@@ -28,7 +30,11 @@ SHORT: Mapping[str, str] = {
 
 
 def full_key(name: str) -> str:
-    """Return the scenario's key for a name that may be short, such as ``loss.p``."""
+    """Return the scenario's key for a name that may be short, such as ``loss.p``.
+
+    Wherever a user names a key, short names are understood: ``noack set``, ``--set``, settings of
+    the library and of campaigns, ``[[changes]]``.
+    """
     if name in SHORT:
         return SHORT[name]
     return f"network.{name}" if name.startswith("loss.") else name
@@ -48,11 +54,11 @@ def require_runtime_parameters(settings: Mapping[str, Any], trigger: PolicySetti
     known = (LOSS, MANSD, CONSTRAINTS, *trigger_parameters(trigger), SETPOINT)
     for key, value in settings.items():
         if key not in known and not key.startswith(f"{LOSS}."):
-            short = ", ".join(SHORT)
-            raise ValueError(
-                f"{key}: cannot be changed during a run; what can is {_list(known)} "
-                f"(for short: {short})"
-            )
+            short = [name for name, full in SHORT.items() if full in (*known, _PROBABILITY)]
+            near = nearest_key(key, (*short, *known, _PROBABILITY))
+            hint = near and f"did you mean {near}?"
+            all_known = f"what can is {_list(known)} (for short: {', '.join(short)})"
+            raise ValueError(f"{key}: cannot be changed during a run; {hint or all_known}")
         if _has_none(value):
             raise ValueError(f"{key}: needs a value")
 

@@ -30,6 +30,7 @@ from noack.config.theory_coverage import TheoryCoverage
 from noack.config.timing import Timing
 from noack.controllers.linear_feedback import LinearFeedbackSettings
 from noack.core.errors import CallerError
+from noack.core.row_display import as_html, as_text
 from noack.protocol.loop_protocol import PROTOCOLS, LoopProtocol
 from noack.settings.section import ScenarioSection
 from noack.trigger.decaying import DecayingSettings
@@ -74,26 +75,34 @@ class Scenario(ScenarioSection):
     ports: PortsSection = PortsSection()
     realtime: RealtimeSection = RealtimeSection()
 
-    def __str__(self) -> str:
-        """The most important settings, in a few lines."""
+    def _rows(self) -> list[tuple[str, str]]:
         n, m = self.model.dimensions
-        lines = {
-            "scenario": self.name + (f": {self.description}" if self.description else ""),
-            "mode": "model-based" if self.mode == "model" else "zero-order hold",
-            "plant": f"{self.plant.system.kind}, n = {n}, m = {m}, {self.plant.rate_hz:g} Hz",
-            "trigger": _said(self.trigger, "policy"),
-            "network": f"{_said(self.network.loss, 'model')}; M − 1 = {self.network.mansd}",
-            "horizon": f"{self.horizon_s:g} s",
-        }
+        rows = [
+            ("scenario", self.name + (f": {self.description}" if self.description else "")),
+            ("mode", "model-based" if self.mode == "model" else "zero-order hold"),
+            ("plant", f"{self.plant.system.kind}, n = {n}, m = {m}, {self.plant.rate_hz:g} Hz"),
+            ("trigger", _said(self.trigger, "policy")),
+            ("network", f"{_said(self.network.loss, 'model')}; M − 1 = {self.network.mansd}"),
+            ("horizon", f"{self.horizon_s:g} s"),
+        ]
         if self.loops is not None:
-            lines["loops"] = ", ".join(
+            loops = (
                 one.name if one.count == 1 else f"{one.count} x {one.name}" for one in self.loops
             )
-        return "\n".join(f"{name:<10} {text}" for name, text in lines.items())
+            rows.append(("loops", ", ".join(loops)))
+        return rows
+
+    def __str__(self) -> str:
+        """The most important settings, in a few lines."""
+        return as_text(self._rows())
 
     def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
-        """Show the same text in IPython and notebooks."""
+        """Show the same text in IPython."""
         printer.text(str(self))
+
+    def _repr_html_(self) -> str:
+        """Show the same as a table in notebooks."""
+        return as_html(self._rows())
 
     @property
     def timing(self) -> Timing:

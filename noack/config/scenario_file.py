@@ -13,9 +13,12 @@ import tomli_w
 from noack.config import toml_file
 from noack.config.loops import with_loop_tables
 from noack.config.matrix_files import with_matrices
+from noack.config.runtime_parameters import SHORT, full_key
 from noack.config.scenario import Scenario
 from noack.config.scenario_checks import check_kept_loss
 from noack.config.sections.network_section import DirectionSection
+from noack.config.validation_messages import keys as known_keys
+from noack.config.validation_messages import nearest_key
 from noack.core.errors import CallerError, printable, shortened
 from noack.settings.named_file import FileSettings, file_tables, located, with_tables
 
@@ -116,6 +119,13 @@ def _attributed(lines: str, path: Path, keys: Sequence[str]) -> str:
     names = [shortened(key) for key in keys]
 
     def attributed(line: re.Match[str]) -> str:
+        what, _, hint = line["rest"].rpartition(": unknown key; ")
+        for name in names:  # an unknown section: the whole name may be similar to a key
+            section, dot, _ = name.partition(".")
+            if what.startswith(f"{section} = "):
+                near = nearest_key(name, (*SHORT, *known_keys(Scenario)))
+                hint = f"did you mean {near}?" if near else hint
+                return f"--set {name if dot else what}: unknown key; {hint}"
         if any(re.match(rf"{re.escape(name)}[.:=\s]", line["rest"]) for name in names):
             return f"--set {line['rest']}"
         if not is_valid_alone:
@@ -135,8 +145,9 @@ def _apply(content: dict[str, Any], override: str) -> str:
     if not equals or not key.strip():
         shown = shortened(printable(override))
         raise CallerError(f"--set {shown}: write it as key=value, e.g. trigger.beta=0.3")
-    put(content, key.strip(), value_of(text, f"--set {key}"), f"--set {override}")
-    return key.strip()
+    name = full_key(key.strip())
+    put(content, name, value_of(text, f"--set {key}"), f"--set {override}")
+    return name
 
 
 def value_of(text: str, source: str) -> Any:
@@ -153,7 +164,7 @@ def value_of(text: str, source: str) -> Any:
 
 
 def put(content: dict[str, Any], key: str, value: Any, source: str) -> None:
-    """Set the value of a key such as ``trigger.beta``; missing tables are created.
+    """Set the value of a key such as ``trigger.beta``, which may be short; create missing tables.
 
     An entry of a list is named by its number: ``network.impairments.0.rate_bps``.
 
@@ -162,7 +173,7 @@ def put(content: dict[str, Any], key: str, value: Any, source: str) -> None:
             has too many parts.
     """
     table: Any = content
-    *path, last = key.split(".")
+    *path, last = full_key(key).split(".")
     if len(path) >= toml_file.MOST_LEVELS:
         raise CallerError(f"{source}: the key has more than {toml_file.MOST_LEVELS} parts")
     for depth, part in enumerate(path):

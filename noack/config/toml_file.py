@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 
 from noack.config.validation_messages import explain
-from noack.core.errors import CallerError, printable
+from noack.core.errors import CallerError, did_you_mean, printable, shortened
 from noack.core.file_access import read_regular
 from noack.settings.section import ScenarioSection
 
@@ -32,6 +32,12 @@ _STRING = re.compile(
     re.VERBOSE | re.DOTALL,
 )
 """Strings and comments of TOML; an unterminated one ends at the last possible place."""
+_TWICE = re.compile(
+    r"(?:Cannot (?:overwrite|declare|redefine|mutate)|Duplicate inline table key '(?P<inner>.*)').*"
+    r"\(at (?:line (?P<line>\d+)|end)"
+)
+"""Errors of :mod:`tomllib` about a key that is defined already: most do not name it."""
+_TABLE = re.compile(r"\s*\[+([^\]\n]+)\]")
 _TOO_DEEP = f"tables and lists lie within each other more than {MOST_LEVELS} levels deep"
 _TOO_LARGE = "an integer is too large"
 _MOST_LOOKED_AT = 100
@@ -43,7 +49,7 @@ def read(
 ) -> dict[str, Any]:
     """Read a TOML file of at most ``most_bytes``.
 
-    If the file does not exist, the message names files of the type ``model`` beside it.
+    If the file does not exist, the message suggests a similar file of the type ``model`` beside it.
 
     Raises:
         CallerError: the file does not exist, is too large, is not a regular file, or is not TOML.
@@ -74,7 +80,8 @@ def parsed(text: str, source: str) -> dict[str, Any]:
     except RecursionError:
         raise CallerError(f"{source}: {_TOO_DEEP}") from None
     except tomllib.TOMLDecodeError as error:
-        raise CallerError(printable(f"{source}: not valid TOML: {error}")) from None
+        wrong = _defined_twice(text, str(error)) or str(error)
+        raise CallerError(printable(f"{source}: not valid TOML: {wrong}")) from None
     except ValueError:  # an integer has thousands of digits
         raise CallerError(f"{source}: {_TOO_LARGE}") from None
 
@@ -115,8 +122,48 @@ def _missing(path: Path, model: type[ScenarioSection]) -> str:
         with suppress(CallerError):
             if needed <= read(other).keys():
                 others.append(str(other))
-    names = ", ".join(others[:10])
-    return f"{path}: no such file" + (f"; there are {names}" if names else "")
+    near = did_you_mean(str(path), others)
+    return f"{path}: no such file" + (f"; {near}" if near else "")
+
+
+def _defined_twice(text: str, error: str) -> str | None:
+    """Return which key is defined twice, and in which lines; None if the error is another one."""
+    found = _TWICE.match(error)
+    if found is None:
+        return None
+    keys = _keys(text, int(found["line"] or text.count("\n") + 1))
+    line, key = keys.pop()
+    if (inner := found["inner"]) is not None:
+        return f"line {line}: {shortened(f'{key}.{inner}')} is defined twice"
+    before = [one for one, other in keys if other == key] or [
+        one for one, other in keys if key.startswith(f"{other}.") or other.startswith(f"{key}.")
+    ]
+    where = f"already defined in line {before[-1]}" if before else "a table with a key twice"
+    return f"line {line}: {shortened(key)} is {where}"
+
+
+def _keys(text: str, last: int) -> list[tuple[int, str]]:
+    """Return line and full key of each key and table that begins in the lines up to the last."""
+
+    def hidden(found: re.Match[str]) -> str:
+        return re.sub(r"[^\n]", " " if found["comment"] else "_", found[0])
+
+    keys, table, depth = list[tuple[int, str]](), "", 0
+    lines = zip(text.split("\n"), _STRING.sub(hidden, text).split("\n"), strict=True)
+    for number, (line, bare) in enumerate(list(lines)[:last], 1):
+        header = _TABLE.match(bare) if depth == 0 else None
+        if header is not None:
+            table = _plain(line[slice(*header.span(1))])
+            keys.append((number, table))
+        elif depth == 0 and "=" in bare:
+            key = _plain(line[: bare.index("=")])
+            keys.append((number, f"{table}.{key}" if table else key))
+        depth += sum(map(bare.count, "[{")) - sum(map(bare.count, "]}"))
+    return keys
+
+
+def _plain(key: str) -> str:
+    return ".".join(part.strip() for part in key.split("."))
 
 
 def _unfit(value: object) -> None:

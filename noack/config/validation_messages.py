@@ -3,11 +3,11 @@
 import difflib
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from types import UnionType
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from noack.core.errors import printable, shortened
@@ -22,6 +22,8 @@ _PATTERNS = {
     "^[0-9a-f]{64}$": "use 64 hexadecimal digits, in small letters",
 }
 _MOST_LINES = 50
+_SIMILAR = 0.8
+"""Least similarity of a suggested key, or of its last part, as difflib measures it."""
 _MATRIX = "should be a list; a matrix is a list of rows, e.g. [[0.0, 1.0], [2.0, 3.0]]"
 _LISTS = {
     float: "should be a list of numbers, e.g. [1.0, 0.0]",
@@ -47,6 +49,34 @@ def explain(error: ValidationError, source: str, root: type[ScenarioSection]) ->
     ]
     more = len(mistakes) - _MOST_LINES
     return [*shown, printable(f"{source}: {more} more mistakes")] if more > 0 else shown
+
+
+def nearest_key(key: str, known: Iterable[str]) -> str | None:
+    """Return the known key most similar to a key, as a whole or in its last part, if one is."""
+
+    def similarity(one: str) -> tuple[float, float]:
+        pairs = (key, one), (key.rpartition(".")[2], one.rpartition(".")[2])
+        whole, last = (difflib.SequenceMatcher(None, *pair).ratio() for pair in pairs)
+        return max(whole, last), whole
+
+    best = max(known, key=similarity, default="")
+    return best if similarity(best)[0] >= _SIMILAR else None
+
+
+def keys(section: type[BaseModel], prefix: str = "") -> list[str]:
+    """Return the keys of a settings file, each once; of a union of tables, the keys of all."""
+    return list(dict.fromkeys(_keys(section, prefix, ())))
+
+
+def _keys(
+    section: type[BaseModel], prefix: str, within: tuple[type[BaseModel], ...]
+) -> Iterator[str]:
+    for name, field in section.model_fields.items():
+        inner = [one for one in sections_of(field.annotation) if one not in within]
+        for one in inner:  # a trigger may contain another
+            yield from _keys(one, f"{prefix}{name}.", (*within, *inner))
+        if not inner:
+            yield f"{prefix}{name}"
 
 
 def brief(error: ValidationError) -> str:

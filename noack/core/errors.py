@@ -1,7 +1,9 @@
 """Errors by cause: the caller, a peer process, or the computer that the process runs on."""
 
 import os
+from collections.abc import Iterable
 from enum import IntEnum
+from pathlib import Path
 
 
 class ExitStatus(IntEnum):
@@ -68,6 +70,18 @@ def why(error: OSError | ValueError) -> str:
 def shortened(text: str, longest: int = 80) -> str:
     """Return a text, or its beginning and ``...`` if it has more than ``longest`` characters."""
     return text if len(text) <= longest else f"{text[: longest - 3]}..."
+
+
+def did_you_mean(name: str, files: Iterable[str]) -> str:
+    """Return ``did you mean NAME?`` for the most similar file; empty if none is similar.
+
+    Names are compared without folder and suffix.
+    """
+    from difflib import get_close_matches
+
+    by_stem = {Path(one).stem: one for one in files}
+    close = get_close_matches(Path(name).stem, by_stem, n=1)
+    return f"did you mean {by_stem[close[0]]}?" if close else ""
 
 
 def printable(text: str) -> str:

@@ -37,7 +37,7 @@ class PythonTriggerSettings(ClassSettings, WeightedSettings):
         return
 
     def trigger_policy(self, model: ModelMatrices) -> CodedPolicy:
-        return CodedPolicy(self.weight_matrix, partial(PythonTrigger, self))
+        return CodedPolicy(self.weight_matrix, partial(PythonTrigger, self), _BEYOND_EXACT)
 
     @property
     def description(self) -> str:

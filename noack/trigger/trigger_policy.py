@@ -38,11 +38,13 @@ class CodedPolicy:
     weight: Matrix | None
     new_trigger: Callable[[], "EventTrigger"]
     """Returns a trigger that has not started."""
+    why_no_rule: str
+    """What a user is told where a trigger rule is needed."""
     initial_dynamic_variable = 0.0
 
     def trigger_rule(self, n: int) -> TriggerRule:
         """Raise a CallerError."""
-        raise CallerError("trigger.policy: this one is code and has no trigger rule")
+        raise CallerError(self.why_no_rule)
 
 
 class EventTrigger(Protocol):

@@ -7,7 +7,7 @@ other, and gives the same figure the same bytes.
 import math
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import matplotlib as mpl
@@ -15,6 +15,7 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
 from matplotlib.ticker import LogFormatter
 
 from cosim.output import palette
@@ -50,6 +51,13 @@ _COLUMNS = 600
 _MARKS, _CROWD = 120, 80
 """Columns of markers in a panel, which are wider than a pixel; more markers than ``_CROWD`` are
 drawn smaller."""
+_IN_SHORT = (
+    ("certified for every plant of the uncertainty ", "certified: "),
+    ("certified for the scenario's ", "certified: "),
+    ("certified for the ", "certified: "),
+    ("certified from the ", "certified: "),
+)
+"""What the legends of papers leave out of the labels of bounds."""
 _MARKUP = re.compile(r"[$\\{}^_]|(?<=\\)\w+")
 _LARGEST = 1e150
 _LONGEST_NAME = 16
@@ -120,8 +128,44 @@ def head_in(labels: Sequence[str], width_in: float | None = None, *, titled: boo
 
 def _legend_rows(labels: Sequence[str], width_in: float | None) -> int:
     """Return the number of rows of a legend without the one that the title shares."""
-    rows = math.ceil(len(labels) / legend_columns(labels, width_in))
-    return max(rows - 1, 0) if layout().beside_title else rows
+    space = layout()
+    columns = legend_columns(labels, width_in)
+    rows = len(_packed(labels, width_in)) if space.is_paper else math.ceil(len(labels) / columns)
+    return max(rows - 1, 0) if space.beside_title else rows
+
+
+def _packed(labels: Sequence[str], width_in: float | None) -> list[list[int]]:
+    """Return which entries are in each row of a legend in a paper, in their order."""
+    rows, left_in = list[list[int]](), 0.0
+    for number, entry_in in enumerate(_entries_in(map(_short, labels))):
+        if entry_in > left_in:
+            rows.append([])
+            left_in = _legend_room_in(width_in)
+        rows[-1].append(number)
+        left_in -= entry_in
+    return rows
+
+
+def _legend_room_in(width_in: float | None) -> float:
+    """Return the width of a legend: beside the title, or below it as wide as the figure."""
+    space = layout()
+    if not space.beside_title:
+        return space.width_in - 2 * space.right_in
+    width_in = panel_width_in() if width_in is None else width_in
+    return width_in - _TITLE_CHARACTERS * space.character_in
+
+
+def _short(label: str) -> str:
+    """Return the label of a bound as it is in the legends of papers."""
+    for long, brief in _IN_SHORT:
+        label = label.replace(long, brief)
+    return label
+
+
+def _entries_in(labels: Iterable[str]) -> list[float]:
+    """Return the widths of a legend's entries."""
+    space = layout()
+    return [space.handle_in + space.character_in * len(_MARKUP.sub("", label)) for label in labels]
 
 
 def legend_columns(labels: Sequence[str], width_in: float | None = None) -> int:
@@ -129,13 +173,7 @@ def legend_columns(labels: Sequence[str], width_in: float | None = None) -> int:
 
     Below the title, a legend may be as wide as the figure.
     """
-    space = layout()
-    character_in = space.character_in
-    entries_in = [space.handle_in + character_in * len(_MARKUP.sub("", one)) for one in labels]
-    room_in = space.width_in - 2 * space.right_in
-    if space.beside_title:
-        width_in = panel_width_in() if width_in is None else width_in
-        room_in = width_in - _TITLE_CHARACTERS * character_in
+    entries_in, room_in = _entries_in(labels), _legend_room_in(width_in)
     for columns in range(len(labels), 1, -1):
         widths_in = [max(column) for column in np.array_split(entries_in, columns)]
         if sum(widths_in) <= room_in:
@@ -145,18 +183,27 @@ def legend_columns(labels: Sequence[str], width_in: float | None = None) -> int:
 
 def legend(axes: Axes, shown: Sequence[Shown]) -> None:
     """Put the legend above the axes at the right, where there are no data; the title is set."""
-    if shown:
-        handles, labels = zip(*shown, strict=True)
-        space, place = layout(), axes.get_position()
-        width_in = place.width * space.width_in
-        columns, right = legend_columns(labels, width_in), 1.0
-        if not space.beside_title:  # it ends where the figure's axes end
-            right = (1 - space.right_in / space.width_in - place.x0) / place.width
+    if not shown:
+        return
+    handles, labels = zip(*shown, strict=True)
+    space, place = layout(), axes.get_position()
+    width_in, right = place.width * space.width_in, 1.0
+    if not space.is_paper:
+        columns = legend_columns(labels, width_in)
         axes.legend(handles, labels, loc="lower right", bbox_to_anchor=(right, 1), ncols=columns)
-        if not space.beside_title:
-            rows_pt = 72 * space.legend_row_in * _legend_rows(labels, width_in)
-            pad_pt = rows_pt + mpl.rcParams["axes.titlepad"]
-            axes.set_title(axes.get_title("left"), pad=pad_pt)
+        return
+    rows = _packed(labels, width_in)
+    if not space.beside_title:  # it ends where the figure's axes end
+        right = (1 - space.right_in / space.width_in - place.x0) / place.width
+        pad_pt = 72 * space.legend_row_in * len(rows) + mpl.rcParams["axes.titlepad"]
+        axes.set_title(axes.get_title("left"), pad=pad_pt)
+    row = space.legend_row_in * axes.figure.dpi / axes.bbox.height
+    for above, entries in enumerate(reversed(rows)):
+        one = Legend(
+            axes, [handles[i] for i in entries], [_short(labels[i]) for i in entries],
+            loc="lower right", bbox_to_anchor=(right, 1 + above * row), ncols=len(entries),
+        )  # fmt: skip
+        axes.add_artist(one)
 
 
 def finite(values: Reals, *, positive: bool = False) -> Reals:

@@ -18,6 +18,7 @@ from cosim.output.figure_format import SCREEN_IN
 
 _PAPER_DPI = 600  # what publishers require of line art
 _EM_PER_CHARACTER = 0.6
+_EM_PER_CHARACTER_OF_LABEL = 0.5  # a label of an axis may be a little longer than the axis
 _POINTS_PER_IN = 72
 
 
@@ -134,12 +135,13 @@ def fit_to_paper(figure: Figure) -> None:
         line.set_linewidth(line.get_linewidth() * space.line_scale)
         line.set_markersize(line.get_markersize() * space.line_scale)
         line.set_markeredgewidth(line.get_markeredgewidth() * space.line_scale)
+    character_in = _EM_PER_CHARACTER_OF_LABEL * space.label_pt / _POINTS_PER_IN
     for axes in figure.axes:
         place, (width_in, height_in) = axes.get_position(), figure.get_size_inches()
         for axis, length_in in (
             (axes.xaxis, place.width * width_in), (axes.yaxis, place.height * height_in),
         ):  # fmt: skip
-            most = max(int(length_in / space.character_in), _SHORTEST_LINE)
+            most = max(int(length_in / character_in), _SHORTEST_LINE)
             axis.set_label_text(_wrapped(axis.get_label_text(), most))
 
 

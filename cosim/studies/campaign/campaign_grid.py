@@ -189,7 +189,10 @@ def _work(campaign: Campaign, scenario: Scenario) -> tuple[Work, float | None]:
             'network has no delay; leave it out, e.g. settings = { "network.impairments" = [] }, '
             'or use time = "sampled"'
         )
-    setting = replace(setting_of(resolved), **measured)
+    try:
+        setting = replace(setting_of(resolved), **measured)
+    except CallerError as error:
+        raise CallerError(f'{error}; time = "sampled" runs it as `noack simulate` does') from None
     return ContinuousWork(setting, box_of(scenario), campaign.seed), certified_error(resolved)
 
 

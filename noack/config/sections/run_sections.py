@@ -2,8 +2,9 @@
 
 from typing import Annotated, Any, Self
 
-from pydantic import Field, FiniteFloat, model_validator
+from pydantic import Field, FiniteFloat, field_validator, model_validator
 
+from noack.config.runtime_parameters import full_key
 from noack.core.clock import NS_PER_S
 from noack.settings.section import ScenarioSection, Seed
 
@@ -54,6 +55,14 @@ class ScheduledChange(ScenarioSection):
     set: Annotated[dict[str, Any], Field(min_length=1)]
     """The new values by their keys, e.g. "network.loss.probability" = 0.9: the keys of
     network.loss, network.mansd, controller.setpoint, and the numbers of the trigger."""
+
+    @field_validator("set")
+    @classmethod
+    def _with_full_keys(cls, given: dict[str, Any]) -> dict[str, Any]:
+        settings = {full_key(name): value for name, value in given.items()}
+        if len(settings) < len(given):
+            raise ValueError("a key is given twice, by its short name, too")
+        return settings
 
     @property
     def at_ns(self) -> int:

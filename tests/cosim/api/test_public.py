@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import pydoc
 import re
 import subprocess
 import sys
@@ -60,6 +61,13 @@ def test_every_public_name_has_a_docstring(name: str) -> None:
             if inspect.isfunction(target) and not target.__name__.startswith("_"):
                 assert inspect.getdoc(target)
                 assert inspect.signature(target).return_annotation is not inspect.Signature.empty
+
+
+@pytest.mark.parametrize("name", sorted(set(noack.__all__) - {"__version__"}))
+def test_the_help_of_a_public_name_names_noack(name: str) -> None:
+    found = getattr(noack, name)
+    assert found.__module__.partition(".")[0] == "noack"
+    assert f"{name} in module noack" in pydoc.render_doc(found, renderer=pydoc.plaintext)
 
 
 def test_importing_noack_loads_no_heavy_modules() -> None:

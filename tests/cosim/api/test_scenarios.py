@@ -126,7 +126,12 @@ def test_an_invalid_system_gives_one_line(gain: Any, initial_state: Any, message
 
 
 def test_a_notebook_shows_a_short_form_of_a_scenario() -> None:
-    shown = str(noack.load("lane_following"))
+    scenario = noack.load("lane_following")
+    table = scenario._repr_html_()
     for word in ("lane_following", "beta = 0.5", "bernoulli", "M − 1 = 4", "20 s"):
-        assert word in shown
-    assert len(shown.splitlines()) < 10
+        assert word in str(scenario)
+        assert word in table
+    assert len(str(scenario).splitlines()) < 10
+    assert table.startswith("<table>")
+    harmless = noack.with_settings(scenario, {"description": "<script>"})._repr_html_()
+    assert "<script>" not in harmless

@@ -1,5 +1,7 @@
 """Behaviour that all commands share."""
 
+import json
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -11,6 +13,8 @@ import tomli_w
 from typer.testing import CliRunner
 
 from cosim.cli import app
+from cosim.cli import command as cli
+from cosim.shipped_files import find_shipped
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a POSIX shell's redirection")
@@ -61,3 +65,43 @@ def test_check_prints_the_defaults_that_depend_on_other_keys(
     content["start_within_s"] = 60.0
     explicit = message()
     assert not any(key in explicit for key in ("watchdog:", "safe_input:", "_within_s:"))
+
+
+INTERRUPTED = "noack: stopped by the user (SIGINT)\n"
+
+
+def test_ctrl_c_during_a_simulation_gives_one_line_and_leaves_no_run(tmp_path: Path) -> None:
+    """The trigger's class sends the signal, amid the run."""
+    (tmp_path / "own.py").write_text(
+        "import signal\n"
+        "class Own:\n"
+        "    def start(self, t_s, x): pass\n"
+        "    def test(self, t_s, x, e_s):\n"
+        "        if t_s > 0.5: signal.raise_signal(signal.SIGINT)\n"
+        "        return False\n"
+    )
+    trigger = 'trigger={policy="python", file="own.py", name="Own"}'
+    shutil.copy(find_shipped("double_integrator", "scenarios"), tmp_path / "own.toml")
+    done = subprocess.run(
+        [sys.executable, "-m", "cosim.cli", "simulate", "own.toml", "--set", trigger],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", INTERRUPTED)
+    assert list((tmp_path / "runs").iterdir()) == []
+
+
+@pytest.mark.parametrize("line", [
+    "simulate lane_following", "certify lane_following", "adversary lane_following",
+    "margin lane_periodic", "design lane_following --settling 14",
+])  # fmt: skip
+def test_ctrl_c_during_any_command_gives_one_line(
+    line: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "load_scenario", interrupted)
+    done = CliRunner().invoke(app, line.split(), prog_name="noack")
+    assert (done.exit_code, done.stdout, done.stderr) == (130, "", INTERRUPTED)
+    done = CliRunner().invoke(app, [*line.split(), "--json"], prog_name="noack")
+    assert json.loads(done.stdout)["exit"]["status"] == 130

@@ -9,8 +9,9 @@ import pytest
 from typer.testing import CliRunner
 
 from cosim.cli import app
-from cosim.cli.completion import keys, run_directories
+from cosim.cli.completion import run_directories
 from noack.config.scenario import Scenario
+from noack.config.validation_messages import keys
 
 
 def completed(line: str) -> list[str]:
@@ -32,7 +33,9 @@ def completed(line: str) -> list[str]:
     ("noack run lane_following --set network.mansd", ["network.mansd="]),
     ("noack view runs/l", ["runs/latest"]),
     ("noack replay runs/2", ["runs/20260102-000000-b", "runs/20260101-000000-a"]),
+    ("noack run lane_following --set loss", ["loss=", "loss.p="]),
     ("noack set loss", ["loss", "loss.p"]),
+    ("noack set network.loss", ["network.loss", "network.loss.probability"]),
     ("noack simulate lane_following --tri", ["--trigger"]),
     ("noack simulate lane_following --trigger c", ["continuous"]),
 ])  # fmt: skip

@@ -7,14 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import tomli_w
 from typer.testing import CliRunner
 
 from cosim.cli import app
 from cosim.cli.commands.set_command import parsed
 from cosim.cli.execute_run import warn_of_other_runs
 from cosim.live.coordinator import Coordinator
+from noack.config.feature_kinds import POLICIES
+from noack.config.parameter_changes import changed
 from noack.config.resolution import resolve
-from noack.config.scenario_file import validate
+from noack.config.runtime_parameters import SHORT, trigger_parameters
+from noack.config.scenario_file import load, validate
 from noack.core.errors import CallerError
 from noack.runtime import run_registry
 from noack.runtime.join_ticket import Ticket, new_ticket
@@ -45,6 +49,81 @@ def test_arguments_are_keys_and_values() -> None:
         "network.loss.model": "bernoulli",
     }
     assert parsed(["trigger.floor", "-0.5"]) == {"trigger.floor": -0.5}
+
+
+VALUES = {
+    "loss": '{ model = "gilbert_elliott", mean_loss = 0.5, mean_burst = 3 }',
+    "loss.p": "0.9",
+    "mansd": "1",
+    "constraints": '[{ kind = "at_most", losses = 1, window = 10 }]',
+    "beta": "0.3",
+    "alpha": "0.2",
+    "floor": "0.01",
+    "setpoint": "[3.0, 0.0]",
+}
+"""A value of each runtime parameter that has a short name."""
+
+
+def test_every_short_name_has_a_value_here() -> None:
+    assert VALUES.keys() == SHORT.keys()
+
+
+@pytest.mark.parametrize("short", VALUES)
+def test_both_names_of_a_parameter_work_in_noack_set_in_the_option_and_in_changes(
+    short: str, content: dict[str, Any], tmp_path: Path
+) -> None:
+    path, text, found = tmp_path / "some.toml", VALUES[short], []
+    path.write_text(tomli_w.dumps(content))
+    for name in (short, SHORT[short]):
+        settings = parsed([name, text])
+        found.append(changed(load(path), settings))
+        found.append(load(path, [f"{name}={text}"]))
+        change = {"at_s": 0.5, "set": {name: settings[SHORT[short]]}}
+        scheduled = validate(content | {"changes": [change]}, "here")
+        found.append(changed(load(path), scheduled.changes[0].set))
+    assert found[0] != load(path)
+    assert found[1:] == found[:-1]
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_the_numbers_of_every_policy_can_be_set_before_and_during_a_run(
+    policy: str, content: dict[str, Any], tmp_path: Path
+) -> None:
+    trigger = POLICIES[policy].example(2)
+    if trigger is None:
+        return  # a class of one's own
+    path = tmp_path / "some.toml"
+    trigger_table = trigger.model_dump(mode="json", exclude_none=True)
+    path.write_text(tomli_w.dumps(content | {"trigger": trigger_table}))
+    for key in trigger_parameters(trigger):
+        value = getattr(trigger, key.removeprefix("trigger."))
+        if value is not None:
+            assert load(path, [f"{key}={value}"]) == load(path)
+            assert changed(load(path), parsed([key, str(value)])) == load(path)
+    if "trigger.beta" not in trigger_parameters(trigger):
+        with pytest.raises(CallerError, match="beta: cannot be changed") as refused:
+            changed(load(path), parsed(["beta", "1"]))
+        assert "beta" not in str(refused.value).partition("cannot")[2]
+
+
+@pytest.mark.parametrize(
+    ("name", "near"),
+    [("bta", "beta"), ("lss.p", "loss.p"), ("loss_p", "loss.p"), ("mansd.x", "mansd"),
+     ("network.manzd", "network.mansd"), ("probability", "network.loss.probability"),
+     ("alpha_per_s", "trigger.alpha_per_s"), ("set_point", "setpoint"), ("speed", None)],
+)  # fmt: skip
+def test_an_unknown_name_gives_one_line_with_a_suggestion(
+    name: str, near: str | None, ticket: Ticket
+) -> None:
+    with pytest.raises(CallerError) as refused:
+        changed(ticket.scenario, parsed([name, "1"]))
+    hint = f"did you mean {near}?" if near else "what can is network.loss, network.mansd, "
+    assert f"{name}: cannot be changed during a run; {hint}" in str(refused.value)
+    if near is None or name.startswith("network."):  # the option has it, or names the section's
+        return
+    done = CliRunner().invoke(app, ["check", "lane_following", "--set", f"{name}=1"])
+    shown = name if "." in name else f"{name} = 1"
+    assert done.stderr == f"noack: --set {shown}: unknown key; did you mean {near}?\n"
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""``noack scenarios``: the shipped scenarios, and a file to start one's own from."""
+"""The shipped scenarios: each runs on each user interface; ``noack scenarios`` copies them."""
 
 import json
 import tomllib
@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
+import noack
 from cosim.cli import app
+from noack.config.resolution import resolved_loops
 from noack.config.scenario_file import load
 
 ROOT = Path(__file__).parents[3]
@@ -15,8 +17,70 @@ SCENARIOS = sorted(file.stem for file in (ROOT / "scenarios").glob("*.toml"))
 CAMPAIGNS = sorted(file.stem for file in (ROOT / "campaigns").glob("*.toml"))
 
 
+def run(*words: str) -> Result:
+    return CliRunner().invoke(app, words, prog_name="noack")
+
+
 def scenarios(*words: str) -> Result:
-    return CliRunner().invoke(app, ["scenarios", *words], prog_name="noack")
+    return run("scenarios", *words)
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_a_shipped_scenario_runs_from_the_command_line_and_in_the_library(
+    name: str, tmp_path: Path
+) -> None:
+    scenario = noack.load(name, {"horizon_s": 0.2})
+    try:
+        resolved_loops(scenario)
+    except noack.NoackError as error:
+        if "pip install" not in str(error):
+            raise
+        pytest.skip(str(error))
+    checked = run("check", name)
+    assert checked.exit_code == 0, checked.output
+    short = ["simulate", name, "--set", "horizon_s=0.2", "--runs", str(tmp_path), "--no-report"]
+    simulated = run(*short, "--json")
+    assert simulated.exit_code == 0, simulated.output
+    assert json.loads(simulated.stdout)["exit"]["status"] == 0
+    assert noack.simulate(scenario).ok
+    if scenario.loops is None:
+        assert noack.explore(scenario).run.t_s[-1] == pytest.approx(0.2)
+
+
+def test_each_command_runs_a_trigger_of_ones_own_or_says_why_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``lane_python_trigger``: its trigger is a class, so it has no rule, bound or exact run."""
+    monkeypatch.chdir(tmp_path)
+    own, last = "lane_python_trigger", "runs/latest"
+    Path("own.toml").write_text(
+        f'name = "own"\nscenario = "{own}"\ndraws = 2\n'
+        'axes = [{ name = "loss", key = "network.loss.probability", values = [0.2, 0.8] }]\n'
+        'figures = [{ kind = "curve", x = "loss", metric = "transmissions" }]\n'
+    )
+    works = (
+        f"simulate {own} --set horizon_s=1",
+        f"summary {last} --verbose", f"replay {last}", f"report {last}", f"compare {last} {last}",
+        f"export {last} --format csv",
+    )  # fmt: skip
+    for line in works:
+        done = run(*line.split())
+        assert done.exit_code == 0, done.output
+    needs = 'trigger.policy: needs a policy that is a rule; this scenario has "python"'
+    refuses = (
+        (f"certify {own}", needs),
+        (f"margin {own}", needs),
+        (f"adversary {own}", needs),
+        (f"simulate {own} --trigger continuous", needs),
+        (f"fidelity {last}", needs),
+        (f"design {own} --settling 5", "trigger.policy: needs the paper's trigger"),
+        ("campaign own.toml", 'time = "sampled" runs it as `noack simulate` does'),
+    )
+    for line, reason in refuses:
+        done = run(*line.split())
+        assert done.exit_code == 2, done.output
+        assert reason in done.stderr
+        assert done.stderr.count("\n") == 1
 
 
 def test_all_shipped_scenarios_are_listed_with_their_description() -> None:

@@ -36,8 +36,8 @@ def printed(outcome: Outcome, *, verbose: bool = False, **changed: Any) -> str:
     return file.getvalue()
 
 
-def claim(verdict: str, why: str = "") -> dict[str, Any]:
-    return {"what": "a", "source": "b", "bound": "c", "ratio": 1.0, "since_s": 1.0, "why": why,
+def claim(verdict: str, why: str = "", what: str = "a") -> dict[str, Any]:
+    return {"what": what, "source": "b", "bound": "c", "ratio": 1.0, "since_s": 1.0, "why": why,
             "verdict": verdict}  # fmt: skip
 
 
@@ -90,10 +90,13 @@ def test_the_first_line_states_how_the_run_ended(
 def test_claims_that_did_not_hold_are_counted_with_a_reason(outcome: Outcome) -> None:
     claims = [claim("held"), claim("void", "late"), claim("not applicable", "ideal")]
     line = verdict(outcome.summary | {"claims": claims})[2]
-    assert line.text == "claims: 1 of 3 held, 1 void (late), 1 not applicable (assumption not met)"
-    worse = verdict(outcome.summary | {"claims": [*claims, claim("violated")]})[2]
-    assert worse.text.startswith("claims: 1 of 4 held, 1 violated, 1 void")
+    assert line.text == "claims: 1 of 3 held, 1 void (late), 1 not applicable (a: ideal)"
+    worse = verdict(outcome.summary | {"claims": [*claims, claim("violated", what="b")]})[2]
+    assert worse.text.startswith("claims: 1 of 4 held, 1 violated (b), 1 void (late)")
     assert worse.style == "bold red"
+    many = [claim("not applicable", "ideal", name) for name in "abcde"]
+    line = verdict(outcome.summary | {"claims": many})[2]
+    assert line.text == "claims: 0 of 5 held, 5 not applicable (a; b; c; 2 more: ideal)"
     assert verdict(outcome.summary | {"claims": []})[2].text == "claims: none"
 
 

@@ -305,7 +305,23 @@ def test_a_long_value_is_shortened(tmp_path: Path) -> None:
     ("text", "says"),
     [
         ("name = \n", "Invalid value (at line 1, column 8)"),
-        ("name = 'a'\nname = 'b'\n", "line 2"),
+        ("name = 'a'\nname = 'b'", "line 2: name is already defined in line 1"),
+        (
+            "[trigger]\nbeta = 1\nnorm = '='\nbeta = 2\n",
+            "line 4: trigger.beta is already defined in line 2",
+        ),
+        (
+            "[model]\nA = [\n  [1.0],  # [\n]\nB = 1\nA = [\n  [2.0],\n]\n",
+            "line 6: model.A is already defined in line 2",
+        ),
+        ("[trigger]\nbeta = 1\n[trigger]\n", "line 3: trigger is already defined in line 1"),
+        (
+            "[[loops]]\na = 1\n[[loops]]\na = 1\na = 2",
+            "line 5: loops.a is already defined in line 4",
+        ),
+        ("seeds.loss = 1\n[seeds]\nloss = 2", "line 2: seeds is already defined in line 1"),
+        ("loss = { model = 'a', model = 'b' }", "line 1: loss.model is defined twice"),
+        ("x = [{ a = 1 },\n{ b = 1, b.c = 2 }]", "line 1: x is a table with a key twice"),
         ("[plant\n", "line 1"),
         ("just words", "line 1"),
     ],
@@ -316,14 +332,16 @@ def test_invalid_toml_is_reported_with_its_line(text: str, says: str, tmp_path: 
     assert says in line
 
 
-def test_a_missing_file_is_reported_with_the_files_beside_it(tmp_path: Path) -> None:
+def test_a_missing_file_is_reported_with_a_similar_one_beside_it(tmp_path: Path) -> None:
     (tmp_path / "lane.toml").write_text(LANE)
     with pytest.raises(CallerError) as caught:
         load(tmp_path / "lan.toml")
-    assert str(caught.value) == f"{tmp_path}/lan.toml: no such file; there are {tmp_path}/lane.toml"
-    with pytest.raises(CallerError) as caught:
-        load(tmp_path / "nowhere" / "lan.toml")
-    assert str(caught.value) == f"{tmp_path}/nowhere/lan.toml: no such file"
+    near = f"did you mean {tmp_path}/lane.toml?"
+    assert str(caught.value) == f"{tmp_path}/lan.toml: no such file; {near}"
+    for other in (tmp_path / "nowhere" / "lan.toml", tmp_path / "other.toml"):
+        with pytest.raises(CallerError) as caught:
+            load(other)
+        assert str(caught.value) == f"{other}: no such file"
 
 
 def test_an_unreadable_file_is_reported(tmp_path: Path) -> None:

@@ -170,10 +170,10 @@ class _Named(ScenarioSection):
 
 def test_a_missing_file_suggests_only_files_of_its_type(tmp_path: Path) -> None:
     (tmp_path / "one.toml").write_text("name = 'one'\nmore = 1")
-    (tmp_path / "pyproject.toml").write_text("[project]\nname = 'other'")
-    (tmp_path / "broken.toml").write_text("name = ")
-    os.mkfifo(tmp_path / "fifo.toml")
+    (tmp_path / "nine.toml").write_text("name = ")
+    (tmp_path / "tone.toml").write_text("[project]\nname = 'other'")
+    os.mkfifo(tmp_path / "nose.toml")
     with pytest.raises(CallerError) as caught:
         toml_file.read(tmp_path / "none.toml", _Named)
-    there = f"; there are {tmp_path}/one.toml"
-    assert str(caught.value) == f"{tmp_path}/none.toml: no such file{there}"
+    near = f"did you mean {tmp_path}/one.toml?"
+    assert str(caught.value) == f"{tmp_path}/none.toml: no such file; {near}"

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
 from PIL import ImageColor
 
 from cosim.analysis.quantile_sketch import QuantileSketch
@@ -118,6 +119,11 @@ def as_wide(request: pytest.FixtureRequest) -> Iterator[dict[str, Figure]]:
         yield drawn_for(case)
 
 
+def legends(axes: Axes) -> list[Legend]:
+    """The legend of axes; in a paper, one for each of its rows."""
+    return [one for one in axes.get_children() if isinstance(one, Legend)]
+
+
 def test_nothing_is_cut_off_and_no_texts_overlap(as_wide: dict[str, Figure]) -> None:
     for name, figure in as_wide.items():
         with settings():
@@ -127,10 +133,10 @@ def test_nothing_is_cut_off_and_no_texts_overlap(as_wide: dict[str, Figure]) -> 
             assert box.x1 <= size_in[0], name
             assert box.y1 <= size_in[1], name
             for axes in figure.axes:
-                legend = axes.get_legend()
-                assert not legend or legend.get_window_extent().y0 >= axes.bbox.y1 - 1, name
                 heads = [*axes.texts, axes.title, axes.yaxis.get_offset_text(), axes._left_title]
-                heads += legend.get_texts() if legend else []
+                for legend in legends(axes):
+                    assert legend.get_window_extent().y0 >= axes.bbox.y1 - 1, name
+                    heads += legend.get_texts()
                 boxes = [text.get_window_extent() for text in heads if text.get_text()]
                 for i, one in enumerate(boxes):
                     assert not any(one.overlaps(other) for other in boxes[:i]), name
@@ -166,8 +172,7 @@ def test_a_long_run_is_drawn_with_its_peaks_and_few_points(tmp_path: Path) -> No
 
 
 def labels(axes: Axes) -> list[str]:
-    legend = axes.get_legend()
-    return [] if legend is None else [text.get_text() for text in legend.get_texts()]
+    return [text.get_text() for legend in legends(axes) for text in legend.get_texts()]
 
 
 def test_intervals_and_fates_are_drawn_at_their_times() -> None:
@@ -249,6 +254,23 @@ def test_a_legend_has_as_few_rows_as_its_width_permits() -> None:
     bound.append(Bound("bound from (I1)", t_s, 2.0 + t_s, "identity"))
     (axes,) = signal_figures.error_figure(t_s, t_s, t_s, t_s, bound).axes
     assert axes.get_legend()._ncols == 2
+    # In a paper its rows are filled one by one, and take little of the height of the axes.
+    kinds = ("for the scenario's plant", "for the missing events", names[1])
+    bound = [*(Bound(f"certified {kind}", t_s, 3.0 + t_s) for kind in kinds), bound[-1]]
+    for width_in, share in ((3.5, 0.4), (7.16, 0.3)):
+        with figure_width(width_in), settings():
+            (axes,) = signal_figures.error_figure(t_s, t_s, t_s, t_s, bound).axes
+            axes.figure.draw_without_rendering()  # type: ignore[union-attr]
+            rows = [one.get_window_extent() for one in legends(axes)]
+            assert max(row.y1 for row in rows) - axes.bbox.y1 <= share * axes.bbox.height
+            assert {"certified: plant", "certified: box"} <= set(labels(axes))
+
+
+def test_short_labels_of_axes_are_on_one_line_in_a_column() -> None:
+    with figure_width(3.5):
+        drawn = drawn_for("long")
+    texts = [axes.get_ylabel() for figure in drawn.values() for axes in figure.axes]
+    assert {"interval [s]", "inter-event time [s]"} <= set(texts)
 
 
 def test_the_distribution_of_lateness_is_exact_at_its_ends() -> None:
