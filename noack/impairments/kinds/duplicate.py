@@ -31,6 +31,7 @@ class Duplicate(CorrelatedChance, Impairment):
     )
     behaviour: ClassVar = Behaviour(ChanceStage, apply)
     action: ClassVar = "duplicate"
+    copies: ClassVar = True
 
     def text(self) -> str:
         return f"duplicate {self.chance_text}"
