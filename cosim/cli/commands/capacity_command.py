@@ -1,5 +1,6 @@
 """``noack capacity``: how many loops a link carries."""
 
+import math
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -141,6 +142,8 @@ def capacity(
     if draws is not None:
         depth = depth._replace(draws=draws)
     if disturbance is not None:
+        if not math.isfinite(disturbance):
+            raise CallerError(f"--disturbance {disturbance}: should be a finite number")
         depth = depth._replace(amplitude=disturbance)
     plan = _plan(
         cli.find_scenario(scenario), settings or [], policy or [], depth, loops=loops,

@@ -242,6 +242,7 @@ def test_the_command_compares_the_policies_and_confirms_a_point_live(tmp_path: P
         (["--set", "network.impairments=[]"], "no bottleneck that the loops could share"),
         (["--loops", "0,3"], "numbers of loops are at least 1"),
         (["--loops", "12"], "--loops 12: should be a multiple of 11"),
+        (["--disturbance", "nan"], "--disturbance nan: should be a finite number"),
         (["--loops", "few"], "--loops few: write it as"),
         (["--update-period", "99"], "--update-period 99: between 0 and the horizon"),
         (
