@@ -33,7 +33,7 @@ SHORTER = {
     "run": ("--no-report",),
     "adversary": ("--set", "horizon_s=2", "--nodes", "2000"),
     "design": ("--draws", "100"),
-    "capacity": ("--draws", "1", "--loops", "2", "--set", "horizon_s=1"),
+    "capacity": ("--draws", "1", "--loops", "11", "--set", "horizon_s=1"),
     "margin": ("--no-period",),
     "doctor": ("--seconds", "0.1"),
 }

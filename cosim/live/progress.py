@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 _PLAIN_LINES = 10
 """Progress lines of a run on a terminal that cannot redraw a line."""
+_LINE_EVERY_S = 5.0
+"""Time between two lines about the completed runs, if there is no terminal."""
 
 
 class PatientConsole(Console):
@@ -164,21 +166,29 @@ def draws_bar(console: Console) -> Iterator[Callable[[int, int], None]]:
 
 @contextmanager
 def runs_bar(console: Console) -> Iterator[Callable[[int, int], None]]:
-    """Show the number of completed runs, their rate and the remaining time."""
+    """Show the number of completed runs, their rate and the remaining time.
+
+    Where there is no terminal, print the number as a line at intervals.
+    """
     columns = (
         TextColumn("{task.completed:,.0f}/{task.total:,.0f} runs"),
         TextColumn("{task.fields[rate]}"),
         TimeRemainingColumn(),
     )
     began_s, before = time.monotonic(), -1
+    line_s = began_s
     with _bar(console, 1, *columns) as show:
 
         def update(done: int, total: int) -> None:
-            nonlocal before
-            before = done if before < 0 else before
-            rate = (done - before) / max(time.monotonic() - began_s, 1e-3)
+            nonlocal before, line_s
+            before, now_s = done if before < 0 else before, time.monotonic()
+            rate = (done - before) / max(now_s - began_s, 1e-3)
             text = f"{rate:,.0f}/s" if done > before else "starting; compiles at first use"
             show(completed=done, total=total, rate=text)
+            if not console.is_terminal and now_s - line_s >= _LINE_EVERY_S:
+                line_s = now_s
+                line = f"{done:,} of {total:,} runs after {now_s - began_s:.0f} s"
+                console.print(f"noack: {line}", highlight=False, markup=False, soft_wrap=True)
 
         yield update
 

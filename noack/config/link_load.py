@@ -9,9 +9,17 @@ largest time between two of its transmissions. The datagrams that must pass need
 Without constraints: if r bits per second exceed m = Σ b/(M d), the delay D in a tail-drop queue of
 Q places is bounded. Datagrams leave in their order, so those before the end of a transmission came
 within D. At most Q of them found a free place; of each loop, at most 1 + D/(M d) had to pass. Hence
-D is at most (Q max b + Σ b)/(r − m). If r is even at least Σ b/d, a queue that has been busy for t
-got at most 1 + t/d datagrams of each loop, and has sent r t bits: D is at most Σ b/r. A live run
-adds the lateness of its processes.
+D is at most (Q max b + Σ b)/(r − m). If r is even at least e = Σ b/d, a queue that has been busy
+for t got at most 1 + t/d datagrams of each loop, and has sent r t bits: D is at most Σ b/r.
+
+Impairments before the queue delay a datagram by a time between two bounds that differ by J. It
+enters the queue in the order of its transmission, and after a time between these bounds, too. So
+what enters within t was transmitted within t + J. Then D is at most (Q max b + Σ b + m J)/(r − m),
+or (Σ b + e J)/r. If they may send datagrams twice, each counts twice in the second bound.
+
+The delay in the network is at most the sum L of the bounds of its impairments. A datagram that is
+held back for the guarantee leaves with an earlier one of its loop, which leaves within L of its own
+transmission: so L bounds this delay, too. A live run adds the lateness of its processes.
 """
 
 import math
@@ -27,7 +35,6 @@ from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.impairments.constraints import guarantee_of
 from noack.impairments.disciplines.tail_drop import TailDrop
-from noack.impairments.kinds.loss import LossOf
 from noack.impairments.kinds.opportunities import Opportunities
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.loss_guarantee import LossWindow
@@ -75,6 +82,22 @@ class LinkLoad(NamedTuple):
     """Bound of a datagram's delay in this queue, in the whole run; None: there is none."""
 
 
+class DelayBound(NamedTuple):
+    """What bounds the delay of updates in the network, in the whole run and in virtual time."""
+
+    impairments_s: dict[str, float]
+    """The largest delay in each impairment that delays, by its key; infinite: no bound is known."""
+    largest_s: float
+    """The largest delay in all of them."""
+    certified_s: float
+    """The delay that the certificates cover."""
+
+    @property
+    def is_certified(self) -> bool:
+        """Whether the certificates cover every delay; times are whole nanoseconds."""
+        return round(self.certified_s * NS_PER_S) >= self.largest_s * NS_PER_S - 0.5
+
+
 def link_loads(scenario: Scenario) -> list[LinkLoad]:
     """Return what the loops need of each bottleneck of the network, in either direction.
 
@@ -84,6 +107,27 @@ def link_loads(scenario: Scenario) -> list[LinkLoad]:
     Raises:
         CallerError: a loop cannot be resolved, or its trigger excludes its model.
     """
+    updates, actuations = _stages(scenario)
+    found = _link_loads(updates, Flow.UPDATE, "network")
+    return found + _link_loads(actuations, Flow.ACTUATION, "network.actuation")
+
+
+def update_delay(scenario: Scenario) -> DelayBound:
+    """Return what bounds the delay of updates, and what the certificates cover.
+
+    Raises:
+        CallerError: as :func:`link_loads`.
+    """
+    delays_s, largest_s = _largest_delays_s(_stages(scenario)[0])
+    own_s = {f"network.impairments.{place}": t_s for place, t_s in enumerate(delays_s) if t_s}
+    certified_s = scenario.certificate.network_delay_s
+    if certified_s is None:
+        certified_s = scenario.network.link.longest_delay_s
+    return DelayBound(own_s, largest_s, certified_s)
+
+
+def _stages(scenario: Scenario) -> tuple[list[_Stage], list[_Stage]]:
+    """Return the parts of the run between changes of settings: updates, actuations."""
     sections = scenario.loops
     loops = [scenario] if sections is None else [loop_scenario(scenario, one) for one in sections]
     counts = [1] if sections is None else [one.count for one in sections]
@@ -97,18 +141,19 @@ def link_loads(scenario: Scenario) -> list[LinkLoad]:
         if network.actuation is not None:
             demands = [*map(_actuations, resolved, counts)]
             actuations.append(_Stage(begin, network.actuation, demands))
-    found = _link_loads(updates, Flow.UPDATE, "network")
-    return found + _link_loads(actuations, Flow.ACTUATION, "network.actuation")
+    return updates, actuations
 
 
 def _link_loads(stages: Sequence[_Stage], flow: Flow, path: str) -> list[LinkLoad]:
     found: list[LinkLoad] = []
-    # The impairments cannot change.
-    for place, one in enumerate(stages[0].direction.impairments if stages else ()):
+    if not stages:
+        return found
+    delays_s, _ = _largest_delays_s(stages)
+    for place, one in enumerate(stages[0].direction.impairments):
         if not isinstance(one, Rate | Opportunities):
             continue
         before: LinkLoad | None = None
-        delay_s = _delay_bound_s(stages, place)
+        delay_s = delays_s[place] if math.isfinite(delays_s[place]) else None
         for begin, direction, loops in stages:
             window = _window(direction)
             bits = [int(one.line_bits(loop.payload_bytes)) * loop.loops for loop in loops]
@@ -138,29 +183,49 @@ def _share(window: LossWindow) -> float:
     return (window.packets - window.losses) / window.packets
 
 
-def _delay_bound_s(stages: Sequence[_Stage], place: int) -> float | None:
+def _largest_delays_s(stages: Sequence[_Stage]) -> tuple[list[float], float]:
+    """Return the bound of the delay in each impairment, and in all of them; infinite: none."""
+    least_s = largest_s = 0.0
+    found_s, copied = list[float](), False
+    for one in stages[0].direction.impairments:  # they cannot change
+        if isinstance(one, Rate):
+            own_s = _queue_delay_s(one, stages, largest_s - least_s, copied=copied)
+            largest_s += own_s
+        else:
+            own_s = one.longest_s if one.is_bounded else math.inf
+            least_s, largest_s = one.delay_range_s(least_s, largest_s)
+        found_s.append(own_s)
+        copied = copied or one.copies
+    return found_s, largest_s
+
+
+def _queue_delay_s(one: Rate, stages: Sequence[_Stage], spread_s: float, *, copied: bool) -> float:
     """Return the bound for the least M and the shortest times between transmissions of the run.
 
     What waits in the queue at a change was sent before it, so no stage has a bound of its own.
+
+    Args:
+        one: the bottleneck.
+        stages: the parts of the run.
+        spread_s: by how much the delays before the queue can differ.
+        copied: datagrams may have been sent twice before the queue.
     """
-    direction = stages[0].direction
-    one = direction.impairments[place]
-    if not (isinstance(one, Rate) and isinstance(one.discipline, TailDrop)):
-        return None
-    if not _is_first(direction, place):
-        return None
+    if not isinstance(one.discipline, TailDrop) or math.isinf(spread_s):
+        return math.inf
     bits = [int(one.line_bits(loop.payload_bytes)) for loop in stages[0].loops]
     counts = [loop.loops for loop in stages[0].loops]
     by_loops = zip(*(stage.loops for stage in stages), strict=True)
     least_s: list[float] = [min(one.least_s for one in each) for each in by_loops]
-    every: float = sum(b * k / d for b, k, d in zip(bits, counts, least_s, strict=True))
+    every_bps: float = sum(b * k / d for b, k, d in zip(bits, counts, least_s, strict=True))
     together = sum(b * k for b, k in zip(bits, counts, strict=True))
-    if every <= one.rate_bps:
-        return together / one.rate_bps
-    spare_bps = one.rate_bps - every * max(_share(_window(stage.direction)) for stage in stages)
-    if spare_bps > 0 and not any(stage.direction.constraints for stage in stages):
-        return (one.queue * max(bits) + together) / spare_bps
-    return None
+    copies = 2 if copied else 1
+    if copies * every_bps <= one.rate_bps:
+        return copies * (together + every_bps * spread_s) / one.rate_bps
+    needed_bps = every_bps * max(_share(_window(stage.direction)) for stage in stages)
+    if needed_bps < one.rate_bps and not any(stage.direction.constraints for stage in stages):
+        waiting = one.queue * max(bits) + together + needed_bps * spread_s
+        return waiting / (one.rate_bps - needed_bps)
+    return math.inf
 
 
 def require_capacity(scenario: Scenario) -> None:
@@ -177,23 +242,21 @@ def require_capacity(scenario: Scenario) -> None:
 
 def load_warnings(loads: Sequence[LinkLoad], scenario: Scenario) -> Iterator[str]:
     """Yield what may go wrong at the bottlenecks, one line each."""
-    for load in loads:
-        if load.mandatory_at_most_bps > load.rate_bps:
-            yield (
-                f"{load.key}, {load.rate_bps:.0f} bit/s: {load.begin}if all loops transmit as "
-                "often as they can, the datagrams that must pass need "
-                f"{math.ceil(load.mandatory_at_most_bps)} bit/s; then the queue grows without bound"
-            )
-        if load.flow is not Flow.UPDATE or load.begin:
-            continue  # the rest is about the delay of updates in the whole run
-        certified_s = scenario.certificate.network_delay_s
-        if certified_s is None:
-            certified_s = scenario.network.link.longest_delay_s
-        if load.delay_bound_s is not None and load.delay_bound_s > certified_s:
-            yield (
-                f"{load.key}: datagrams may be delayed by up to {load.delay_bound_s:.3g} s, the "
-                f"certificates cover {certified_s:.3g} s; see certificate.network_delay_s"
-            )
+    overloaded = [load for load in loads if load.mandatory_at_most_bps > load.rate_bps]
+    for load in overloaded:
+        yield (
+            f"{load.key}, {load.rate_bps:.0f} bit/s: {load.begin}if all loops transmit as "
+            "often as they can, the datagrams that must pass need "
+            f"{math.ceil(load.mandatory_at_most_bps)} bit/s; then the queue grows without bound"
+        )
+    delay = update_delay(scenario)
+    unknown = [key for key, own_s in delay.impairments_s.items() if math.isinf(own_s)]
+    covered = f"the certificates cover {delay.certified_s:.3g} s; see certificate.network_delay_s"
+    if not unknown and not delay.is_certified:
+        parts = ", ".join(f"{key} {own_s:.3g} s" for key, own_s in delay.impairments_s.items())
+        yield f"updates may be delayed by up to {delay.largest_s:.3g} s ({parts}), {covered}"
+    elif set(unknown) - {load.key for load in overloaded}:
+        yield f"no bound of the delay of updates is known ({', '.join(unknown)}), {covered}"
 
 
 def _demand(loop: Scenario, count: int) -> Demand:
@@ -225,9 +288,3 @@ def _actuations(loop: Scenario, count: int) -> Demand:
     size_bytes = datagram_bytes(loop.message_sizes.actuation_entries)
     period_s = loop.timing.controller_period_ns / NS_PER_S
     return Demand(count, size_bytes, period_s, period_s)
-
-
-def _is_first(direction: DirectionSection, place: int) -> bool:
-    """Whether datagrams reach an impairment once each, and as they were sent."""
-    before = direction.impairments[:place]
-    return all(isinstance(one, LossOf) for one in before)

@@ -4,6 +4,7 @@ A feature is a loss model, a kind of impairment, a queue discipline, or a constr
 class in its own file, derived from one of the classes at the end.
 """
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -177,6 +178,8 @@ class Impairment(StageFeature):
     """Whether it changes payloads."""
     delays: ClassVar[bool] = False
     """Whether it may delay packets."""
+    copies: ClassVar[bool] = False
+    """Whether it may send packets twice."""
 
     @property
     def longest_s(self) -> float:
@@ -187,6 +190,16 @@ class Impairment(StageFeature):
     def is_bounded(self) -> bool:
         """Whether no packet is delayed for longer than :meth:`longest_s`."""
         return True
+
+    @property
+    def shortest_s(self) -> float:
+        """A time in seconds by which every packet is delayed at least."""
+        return 0.0
+
+    def delay_range_s(self, least_s: float, largest_s: float) -> tuple[float, float]:
+        """Return bounds of a packet's delay after it, given those before it; infinite: none."""
+        own_s = self.longest_s if self.is_bounded else math.inf
+        return least_s + self.shortest_s, largest_s + own_s
 
     def reorders(self, delayed: bool, reordered: bool) -> tuple[bool, bool]:
         """Return whether packets may be delayed, and reordered, after it; given both before it."""

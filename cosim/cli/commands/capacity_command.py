@@ -1,5 +1,6 @@
 """``noack capacity``: how many loops a link carries."""
 
+import math
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,13 +13,17 @@ from noack.core.errors import CallerError, ExitStatus
 from noack.runtime.command_line import print_to_stderr
 
 if TYPE_CHECKING:
-    from cosim.studies.capacity.capacity_plan import CapacityPlan
+    from collections.abc import Sequence
+
+    from cosim.studies.capacity.capacity_plan import CapacityPlan, Depth
+    from cosim.studies.capacity.loop_mixture import Kind
 
 Loops = Annotated[
     str | None,
     typer.Option(
         metavar="N,N,...",
-        help="Numbers of loops; by default around the number of periodic loops that fit.",
+        help="Numbers of loops in all; by default around the number of periodic loops that fit. "
+        "Of different loops, multiples of the smallest number with their proportions.",
     ),
 ]
 RateBps = Annotated[
@@ -53,12 +58,25 @@ PolicyOption = Annotated[
     ),
 ]
 Disturbance = Annotated[
-    float,
+    float | None,
     typer.Option(
-        help="Amplitude of a pulse of 0.5 s on the inputs of all loops at once; 0: no such runs."
+        help="Amplitude of a pulse of 0.5 s on the inputs of all loops at once; 0: no such runs, "
+        "the default. With --thorough 1.",
     ),
 ]
-Draws = Annotated[int, typer.Option(help="Runs at each number of loops.", min=1, max=10_000)]
+Draws = Annotated[
+    int | None,
+    typer.Option(
+        help="Runs at each number of loops; 1 by default, 10 with --thorough.", min=1, max=10_000
+    ),
+]
+Thorough = Annotated[
+    bool,
+    typer.Option(
+        help="More numbers of loops, 10 draws, and runs with a common disturbance: about 25 times "
+        "as long."
+    ),
+]
 Seed = Annotated[int, typer.Option(help="Seed of the draws.", min=0, max=2**63 - 1)]
 Live = Annotated[
     str | None,
@@ -69,24 +87,30 @@ Live = Annotated[
     ),
 ]
 Out = Annotated[
-    Path | None, typer.Option("--out", help="Folder of the study; runs/capacity/NAME by default.")
+    Path | None,
+    typer.Option(
+        "--out", help="Folder of the study; runs/capacity/NAME by default, or NAME-thorough."
+    ),
 ]
 
 
 @cli.command(cli.CAMPAIGNS, 30, [
-    ("noack capacity shared_bottleneck --rate-bps 50000", "periodic, ZOH-ET and MB-ET"),
-    ("noack capacity shared_bottleneck --loops 5,10,20 --draws 8 --confirm model=5", ""),
+    ("noack capacity shared_bottleneck", "periodic, ZOH-ET and MB-ET: below a minute on two cores"),
+    ("noack capacity shared_bottleneck --thorough", "finite intervals, in half an hour"),
+    ("noack capacity shared_bottleneck --set 'loops=[{ name = \"p\" }]'", "loops of one kind"),
+    ("noack capacity shared_bottleneck --loops 11,22 --draws 8 --confirm model=11", ""),
 ])  # fmt: skip
 def capacity(
     scenario: cli.ScenarioArgument,
     *,
+    thorough: Thorough = False,
     loops: Loops = None,
     rate_bps: RateBps = None,
     update_period: Period = None,
     late_after: Deadline = None,
     policy: PolicyOption = None,
-    disturbance: Disturbance = 1.0,
-    draws: Draws = 10,
+    disturbance: Disturbance = None,
+    draws: Draws = None,
     seed: Seed = 0,
     confirm: Live = None,
     workers: Workers = None,
@@ -98,7 +122,11 @@ def capacity(
 ) -> int:
     """How many loops a link carries, until guarantee, deadline or cost is exceeded.
 
-    An interrupted study is continued if it is started again with the same folder.
+    Different loops keep their proportions: the answer is a multiple of the given [[loops]].
+
+    The time is estimated before the start. The default is a rough study with few runs;
+    with --thorough it is precise. An interrupted study is continued if it is started again with
+    the same folder.
 
     Exit status 1: a live run failed, or does not agree with the simulation.
     """
@@ -106,17 +134,26 @@ def capacity(
     from cosim.output.figure_format import figure_files
     from cosim.studies.capacity import capacity_live, capacity_page
     from cosim.studies.capacity.capacity_criteria import capacities
+    from cosim.studies.capacity.capacity_plan import QUICK, THOROUGH
 
     start = worker_pool(workers)
     files_of_figures = figure_files(figure_format, width)
+    depth = THOROUGH if thorough else QUICK
+    if draws is not None:
+        depth = depth._replace(draws=draws)
+    if disturbance is not None:
+        if not math.isfinite(disturbance):
+            raise CallerError(f"--disturbance {disturbance}: should be a finite number")
+        depth = depth._replace(amplitude=disturbance)
     plan = _plan(
-        cli.find_scenario(scenario), settings or [], policy or [], loops=loops, rate_bps=rate_bps,
-        period_s=update_period, deadline_s=late_after, amplitude=disturbance, draws=draws,
-        seed=seed,
+        cli.find_scenario(scenario), settings or [], policy or [], depth, loops=loops,
+        rate_bps=rate_bps, period_s=update_period, deadline_s=late_after, seed=seed,
     )  # fmt: skip
     chosen = capacity_live.chosen_points(confirm, plan)
-    folder = out or cli.DEFAULT_RUNS / "capacity" / plan.scenario.name
+    name = f"{plan.scenario.name}-thorough" if thorough else plan.scenario.name
+    folder = out or cli.DEFAULT_RUNS / "capacity" / name
     console = PatientConsole(stderr=True)
+    estimated_s = _announce(plan, folder, workers or cli.cores(), len(chosen), thorough=thorough)
     done = execute_campaign(console, plan.campaign(), Path("noack capacity"), start, folder=folder)
     points = []
     for policy_name, count in chosen:
@@ -124,11 +161,15 @@ def capacity(
             at = policy_name, count
             points.append(capacity_live.live_point(at, done.summary.found, folder / "live"))
     result = capacity_page.CapacityResult(
-        plan, done.summary, capacities(done.summary, done.store), points
+        plan, done.summary, capacities(plan, done.summary, done.store), points
     )
     files = [*capacity_page.write(result, folder, files_of_figures), *done.files]
     if json:
-        cli.print_json(result.document() | {"made": done.made, "files": [str(f) for f in files]})
+        cli.print_json(
+            result.document()
+            | {"thorough": thorough, "estimated_s": estimated_s, "made": done.made}
+            | {"files": [str(f) for f in files]}
+        )
     else:
         capacity_page.print_result(cli.console(), result)
         for file in files:
@@ -137,57 +178,89 @@ def capacity(
     return ExitStatus.OK if agree else ExitStatus.FAILED
 
 
+def _announce(
+    plan: "CapacityPlan", folder: Path, workers: int, live: int, *, thorough: bool
+) -> float:
+    """Print on standard error what is computed and about how long it takes; return the seconds."""
+    from cosim.studies.campaign.campaign_grid import grid
+    from cosim.studies.capacity import capacity_time
+    from cosim.studies.capacity.capacity_plan import THOROUGH
+
+    points = grid(plan.campaign(), Path("noack capacity"))
+    longer = plan if thorough else plan.with_depth(THOROUGH)
+    missing = capacity_time.missing_loops(plan, points, folder)
+    if not missing:
+        return 0.0
+    cpu_s = capacity_time.cpu_per_loop_s(points)
+    estimated_s = capacity_time.estimated_s(missing, cpu_s, workers)
+    longer_s = capacity_time.estimated_s(sum(longer.sizes) * longer.draws, cpu_s, workers)
+    of_live = f", and {live} live" if live else ""
+    idle = "an idle core" if workers == 1 else f"{workers} idle cores"
+    print_to_stderr(
+        f"noack capacity: {len(plan.sizes) * plan.draws:,} runs of {plan.scenario.horizon_s:g} s "
+        f"with {min(plan.sizes):,} to {max(plan.sizes):,} loops{of_live}; the simulation takes "
+        f"about {capacity_time.time_text(estimated_s)} on {idle}"
+        + ("" if longer == plan else f"; --thorough: {capacity_time.time_text(longer_s)}")
+    )
+    return estimated_s
+
+
 def _plan(
-    path: Path, overrides: list[str], policies: list[str], *, loops: str | None,
-    rate_bps: int | None, period_s: float | None, deadline_s: float | None, **more: Any,
+    path: Path, overrides: list[str], policies: list[str], depth: "Depth", *, loops: str | None,
+    rate_bps: int | None, period_s: float | None, deadline_s: float | None, seed: int,
 ) -> "CapacityPlan":  # fmt: skip
     from cosim.studies.capacity import capacity_plan as plans
+    from cosim.studies.capacity import loop_mixture
     from noack.config.scenario_file import load, value_of
-    from noack.config.sections.loop_section import NAME_PATTERN
 
     settings: dict[str, Any] = {}
     for text in overrides:
         key, _, value = text.partition("=")
         settings[key.strip()] = value_of(value, f"--set {key}")
-    loaded = load(path, overrides)
-    given = loaded.model_copy(update={"loops": None})
+    given = load(path, overrides)
     if rate_bps is not None:
         given = plans.with_rate(given, rate_bps)
         stages = [
             one.model_dump(mode="json", exclude_none=True) for one in given.network.impairments
         ]
         settings["network.impairments"] = stages
-    settings["loops"] = [{"name": "loop"}]
-    rate_bps = plans.bottleneck(given).rate_bps
+    plans.bottleneck(given)
     for option, seconds in (("--update-period", period_s), ("--late-after", deadline_s)):
         if seconds is not None and not 0 < seconds < given.horizon_s:
             raise CallerError(f"{option} {seconds:g}: between 0 and the horizon of the scenario")
-    if period_s is None:
-        period_s = plans.sampling_period_s(given)
-    period_s = plans.require_multiple(period_s, given)
-    deadline_s = deadline_s or given.certificate.network_delay_s or period_s
+    kinds = loop_mixture.kinds_of(given, period_s)
+    shortest_s = min(kind.period_s for kind in kinds)
+    deadline_s = deadline_s or given.certificate.network_delay_s or shortest_s
     settings["certificate.network_delay_s"] = deadline_s
-    compared = plans.default_policies(given, period_s)
+    compared = loop_mixture.policies_of(kinds) | _more_policies(policies, kinds)
+    least = loop_mixture.smallest_mixture(kinds)
+    if loops is None:
+        counts = plans.default_counts(plans.periodic_loops(given, kinds), least, depth)
+    else:
+        counts = plans.require_counts(_counts(loops), least)
+    return plans.CapacityPlan(
+        given, kinds, path, settings, deadline_s, counts, compared, depth.amplitude, depth.draws,
+        seed,
+    )  # fmt: skip
+
+
+def _more_policies(policies: list[str], kinds: "Sequence[Kind]") -> dict[str, dict[str, Any]]:
+    from cosim.studies.capacity.loop_mixture import MODEL, PERIODIC, ZOH
+    from noack.config.scenario_file import value_of
+    from noack.config.sections.loop_section import NAME_PATTERN
+
+    found: dict[str, dict[str, Any]] = {}
     for text in policies:
         name, equals, trigger = text.partition("=")
-        if not equals or not re.match(NAME_PATTERN, name.strip()) or name.strip() in compared:
+        name = name.strip()
+        if not equals or not re.match(NAME_PATTERN, name) or name in {PERIODIC, ZOH, MODEL, *found}:
             raise CallerError(
                 f"--policy {text}: write it as NAME=TRIGGER, with a new name of letters, digits, _ "
                 "and -"
             )
-        compared[name.strip()] = {"trigger": value_of(trigger, f"--policy {name}")}
-    fitting = plans.periodic_loops(given, rate_bps, period_s)
-    counts = (
-        plans.default_counts(fitting) if loops is None else plans.require_counts(_counts(loops))
-    )
-    if own := plans.loops_with_own_settings(loaded):
-        print_to_stderr(
-            "noack capacity: all loops are as at the top level of the scenario, "
-            f"without the settings of [[loops]] {', '.join(own)}"
-        )
-    return plans.CapacityPlan(
-        given, path, settings, rate_bps, period_s, deadline_s, counts, compared, **more
-    )
+        change = {"trigger": value_of(trigger, f"--policy {name}")}
+        found[name] = {"loops": [kind.under(change) for kind in kinds]}
+    return found
 
 
 def _counts(text: str) -> list[int]:

@@ -1,5 +1,6 @@
 """``noack check``: a scenario with everything made explicit, and the assumptions it meets."""
 
+import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
@@ -59,7 +60,12 @@ def check(
 
 def _check_loops(scenario: "Scenario", *, json: bool) -> int:
     """Check each loop and the bottleneck; print the scenario, which is not resolved."""
-    from noack.config.link_load import link_loads, load_warnings, require_capacity
+    from noack.config.link_load import (
+        link_loads,
+        load_warnings,
+        require_capacity,
+        update_delay,
+    )
     from noack.config.loops import phases_ns
     from noack.config.resolution import policy_of, resolved_loops
     from noack.config.scenario_file import dumps as scenario_toml
@@ -84,6 +90,12 @@ def _check_loops(scenario: "Scenario", *, json: bool) -> int:
             f"{load.mandatory_at_most_bps:.0f} bit/s; delay: "
             + ("no bound" if delay is None else f"at most {delay:.4g} s in virtual time")
         )
+    updates = update_delay(scenario)
+    print(
+        f"{_COMMENT}delay of updates in the network: "
+        + (f"at most {updates.largest_s:.4g} s" if math.isfinite(updates.largest_s) else "no bound")
+        + f" in virtual time; the certificates cover {updates.certified_s:.4g} s"
+    )
     for line in load_warnings(loads, scenario):
         print(f"{_COMMENT}warning: {line}")
     return ExitStatus.OK

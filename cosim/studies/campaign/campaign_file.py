@@ -23,6 +23,9 @@ MOST_POINTS = 10_000
 MOST_SERIES = 12
 """Largest number of curves in a figure."""
 
+LOOPS = "loops"
+"""The key of [[loops]]; see :func:`scales_loops`."""
+
 Identifier = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
 Settings = Annotated[dict[str, JsonValue], Field(min_length=1)]
 
@@ -58,6 +61,11 @@ def replaced(before: Iterable[str], after: Iterable[str]) -> tuple[str, str] | N
     """Return a key and a later key that replaces its value or its table; None if there is none."""
     pairs = itertools.product(before, after)
     return next(((old, new) for old, new in pairs if f"{old}.".startswith(f"{new}.")), None)
+
+
+def scales_loops(key: str, value: Any) -> bool:
+    """Whether a setting is a number of loops, which is applied after all other settings."""
+    return key == LOOPS and isinstance(value, int)
 
 
 def _require_kept(place: str, settings: Mapping[str, JsonValue]) -> None:
@@ -116,6 +124,12 @@ class Axis(ScenarioSection):
     def keys(self) -> tuple[str, ...]:
         """All keys that the axis sets."""
         return tuple({key: None for settings in self.settings for key in settings})
+
+    @property
+    def replaced_keys(self) -> tuple[str, ...]:
+        """The keys whose value or table the axis replaces."""
+        given = (item for settings in self.settings for item in settings.items())
+        return tuple({key: None for key, value in given if not scales_loops(key, value)})
 
     @property
     def numbers(self) -> list[float] | None:
@@ -264,7 +278,7 @@ class Campaign(ScenarioSection):
             raise ValueError(f"axes.{twice}.name: another axis has this name")
         for i, axis in enumerate(self.axes):
             for other in self.axes[:i]:
-                if (lost := replaced(other.keys, axis.keys)) is not None:
+                if (lost := replaced(other.replaced_keys, axis.replaced_keys)) is not None:
                     raise ValueError(
                         f"axes.{i}.name: {lost[1]} would replace {lost[0]} of axis {other.name}; "
                         "an axis that sets a whole table comes first, "

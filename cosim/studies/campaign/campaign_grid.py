@@ -1,6 +1,7 @@
 """The grid points of a campaign file: each has a scenario and the work for its draws."""
 
 import copy
+import math
 import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,9 +15,9 @@ from numpy.typing import NDArray
 from cosim.shipped_files import find_shipped
 from cosim.simulation.batch.batch_interface import ROW, Setting, run_batch, setting_of
 from cosim.simulation.continuous.network_fates import timeless
-from cosim.studies.campaign.campaign_file import Campaign, Value
+from cosim.studies.campaign.campaign_file import LOOPS, Campaign, Value, scales_loops
 from cosim.studies.campaign.campaign_workers import Work
-from cosim.studies.campaign.loops_draws import LOOPS_ROW, LoopsWork
+from cosim.studies.campaign.loops_draws import LoopsWork
 from cosim.studies.campaign.metrics import certified_error
 from cosim.studies.campaign.random_draws import Box, box_of
 from cosim.studies.campaign.sampled_draws import SampledWork, in_virtual_time
@@ -29,8 +30,6 @@ from noack.core.linear_systems import Matrix
 from noack.settings.matrices import Rows, require_shape
 
 SCENARIOS = "scenarios"
-LOOPS = "loops"
-"""The key of an axis over the number of loops."""
 
 
 @dataclass(frozen=True)
@@ -101,12 +100,15 @@ def grid(campaign: Campaign, path: Path) -> list[Point]:
         labels = {axis.name: axis.labels[i] for axis, i in chosen}
         values = {axis.name: (axis.numbers or axis.labels)[i] for axis, i in chosen}
         source = f"{path}: at {', '.join(f'{name} = {label}' for name, label in labels.items())}"
-        for axis, i in chosen:
-            for key, value in axis.settings[i].items():
-                if key == LOOPS:
-                    _put_loops(content, value, source)
-                else:
-                    put(content, key, value, source)
+        given = [item for axis, i in chosen for item in axis.settings[i].items()]
+        scaled = [value for key, value in given if scales_loops(key, value)]
+        if scaled:
+            content.setdefault(LOOPS, [{"name": "loop"}])
+        for key, value in given:
+            if not scales_loops(key, value):
+                put(content, key, value, source)
+        for value in scaled:
+            content[LOOPS] = _scaled(content[LOOPS], value, source)
         scenario = completed(content, scenario_path, source)
         try:
             work, certified = _work(campaign, scenario)
@@ -116,24 +118,44 @@ def grid(campaign: Campaign, path: Path) -> list[Point]:
     if len({point.scenario.loops is None for point in points}) > 1:
         raise CallerError(f"{path}: axes: either all grid points have loops, or none has")
     _require_effects(campaign, points, path)
+    entries = (entry.name for point in points for entry in point.scenario.loops or ())
+    if len(names := tuple(dict.fromkeys(entries))) > 1:
+        return [_with_entries(point, names) for point in points]
     return points
+
+
+def _with_entries(point: Point, names: tuple[str, ...]) -> Point:
+    assert isinstance(point.work, LoopsWork)
+    return replace(point, work=replace(point.work, entries=names))
 
 
 def row_type(points: Sequence[Point]) -> np.dtype[np.void]:
     """Return the type of the rows of runs."""
-    shared = any(point.scenario.loops is not None for point in points)
-    return LOOPS_ROW if shared else ROW
+    work = points[0].work
+    return work.row_type if isinstance(work, LoopsWork) else ROW
 
 
-def _put_loops(content: dict[str, Any], count: Any, source: str) -> None:
-    """Set the number of loops: those of the one entry of [[loops]], or of a new one."""
-    entries = content.get(LOOPS, [{"name": "loop"}])
-    if not isinstance(entries, list) or len(entries) != 1 or not isinstance(entries[0], dict):
+def _scaled(entries: Any, value: Any, source: str) -> list[dict[str, Any]]:
+    """Return the entries of [[loops]] with so many loops in all, in the same proportions."""
+    if not isinstance(entries, list) or not all(isinstance(one, dict) for one in entries):
+        raise CallerError(f"{source}: loops: should be a list of tables")
+    if len(entries) == 1:
+        return [entries[0] | {"count": value}]
+    counts = [one.get("count", 1) for one in entries]
+    if not all(isinstance(one, int) and one > 0 for one in counts):
+        return entries  # the scenario's validation says what is wrong
+    least = sum(counts) // math.gcd(*counts)
+    if value < 1 or value % least:
+        given = zip(entries, counts, strict=True)
+        names = ", ".join(f"{count} {one.get('name')}" for one, count in given)
         raise CallerError(
-            f"{source}: loops = {count}: the scenario has several entries of [[loops]]; set a list "
-            "of tables with variants"
+            f"{source}: loops = {value}: should be a multiple of {least}, to keep the proportions "
+            f"of [[loops]]: {names}"
         )
-    content[LOOPS] = [entries[0] | {"count": count}]
+    total = sum(counts)
+    return [
+        one | {"count": count * value // total} for one, count in zip(entries, counts, strict=True)
+    ]
 
 
 def _require_effects(campaign: Campaign, points: Sequence[Point], path: Path) -> None:

@@ -60,15 +60,23 @@ class LoopsWork(SampledWork):
     Loop k of draw i has the same plant, initial state and phase for any number of loops.
     """
 
+    entries: tuple[str, ...] = ()
+    """Names of the entries of [[loops]] at all grid points, if there are several."""
+
     judges: bool = False
     """Whether the claims of each loop are judged, which takes as long as the run."""
 
     count_from_s: float = 0.0
     """Updates that were sent earlier do not count in the last three columns of the row."""
 
+    @property
+    def row_type(self) -> np.dtype[np.void]:
+        """The type of the rows: that of a run, and the mean cost of the loops of each entry."""
+        return np.dtype([*LOOPS_ROW.descr, *((cost_of(name), "<f8") for name in self.entries)])
+
     def run(self, draws: range) -> NDArray[np.void]:
-        """Compute consecutive draws; one row of :data:`LOOPS_ROW` each."""
-        rows = np.zeros(len(draws), LOOPS_ROW)
+        """Compute consecutive draws; one row each."""
+        rows = np.zeros(len(draws), self.row_type)
         for row, draw in zip(rows, draws, strict=True):
             seeds = seeds_of(self.seed, draw)
             shared = simulate_loops(self.scenario.model_copy(update={"seeds": seeds}))
@@ -91,6 +99,13 @@ class LoopsWork(SampledWork):
         row["diverged_at_s"] = np.nanmin(np.append(loops["diverged_at_s"], np.inf))
         row["status"] = OK
         row["cost_worst"] = np.max(loops["cost"])
+        for name in self.entries:
+            row[cost_of(name)] = np.nan
+        if self.entries:
+            sections = self.scenario.loops or ()
+            ends = np.cumsum([one.count for one in sections])[:-1]
+            for one, costs in zip(sections, np.split(loops["cost"], ends), strict=True):
+                row[cost_of(one.name)] = np.mean(costs)
         row["loops_failed"] = np.mean(loops["status"] != OK)
         row["loops_claims_held"] = np.mean(held) if self.judges else np.nan
         self._measure_network(records, row)
@@ -107,6 +122,11 @@ class LoopsWork(SampledWork):
         due_ns = scenario.timing.measurement_period_ns if due_s is None else due_s * NS_PER_S
         row["updates_late"] = np.mean(delays_ns > due_ns) if len(delays_ns) else 0.0
         row["delay_max_s"] = delays_ns.max(initial=0) / NS_PER_S
+
+
+def cost_of(entry: str) -> str:
+    """Return the column with the mean cost of the loops of an entry of [[loops]]."""
+    return f"cost_of_{entry}"
 
 
 def _updates(record: RunRecord, from_s: float) -> Rows:

@@ -5,7 +5,9 @@ A run reaches a limit if
 * guarantee: a loop has used up its guarantee, because of the full queue;
 * deadline: more than :data:`LATE` of the delivered updates are late;
 * cost: the mean cost of the loops is at least :data:`COST_FACTOR` times the mean over all draws of
-  the cost of one loop. A run of one loop reaches it only by diverging.
+  the cost of one loop. A run of one loop reaches it only by diverging. With several kinds of loops:
+  the mean cost of a kind is at least :data:`COST_FACTOR` times that of the same loops, in the same
+  draw, on a link as many times as fast as there are loops.
 
 The capacity of a draw is the largest number of loops of the study up to which no run reaches the
 limit: 0 if one loop reaches it, infinite if none does. The estimate is the median over the draws,
@@ -18,11 +20,19 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.studies.campaign.campaign_grid import Point
 from cosim.studies.campaign.campaign_summary import CampaignSummary, runs_at
 from cosim.studies.campaign.chunk_store import Store
 from cosim.studies.campaign.draw_statistics import quantile_interval, quartiles
 from cosim.studies.campaign.metrics import Metric
-from cosim.studies.capacity.capacity_plan import DISTURBANCE, LOOPS, OWN, POLICY
+from cosim.studies.capacity.capacity_plan import (
+    DISTURBANCE,
+    LOOPS,
+    OWN,
+    POLICY,
+    CapacityPlan,
+    unshared,
+)
 from noack.core.linear_systems import Matrix, Vector
 
 LATE, COST_FACTOR = 0.01, 2.0
@@ -65,14 +75,21 @@ class PolicyCapacity(NamedTuple):
         }  # fmt: skip
 
 
-def capacities(summary: CampaignSummary, store: Store) -> list[PolicyCapacity]:
+def capacities(plan: CapacityPlan, summary: CampaignSummary, store: Store) -> list[PolicyCapacity]:
     """Return the capacity of the link for each policy and disturbance."""
-    groups: dict[tuple[str, str], dict[int, Mapping[Metric, Vector]]] = {}
+    groups: dict[tuple[str, str], dict[str, Mapping[str, Vector]]] = {}
     for one in summary.found:
         labels = one.point.labels
         key = labels[POLICY], labels.get(DISTURBANCE, OWN)
-        groups.setdefault(key, {})[int(labels[LOOPS])] = runs_at(one.point, store)[0]
-    return [_capacity(policy, how, by_count) for (policy, how), by_count in groups.items()]
+        groups.setdefault(key, {})[labels[LOOPS]] = _measured(plan, one.point, store)
+    return [capacity_of(plan, policy, how, runs) for (policy, how), runs in groups.items()]
+
+
+def _measured(plan: CapacityPlan, point: Point, store: Store) -> Mapping[str, Vector]:
+    """Return the metrics of the runs at a grid point, and the mean costs of the kinds."""
+    costs = store.columns(point.number, plan.cost_columns)
+    found: dict[str, Vector] = {str(name): one for name, one in runs_at(point, store)[0].items()}
+    return found | {name: np.where(np.isnan(one), np.inf, one) for name, one in costs.items()}
 
 
 def cost_limit(cost_of_one_loop: Vector) -> float:
@@ -93,22 +110,29 @@ def carried(counts: Sequence[int], reached: NDArray[np.bool_]) -> Vector:
     return np.where(reached.any(axis=0), found, np.inf)
 
 
-def _capacity(
-    policy: str, disturbance: str, by_count: Mapping[int, Mapping[Metric, Vector]]
+def capacity_of(
+    plan: CapacityPlan, policy: str, disturbance: str, runs: Mapping[str, Mapping[str, Vector]]
 ) -> PolicyCapacity:
-    counts = sorted(by_count)
+    """Return the capacity of the link from the metrics of its runs, by the label of their number.
 
-    def values(limit: Limit) -> Matrix:
-        return np.stack([by_count[count][LIMITS[limit]] for count in counts])
+    Each metric has the values of the draws, (draws,).
+    """
 
-    cost = values("cost")
+    def values(metric: str) -> Matrix:
+        return np.stack([runs[str(count)][metric] for count in plan.counts])
+
     reached: dict[Limit, NDArray[np.bool_]] = {
-        "guarantee": values("guarantee") > 0,
-        "deadline": values("deadline") > LATE,
-        "cost": cost >= cost_limit(cost[0]),
+        "guarantee": values(LIMITS["guarantee"]) > 0,
+        "deadline": values(LIMITS["deadline"]) > LATE,
+        "cost": np.zeros((len(plan.counts), plan.draws), dtype=np.bool_),
     }
-    reached["cost"][0] = np.isinf(cost[0])  # one loop is the reference, however costly its draw
-    draws = {limit: carried(counts, one) for limit, one in reached.items()}
+    if plan.is_one_kind:
+        reached["cost"] = values("cost") >= cost_limit(values("cost")[0])
+        reached["cost"][0] = np.isinf(values("cost")[0])  # it is the reference, however costly
+    for column in () if plan.is_one_kind else plan.cost_columns:
+        own = np.stack([runs[unshared(count)][column] for count in plan.counts])
+        reached["cost"] |= values(column) >= COST_FACTOR * own
+    draws = {limit: carried(plan.counts, one) for limit, one in reached.items()}
     limits = {limit: _estimate(one) for limit, one in draws.items()}
     worst = np.min(np.stack([*draws.values()]), axis=0)
     return PolicyCapacity(policy, disturbance, limits, _estimate(worst))

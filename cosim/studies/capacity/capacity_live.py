@@ -18,7 +18,7 @@ from cosim.record.run_directory import SUMMARY_FILE, read_object
 from cosim.record.run_record import RunRecord, load_record
 from cosim.studies.campaign.campaign_summary import GridPointResult
 from cosim.studies.campaign.draw_statistics import Estimate
-from cosim.studies.campaign.loops_draws import LOOPS_ROW, LoopsWork
+from cosim.studies.campaign.loops_draws import LoopsWork
 from cosim.studies.campaign.metrics import Metric, measured
 from cosim.studies.campaign.random_draws import seeds_of
 from cosim.studies.capacity.capacity_criteria import LIMITS
@@ -75,10 +75,11 @@ def live_point(
         NoackError: the run could not be started or completed.
     """
     places = {
-        (one.point.labels[POLICY], int(one.point.labels[LOOPS])): one
+        (one.point.labels[POLICY], one.point.labels[LOOPS]): one
         for one in found if one.point.labels.get(DISTURBANCE, OWN) == OWN
     }  # fmt: skip
-    return _live_point(places[chosen], folder)
+    policy, count = chosen
+    return _live_point(places[policy, str(count)], folder)
 
 
 def _live_point(found: GridPointResult, folder: Path) -> LivePoint:
@@ -88,9 +89,9 @@ def _live_point(found: GridPointResult, folder: Path) -> LivePoint:
     scenario = point.scenario.model_copy(update={"seeds": seeds_of(work.seed, 0), "name": name})
     outcome = finalize(launch(scenario, folder), report=False)
     records = _records(outcome.run_dir, scenario)
-    rows = np.zeros(1, LOOPS_ROW)
+    rows = np.zeros(1, work.row_type)
     work.measure_loops(records, rows[0])
-    columns = {column: rows[column] for column in LOOPS_ROW.names or ()}
+    columns = {column: rows[column] for column in work.row_type.names or ()}
     values = {key: float(value[0]) for key, value in measured(columns, None).items()}
     judged: list[Metric] = ["transmissions", *LIMITS.values()]
     return LivePoint(

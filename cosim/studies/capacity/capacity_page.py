@@ -1,7 +1,7 @@
 """The output of a capacity study: page, figures, JSON, and a table for a terminal."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,10 +36,10 @@ from cosim.studies.capacity.capacity_plan import (
     DISTURBANCE,
     LOOPS,
     OWN,
-    PERIODIC,
     POLICY,
     CapacityPlan,
 )
+from cosim.studies.capacity.loop_mixture import PERIODIC
 from noack.core.file_access import write_whole
 from noack.core.number_format import number
 
@@ -47,8 +47,11 @@ PAGE, RESULTS = "capacity.html", "capacity.json"
 _SENTENCES = {
     "guarantee": "a loop used up its guarantee: M − 1 consecutive losses, one in the full queue",
     "deadline": f"more than {100 * LATE:g} % of the updates were late",
-    "cost": f"the mean cost was at least {COST_FACTOR:g} times that of one loop",
+    "cost": f"the mean cost of the loops, or of one kind of them, was at least {COST_FACTOR:g} "
+    "times that of loops that have the link for themselves",
 }
+_FINITE_FROM = 6
+"""Number of draws from which on the interval of a median is finite."""
 
 
 class CapacityResult(NamedTuple):
@@ -63,10 +66,15 @@ class CapacityResult(NamedTuple):
         """Return the results for JSON."""
         plan = self.plan
         return {
-            "scenario": plan.scenario.name, "rate_bps": plan.rate_bps, "period_s": plan.period_s,
+            "scenario": plan.scenario.name, "rate_bps": plan.rate_bps,
             "deadline_s": plan.deadline_s, "periodic_loops_by_rate": plan.periodic_loops,
-            "loops": list(plan.counts), "draws": plan.draws, "seed": plan.seed,
-            "capacities": [one.document() for one in self.capacities],
+            "mixture": [
+                {"name": kind.name, "count": kind.given, "period_s": kind.period_s}
+                for kind in plan.kinds
+            ],
+            "loops": list(plan.counts), "draws": plan.draws, "disturbance": plan.amplitude,
+            "seed": plan.seed,
+            "capacities": [one.document() | _as_mixture(plan, one) for one in self.capacities],
             "comparisons": list(comparisons(self)),
             "points": self.summary.document()["points"],
             "live": [one.document() for one in self.live],
@@ -101,9 +109,8 @@ def page(result: CapacityResult) -> str:
         title=plan.scenario.name,
         subtitle=f"{plan.rate_bps / 1000:g} kbit/s, {plan.draws:,} draws at each number of loops, "
         f"seed {plan.seed}",
-        verdict=f"The rate carries {plan.periodic_loops:.1f} loops that transmit every "
-        f"{plan.period_s:g} s.",
-        comparisons=list(comparisons(result)),
+        verdict=f"{by_rate(plan).capitalize()}.",
+        comparisons=[*comparisons(result), *mixtures(result), *caveats(plan)],
         counts=", ".join(map(str, plan.counts)),
         deadline=f"{plan.deadline_s:g} s",
         from_s=f"{plan.counted_from_s:g} s",
@@ -129,6 +136,60 @@ def rows(result: CapacityResult) -> Iterator[tuple[str, ...]]:
         yield (
             one.policy, one.disturbance, _shown(one.any_limit, last), one.limited_by or "–", *limits
         )  # fmt: skip
+
+
+def by_rate(plan: CapacityPlan) -> str:
+    """Say how many periodic loops the rate carries."""
+    if plan.is_one_kind:
+        (kind,) = plan.kinds
+        return (
+            f"the rate carries {plan.periodic_loops:.1f} loops, periodic every {kind.period_s:g} s"
+        )
+    periods = ", ".join(f"{kind.name} every {kind.period_s:g} s" for kind in plan.kinds)
+    factor = plan.factor(plan.periodic_loops)
+    return (
+        f"the rate carries {factor:.2f} × the given mixture, {plan.periodic_loops:.1f} loops, "
+        f"periodic: {periods}"
+    )
+
+
+def mixtures(result: CapacityResult) -> Iterator[str]:
+    """Yield the median capacities as multiples of the mixture that the scenario has."""
+    plan = result.plan
+    for one in () if plan.is_one_kind else result.capacities:
+        median, least = one.any_limit.median, ""
+        if math.isinf(median):
+            median, least = plan.counts[-1], "at least "
+        text = f"{least}{plan.factor(median):g} × the given mixture"
+        if median:
+            text += f" ({_listed(plan.composition(median))})"
+        else:
+            text += f"; {_listed(plan.composition(plan.counts[0]))} already reach a limit"
+        yield f"{one.policy}, disturbance {one.disturbance}: {text}"
+
+
+def caveats(plan: CapacityPlan) -> Iterator[str]:
+    """Yield what a thorough study has, and this one has not."""
+    if plan.draws < _FINITE_FROM:
+        number = "one draw" if plan.draws == 1 else f"{plan.draws} draws"
+        yield (
+            f"{number}: the intervals are infinite, which decides no comparison; {_FINITE_FROM} "
+            "draws, or --thorough, make them finite"
+        )
+    if not plan.amplitude:
+        yield "no runs with a common disturbance, after which event-triggered loops carry fewer"
+
+
+def _as_mixture(plan: CapacityPlan, one: PolicyCapacity) -> dict[str, Any]:
+    """Return a finite median capacity as a multiple of the given mixture, and loops by kind."""
+    median = one.any_limit.median
+    if math.isinf(median):
+        return {"factor": None, "loops_by_kind": None}
+    return {"factor": plan.factor(median), "loops_by_kind": plan.composition(median)}
+
+
+def _listed(composition: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {name}" for name, count in composition.items())
 
 
 def comparisons(result: CapacityResult) -> Iterator[str]:
@@ -167,12 +228,12 @@ def figures(result: CapacityResult) -> Iterator[tuple[str, Figure, str]]:
 def _figure(result: CapacityResult, limit: Limit, disturbance: str) -> Figure:
     counts, metric = result.plan.counts, LIMITS[limit]
     found = {
-        (one.point.labels[POLICY], int(one.point.labels[LOOPS])): one.estimates[metric]
+        (one.point.labels[POLICY], one.point.labels[LOOPS]): one.estimates[metric]
         for one in result.summary.found
         if one.point.labels.get(DISTURBANCE, OWN) == disturbance
     }
     policies = list(result.plan.policies)
-    series = {name: [found[name, count] for count in counts] for name in policies}
+    series = {name: [found[name, str(count)] for count in counts] for name in policies}
     figure = curve_figure(
         np.array(counts, dtype=np.float64), [*map(str, counts)], series, "number of loops", metric
     )
@@ -226,13 +287,16 @@ def print_result(console: Console, result: CapacityResult) -> None:
     shown = HEADINGS[:4]  # the table must fit into 80 columns
     for heading in shown:
         table.add_column(heading)
+    shown_counts = ", ".join(map(str, plan.counts))
     for row in rows(result):
         table.add_row(*row[: len(shown)])
     console.print(table)
     lines = [
-        "loops carried: median [95 % interval], which is finite from six draws on",
-        f"periodic every {plan.period_s:g} s: the rate carries {plan.periodic_loops:.1f} loops",
+        f"loops carried: median [95 % interval] of {shown_counts} loops",
+        by_rate(plan),
+        *mixtures(result),
         *comparisons(result),
+        *caveats(plan),
         *(f"live: {one.policy}, {one.loops} loops: {live_row(one)[-1]}" for one in result.live),
     ]
     for line in lines:

@@ -1,34 +1,42 @@
 """The campaign of a capacity study: policies × numbers of loops × disturbances.
 
-The loop of all runs is the top level of the scenario; its [[loops]] are replaced. The campaign's
-draws have common random numbers: loop k of draw i is the same for any policy and number of loops.
+The draws have common random numbers: loop k of draw i is the same for any policy. If all loops are
+of one kind, it is the same for any number of loops, too, and the reference of their cost is that of
+one loop. The reference of loops of several kinds is the same loops on a link that is as many times
+as fast as there are loops.
 """
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
-
-import numpy as np
+from typing import Any, NamedTuple
 
 from cosim.studies.campaign.campaign_file import Axis, Campaign, Metrics
-from noack.config.resolution import loop_of, resolve
+from cosim.studies.campaign.loops_draws import cost_of
+from cosim.studies.capacity.loop_mixture import Kind, smallest_mixture
 from noack.config.scenario import Scenario
-from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.impairments.kinds.rate import Rate
 from noack.protocol.wire_format import datagram_bytes
-from noack.trigger.periodic_trigger import PeriodicSettings
 
 POLICY, LOOPS, DISTURBANCE = "policy", "number_of_loops", "disturbance"
 """The axes."""
 OWN, COMMON = "as in the scenario", "common"
 """Values of the axis of disturbances."""
-PERIODIC, ZOH, MODEL = "periodic", "zoh", "model"
-_SHARES = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0)
-"""Default numbers of loops, as shares of the periodic loops that the link carries."""
-_PERIOD_PER_TIME_CONSTANT = 0.3
+
+
+class Depth(NamedTuple):
+    """Defaults of a study."""
+
+    shares: tuple[float, ...]
+    """Numbers of loops, as shares of the periodic loops that the link carries."""
+    draws: int
+    amplitude: float
+    """Amplitude of the common disturbance; 0: no such runs."""
+
+
+QUICK = Depth((0.5, 1.0, 1.5), 1, 0.0)
+THOROUGH = Depth((0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0), 10, 1.0)
 _PULSE_S = 0.5
 _QUEUE = 10
 """Queue of a bottleneck that the scenario does not have."""
@@ -39,13 +47,12 @@ class CapacityPlan:
     """What a capacity study runs."""
 
     scenario: Scenario
-    """The loop and the network; not resolved."""
+    """The loops and the network; not resolved."""
+    kinds: tuple[Kind, ...]
+    """The kinds of loops."""
     file: Path
     settings: Mapping[str, Any]
     """Settings of all runs, which replace the scenario's."""
-    rate_bps: int
-    period_s: float
-    """Period of the periodic policy."""
     deadline_s: float
     counts: tuple[int, ...]
     policies: Mapping[str, Mapping[str, Any]]
@@ -56,9 +63,43 @@ class CapacityPlan:
     seed: int
 
     @property
+    def rate_bps(self) -> int:
+        """Rate of the bottleneck."""
+        return bottleneck(self.scenario).rate_bps
+
+    @property
     def periodic_loops(self) -> float:
-        """Number of periodic loops whose updates the bottleneck carries: R h / bits."""
-        return periodic_loops(self.scenario, self.rate_bps, self.period_s)
+        """Number of periodic loops of the mixture whose updates the bottleneck carries."""
+        return periodic_loops(self.scenario, self.kinds)
+
+    @property
+    def is_one_kind(self) -> bool:
+        """Whether all loops have the same settings in the scenario."""
+        return len(self.kinds) == 1
+
+    @property
+    def cost_columns(self) -> list[str]:
+        """The columns of the runs with the mean cost of the loops of each kind."""
+        return ["cost"] if self.is_one_kind else [cost_of(kind.name) for kind in self.kinds]
+
+    def with_depth(self, depth: Depth) -> "CapacityPlan":
+        """Return the plan with the defaults of a depth."""
+        counts = default_counts(self.periodic_loops, smallest_mixture(self.kinds), depth)
+        return replace(self, counts=counts, draws=depth.draws, amplitude=depth.amplitude)
+
+    @property
+    def sizes(self) -> list[int]:
+        """Numbers of loops of the runs of a draw."""
+        sizes = self.counts if self.is_one_kind else [*self.counts, *self.counts]
+        return [*sizes] * (len(self.policies) * (2 if self.amplitude else 1))
+
+    def factor(self, loops: float) -> float:
+        """Return a number of loops as a multiple of the mixture that the scenario has."""
+        return loops / sum(kind.given for kind in self.kinds)
+
+    def composition(self, loops: float) -> dict[str, int]:
+        """Return how many loops of each kind a finite number of loops has."""
+        return {kind.name: round(self.factor(loops) * kind.given) for kind in self.kinds}
 
     @property
     def counted_from_s(self) -> float:
@@ -75,19 +116,19 @@ class CapacityPlan:
         """Return the campaign of all runs."""
         axes = [
             Axis(name=POLICY, variants={name: dict(one) for name, one in self.policies.items()}),
-            Axis(name=LOOPS, title="number of loops", key="loops", values=self.counts),
+            self._numbers(),
         ]
         if self.amplitude:
-            own = [one.model_dump(mode="json") for one in self.scenario.plant.disturbances]
-            own = [{k: v for k, v in one.items() if v is not None} for one in own]
             begin_s, end_s = self.pulse_s
-            pulse = {
-                "kind": "step", "amplitude": [self.amplitude] * self.scenario.model.dimensions[1],
-                "from_s": begin_s, "until_s": end_s,
-            }  # fmt: skip
-            key = "plant.disturbances"
-            variants: dict[str, dict[str, Any]] = {OWN: {key: own}, COMMON: {key: [*own, pulse]}}
-            axes.append(Axis(name=DISTURBANCE, variants=variants))
+            pulse = {"kind": "step", "from_s": begin_s, "until_s": end_s}
+            variants = {
+                name: {
+                    f"loops.{place}.plant.disturbances": kind.disturbed(pulse, amplitude)
+                    for place, kind in enumerate(self.kinds)
+                }
+                for name, amplitude in ((OWN, 0.0), (COMMON, self.amplitude))
+            }
+            axes.append(Axis.model_validate({"name": DISTURBANCE, "variants": variants}))
         return Campaign(
             name=self.scenario.name,
             description=f"How many loops does a link of {self.rate_bps / 1000:g} kbit/s carry?",
@@ -107,11 +148,30 @@ class CapacityPlan:
             ),
         )  # fmt: skip
 
+    def _numbers(self) -> Axis:
+        """Return the axis of the numbers of loops."""
+        title = "number of loops"
+        if self.is_one_kind:
+            return Axis(name=LOOPS, title=title, key="loops", values=self.counts)
+        variants: dict[str, Any] = {str(count): {"loops": count} for count in self.counts}
+        for count in self.counts:
+            variants[unshared(count)] = {"loops": count, **self._faster(count)}
+        return Axis(name=LOOPS, title=title, variants=variants)
 
-def loops_with_own_settings(scenario: Scenario) -> list[str]:
-    """Return the names of [[loops]] with settings of their own, which a study leaves out."""
-    drawn = {"name", "count", "phase", "seeds"}
-    return [one.name for one in scenario.loops or () if one.model_fields_set - drawn]
+    def _faster(self, factor: int) -> dict[str, Any]:
+        """Return the settings of bottlenecks that are so many times as fast, with longer queues."""
+        settings: dict[str, Any] = {}
+        for place, one in enumerate(self.scenario.network.impairments):
+            if isinstance(one, Rate):
+                key = f"network.impairments.{place}"
+                settings[f"{key}.rate_bps"] = min(one.rate_bps * factor, 10**12)
+                settings[f"{key}.queue"] = min(one.queue * factor, 10**6)
+        return settings
+
+
+def unshared(count: int) -> str:
+    """Return the label of the runs of loops that each have the rate of the link for themselves."""
+    return f"{count} unshared"
 
 
 def bottleneck(scenario: Scenario) -> Rate:
@@ -129,6 +189,21 @@ def bottleneck(scenario: Scenario) -> Rate:
     return min(rates, key=lambda one: one.rate_bps)
 
 
+def periodic_loops(scenario: Scenario, kinds: Sequence[Kind]) -> float:
+    """Return how many periodic loops, in the kinds' proportions, a bottleneck of R bit/s carries.
+
+    A loop needs b / h bits per second, so it is R / (mean of b / h); of one kind, R h / b.
+    """
+    queue = bottleneck(scenario)
+    loops = sum(kind.given for kind in kinds)
+    needed_bps = sum(
+        kind.given * int(queue.line_bits(datagram_bytes(kind.scenario.model.dimensions[0])))
+        / kind.period_s
+        for kind in kinds
+    )  # fmt: skip
+    return queue.rate_bps * loops / needed_bps
+
+
 def with_rate(scenario: Scenario, rate_bps: int) -> Scenario:
     """Return the scenario with this rate of its slowest bottleneck; without one, add it."""
     stages = list(scenario.network.impairments)
@@ -141,76 +216,30 @@ def with_rate(scenario: Scenario, rate_bps: int) -> Scenario:
     return scenario.model_copy(update={"network": network})
 
 
-def periodic_loops(scenario: Scenario, rate_bps: int, period_s: float) -> float:
-    """Return the number of periodic loops whose updates a rate carries: R h / bits."""
-    bits = int(bottleneck(scenario).line_bits(datagram_bytes(scenario.model.dimensions[0])))
-    return rate_bps * period_s / bits
+def default_counts(periodic: float, least: int, depth: Depth) -> tuple[int, ...]:
+    """Return numbers of loops around that of the periodic loops that the link carries.
+
+    Args:
+        periodic: number of periodic loops that the link carries.
+        least: number of loops of the smallest mixture.
+        depth: how thorough the study is.
+    """
+    multiples = {max(round(share * periodic / least), 1) for share in depth.shares}
+    return require_counts([least * one for one in multiples], least)
 
 
-def sampling_period_s(scenario: Scenario) -> float:
-    """Return the period that the loop needs by the usual rule ω h ≤ 0.3.
-
-    ω is the largest absolute eigenvalue of Â + B̂K; h is a multiple of the measurement period.
+def require_counts(counts: Sequence[int], least: int) -> tuple[int, ...]:
+    """Return sorted numbers of loops; of one kind with 1, the reference of the cost.
 
     Raises:
-        CallerError: h is not shorter than the run.
+        CallerError: a number is not a positive multiple of that of the smallest mixture.
     """
-    loop = loop_of(resolve(scenario))
-    fastest = float(np.abs(np.linalg.eigvals(loop.A_model + loop.B_model @ loop.K)).max())
-    measured_s = scenario.timing.measurement_period_ns / NS_PER_S
-    if fastest * scenario.horizon_s <= _PERIOD_PER_TIME_CONSTANT:
-        raise CallerError(
-            f"--update-period: 0.3 / {fastest:.3g}, from the fastest eigenvalue of A + BK, is not "
-            f"shorter than the run of {scenario.horizon_s:g} s; give a period"
-        )
-    return max(math.floor(_PERIOD_PER_TIME_CONSTANT / fastest / measured_s), 1) * measured_s
-
-
-def require_multiple(period_s: float, scenario: Scenario) -> float:
-    """Return a period of transmissions; between two measurements there is none.
-
-    Raises:
-        CallerError: it is not a multiple of the measurement period.
-    """
-    measured_ns = scenario.timing.measurement_period_ns
-    if round(period_s * NS_PER_S) % measured_ns:
-        raise CallerError(
-            f"--update-period {period_s:g}: not a multiple of the time between two measurements, "
-            f"{measured_ns / NS_PER_S:g} s"
-        )
-    return period_s
-
-
-def default_counts(periodic: float) -> tuple[int, ...]:
-    """Return numbers of loops around that of the periodic loops that the link carries."""
-    return tuple(sorted({1, *(max(round(share * periodic), 1) for share in _SHARES)}))
-
-
-def default_policies(scenario: Scenario, period_s: float) -> dict[str, dict[str, Any]]:
-    """Return the policies that are always compared.
-
-    Raises:
-        CallerError: the scenario's own policy is periodic.
-    """
-    if isinstance(scenario.trigger, PeriodicSettings):
-        raise CallerError(
-            'trigger.policy = "periodic": the event-triggered loops need an event-triggered '
-            "policy, e.g. --set 'trigger={ policy = \"absolute\", delta = 0.05 }'"
-        )
-    periodic = {"policy": "periodic", "period_s": period_s}
-    return {
-        PERIODIC: {"mode": "zoh", "trigger": periodic},
-        ZOH: {"mode": "zoh"},
-        MODEL: {"mode": "model"},
-    }
-
-
-def require_counts(counts: Sequence[int]) -> tuple[int, ...]:
-    """Return sorted numbers of loops, with 1, the reference of the cost.
-
-    Raises:
-        CallerError: a number is not positive.
-    """
-    if (least := min(counts)) < 1:
-        raise CallerError(f"--loops {least}: numbers of loops are at least 1")
-    return tuple(sorted({1, *counts}))
+    for one in counts:
+        if one < 1:
+            raise CallerError(f"--loops {one}: numbers of loops are at least 1")
+        if one % least:
+            raise CallerError(
+                f"--loops {one}: should be a multiple of {least}, to keep the proportions of "
+                "[[loops]]; or study one kind, e.g. --set 'loops=[{ name = \"p\" }]'"
+            )
+    return tuple(sorted({*counts, *([1] if least == 1 else [])}))

@@ -133,8 +133,15 @@ class Delay(Impairment):
     @property
     def longest_s(self) -> float:
         if self.samples_s is not None:
-            return self.delay_s + max(self.samples_s)
+            return max(self.delay_s + max(self.samples_s), 0.0)
         return self.delay_s + self.jitter_s * (1 if self.distribution == "uniform" else 4)
+
+    @property
+    def shortest_s(self) -> float:
+        if not self.is_bounded or self.file is not None:
+            return 0.0
+        lowest_s = -self.jitter_s if self.samples_s is None else min(self.samples_s)
+        return max(self.delay_s + lowest_s, 0.0)
 
     @property
     def is_bounded(self) -> bool:

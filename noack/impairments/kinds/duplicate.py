@@ -20,6 +20,7 @@ class Duplicate(CorrelatedChance, Impairment):
     )
     behaviour: ClassVar = "duplicate"
     action: ClassVar = "duplicate"
+    copies: ClassVar = True
 
     def text(self) -> str:
         return f"duplicate {self.chance_text}"

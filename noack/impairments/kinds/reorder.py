@@ -46,6 +46,9 @@ class Reorder(CorrelatedChance, Impairment):
     def reorders(self, delayed: bool, reordered: bool) -> tuple[bool, bool]:
         return delayed, reordered or (delayed and self.probability > 0)
 
+    def delay_range_s(self, least_s: float, largest_s: float) -> tuple[float, float]:
+        return 0.0, largest_s
+
     def text(self) -> str:
         gap = f" gap {self.gap}" if self.gap != 1 else ""
         return f"reorder {self.chance_text}{gap}"

@@ -1,5 +1,6 @@
 """What loops need of a bottleneck: the refusal at its limit, and bounds that random loads test."""
 
+import math
 import re
 from typing import Any
 
@@ -10,10 +11,15 @@ from hypothesis import strategies as st
 
 from cosim.simulation.shared_network import simulate_loops
 from netem.link_machine import Datagram, Link
-from noack.config.link_load import link_loads, load_warnings, require_capacity
+from noack.config.link_load import link_loads, load_warnings, require_capacity, update_delay
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
 from noack.core.errors import CallerError
+from noack.impairments.feature import Impairment, StageTables
+from noack.impairments.kinds import IMPAIRMENTS
+from noack.impairments.kinds.delay import Delay
+from noack.impairments.kinds.rate import Rate
+from noack.impairments.link_settings import require_scores
 from noack.protocol.record_tables import NETEM_PACKET
 from noack.protocol.wire_format import datagram_bytes
 
@@ -158,18 +164,96 @@ def test_no_load_exceeds_the_bound_of_the_delay(
     scenario = scenario_of(content, rate_bps, queue, {"name": "a", "count": loops})
     (found,) = link_loads(scenario)
     assert found.delay_bound_s is not None
+    assert longest_delay_s(scenario, loops, seed, together) <= found.delay_bound_s * (1 + 1e-9)
+
+
+def longest_delay_s(scenario: Scenario, loops: int, seed: int, together: bool) -> float:
+    """Return the longest delay of 200 updates of each loop, 50 ms apart or more."""
     rng = np.random.default_rng(seed)
     gaps_s = 0.05 * (1 + (rng.random((loops, 200)) < 0.2) * rng.random((loops, 200)))
     begin_s = 0.0 if together else rng.uniform(0, 0.05, (loops, 1))
     times_ns = ((begin_s + np.cumsum(gaps_s, axis=1)) * 1e9).round().astype(np.int64)
     link = Link(scenario.network.link, seed, "x")
     size = datagram_bytes(2)
-    longest_s = 0.0
+    longest_ns = 0
     for place in np.argsort(times_ns, axis=None, kind="stable").tolist():
         now_ns = int(times_ns.ravel()[place])
-        link.handle(Datagram(place // 200, bytes(size)), now_ns)
         while (due_ns := link.next_deadline_ns()) is not None and due_ns <= now_ns:
             link.on_timer(due_ns)
-        if link.decision.release_ns >= 0:
-            longest_s = max(longest_s, (link.decision.release_ns - now_ns) * 1e-9)
-    assert longest_s <= found.delay_bound_s * (1 + 1e-9)
+        link.handle(Datagram(place // 200, bytes(size)), now_ns)
+        leaves_ns = max(link.decision.release_ns, link.decision.copy_ns)
+        longest_ns = max(longest_ns, leaves_ns - now_ns)
+    return longest_ns * 1e-9
+
+
+def test_the_delay_after_a_queue_counts(content: dict[str, Any]) -> None:
+    """Ten updates of 736 bits at 80 kbit/s wait for up to 92 ms, and are delayed by 50 ms more."""
+    content["plant"]["rate_hz"] = 100.0
+    loops = {"name": "a", "count": 10, "trigger": PERIODIC | {"period_s": 0.1}}
+
+    def warnings(stages: list[Any], covered_s: float) -> list[str]:
+        given = [one.model_dump(mode="json", exclude_none=True) for one in stages]
+        content["network"]["impairments"] = given
+        content["certificate"] = {"network_delay_s": covered_s}
+        scenario = validate(content | {"loops": [loops]}, "here")
+        return [*load_warnings(link_loads(scenario), scenario)]
+
+    queue = Rate(rate_bps=80_000, queue=20)
+    for order in ([queue, Delay(delay_s=0.05)], [Delay(delay_s=0.05), queue]):
+        (warning,) = warnings(order, 0.1)
+        assert "updates may be delayed by up to 0.142 s" in warning
+        assert "the certificates cover 0.1 s" in warning
+        assert warnings(order, 0.142) == []
+    (warning,) = warnings([queue, Delay(jitter_s=0.001, distribution="normal")], 10.0)
+    assert "no bound of the delay of updates is known (network.impairments.1)" in warning
+
+
+def _is_alone_valid(one: Impairment) -> bool:
+    """Whether it needs no file, and no loss rate of several stages together."""
+    try:
+        one.stage(StageTables(scored=True))
+    except ValueError:
+        return False
+    return not getattr(getattr(one, "loss", None), "keep", False)
+
+
+EXAMPLES = [one for kind in IMPAIRMENTS for one in kind.examples() if _is_alone_valid(one)]
+QUEUES = [
+    Rate(rate_bps=round(7 * BITS / 0.05 * share), queue=queue)
+    for share in (0.4, 0.7, 1.1, 2.5) for queue in (1, 4)
+]  # fmt: skip
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    stages=st.lists(st.sampled_from(EXAMPLES) | st.sampled_from(QUEUES), max_size=5),
+    loops=st.integers(1, 7),
+    seed=st.integers(0, 2**32),
+    together=st.booleans(),
+    covered=st.sampled_from([0.5, 0.99, 1.0, 1.01, 3.0]),
+)
+def test_the_largest_delay_is_bounded_and_a_warning_tells_that_it_is_not_covered(
+    stages: list[Impairment], loops: int, seed: int, together: bool, covered: float
+) -> None:
+    """Every kind of impairment, in any order; updates are held back for the guarantee, M = 3."""
+    try:
+        require_scores(stages)
+    except ValueError:
+        stages = [one for one in stages if not getattr(one, "loss_correlation", 0)]
+    content = {
+        "name": "small", "horizon_s": 1.0, "model": {"name": "double_integrator"},
+        "plant": {"initial_state": [1.0, 0.0]}, "trigger": PERIODIC,
+        "network": {"mansd": 2, "loss": {"model": "bernoulli", "probability": 0.3}},
+    }  # fmt: skip
+    scenario = scenario_of(content, 1000, 1, {"name": "a", "count": loops})
+    network = scenario.network.model_copy(update={"impairments": tuple(stages)})
+    scenario = scenario.model_copy(update={"network": network})
+    bound_s = update_delay(scenario).largest_s
+    longest_s = longest_delay_s(scenario, loops, seed, together)
+    assert longest_s <= bound_s + 1e-9 * (len(stages) + 1)
+    covered_s = covered * (bound_s if math.isfinite(bound_s) else longest_s)
+    certificate = scenario.certificate.model_copy(update={"network_delay_s": covered_s})
+    scenario = scenario.model_copy(update={"certificate": certificate})
+    warnings = [*load_warnings(link_loads(scenario), scenario)]
+    warned = any("certificates cover" in one or "without bound" in one for one in warnings)
+    assert warned == (bound_s > covered_s)

@@ -61,12 +61,32 @@ def test_the_number_of_loops_is_an_axis(write: Write, plan: dict[str, Any]) -> N
     assert [type(point.work) for point in points] == [LoopsWork, LoopsWork]
     with pytest.raises(CallerError, match='needs time = "sampled"'):
         _points(write(plan, axes=[AXIS], **sampled | {"time": "continuous"}))
-    loops = [{"name": "a"}, {"name": "b"}]
-    with pytest.raises(CallerError, match="has several entries of"):
-        _points(write(plan, axes=[AXIS], settings={"loops": loops}, **sampled))
     some = {"name": "some", "variants": {"one": {"mode": "zoh"}, "two": {"loops": 2}}}
     with pytest.raises(CallerError, match="either all grid points have loops, or none has"):
         _points(write(plan, axes=[some], **sampled))
+
+
+def test_different_loops_keep_their_proportions(write: Write, plan: dict[str, Any]) -> None:
+    """The number of loops applies after all other settings."""
+    loops = [{"name": "a", "count": 4}, {"name": "b", "count": 2, "mode": "zoh"}]
+    sampled: dict[str, Any] = {"time": "sampled", "compare": None, "figures": []}
+
+    def axes(*numbers: int) -> list[dict[str, Any]]:
+        variants = {f"v{value}": {"loops": value} for value in numbers}
+        own = {"slow": {"loops.1.plant": {"initial_state": [2.0, 0.0]}}, "same": {"loops": loops}}
+        return [{"name": "number", "variants": variants}, {"name": "own", "variants": own}]
+
+    settings = {"loops": loops}
+    _, points = _points(write(plan, axes=axes(3, 9), settings=settings, **sampled))
+    found = [[(one.name, one.count) for one in point.scenario.loops] for point in points[::2]]
+    assert found == [[("a", 2), ("b", 1)], [("a", 6), ("b", 3)]]
+    assert points[0].scenario.loops[1].plant == {"initial_state": [2.0, 0.0]}
+    rows = points[0].work.run(range(1))
+    assert row_type(points) == rows.dtype
+    mean = (2 * rows["cost_of_a"] + rows["cost_of_b"]) / 3
+    assert rows["cost"] == pytest.approx(mean, rel=1e-12)
+    with pytest.raises(CallerError, match="should be a multiple of 3"):
+        _points(write(plan, axes=axes(3, 4), settings=settings, **sampled))
 
 
 def _points(path: Path) -> tuple[Any, Any]:

@@ -107,7 +107,7 @@ def test_an_interrupted_and_then_killed_campaign_continues_where_it_stopped(
     os.killpg(interrupted.pid, signal.SIGINT)  # as a terminal does: to all processes
     _, err = interrupted.communicate()
     assert interrupted.returncode == 130
-    assert err == (
+    assert err.splitlines(keepends=True)[-1] == (  # lines of progress may be before it
         f"noack: interrupted; {len(files(folder))} of {RUNS} runs are in {folder}; "
         "the same command continues the campaign\n"
     )
@@ -142,7 +142,7 @@ def test_a_signal_ends_a_campaign_with_one_line(
     ended = run_command(many)
     assert signal.getsignal(number) == before
     assert ended.exit_code == 143
-    assert ended.stderr == (
+    assert ended.stderr.splitlines(keepends=True)[-1] == (
         f"noack: ended by {number.name}; 5 of {RUNS} runs are in {tmp_path / 'out'}; "
         "the same command continues the campaign\n"
     )

@@ -3,6 +3,7 @@
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,15 +11,21 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from cosim.cli import app
-from cosim.studies.campaign.campaign_grid import grid
+from cosim.studies.campaign.campaign_grid import Point, grid
 from cosim.studies.campaign.campaign_run import run_campaign
 from cosim.studies.campaign.campaign_summary import summarise
 from cosim.studies.campaign.campaign_workers import alone
 from cosim.studies.campaign.chunk_store import Store
 from cosim.studies.campaign.loops_draws import used_up
 from cosim.studies.capacity import capacity_plan as plans
-from cosim.studies.capacity.capacity_criteria import PolicyCapacity, capacities, carried
-from cosim.studies.capacity.capacity_page import CapacityResult, comparisons, figures
+from cosim.studies.capacity.capacity_criteria import (
+    PolicyCapacity,
+    capacities,
+    capacity_of,
+    carried,
+)
+from cosim.studies.capacity.capacity_page import CapacityResult, comparisons, figures, mixtures
+from cosim.studies.capacity.loop_mixture import kinds_of, policies_of, smallest_mixture
 from noack.config.scenario_file import load
 from noack.protocol.record_tables import Fate
 
@@ -29,28 +36,38 @@ BITS = 8 * (28 + 64)
 SHORT = ("--set", "horizon_s=1.0", "--set", "plant.rate_hz=50", "--set", "controller.rate_hz=50")
 
 
-def study(tmp_path: Path, queue: int, deadline_s: float = PERIOD_S) -> CapacityResult:
-    """Periodic loops on a link that carries exactly six of them."""
-    rate_bps = round(6 * BITS / PERIOD_S)
+LOOP = "loops=[{ name = 'loop' }]"
+
+
+def study(
+    tmp_path: Path,
+    queue: int,
+    deadline_s: float = PERIOD_S,
+    *,
+    loops: str = LOOP,
+    fitting: float = 6 / PERIOD_S,
+    counts: tuple[int, ...] = (1, 6, 7),
+) -> CapacityResult:
+    """Periodic loops on a link that carries exactly so many updates per second."""
+    rate_bps = round(fitting * BITS)
     stage = f"network.impairments=[{{ kind = 'rate', rate_bps = {rate_bps}, queue = {queue} }}]"
-    scenario = load(FILE, [stage, "network.loss.probability=0.0"])
+    scenario = load(FILE, [stage, "network.loss.probability=0.0", "horizon_s=3.0", loops])
     settings = {
         "horizon_s": 3.0,
         "network.impairments": [{"kind": "rate", "rate_bps": rate_bps, "queue": queue}],
         "network.loss.probability": 0.0,
         "certificate.network_delay_s": deadline_s,
-        "loops": [{"name": "loop"}],
     }
-    policies = plans.default_policies(scenario, PERIOD_S)
+    kinds = kinds_of(scenario, PERIOD_S)
     plan = plans.CapacityPlan(
-        scenario.model_copy(update={"loops": None, "horizon_s": 3.0}), FILE, settings, rate_bps,
-        PERIOD_S, deadline_s, (1, 6, 7), {"periodic": policies["periodic"]}, 0.0, 2, 5,
+        scenario, kinds, FILE, settings, deadline_s, counts,
+        {"periodic": policies_of(kinds)["periodic"]}, 0.0, 2, 5,
     )  # fmt: skip
     campaign = plan.campaign()
     store = Store(tmp_path, grid(campaign, Path("study")), plan.draws, 1)
     run_campaign(store, alone)
     summary = summarise(campaign, store)
-    return CapacityResult(plan, summary, capacities(summary, store), [])
+    return CapacityResult(plan, summary, capacities(plan, summary, store), [])
 
 
 def limits_of(result: CapacityResult) -> tuple[PolicyCapacity, dict[str, float]]:
@@ -66,6 +83,64 @@ def test_a_short_queue_carries_as_many_periodic_loops_as_the_rate_allows(tmp_pat
     assert found.any_limit.median == limits["guarantee"] == 6
     assert limits["deadline"] == np.inf
     assert found.limited_by == "guarantee"
+
+
+def test_different_periods_use_the_rate_together(tmp_path: Path) -> None:
+    """Three pairs with periods of 0.1 s and 0.2 s send 45 updates per second, the link's rate."""
+    slow = "{ name = 'b', trigger = { policy = 'periodic', period_s = 0.2 } }"
+    result = study(
+        tmp_path, 6, 2 * PERIOD_S, loops=f"loops=[{{ name = 'a' }}, {slow}]", fitting=45,
+        counts=(2, 6, 8),
+    )  # fmt: skip
+    assert result.plan.periodic_loops == pytest.approx(6.0, rel=1e-4)
+    found, _ = limits_of(result)
+    assert found.any_limit.median == found.limits["guarantee"].median == 6
+    assert list(mixtures(result)) == [
+        "periodic, disturbance as in the scenario: 3 × the given mixture (3 a, 3 b)"
+    ]
+    (document,) = result.document()["capacities"]
+    assert (document["factor"], document["loops_by_kind"]) == (3.0, {"a": 3, "b": 3})
+
+
+def test_equal_kinds_are_as_one_kind() -> None:
+    """The mixture's runs have the values of those with as many loops of one kind, bit by bit."""
+
+    def points(loops: str) -> list[Point]:
+        scenario = load(FILE, [loops, "horizon_s=1.0"])
+        kinds = kinds_of(scenario, None)
+        settings = {"horizon_s": 1.0, "plant.rate_hz": 50, "controller.rate_hz": 50}
+        plan = plans.CapacityPlan(
+            scenario, kinds, FILE, settings, 0.1,
+            plans.require_counts([4], smallest_mixture(kinds)), policies_of(kinds), 0.3, 1, 5,
+        )  # fmt: skip
+        return grid(plan.campaign(), Path("study"))
+
+    plain = {(*one.labels.values(),): one for one in points("loops=[{ name = 'p', count = 7 }]")}
+    mixed = points("loops=[{ name = 'a', count = 3 }, { name = 'b', count = 3 }]")
+    shared = [one for one in mixed if "unshared" not in one.labels["number_of_loops"]]
+    assert len(shared) == 3 * 2  # policies, disturbances
+    for point in shared:
+        found, expected = (
+            one.work.run(range(1)) for one in (point, plain[(*point.labels.values(),)])
+        )
+        for name in expected.dtype.names:
+            assert np.array_equal(found[name], expected[name], equal_nan=True), name
+
+
+def test_the_cost_of_each_kind_counts() -> None:
+    """Kind b costs a hundred times as much as a; a alone doubles its cost in the mixture."""
+    kinds = kinds_of(load(FILE, ["loops=[{ name = 'a' }, { name = 'b' }]"]), PERIOD_S)
+    plan = plans.CapacityPlan(
+        load(FILE), kinds, FILE, {}, 0.1, (2, 4), policies_of(kinds), 0.0, 3, 0
+    )
+    quiet = {"loops_guarantee_used": np.zeros(3), "updates_late": np.zeros(3)}
+
+    def runs(a: float, b: float) -> dict[str, Any]:
+        return quiet | {"cost_of_a": np.full(3, a), "cost_of_b": np.full(3, b)}
+
+    own = {"2 unshared": runs(1.0, 100.0), "4 unshared": runs(1.0, 90.0)}
+    found = capacity_of(plan, "model", "own", {"2": runs(1.9, 110.0), "4": runs(2.1, 110.0)} | own)
+    assert (found.any_limit.median, found.limited_by) == (2, "cost")
 
 
 def test_a_long_queue_delays_what_it_does_not_drop(tmp_path: Path) -> None:
@@ -115,16 +190,39 @@ def capacity(*words: str) -> Result:
     return CliRunner().invoke(app, ["capacity", *words])
 
 
-def test_loops_with_settings_of_their_own_are_named() -> None:
-    drawn = load(FILE, ["loops=[{ name = 'a', count = 3, phase = 0.5, seeds = { noise = 1 } }]"])
-    assert plans.loops_with_own_settings(drawn) == []
-    own = load(FILE, ["loops=[{ name = 'a' }, { name = 'b', mode = 'zoh' }]"])
-    assert plans.loops_with_own_settings(own) == ["b"]
+def test_the_default_answers_for_the_shipped_mixture_and_says_how_long_it_takes(
+    tmp_path: Path,
+) -> None:
+    out = "--out", str(tmp_path), "--workers", "1", "--json", "--set", "horizon_s=0.5"
+    result = capacity("shared_bottleneck", *out, *SHORT[2:])
+    assert result.exit_code == 0, result.output
+    assert re.search(
+        r"18 runs of 0.5 s with 11 to 33 loops; the simulation takes about \d+ s on an idle core; "
+        r"--thorough: \d+ (s|min)\n",
+        result.stderr,
+    )
+    found = json.loads(result.stdout)
+    assert (found["loops"], found["draws"], found["thorough"]) == ([11, 22, 33], 1, False)
+    assert [(one["name"], one["count"], one["period_s"]) for one in found["mixture"]] == [
+        ("pendulum", 10, 0.16), ("periodic", 1, 0.2),
+    ]  # fmt: skip
+    assert found["estimated_s"] > 0
+    for one in found["capacities"]:
+        if one["median"] is not None:
+            assert one["loops_by_kind"]["pendulum"] == 10 * one["factor"] == one["median"] / 1.1
+    page = (tmp_path / "capacity.html").read_text()
+    assert "one draw: the intervals are infinite" in page
+    assert "no runs with a common disturbance" in page
+    again = capacity("shared_bottleneck", *out, *SHORT[2:])
+    assert again.exit_code == 0
+    assert json.loads(again.stdout)["made"] == 0
+    assert "takes about" not in again.stderr
 
 
 def test_the_command_compares_the_policies_and_confirms_a_point_live(tmp_path: Path) -> None:
     result = capacity(
-        str(FILE), "--loops", "2", "--draws", "1", "--workers", "1", "--json", *SHORT,
+        str(FILE), "--set", LOOP, "--loops", "2", "--draws", "1", "--disturbance", "1",
+        "--workers", "1", "--json", *SHORT,
         "--rate-bps", "60000", "--policy", "slow={ policy = 'periodic', period_s = 0.5 }",
         "--confirm", "model=2", "--out", str(tmp_path),
     )  # fmt: skip
@@ -144,6 +242,8 @@ def test_the_command_compares_the_policies_and_confirms_a_point_live(tmp_path: P
     [
         (["--set", "network.impairments=[]"], "no bottleneck that the loops could share"),
         (["--loops", "0,3"], "numbers of loops are at least 1"),
+        (["--loops", "12"], "--loops 12: should be a multiple of 11"),
+        (["--disturbance", "nan"], "--disturbance nan: should be a finite number"),
         (["--loops", "few"], "--loops few: write it as"),
         (["--update-period", "99"], "--update-period 99: between 0 and the horizon"),
         (
