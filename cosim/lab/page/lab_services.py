@@ -37,7 +37,6 @@ class LabServices:
         self._pool.shutdown(wait=True)
         if self.live is not None:
             self.live.stop()
-            self.live.remove_copies()
 
     @property
     def known(self) -> Mapping[str, str]:
@@ -60,12 +59,12 @@ class LabServices:
         loop = asyncio.get_running_loop()
         return asyncio.shield(loop.run_in_executor(self._pool, function, *arguments))
 
-    async def run_live(self, text: str, horizon_s: float, beside: Path) -> LiveRun:
+    async def run_live(self, text: str, horizon_s: float, folder: Path) -> LiveRun:
         """Start a live run, after the end of the one before."""
         if self.live is not None:
             await self.live.end()
         self.live = LiveRun(horizon_s)
-        await self.live.start(text, beside, self.runs)
+        await self.live.start(text, folder, self.runs)
         self._following = asyncio.create_task(self.live.follow())
         return self.live
 
