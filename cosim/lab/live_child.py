@@ -1,6 +1,7 @@
 """A live run of the page, as a process of its own: so the page never disturbs the loop.
 
-It reads the scenario's text from standard input, until its end. It writes one JSON object per line on standard output: what happened, with its fields.
+It reads the scenario's text from standard input, until its end. It writes one JSON object per line
+on standard output: what happened, with its fields.
 """
 
 import json
@@ -30,6 +31,7 @@ def main() -> int:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # a stop now must not cost the summary
         _say("finalising", reason=ending.reason)
         from cosim.live.finalize import finalize
+        from cosim.output.run_verdict import verdict
 
         outcome = finalize(ending, report=False)
     except NoackError as error:
@@ -37,7 +39,7 @@ def main() -> int:
         return error.exit_status
     _say(
         "ended", run_dir=str(outcome.run_dir), reason=outcome.reason,
-        ok=outcome.status is ExitStatus.OK,
+        ok=outcome.status is ExitStatus.OK, verdict=verdict(outcome.summary),
     )  # fmt: skip
     return outcome.status
 

@@ -14,7 +14,8 @@ from noack.core.python_process import python_command
 from noack.protocol.topology import LOOP_ROLES
 
 _ADDRESS = re.compile(r"http://\S+")
-_MOST_LINES = 200
+MOST_LINES = 200
+"""Of the log."""
 _STOP_S = 20.0
 _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
 _CMDLINE = Path("/proc")
@@ -33,6 +34,10 @@ class LiveRun:
     progress: dict[str, Any] = field(default_factory=dict)
     lines: list[str] = field(default_factory=list)
     """What happened, the newest line last."""
+    first_line: int = 0
+    """Number of lines that happened before these."""
+    verdict: list[tuple[str, str]] = field(default_factory=list)
+    """At the end: lines, each with its style as :mod:`cosim.output.run_verdict` names it."""
     ok: bool | None = None
     version: int = 0
     """Grows with each change."""
@@ -125,6 +130,7 @@ class LiveRun:
             case "ended":
                 self.state, self.ok = "ended", said["ok"]
                 self.run_dir = Path(said["run_dir"])
+                self.verdict = [(text, style) for text, style in said["verdict"]]
                 self._add(f"recorded in {self.run_dir}")
             case _:
                 self.state, self.ok = "failed", False
@@ -141,7 +147,10 @@ class LiveRun:
 
     def _add(self, line: str) -> None:
         if line:
-            self.lines = [*self.lines, line][-_MOST_LINES:]
+            self.lines.append(line)
+            more = max(len(self.lines) - MOST_LINES, 0)
+            del self.lines[:more]
+            self.first_line += more
 
 
 def _descendants(pid: int) -> list[int]:

@@ -23,6 +23,9 @@ _HEADERS = (
     (b"x-content-type-options", b"nosniff"),
     (b"cross-origin-opener-policy", b"same-origin"),
     (b"cross-origin-resource-policy", b"same-origin"),
+    # The rerun viewer, which is in a frame, draws in another process of the browser: while it
+    # draws without a graphics card, it would keep this page from handling clicks for seconds.
+    (b"origin-agent-cluster", b"?1"),
     # The framework compiles its templates in the browser, which needs unsafe-eval.
     (b"content-security-policy",
      b"default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; "

@@ -15,6 +15,7 @@ from nicegui import ui
 from cosim.lab.page.address_guard import AddressGuard, new_secret
 from cosim.lab.page.lab_page import show_page
 from cosim.lab.page.lab_services import LabServices
+from cosim.lab.page.run_verdict_card import serve_reports
 from noack.core.errors import MachineError
 
 HOST = "127.0.0.1"
@@ -55,6 +56,7 @@ def serve(options: LabOptions, announce: Callable[[str], None]) -> None:
         async def lab() -> None:
             await show_page(services)
 
+        serve_reports(application, services)
         # Without a history of messages: each redraw is one. A reconnected page loads itself again.
         ui.run_with(
             application, title="noack lab", favicon="🧪", dark=None, message_history_length=0,

@@ -21,7 +21,7 @@ STEPS = (
         "What is an event?",
         "The sensor runs a model x_s of the plant and knows the plant's state x. It transmits only "
         "when its error ‖x_s − x‖ exceeds the threshold βe^(−αt). Each point in the lowest panel "
-        "is a transmission.",
+        "of the figure is a transmission.",
         "lane_following", {"network.loss": {"model": "lossless"}},
         "Drag β: a larger threshold gives fewer events and larger errors.",
     ),
@@ -69,11 +69,11 @@ Begin = Callable[[Step], Awaitable[None]]
 
 
 class TutorialPanel:
-    """The panel: one step at a time."""
+    """The text of one step at a time; the figure is beside it."""
 
     def __init__(self, begin: Begin) -> None:
         self._begin, self._place = begin, 0
-        self._card = ui.card().classes("w-full max-w-3xl")
+        self._card = ui.card().classes("w-full")
         self._show()
 
     def _show(self) -> None:
@@ -91,10 +91,12 @@ class TutorialPanel:
                     ui.button("back", on_click=lambda: self._go(-1)).props("flat")
                 if self._place < len(STEPS) - 1:
                     ui.button("next", on_click=lambda: self._go(1)).props("flat")
+            ui.label("“show it”, “next” and “back” replace the settings by those of the step.")
 
-    def _go(self, by: int) -> None:
+    async def _go(self, by: int) -> None:
         self._place += by
         self._show()
+        await self._start()
 
     async def _start(self) -> None:
         await self._begin(STEPS[self._place])
