@@ -11,6 +11,8 @@ from cosim.lab.chart_options import HEIGHT, data_options, figure_options
 from cosim.lab.page.session import Session
 from noack.core.number_format import number
 
+_DRAWN_S = 10.0
+"""A redraw without an answer for so long is repeated as a whole."""
 _TONES = {CERTIFIED: "text-positive"}
 
 
@@ -78,7 +80,7 @@ class ExplorePanel:
             return
         try:
             # Awaited, so that a slow browser is not sent more than it draws.
-            await self._chart.run_chart_method("setOption", data_options(shown), timeout=2)
+            await self._chart.run_chart_method("setOption", data_options(shown), timeout=_DRAWN_S)
         except TimeoutError:
             self._shape = ()
 

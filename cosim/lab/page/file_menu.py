@@ -12,7 +12,7 @@ from nicegui import ui
 
 from cosim.interactive.exploration import Exploration
 from cosim.interactive.figure_curves import Shown
-from cosim.lab.page.lab_services import LabServices, PageCalls
+from cosim.lab.page.lab_services import ANSWER_S, LabServices, PageCalls
 from cosim.lab.page.session import Session
 from cosim.output.figure_format import FigureFormat
 from noack.core.errors import NoackError
@@ -62,7 +62,7 @@ class FileMenu:
         ui.notify(f"saved as {path.name}; noack run {path.name}", type="positive")
 
     async def _share(self) -> None:
-        address = await ui.run_javascript("location.href")
+        address = await ui.run_javascript("location.href", timeout=ANSWER_S)
         ui.clipboard.write(address)
         ui.notify("copied; it opens as long as this page runs", type="positive")
 

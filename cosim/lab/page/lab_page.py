@@ -1,6 +1,7 @@
 """The page as a visitor sees it: settings at the left, what follows from them at the right."""
 
 import json
+from contextlib import suppress
 from typing import Any
 
 from nicegui import ui
@@ -8,7 +9,7 @@ from nicegui import ui
 from cosim.interactive.draft import Draft, DraftError, draft_of_query, open_draft
 from cosim.lab.page.explore_panel import ExplorePanel
 from cosim.lab.page.file_menu import FileMenu
-from cosim.lab.page.lab_services import LabServices, PageCalls
+from cosim.lab.page.lab_services import ANSWER_S, LabServices, PageCalls
 from cosim.lab.page.live_panel import LivePanel
 from cosim.lab.page.runs_panel import RunsPanel
 from cosim.lab.page.session import Session
@@ -101,7 +102,8 @@ async def show_page(services: LabServices) -> None:
     page.build()
     if problem:
         ui.notify(problem, type="warning", multi_line=True, close_button="close")
-    await page.begin()
+    with suppress(TimeoutError):  # the page was closed
+        await page.begin()
 
 
 class _Page:
@@ -168,11 +170,12 @@ class _Page:
         ui.run_javascript(_LOST)
         self._settings.begin()
         self._is_dark = await ui.run_javascript(
-            "window.matchMedia('(prefers-color-scheme: dark)').matches"
+            "window.matchMedia('(prefers-color-scheme: dark)').matches", timeout=ANSWER_S
         )
         self._settings.show_dark(dark=self._is_dark)
         self._live.take(self._session.draft)
         await self._session.change(self._session.draft)
+        await self._live.begin()
 
     async def _show_tab(self, event: Any) -> None:
         self._tab = event.value

@@ -16,6 +16,8 @@ from cosim.record.run_directory import SUMMARY_FILE
 
 T = TypeVar("T")
 
+ANSWER_S = 60.0
+"""So long a browser may take to answer: without a graphics card it may draw for seconds."""
 _GIVE_UP_S = 3.0
 """So long the worker may go on with a call whose page does not want it any more."""
 _NICE = 10

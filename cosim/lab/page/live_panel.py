@@ -9,12 +9,20 @@ from nicegui import ui
 from cosim.interactive.controls import controls_of
 from cosim.interactive.draft import Draft, DraftError
 from cosim.lab.live_run import MOST_LINES, LiveRun
-from cosim.lab.page.lab_services import LabServices
+from cosim.lab.page.lab_services import ANSWER_S, LabServices
 from cosim.lab.page.run_verdict_card import show_verdict
 from noack.core.errors import NoackError
 from noack.core.number_format import number
 from noack.runtime.run_registry import find, request_change
 
+_DRAWS_BY_PROCESSOR = """(() => {
+  const gl = document.createElement('canvas').getContext('webgl2');
+  const info = gl?.getExtension('WEBGL_debug_renderer_info');
+  const name = gl?.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
+  gl?.getExtension('WEBGL_lose_context')?.loseContext();
+  return !name || /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
+})()"""
+"""Whether the browser has no graphics card to draw with."""
 _POLL_S = 0.25
 _REJOIN_S = 5.0
 _KILLABLE = ("sensor", "netem", "controller")
@@ -25,7 +33,8 @@ _ABOUT = (
     "says when a claim becomes void, and why.",
     "The kill buttons end a process by SIGKILL. If killed processes are restarted, the loop goes "
     "on; otherwise the run fails.",
-    "At the end come a verdict of three lines and a link to the report. The record is kept in the folder {}.",
+    "At the end come a verdict of three lines and a link to the report. The record is kept in the "
+    "folder {}.",
 )
 
 
@@ -41,6 +50,8 @@ class LivePanel:
         """The run that is shown, with its version and the number of its lines that are shown."""
         self._version = self._lines = 0
         self._viewer = ""
+        self._shows_viewer = False
+        """Whether the viewer is shown without being asked for."""
         self._plan = ui.label()
         with ui.row().classes("items-center gap-2"):
             self._start = ui.button("run live", icon="play_arrow", on_click=self._begin)
@@ -68,6 +79,11 @@ class LivePanel:
         self._state.set_visibility(False)
         self._stop.disable()
         ui.timer(_POLL_S, self._show)
+
+    async def begin(self) -> None:
+        """Decide whether the viewer is shown without being asked for."""
+        slow = await ui.run_javascript(_DRAWS_BY_PROCESSOR, timeout=ANSWER_S)
+        self._shows_viewer = not slow
 
     def take(self, draft: Draft) -> None:
         """Take the draft that the next run has."""
@@ -150,7 +166,7 @@ class LivePanel:
             button.set_enabled(enabled)
         if live.viewer and live.viewer != self._viewer:
             self._viewer = live.viewer
-            self._show_viewer(live.viewer)
+            self._offer_viewer(live.viewer)
         if live.verdict and live.run_dir is not None and not self._verdict.default_slot.children:
             name = live.run_dir.name
             with self._verdict:
@@ -167,6 +183,17 @@ class LivePanel:
         self._state.set_visibility(True)
         for one in (self._log, self._frame, self._verdict):
             one.clear()
+
+    def _offer_viewer(self, address: str) -> None:
+        if self._shows_viewer:
+            self._show_viewer(address)
+            return
+        with self._frame:
+            ui.label("This browser draws without a graphics card: the viewer would take the "
+                     "processor from the loop and from this page.")  # fmt: skip
+            ui.button("show the viewer here", on_click=lambda: self._show_viewer(address)).props(
+                "outline no-caps"
+            )
 
     def _show_viewer(self, address: str) -> None:
         self._frame.clear()

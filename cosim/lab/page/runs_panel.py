@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from nicegui import ui
 
-from cosim.lab.page.lab_services import LabServices, PageCalls
+from cosim.lab.page.lab_services import ANSWER_S, LabServices, PageCalls
 from cosim.lab.page.run_verdict_card import show_verdict
 from cosim.output.figure_format import SCREEN_IN
 from noack.core.errors import NoackError
@@ -117,7 +117,7 @@ class RunsPanel:
             ui.label("reading the run and drawing its figures, which takes some seconds")
         found: Opened | str
         try:
-            is_narrow = await ui.run_javascript(f"innerWidth <= {NARROW_PX}")
+            is_narrow = await ui.run_javascript(f"innerWidth <= {NARROW_PX}", timeout=ANSWER_S)
             found = await self._calls.compute(
                 opened, directory, _COLUMN_IN if is_narrow else SCREEN_IN
             )

@@ -36,10 +36,12 @@ def test_the_states_follow_each_other() -> None:
     said(run, "finalising", reason="horizon")
     assert run.state == "finalising"
     assert not run.is_over
-    said(run, "ended", run_dir="/runs/one", reason="horizon", ok=True)
+    lines = [["completed 20 s", "green"], ["3 transmissions, 2 delivered", ""]]
+    said(run, "ended", run_dir="/runs/one", reason="horizon", ok=True, verdict=lines)
     assert run.is_over
     assert run.ok
     assert run.progress["events"] == 3
+    assert run.verdict == [("completed 20 s", "green"), ("3 transmissions, 2 delivered", "")]
 
 
 def test_each_warning_and_change_is_a_line_once() -> None:
@@ -77,6 +79,7 @@ def test_the_log_is_bounded() -> None:
         run._take(f"line {number}")
     assert len(run.lines) == 200
     assert run.lines[-1] == "line 999"
+    assert run.first_line == 800
 
 
 def test_a_stop_after_the_loop_ended_keeps_the_summary(tmp_path: Path) -> None:
