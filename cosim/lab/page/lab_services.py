@@ -64,13 +64,18 @@ class LabServices:
         loop = asyncio.get_running_loop()
         await self._turn.acquire()
         call: asyncio.Future[T] = loop.run_in_executor(self._pool, function, *arguments)
-        call.add_done_callback(lambda _: self._turn.release())
+        call.add_done_callback(self._end_turn)
         try:
             # Shielded: Python 3.11 prints a traceback when a pool ends that has cancelled calls.
             return await asyncio.shield(call)
         except asyncio.CancelledError:
             loop.call_later(_GIVE_UP_S, self._give_up, call)
             raise
+
+    def _end_turn(self, call: asyncio.Future[Any]) -> None:
+        self._turn.release()
+        if not call.cancelled():
+            call.exception()  # perhaps nobody waits for it any more
 
     def _give_up(self, call: asyncio.Future[Any]) -> None:
         if not call.done():

@@ -73,25 +73,24 @@ class TutorialPanel:
 
     def __init__(self, begin: Begin) -> None:
         self._begin, self._place = begin, 0
-        self._card = ui.card().classes("w-full")
+        with ui.card().classes("w-full"):
+            self._title = ui.label().classes("text-h6").props("role=heading aria-level=2")
+            self._text = ui.label()
+            self._drag = ui.label().classes("font-bold")
+            with ui.row():
+                ui.button("show it", on_click=self._start)
+                self._back = ui.button("back", on_click=lambda: self._go(-1)).props("flat")
+                self._next = ui.button("next", on_click=lambda: self._go(1)).props("flat")
+            ui.label("“show it”, “next” and “back” replace the settings by those of the step.")
         self._show()
 
     def _show(self) -> None:
         step = STEPS[self._place]
-        self._card.clear()
-        with self._card:
-            ui.label(f"{self._place + 1} of {len(STEPS)}: {step.title}").classes("text-h6").props(
-                "role=heading aria-level=2"
-            )
-            ui.label(step.text)
-            ui.label(step.drag).classes("font-bold")
-            with ui.row():
-                ui.button("show it", on_click=self._start)
-                if self._place:
-                    ui.button("back", on_click=lambda: self._go(-1)).props("flat")
-                if self._place < len(STEPS) - 1:
-                    ui.button("next", on_click=lambda: self._go(1)).props("flat")
-            ui.label("“show it”, “next” and “back” replace the settings by those of the step.")
+        self._title.set_text(f"{self._place + 1} of {len(STEPS)}: {step.title}")
+        self._text.set_text(step.text)
+        self._drag.set_text(step.drag)
+        self._back.set_visibility(self._place > 0)
+        self._next.set_visibility(self._place < len(STEPS) - 1)
 
     async def _go(self, by: int) -> None:
         self._place += by

@@ -42,7 +42,8 @@ class Served:
             self._process.kill()
             assert self._process.stdout is not None
             self._process.stdout.close()
-        assert self.errors.read_text() == ""
+        errors = self.errors.read_text()
+        assert not errors, errors
 
 
 class Page:
@@ -105,7 +106,7 @@ class Page:
         """Click on a button with the mouse, once it can be clicked."""
         found = (
             f"[...document.querySelectorAll('button')].find(e => !e.disabled && "
-            f"e.innerText.trim().endsWith({json.dumps(text)}))"
+            f"e.innerText.trim().toLowerCase().endsWith({json.dumps(text)}))"
         )
         self.wait(f"!!{found}")
         self.js(f"{found}.scrollIntoView({{ block: 'center' }})")

@@ -1,6 +1,7 @@
 """The worker process that computes for all pages."""
 
 import asyncio
+import gc
 import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -14,11 +15,17 @@ from tests.integration import conftest as live
 
 
 def with_services(use: Callable[[LabServices], Awaitable[Any]], folder: Path) -> Any:
+    unhandled = list[dict[str, Any]]()
+
     async def run() -> Any:
+        asyncio.get_running_loop().set_exception_handler(lambda _, what: unhandled.append(what))
         with LabServices("lane_following", folder, folder / "runs") as services:
             return await asyncio.wait_for(use(services), live.PATIENCE_S)
 
-    return asyncio.run(run())
+    found = asyncio.run(run())
+    gc.collect()  # the loop hears of exceptions that nobody asked for when they are removed
+    assert unhandled == []
+    return found
 
 
 def test_a_closed_page_gives_up_its_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -138,7 +138,7 @@ def test_the_tutorial_has_its_figure_beside_it(browser: Browser, address: str) -
     page.click("tutorial", ".q-tab")
     page.wait("!!document.querySelector('.lab-guided canvas')")
     page.click("next", "button")
-    page.wait(f"{TEXT}.includes('2 of 5') && location.search.includes('bernoulli')")
+    page.wait(f"{TEXT}.includes('2 of 5') && location.search.includes('loss.probability=0.5')")
     assert page.js("document.querySelector('.q-tab--active').innerText") == "tutorial"
     page.drag("loss probability", 0.0)
     page.wait("document.querySelector('.lab-guided').innerText.includes(', 0 (0 %) lost')")
