@@ -73,6 +73,20 @@ class Exploration:
         return norms
 
     @property
+    def controller_knows(self) -> NDArray[np.bool_]:
+        """Whether the controller has a state: not before its first update, (N,)."""
+        if self.scenario.network.initial_sync == "known_state":
+            return np.ones(len(self.t_s), np.bool_)
+        first_s = self.event_s[self.delivered].min(initial=np.inf)
+        if not np.isfinite(first_s):
+            return np.zeros(len(self.t_s), np.bool_)
+        at = np.flatnonzero(self.t_s == first_s)
+        # If the time of the event occurs twice, it is first the time before the reset.
+        start = int(at[min(1, len(at) - 1)]) if len(at) else int(np.sum(self.t_s < first_s))
+        known: NDArray[np.bool_] = np.arange(len(self.t_s)) >= start
+        return known
+
+    @property
     def state_names(self) -> tuple[str, ...]:
         """Names of the n states."""
         return loop_of(self.scenario).state_names

@@ -35,7 +35,8 @@ _POINTS_PER_PIXEL = 0.75
 @styled
 def exploration_figure(shown: Shown) -> Figure:
     """Draw the four panels of a run with all that is known of it."""
-    points, named = sources(shown), legends(shown)
+    points = sources(shown)
+    named = legends(points)
     space = draw.layout()
     head_in = draw.head_in([name for names in named.values() for name in names][:1]) + _GAP_IN
     height_in = len(PANELS) * head_in + _PANELS_IN + space.below_in

@@ -97,6 +97,11 @@ def sources(shown: Shown) -> dict[str, Columns]:
     return {name: {**columns[name], **given} for name, given in found.items()}
 
 
+def is_drawn(curve: Curve, points: Mapping[str, Columns]) -> bool:
+    """Whether a curve has a point."""
+    return bool(np.isfinite(points[curve.source][curve.column]).any())
+
+
 def titles(shown: Shown) -> Sequence[str]:
     """Return the titles of the panels."""
     name = shown.run.state_names[shown.state]
@@ -106,25 +111,30 @@ def titles(shown: Shown) -> Sequence[str]:
     )  # fmt: skip
 
 
-def legends(shown: Shown) -> dict[str, list[str]]:
-    """Return the names in the legends of panels; one of several panels is in the first's only."""
-    known = {KEPT, "‖x‖"} if shown.reference is None else {"‖x‖"}
-    found: dict[str, list[str]] = {}
+def legends(points: Mapping[str, Columns]) -> dict[str, list[str]]:
+    """Return the names in the legends of panels: of what is drawn, each in one panel only.
+
+    A panel whose curves have names of its own is always there, perhaps without names.
+    """
+    known, found = {"‖x‖"}, dict[str, list[str]]()
     for curve in CURVES:
         if curve.name not in known:
             known.add(curve.name)
-            found.setdefault(curve.panel, []).append(curve.name)
+            names = found.setdefault(curve.panel, [])
+            names += [curve.name] * any(is_drawn(one, points) for one in CURVES
+                                        if one.name == curve.name)  # fmt: skip
     return found
 
 
 def _run(shown: Shown) -> Columns:
     run, i = shown.run, shown.state
-    floor = _floor(run)
+    floor, known = _floor(run), run.controller_knows
     threshold = np.full(len(run.t_s), np.nan) if run.threshold is None else run.threshold
     return {
-        "t": run.t_s, "x": run.x[:, i], "x_s": run.x_s[:, i], "x_c": run.x_c[:, i],
+        "t": run.t_s, "x": run.x[:, i], "x_s": run.x_s[:, i],
+        "x_c": np.where(known, run.x_c[:, i], np.nan),
         "threshold": threshold, "e_s": _positive(run.e_s_norm, floor),
-        "e_c": _positive(run.e_c_norm, floor), "norm": _norm(run),
+        "e_c": np.where(known, _positive(run.e_c_norm, floor), np.nan), "norm": _norm(run),
     }  # fmt: skip
 
 
@@ -132,7 +142,7 @@ def _reference(shown: Shown) -> Columns:
     run = shown.reference
     if run is None or shown.state >= run.x.shape[1]:
         return {}
-    e_c = _positive(run.e_c_norm, _floor(shown.run))
+    e_c = np.where(run.controller_knows, _positive(run.e_c_norm, _floor(shown.run)), np.nan)
     return {"t": run.t_s, "x": run.x[:, shown.state], "e_c": e_c, "norm": _norm(run)}
 
 

@@ -16,6 +16,7 @@ from cosim.interactive.exploration import (
 )
 from cosim.live.finalize import finalize
 from cosim.live.simulated_run import simulate_run
+from cosim.record.align import align_tables
 from cosim.record.data_frames import events, samples
 from cosim.record.decimate import decimate_all
 from cosim.record.run_record import load_record
@@ -45,10 +46,12 @@ def simulate_sampled(scenario: Scenario) -> Exploration:
         outcome = finalize(simulate_run(scenario, Path(folder), view=False), report=False)
         record = load_record(outcome.run_dir)
         sampled, sent, resolved = samples(record), events(record), record.scenario
+        known = align_tables(record).since_delivery(resolved)
     n = len(resolved.model.state_names or ()) or resolved.model.dimensions[0]
     t_s = _column(sampled, "t_s")
     x, x_s, x_c = (_states(sampled, name, n) for name in ("x", "x_s", "x_c"))
     e_s_norm, e_c_norm = _column(sampled, "e_s_norm"), _column(sampled, "e_c_norm")
+    x_c, e_c_norm = np.where(known[:, None], x_c, np.nan), np.where(known, e_c_norm, np.nan)
     curves = np.column_stack([x, x_s, x_c, e_s_norm, e_c_norm])
     kept = decimate_all(t_s, curves, _COLUMNS)
     threshold = threshold_at(resolved, t_s[kept])

@@ -32,7 +32,8 @@ _TICK = (
     " : (+v.toPrecision(9)).toExponential()"
 )
 """Text at a value axis in JavaScript: short, so that the panels have equal widths."""
-_TITLE, _LEGEND, _TIMES, _BOTTOM = 22, 24, 24, 38
+_TITLE, _LEGEND, _TIMES, _BOTTOM = 22, 27, 24, 38
+_FONT_PX = 13
 HEIGHT = 860
 """Height of the figure in pixels."""
 _MARKS: Mapping[str, Options] = {
@@ -45,33 +46,30 @@ _MARKS: Mapping[str, Options] = {
 def figure_options(shown: Shown) -> Options:
     """Return the options of the whole figure."""
     ink, lines = ("#d5d9e0", "#3a3f47") if shown.dark else ("#30363d", "#dfe3e8")
-    named = legends(shown)
+    changing, named = data_options(shown), legends(sources(shown))
     heads = [_TITLE + _LEGEND * (name in named) for name in PANELS]
     room = HEIGHT - sum(heads) - _TIMES * (len(PANELS) - 1) - _BOTTOM
     bottom, grids = float(-_TIMES), []
     for head, share in zip(heads, PANELS.values(), strict=True):
         top = bottom + _TIMES + head
         bottom = top + room * share
-        grids.append({"left": 54, "right": 16, "top": round(top), "height": round(room * share)})
-    text = {"color": ink}
+        grids.append({"left": 58, "right": 16, "top": round(top), "height": round(room * share)})
+    with_legend = [grid for name, grid in zip(PANELS, grids, strict=True) if name in named]
+    text = {"color": ink, "fontSize": _FONT_PX}
     axis = {"axisLine": {"lineStyle": {"color": ink}}, "axisLabel": text,
             "splitLine": {"lineStyle": {"color": lines}}}  # fmt: skip
     heading = titles(shown)
     return {
         "animation": False,
-        "textStyle": {"color": ink, "fontFamily": "inherit"},
+        "textStyle": {**text, "fontFamily": "Roboto, sans-serif"},
         "aria": {"enabled": True, "label": {"description": "; ".join(heading)}},
-        "legend": [{"type": "scroll", "left": 8, "right": 8, "top": grid["top"] - _LEGEND - 3,
-                    "textStyle": text, "pageTextStyle": text, "itemGap": 8, "itemWidth": 12,
-                    "inactiveColor": "#808080", "data": [_item(one) for one in named[name]]}
-                   for name, grid in zip(PANELS, grids, strict=True) if name in named],
         "tooltip": {"trigger": "axis", "axisPointer": {"type": "line"}, "confine": True,
                     "transitionDuration": 0, ":valueFormatter":
                     "v => v == null ? '–' : Number(v).toPrecision(4)"},
         "axisPointer": {"link": [{"xAxisIndex": "all"}]},
         "grid": grids,
         "title": [{"text": title, "left": 3, "top": grid["top"] - head - 3,
-                   "textStyle": {"fontSize": 13, "fontWeight": "bold", "color": ink}}
+                   "textStyle": {**text, "fontWeight": "bold"}}
                   for title, grid, head in zip(heading, grids, heads, strict=True)],
         "xAxis": [{"type": "value", "gridIndex": i, "min": 0,
                    "max": float(shown.run.scenario.horizon_s),
@@ -83,16 +81,22 @@ def figure_options(shown: Shown) -> Options:
                   for i, name in enumerate(PANELS)],
         "dataZoom": [{"type": "inside", "xAxisIndex": list(range(len(PANELS))),
                       "zoomOnMouseWheel": "shift", "preventDefaultMouseMove": False}],
-        **data_options(shown),
+        **changing,
+        "legend": [{"type": "scroll", "left": 8, "right": 8, "top": grid["top"] - _LEGEND - 3,
+                    "textStyle": text, "pageTextStyle": text, "itemGap": 6, "itemWidth": 10,
+                    "inactiveColor": "#808080"} | legend
+                   for grid, legend in zip(with_legend, changing["legend"], strict=True)],
     }  # fmt: skip
 
 
 def data_options(shown: Shown) -> Options:
-    """Return the data and the series, which change with each redraw."""
+    """Return the data, the series and their names, which change with each redraw."""
     points = sources(shown)
     places = {name: i for i, name in enumerate(points)}
     series = [one for curve in CURVES for one in _series(curve, places[curve.source])]
-    return {"dataset": [{"source": _source(one)} for one in points.values()], "series": series}
+    return {"dataset": [{"source": _source(one)} for one in points.values()], "series": series,
+            "legend": [{"data": [_item(one) for one in names]}
+                       for names in legends(points).values()]}  # fmt: skip
 
 
 def _series(curve: Curve, dataset: int) -> list[Options]:

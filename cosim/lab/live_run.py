@@ -5,7 +5,6 @@ import json
 import os
 import re
 import signal
-import tempfile
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +14,8 @@ from noack.core.python_process import python_command
 from noack.protocol.topology import LOOP_ROLES
 
 _ADDRESS = re.compile(r"http://\S+")
-_MOST_LINES = 200
+MOST_LINES = 200
+"""Of the log."""
 _STOP_S = 20.0
 _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
 _CMDLINE = Path("/proc")
@@ -34,34 +34,34 @@ class LiveRun:
     progress: dict[str, Any] = field(default_factory=dict)
     lines: list[str] = field(default_factory=list)
     """What happened, the newest line last."""
+    first_line: int = 0
+    """Number of lines that happened before these."""
+    verdict: list[tuple[str, str]] = field(default_factory=list)
+    """At the end: lines, each with its style as :mod:`cosim.output.run_verdict` names it."""
     ok: bool | None = None
     version: int = 0
     """Grows with each change."""
     _process: asyncio.subprocess.Process | None = None
-    _folder: tempfile.TemporaryDirectory[str] | None = None
-    _beside: Path | None = None
 
     @property
     def is_over(self) -> bool:
         """Whether it has ended."""
         return self.state in ("ended", "failed")
 
-    async def start(self, text: str, beside: Path, runs: Path) -> None:
-        """Start the run of a scenario's text; relative file names are relative to ``beside``."""
-        self._folder = tempfile.TemporaryDirectory(prefix="noack-lab-")
-        path = Path(self._folder.name) / "scenario.toml"
-        path.write_text(text, encoding="utf-8")
-        if _mentions_files(text):
-            with suppress(OSError):  # a folder that cannot be written
-                other = beside / f".lab-{os.getpid()}.toml"
-                other.write_text(text, encoding="utf-8")
-                path = self._beside = other
+    async def start(self, text: str, folder: Path, runs: Path) -> None:
+        """Start the run of a scenario's text; relative file names in it are relative to ``folder``.
+
+        The text goes through a pipe: another user may be able to replace a file.
+        """
         environment = {key: value for key, value in os.environ.items() if key not in _DISPLAYS}
         self._process = await asyncio.create_subprocess_exec(
-            *python_command("-m", "cosim.lab.live_child", str(path), str(runs.absolute())),
+            *python_command("-m", "cosim.lab.live_child", folder.absolute(), runs.absolute()),
             stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
-            stdin=asyncio.subprocess.DEVNULL, env=environment, start_new_session=True,
+            stdin=asyncio.subprocess.PIPE, env=environment, start_new_session=True,
         )  # fmt: skip
+        assert self._process.stdin is not None
+        self._process.stdin.write(text.encode())
+        self._process.stdin.close()  # after the text; a process that has ended needs none
 
     async def follow(self) -> None:
         """Read what the run says until it has ended."""
@@ -74,15 +74,7 @@ class LiveRun:
         if not self.is_over:
             self.state, self.ok = "failed", False
             self._add(f"the run ended with status {status}")
-        self.remove_copies()
         self.version += 1
-
-    def remove_copies(self) -> None:
-        """Remove the scenario files that were written for the run, which has read them."""
-        if self._beside is not None:
-            self._beside.unlink(missing_ok=True)
-        if self._folder is not None:
-            self._folder.cleanup()
 
     def stop(self) -> None:
         """Ask the run to end; what was recorded is kept."""
@@ -138,6 +130,7 @@ class LiveRun:
             case "ended":
                 self.state, self.ok = "ended", said["ok"]
                 self.run_dir = Path(said["run_dir"])
+                self.verdict = [(text, style) for text, style in said["verdict"]]
                 self._add(f"recorded in {self.run_dir}")
             case _:
                 self.state, self.ok = "failed", False
@@ -154,12 +147,10 @@ class LiveRun:
 
     def _add(self, line: str) -> None:
         if line:
-            self.lines = [*self.lines, line][-_MOST_LINES:]
-
-
-def _mentions_files(text: str) -> bool:
-    """Whether a scenario may name files beside it."""
-    return bool(re.search(r"\bfile\b|\.(npz|mat|py|fmu|csv|toml|pcap)", text))
+            self.lines.append(line)
+            more = max(len(self.lines) - MOST_LINES, 0)
+            del self.lines[:more]
+            self.first_line += more
 
 
 def _descendants(pid: int) -> list[int]:

@@ -13,7 +13,7 @@ from rich.text import Text
 
 from cosim.analysis.loops_summary import has_loops
 from cosim.analysis.run_summary import Outcome, Summary
-from cosim.output.loops_tables import print_loops
+from cosim.output.loops_tables import claims_line, print_loops
 from cosim.output.remarks import remarks
 from cosim.output.run_tables import number_table, print_details, short_numbers
 from cosim.record.run_directory import RECORDING_FILE, REPORT_FILE
@@ -35,8 +35,10 @@ class VerdictLine(NamedTuple):
     """Name of a style of rich."""
 
 
-def verdict(summary: Summary) -> tuple[VerdictLine, VerdictLine, VerdictLine]:
-    """Return three lines: how the run ended, its transmissions, its claims."""
+def verdict(summary: Summary) -> tuple[VerdictLine, ...]:
+    """Return how the run ended, its transmissions, its claims; of several loops not the second."""
+    if has_loops(summary):
+        return ending_line(summary), VerdictLine(claims_line(summary), NEUTRAL)
     return ending_line(summary), VerdictLine(_transmissions(summary), NEUTRAL), _claims(summary)
 
 

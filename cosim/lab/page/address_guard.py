@@ -3,12 +3,18 @@
 Every user of the machine can connect to loopback, and so can every page that a browser shows. So
 everything is under a path that begins with a secret. A request with another host name (DNS
 rebinding) or from another origin is refused, also for a WebSocket.
+
+A browser is started with an address on its command line, which every user can read. So it gets
+another secret, which leads to the page for processes of this user only.
 """
 
+import os
 import re
 import secrets
 from collections.abc import Awaitable, Callable, MutableMapping
 from typing import Any
+
+from cosim.output.viewer.web_viewer import socket_user
 
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
@@ -23,6 +29,9 @@ _HEADERS = (
     (b"x-content-type-options", b"nosniff"),
     (b"cross-origin-opener-policy", b"same-origin"),
     (b"cross-origin-resource-policy", b"same-origin"),
+    # The rerun viewer, which is in a frame, draws in another process of the browser: while it
+    # draws without a graphics card, it would keep this page from handling clicks for seconds.
+    (b"origin-agent-cluster", b"?1"),
     # The framework compiles its templates in the browser, which needs unsafe-eval.
     (b"content-security-policy",
      b"default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; "
@@ -43,11 +52,17 @@ def new_secret() -> str:
 
 
 class AddressGuard:
-    """An ASGI application in front of another one, which sees the secret as its root path."""
+    """An ASGI application in front of another one, which sees the secret as its root path.
 
-    def __init__(self, application: Application, secret: str) -> None:
+    Args:
+        application: the other one.
+        secret: of the page.
+        opening: the secret for a command line.
+    """
+
+    def __init__(self, application: Application, secret: str, opening: str) -> None:
         self._application = application
-        self._root = f"/{secret}"
+        self._root, self._opening = f"/{secret}", f"/{opening}"
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass an admitted request on; refuse another one."""
@@ -55,6 +70,12 @@ class AddressGuard:
             await self._application(scope, receive, send)
             return
         status = self._refusal(scope)
+        if status == 404 and self._may_open(scope):
+            to = f"{self._root}/?".encode() + scope["query_string"]
+            headers = [(b"location", to), *_HEADERS]
+            await send({"type": "http.response.start", "status": 303, "headers": headers})
+            await send({"type": "http.response.body"})
+            return
         if status is not None:
             await _refuse(scope, receive, send, status)
             return
@@ -71,8 +92,18 @@ class AddressGuard:
             return 403
         if scope["type"] == "websocket" and not origins:
             return 403  # a browser names it; nothing else needs this socket
-        first = "/" + scope["path"].removeprefix("/").partition("/")[0]
-        return None if secrets.compare_digest(first.encode(), self._root.encode()) else 404
+        return None if _begins(scope, self._root) else 404
+
+    def _may_open(self, scope: Scope) -> bool:
+        """Whether this is the first request of a browser that this user has started."""
+        if scope["type"] != "http" or not _begins(scope, self._opening):
+            return False
+        return socket_user(scope["client"], scope["server"]) == os.getuid()
+
+
+def _begins(scope: Scope, root: str) -> bool:
+    first = "/" + scope["path"].removeprefix("/").partition("/")[0]
+    return secrets.compare_digest(first.encode(), root.encode())
 
 
 async def _refuse(scope: Scope, receive: Receive, send: Send, status: int) -> None:

@@ -11,6 +11,8 @@ from cosim.lab.chart_options import HEIGHT, data_options, figure_options
 from cosim.lab.page.session import Session
 from noack.core.number_format import number
 
+_DRAWN_S = 10.0
+"""A redraw without an answer for so long is repeated as a whole."""
 _TONES = {CERTIFIED: "text-positive"}
 
 
@@ -23,13 +25,13 @@ class ExplorePanel:
         self._guaranteed: tuple[int, int] | None = None
         """Which guarantee and margin are shown; arrays are not compared."""
         self._chart: ui.echart | None = None
-        self._step = ui.label().classes("text-sm font-bold")
-        self._step.set_visibility(False)
-        with ui.row().classes("w-full items-baseline gap-x-4 gap-y-0 text-sm"):
+        with ui.row().classes("w-full items-center gap-x-4 gap-y-0"):
             self._summary = ui.label()
             self._verdict = ui.label()
-        self._note = ui.label().classes("text-warning text-sm").props("role=status")
-        self._state = ui.row().classes("items-center gap-2")
+            self._pending = ui.label().props("role=status")
+            self._state = ui.row().classes("items-center gap-2")
+        self._note = ui.label().classes("text-warning").props("role=status")
+        self._note.set_visibility(False)
         self._area = ui.element("div").classes("w-full")
         self._stale = False
         with ui.element("div").classes("w-full lab-facts"):
@@ -45,20 +47,17 @@ class ExplorePanel:
         note = first + more or session.warning or session.note
         shown = session.shown(dark=dark)
         self._mark_stale(shown is None)
-        if shown is None:
-            old = "" if self._chart is None else ". Below: the settings before"
-            self._note.set_text(note + old)
-            return
+        if shown is None and self._chart is not None:
+            note += ". Below: the settings before"
         self._note.set_text(note)
+        self._note.set_visibility(bool(note))
+        self._pending.set_text(session.pending)
+        if shown is None:
+            return
         self._choose_state(session)
         await self._show_figure(shown)
         if not self._area.is_deleted:
             self._show_facts(session)
-
-    def show_step(self, text: str) -> None:
-        """Show what a step of the tutorial asks for."""
-        self._step.set_text(text)
-        self._step.set_visibility(bool(text))
 
     def _mark_stale(self, stale: bool) -> None:
         """Draw the figure faintly while it is not that of the settings."""
@@ -81,7 +80,7 @@ class ExplorePanel:
             return
         try:
             # Awaited, so that a slow browser is not sent more than it draws.
-            await self._chart.run_chart_method("setOption", data_options(shown), timeout=2)
+            await self._chart.run_chart_method("setOption", data_options(shown), timeout=_DRAWN_S)
         except TimeoutError:
             self._shape = ()
 
@@ -125,34 +124,30 @@ class ExplorePanel:
             f"{numbers.get('transmissions', 0)} transmissions, {numbers.get('lost', 0)} lost; "
             f"‖x‖ from {number(first, 3)} to {number(last, 3)}"
         )
-        verdict = session.guarantee.verdict if session.guarantee else "certificate: …"
+        verdict = session.guarantee.verdict if session.guarantee else ""
         self._verdict.set_text(verdict)
-        self._verdict.classes(
-            replace=_TONES.get(verdict, "text-warning" if session.guarantee else "")
-        )
+        self._verdict.classes(replace=_TONES.get(verdict, "text-warning"))
 
 
 def _show_guarantee(found: Guarantee | None) -> None:
     _heading("certificate")
     if found is None:
-        ui.label("follows when no setting changes").classes("text-xs")
+        ui.label("follows when no setting changes")
         return
-    ui.label(f"{found.verdict}: {found.reason}").classes(
-        f"text-sm {_TONES.get(found.verdict, 'text-warning')}"
-    )
+    ui.label(f"{found.verdict}: {found.reason}").classes(_TONES.get(found.verdict, "text-warning"))
     _Rows().show(found.rows)
     for verdict, what, why in found.assumptions:
-        ui.label(f"{verdict}: {what} ({why})").classes("text-xs")
+        ui.label(f"{verdict}: {what} ({why})")
 
 
 def _show_margin(found: Margin | None) -> None:
     if found is None or not found.defined:
         return
     _heading("margin")
-    ui.label(found.verdict).classes("text-sm")
+    ui.label(found.verdict)
     ui.label("Pattern: D delivered, L lost. Growth of the worst pattern per event; 1 is the limit.")
     for m, growth, verdict in found.rows:
-        ui.label(f"M = {m}: growth {growth}, {verdict}").classes("text-xs")
+        ui.label(f"M = {m}: growth {growth}, {verdict}")
 
 
 def _heading(text: str) -> ui.label:
@@ -165,7 +160,7 @@ class _Rows:
     def __init__(self) -> None:
         self._names: list[str] = []
         self._values: list[ui.label] = []
-        self._list = ui.element("dl").classes("lab-rows text-xs")
+        self._list = ui.element("dl").classes("lab-rows")
 
     def show(self, rows: Sequence[tuple[str, str]]) -> None:
         """Show other rows."""

@@ -12,7 +12,7 @@ from nicegui import ui
 
 from cosim.interactive.exploration import Exploration
 from cosim.interactive.figure_curves import Shown
-from cosim.lab.page.lab_services import LabServices
+from cosim.lab.page.lab_services import ANSWER_S, LabServices, PageCalls
 from cosim.lab.page.session import Session
 from cosim.output.figure_format import FigureFormat
 from noack.core.errors import NoackError
@@ -24,8 +24,8 @@ _NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,63}\.toml")
 class FileMenu:
     """The menu in the header."""
 
-    def __init__(self, services: LabServices, session: Session) -> None:
-        self._services, self._session = services, session
+    def __init__(self, services: LabServices, calls: PageCalls, session: Session) -> None:
+        self._services, self._calls, self._session = services, calls, session
         opener = ui.button(icon="more_vert").props('flat color=white dense aria-label="files"')
         with opener, ui.menu():
             ui.menu_item("save as scenario …", self._ask)
@@ -62,7 +62,7 @@ class FileMenu:
         ui.notify(f"saved as {path.name}; noack run {path.name}", type="positive")
 
     async def _share(self) -> None:
-        address = await ui.run_javascript("location.href")
+        address = await ui.run_javascript("location.href", timeout=ANSWER_S)
         ui.clipboard.write(address)
         ui.notify("copied; it opens as long as this page runs", type="positive")
 
@@ -73,7 +73,7 @@ class FileMenu:
     async def _figure(self, kind: FigureFormat) -> None:
         shown = self._session.shown(dark=False)
         if shown is not None:
-            content = await self._services.compute(figure_file, shown, kind)
+            content = await self._calls.compute(figure_file, shown, kind)
             ui.download(content, f"exploration.{kind}")
 
 

@@ -90,7 +90,7 @@ class FormPanel:
         with ui.expansion(title, on_value_change=opened).classes("w-full") as expansion:
             expansion.props("dense")
             if group.help:
-                ui.label(group.help).classes("text-xs")
+                ui.label(group.help)
             column = ui.column().classes("w-full gap-1")
         self._open[group.key] = expansion, column
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import socket
+import sys
 import webbrowser
 from collections.abc import Callable
 from contextlib import suppress
@@ -15,6 +16,7 @@ from nicegui import ui
 from cosim.lab.page.address_guard import AddressGuard, new_secret
 from cosim.lab.page.lab_page import show_page
 from cosim.lab.page.lab_services import LabServices
+from cosim.lab.page.run_verdict_card import serve_reports
 from noack.core.errors import MachineError
 
 HOST = "127.0.0.1"
@@ -43,11 +45,9 @@ def serve(options: LabOptions, announce: Callable[[str], None]) -> None:
     Raises:
         MachineError: the port is in use.
     """
-    secret = new_secret()
+    secret, opening = new_secret(), new_secret()
     listener = _listener(options.port)
-    address = f"http://{HOST}:{listener.getsockname()[1]}/{secret}/"
-    if options.settings:
-        address += f"?{options.settings}"
+    origin, query = f"http://{HOST}:{listener.getsockname()[1]}", f"?{options.settings}".rstrip("?")
     with LabServices(options.scenario, options.folder, options.runs) as services:
         application = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
 
@@ -55,6 +55,7 @@ def serve(options: LabOptions, announce: Callable[[str], None]) -> None:
         async def lab() -> None:
             await show_page(services)
 
+        serve_reports(application, services)
         # Without a history of messages: each redraw is one. A reconnected page loads itself again.
         ui.run_with(
             application, title="noack lab", favicon="🧪", dark=None, message_history_length=0,
@@ -62,14 +63,22 @@ def serve(options: LabOptions, announce: Callable[[str], None]) -> None:
             reconnect_timeout=_RECONNECT_S,
         )  # fmt: skip
         config = uvicorn.Config(
-            AddressGuard(application, secret), log_level="warning", access_log=False,
+            AddressGuard(application, secret, opening), log_level="warning", access_log=False,
             ws_per_message_deflate=False, timeout_graceful_shutdown=2, server_header=False,
         )  # fmt: skip
-        server = _Server(config, lambda: _announced(address, options, announce))
+
+        def announced() -> None:
+            announce(f"{origin}/{secret}/{query}")
+            if options.open_browser:
+                webbrowser.open(f"{origin}/{opening if _CAN_CHECK else secret}/{query}")
+
+        server = _Server(config, announced)
         with listener, suppress(KeyboardInterrupt):  # Ctrl-C is how it ends
             asyncio.run(server.serve(sockets=[listener]))
 
 
+_CAN_CHECK = sys.platform == "linux"
+"""Whether the user of a connection can be seen."""
 _RECONNECT_S = 60.0
 """A page that is silent for less than 0.4 of this is not cut off: a busy machine may stall."""
 
@@ -86,12 +95,6 @@ class _Server(uvicorn.Server):
         await super().startup(sockets)
         if self.started:
             self._on_start()
-
-
-def _announced(address: str, options: LabOptions, announce: Callable[[str], None]) -> None:
-    announce(address)
-    if options.open_browser:
-        webbrowser.open(address)
 
 
 def _listener(port: int) -> socket.socket:

@@ -1,12 +1,14 @@
 """Recorded runs: key numbers, claims and figures; replay and fidelity on request."""
 
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from nicegui import ui
 
-from cosim.lab.page.lab_services import LabServices
+from cosim.lab.page.lab_services import ANSWER_S, LabServices, PageCalls
+from cosim.lab.page.run_verdict_card import show_verdict
 from cosim.output.figure_format import SCREEN_IN
 from noack.core.errors import NoackError
 
@@ -22,6 +24,8 @@ NARROW_PX = 800
 class Opened(NamedTuple):
     """What is shown of a run."""
 
+    verdict: list[tuple[str, str]]
+    """Lines, each with its style."""
     facts: list[tuple[str, str]]
     claims: list[tuple[str, str]]
     """Verdict and claim."""
@@ -35,6 +39,7 @@ def opened(directory: Path, width_in: float) -> Opened:
     from cosim.api.run_facts import run_facts
     from cosim.output.report.figure_files import inline
     from cosim.output.report.figure_layout import figure_width
+    from cosim.output.run_verdict import verdict
 
     run = noack.open_run(directory)
     figures = []
@@ -43,7 +48,8 @@ def opened(directory: Path, width_in: float) -> Opened:
             with suppress(NoackError):
                 figures.append(inline(run.plot(name), f"run-{name}", f"figure: {name}"))
     claims = [(str(one["verdict"]), f"{one['what']} ({one['source']})") for one in run.claims]
-    return Opened(run_facts(run), claims, figures)
+    lines = [(line.text, line.style) for line in verdict(run.summary)]
+    return Opened(lines, run_facts(run), claims, figures)
 
 
 def replayed(directory: Path) -> str:
@@ -68,43 +74,67 @@ def compared(directory: Path) -> str:
 class RunsPanel:
     """The panel."""
 
-    def __init__(self, services: LabServices) -> None:
-        self._services = services
+    def __init__(
+        self, services: LabServices, calls: PageCalls, run_live: Callable[[], object]
+    ) -> None:
+        self._services, self._calls = services, calls
+        self._newest: str | None = None
         with ui.row().classes("items-center gap-2"):
             self._select = ui.select([], label="run", on_change=self._open).classes("w-72")
             ui.button(icon="refresh", on_click=self.refresh).props(
                 'flat dense aria-label="look for new runs"'
             )
+        with ui.column().classes("gap-2") as self._empty:
+            ui.label(f"No run has ended in the folder {services.runs} yet.")
+            ui.label(
+                "A live run appears here with its verdict, key numbers, claims and figures; so "
+                "does each run of “noack run” and “noack simulate” in this folder."
+            )
+            ui.button("to the live run", icon="play_arrow", on_click=run_live).props("no-caps")
         self._content = ui.column().classes("w-full gap-2")
-        self.refresh()
 
     def refresh(self) -> None:
-        """Look for new runs."""
-        self._select.set_options(self._services.recorded())
+        """Look for new runs; open the newest that has ended, if it is a new one."""
+        names = self._services.recorded()
+        newest = next((name for name in names if self._services.has_ended(name)), None)
+        chosen = self._select.value if newest == self._newest else newest
+        self._newest = newest
+        self._empty.set_visibility(newest is None)
+        self._select.set_options(names, value=chosen)
+
+    def show(self, name: str) -> None:
+        """Open a run."""
+        self.refresh()
+        self._select.set_value(name)
 
     async def _open(self, event: Any) -> None:
         if not event.value:
             return
         directory = self._services.runs / event.value
         self._content.clear()
-        with self._content:
-            waiting = ui.spinner(size="lg")
+        with self._content, ui.row().classes("items-center gap-2"):
+            ui.spinner(size="lg")
+            ui.label("reading the run and drawing its figures, which takes some seconds")
+        found: Opened | str
         try:
-            is_narrow = await ui.run_javascript(f"innerWidth <= {NARROW_PX}")
-            found = await self._services.compute(
+            is_narrow = await ui.run_javascript(f"innerWidth <= {NARROW_PX}", timeout=ANSWER_S)
+            found = await self._calls.compute(
                 opened, directory, _COLUMN_IN if is_narrow else SCREEN_IN
             )
         except NoackError as error:
-            waiting.delete()
-            with self._content:
-                ui.label(str(error)).classes("text-negative")
-            return
+            found = str(error)
+        if self._select.value != event.value:
+            return  # another run was chosen meanwhile
         self._content.clear()
         with self._content:
-            self._show(found, directory)
+            if isinstance(found, str):
+                ui.label(found).classes("text-negative")
+            else:
+                self._show(found, directory)
 
     def _show(self, found: Opened, directory: Path) -> None:
-        with ui.element("dl").classes("lab-rows text-sm"):
+        show_verdict(found.verdict, directory.name)
+        with ui.element("dl").classes("lab-rows"):
             for name, value in found.facts:
                 with ui.element("dt"):
                     ui.label(name)
@@ -112,7 +142,7 @@ class RunsPanel:
                     ui.label(value)
         with ui.expansion(f"{len(found.claims)} claims").classes("w-full"):
             for verdict, claim in found.claims:
-                ui.label(f"{verdict}: {claim}").classes("text-xs")
+                ui.label(f"{verdict}: {claim}")
         with ui.row().classes("items-center gap-2"):
             for words, function in (
                 ("replay", replayed),
@@ -123,15 +153,15 @@ class RunsPanel:
             ui.html(figure, sanitize=False).classes("w-full lab-figure")
 
     def _on_request(self, words: str, function: Any, directory: Path) -> None:
-        answer = ui.label().classes("text-sm")
+        answer = ui.label()
 
         async def ask() -> None:
             button.disable()
             try:
-                answer.set_text(await self._services.compute(function, directory))
+                answer.set_text(await self._calls.compute(function, directory))
             except NoackError as error:
                 answer.set_text(str(error))
             button.enable()
 
-        button = ui.button(words, on_click=ask).props("outline dense")
+        button = ui.button(words, on_click=ask).props("outline no-caps")
         answer.move()

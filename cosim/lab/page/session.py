@@ -4,6 +4,7 @@ import asyncio
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 from cosim.interactive.draft import Draft, DraftError, Mistake
 from cosim.interactive.ensemble import Ensemble, explore_ensemble
@@ -17,19 +18,23 @@ from cosim.interactive.scenario_guarantee import (
     margin_of,
     warning,
 )
-from cosim.lab.page.lab_services import LabServices
+from cosim.lab.page.lab_services import PageCalls
+from noack.config.scenario import Scenario
 from noack.core.errors import NoackError
 
 _QUIET_S = 0.15
 """So long after the last change, what takes longer than a redraw is computed."""
 _MARGIN_S = 0.6
+_SLOW_S = 1.0
+"""Without a result for so long, the page says that it waits."""
+T = TypeVar("T")
 
 
 @dataclass
 class Session:
     """The state of one page; :meth:`change` is called with each new draft."""
 
-    services: LabServices
+    calls: PageCalls
     draft: Draft
     on_drawn: Callable[[], Awaitable[None]]
     """Called when there is something new to draw."""
@@ -42,6 +47,8 @@ class Session:
     mistakes: list[Mistake] = field(default_factory=list)
     note: str = ""
     """Why there is no run, or what its drawing leaves out."""
+    pending: str = ""
+    """In words: what is computed, or waits for the processor."""
     redraw_ms: float = 0.0
     _wanted: int = 0
     _drawn: int = 0
@@ -52,6 +59,7 @@ class Session:
         """Compute nothing more: the page was closed."""
         if self._later is not None:
             self._later.cancel()
+        self.calls.give_up()
 
     async def change(self, draft: Draft) -> None:
         """Take another draft; of several changes during a redraw only the newest is drawn."""
@@ -71,7 +79,7 @@ class Session:
                 self.redraw_ms = 1e3 * (time.perf_counter() - began_s)
         finally:
             self._busy = False
-        self._later = asyncio.create_task(self._compute_rest(self._wanted))
+        self._later = asyncio.create_task(self._compute_rest())
 
     @property
     def warning(self) -> str:
@@ -101,32 +109,43 @@ class Session:
                 self.run = explore(scenario)
             else:
                 self.note = f"in virtual time, which takes about a second: {why}"
-                self.run = await self.services.compute(simulate_sampled, scenario)
+                self.run = await self._compute("run", simulate_sampled, scenario)
         except DraftError as error:
             self.run, self.mistakes = None, error.mistakes
         except NoackError as error:
             self.run, self.note = None, str(error)
+        self.pending = "" if self.run is None else "computing: certificate"
 
-    async def _compute_rest(self, wanted: int) -> None:
+    async def _compute_rest(self) -> None:
         """Compute what takes longer, once the settings have rested for a moment."""
         if self.run is None:
             return
         await asyncio.sleep(_QUIET_S)
         scenario = self.draft.scenario
         try:
-            guarantee = await self.services.compute(certify, scenario)
-            ensemble = None
-            if why_not_exact(scenario) is None:
-                ensemble = await self.services.compute(explore_ensemble, scenario)
-            if wanted != self._wanted:
-                return
-            self.guarantee, self.ensemble = guarantee, ensemble
+            self.guarantee = await self._compute("certificate", certify, scenario)
             await self.on_drawn()
-            await asyncio.sleep(_MARGIN_S)
-            margin = await self.services.compute(margin_of, scenario)
-            if wanted == self._wanted:
-                self.margin = margin
+            if why_not_exact(scenario) is None:
+                self.ensemble = await self._compute("bands", explore_ensemble, scenario)
                 await self.on_drawn()
+            await asyncio.sleep(_MARGIN_S)
+            self.margin = await self._compute("margin", margin_of, scenario)
         except NoackError as error:
             self.note = str(error)
+        self.pending = ""
+        await self.on_drawn()
+
+    async def _compute(self, what: str, function: Callable[[Scenario], T], scenario: Scenario) -> T:
+        """Compute a result, and say so; if it does not come soon, that it waits."""
+
+        async def say_waiting() -> None:
+            await asyncio.sleep(_SLOW_S)
+            self.pending = f"{what}: waiting for the processor"
             await self.on_drawn()
+
+        self.pending = f"computing: {what}"
+        waiting = asyncio.create_task(say_waiting())
+        try:
+            return await self.calls.compute(function, scenario)
+        finally:
+            waiting.cancel()

@@ -17,6 +17,21 @@ _NAME_EDITOR = """() => {
   for (const area of document.querySelectorAll('.cm-scroller')) area.tabIndex = 0;
 }"""
 """The editor cannot be given these from the server."""
+_SPEAK = """
+const panel = document.querySelector('.lab-settings');
+const speak = () => {
+  for (const slider of panel.querySelectorAll('.q-slider')) {
+    const text = slider.previousElementSibling.lastElementChild.textContent;
+    if (slider.ariaValueText !== text) slider.ariaValueText = text;
+  }
+};
+new MutationObserver(speak).observe(panel, {subtree: true, childList: true, characterData: true});
+speak();
+"""
+"""Gives each slider its value in words: the place of a logarithmic one is the value's logarithm.
+
+Set by the server, it would send the slider's old place, too, while it is dragged.
+"""
 Changed = Callable[[Draft, str], Awaitable[None]]
 """Called with the new draft and the key that changed; an empty key: the whole text."""
 
@@ -49,7 +64,7 @@ class SettingsPanel:
             self._mistakes = ui.column().classes("gap-0 w-full").props("role=status")
             self._editor = ui.codemirror(
                 draft.text, language="TOML", line_wrapping=False, on_change=self._edited
-            ).classes("w-full h-96 text-xs")
+            ).classes("w-full h-96")
         whole.on("after-show", js_handler=_NAME_EDITOR)
         self._build()
 
@@ -65,6 +80,10 @@ class SettingsPanel:
         finally:
             self._quiet = False
 
+    def begin(self) -> None:
+        """Name in the browser what can only be named there."""
+        ui.run_javascript(_SPEAK)
+
     def show_dark(self, *, dark: bool) -> None:
         """Choose the colours of the editor."""
         self._editor.set_theme("vscodeDark" if dark else "vscodeLight")
@@ -75,7 +94,7 @@ class SettingsPanel:
         self._mistakes.clear()
         with self._mistakes:
             for one in mistakes:
-                ui.label(one.text).classes("text-negative text-xs")
+                ui.label(one.text).classes("text-negative")
         wrong = {one.key for one in mistakes}
         for key, (_, _, shown) in self._sliders.items():
             change = "add" if key in wrong else "remove"
@@ -127,7 +146,7 @@ class SettingsPanel:
                 return None
             return self._apply(lambda draft: dragged(draft, current, value), key)
 
-        with ui.row().classes("w-full no-wrap justify-between gap-2 mt-1 text-xs"):
+        with ui.row().classes("w-full no-wrap justify-between gap-2 mt-1"):
             ui.label(slider.label)
             shown = ui.label(_text(slider.value)).classes("font-mono")
         element = FastSlider(slider, moved).classes("w-full")

@@ -21,7 +21,7 @@ STEPS = (
         "What is an event?",
         "The sensor runs a model x_s of the plant and knows the plant's state x. It transmits only "
         "when its error ‖x_s − x‖ exceeds the threshold βe^(−αt). Each point in the lowest panel "
-        "is a transmission.",
+        "of the figure is a transmission.",
         "lane_following", {"network.loss": {"model": "lossless"}},
         "Drag β: a larger threshold gives fewer events and larger errors.",
     ),
@@ -69,32 +69,33 @@ Begin = Callable[[Step], Awaitable[None]]
 
 
 class TutorialPanel:
-    """The panel: one step at a time."""
+    """The text of one step at a time; the figure is beside it."""
 
     def __init__(self, begin: Begin) -> None:
         self._begin, self._place = begin, 0
-        self._card = ui.card().classes("w-full max-w-3xl")
+        with ui.card().classes("w-full"):
+            self._title = ui.label().classes("text-h6").props("role=heading aria-level=2")
+            self._text = ui.label()
+            self._drag = ui.label().classes("font-bold")
+            with ui.row():
+                ui.button("show it", on_click=self._start)
+                self._back = ui.button("back", on_click=lambda: self._go(-1)).props("flat")
+                self._next = ui.button("next", on_click=lambda: self._go(1)).props("flat")
+            ui.label("“show it”, “next” and “back” replace the settings by those of the step.")
         self._show()
 
     def _show(self) -> None:
         step = STEPS[self._place]
-        self._card.clear()
-        with self._card:
-            ui.label(f"{self._place + 1} of {len(STEPS)}: {step.title}").classes("text-h6").props(
-                "role=heading aria-level=2"
-            )
-            ui.label(step.text)
-            ui.label(step.drag).classes("font-bold")
-            with ui.row():
-                ui.button("show it", on_click=self._start)
-                if self._place:
-                    ui.button("back", on_click=lambda: self._go(-1)).props("flat")
-                if self._place < len(STEPS) - 1:
-                    ui.button("next", on_click=lambda: self._go(1)).props("flat")
+        self._title.set_text(f"{self._place + 1} of {len(STEPS)}: {step.title}")
+        self._text.set_text(step.text)
+        self._drag.set_text(step.drag)
+        self._back.set_visibility(self._place > 0)
+        self._next.set_visibility(self._place < len(STEPS) - 1)
 
-    def _go(self, by: int) -> None:
+    async def _go(self, by: int) -> None:
         self._place += by
         self._show()
+        await self._start()
 
     async def _start(self) -> None:
         await self._begin(STEPS[self._place])

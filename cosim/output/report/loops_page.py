@@ -12,7 +12,6 @@ from cosim.output.loops_tables import (
     CAPTION,
     HEADINGS,
     badness,
-    claims_line,
     loop_row,
     network_rows,
 )
@@ -26,7 +25,7 @@ from cosim.output.report.loops_figures import (
 )
 from cosim.output.report.report_page import environment_rows, templates
 from cosim.output.report.run_figures import Envelope, RunFigure, pictures
-from cosim.output.run_verdict import ending_line
+from cosim.output.run_verdict import verdict
 from cosim.record.loops_run import loop_directories
 from cosim.record.run_directory import (
     ENVIRONMENT_FILE,
@@ -64,7 +63,7 @@ def write_loops_report(
     directories = loop_directories(run_dir, network.scenario)
     worst = worst_loop(run_dir, summary["loops"])
     drawings = pictures(load_record(directories[worst.number]), envelopes)
-    lines = _verdict(summary)
+    lines = [line.text for line in verdict(dict(summary))]
     is_bad = summary["exit"]["status"] != ExitStatus.OK or "violated" in lines[1]
     environment = read_object(run_dir / ENVIRONMENT_FILE)
     loops = sorted(summary["loops"], key=badness, reverse=True)
@@ -88,11 +87,6 @@ def write_loops_report(
         environment_rows=environment_rows(environment),
     )  # fmt: skip
     return write_whole(run_dir / REPORT_FILE, html)
-
-
-def _verdict(summary: Mapping[str, Any]) -> list[str]:
-    """Return how the run ended, and how many claims about its loops have each verdict."""
-    return [ending_line(dict(summary)).text, claims_line(dict(summary))]
 
 
 def _link(run_dir: Path, name: str) -> str | None:

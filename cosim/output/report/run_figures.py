@@ -97,7 +97,7 @@ def _thinned(record: RunRecord) -> _Thinned:
     """Align a run; of each part, keep the extremes of all curves at the resolution of a figure."""
     found = []
     for part in aligned_parts(record):
-        run, true_x = part.aligned, part.true_x
+        run, true_x = _from_first_update(part.aligned, record), part.true_x
         curves = [run.x, run.x_s, run.x_c, run.e_s_norm, run.threshold, run.e_c_norm]
         curves += [] if true_x is None else [true_x]
         keep = decimate_all(_seconds(run.t_ns), np.column_stack(curves), record.slice_columns)
@@ -106,6 +106,15 @@ def _thinned(record: RunRecord) -> _Thinned:
     whole = AlignedRun._make(map(np.concatenate, zip(*(one.run for one in found), strict=True)))
     true_states = [one.true_x for one in found if one.true_x is not None]
     return _Thinned(whole, np.concatenate(true_states) if true_states else None)
+
+
+def _from_first_update(run: AlignedRun, record: RunRecord) -> AlignedRun:
+    """Return the samples without the controller's state and error where it knows no state."""
+    known = run.since_delivery(record.scenario)
+    return run._replace(
+        x_c=np.where(known[:, None], run.x_c, np.nan),
+        e_c_norm=np.where(known, run.e_c_norm, np.nan),
+    )
 
 
 def _reduced(record: RunRecord, table: str, column: str) -> tuple[Reals, Reals]:

@@ -77,18 +77,28 @@ class WebViewer:
 def peer_user(connection: socket.socket) -> int | None:
     """Return the user id of the process at the other end; None if there is none, or it is unknown.
 
-    Linux's list of sockets has the user of each. A connection that no process has accepted yet has
-    no user.
+    A connection that no process has accepted yet has no user.
     """
     try:
-        wanted = [_written(connection.getpeername()), _written(connection.getsockname())]
+        return socket_user(connection.getpeername(), connection.getsockname())
+    except OSError:  # the connection is broken
+        return None
+
+
+def socket_user(own: tuple[str, int], peer: tuple[str, int]) -> int | None:
+    """Return the user id of a socket by its addresses; None if there is none, or it is unknown.
+
+    Linux's list of sockets has the user of each.
+    """
+    try:
+        wanted = [_written(own), _written(peer)]
         for _ in range(_TRIES):
             for line in _SOCKETS.read_text().splitlines()[1:]:
                 fields = line.split()
                 user, inode = fields[7], fields[9]
                 if fields[1:3] == wanted and inode != "0":
                     return int(user)
-    except OSError:  # the connection is broken, or this is not Linux
+    except OSError:  # this is not Linux
         pass
     return None
 

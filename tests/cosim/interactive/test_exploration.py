@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 import noack
-from cosim.interactive import ensemble, exploration, run_exploration
+from cosim.interactive import ensemble, exploration, figure_curves, run_exploration
 from cosim.interactive import scenario_guarantee as guarantee
+from cosim.interactive.figure_curves import Shown
+from cosim.lab.chart_options import data_options
 from cosim.simulation.continuous.continuous_report import run_continuous
 from cosim.studies.campaign.random_draws import drawn_scenario
 from noack.config.resolution import resolve
@@ -35,6 +37,38 @@ def test_the_sensor_error_stays_at_or_below_its_threshold() -> None:
     assert found.threshold is not None
     # Event 0 is at t = 0, before the models know the state.
     assert (found.e_s_norm <= found.threshold * (1 + 1e-9)).all()
+
+
+def test_the_controllers_curves_begin_with_its_first_update() -> None:
+    found = exploration.explore(noack.load("lane_following"))
+    drawn = figure_curves.sources(Shown(found, 0))["run"]
+    assert found.e_c_norm[0] == pytest.approx(found.x_norm[0])  # it knows no state
+    for column in (drawn["x_c"], drawn["e_c"]):
+        assert np.flatnonzero(np.isnan(column)).tolist() == [0]
+    assert drawn["x_c"][1] == drawn["x"][1]
+    known = exploration.explore(
+        noack.load("lane_following", {"network.initial_sync": "known_state"})
+    )
+    assert np.isfinite(figure_curves.sources(Shown(known, 0))["run"]["e_c"]).all()
+
+
+def test_a_legend_names_what_is_drawn() -> None:
+    scenario = noack.load("lane_following")
+    run = exploration.explore(scenario)
+    alone = Shown(run, 0)
+    certified = alone._replace(guarantee=guarantee.certify(scenario))
+    void = alone._replace(guarantee=guarantee.certify(noack.load("unstable_pendulum", {
+        "mode": "zoh", "network.mansd": 10, "trigger": {"policy": "periodic", "period_s": 0.1},
+    })))  # fmt: skip
+    assert void.guarantee is not None
+    assert void.guarantee.verdict != guarantee.CERTIFIED
+    for shown, expected in ((alone, False), (certified, True), (void, False)):
+        legends = figure_curves.legends(figure_curves.sources(shown))
+        assert ("certified bound" in legends["errors"]) is expected
+        assert figure_curves.BAND not in legends["state"]
+        assert data_options(shown)["legend"][1]["data"] == [
+            {"name": name} for name in legends["errors"]
+        ]
 
 
 def test_a_run_that_diverges_is_drawn_up_to_that_time() -> None:

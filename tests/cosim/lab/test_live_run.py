@@ -2,6 +2,8 @@
 
 import asyncio
 import json
+import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -34,10 +36,12 @@ def test_the_states_follow_each_other() -> None:
     said(run, "finalising", reason="horizon")
     assert run.state == "finalising"
     assert not run.is_over
-    said(run, "ended", run_dir="/runs/one", reason="horizon", ok=True)
+    lines = [["completed 20 s", "green"], ["3 transmissions, 2 delivered", ""]]
+    said(run, "ended", run_dir="/runs/one", reason="horizon", ok=True, verdict=lines)
     assert run.is_over
     assert run.ok
     assert run.progress["events"] == 3
+    assert run.verdict == [("completed 20 s", "green"), ("3 transmissions, 2 delivered", "")]
 
 
 def test_each_warning_and_change_is_a_line_once() -> None:
@@ -75,14 +79,18 @@ def test_the_log_is_bounded() -> None:
         run._take(f"line {number}")
     assert len(run.lines) == 200
     assert run.lines[-1] == "line 999"
+    assert run.first_line == 800
 
 
 def test_a_stop_after_the_loop_ended_keeps_the_summary(tmp_path: Path) -> None:
-    scenario = tmp_path / "one.toml"
-    scenario.write_text(open_draft("double_integrator").with_value("horizon_s", 1.0).text)
-    command = python_command("-m", "cosim.lab.live_child", str(scenario), str(tmp_path / "runs"))
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    text = open_draft("double_integrator").with_value("horizon_s", 1.0).text
+    command = python_command("-m", "cosim.lab.live_child", tmp_path, tmp_path / "runs")
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                          text=True) as process:  # fmt: skip
+        assert process.stdin is not None
         assert process.stdout is not None
+        process.stdin.write(text)
+        process.stdin.close()
         told = []
         for line in process.stdout:
             told.append(json.loads(line)["what"])
@@ -91,6 +99,30 @@ def test_a_stop_after_the_loop_ended_keeps_the_summary(tmp_path: Path) -> None:
     assert told[-2:] == ["finalising", "ended"]
     (run,) = [path for path in (tmp_path / "runs").iterdir() if not path.is_symlink()]
     assert (run / "summary.json").exists()
+
+
+def test_a_run_writes_nothing_beside_the_scenario_and_reads_the_files_there(
+    tmp_path: Path,
+) -> None:
+    """Another user may replace what is written there, or place links before."""
+    folder, private = tmp_path / "shared", tmp_path / "private"
+    folder.mkdir()
+    private.write_text("precious")
+    draft = open_draft("saturated_lqr").with_value("horizon_s", 0.5)
+    shutil.copy(draft.folder / "saturated_lqr.py", folder)
+    (folder / f".lab-{os.getpid()}.toml").symlink_to(private)
+    before = folder.stat().st_mtime_ns  # changes if a file is made, renamed or removed
+
+    async def run() -> LiveRun:
+        live = LiveRun(0.5)
+        await live.start(draft.text, folder, tmp_path / "runs")
+        await live.follow()
+        return live
+
+    live = asyncio.run(run())
+    assert live.state == "ended", live.lines
+    assert folder.stat().st_mtime_ns == before
+    assert private.read_text() == "precious"
 
 
 STUBBORN = """

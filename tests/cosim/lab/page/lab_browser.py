@@ -42,7 +42,8 @@ class Served:
             self._process.kill()
             assert self._process.stdout is not None
             self._process.stdout.close()
-        assert self.errors.read_text() == ""
+        errors = self.errors.read_text()
+        assert not errors, errors
 
 
 class Page:
@@ -100,6 +101,23 @@ class Page:
         )
         self.wait(f"{found}.length > 0")
         self.js(f"{found}.at(-1).click()")
+
+    def press_button(self, text: str) -> None:
+        """Click on a button with the mouse, once it can be clicked."""
+        found = (
+            f"[...document.querySelectorAll('button')].find(e => !e.disabled && "
+            f"e.innerText.trim().toLowerCase().endsWith({json.dumps(text)}))"
+        )
+        self.wait(f"!!{found}")
+        self.js(f"{found}.scrollIntoView({{ block: 'center' }})")
+        x, y = self.js(
+            f"(r => [r.x + r.width / 2, r.y + r.height / 2])({found}.getBoundingClientRect())"
+        )
+        for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
+            self.call(
+                "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1,
+                clickCount=1,
+            )  # fmt: skip
 
     def unfold(self, title: str) -> None:
         """Open a part of the settings."""

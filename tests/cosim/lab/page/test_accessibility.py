@@ -1,6 +1,7 @@
 """The page for everyone: names, contrast, keyboard, small screens, in light and dark."""
 
 import json
+import math
 from importlib.resources import files
 from typing import Any
 
@@ -14,6 +15,11 @@ from tools.screenshot_recording import Browser
 
 TABS = ("explore", "run live", "recorded runs", "tutorial")
 CONTROLS = {"slider", "button", "textbox", "combobox", "tab", "switch", "checkbox", "link"}
+SMALL = """[...document.querySelectorAll('.lab-body *')].filter(e =>
+  e.checkVisibility({visibilityProperty: true}) && parseFloat(getComputedStyle(e).fontSize) < 13
+  && [...e.childNodes].some(n => n.nodeType === Node.TEXT_NODE && n.textContent.trim())
+).map(e => e.innerText)"""
+"""Texts in a size that is hard to read."""
 RULES = {"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa"], "iframes": False}
 EDITOR = {"light": "=== 'rgb(255, 255, 255)'", "dark": "!== 'rgb(255, 255, 255)'"}
 
@@ -48,6 +54,8 @@ def test_controls_have_names_and_text_has_contrast(
 ) -> None:
     page = Page(browser, address, size=size, scheme=scheme)
     page.js("document.head.insertAdjacentHTML('beforeend', '<style>*{transition:none !important}')")
+    if size[0] < 800:
+        page.press_button("settings")
     for part in ("all settings (form)", "trigger", "all settings (TOML)"):
         page.unfold(part)
     page.wait("!!document.querySelector('.cm-content[aria-label]')")
@@ -61,9 +69,44 @@ def test_controls_have_names_and_text_has_contrast(
         assert violations(page) == [], tab
         assert nameless(page) == [], tab
         assert page.js("document.scrollingElement.scrollWidth <= innerWidth"), tab
+        assert page.js(SMALL) == [], tab
     page.fill("beta", "abc")
     page.wait("!!document.querySelector('.q-field--error')")
     assert violations(page) == []
+
+
+def test_on_a_small_screen_the_settings_are_folded_and_the_header_is_one_row(
+    browser: Browser, address: str
+) -> None:
+    page = Page(browser, address, size=(390, 844))
+    height = "document.querySelector('.lab-settings').getBoundingClientRect().height"
+    assert page.js("document.querySelector('.q-header').getBoundingClientRect().height") < 60
+    expanded = "document.querySelector('[aria-expanded]:is(button)').ariaExpanded"
+    folded = page.js(height)
+    assert folded < 60
+    assert "slider" not in roles(page)
+    page.press_button("settings")
+    page.wait(f"{expanded} === 'true' && {height} > 300")
+    assert "slider" in roles(page)
+    page.drag("loss probability", 0.0)
+    page.wait(f"{TEXT}.includes(', 0 (0 %) lost')")
+    page.press_button("settings")
+    page.wait(f"{expanded} === 'false' && {height} === {folded}")
+
+
+def roles(page: Page) -> set[str]:
+    """Return the roles of what can be used now."""
+    nodes = page.call("Accessibility.getFullAXTree")["nodes"]
+    return {node["role"]["value"] for node in nodes if not node["ignored"]}
+
+
+def test_a_slider_says_its_value_not_its_place(browser: Browser, address: str) -> None:
+    page = Page(browser, address)
+    beta = "document.querySelector('[aria-label=\"β, threshold at the start\"]')"
+    page.wait(f"{beta}.ariaValueText === '0.5'")
+    assert float(page.js(f"{beta}.ariaValueNow")) == pytest.approx(math.log10(0.5))
+    page.drag("β, threshold at the start", 1.0)
+    page.wait(f"{beta}.ariaValueText === '5'")
 
 
 FOCUSED = """(() => {

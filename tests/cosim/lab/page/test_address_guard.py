@@ -1,16 +1,21 @@
 """Only requests that know the secret and come from the page itself are answered."""
 
 import asyncio
+import os
 from collections.abc import MutableMapping
+from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 
 pytest.importorskip("nicegui", reason="the extra `lab` is not installed")
 
+from cosim.lab.page import address_guard, lab_server
 from cosim.lab.page.address_guard import AddressGuard
+from cosim.lab.page.lab_server import LabOptions
 
-SECRET = "s" * 43
+SECRET, OPENING = "s" * 43, "o" * 43
 
 
 def answer(kind: str, path: str, **headers: str) -> list[MutableMapping[str, Any]]:
@@ -28,8 +33,11 @@ def answer(kind: str, path: str, **headers: str) -> list[MutableMapping[str, Any
         sent.append(message)
 
     given = [(name.encode(), value.encode()) for name, value in headers.items()]
-    scope = {"type": kind, "path": path, "headers": given}
-    asyncio.run(AddressGuard(inner, SECRET)(scope, receive, send))
+    scope = {
+        "type": kind, "path": path, "headers": given, "query_string": b"a=1",
+        "client": ("127.0.0.1", 4711), "server": ("127.0.0.1", 8765),
+    }  # fmt: skip
+    asyncio.run(AddressGuard(inner, SECRET, OPENING)(scope, receive, send))
     return sent
 
 
@@ -64,3 +72,36 @@ def test_a_websocket_of_another_page_is_refused(origin: str | None) -> None:
     headers = {"host": "127.0.0.1:8765"} | ({} if origin is None else {"origin": origin})
     (message,) = answer("websocket", f"/{SECRET}/", **headers)
     assert message["type"] == "websocket.close"
+
+
+@pytest.mark.parametrize("user", [os.getuid(), os.getuid() + 1, None])
+def test_the_address_on_a_command_line_is_for_processes_of_this_user(
+    user: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every user can read command lines."""
+    asked = []
+    monkeypatch.setattr(address_guard, "socket_user", lambda *of: asked.append(of) or user)
+    first, _ = answer("http", f"/{OPENING}/", host="127.0.0.1:8765")
+    assert asked == [(("127.0.0.1", 4711), ("127.0.0.1", 8765))]
+    if user == os.getuid():
+        assert (first["status"], first["headers"][0][1]) == (303, f"/{SECRET}/?a=1".encode())
+    else:
+        assert first["status"] == 404
+        assert SECRET not in str(first)
+
+
+def test_the_browser_is_started_with_the_address_for_command_lines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened, announced = list[str](), list[str]()
+
+    def open_page(address: str) -> None:
+        opened.append(address)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(lab_server.webbrowser, "open", open_page)
+    options = LabOptions("lane_following", "", tmp_path, tmp_path / "runs", 0, open_browser=True)
+    lab_server.serve(options, announced.append)
+    (page,), (line) = announced, opened[0]
+    assert urlsplit(page).netloc == urlsplit(line).netloc
+    assert urlsplit(page).path != urlsplit(line).path

@@ -10,7 +10,7 @@ import pytest
 from cosim.interactive.draft import open_draft
 from cosim.interactive.scenario_guarantee import VOID, Margin
 from cosim.lab.page import session as under_test
-from cosim.lab.page.lab_services import LabServices
+from cosim.lab.page.lab_services import PageCalls
 from cosim.lab.page.session import Session
 
 
@@ -30,7 +30,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Session]:
     return []
 
 
-def session_of(name: str, drawn: list[Session], **settings: Any) -> Session:
+def session_of(name: str, drawn: list[Session], calls: object = None, **settings: Any) -> Session:
     draft = open_draft(name)
     for key, value in settings.items():
         draft = draft.with_value(key.replace("__", "."), value)
@@ -39,7 +39,7 @@ def session_of(name: str, drawn: list[Session], **settings: Any) -> Session:
         drawn.append(found)
         await asyncio.sleep(0)  # as the browser's answer is awaited
 
-    found = Session(cast("LabServices", Inline()), draft, on_drawn)
+    found = Session(cast("PageCalls", calls or Inline()), draft, on_drawn)
     return found
 
 
@@ -55,8 +55,38 @@ def test_certificate_and_margin_follow_the_run(drawn: list[Session]) -> None:
     assert found.run is not None
     assert found.guarantee is not None
     assert found.margin is not None
-    assert len(drawn) == 3
+    assert len(drawn) == 4
     assert found.warning == ""
+
+
+class Watched(Inline):
+    """Notes what the page shows when a computation begins."""
+
+    def __init__(self) -> None:
+        self.session: Session | None = None
+        self.begun: list[tuple[str, bool]] = []
+
+    async def compute(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        assert self.session is not None
+        while not self.session.pending.endswith("waiting for the processor"):
+            await asyncio.sleep(0)
+        self.begun.append((self.session.pending, self.session.guarantee is not None))
+        return await super().compute(function, *arguments)
+
+
+def test_the_certificate_is_shown_before_the_bands_and_waiting_is_said(
+    drawn: list[Session], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(under_test, "_SLOW_S", 0.0)
+    calls = Watched()
+    found = calls.session = session_of("lane_following", drawn, calls, horizon_s=2.0)
+    asyncio.run(settled(found))
+    assert calls.begun == [
+        ("certificate: waiting for the processor", False),
+        ("bands: waiting for the processor", True),
+        ("margin: waiting for the processor", True),
+    ]
+    assert found.pending == ""
 
 
 def test_of_many_changes_the_newest_is_drawn(drawn: list[Session]) -> None:

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from PIL import ImageColor
 
+import noack
 from cosim.analysis.quantile_sketch import QuantileSketch
 from cosim.output import palette
 from cosim.output.report import signal_figures
@@ -25,6 +26,7 @@ from noack.core.errors import CallerError
 from tests.cosim.output.report.conftest import HOSTILE
 from tests.cosim.output.test_palette import BACKGROUNDS, luminance
 
+CONTROLLER = printed(palette.CONTROLLER)
 SIZES = {"empty": 0, "one": 1, "not finite": 1000, "ten": 300, "long": 100_000}
 UNITS = re.compile(r"\[(s|wall µs)\]$")
 UNITLESS = re.compile(r"x_\d|norm|input|count|share of steps at least as late")
@@ -207,6 +209,17 @@ def test_the_papers_figure_is_named_as_in_the_paper(mode: Any, head: str) -> Non
         dropped=no, received_s=none, forced=no, title="one draw out of 1,000",
     )  # fmt: skip
     assert [text.get_text() for text in figure.texts] == [f"{head}: one draw out of 1,000"]
+
+
+def test_the_controllers_state_is_drawn_from_its_first_update_on() -> None:
+    late = {"network.impairments": [{"kind": "delay", "delay_s": 0.1}], "horizon_s": 1.0}
+    run = noack.simulate(noack.load("lane_following", late))
+    assert run.samples()["x_c_1"][0].as_py() == 0.0  # recorded: its state without an update
+    for name, axes in (("states", 0), ("errors", 0)):
+        lines = run.plot(name).axes[axes].lines
+        (points,) = [np.array(one.get_xydata()) for one in lines if one.get_color() == CONTROLLER]
+        first_s = points[np.isfinite(points[:, 1])][0, 0]
+        assert first_s == pytest.approx(0.1, abs=0.01), name
 
 
 def test_signal_names_are_drawn_literally() -> None:
