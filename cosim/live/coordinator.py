@@ -165,6 +165,11 @@ class Coordinator:
         member = self._members.get(role)
         return member is not None and member.is_over
 
+    def has_ended(self, role: str) -> bool:
+        """Whether the process of a role has reported its end; one that is lost has not."""
+        member = self._members.get(role)
+        return member is not None and member.state is State.GONE
+
     def is_exiting(self, role: str) -> bool:
         """Whether a process reported its end a moment ago, so that it may not have exited yet."""
         member = self._members.get(role)

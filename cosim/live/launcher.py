@@ -23,7 +23,7 @@ from cosim.live.fork_server import ForkServer, fork_server
 from cosim.live.remote_access import Listening, open_to_hosts, with_clocks
 from cosim.live.remote_hosts import RemoteStart
 from cosim.live.restart_policy import RestartPolicy
-from cosim.live.start_limit import DEFAULT_S, StartLimit
+from cosim.live.wait_limit import DEFAULT_S, WaitLimit
 from cosim.record.environment import write_environment
 from cosim.record.run_directory import active_run, new_run_dir, point_to_latest, write_scenario
 from cosim.record.run_ending import EndingFile, RunEnding
@@ -192,7 +192,8 @@ class _Run:
         self._watcher = watcher
         self._by_hand = [role for role in ROLES if role not in children]
         self._missing: tuple[str, ...] = ()
-        self._limit = StartLimit(self._start_within_s())
+        self._limit = WaitLimit(self._start_within_s())
+        """How long the launcher still waits: for the start, for the end, or for the stop."""
         self._policy = RestartPolicy(
             ticket.scenario,
             coordinator,
@@ -207,30 +208,31 @@ class _Run:
         ``store`` is called with the result of a run that ends early, before its processes end.
         """
         result: Failure | None = None
-        deadline_s, last_s, started = float("inf"), time.monotonic(), False
+        last_s, started = time.monotonic(), False
         while not self._is_over(stopping=result is not None):
             self._coordinator.poll()
             now_s = time.monotonic()
-            if self._coordinator.epoch_ns is None:
+            if result is not None or not self._is_in_loop():
                 self._limit.wait(now_s - last_s, os.getloadavg()[0])
-                last_s = now_s
+            last_s = now_s
+            if self._coordinator.epoch_ns is None:
                 if result is None:
                     self._notify_missing()
             elif not started:
                 started = True
                 point_to_latest(self._run_dir)
                 self._notify("started", self._run_dir)
-                deadline_s = now_s + longest_s(self._scenario.horizon_s / self._scenario.speed)
+                self._limit = WaitLimit(overtime_s(self._scenario.horizon_s / self._scenario.speed))
             self._notify_progress()
             if result is None:
                 result = _signalled(signals) or self._policy.check()
-                if result is None and (now_s > deadline_s or self._limit.is_reached):
+                if result is None and self._limit.is_reached:
                     result = (ExitStatus.FAILED, self._overdue())
                 if result is not None:
                     store(*result)
                     self._coordinator.stop(result[1])
-                    deadline_s = now_s + _STOP_TIMEOUT_S
-            elif now_s > deadline_s:
+                    self._limit = WaitLimit(_STOP_TIMEOUT_S)
+            elif self._limit.is_reached:
                 break
             time.sleep(_POLL_S)
         self._notify_progress()  # the last report may have arrived with the end
@@ -249,6 +251,11 @@ class _Run:
             failures = self._coordinator.failures()
             return stopping and all(role in failures for role in running)
         return stopping or all(self._coordinator.is_over(role) for role in self._by_hand)
+
+    def _is_in_loop(self) -> bool:
+        """Whether the run has started and has not reached its horizon."""
+        started = self._coordinator.epoch_ns is not None
+        return started and self._coordinator.now_ns() < self._scenario.timing.horizon_ns
 
     def _notify_missing(self) -> None:
         missing = tuple(role for role in self._coordinator.missing() if role in self._by_hand)
@@ -274,14 +281,15 @@ class _Run:
 
     def _overdue(self) -> str:
         if self._coordinator.epoch_ns is None:
-            return f"{', '.join(self._coordinator.missing())} {self._limit.explain()}"
-        here = [role for role in ROLES if not self._coordinator.is_over(role)]
+            return f"{', '.join(self._coordinator.missing())} {self._limit.explain_start()}"
+        # One that is lost, too: the recorder may not respond while it sorts a long record.
+        silent = [role for role in ROLES if not self._coordinator.has_ended(role)]
         # The recorder waits for the others.
-        late = [role for role in here if role != RECORDER] or here
-        return (
-            f"the run did not end at its horizon: no report from {', '.join(late)}, too slow or "
-            "stopped; reduce the speed or the rates"
-        )
+        silent = [role for role in silent if role != RECORDER] or silent
+        what = f"no report from {', '.join(silent)}"
+        if not silent:
+            what = f"{', '.join(self._children.running())} reported the end, but did not exit"
+        return f"the run did not end at its horizon: {what}, {self._limit.explain_end()}"
 
 
 def _signalled(signals: Signals) -> Failure | None:
@@ -290,6 +298,6 @@ def _signalled(signals: Signals) -> Failure | None:
     return signals.status, f"{_STOPPED[signals.received]} ({signal_name(signals.received)})"
 
 
-def longest_s(run_s: float) -> float:
-    """How long a run of ``run_s`` of wall time may take until all its processes have ended."""
-    return run_s * (1 + _OVERTIME_SHARE) + _OVERTIME_S
+def overtime_s(run_s: float) -> float:
+    """How long the processes of a run of ``run_s`` of wall time may take to end after it."""
+    return run_s * _OVERTIME_SHARE + _OVERTIME_S
