@@ -60,6 +60,7 @@ class Watcher:
     failed: Callable[[str, float, str | None], None] = lambda why, t_s, by_hand: None
     restarted: Callable[[str, float], None] = lambda role, t_s: None
     progress: Callable[[dict[str, Any]], None] = lambda progress: None
+    stopping: Callable[[str], None] = lambda why: None
 
 
 def joint_watcher(watchers: Sequence[Watcher]) -> Watcher:
@@ -231,6 +232,8 @@ class _Run:
                 if result is not None:
                     store(*result)
                     self._coordinator.stop(result[1])
+                    if started:
+                        self._notify("stopping", result[1])
                     self._limit = WaitLimit(_STOP_TIMEOUT_S)
             elif self._limit.is_reached:
                 break

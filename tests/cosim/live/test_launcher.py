@@ -270,6 +270,32 @@ def test_a_progress_report_that_arrives_at_the_end_is_shown(case: Case) -> None:
     assert shown == [{"warnings": ["late"]}]
 
 
+def test_why_a_run_ends_early_is_shown_before_its_processes_end(case: Case) -> None:
+    """The completion of the record of many loops takes minutes."""
+    children = case.children(None)
+    shown: list[str] = []
+
+    class Ending(FakeCoordinator):
+        def poll(self) -> None:
+            children.exit("plant", -9)  # never restarted
+
+        def progress(self) -> None: ...
+
+        def stop(self, reason: str) -> None: ...
+
+    def stopping(why: str) -> None:
+        assert children.running()
+        shown.append(why)
+        for role in ROLES:
+            children.exit(role, 0)
+
+    status, reason = case.run(children, Ending(0.5), stopping=stopping).watch(
+        Signals(), lambda *_: None
+    )
+    assert shown == [reason] == ["plant died: killed by SIGKILL"]
+    assert status is ExitStatus.FAILED
+
+
 def test_a_refused_session_leaves_no_run_directory(
     content: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
