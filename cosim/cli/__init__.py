@@ -25,10 +25,10 @@ def main() -> None:
     """Entry point."""
     from contextlib import suppress
 
-    from noack.runtime.signals import quiet_interrupt
+    from noack.runtime.signals import stoppable_imports
 
     words = sys.argv[1:]
-    with quiet_interrupt():
+    with stoppable_imports():
         server = None
         if sys.platform == "linux" and words[:1] and words[0] in _LIVE and "--help" not in words:
             from cosim.live.fork_server import ForkServer
@@ -38,4 +38,4 @@ def main() -> None:
         from cosim.cli.command import register_commands, run_program
 
         register_commands(*words[:1])
-    run_program(server)
+        run_program(server)  # a command handles signals itself

@@ -24,6 +24,7 @@ from noack.core.python_process import cores as cores
 from noack.runtime.command_line import failed
 from noack.runtime.json_log import LogFormat as LogFormat
 from noack.runtime.json_log import log_format
+from noack.runtime.signals import StopRequestError, stop_requests_raised
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -242,9 +243,13 @@ def command(
         def reported(*arguments: Any, **options: Any) -> None:
             as_json = bool(options.get("json"))
             try:
-                status = function(*arguments, **options)
+                with stop_requests_raised():
+                    status = function(*arguments, **options)
                 if sys.stdout is not None:  # closed by the shell: >&-
                     sys.stdout.flush()
+            except StopRequestError as error:
+                what = "; ".join([str(error), *getattr(error, "__notes__", ())])
+                status = failed(what, error.exit_status, who=NAME, as_json=as_json)
             except NoackError as error:
                 status = failed(str(error), error.exit_status, who=NAME, as_json=as_json)
             except OSError as error:  # standard output is on a full disk
@@ -329,7 +334,4 @@ def run_program(server: "ForkServer | None" = None) -> None:
     """Run the command of the command line; a live run uses the server."""
     if sys.argv[1:2] != ["netem"]:  # the emulator ends when its output is closed
         be_patient()
-    try:
-        app(prog_name=NAME, obj=server)
-    except KeyboardInterrupt:
-        sys.exit(ExitStatus.INTERRUPTED)
+    app(prog_name=NAME, obj=server)

@@ -7,15 +7,14 @@ directory with everything that was recorded.
 import contextlib
 import os
 import shutil
-import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from cosim.live.child_processes import ChildProcesses, Failure, signal_name
+from cosim.live.child_processes import ChildProcesses, Failure
 from cosim.live.compilation import compile_for
 from cosim.live.coordinator import Coordinator
 from cosim.live.disk_space import require_disk_space
@@ -37,13 +36,8 @@ from noack.runtime.control_plane import run_name
 from noack.runtime.invitation import invitation_file
 from noack.runtime.join_ticket import Ticket, new_ticket, published
 from noack.runtime.life_cycle import HORIZON
-from noack.runtime.signals import Signals
+from noack.runtime.signals import Signals, stop_reason
 
-_STOPPED: Mapping[int, str] = {
-    signal.SIGINT: "stopped by the user",
-    signal.SIGTERM: "stopped on request",
-    signal.SIGHUP: "stopped because the terminal was closed",
-}
 _POLL_S = 0.01
 _STOP_TIMEOUT_S = 15.0
 _OVERTIME_S, _OVERTIME_SHARE = 20.0, 0.2
@@ -123,11 +117,11 @@ def launch(
         away = {} if listening is None else listening.hosts
         here = [role for role in spawn if role not in away]
         compile_for(scenario, here)
+        signals = stack.enter_context(Signals().handled())
         run_dir = new_run_dir(runs, resolved.name)
         resolved = write_scenario(resolved, run_dir)
         ticket = new_ticket(resolved, run_dir.resolve(), launched=True)
         write_environment(run_dir, "live", run_name(ticket.run_id))
-        signals = stack.enter_context(Signals().handled())
         stack.enter_context(active_run(run_dir))
         ending = stack.enter_context(EndingFile(run_dir))
         _publish_run(stack, ticket, session)  # first: its file leads to a killed run's socket
@@ -298,7 +292,7 @@ class _Run:
 def _signalled(signals: Signals) -> Failure | None:
     if signals.received is None:
         return None
-    return signals.status, f"{_STOPPED[signals.received]} ({signal_name(signals.received)})"
+    return signals.status, stop_reason(signals.received)
 
 
 def overtime_s(run_s: float) -> float:
