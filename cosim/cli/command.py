@@ -20,6 +20,7 @@ from cosim.output.figure_format import FigureFormat
 from cosim.record.run_directory import DEFAULT_RUNS as DEFAULT_RUNS
 from cosim.shipped_files import find_shipped
 from noack.core.errors import ExitStatus, NoackError, why
+from noack.core.process_limits import exhausted_limit
 from noack.core.python_process import cores as cores
 from noack.runtime.command_line import failed
 from noack.runtime.json_log import LogFormat as LogFormat
@@ -252,13 +253,10 @@ def command(
                 status = failed(what, error.exit_status, who=NAME, as_json=as_json)
             except NoackError as error:
                 status = failed(str(error), error.exit_status, who=NAME, as_json=as_json)
-            except OSError as error:  # standard output is on a full disk
-                what = (
-                    f"cannot write: {why(error)}"
-                    if _is_here()
-                    else "the current folder was deleted"
-                )
-                status = failed(what, ExitStatus.FAILED, who=NAME, as_json=as_json)
+            except Exception as error:
+                if (line := exhausted_limit(error) or _why_not_written(error)) is None:
+                    raise
+                status = failed(line, ExitStatus.FAILED, who=NAME, as_json=as_json)
             raise typer.Exit(int(status))
 
         epilog = "\n".join(["\b", "Examples:", *_columns(examples)]) if examples else None
@@ -271,12 +269,15 @@ def command(
     return register
 
 
-def _is_here() -> bool:
-    """Whether the current folder still exists."""
+def _why_not_written(error: Exception) -> str | None:
+    """Return why standard output cannot be written; None if this is another error."""
+    if not isinstance(error, OSError):
+        return None
     try:
-        return Path.cwd().is_dir()
+        here = Path.cwd().is_dir()
     except OSError:
-        return False
+        here = False
+    return f"cannot write: {why(error)}" if here else "the current folder was deleted"
 
 
 def register_commands(wanted: str = "") -> None:
