@@ -96,6 +96,8 @@ class Coordinator:
         """The process of each role that has joined last."""
         self._replaceable: dict[str, str] = {}
         """Roles that a restarted process may take, and how the process before it ended."""
+        self.joined: dict[str, dict[str, Any]] = {}
+        """The processes that passed the start barrier, by instance: ``process``, ``generation``."""
         self._reported: dict[str, str] = {}
         self._stopped: str | None = None
 
@@ -334,6 +336,7 @@ class Coordinator:
         """Answer a join request with the start of the run."""
         if member.state is State.AT_BARRIER:
             member.apply(Event.START)
+        self.joined[member.instance] = {"process": member.role, "generation": member.generation}
         addresses = {role: self._members[role].address for role in LOOP_ROLES}
         query, member.query = member.query, None
         assert query is not None

@@ -5,6 +5,7 @@ directory with everything that was recorded.
 """
 
 import contextlib
+import json
 import os
 import shutil
 import sys
@@ -24,11 +25,18 @@ from cosim.live.remote_hosts import RemoteStart
 from cosim.live.restart_policy import RestartPolicy
 from cosim.live.wait_limit import DEFAULT_S, WaitLimit
 from cosim.record.environment import write_environment
-from cosim.record.run_directory import active_run, new_run_dir, point_to_latest, write_scenario
+from cosim.record.run_directory import (
+    PROCESSES_FILE,
+    active_run,
+    new_run_dir,
+    point_to_latest,
+    write_scenario,
+)
 from cosim.record.run_ending import EndingFile, RunEnding
 from noack.config.resolution import resolved_loops, tables_of
 from noack.config.scenario import Scenario
-from noack.core.errors import ExitStatus, NeverStartedError, NoackError
+from noack.core.errors import ExitStatus, MachineError, NeverStartedError, NoackError
+from noack.core.file_access import write_whole
 from noack.protocol.topology import PLANT, RECORDER, ROLES
 from noack.runtime import run_registry
 from noack.runtime.address import text_of
@@ -203,7 +211,7 @@ class _Run:
         ``store`` is called with the result of a run that ends early, before its processes end.
         """
         result: Failure | None = None
-        last_s, started = time.monotonic(), False
+        last_s, started, joined = time.monotonic(), False, 0
         while not self._is_over(stopping=result is not None):
             self._coordinator.poll()
             now_s = time.monotonic()
@@ -218,6 +226,9 @@ class _Run:
                 point_to_latest(self._run_dir)
                 self._notify("started", self._run_dir)
                 self._limit = WaitLimit(overtime_s(self._scenario.horizon_s / self._scenario.speed))
+            if len(self._coordinator.joined) > joined:
+                joined = len(self._coordinator.joined)
+                self._write_processes()
             self._notify_progress()
             if result is None:
                 result = _signalled(signals) or self._policy.check()
@@ -253,6 +264,12 @@ class _Run:
         """Whether the run has started and has not reached its horizon."""
         started = self._coordinator.epoch_ns is not None
         return started and self._coordinator.now_ns() < self._scenario.timing.horizon_ns
+
+    def _write_processes(self) -> None:
+        """Write which processes joined, for `noack collect`; without that the run goes on."""
+        text = json.dumps(self._coordinator.joined, indent=2)
+        with contextlib.suppress(MachineError):
+            write_whole(self._run_dir / PROCESSES_FILE, text, make_folder=False)
 
     def _notify_missing(self) -> None:
         missing = tuple(role for role in self._coordinator.missing() if role in self._by_hand)

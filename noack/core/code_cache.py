@@ -187,7 +187,7 @@ def _optimised_once() -> Iterator[None]:
 
 @contextmanager
 def _to_the_end() -> Iterator[None]:
-    """Delay signals that are handled: an exception in a callback of LLVM would crash the process."""
+    """Delay handled signals: an exception in a Python callback of LLVM would crash the process."""
     came: list[int] = []
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     before = {number: signal.getsignal(number) for number in numbers}

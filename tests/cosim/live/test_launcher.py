@@ -41,6 +41,7 @@ class FakeCoordinator:
         self._now_s, self._exiting, self._failures = now_s, exiting, failures
         self._running: tuple[str, ...] = ROLES
         self.restarts: list[str] = []
+        self.joined: dict[str, Any] = {}
 
     def now_ns(self) -> int:
         return round(self._now_s * 1e9)

@@ -108,8 +108,8 @@ def test_an_interrupted_and_then_killed_campaign_continues_where_it_stopped(
     _, err = interrupted.communicate()
     assert interrupted.returncode == 130
     assert err == (
-        f"noack: stopped by the user (SIGINT); {len(files(folder))} of {RUNS} runs are in {folder}; "
-        "the same command continues the campaign\n"
+        f"noack: stopped by the user (SIGINT); {len(files(folder))} of {RUNS} runs are in "
+        f"{folder}; the same command continues the campaign\n"
     )
     assert psutil.wait_procs(children, timeout=60)[1] == []
     killed = start()
