@@ -91,20 +91,27 @@ def collect(run_dir: Path, source: str, complete: Callable[[Path], T]) -> tuple[
             merged = Path(scratch) / run_dir.name
             shutil.copytree(run_dir, merged, symlinks=True)
             roles = _take(folder / SPOOL, merged, source)
-            try:
-                outcome = complete(merged)
-                _require_consistent(run_dir, merged, source)
-            except NoackError:
-                raise
-            except Exception as error:  # rows that no process writes
-                raise PeerError(
-                    f"{source}: what was kept there cannot be merged: {error!r}"
-                ) from None
+            outcome = _completed(complete, merged, run_dir, source)
+            _require_consistent(run_dir, merged, source)
             run_dir.rename(Path(scratch) / "before")
             merged.rename(run_dir)
     except OSError as error:
-        raise MachineError(f"{run_dir}: nothing was added from {source}: {why(error)}") from None
+        # Of several files that cannot be copied, each with source and copy: the first one's reason.
+        reason = error.args[0][0][2] if isinstance(error, shutil.Error) else why(error)
+        raise MachineError(f"{run_dir}: nothing was added from {source}: {reason}") from None
     return outcome, roles
+
+
+def _completed(complete: Callable[[Path], T], merged: Path, run_dir: Path, source: str) -> T:
+    """Complete the merged record; an error names the run, and not the copy that is removed."""
+    try:
+        return complete(merged)
+    except MachineError as error:
+        reason = str(error).partition(";")[0].replace(str(merged), str(run_dir))
+        raise MachineError(f"{reason}; nothing was added from {source}") from None
+    except Exception as error:  # rows that no process writes
+        text = str(error) if isinstance(error, NoackError) else repr(error)
+        raise PeerError(f"{source}: what was kept there cannot be merged: {text}") from None
 
 
 def _require_kept_of(run_dir: Path, folder: Path, source: str) -> None:

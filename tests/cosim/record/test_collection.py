@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from cosim.record.spool_conversion import finish_record
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
-from noack.core.errors import CallerError, NoackError, PeerError
+from noack.core.errors import CallerError, MachineError, NoackError, PeerError
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP
 from noack.runtime.record_handover import OwnSpool
 from noack.runtime.spool import SPOOL, SpoolWriter, writer_of
@@ -43,7 +44,9 @@ def run_dir(whole: RunRecord, tmp_path: Path) -> Path:
     found.mkdir(parents=True)
     write_scenario(whole.scenario, found)
     write_environment(found, "live", RUN)
-    reports = {role: one | {"process": role, "generation": 0} for role, one in whole.reports.items()}
+    reports = {
+        role: one | {"process": role, "generation": 0} for role, one in whole.reports.items()
+    }
     del reports["controller"]
     (found / REPORTS_FILE).write_text(json.dumps(reports))
     joined = {WRITER[role]: {"process": role, "generation": 0} for role in SECRETS}
@@ -209,13 +212,29 @@ def test_a_hostile_host_changes_nothing(
     assert contents(run_dir.parent) == before
 
 
-def test_a_record_that_cannot_be_completed_changes_nothing(run_dir: Path, kept: Kept) -> None:
-    def fail(_: Path) -> None:
-        raise ZeroDivisionError
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (ZeroDivisionError(), r"cannot be merged: ZeroDivisionError\(\)"),
+        (CallerError("damaged"), "cannot be merged: damaged"),
+        (
+            MachineError("record: disk full; try again"),
+            "^record: disk full; nothing was added from",
+        ),
+        (shutil.Error([("a", "b", "disk full")]), "nothing was added from .*: disk full"),
+    ],
+)
+def test_a_record_that_cannot_be_completed_changes_nothing(
+    run_dir: Path, kept: Kept, error: Exception, reason: str
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise error
 
     kept.keep()
     before = contents(run_dir.parent)
-    with pytest.raises(PeerError, match="cannot be merged: ZeroDivisionError"):
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(NoackError, match=reason):
+        if isinstance(error, shutil.Error):
+            patch.setattr(shutil, "copytree", fail)
         collect(run_dir, str(kept.folder), fail)
     assert contents(run_dir.parent) == before
 
