@@ -3,9 +3,9 @@
 import sys
 from collections.abc import Sequence
 
-from noack.runtime.signals import quiet_interrupt
+from noack.runtime.signals import stoppable_imports
 
-with quiet_interrupt():
+with stoppable_imports():
     from controller_node.controller import controller_of
     from controller_node.controller_arrays import CONTROLLER_FLEET
     from noack.core.errors import ExitStatus

@@ -8,9 +8,9 @@ In a run, it is one of the run's processes. On its own, it relays for any UDP pr
 import sys
 from collections.abc import Mapping, Sequence
 
-from noack.runtime.signals import quiet_interrupt
+from noack.runtime.signals import stoppable_imports
 
-with quiet_interrupt():
+with stoppable_imports():
     from netem.duplex_link import network_of
     from netem.engine.run_network import RunNetwork
     from netem.run_relay import CoreShell, RelayShell

@@ -66,8 +66,6 @@ class LinkState:
         """(rows,) of ``noack_flow``."""
         self.decision: Any = ffi.new("noack_decision *")
         """The decision for the last packet, a ``noack_decision``; overwritten by the next."""
-        self._memory: dict[str, Any] = {}
-        self._stages: Any = None
         self.core: Any = ffi.new("noack_link *")
         """The link, as the core's functions take it; its address does not change. It is valid as
         long as this object lives."""

@@ -3,9 +3,9 @@
 import sys
 from collections.abc import Sequence
 
-from noack.runtime.signals import quiet_interrupt
+from noack.runtime.signals import stoppable_imports
 
-with quiet_interrupt():
+with stoppable_imports():
     from noack.core.errors import ExitStatus
     from noack.runtime import process_entry
     from noack.runtime.loop_machines import run_machines

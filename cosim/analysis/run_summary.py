@@ -153,6 +153,9 @@ def _why_failed(
         if notice["level"] == FAILED:
             at_s = notice["t_ns"] * 1e-9
             return f"the {notice['process']} failed at {at_s:g} s: {notice['text']}"
+    surplus = [f"{-n:,} of {table}" for table, n in missing.items() if n < 0]
+    if surplus:
+        return f"the record has more rows than the processes reported: {', '.join(surplus)}"
     # Missing last rows of a killed process are no failure: a restarted process replaced it.
     incomplete = [f"{missing[table]:,} of {table}" for table in record.tables if missing[table] > 0]
     return f"rows are missing from the record: {', '.join(incomplete)}" if incomplete else None

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from cosim.cli.command import app, find_scenario
+    from cosim.live.fork_server import ForkServer
 else:
 
     def __getattr__(name: str) -> Any:
@@ -23,19 +24,36 @@ _LIVE = ("run", "demo", "record")
 
 def main() -> None:
     """Entry point."""
-    from contextlib import suppress
-
-    from noack.runtime.signals import quiet_interrupt
+    from noack.core.errors import NoackError
+    from noack.core.process_limits import exhausted_limit
+    from noack.runtime.command_line import failed
+    from noack.runtime.signals import stoppable_imports
 
     words = sys.argv[1:]
-    with quiet_interrupt():
-        server = None
-        if sys.platform == "linux" and words[:1] and words[0] in _LIVE and "--help" not in words:
-            from cosim.live.fork_server import ForkServer
+    as_json = "--json" in words
+    with stoppable_imports():
+        try:
+            server = _fork_server(words)
+            from cosim.cli.command import register_commands, run_program
 
-            with suppress(OSError):  # the command reports it
-                server = ForkServer()  # it imports while this process does
-        from cosim.cli.command import register_commands, run_program
+            register_commands(*words[:1])
+            run_program(server)  # a command handles signals itself
+        except NoackError as error:
+            sys.exit(failed(str(error), error.exit_status, who="noack", as_json=as_json))
+        except Exception as error:
+            if (line := exhausted_limit(error)) is None:
+                raise
+            sys.exit(failed(line, NoackError.exit_status, who="noack", as_json=as_json))
 
-        register_commands(*words[:1])
-    run_program(server)
+
+def _fork_server(words: list[str]) -> "ForkServer | None":
+    """Start the fork server of a live run, which imports while this process does."""
+    if sys.platform != "linux" or "--help" in words or not words or words[0] not in _LIVE:
+        return None
+    from contextlib import suppress
+
+    from cosim.live.fork_server import ForkServer
+
+    with suppress(OSError):  # the command reports it
+        return ForkServer()
+    return None

@@ -20,10 +20,12 @@ from cosim.output.figure_format import FigureFormat
 from cosim.record.run_directory import DEFAULT_RUNS as DEFAULT_RUNS
 from cosim.shipped_files import find_shipped
 from noack.core.errors import ExitStatus, NoackError, why
+from noack.core.process_limits import exhausted_limit
 from noack.core.python_process import cores as cores
 from noack.runtime.command_line import failed
 from noack.runtime.json_log import LogFormat as LogFormat
 from noack.runtime.json_log import log_format
+from noack.runtime.signals import StopRequestError, stop_requests_raised
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -45,7 +47,6 @@ _TOUR = (
 )
 """A first session: commands and their descriptions."""
 _MOST_COLUMNS = 78
-_INTERRUPTED = "stopped by the user (SIGINT)"
 
 RUNS, THEORY, CAMPAIGNS = "Runs", "Theory", "Campaigns"
 MEASURING = "Real networks"
@@ -243,20 +244,19 @@ def command(
         def reported(*arguments: Any, **options: Any) -> None:
             as_json = bool(options.get("json"))
             try:
-                status = function(*arguments, **options)
+                with stop_requests_raised():
+                    status = function(*arguments, **options)
                 if sys.stdout is not None:  # closed by the shell: >&-
                     sys.stdout.flush()
+            except StopRequestError as error:
+                what = "; ".join([str(error), *getattr(error, "__notes__", ())])
+                status = failed(what, error.exit_status, who=NAME, as_json=as_json)
             except NoackError as error:
                 status = failed(str(error), error.exit_status, who=NAME, as_json=as_json)
-            except KeyboardInterrupt:  # typer would end the program without a word
-                status = failed(_INTERRUPTED, ExitStatus.INTERRUPTED, who=NAME, as_json=as_json)
-            except OSError as error:  # standard output is on a full disk
-                what = (
-                    f"cannot write: {why(error)}"
-                    if _is_here()
-                    else "the current folder was deleted"
-                )
-                status = failed(what, ExitStatus.FAILED, who=NAME, as_json=as_json)
+            except Exception as error:
+                if (line := exhausted_limit(error) or _why_not_written(error)) is None:
+                    raise
+                status = failed(line, ExitStatus.FAILED, who=NAME, as_json=as_json)
             raise typer.Exit(int(status))
 
         epilog = "\n".join(["\b", "Examples:", *_columns(examples)]) if examples else None
@@ -269,12 +269,15 @@ def command(
     return register
 
 
-def _is_here() -> bool:
-    """Whether the current folder still exists."""
+def _why_not_written(error: Exception) -> str | None:
+    """Return why standard output cannot be written; None if this is another error."""
+    if not isinstance(error, OSError):
+        return None
     try:
-        return Path.cwd().is_dir()
+        here = Path.cwd().is_dir()
     except OSError:
-        return False
+        here = False
+    return f"cannot write: {why(error)}" if here else "the current folder was deleted"
 
 
 def register_commands(wanted: str = "") -> None:
@@ -332,7 +335,4 @@ def run_program(server: "ForkServer | None" = None) -> None:
     """Run the command of the command line; a live run uses the server."""
     if sys.argv[1:2] != ["netem"]:  # the emulator ends when its output is closed
         be_patient()
-    try:
-        app(prog_name=NAME, obj=server)
-    except KeyboardInterrupt:
-        sys.exit(failed(_INTERRUPTED, ExitStatus.INTERRUPTED, who=NAME, as_json=False))
+    app(prog_name=NAME, obj=server)

@@ -141,6 +141,14 @@ def warn_of_other_runs() -> None:
 
 def finalize_run(ending: "RunEnding", output: RunOutput) -> int:
     """Finish a run's record, print its verdict, and return its exit status."""
+    try:
+        return _finalize_run(ending, output)
+    except KeyboardInterrupt as error:
+        error.add_note(f"`noack summary {ending.run_dir}` completes its record")
+        raise
+
+
+def _finalize_run(ending: "RunEnding", output: RunOutput) -> int:
     from cosim.live.finalize import finalize
     from cosim.live.progress import PatientConsole
     from cosim.live.run_log import log_end

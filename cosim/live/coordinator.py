@@ -96,6 +96,8 @@ class Coordinator:
         """The process of each role that has joined last."""
         self._replaceable: dict[str, str] = {}
         """Roles that a restarted process may take, and how the process before it ended."""
+        self.joined: dict[str, dict[str, Any]] = {}
+        """The processes that passed the start barrier, by instance: ``process``, ``generation``."""
         self._reported: dict[str, str] = {}
         self._stopped: str | None = None
 
@@ -164,6 +166,11 @@ class Coordinator:
         """Whether the process of a role has joined, and has ended or is lost."""
         member = self._members.get(role)
         return member is not None and member.is_over
+
+    def has_ended(self, role: str) -> bool:
+        """Whether the process of a role has reported its end; one that is lost has not."""
+        member = self._members.get(role)
+        return member is not None and member.state is State.GONE
 
     def is_exiting(self, role: str) -> bool:
         """Whether a process reported its end a moment ago, so that it may not have exited yet."""
@@ -329,6 +336,7 @@ class Coordinator:
         """Answer a join request with the start of the run."""
         if member.state is State.AT_BARRIER:
             member.apply(Event.START)
+        self.joined[member.instance] = {"process": member.role, "generation": member.generation}
         addresses = {role: self._members[role].address for role in LOOP_ROLES}
         query, member.query = member.query, None
         assert query is not None

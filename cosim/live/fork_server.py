@@ -19,6 +19,7 @@ from importlib import import_module
 from typing import IO
 
 from noack.core.errors import MachineError
+from noack.core.process_limits import require_limits
 from noack.core.python_process import python_command
 from noack.runtime.command_line import TICKET_ON_STDIN
 
@@ -82,9 +83,14 @@ class ForkServer:
 
     The server forks twice. Linux gives a process whose parent has ended to its nearest ancestor
     that adopts orphans: while the server lives, this process does.
+
+    Raises:
+        MachineError: a limit of the system is too low for a run.
+        OSError: it cannot be started.
     """
 
     def __init__(self) -> None:
+        require_limits()
         self._socket, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._socket.settimeout(_START_TIMEOUT_S)
         with its, ExitStack() as on_error:

@@ -5,17 +5,17 @@ directory with everything that was recorded.
 """
 
 import contextlib
+import json
 import os
 import shutil
-import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from cosim.live.child_processes import ChildProcesses, Failure, signal_name
+from cosim.live.child_processes import ChildProcesses, Failure
 from cosim.live.compilation import compile_for
 from cosim.live.coordinator import Coordinator
 from cosim.live.disk_space import require_disk_space
@@ -23,13 +23,20 @@ from cosim.live.fork_server import ForkServer, fork_server
 from cosim.live.remote_access import Listening, open_to_hosts, with_clocks
 from cosim.live.remote_hosts import RemoteStart
 from cosim.live.restart_policy import RestartPolicy
-from cosim.live.start_limit import DEFAULT_S, StartLimit
+from cosim.live.wait_limit import DEFAULT_S, WaitLimit
 from cosim.record.environment import write_environment
-from cosim.record.run_directory import active_run, new_run_dir, point_to_latest, write_scenario
+from cosim.record.run_directory import (
+    PROCESSES_FILE,
+    active_run,
+    new_run_dir,
+    point_to_latest,
+    write_scenario,
+)
 from cosim.record.run_ending import EndingFile, RunEnding
 from noack.config.resolution import resolved_loops, tables_of
 from noack.config.scenario import Scenario
-from noack.core.errors import ExitStatus, NeverStartedError, NoackError
+from noack.core.errors import ExitStatus, MachineError, NeverStartedError, NoackError
+from noack.core.file_access import write_whole
 from noack.protocol.topology import PLANT, RECORDER, ROLES
 from noack.runtime import run_registry
 from noack.runtime.address import text_of
@@ -37,13 +44,8 @@ from noack.runtime.control_plane import run_name
 from noack.runtime.invitation import invitation_file
 from noack.runtime.join_ticket import Ticket, new_ticket, published
 from noack.runtime.life_cycle import HORIZON
-from noack.runtime.signals import Signals
+from noack.runtime.signals import Signals, stop_reason
 
-_STOPPED: Mapping[int, str] = {
-    signal.SIGINT: "stopped by the user",
-    signal.SIGTERM: "stopped on request",
-    signal.SIGHUP: "stopped because the terminal was closed",
-}
 _POLL_S = 0.01
 _STOP_TIMEOUT_S = 15.0
 _OVERTIME_S, _OVERTIME_SHARE = 20.0, 0.2
@@ -60,6 +62,7 @@ class Watcher:
     failed: Callable[[str, float, str | None], None] = lambda why, t_s, by_hand: None
     restarted: Callable[[str, float], None] = lambda role, t_s: None
     progress: Callable[[dict[str, Any]], None] = lambda progress: None
+    stopping: Callable[[str], None] = lambda why: None
 
 
 def joint_watcher(watchers: Sequence[Watcher]) -> Watcher:
@@ -122,11 +125,11 @@ def launch(
         away = {} if listening is None else listening.hosts
         here = [role for role in spawn if role not in away]
         compile_for(scenario, here)
+        signals = stack.enter_context(Signals().handled())
         run_dir = new_run_dir(runs, resolved.name)
         resolved = write_scenario(resolved, run_dir)
         ticket = new_ticket(resolved, run_dir.resolve(), launched=True)
         write_environment(run_dir, "live", run_name(ticket.run_id))
-        signals = stack.enter_context(Signals().handled())
         stack.enter_context(active_run(run_dir))
         ending = stack.enter_context(EndingFile(run_dir))
         _publish_run(stack, ticket, session)  # first: its file leads to a killed run's socket
@@ -192,7 +195,8 @@ class _Run:
         self._watcher = watcher
         self._by_hand = [role for role in ROLES if role not in children]
         self._missing: tuple[str, ...] = ()
-        self._limit = StartLimit(self._start_within_s())
+        self._limit = WaitLimit(self._start_within_s())
+        """How long the launcher still waits: for the start, for the end, or for the stop."""
         self._policy = RestartPolicy(
             ticket.scenario,
             coordinator,
@@ -207,30 +211,36 @@ class _Run:
         ``store`` is called with the result of a run that ends early, before its processes end.
         """
         result: Failure | None = None
-        deadline_s, last_s, started = float("inf"), time.monotonic(), False
+        last_s, started, joined = time.monotonic(), False, 0
         while not self._is_over(stopping=result is not None):
             self._coordinator.poll()
             now_s = time.monotonic()
-            if self._coordinator.epoch_ns is None:
+            if result is not None or not self._is_in_loop():
                 self._limit.wait(now_s - last_s, os.getloadavg()[0])
-                last_s = now_s
+            last_s = now_s
+            if self._coordinator.epoch_ns is None:
                 if result is None:
                     self._notify_missing()
             elif not started:
                 started = True
                 point_to_latest(self._run_dir)
                 self._notify("started", self._run_dir)
-                deadline_s = now_s + longest_s(self._scenario.horizon_s / self._scenario.speed)
+                self._limit = WaitLimit(overtime_s(self._scenario.horizon_s / self._scenario.speed))
+            if len(self._coordinator.joined) > joined:
+                joined = len(self._coordinator.joined)
+                self._write_processes()
             self._notify_progress()
             if result is None:
                 result = _signalled(signals) or self._policy.check()
-                if result is None and (now_s > deadline_s or self._limit.is_reached):
+                if result is None and self._limit.is_reached:
                     result = (ExitStatus.FAILED, self._overdue())
                 if result is not None:
                     store(*result)
                     self._coordinator.stop(result[1])
-                    deadline_s = now_s + _STOP_TIMEOUT_S
-            elif now_s > deadline_s:
+                    if started:
+                        self._notify("stopping", result[1])
+                    self._limit = WaitLimit(_STOP_TIMEOUT_S)
+            elif self._limit.is_reached:
                 break
             time.sleep(_POLL_S)
         self._notify_progress()  # the last report may have arrived with the end
@@ -249,6 +259,17 @@ class _Run:
             failures = self._coordinator.failures()
             return stopping and all(role in failures for role in running)
         return stopping or all(self._coordinator.is_over(role) for role in self._by_hand)
+
+    def _is_in_loop(self) -> bool:
+        """Whether the run has started and has not reached its horizon."""
+        started = self._coordinator.epoch_ns is not None
+        return started and self._coordinator.now_ns() < self._scenario.timing.horizon_ns
+
+    def _write_processes(self) -> None:
+        """Write which processes joined, for `noack collect`; without that the run goes on."""
+        text = json.dumps(self._coordinator.joined, indent=2)
+        with contextlib.suppress(MachineError):
+            write_whole(self._run_dir / PROCESSES_FILE, text, make_folder=False)
 
     def _notify_missing(self) -> None:
         missing = tuple(role for role in self._coordinator.missing() if role in self._by_hand)
@@ -274,22 +295,23 @@ class _Run:
 
     def _overdue(self) -> str:
         if self._coordinator.epoch_ns is None:
-            return f"{', '.join(self._coordinator.missing())} {self._limit.explain()}"
-        here = [role for role in ROLES if not self._coordinator.is_over(role)]
+            return f"{', '.join(self._coordinator.missing())} {self._limit.explain_start()}"
+        # One that is lost, too: the recorder may not respond while it sorts a long record.
+        silent = [role for role in ROLES if not self._coordinator.has_ended(role)]
         # The recorder waits for the others.
-        late = [role for role in here if role != RECORDER] or here
-        return (
-            f"the run did not end at its horizon: no report from {', '.join(late)}, too slow or "
-            "stopped; reduce the speed or the rates"
-        )
+        silent = [role for role in silent if role != RECORDER] or silent
+        what = f"no report from {', '.join(silent)}"
+        if not silent:
+            what = f"{', '.join(self._children.running())} reported the end, but did not exit"
+        return f"the run did not end at its horizon: {what}, {self._limit.explain_end()}"
 
 
 def _signalled(signals: Signals) -> Failure | None:
     if signals.received is None:
         return None
-    return signals.status, f"{_STOPPED[signals.received]} ({signal_name(signals.received)})"
+    return signals.status, stop_reason(signals.received)
 
 
-def longest_s(run_s: float) -> float:
-    """How long a run of ``run_s`` of wall time may take until all its processes have ended."""
-    return run_s * (1 + _OVERTIME_SHARE) + _OVERTIME_S
+def overtime_s(run_s: float) -> float:
+    """How long the processes of a run of ``run_s`` of wall time may take to end after it."""
+    return run_s * _OVERTIME_SHARE + _OVERTIME_S

@@ -14,6 +14,8 @@ _ENVIRONMENT = dict.fromkeys(
 ) | {"PYTHONSAFEPATH": "1"}
 """One thread each, and no imports from the current folder (:mod:`noack.core.python_process`)."""
 
+_ENDING = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
+
 
 @contextmanager
 def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
@@ -54,11 +56,11 @@ def _depend_on(parent: Connection) -> None:
 
 @contextmanager
 def interrupts_held() -> Iterator[None]:
-    """Block Ctrl-C and hang-up signals in processes that are started meanwhile.
+    """Block the signals that end a program in processes that are started meanwhile.
 
     The parent handles them.
     """
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
     try:
         yield
     finally:

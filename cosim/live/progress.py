@@ -45,7 +45,7 @@ def progress_line(
         shown = _RunProgress(console, progress, scenario, session)
         yield Watcher(
             shown.waiting, shown.listening, shown.started, shown.failed, shown.restarted,
-            shown.update,
+            shown.update, shown.stopping,
         )  # fmt: skip
 
 
@@ -104,6 +104,10 @@ class _RunProgress:
     def restarted(self, role: str, t_s: float) -> None:
         """Name a process that runs again."""
         self._print(f"{role} runs again at {t_s:.1f} s")
+
+    def stopping(self, why: str) -> None:
+        """Say why the run ends early: the completion of its record may take minutes."""
+        self._print(f"{escape(why)}; the run ends, and its record is completed")
 
     def update(self, report: dict[str, Any]) -> None:
         """Show the recorder's progress report."""

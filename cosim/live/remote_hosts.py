@@ -12,7 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, Annotated, NamedTuple, Self
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from noack.config import toml_file
 from noack.core.errors import CallerError
@@ -25,14 +25,23 @@ _CONNECT_WITHIN_S = 10
 _OPTIONS = ("-T", "-o", "BatchMode=yes", "-o", f"ConnectTimeout={_CONNECT_WITHIN_S}")
 
 
+def _require_printable(text: str) -> str:
+    if not text.isprintable():  # no argument of a command has a zero character
+        raise ValueError("has a control character")
+    return text
+
+
+_Word = Annotated[str, Field(min_length=1), AfterValidator(_require_printable)]
+
+
 class Host(ScenarioSection):
     """Where a process runs."""
 
-    ssh: Annotated[str, Field(pattern=r"^[^-\s]\S*$")]
+    ssh: Annotated[_Word, Field(pattern=r"^[^-\s]\S*$")]
     """The host, as the command ssh takes it: a name of ~/.ssh/config, HOST or USER@HOST."""
-    command: Annotated[str, Field(min_length=1)] = "noack"
+    command: _Word = "noack"
     """How noack is called there, e.g. "noack/.venv/bin/noack"; the shell of that host reads it."""
-    runs: Annotated[str, Field(min_length=1)] = "runs"
+    runs: _Word = "runs"
     """Folder there for rows that cannot be sent to the recorder."""
 
 

@@ -23,6 +23,7 @@ from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import ExitStatus, MachineError, why
 from noack.core.file_access import write_whole
+from noack.core.process_limits import require_limits
 from noack.runtime.life_cycle import HORIZON
 
 
@@ -47,8 +48,9 @@ def simulate_run(
 
     Raises:
         CallerError: the scenario's numbers are too large.
-        MachineError: the run directory cannot be written.
+        MachineError: the run directory cannot be written, or a limit of the system is too low.
     """
+    require_limits()
     if scenario.loops is not None:
         return _into_new_run(
             scenario, runs, lambda run_dir, _: _write_loops(scenario, run_dir, progress)

@@ -187,19 +187,22 @@ def _optimised_once() -> Iterator[None]:
 
 @contextmanager
 def _to_the_end() -> Iterator[None]:
-    """Delay Ctrl-C: an exception in a Python callback of LLVM would crash the process."""
-    before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or not callable(before):
-        yield
-        return
+    """Delay handled signals: an exception in a Python callback of LLVM would crash the process."""
     came: list[int] = []
-    signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.getsignal(number) for number in numbers}
+    delayed = {number: found for number, found in before.items() if callable(found)}
+    if threading.current_thread() is not threading.main_thread():
+        delayed = {}
+    for number in delayed:
+        signal.signal(number, lambda number, _: came.append(number))
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, found in delayed.items():
+            signal.signal(number, found)
         if came:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(came[0])
 
 
 def _numba() -> Any:

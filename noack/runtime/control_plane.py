@@ -25,6 +25,7 @@ from noack.runtime.address import text_of
 from noack.runtime.control_messages import ChangeAnnouncement, parse_message
 from noack.runtime.join_ticket import Ticket
 from noack.runtime.reachability import why_unreachable
+from noack.runtime.spool import writer_of
 from noack.runtime.zenoh_session import (
     cause_of,
     first_reply,
@@ -61,7 +62,8 @@ class ControlPlane:
     def __init__(self, ticket: Ticket, role: str, *, listen: bool = False) -> None:
         self._prefix = f"noack/{run_name(ticket.run_id)}"
         self.role = role
-        self.instance = secrets.token_hex(8)
+        self.secret = secrets.token_hex(32)
+        self.instance = writer_of(self.secret)
         self._resources = ExitStack()
         try:
             self.session = (

@@ -13,6 +13,7 @@ from pathlib import Path
 from setproctitle import setproctitle
 
 from noack.core.errors import ExitStatus, NoackError, NoAnswerError, PeerError
+from noack.core.process_limits import exhausted_limit, require_limits
 from noack.runtime.address import text_of
 from noack.runtime.command_line import TICKET_ON_STDIN, Parser, failed
 from noack.runtime.control_plane import ControlPlane
@@ -45,6 +46,7 @@ def run_process(
     """
     with Signals().handled() as signals:
         try:
+            require_limits()
             if invitation is None:
                 ticket = _ticket(role, session, signals)
             else:
@@ -64,7 +66,9 @@ def run_process(
         except NoackError as error:
             if signals.received is None:
                 return failed(str(error), error.exit_status, who=f"noack {role}", as_json=as_json)
-        except Exception:
+        except Exception as error:
+            if (line := exhausted_limit(error)) is not None:
+                return failed(line, ExitStatus.FAILED, who=f"noack {role}", as_json=as_json)
             traceback.print_exc()
             print(f"noack {role}: internal error, see above", file=sys.stderr)
             return ExitStatus.FAILED

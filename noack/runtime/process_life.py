@@ -215,7 +215,7 @@ class RunProcess:
 
     @cached_property
     def _spool(self) -> OwnSpool:
-        return own_spool(self.ticket, self.role, self.plane.instance)
+        return own_spool(self.ticket, self.role, self.plane.secret)
 
     def _telemetry(self) -> TelemetryBuffer:
         tables = tables_of(self.scenario)

@@ -13,11 +13,13 @@ from noack.runtime.control_plane import ControlPlane, run_name
 from noack.runtime.join_ticket import Ticket
 from noack.runtime.log_lines import NOTICES, notice_number, notices_of
 from noack.runtime.spool import (
+    KEPT_KEY,
     KEPT_REPORT,
     RUN_NAME_FILE,
     SPOOL,
     SpoolWriter,
     kept_run_name,
+    writer_of,
 )
 from noack.runtime.telemetry import TelemetryBuffer, first_row
 
@@ -66,12 +68,13 @@ class OwnSpool:
     Args:
         run_dir: the run's directory.
         role: the process.
-        writer: names its files.
-        kept_of: on another host than the recorder's, the name of the run.
+        secret: the process's; its files are named after it by `writer_of`.
+        kept_of: on another host than the recorder's, the name of the run. The secret is kept there,
+            too: it shows that the rows are those of this process.
     """
 
-    def __init__(self, run_dir: Path, role: str, writer: str, kept_of: str | None = None) -> None:
-        self._run_dir, self._role, self._writer, self._kept_of = run_dir, role, writer, kept_of
+    def __init__(self, run_dir: Path, role: str, secret: str, kept_of: str | None = None) -> None:
+        self._run_dir, self._role, self._secret, self._kept_of = run_dir, role, secret, kept_of
 
     @cached_property
     def folder(self) -> Path:
@@ -82,7 +85,10 @@ class OwnSpool:
 
     @cached_property
     def _files(self) -> SpoolWriter:
-        return SpoolWriter(self.folder / SPOOL, self._writer)
+        files = SpoolWriter(self.folder / SPOOL, writer_of(self._secret))
+        if self._kept_of is not None:
+            files.append(KEPT_KEY, 0, self._secret.encode())
+        return files
 
     def append(self, table: str, header: bytes, payload: bytes) -> None:
         """Write a batch; raise MachineError if it cannot be written."""
@@ -97,10 +103,10 @@ class OwnSpool:
         self._files.append(KEPT_REPORT, 0, text.encode())
 
 
-def own_spool(ticket: Ticket, role: str, writer: str) -> OwnSpool:
+def own_spool(ticket: Ticket, role: str, secret: str) -> OwnSpool:
     """Return the spool of a process: the recorder reads it, or `noack collect` on another host."""
     kept_of = None if ticket.remote is None else run_name(ticket.run_id)
-    return OwnSpool(Path(ticket.run_dir), role, writer, kept_of)
+    return OwnSpool(Path(ticket.run_dir), role, secret, kept_of)
 
 
 def _kept_folder(run_dir: Path, name: str) -> Path:

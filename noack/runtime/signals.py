@@ -1,11 +1,15 @@
-"""Signals: a flag that loops poll, so that no write is interrupted; Ctrl-C during the imports."""
+"""Signals that end a program: a flag that loops poll, an error elsewhere, an exit in the imports.
+
+In the loop of a process no write may be interrupted. A command is interrupted by an error, so that
+it cleans up. During the imports an error would be printed from within them, or caught there.
+"""
 
 import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from types import FrameType
 
 from noack.core.errors import ExitStatus
@@ -51,49 +55,70 @@ _ENDING = {
     signal.SIGTERM.value: ExitStatus.TERMINATED,
     signal.SIGHUP.value: ExitStatus.TERMINATED,
 }
+_REASONS = {
+    signal.SIGINT.value: "stopped by the user",
+    signal.SIGTERM.value: "stopped on request",
+    signal.SIGHUP.value: "stopped because the terminal was closed",
+}
+
+
+def stop_reason(number: int) -> str:
+    """Return why a program stops after a signal, with the signal's name."""
+    return f"{_REASONS[number]} ({signal.Signals(number).name})"
+
+
+class StopRequestError(KeyboardInterrupt):
+    """A signal asks the program to stop: what cleans up after Ctrl-C does so after each of them."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(stop_reason(number))
+        self.exit_status = _ENDING[number]
 
 
 @contextmanager
-def quiet_interrupt() -> Iterator[None]:
-    """End the process on SIGINT with exit status 130 and no traceback, while the context lasts.
+def stop_requests_raised() -> Iterator[None]:
+    """Raise StopRequestError on SIGINT, SIGTERM and SIGHUP while the context lasts.
 
-    A ``KeyboardInterrupt`` would be printed from within the imports, or caught there. A handler
-    that another program has set is not replaced.
+    Ignored signals stay ignored, and a handler that another program has set is not replaced.
     """
-    usual = signal.default_int_handler
-    if threading.current_thread() is not threading.main_thread() or (
-        signal.getsignal(signal.SIGINT) is not usual
-    ):
+    came_ns: int | None = None
+
+    def stop(number: int, _frame: FrameType | None) -> None:
+        nonlocal came_ns
+        now_ns = time.monotonic_ns()
+        if came_ns is None or now_ns - came_ns > _ECHO_NS:
+            came_ns = now_ns
+            raise StopRequestError(number)
+
+    with _default_replaced(stop):
         yield
-        return
-    signal.signal(signal.SIGINT, lambda *_: os._exit(ExitStatus.INTERRUPTED))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, usual)
 
 
 @contextmanager
-def exit_on_signals() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP raise SystemExit meanwhile, so that temporary files are removed.
+def stoppable_imports() -> Iterator[None]:
+    """End the process with one line and its exit status on a signal, while the context lasts."""
+    with _default_replaced(_end_at_once):
+        yield
 
-    Only the main thread can handle signals; in others this has no effect.
-    """
 
-    def leave(number: int, _frame: FrameType | None) -> None:
-        raise SystemExit(_ENDING[number])
+def _end_at_once(number: int, _frame: FrameType | None) -> None:
+    with suppress(OSError):  # standard error may be closed or full
+        os.write(2, f"noack: {stop_reason(number)}\n".encode())
+    os._exit(_ENDING[number])
 
+
+@contextmanager
+def _default_replaced(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    numbers = (signal.SIGTERM, signal.SIGHUP)
-    before = {
-        number: signal.signal(number, leave)
-        for number in numbers
-        if signal.getsignal(number) == signal.SIG_DFL
-    }
+    usual = (signal.SIG_DFL, signal.default_int_handler, _end_at_once)
+    before = {number: signal.getsignal(number) for number in _ENDING}
+    replaced = {number: found for number, found in before.items() if found in usual}
+    for number in replaced:
+        signal.signal(number, handler)
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, found in replaced.items():
+            signal.signal(number, found)

@@ -6,21 +6,31 @@ writers may write the same rows; the row numbers identify them.
 """
 
 import contextlib
+import hashlib
 import os
 import struct
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import IO, BinaryIO, NamedTuple
 
 from noack.core.errors import MachineError, why
+from noack.core.file_access import read_regular
 
 SPOOL = "spool"  # the spool's folder in the run directory
 KEPT_REPORT = "report"
 """Name of a process's final report in the spool, in place of a table's."""
+KEPT_KEY = "key"
+"""Name of a process's secret in the spool that it keeps on another host; see `writer_of`."""
 RUN_NAME_FILE = "run_name.txt"
 """In the folder of what a process on another host keeps: of which run it is."""
 _CHUNK = struct.Struct("<QQ")
 _READ_BYTES = 256 * 1024
+_MOST_NAME_BYTES = 1024
+
+
+def writer_of(secret: str) -> str:
+    """Return the name of a process, which names its files: only the process knows the secret."""
+    return hashlib.sha256(secret.encode()).hexdigest()[:32]
 
 
 class SpoolWriter:
@@ -108,8 +118,8 @@ class Chunk(NamedTuple):
 
 def kept_run_name(folder: Path) -> str:
     """Return of which run a folder on another host has rows; empty if none says so."""
-    with contextlib.suppress(OSError, UnicodeDecodeError):
-        return (folder / RUN_NAME_FILE).read_text(encoding="ascii")
+    with contextlib.suppress(OSError, ValueError):
+        return read_regular(folder / RUN_NAME_FILE, _MOST_NAME_BYTES).decode("ascii")
     return ""
 
 
@@ -121,15 +131,24 @@ def spool_files(folder: Path, table: str) -> list[Path]:
 def chunks_in(path: Path, begin: int = 0, end: int | None = None) -> Iterator[Chunk]:
     """Yield the complete batches of a file from the offset ``begin`` up to ``end``."""
     with path.open("rb", buffering=_READ_BYTES) as file:
-        size = os.fstat(file.fileno()).st_size
-        end = size if end is None else end
-        file.seek(begin)
-        while begin < end and len(head := file.read(_CHUNK.size)) == _CHUNK.size:
-            first, length = _CHUNK.unpack(head)
-            begin += _CHUNK.size + length
-            if begin > size:  # incomplete, or damaged: a read could be endless
-                break
-            yield Chunk(first, file.read(length), begin)
+        yield from chunks_of(file, begin, end)
+
+
+def chunks_of(
+    file: IO[bytes], begin: int = 0, end: int | None = None, most_bytes: int | None = None
+) -> Iterator[Chunk]:
+    """Do the same for an open file; raise ValueError for a batch of more than ``most_bytes``."""
+    size = os.fstat(file.fileno()).st_size
+    end = size if end is None else end
+    file.seek(begin)
+    while begin < end and len(head := file.read(_CHUNK.size)) == _CHUNK.size:
+        first, length = _CHUNK.unpack(head)
+        begin += _CHUNK.size + length
+        if begin > size:  # incomplete, or damaged: a read could be endless
+            break
+        if most_bytes is not None and length > most_bytes:
+            raise ValueError(f"a batch of {length} bytes")
+        yield Chunk(first, file.read(length), begin)
 
 
 def read_chunks(folder: Path, table: str) -> Iterator[tuple[int, bytes]]:

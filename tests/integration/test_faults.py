@@ -27,6 +27,7 @@ def test_a_killed_recorder_is_named_and_no_recorded_row_is_lost(start: Start) ->
     finished = running.finish()
     assert finished.status == 1
     assert finished.summary["exit"]["reason"] == reason
+    assert f"{reason}; the run ends, and its record is completed\n" in finished.stderr
     record = load_record(finished.run_dir)
     for table in ("plant_step", "sensor_measurement", "controller_step"):
         rows = record[table]

@@ -1,5 +1,6 @@
 """``noack collect``: adds what processes on other hosts kept of a run to its record."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -31,12 +32,14 @@ def collect(
     from cosim.output.run_verdict import print_outcome
     from cosim.record import collection
     from cosim.record.run_directory import chosen_run
+    from noack.runtime.command_line import print_to_stderr
 
     run_dir = chosen_run(run_dir, cli.DEFAULT_RUNS)
-    reopen(run_dir)  # refuses a run that is under way
+    outcome = reopen(run_dir)  # refuses a run that is under way
     for source in sources:
-        collection.collect(run_dir, source)
-    outcome = reopen(run_dir)
+        merged, roles = collection.collect(run_dir, source, reopen)
+        outcome = replace(merged, run_dir=run_dir)
+        print_to_stderr(f"noack: {source}: took what {', '.join(roles) or 'no process'} kept")
     if json:
         cli.print_json(outcome.summary)
     else:

@@ -1,9 +1,6 @@
 """Runs a campaign: computes the runs that its folder does not have yet."""
 
-import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from types import FrameType
+from collections.abc import Callable
 
 from cosim.studies.campaign.campaign_workers import LostWorkersError, OtherArithmeticError, Runner
 from cosim.studies.campaign.chunk_store import Store
@@ -14,45 +11,18 @@ Progress = Callable[[int, int], None]
 
 
 class InterruptedCampaignError(NoackError):
-    """A user interrupted the campaign; written runs are kept."""
+    """A user or a signal interrupted the campaign; written runs are kept."""
 
-    exit_status = ExitStatus.INTERRUPTED
-
-
-class TerminatedCampaignError(NoackError):
-    """A signal ended the campaign; written runs are kept."""
-
-    exit_status = ExitStatus.TERMINATED
-
-
-@contextmanager
-def terminations_raised() -> Iterator[None]:
-    """Raise an exception on SIGTERM and SIGHUP, unless they are ignored.
-
-    Raises:
-        TerminatedCampaignError: one of them was received.
-    """
-
-    def terminated(number: int, _: FrameType | None) -> None:
-        raise TerminatedCampaignError(f"ended by {signal.Signals(number).name}")
-
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
-    for number, handler in before.items():
-        if handler is signal.SIG_DFL:
-            signal.signal(number, terminated)
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    def __init__(self, message: str, exit_status: ExitStatus) -> None:
+        super().__init__(message)
+        self.exit_status = exit_status
 
 
 def run_campaign(store: Store, runner: Runner, progress: Progress | None = None) -> int:
     """Compute the missing runs; return their number.
 
     Raises:
-        InterruptedCampaignError: the user pressed Ctrl-C.
-        TerminatedCampaignError: a signal was received within :func:`terminations_raised`.
+        InterruptedCampaignError: a signal was received.
         LostWorkersError: workers have died.
         MachineError: the results cannot be written.
     """
@@ -73,8 +43,9 @@ def run_campaign(store: Store, runner: Runner, progress: Progress | None = None)
             store.write(chunk, rows)
             done += len(chunk.draws)
             report(done, total)
-    except KeyboardInterrupt:
-        raise InterruptedCampaignError(message("interrupted")) from None
-    except (LostWorkersError, OtherArithmeticError, TerminatedCampaignError, MachineError) as error:
+    except KeyboardInterrupt as error:
+        status = getattr(error, "exit_status", ExitStatus.INTERRUPTED)
+        raise InterruptedCampaignError(message(str(error) or "interrupted"), status) from None
+    except (LostWorkersError, OtherArithmeticError, MachineError) as error:
         raise type(error)(message(error)) from None
     return total - before

@@ -9,10 +9,11 @@ from cosim.output.figure_format import FigureFiles
 from cosim.studies.campaign.campaign_file import Campaign
 from cosim.studies.campaign.campaign_grid import base_of, grid
 from cosim.studies.campaign.campaign_report import write_report
-from cosim.studies.campaign.campaign_run import Progress, run_campaign, terminations_raised
+from cosim.studies.campaign.campaign_run import Progress, run_campaign
 from cosim.studies.campaign.campaign_summary import CampaignSummary, summarise
 from cosim.studies.campaign.campaign_workers import Runner
 from cosim.studies.campaign.chunk_store import Store, opened
+from noack.runtime.signals import stop_requests_raised
 
 Show = Callable[[str], AbstractContextManager[object]]
 """Shows what is done meanwhile."""
@@ -62,7 +63,7 @@ def finish_campaign(
         points = grid(plan, path)
     _, base = base_of(plan, path)
     store = Store(folder, points, draws or plan.draws, plan.chunk)
-    with terminations_raised(), opened(plan, base, store):
+    with stop_requests_raised(), opened(plan, base, store):
         with workers() as runner, bar or nullcontext() as progress:
             made = run_campaign(store, runner, progress)
         with show("summarising"):

@@ -27,7 +27,6 @@ from noack.config.loops import loops_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, MachineError, why
-from noack.runtime.signals import exit_on_signals
 from noack.settings.named_file import file_tables
 
 _MOST_STEPS = 20_000_000
@@ -126,7 +125,7 @@ class _Compared(NamedTuple):
 @contextmanager
 def _folder(into: Path | None) -> Iterator[Path]:
     if into is None:
-        with exit_on_signals(), tempfile.TemporaryDirectory(prefix="noack-") as temporary:
+        with tempfile.TemporaryDirectory(prefix="noack-") as temporary:
             yield Path(temporary)
         return
     try:

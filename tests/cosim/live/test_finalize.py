@@ -169,6 +169,17 @@ def test_a_run_whose_rows_are_missing_fails(run_dir: Path, cut: slice) -> None:
     assert finalize(stopped, report=False).status == ExitStatus.INTERRUPTED
 
 
+def test_a_run_with_more_rows_than_were_reported_fails(run_dir: Path) -> None:
+    reports = json.loads((run_dir / REPORTS_FILE).read_text())
+    reports["plant"]["rows"][PLANT_STEP] -= 7
+    (run_dir / REPORTS_FILE).write_text(json.dumps(reports))
+    outcome = finalize(ended_well(run_dir), report=False)
+    assert (outcome.status, outcome.reason) == (
+        ExitStatus.FAILED,
+        "the record has more rows than the processes reported: 7 of plant_step",
+    )
+
+
 def test_an_interrupted_replay_leaves_a_summary(
     run_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

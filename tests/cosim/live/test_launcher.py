@@ -7,7 +7,7 @@ from typing import Any, cast
 import pytest
 
 from cosim.live.child_processes import ChildProcesses, Failure
-from cosim.live.launcher import Watcher, _Run, launch, longest_s
+from cosim.live.launcher import Watcher, _Run, launch, overtime_s
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
 from noack.core.errors import CallerError, ExitStatus, MachineError
@@ -41,6 +41,7 @@ class FakeCoordinator:
         self._now_s, self._exiting, self._failures = now_s, exiting, failures
         self._running: tuple[str, ...] = ROLES
         self.restarts: list[str] = []
+        self.joined: dict[str, Any] = {}
 
     def now_ns(self) -> int:
         return round(self._now_s * 1e9)
@@ -53,6 +54,9 @@ class FakeCoordinator:
 
     def is_over(self, role: str) -> bool:
         return role not in self._running
+
+    def has_ended(self, role: str) -> bool:
+        return role not in (*self._running, *self._failures)
 
     def is_exiting(self, role: str) -> bool:
         return role == self._exiting
@@ -182,23 +186,59 @@ def test_a_restarted_process_that_fails_ends_the_run_with_both_reasons(case: Cas
 
 
 def test_a_long_run_has_more_time_after_its_horizon() -> None:
-    assert longest_s(20.0) - 20.0 < 30.0
-    assert longest_s(3600.0) - 3600.0 > 300.0
+    assert overtime_s(20.0) < 30.0
+    assert overtime_s(3600.0) > 300.0
 
 
 @pytest.mark.parametrize(
-    ("running", "late"), [(("plant", RECORDER), "plant"), ((RECORDER,), RECORDER)]
+    ("running", "lost", "late"),
+    [
+        (("plant", RECORDER), (), "no report from plant"),
+        ((RECORDER,), (), "no report from recorder"),
+        ((), (RECORDER,), "no report from recorder"),  # it sorts a long record
+        ((), (), f"{', '.join(ROLES)} reported the end, but did not exit"),
+    ],
 )
 def test_a_run_that_does_not_end_names_the_late_process(
-    case: Case, running: tuple[str, ...], late: str
+    case: Case, running: tuple[str, ...], lost: tuple[str, ...], late: str
 ) -> None:
-    coordinator = FakeCoordinator(2.0)
+    coordinator = FakeCoordinator(2.0, **dict.fromkeys(lost, "stopped responding"))
     coordinator._running = running
     reason = case.run(case.children(None), coordinator)._overdue()
     assert reason == (
-        f"the run did not end at its horizon: no report from {late}, too slow or stopped; "
-        "reduce the speed or the rates"
+        f"the run did not end at its horizon: {late}, too slow or stopped; reduce the speed or the "
+        "rates"
     )
+
+
+@pytest.mark.parametrize(("load", "counts"), [(0.0, 1), (8.0, 4)])
+def test_the_wait_for_the_end_grows_with_the_load(
+    case: Case, monkeypatch: pytest.MonkeyPatch, load: float, counts: int
+) -> None:
+    """All processes go on after the horizon; time passes by a second at each look."""
+    elapsed_s = [0.0]
+
+    def sleep(_: float) -> None:
+        elapsed_s[0] += 1.0
+
+    class GoingOn(FakeCoordinator):
+        def poll(self) -> None: ...
+
+        def progress(self) -> None: ...
+
+        def stop(self, reason: str) -> None: ...
+
+    monkeypatch.setattr("cosim.live.launcher.time.monotonic", lambda: elapsed_s[0])
+    monkeypatch.setattr("cosim.live.launcher.time.sleep", sleep)
+    monkeypatch.setattr("os.getloadavg", lambda: (load, 0.0, 0.0))
+    monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1})
+    stopped_s: list[float] = []
+    run = case.run(case.children(None), GoingOn(1.0))
+    status, reason = run.watch(Signals(), lambda *_: stopped_s.append(elapsed_s[0]))
+    assert status is ExitStatus.FAILED
+    assert stopped_s == pytest.approx([counts * overtime_s(1.0)], abs=2 * counts)
+    assert ("start fewer runs at once" in reason) == (counts > 1)
+    assert elapsed_s[0] - stopped_s[0] > 10.0 * counts  # and for the processes to stop
 
 
 def test_a_recorder_that_sorts_a_long_record_need_not_respond(case: Case) -> None:
@@ -229,6 +269,32 @@ def test_a_progress_report_that_arrives_at_the_end_is_shown(case: Case) -> None:
     run = case.run(children, Ending(1.0), progress=shown.append)
     assert run.watch(Signals(), lambda status, reason: None)[0] is ExitStatus.OK
     assert shown == [{"warnings": ["late"]}]
+
+
+def test_why_a_run_ends_early_is_shown_before_its_processes_end(case: Case) -> None:
+    """The completion of the record of many loops takes minutes."""
+    children = case.children(None)
+    shown: list[str] = []
+
+    class Ending(FakeCoordinator):
+        def poll(self) -> None:
+            children.exit("plant", -9)  # never restarted
+
+        def progress(self) -> None: ...
+
+        def stop(self, reason: str) -> None: ...
+
+    def stopping(why: str) -> None:
+        assert children.running()
+        shown.append(why)
+        for role in ROLES:
+            children.exit(role, 0)
+
+    status, reason = case.run(children, Ending(0.5), stopping=stopping).watch(
+        Signals(), lambda *_: None
+    )
+    assert shown == [reason] == ["plant died: killed by SIGKILL"]
+    assert status is ExitStatus.FAILED
 
 
 def test_a_refused_session_leaves_no_run_directory(

@@ -47,6 +47,9 @@ def test_processes_without_a_table_stay_here(tmp_path: Path) -> None:
         ('listen = "192.0.2.1"\n[plant]\nssh = "-oProxyCommand=reboot"\n', "plant.ssh"),
         ('listen = "192.0.2.1"\n[plant]\nssh = "a b"\n', "plant.ssh"),
         ('listen = "192.0.2.1"\nplant = "robot"\n', "plant"),
+        ('listen = "192.0.2.1"\n[plant]\nssh = "a\\u0000b"\n', "has a control character"),
+        (f'listen = "192.0.2.1"\n{ROBOT}command = "a\\u0000"\n', "controller.command"),
+        (f'listen = "192.0.2.1"\n{ROBOT}runs = "a\\nb"\n', "controller.runs"),
     ],
 )
 def test_a_mistake_gives_one_line(tmp_path: Path, text: str, line: str) -> None:

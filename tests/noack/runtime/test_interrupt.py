@@ -1,5 +1,6 @@
-"""Ctrl-C during the imports ends a program with status 130 and without output."""
+"""A signal during the imports ends a program with one line and its status."""
 
+import signal
 import subprocess
 import sys
 
@@ -11,15 +12,22 @@ import os, runpy, signal, sys
 class Interrupt:
     def find_spec(self, name, path=None, target=None):
         if name == imported:
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), int(number))
 
-module, imported, *sys.argv[1:] = sys.argv[1:]
+number, module, imported, *sys.argv[1:] = sys.argv[1:]
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's & has it ignored
 sys.meta_path.insert(0, Interrupt())
 runpy.run_module(module, run_name="__main__", alter_sys=True)
 """
 
 
+@pytest.mark.parametrize(
+    ("number", "status", "why"),
+    [
+        (signal.SIGINT, 130, "stopped by the user (SIGINT)"),
+        (signal.SIGTERM, 143, "stopped on request (SIGTERM)"),
+    ],
+)
 @pytest.mark.parametrize(
     "words",
     [
@@ -28,8 +36,9 @@ runpy.run_module(module, run_name="__main__", alter_sys=True)
         ["plant_server", "noack.runtime.process_entry", "--help"],
     ],
 )
-def test_interrupt_during_imports_leaves_no_traceback(words: list[str]) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", INTERRUPTED, *words], capture_output=True, text=True, timeout=200
-    )
-    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+def test_a_signal_during_the_imports_gives_one_line(
+    words: list[str], number: signal.Signals, status: int, why: str
+) -> None:
+    command = [sys.executable, "-c", INTERRUPTED, str(int(number)), *words]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=200)
+    assert (done.returncode, done.stdout, done.stderr) == (status, "", f"noack: {why}\n")

@@ -74,5 +74,5 @@ def test_what_two_runs_with_one_directory_keep_stays_apart(tmp_path: Path) -> No
     assert one.folder == again.folder == tmp_path / "run"
     assert other.folder == tmp_path / "run-0002"
     assert [kept_run_name(found) for found in (one.folder, other.folder)] == ["0001", "0002"]
-    assert len(list((one.folder / "spool").iterdir())) == 2
-    assert len(list((other.folder / "spool").iterdir())) == 1
+    assert len(list((one.folder / "spool").glob("sensor_event.*"))) == 2
+    assert len(list((other.folder / "spool").glob("sensor_event.*"))) == 1

@@ -108,8 +108,8 @@ def test_an_interrupted_and_then_killed_campaign_continues_where_it_stopped(
     _, err = interrupted.communicate()
     assert interrupted.returncode == 130
     assert err.splitlines(keepends=True)[-1] == (  # lines of progress may be before it
-        f"noack: interrupted; {len(files(folder))} of {RUNS} runs are in {folder}; "
-        "the same command continues the campaign\n"
+        f"noack: stopped by the user (SIGINT); {len(files(folder))} of {RUNS} runs are in "
+        f"{folder}; the same command continues the campaign\n"
     )
     assert psutil.wait_procs(children, timeout=60)[1] == []
     killed = start()
@@ -126,9 +126,15 @@ def test_an_interrupted_and_then_killed_campaign_continues_where_it_stopped(
 
 
 @pytest.mark.usefixtures("usual_signals")
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize(
+    ("number", "why"),
+    [
+        (signal.SIGTERM, "stopped on request (SIGTERM)"),
+        (signal.SIGHUP, "stopped because the terminal was closed (SIGHUP)"),
+    ],
+)
 def test_a_signal_ends_a_campaign_with_one_line(
-    many: Path, tmp_path: Path, number: signal.Signals, run_command: Command,
+    many: Path, tmp_path: Path, number: signal.Signals, why: str, run_command: Command,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     def signalled(works: Sequence[Work], chunks: Iterable[Chunk]) -> Iterator[Finished]:
@@ -143,6 +149,6 @@ def test_a_signal_ends_a_campaign_with_one_line(
     assert signal.getsignal(number) == before
     assert ended.exit_code == 143
     assert ended.stderr.splitlines(keepends=True)[-1] == (
-        f"noack: ended by {number.name}; 5 of {RUNS} runs are in {tmp_path / 'out'}; "
+        f"noack: {why}; 5 of {RUNS} runs are in {tmp_path / 'out'}; "
         "the same command continues the campaign\n"
     )

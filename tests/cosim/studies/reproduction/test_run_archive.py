@@ -279,7 +279,7 @@ def test_a_repetition_that_is_terminated_leaves_no_folder(archive: Path, tmp_pat
         "import os, signal, sys, tempfile; tempfile.tempdir = sys.argv[2];"
         "from cosim.studies.reproduction import run_repetition as module;"
         "module.simulate_run = lambda *_, **__: os.kill(os.getpid(), signal.SIGTERM);"
-        "from pathlib import Path; module.repeat_archive(Path(sys.argv[1]))"
+        "from cosim.cli import app; app(['reproduce', sys.argv[1]])"
     )
     done = subprocess.run(
         [sys.executable, "-c", code, archive, tmp_path], capture_output=True, check=False

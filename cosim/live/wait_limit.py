@@ -1,4 +1,4 @@
-"""Time limit of the start barrier, longer on a loaded machine.
+"""Limits of how long a launcher waits for the processes of a run, longer on a loaded machine.
 
 When the system load (one-minute average) is k > 1 times the number of cores, a process gets 1/k of
 a core, and a second of waiting counts as 1/k s, but at least as 1/20 s.
@@ -18,8 +18,8 @@ def _cores() -> int:
 
 
 @dataclass
-class StartLimit:
-    """The time that the processes of a run have to get ready."""
+class WaitLimit:
+    """The time that the processes of a run have to get ready, or to end."""
 
     within_s: float
     cores: int = field(default_factory=_cores)
@@ -41,13 +41,28 @@ class StartLimit:
         """Whether the limit is reached."""
         return self.counted_s > self.within_s
 
-    def explain(self) -> str:
-        """Why the limit was reached, and what would help."""
-        load = f"a load of {self.load:.1f} on {self.cores} cores"
+    @property
+    def load_text(self) -> str:
+        """The newest load, for messages."""
+        return f"a load of {self.load:.1f} on {self.cores} cores"
+
+    @property
+    def is_loaded(self) -> bool:
+        """Whether the load extended the limit, so that it is the likely cause."""
+        return self.waited_s > _OVERLOADED * self.counted_s
+
+    def explain_start(self) -> str:
+        """Why processes were not ready within the limit, and what would help."""
         waited = f"not ready in time: waited {self.waited_s:.0f} s"
-        if self.waited_s > _OVERLOADED * self.counted_s:
+        if self.is_loaded:
             return (
-                f"{waited}; likely cause: {load}; start fewer runs at once, or set "
+                f"{waited}; likely cause: {self.load_text}; start fewer runs at once, or set "
                 f"start_within_s above {self.within_s:g}"
             )
-        return f"{waited} (start_within_s); {load} is not the likely cause"
+        return f"{waited} (start_within_s); {self.load_text} is not the likely cause"
+
+    def explain_end(self) -> str:
+        """Why a run did not end within the limit after its horizon, and what would help."""
+        if self.is_loaded:
+            return f"likely cause: {self.load_text}; start fewer runs at once"
+        return "too slow or stopped; reduce the speed or the rates"

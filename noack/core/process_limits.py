@@ -1,0 +1,61 @@
+"""Limits of the system on a process (``ulimit``): what a run needs, errors of who reached one."""
+
+import errno
+import resource
+
+from noack.core.errors import MachineError, one_line
+
+_FILES = 64
+"""Open files of a process of a run, up to 40, and some more."""
+_ADDRESS_SPACE_BYTES = 3_000_000_000
+"""Address space of a launcher, 2.8 GB, most of it never used; it has 0.3 GB in memory."""
+_OUT_OF_MEMORY = ("failed to map segment", "cannot allocate memory", "can't start new thread")
+
+
+def require_limits() -> None:
+    """Check the limits before a run; raise the limit of open files if that is permitted.
+
+    Libraries abort, print stack traces or wait for ever when they reach a limit.
+
+    Raises:
+        MachineError: a limit is too low.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if _is_less(soft, _FILES):
+        if _is_less(hard, _FILES):
+            raise MachineError(
+                f"at most {hard} open files are permitted; a process of a run needs {_FILES}: "
+                "ulimit -n 1024"
+            )
+        resource.setrlimit(resource.RLIMIT_NOFILE, (_FILES, hard))
+    soft, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if _is_less(soft, _ADDRESS_SPACE_BYTES):
+        raise MachineError(
+            f"at most {_gb(soft)} of address space are permitted; a process of a run needs "
+            f"{_gb(_ADDRESS_SPACE_BYTES)}: ulimit -v unlimited"
+        )
+
+
+def exhausted_limit(error: BaseException) -> str | None:
+    """Return one line with the remedy if an error is that of a limit; None if it is not."""
+    number = error.errno if isinstance(error, OSError) else None
+    if number in (errno.EMFILE, errno.ENFILE):
+        soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+        return f"too many open files: at most {soft} are permitted; see `ulimit -n`"
+    text = one_line(error)
+    known = isinstance(error, ImportError | RuntimeError)
+    known = known and any(one in text.lower() for one in _OUT_OF_MEMORY)
+    if not (known or isinstance(error, MemoryError) or number == errno.ENOMEM):
+        return None
+    soft, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if soft == resource.RLIM_INFINITY:
+        return f"out of memory: {text}"
+    return f"out of memory: at most {_gb(soft)} of address space are permitted; see `ulimit -v`"
+
+
+def _is_less(limit: int, needed: int) -> bool:
+    return limit != resource.RLIM_INFINITY and limit < needed
+
+
+def _gb(size_bytes: int) -> str:
+    return f"{size_bytes / 1e9:.2g} GB"
