@@ -43,7 +43,7 @@ def progress_line(
         shown = _RunProgress(console, progress, scenario, session)
         yield Watcher(
             shown.waiting, shown.listening, shown.started, shown.failed, shown.restarted,
-            shown.update,
+            shown.update, shown.notice,
         )  # fmt: skip
 
 
@@ -102,6 +102,10 @@ class _RunProgress:
     def restarted(self, role: str, t_s: float) -> None:
         """Name a process that runs again."""
         self._print(f"{role} runs again at {t_s:.1f} s")
+
+    def notice(self, line: str) -> None:
+        """Show a line about the run."""
+        self._print(escape(line))
 
     def update(self, report: dict[str, Any]) -> None:
         """Show the recorder's progress report."""

@@ -1,28 +1,25 @@
 """zenoh sessions over Unix sockets: one process listens, the others connect.
 
 A socket is in the user's runtime directory, which is closed to other users: nobody else can connect
-to it, or listen in its place. From another host, a session connects by TLS to
-:mod:`cosim.live.remote_access`, which forwards to such a socket. Both ends have certificates of the
-run.
+to it, or listen in its place. From another host, a session connects through
+:mod:`noack.runtime.coordinator_link` by TLS to :mod:`cosim.live.remote_access`, which forwards to
+such a socket. Both ends have certificates of the run.
 """
 
-import asyncio
-import base64
 import json
 import os
-import socket
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import zenoh
 from zenoh.handlers import FifoChannel
 
-from noack.core.errors import CallerError
-from noack.runtime.address import LOOPBACK, Address, family_of, text_of
-from noack.runtime.connection_forwarder import forwarding
+from noack.core.errors import CallerError, NoAnswerError
+from noack.runtime.address import text_of
+from noack.runtime.coordinator_link import Destination, coordinator_link
 from noack.runtime.join_ticket import RemoteAccess
 from noack.runtime.private_folder import open_private
 
@@ -30,6 +27,8 @@ LEASE_MS = 6000
 """A connection whose other end is silent for longer breaks. On a busy machine a process may not run
 for seconds."""
 _CONNECT_MS = 5000
+_REMOTE_CONNECT_MS = 9000
+"""Two attempts of the link to the coordinator."""
 _RETRY = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5}
 """Of a connection whose other end does not answer."""
 _FOLDERS: dict[Path, int] = {}
@@ -46,33 +45,29 @@ def open_session(kind: str, name: str, *, listen: bool) -> zenoh.Session:
 
 
 @contextmanager
-def open_remote_session(remote: RemoteAccess) -> Iterator[zenoh.Session]:
-    """Give a session with a coordinator on another host; raise zenoh.ZError if that fails.
+def open_remote_session(remote: RemoteAccess, key: bytes) -> Iterator[zenoh.Session]:
+    """Give a session with a coordinator on another host, in a run with this key.
 
-    zenoh's TLS does not accept an IPv6 address. The connection with one begins at a forwarder on
-    loopback; its two ends of TLS are the same.
+    Raises:
+        NoAnswerError: that fails.
+        MachineError: the link to the coordinator cannot be started.
+        CallerError: other users have access to the user's runtime directory.
     """
-
-    def encoded(pem: str) -> str:
-        return base64.b64encode(pem.encode()).decode()
-
-    tls = {
-        "root_ca_certificate_base64": encoded(remote.authority),
-        "connect_certificate_base64": encoded(remote.certificate),
-        "connect_private_key_base64": encoded(remote.private_key),
-        "enable_mtls": True,
-        "verify_name_on_connect": True,
-    }
-    address: Address = remote.host, remote.port
-    with ExitStack() as stack:
-        if family_of(address) == socket.AF_INET6:
-            listening = stack.enter_context(socket.create_server((LOOPBACK, 0)))
-            stack.enter_context(forwarding(listening, lambda: asyncio.open_connection(*address)))
-            endpoint = f"tls/{text_of(listening.getsockname())}"
-        else:
-            endpoint = f"tls/{text_of(address)}"
-        more = {"transport/link/tls": tls}
-        yield zenoh.open(session_config(endpoint, listen=False, more=more))
+    destination = Destination(
+        remote.host, remote.port, remote.authority, remote.certificate, remote.private_key,
+        key.hex(),
+    )  # fmt: skip
+    with coordinator_link(destination) as link:
+        more = {"connect/timeout_ms": _REMOTE_CONNECT_MS}
+        try:
+            config = session_config(f"unixsock-stream/{link.path}", listen=False, more=more)
+            session = zenoh.open(config)
+        except zenoh.ZError:
+            address = text_of((remote.host, remote.port))
+            raise NoAnswerError(
+                f"cannot reach the run at {address}: {link.why_unreachable()}"
+            ) from None
+        yield session
 
 
 def endpoint_of(kind: str, name: str) -> str:
