@@ -11,6 +11,7 @@ import os
 import secrets
 import signal
 import socket
+import ssl
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -32,6 +33,10 @@ _LINGER_S = 5.0
 _READY = b"ready\n"
 _BACKLOG = 16
 _LONGEST_REASON = 4096
+_FOREIGN = (
+    "a program listens there, but does not accept this invitation; each run has a new one: copy "
+    "that of the open run"
+)
 _NO_REASON = "no connection in time; is this host or the recording host overloaded?"
 
 
@@ -135,7 +140,9 @@ async def connect(destination: Destination) -> Streams:
         )
     except ConnectionResetError:
         reason = _flooded("it closed the connection")
-    except OSError as error:  # also of TLS
+    except ssl.SSLError:
+        reason = _FOREIGN
+    except OSError as error:
         reason = why(error)
     raise NoAnswerError(reason)
 
@@ -152,10 +159,7 @@ async def _connect(destination: Destination) -> Streams:
         if answer == b"":
             raise ConnectionResetError
         if answer != Answer.ADMITTED:
-            raise NoAnswerError(
-                "a program listens there, but does not accept this invitation; each run has a new "
-                "one: copy that of the open run"
-            )
+            raise NoAnswerError(_FOREIGN)
         context = tls_context(
             destination.authority, destination.certificate, destination.private_key, server=False
         )
