@@ -37,6 +37,10 @@ _FOREIGN = (
     "a program listens there, but does not accept this invitation; each run has a new one: copy "
     "that of the open run"
 )
+_FLOODED = (
+    "it had no room for this connection: other connections flood its port; start this process "
+    "again, and see what `noack record` says about the flood"
+)
 _NO_REASON = "no connection in time; is this host or the recording host overloaded?"
 
 
@@ -138,8 +142,11 @@ async def connect(destination: Destination) -> Streams:
         reason = (
             "nothing listens there; if `noack record` has ended, copy the invitation of a new one"
         )
-    except ConnectionResetError:
-        reason = _flooded("it closed the connection")
+    except (ConnectionResetError, ConnectionAbortedError):
+        reason = (
+            "it closed the connection without an answer; has `noack record` just ended, or do "
+            "other connections flood its port?"
+        )
     except ssl.SSLError:
         reason = _FOREIGN
     except OSError as error:
@@ -155,7 +162,7 @@ async def _connect(destination: Destination) -> Streams:
         writer.write(proof.make(*addresses))
         answer = await reader.read(1)
         if answer == Answer.NO_ROOM:
-            raise NoAnswerError(_flooded("it had no room for this connection"))
+            raise NoAnswerError(_FLOODED)
         if answer == b"":
             raise ConnectionResetError
         if answer != Answer.ADMITTED:
@@ -168,13 +175,6 @@ async def _connect(destination: Destination) -> Streams:
         writer.transport.abort()
         raise
     return reader, writer
-
-
-def _flooded(what: str) -> str:
-    return (
-        f"{what}: other connections flood its port; start this process again, and see what "
-        "`noack record` says about the flood"
-    )
 
 
 def _main() -> None:
