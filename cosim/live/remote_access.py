@@ -126,7 +126,7 @@ def open_to_hosts(
     with ExitStack() as stack:
         endpoint = stack.enter_context(_listen(listening.address))
         host, port = endpoint.getsockname()[:2]
-        floods = _FloodWatch()
+        floods = ConnectionFloodWatch()
         protection = Protection(
             coordinator_context(keys), InvitationProof(ticket.key), floods.next_interval
         )
@@ -152,7 +152,7 @@ def open_to_hosts(
         yield Opened((host, port), ticket.model_copy(update=invited), floods.lines)
 
 
-class _FloodWatch:
+class ConnectionFloodWatch:
     """Reports the begin and the end of a flood of connections without an invitation.
 
     The end is reported after a number of consecutive calm intervals, which doubles with each flood,

@@ -14,7 +14,7 @@ use for another one. The coordinator answers with one byte (:class:`Answer`); th
 
 import hashlib
 import hmac
-import socket
+import ipaddress
 from enum import Enum
 
 from noack.protocol.datagram_seal import KEY_BYTES, TAG_BYTES, Tagger
@@ -57,7 +57,5 @@ class InvitationProof:
 
 def _packed(address: tuple[str, int]) -> bytes:
     """Return an address as bytes of a fixed length; a scope is left out."""
-    host = address[0].partition("%")[0]
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    numeric = socket.inet_pton(family, host).ljust(_ADDRESS_BYTES, b"\0")
-    return numeric + address[1].to_bytes(2, "big")
+    host = ipaddress.ip_address(address[0].partition("%")[0])
+    return host.packed.ljust(_ADDRESS_BYTES, b"\0") + address[1].to_bytes(2, "big")

@@ -44,8 +44,10 @@ def forwarding(
     protection: Protection | None = None,
     *,
     linger_s: float = 0.0,
-) -> AbstractContextManager[None]:
+) -> AbstractContextManager[asyncio.AbstractEventLoop]:
     """Forward each connection to a new connection with the target, within the context.
+
+    The context yields the event loop in which ``target`` is called.
 
     Args:
         listening: a socket that listens; the caller closes it.
@@ -90,7 +92,6 @@ class _Forwarder:
             writer.transport.abort()
 
     async def _streams(self, connection: socket.socket) -> Streams:
-        connection.setblocking(False)
         loop, reader = asyncio.get_running_loop(), asyncio.StreamReader()
         protocol = asyncio.StreamReaderProtocol(reader)
         context = None if self._protection is None else self._protection.context

@@ -53,8 +53,8 @@ def accepting(
     name: str,
     linger_s: float = 0.0,
     patience_s: float | None = None,
-) -> Iterator[None]:
-    """Accept connections on a thread meanwhile; end all of them at the end.
+) -> Iterator[asyncio.AbstractEventLoop]:
+    """Accept connections on a thread meanwhile, and yield its event loop; at the end, end all.
 
     Args:
         listening: a socket that listens; the caller closes it.
@@ -70,7 +70,7 @@ def accepting(
     thread = threading.Thread(target=gate.run, name=name, daemon=True)
     thread.start()
     try:
-        yield
+        yield loop
     finally:
         loop.call_soon_threadsafe(loop.stop)
         thread.join(patience_s)
@@ -173,7 +173,6 @@ class _Gate:
                 self._loop.remove_reader(self._descriptor)
                 self._loop.call_later(_NO_DESCRIPTOR_PAUSE_S, self._resume)
                 return
-            connection.setblocking(False)
             host = source[0] if source else ""  # a Unix socket has no host
             if self._first is None:
                 self._serve(connection, b"", host)
@@ -192,7 +191,7 @@ class _Gate:
     def _advance(self, one: _Waiting, first: FirstBytes) -> bool:
         """Read what has arrived; return whether the connection waits no longer."""
         try:
-            data = one.connection.recv(first.most - len(one.data))
+            data = one.connection.recv(first.most - len(one.data), socket.MSG_DONTWAIT)
         except BlockingIOError:
             return False
         except OSError:
@@ -240,7 +239,7 @@ class _Gate:
         self._unserved[one.host] += 1
         self._forget(one)
         with suppress(OSError):
-            one.connection.send(answer)
+            one.connection.send(answer, socket.MSG_DONTWAIT)
         one.connection.close()
 
     def _forget(self, one: _Waiting) -> None:
@@ -248,6 +247,7 @@ class _Gate:
         del self._waiting[one.connection.fileno()]
 
     def _serve(self, connection: socket.socket, data: bytes, host: str) -> None:
+        connection.setblocking(False)
         # The task closes what it is given; the callback, if the task ends before it begins.
         task = self._loop.create_task(self._begin(connection, data, host))
         task.add_done_callback(partial(_finish, connection))

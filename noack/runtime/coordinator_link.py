@@ -14,11 +14,12 @@ import socket
 import ssl
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import NamedTuple
 
-from noack.core.errors import MachineError, NoAnswerError, why
+from noack.core.errors import MachineError, NoAnswerError, PeerError, why
 from noack.core.python_process import python_command
 from noack.protocol.invitation_proof import Answer, InvitationProof
 from noack.runtime.connection_forwarder import Streams, forwarding
@@ -28,11 +29,13 @@ from noack.runtime.tls_context import tls_context
 _FOLDER = "links"
 _OPEN_S = 4.0
 """Longest time for a connection with the coordinator."""
+_PATIENCE_S = 10.0
+"""Time within which the first connection is tried again."""
 _LINGER_S = 5.0
 """Longest time for which the program, at the end, sends what it has received."""
+_PAUSE_S = 0.2
 _READY = b"ready\n"
 _BACKLOG = 16
-_LONGEST_REASON = 4096
 _FOREIGN = (
     "a program listens there, but does not accept this invitation; each run has a new one: copy "
     "that of the open run"
@@ -41,7 +44,6 @@ _FLOODED = (
     "it had no room for this connection: other connections flood its port; start this process "
     "again, and see what `noack record` says about the flood"
 )
-_NO_REASON = "no connection in time; is this host or the recording host overloaded?"
 
 
 class Destination(NamedTuple):
@@ -55,28 +57,12 @@ class Destination(NamedTuple):
     key: str
 
 
-class CoordinatorLink:
-    """An open link."""
-
-    def __init__(self, path: str, reasons: int) -> None:
-        self.path = path
-        """Path of its Unix socket, in the words of this process."""
-        self._reasons = reasons
-
-    def why_unreachable(self) -> str:
-        """Return why the newest connection with the coordinator failed."""
-        os.set_blocking(self._reasons, False)
-        with suppress(BlockingIOError):
-            lines = os.read(self._reasons, _LONGEST_REASON).decode(errors="replace").splitlines()
-            return lines[-1] if lines else _NO_REASON
-        return _NO_REASON
-
-
 @contextmanager
-def coordinator_link(destination: Destination) -> Iterator[CoordinatorLink]:
-    """Open a link within the context.
+def coordinator_link(destination: Destination) -> Iterator[str]:
+    """Open a link within the context; yield the path of its Unix socket, for this process.
 
     Raises:
+        NoAnswerError: the coordinator cannot be reached.
         MachineError: the program cannot be started.
         CallerError: other users have access to the user's runtime directory.
     """
@@ -97,9 +83,12 @@ def coordinator_link(destination: Destination) -> Iterator[CoordinatorLink]:
                 with suppress(BrokenPipeError):
                     program.stdin.write(json.dumps(destination).encode() + b"\n")
                     program.stdin.flush()
-                if program.stdout.readline() != _READY:
+                said = program.stdout.readline()
+                if not said:
                     raise MachineError("the link to the coordinator did not start")
-                yield CoordinatorLink(path, program.stdout.fileno())
+                if said != _READY:
+                    raise NoAnswerError(said.decode().strip())
+                yield path
             finally:
                 with suppress(BrokenPipeError):
                     program.stdin.close()
@@ -125,33 +114,33 @@ def _unnamed_socket() -> Iterator[tuple[socket.socket, str]]:
 
 
 async def connect(destination: Destination) -> Streams:
-    """Connect with the coordinator by TLS.
+    """Connect with the coordinator by TLS; the message of an error is for the person who tries.
 
     Raises:
-        NoAnswerError: that fails; the message says why, for the person who tries.
+        NoAnswerError: that fails, and may succeed later.
+        PeerError: that fails.
     """
     try:
         async with asyncio.timeout(_OPEN_S):
             return await _connect(destination)
     except TimeoutError:
-        reason = (
+        raise NoAnswerError(
             "no answer; is it the recording host's address? Do firewalls pass TCP to this port? "
             "Is that host flooded with connections?"
-        )
+        ) from None
     except ConnectionRefusedError:
-        reason = (
+        raise PeerError(
             "nothing listens there; if `noack record` has ended, copy the invitation of a new one"
-        )
+        ) from None
     except (ConnectionResetError, ConnectionAbortedError):
-        reason = (
+        raise NoAnswerError(
             "it closed the connection without an answer; has `noack record` just ended, or do "
             "other connections flood its port?"
-        )
+        ) from None
     except ssl.SSLError:
-        reason = _FOREIGN
+        raise PeerError(_FOREIGN) from None
     except OSError as error:
-        reason = why(error)
-    raise NoAnswerError(reason)
+        raise PeerError(why(error)) from None
 
 
 async def _connect(destination: Destination) -> Streams:
@@ -166,7 +155,7 @@ async def _connect(destination: Destination) -> Streams:
         if answer == b"":
             raise ConnectionResetError
         if answer != Answer.ADMITTED:
-            raise NoAnswerError(_FOREIGN)
+            raise PeerError(_FOREIGN)
         context = tls_context(
             destination.authority, destination.certificate, destination.private_key, server=False
         )
@@ -181,22 +170,36 @@ def _main() -> None:
     for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(one, signal.SIG_IGN)  # it ends after the process that it serves
     destination = Destination(*json.loads(sys.stdin.buffer.readline()))
-    os.write(sys.stdout.fileno(), _READY)
-    os.set_blocking(sys.stdout.fileno(), False)
+    prepared: list[Streams] = []
 
     async def target() -> Streams:
-        try:
-            return await connect(destination)
-        except NoAnswerError as error:
-            with suppress(OSError):  # nobody reads it any more
-                os.write(sys.stdout.fileno(), f"{error}\n".encode())
-            raise
+        return prepared.pop() if prepared else await connect(destination)
 
     with (
         socket.socket(fileno=int(sys.argv[1])) as listening,
-        forwarding(listening, target, linger_s=_LINGER_S),
+        forwarding(listening, target, linger_s=_LINGER_S) as loop,
+        suppress(BrokenPipeError),  # the other process has ended
     ):
+        opening = asyncio.run_coroutine_threadsafe(_connect_patiently(destination), loop)
+        try:
+            prepared.append(opening.result())
+        except PeerError as error:
+            os.write(sys.stdout.fileno(), f"{error}\n".encode())
+            return
+        os.write(sys.stdout.fileno(), _READY)
         sys.stdin.buffer.read()  # ends when the other process closes it, or ends
+
+
+async def _connect_patiently(destination: Destination) -> Streams:
+    """Connect with the coordinator; try again while that may succeed later."""
+    until_s = time.monotonic() + _PATIENCE_S
+    while True:
+        try:
+            return await connect(destination)
+        except NoAnswerError:
+            if time.monotonic() > until_s:
+                raise
+            await asyncio.sleep(_PAUSE_S)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +27,6 @@ LEASE_MS = 6000
 """A connection whose other end is silent for longer breaks. On a busy machine a process may not run
 for seconds."""
 _CONNECT_MS = 5000
-_REMOTE_CONNECT_MS = 9000
-"""Two attempts of the link to the coordinator."""
 _RETRY = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5}
 """Of a connection whose other end does not answer."""
 _FOLDERS: dict[Path, int] = {}
@@ -57,16 +55,14 @@ def open_remote_session(remote: RemoteAccess, key: bytes) -> Iterator[zenoh.Sess
         remote.host, remote.port, remote.authority, remote.certificate, remote.private_key,
         key.hex(),
     )  # fmt: skip
-    with coordinator_link(destination) as link:
-        more = {"connect/timeout_ms": _REMOTE_CONNECT_MS}
+    address = text_of((remote.host, remote.port))
+    with ExitStack() as stack:
         try:
-            config = session_config(f"unixsock-stream/{link.path}", listen=False, more=more)
-            session = zenoh.open(config)
-        except zenoh.ZError:
-            address = text_of((remote.host, remote.port))
-            raise NoAnswerError(
-                f"cannot reach the run at {address}: {link.why_unreachable()}"
-            ) from None
+            path = stack.enter_context(coordinator_link(destination))
+            session = zenoh.open(session_config(f"unixsock-stream/{path}", listen=False))
+        except (NoAnswerError, zenoh.ZError) as error:
+            reason = error if isinstance(error, NoAnswerError) else cause_of(error)
+            raise NoAnswerError(f"cannot reach the run at {address}: {reason}") from None
         yield session
 
 

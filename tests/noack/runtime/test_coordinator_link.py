@@ -4,12 +4,13 @@ import asyncio
 import socket
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
 import pytest
 
 from cosim.live.tls_keys import TlsKeys, coordinator_context, new_tls_keys
-from noack.core.errors import NoAnswerError
+from noack.core.errors import NoAnswerError, PeerError
 from noack.protocol.invitation_proof import Answer, InvitationProof
 from noack.runtime import coordinator_link as link_module
 from noack.runtime.connection_forwarder import Protection, Streams, forwarding
@@ -30,13 +31,20 @@ def destination(endpoint: socket.socket, keys: TlsKeys = KEYS, key: bytes = KEY)
 
 
 def reason(to: Destination) -> str:
-    with pytest.raises(NoAnswerError) as caught:
+    with pytest.raises(PeerError) as caught:
         asyncio.run(connect(to))
     return str(caught.value)
 
 
 async def nowhere() -> Streams:
     raise ConnectionError
+
+
+def unix_socket(path: str) -> socket.socket:
+    one = socket.socket(socket.AF_UNIX)
+    one.settimeout(60)
+    one.connect(path)
+    return one
 
 
 def protection() -> Protection:
@@ -102,11 +110,7 @@ def test_what_was_sent_before_the_end_arrives(listening: socket.socket) -> None:
         far.settimeout(60)
 
         def send() -> None:
-            with (
-                coordinator_link(destination(listening)) as link,
-                socket.socket(socket.AF_UNIX) as one,
-            ):
-                one.connect(link.path)
+            with coordinator_link(destination(listening)) as path, unix_socket(path) as one:
                 one.sendall(message)
 
         thread = threading.Thread(target=send)
@@ -121,9 +125,34 @@ def test_what_was_sent_before_the_end_arrives(listening: socket.socket) -> None:
 def test_the_link_reports_why_it_fails() -> None:
     with socket.socket() as bound:
         bound.bind(("127.0.0.1", 0))
-        with coordinator_link(destination(bound)) as link:
-            with socket.socket(socket.AF_UNIX) as one:
-                one.settimeout(60)
-                one.connect(link.path)
-                assert one.recv(1) == b""
-            assert link.why_unreachable().startswith("nothing listens there")
+        with (
+            pytest.raises(NoAnswerError, match="nothing listens there"),
+            coordinator_link(destination(bound)),
+        ):
+            pass
+
+
+def test_the_link_tries_again_while_there_is_no_room(listening: socket.socket) -> None:
+    """Then it forwards the first connection by the one that it has."""
+    near, far = socket.socketpair()
+
+    async def target() -> Streams:
+        return await asyncio.open_connection(sock=near)
+
+    def turn_away_then_admit() -> None:
+        connection, _ = listening.accept()
+        with connection:
+            connection.recv(100)
+            connection.sendall(Answer.NO_ROOM.value)
+        with forwarding(listening, target, protection()):
+            assert far.recv(100) == b"hello"
+            far.sendall(b"hello to you")
+            assert far.recv(100) == b""
+
+    far.settimeout(60)
+    with far, ThreadPoolExecutor() as pool:
+        admitted = pool.submit(turn_away_then_admit)
+        with coordinator_link(destination(listening)) as path, unix_socket(path) as one:
+            one.sendall(b"hello")
+            assert one.recv(100) == b"hello to you"
+        admitted.result()
