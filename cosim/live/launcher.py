@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 from cosim.live.child_processes import ChildProcesses, Failure
@@ -63,6 +64,7 @@ class Watcher:
     restarted: Callable[[str, float], None] = lambda role, t_s: None
     progress: Callable[[dict[str, Any]], None] = lambda progress: None
     stopping: Callable[[str], None] = lambda why: None
+    notice: Callable[[str], None] = lambda line: None
 
 
 def joint_watcher(watchers: Sequence[Watcher]) -> Watcher:
@@ -136,10 +138,12 @@ def launch(
         coordinator = Coordinator(ticket, here)
         stack.callback(coordinator.close)
         watcher, remote = watcher or Watcher(), None
+        notices: SimpleQueue[str] = SimpleQueue()
         with _no_directory_if_refused(run_dir):
             if listening is not None:
                 ticket = ticket.model_copy(update={"host": listening.address[0]})
                 opened = stack.enter_context(open_to_hosts(listening, ticket, coordinator))
+                notices = opened.notices
                 remote = RemoteStart(away, opened.invitation.model_dump_json())
             if session is not None:
                 by_hand = ticket.model_copy(update={"launched": False})
@@ -150,7 +154,7 @@ def launch(
                 watcher.listening(text_of(opened.address), listening)
         children = ChildProcesses(ticket, run_dir, spawn, server, remote)
         stack.enter_context(children.started(live=live))
-        run = _Run(ticket, run_dir, coordinator, children, watcher)
+        run = _Run(ticket, run_dir, coordinator, children, watcher, notices)
         status, reason = run.watch(signals, ending.store)
         if coordinator.epoch_ns is None:
             raise NeverStartedError(f"{reason} (logs in {run_dir / 'logs'})", status)
@@ -187,7 +191,9 @@ class _Run:
         coordinator: Coordinator,
         children: ChildProcesses,
         watcher: Watcher,
+        notices: SimpleQueue[str],
     ) -> None:
+        self._notices = notices
         self._scenario = ticket.scenario
         self._run_dir = run_dir
         self._coordinator = coordinator
@@ -280,6 +286,8 @@ class _Run:
     def _notify_progress(self) -> None:
         if (progress := self._coordinator.progress()) is not None:
             self._notify("progress", progress)
+        while not self._notices.empty():
+            self._notify("notice", self._notices.get_nowait())
 
     def _notify(self, callback: str, *arguments: object) -> None:
         try:

@@ -45,7 +45,7 @@ def progress_line(
         shown = _RunProgress(console, progress, scenario, session)
         yield Watcher(
             shown.waiting, shown.listening, shown.started, shown.failed, shown.restarted,
-            shown.update, shown.stopping,
+            shown.update, shown.stopping, shown.notice,
         )  # fmt: skip
 
 
@@ -108,6 +108,10 @@ class _RunProgress:
     def stopping(self, why: str) -> None:
         """Say why the run ends early: the completion of its record may take minutes."""
         self._print(f"{escape(why)}; the run ends, and its record is completed")
+
+    def notice(self, line: str) -> None:
+        """Show a line about the run."""
+        self._print(escape(line))
 
     def update(self, report: dict[str, Any]) -> None:
         """Show the recorder's progress report."""

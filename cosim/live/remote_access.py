@@ -5,9 +5,11 @@ import datetime
 import ipaddress
 import socket
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from queue import SimpleQueue
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -16,9 +18,10 @@ from cosim.live.remote_hosts import Host, load_hosts
 from noack.config.scenario import Scenario
 from noack.config.sections.run_sections import ClocksSection
 from noack.core.errors import CallerError, PeerError, why
+from noack.protocol.invitation_proof import InvitationProof
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.address import Address, family_of, parse_address, text_of
-from noack.runtime.connection_forwarder import forwarding
+from noack.runtime.connection_forwarder import Protection, forwarding
 from noack.runtime.control_plane import RUNS, run_name
 from noack.runtime.invitation import own_host
 from noack.runtime.join_ticket import RemoteAccess, Ticket, new_admission_pass
@@ -26,6 +29,10 @@ from noack.runtime.time_exchange import TimeReference, answering
 from noack.runtime.zenoh_session import socket_path
 
 _BACKLOG = 4096
+_FLOOD_PER_S = 100
+"""Connections without an invitation that are a flood."""
+_CALM_S, _MOST_CALM_S = 3, 60
+"""Seconds without so many, after which it is over."""
 
 
 class Listening(NamedTuple):
@@ -46,6 +53,8 @@ class Opened(NamedTuple):
 
     address: Address
     invitation: Ticket
+    notices: SimpleQueue[str]
+    """Lines for the person who watches the run: floods."""
 
 
 def listening_for(path: Path) -> Listening:
@@ -117,10 +126,12 @@ def open_to_hosts(
     with ExitStack() as stack:
         endpoint = stack.enter_context(_listen(listening.address))
         host, port = endpoint.getsockname()[:2]
+        floods = ConnectionFloodWatch()
+        protection = Protection(
+            coordinator_context(keys), InvitationProof(ticket.key), floods.next_interval
+        )
         stack.enter_context(
-            forwarding(
-                endpoint, lambda: asyncio.open_unix_connection(path), coordinator_context(keys)
-            )
+            forwarding(endpoint, lambda: asyncio.open_unix_connection(path), protection)
         )
         times = TimeReference((host, listening.address[1]), ticket.key)
         stack.callback(times.close)
@@ -138,4 +149,38 @@ def open_to_hosts(
             "launched": False, "admission_pass": shown, "remote": remote,
             "time_reference": times.address,
         }  # fmt: skip
-        yield Opened((host, port), ticket.model_copy(update=invited))
+        yield Opened((host, port), ticket.model_copy(update=invited), floods.lines)
+
+
+class ConnectionFloodWatch:
+    """Reports the begin and the end of a flood of connections without an invitation.
+
+    The end is reported after a number of consecutive calm intervals, which doubles with each flood,
+    so that repeated floods print few lines.
+    """
+
+    def __init__(self) -> None:
+        self.lines: SimpleQueue[str] = SimpleQueue()
+        self._ended = self._calm = 0
+        self._needed = _CALM_S
+
+    def next_interval(self, count: Counter[str]) -> None:
+        """Count connections that ended in a second without an invitation, by host."""
+        total = count.total()
+        if total >= _FLOOD_PER_S:
+            self._calm = 0
+            if not self._ended:
+                self.lines.put(
+                    f"flood: {total} connections without an invitation in a second, from "
+                    f"{len(count)} addresses, most from {count.most_common(1)[0][0]}; "
+                    "processes with an invitation can still join"
+                )
+            self._ended += total
+        elif self._ended:
+            self._ended += total
+            self._calm += 1
+            if self._calm >= self._needed:
+                self.lines.put(
+                    f"the flood is over: {self._ended} connections without an invitation ended"
+                )
+                self._ended, self._needed = 0, min(2 * self._needed, _MOST_CALM_S)

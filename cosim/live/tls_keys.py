@@ -7,9 +7,7 @@ forgotten. Each end accepts only the other one's certificate.
 import datetime
 import ipaddress
 import ssl
-import tempfile
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 from cryptography import x509
@@ -17,7 +15,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from noack.runtime.address import LOOPBACK
+from noack.runtime.tls_context import tls_context
 
 _VALID = datetime.timedelta(days=3650)
 """A run may be long, and the hosts' dates may differ; an invitation ends by its pass."""
@@ -47,8 +45,7 @@ def new_tls_keys(host: str) -> TlsKeys:
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .sign(key, hashes.SHA256())
     )
-    # IPv6 connections begin at a forwarder on loopback.
-    addresses = [x509.IPAddress(ipaddress.ip_address(one)) for one in {host, LOOPBACK}]
+    addresses = [x509.IPAddress(ipaddress.ip_address(host))]
     joining = [x509.DNSName("joining")]
     return TlsKeys(
         _pem(authority),
@@ -104,13 +101,5 @@ def _pem(certificate: x509.Certificate) -> str:
 
 
 def coordinator_context(keys: TlsKeys) -> ssl.SSLContext:
-    """Return the TLS settings of the coordinator's end: TLS 1.3, both ends have certificates."""
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.minimum_version = ssl.TLSVersion.TLSv1_3
-    context.verify_mode = ssl.CERT_REQUIRED
-    context.load_verify_locations(cadata=keys.authority)
-    with tempfile.TemporaryDirectory() as folder:  # closed to others; ssl reads files only
-        path = Path(folder) / "coordinator.pem"
-        path.write_text(keys.coordinator.private_key + keys.coordinator.certificate)
-        context.load_cert_chain(path)
-    return context
+    """Return the TLS settings of the coordinator's end."""
+    return tls_context(keys.authority, *keys.coordinator, server=True)

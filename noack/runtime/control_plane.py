@@ -21,10 +21,8 @@ from noack.config.scenario import MOST_CHANGES
 from noack.core.errors import NoAnswerError, PeerError
 from noack.impairments.kept_loss import remember
 from noack.protocol.topology import COORDINATOR
-from noack.runtime.address import text_of
 from noack.runtime.control_messages import ChangeAnnouncement, parse_message
 from noack.runtime.join_ticket import Ticket
-from noack.runtime.reachability import why_unreachable
 from noack.runtime.spool import writer_of
 from noack.runtime.zenoh_session import (
     cause_of,
@@ -69,14 +67,9 @@ class ControlPlane:
             self.session = (
                 open_session(RUNS, run_name(ticket.run_id), listen=listen)
                 if ticket.remote is None
-                else self._resources.enter_context(open_remote_session(ticket.remote))
+                else self._resources.enter_context(open_remote_session(ticket.remote, ticket.key))
             )
         except zenoh.ZError as error:
-            if ticket.remote is not None:
-                address = ticket.remote.host, ticket.remote.port
-                raise NoAnswerError(
-                    f"cannot reach the run at {text_of(address)}: {why_unreachable(address)}"
-                ) from None
             what = "start the control plane" if listen else "reach the run's coordinator"
             raise NoAnswerError(f"cannot {what}: {cause_of(error)}") from None
         self._token = self.session.liveliness().declare_token(

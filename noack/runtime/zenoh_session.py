@@ -1,16 +1,13 @@
 """zenoh sessions over Unix sockets: one process listens, the others connect.
 
 A socket is in the user's runtime directory, which is closed to other users: nobody else can connect
-to it, or listen in its place. From another host, a session connects by TLS to
-:mod:`cosim.live.remote_access`, which forwards to such a socket. Both ends have certificates of the
-run.
+to it, or listen in its place. From another host, a session connects through
+:mod:`noack.runtime.coordinator_link` by TLS to :mod:`cosim.live.remote_access`, which forwards to
+such a socket. Both ends have certificates of the run.
 """
 
-import asyncio
-import base64
 import json
 import os
-import socket
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -20,9 +17,9 @@ from typing import Any
 import zenoh
 from zenoh.handlers import FifoChannel
 
-from noack.core.errors import CallerError
-from noack.runtime.address import LOOPBACK, Address, family_of, text_of
-from noack.runtime.connection_forwarder import forwarding
+from noack.core.errors import CallerError, NoAnswerError
+from noack.runtime.address import text_of
+from noack.runtime.coordinator_link import Destination, coordinator_link
 from noack.runtime.join_ticket import RemoteAccess
 from noack.runtime.private_folder import open_private
 
@@ -46,33 +43,27 @@ def open_session(kind: str, name: str, *, listen: bool) -> zenoh.Session:
 
 
 @contextmanager
-def open_remote_session(remote: RemoteAccess) -> Iterator[zenoh.Session]:
-    """Give a session with a coordinator on another host; raise zenoh.ZError if that fails.
+def open_remote_session(remote: RemoteAccess, key: bytes) -> Iterator[zenoh.Session]:
+    """Give a session with a coordinator on another host, in a run with this key.
 
-    zenoh's TLS does not accept an IPv6 address. The connection with one begins at a forwarder on
-    loopback; its two ends of TLS are the same.
+    Raises:
+        NoAnswerError: that fails.
+        MachineError: the link to the coordinator cannot be started.
+        CallerError: other users have access to the user's runtime directory.
     """
-
-    def encoded(pem: str) -> str:
-        return base64.b64encode(pem.encode()).decode()
-
-    tls = {
-        "root_ca_certificate_base64": encoded(remote.authority),
-        "connect_certificate_base64": encoded(remote.certificate),
-        "connect_private_key_base64": encoded(remote.private_key),
-        "enable_mtls": True,
-        "verify_name_on_connect": True,
-    }
-    address: Address = remote.host, remote.port
+    destination = Destination(
+        remote.host, remote.port, remote.authority, remote.certificate, remote.private_key,
+        key.hex(),
+    )  # fmt: skip
+    address = text_of((remote.host, remote.port))
     with ExitStack() as stack:
-        if family_of(address) == socket.AF_INET6:
-            listening = stack.enter_context(socket.create_server((LOOPBACK, 0)))
-            stack.enter_context(forwarding(listening, lambda: asyncio.open_connection(*address)))
-            endpoint = f"tls/{text_of(listening.getsockname())}"
-        else:
-            endpoint = f"tls/{text_of(address)}"
-        more = {"transport/link/tls": tls}
-        yield zenoh.open(session_config(endpoint, listen=False, more=more))
+        try:
+            path = stack.enter_context(coordinator_link(destination))
+            session = zenoh.open(session_config(f"unixsock-stream/{path}", listen=False))
+        except (NoAnswerError, zenoh.ZError) as error:
+            reason = error if isinstance(error, NoAnswerError) else cause_of(error)
+            raise NoAnswerError(f"cannot reach the run at {address}: {reason}") from None
+        yield session
 
 
 def endpoint_of(kind: str, name: str) -> str:

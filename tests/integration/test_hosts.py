@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from itertools import islice
 from pathlib import Path
 
 import pytest
@@ -197,6 +198,35 @@ def test_rows_of_a_host_that_was_cut_off_are_collected(
     assert len(load_record(run_dir)["controller_step"]) == 8 * live.RATE_HZ
     again = start(0, "collect", str(run_dir), str(folder), "--json")
     assert json.loads(ended(again)[0])["replay"] == summary["replay"]
+
+
+def test_a_host_that_comes_back_loses_no_row(start: Start, hosts: TwoHosts, tmp_path: Path) -> None:
+    """The link is down until the recorder has given the other host's processes up for lost."""
+    recording = record(start, tmp_path, "10.83.3.1", *live.settings(horizon_s=50.0))
+    processes = [start(0, role) for role in ("plant", "sensor")]
+    processes += [start(1, role, *INVITED) for role in ("netem", "controller")]
+    spooled = tmp_path / "runs" / "latest" / "spool" / "controller_step.recorder"
+    live.wait_for(lambda: spooled.exists() and spooled.stat().st_size > 5000)
+    assert recording.stderr is not None
+    with _cut_off(hosts):
+        lines = (line for line in recording.stderr if "stopped responding" in line)
+        lost = dict(line.split(maxsplit=1) for line in islice(lines, 2))
+    assert set(lost) == {"netem", "controller"}
+    for process in processes:
+        _, stderr = ended(process)
+        assert process.returncode == 0, stderr
+        assert "are kept in" not in stderr
+    stdout, stderr = ended(recording)
+    assert recording.returncode == 0, stderr
+    summary = json.loads(stdout)
+    assert summary["replay"]["complete"]
+    assert summary["replay"]["bit_exact"]
+    assert summary["unintended_losses"] > 0
+    verdicts = {one["verdict"] for one in summary["claims"]}
+    assert "void" in verdicts
+    assert "violated" not in verdicts
+    steps = load_record((tmp_path / "runs" / "latest").resolve())["controller_step"]
+    assert len(steps) == 50 * live.RATE_HZ
 
 
 @contextmanager

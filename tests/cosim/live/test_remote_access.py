@@ -1,10 +1,11 @@
 """Where a run may listen, and what its scenario records then."""
 
+from collections import Counter
 from pathlib import Path
 
 import pytest
 
-from cosim.live.remote_access import listen_address, with_clocks
+from cosim.live.remote_access import ConnectionFloodWatch, listen_address, with_clocks
 from noack.config.scenario_file import load
 from noack.config.sections.run_sections import ClocksSection
 from noack.core.errors import CallerError
@@ -52,3 +53,23 @@ def test_one_loop_records_the_bounds_of_its_clocks() -> None:
     assert with_clocks(one).clocks == ClocksSection()
     strict = one.model_copy(update={"clocks": ClocksSection(largest_error_us=5.0)})
     assert with_clocks(strict) is strict
+
+
+def test_a_flood_of_connections_is_reported_at_its_begin_and_end() -> None:
+    watch = ConnectionFloodWatch()
+
+    def lines(*counts: int) -> list[str]:
+        for count in counts:
+            watch.next_interval(Counter({"192.0.2.7": count, "192.0.2.8": count // 2}))
+        return [watch.lines.get_nowait() for _ in range(watch.lines.qsize())]
+
+    assert lines(3, 0, 40) == []
+    (begin,) = lines(4000, 4000)
+    assert begin == (
+        "flood: 6000 connections without an invitation in a second, from 2 addresses, most from "
+        "192.0.2.7; processes with an invitation can still join"
+    )
+    assert lines(0, 0, 4000, 0, 0) == []
+    assert lines(0) == ["the flood is over: 18000 connections without an invitation ended"]
+    assert len(lines(4000, 0, 0, 0)) == 1  # the next end is reported later
+    assert len(lines(0, 0, 0)) == 1

@@ -5,6 +5,7 @@ import socket
 import threading
 import time
 import urllib.error
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ from cosim.live.launcher import Watcher, joint_watcher
 from cosim.live.run_metrics import RunMetrics
 from tests.netem.control.test_emulator_metrics import exposed, values_of
 from tests.noack.runtime.test_json_log import objects
-from tests.noack.runtime.test_metrics_server import read
+from tests.noack.runtime.test_metrics_server import read, slow_reader
 
 
 def test_metrics_follow_the_launchers_reports() -> None:
@@ -72,10 +73,13 @@ def test_a_live_run_serves_its_metrics_and_logs_its_events(tmp_path: Path) -> No
             except (urllib.error.URLError, ConnectionError):
                 time.sleep(0.02)
                 continue
+            if not found:
+                stack.enter_context(slow_reader(address))
             found.update(values)
             time.sleep(0.1)
 
     reader = threading.Thread(target=scrape)
+    stack = ExitStack()
     reader.start()
     words = ["run", "lane_following", "--set", "horizon_s=1", "--set", "ports={}", "--json"]
     more = ["--no-report", "--runs", str(tmp_path), "--metrics", f":{address[1]}"]
@@ -85,6 +89,7 @@ def test_a_live_run_serves_its_metrics_and_logs_its_events(tmp_path: Path) -> No
     finally:
         done.set()
         reader.join()
+        stack.close()
     assert finished.exit_code == 0, finished.stderr
     summary = json.loads(finished.stdout)
     assert 0 < found["noack_run_simulated_seconds"] <= summary["reached_s"]

@@ -3,19 +3,22 @@
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 
 import pytest
 from prometheus_client import CollectorRegistry
 from prometheus_client.openmetrics.exposition import generate_latest
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
 
+from netem.control import relay_attachments
 from netem.control.command_queue import CommandQueue
 from netem.control.emulator_metrics import EmulatorMetrics, metrics
 from netem.control.emulator_statistics import statistics
 from netem.control.relay_attachments import Options, attached
 from noack.runtime import metrics_server as servers
+from noack.runtime.address import text_of
 from tests.netem.control.relays import FakeRelay
-from tests.noack.runtime.test_metrics_server import read
+from tests.noack.runtime.test_metrics_server import read, slow_reader
 
 Values = dict[str, float]
 
@@ -63,23 +66,26 @@ def test_a_relay_that_has_ended_has_no_metrics(relay: FakeRelay) -> None:
     assert list(EmulatorMetrics(commands).collect()) == []
 
 
-def test_an_emulator_serves_its_metrics(
+def test_an_emulator_serves_its_metrics_and_ends_beside_a_slow_reader(
     relay: FakeRelay, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     threads = threading.active_count()
+    monkeypatch.setattr(servers, "_REQUEST_S", 3600.0)
     asked: list[tuple[str, int]] = []
-    bind = servers._Server.server_bind
-    monkeypatch.setattr(
-        servers._Server, "server_bind", lambda self: (bind(self), asked.append(self.server_address))
-    )
-    with attached(relay, Options(metrics=":0")) as side, ThreadPoolExecutor() as pool:
+    monkeypatch.setattr(relay_attachments, "text_of", lambda at: asked.append(at) or text_of(at))
+    with (
+        ExitStack() as stack,
+        attached(relay, Options(metrics=":0")) as side,
+        ThreadPoolExecutor() as pool,
+    ):
+        stack.enter_context(slow_reader(asked[0]))
         relay.counters["up", "forward"].received = 4
         reading = pool.submit(read, asked[0])
         while not reading.done():
             side.commands.run_pending()
         values = values_of(reading.result())
-    assert values["noack_netem_received_datagrams_total,forward,up"] == 4
     assert threading.active_count() == threads
+    assert values["noack_netem_received_datagrams_total,forward,up"] == 4
     assert (
         capfd.readouterr().err == f"noack netem: metrics: http://127.0.0.1:{asked[0][1]}/metrics\n"
     )

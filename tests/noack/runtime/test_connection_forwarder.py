@@ -8,13 +8,17 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
+from typing import Literal, get_args
 
 import pytest
 
 from cosim.live.tls_keys import KeyPair, TlsKeys, coordinator_context, new_tls_keys
-from noack.runtime.connection_forwarder import forwarding
+from noack.protocol.invitation_proof import PROOF_BYTES, Answer, InvitationProof
+from noack.runtime import connection_forwarder, connection_gate
+from noack.runtime.connection_forwarder import Protection, forwarding
 
 KEYS = new_tls_keys("127.0.0.1")
+PROOF = InvitationProof(bytes(32))
 MESSAGE = bytes(range(256)) * 4000
 
 
@@ -39,7 +43,7 @@ def echo() -> Iterator[socket.socket]:
             return await asyncio.open_connection(sock=near)
 
         echoes: list[asyncio.Task[None]] = []
-        with forwarding(outer, to_itself, coordinator_context(KEYS)):
+        with forwarding(outer, to_itself, Protection(coordinator_context(KEYS), PROOF)):
             yield outer
 
 
@@ -49,16 +53,23 @@ def connected(
     own: KeyPair | None,
     plain: socket.socket | None = None,
 ) -> ssl.SSLSocket:
+    """A connection with TLS, which has proved its invitation."""
+    with ExitStack() as stack:
+        plain = stack.enter_context(plain or socket.create_connection(address, timeout=60))
+        plain.sendall(PROOF.make(plain.getsockname(), address))
+        assert plain.recv(1) == Answer.ADMITTED
+        connection = handshake(plain, keys, own)
+        stack.pop_all()
+    return connection
+
+
+def handshake(plain: socket.socket, keys: TlsKeys, own: KeyPair | None) -> ssl.SSLSocket:
     context = ssl.create_default_context(cadata=keys.authority)
     if own is not None:
         with tempfile.TemporaryDirectory() as folder:
             (path := Path(folder) / "own.pem").write_text(own.private_key + own.certificate)
             context.load_cert_chain(path)
-    with ExitStack() as stack:
-        plain = stack.enter_context(plain or socket.create_connection(address, timeout=60))
-        connection = context.wrap_socket(plain, server_hostname="127.0.0.1")
-        stack.pop_all()
-    return connection
+    return context.wrap_socket(plain, server_hostname="127.0.0.1")
 
 
 def echoed(connection: socket.socket, message: bytes) -> bytes:
@@ -70,19 +81,49 @@ def echoed(connection: socket.socket, message: bytes) -> bytes:
     return found
 
 
-def test_bytes_pass_beside_a_crowd_of_half_open_connections() -> None:
+Kind = Literal["connect", "garbage", "half a proof", "a foreign proof"]
+
+
+@pytest.mark.parametrize("kind", get_args(Kind))
+@pytest.mark.parametrize("addresses", [1, 200])
+def test_a_flood_keeps_nobody_out(
+    monkeypatch: pytest.MonkeyPatch, kind: Kind, addresses: int
+) -> None:
+    """The flood fills all places between any two steps of one who joins, from his address too."""
+    monkeypatch.setattr(connection_gate, "_MOST_WAITING", 64)
+    monkeypatch.setattr(connection_gate, "_ROOM", 16)
+    monkeypatch.setattr(connection_forwarder, "_PROOF_S", 3600.0)
+    foreign = InvitationProof(b"\1" * 32)
     with echo() as listening, ExitStack() as stack:
         address = listening.getsockname()
-        for number in range(300):
-            one = stack.enter_context(closing(socket.create_connection(address, timeout=60)))
-            if number % 3 == 0:
-                one.sendall(b"GET / HTTP/1.1\r\n\r\n")
-        with connected(address, KEYS, KEYS.joining) as connection:
-            assert connection.version() == "TLSv1.3"
+
+        def flood(count: int) -> None:
+            for number in range(count):
+                host = f"127.0.{number % addresses}.1"
+                one = socket.create_connection(address, timeout=60, source_address=(host, 0))
+                stack.enter_context(closing(one))
+                proof = foreign.make(one.getsockname(), address)
+                sent = {"connect": b"", "garbage": b"\x16\3\1" * 100, "half a proof": proof[:10]}
+                with suppress(ConnectionError):
+                    one.sendall(sent.get(kind, proof))
+
+        flood(100)
+        with socket.create_connection(address, timeout=60) as plain:
+            plain.sendall(PROOF.make(plain.getsockname(), address))
+            flood(100)
+            assert plain.recv(1) == Answer.ADMITTED
+            flood(100)
+            connection = stack.enter_context(handshake(plain, KEYS, KEYS.joining))
+            flood(100)
             assert echoed(connection, MESSAGE[:1000]) == MESSAGE[:1000]
 
 
-def test_a_crowd_of_one_host_does_not_end_the_handshake_of_another() -> None:
+def test_a_flood_of_one_host_does_not_end_a_slow_connection_of_another(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(connection_forwarder, "_PROOF_S", 3600.0)
+    monkeypatch.setattr(connection_gate, "_MOST_WAITING", 64)
+    monkeypatch.setattr(connection_gate, "_ROOM", 16)
     with echo() as listening, ExitStack() as stack:
         address = listening.getsockname()
 
@@ -91,10 +132,33 @@ def test_a_crowd_of_one_host_does_not_end_the_handshake_of_another() -> None:
             return stack.enter_context(closing(one))
 
         first = begun("127.0.0.3")
-        crowd = [begun("127.0.0.2") for _ in range(300)]
-        assert crowd[100].recv(1) == b""  # so many were ended
+        crowd = [begun("127.0.0.2") for _ in range(200)]
+        assert crowd[0].recv(1) == Answer.NO_ROOM
         with connected(address, KEYS, KEYS.joining, first) as connection:
             assert echoed(connection, MESSAGE[:1000]) == MESSAGE[:1000]
+
+
+def test_a_proof_is_for_its_connection_only() -> None:
+    with echo() as listening:
+        address = listening.getsockname()
+        with socket.create_connection(address, timeout=60) as one:
+            proof = PROOF.make(one.getsockname(), address)
+            with socket.create_connection(address, timeout=60) as other:
+                other.sendall(proof)
+                assert other.recv(1) == Answer.REFUSED
+            for at in range(PROOF_BYTES):  # it may arrive in parts
+                one.sendall(proof[at : at + 1])
+            assert one.recv(1) == Answer.ADMITTED
+
+
+def test_without_a_proof_a_connection_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connection_forwarder, "_PROOF_S", 0.0)
+    monkeypatch.setattr(connection_gate, "_CHECK_S", 0.01)
+    with (
+        echo() as listening,
+        socket.create_connection(listening.getsockname(), timeout=60) as silent,
+    ):
+        assert silent.recv(1) == b""
 
 
 def test_connections_that_one_host_holds_keep_no_other_host_out() -> None:

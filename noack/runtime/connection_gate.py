@@ -1,0 +1,259 @@
+"""Accepts connections on a thread, and reads the first bytes of each before it costs more.
+
+A connection whose first bytes are not complete has a descriptor and a few bytes, but no task, no
+TLS and no thread. When too many of them wait, the oldest ones end of the hosts that have the most.
+Before one ends, what has arrived of it is read: only a connection without progress ends.
+"""
+
+import asyncio
+import socket
+import threading
+from collections import Counter
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+_MOST_WAITING = 512
+_ROOM = _MOST_WAITING // 4
+"""How many connections end when there are too many: choosing them together costs less."""
+_MOST_AT_ONCE = 128
+"""Connections accepted before others are served."""
+_NO_DESCRIPTOR_PAUSE_S = 0.05
+_CHECK_S = 1.0
+
+Begin = Callable[[socket.socket, bytes, str], Coroutine[Any, Any, None]]
+"""Serves a connection, given its first bytes and the other end's host; it is closed afterwards."""
+
+
+@dataclass(frozen=True)
+class FirstBytes:
+    """What a connection must send before it is served."""
+
+    judge: Callable[[bytes, Any], bool | None]
+    """Given the bytes and the other end's address: whether it is served; None: more are needed."""
+    most: int
+    """More bytes are not read, and not waited for."""
+    within_s: float
+    refused: bytes = b""
+    """Sent before a connection ends whose bytes are wrong."""
+    no_room: bytes = b""
+    """Sent before a connection ends to make room."""
+    unserved: Callable[[Counter[str]], None] = lambda count: None
+    """Called every second: how many connections ended since without being served, by host."""
+
+
+@contextmanager
+def accepting(
+    listening: socket.socket,
+    begin: Begin,
+    first: FirstBytes | None = None,
+    *,
+    name: str,
+    linger_s: float = 0.0,
+    patience_s: float | None = None,
+) -> Iterator[asyncio.AbstractEventLoop]:
+    """Accept connections on a thread meanwhile, and yield its event loop; at the end, end all.
+
+    Args:
+        listening: a socket that listens; the caller closes it.
+        begin: serves a connection in a task of the thread's event loop.
+        first: what a connection must send before; None: it is served at once.
+        name: of the thread.
+        linger_s: at the end, how long connections that are served may go on.
+        patience_s: longest wait at the end for a task that computes; None: no limit.
+    """
+    listening.setblocking(False)
+    loop = asyncio.new_event_loop()
+    gate = _Gate(loop, listening, begin, first, linger_s)
+    thread = threading.Thread(target=gate.run, name=name, daemon=True)
+    thread.start()
+    try:
+        yield loop
+    finally:
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join(patience_s)
+
+
+class TaskLimit:
+    """Limits how many tasks serve connections at once: one of the host that has the most ends.
+
+    Args:
+        most: the largest number.
+        end_newest: whether the newest of that host ends; otherwise the oldest.
+    """
+
+    def __init__(self, most: int, *, end_newest: bool = False) -> None:
+        self._most, self._end_newest = most, end_newest
+        self._hosts: dict[asyncio.Task[Any], str] = {}
+        """Oldest first."""
+
+    @contextmanager
+    def counted(self, host: str) -> Iterator[None]:
+        """Count the current task within the context."""
+        task = asyncio.current_task()
+        assert task is not None
+        self._hosts[task] = host
+        if len(self._hosts) > self._most:
+            self._end_one()
+        try:
+            yield
+        finally:
+            self._hosts.pop(task, None)
+
+    def _end_one(self) -> None:
+        crowd = Counter(self._hosts.values()).most_common(1)[0][0]
+        order = reversed(self._hosts) if self._end_newest else iter(self._hosts)
+        task = next(task for task in order if self._hosts[task] == crowd)
+        del self._hosts[task]
+        task.cancel()
+
+
+@dataclass(slots=True, eq=False)
+class _Waiting:
+    """A connection whose first bytes are not complete."""
+
+    connection: socket.socket
+    source: Any
+    host: str
+    until_s: float
+    data: bytes = b""
+
+
+class _Gate:
+    """The event loop of the thread."""
+
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        listening: socket.socket,
+        begin: Begin,
+        first: FirstBytes | None,
+        linger_s: float,
+    ) -> None:
+        self._loop, self._listening, self._begin, self._first = loop, listening, begin, first
+        self._linger_s = linger_s
+        self._descriptor = listening.fileno()
+        self._waiting: dict[int, _Waiting] = {}
+        """By descriptor, the oldest first."""
+        self._unserved: Counter[str] = Counter()
+        self._ending = False
+
+    def run(self) -> None:
+        """Accept connections until the loop is stopped."""
+        loop = self._loop
+        asyncio.set_event_loop(loop)
+        loop.add_reader(self._descriptor, self._accept)
+        if self._first is not None:
+            loop.call_later(_CHECK_S, self._check)
+        loop.run_forever()
+        self._ending = True
+        loop.remove_reader(self._descriptor)
+        for one in list(self._waiting.values()):
+            self._end(one)
+        left = asyncio.all_tasks(loop)
+        if left and self._linger_s:
+            loop.run_until_complete(asyncio.wait(left, timeout=self._linger_s))
+        for task in left:
+            task.cancel()
+        loop.run_until_complete(asyncio.gather(*left, return_exceptions=True))
+        loop.run_until_complete(asyncio.sleep(0))  # aborted transports close now
+        loop.close()
+
+    def _accept(self) -> None:
+        """Accept the connections that wait in the kernel."""
+        for _ in range(_MOST_AT_ONCE):
+            try:
+                connection, source = self._listening.accept()
+            except BlockingIOError:
+                return
+            except OSError:  # its other end has gone, or there are no descriptors left
+                self._make_room()
+                self._loop.remove_reader(self._descriptor)
+                self._loop.call_later(_NO_DESCRIPTOR_PAUSE_S, self._resume)
+                return
+            host = source[0] if source else ""  # a Unix socket has no host
+            if self._first is None:
+                self._serve(connection, b"", host)
+                continue
+            one = _Waiting(connection, source, host, self._loop.time() + self._first.within_s)
+            self._waiting[connection.fileno()] = one
+            if not self._advance(one, self._first):
+                self._loop.add_reader(connection.fileno(), self._advance, one, self._first)
+            if len(self._waiting) > _MOST_WAITING:
+                self._make_room()
+
+    def _resume(self) -> None:
+        if not self._ending:
+            self._loop.add_reader(self._descriptor, self._accept)
+
+    def _advance(self, one: _Waiting, first: FirstBytes) -> bool:
+        """Read what has arrived; return whether the connection waits no longer."""
+        try:
+            data = one.connection.recv(first.most - len(one.data), socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            return False
+        except OSError:
+            data = b""
+        if not data:
+            self._end(one)
+            return True
+        one.data += data
+        served = first.judge(one.data, one.source)
+        if served is None and len(one.data) < first.most:
+            return False
+        if served:
+            self._forget(one)
+            self._serve(one.connection, one.data, one.host)
+        else:
+            self._end(one, first.refused)
+        return True
+
+    def _make_room(self) -> None:
+        """End the oldest connections without progress, of the hosts that have the most."""
+        newer: Counter[str] = Counter()
+        order: list[tuple[int, int, _Waiting]] = []
+        for age, one in enumerate(reversed(self._waiting.values())):
+            order.append((newer[one.host], age, one))
+            newer[one.host] += 1
+        order.sort(key=lambda entry: entry[:2], reverse=True)
+        for _, _, one in order[:_ROOM]:
+            if self._first is not None and not self._advance(one, self._first):
+                self._end(one, self._first.no_room)
+
+    def _check(self) -> None:
+        """End the connections that are too late, and report how many were not served."""
+        assert self._first is not None
+        now_s = self._loop.time()
+        for one in list(self._waiting.values()):
+            if one.until_s > now_s:
+                break
+            self._end(one)
+        count, self._unserved = self._unserved, Counter()
+        self._first.unserved(count)
+        self._loop.call_later(_CHECK_S, self._check)
+
+    def _end(self, one: _Waiting, answer: bytes = b"") -> None:
+        """Close a connection that is not served."""
+        self._unserved[one.host] += 1
+        self._forget(one)
+        with suppress(OSError):
+            one.connection.send(answer, socket.MSG_DONTWAIT)
+        one.connection.close()
+
+    def _forget(self, one: _Waiting) -> None:
+        self._loop.remove_reader(one.connection.fileno())
+        del self._waiting[one.connection.fileno()]
+
+    def _serve(self, connection: socket.socket, data: bytes, host: str) -> None:
+        connection.setblocking(False)
+        # The task closes what it is given; the callback, if the task ends before it begins.
+        task = self._loop.create_task(self._begin(connection, data, host))
+        task.add_done_callback(partial(_finish, connection))
+
+
+def _finish(connection: socket.socket, task: asyncio.Task[None]) -> None:
+    connection.close()
+    if not task.cancelled():
+        task.exception()  # what failed concerns this connection only
