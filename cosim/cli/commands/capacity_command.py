@@ -73,7 +73,7 @@ Draws = Annotated[
 Thorough = Annotated[
     bool,
     typer.Option(
-        help="More numbers of loops, 10 draws, and runs with a common disturbance: about 25 times "
+        help="More numbers of loops, 10 draws, and runs with a common disturbance: about 50 times "
         "as long."
     ),
 ]
@@ -96,7 +96,7 @@ Out = Annotated[
 
 @cli.command(cli.CAMPAIGNS, 30, [
     ("noack capacity shared_bottleneck", "periodic, ZOH-ET and MB-ET: below a minute on two cores"),
-    ("noack capacity shared_bottleneck --thorough", "finite intervals, in half an hour"),
+    ("noack capacity shared_bottleneck --thorough", "finite intervals, in an hour or less"),
     ("noack capacity shared_bottleneck --set 'loops=[{ name = \"p\" }]'", "loops of one kind"),
     ("noack capacity shared_bottleneck --loops 11,22 --draws 8 --confirm model=11", ""),
 ])  # fmt: skip
