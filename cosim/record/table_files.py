@@ -26,6 +26,7 @@ from cosim.record.record_source import (
 from cosim.record.spool_merge import Segment
 from noack.config.resolution import LoopMatrices
 from noack.core.errors import CallerError, one_line
+from noack.core.file_access import new_file
 from noack.protocol.record_tables import OWNER, entry_names
 
 _GROUP_ROWS = 2 * BATCH_ROWS
@@ -157,14 +158,15 @@ def write_table(
         metadata["state_names"] = json.dumps(loop.state_names)
         metadata["input_names"] = json.dumps(loop.input_names)
     schema = pa.schema(list(_columns(dtype))).with_metadata(metadata)
-    scratch = path.with_suffix(".partial")
     # A dictionary, the default, takes twice the time and the space.
     options: dict[str, Any] = {"compression": "zstd", "use_dictionary": False}
     encodings = {name: _ENCODINGS[kind] for name, kind in _columns(dtype) if kind in _ENCODINGS}
-    with pq.ParquetWriter(scratch, schema, column_encoding=encodings, **options) as writer:
+    with (
+        new_file(path, make_folder=False) as file,
+        pq.ParquetWriter(file, schema, column_encoding=encodings, **options) as writer,
+    ):
         for rows in _regrouped(batches, dtype):
             writer.write_table(pa.table(_arrays(rows), schema=schema))
-    scratch.replace(path)
 
 
 def _regrouped(batches: Iterable[Rows], dtype: RowType) -> Iterator[Rows]:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from noack.config.mat_file import matrices_as_npz
+from noack.core.file_access import new_file
 from noack.core.linear_systems import Matrix
 from noack.protocol.wire_format import MAX_DIMENSION
 from noack.settings.named_file import NamedFile
@@ -125,14 +126,15 @@ def unfit(C: Any, D: Any, dt: Any, n: int) -> str | None:
 
 def write_matrices(path: Path, matrices: Mapping[str, Matrix]) -> None:
     """Write matrices to an ``.npz`` or ``.mat`` file; raise ValueError for another suffix."""
-    if path.suffix == NPZ:
-        np.savez(path, allow_pickle=False, **matrices)
-    elif path.suffix == MAT:
-        from scipy.io import savemat  # imported here: it takes time and memory
-
-        savemat(path, dict(matrices))
-    else:
+    if path.suffix not in (NPZ, MAT):
         raise ValueError(_SUFFIXES)
+    with new_file(path, make_folder=False) as file:
+        if path.suffix == NPZ:
+            np.savez(file, allow_pickle=False, **matrices)
+        else:
+            from scipy.io import savemat  # imported here: it takes time and memory
+
+            savemat(file, dict(matrices))  # type: ignore[arg-type] # accepts files, too
 
 
 _SUFFIXES = f"must end in {NPZ} (NumPy) or {MAT} (MATLAB)"

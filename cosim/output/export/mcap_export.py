@@ -26,6 +26,7 @@ from cosim.record.record_source import Rows
 from cosim.record.run_directory import SCENARIO_FILE, SUMMARY_FILE
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, MachineError, why
+from noack.core.file_access import new_file
 from noack.protocol.record_tables import OWNER
 
 if TYPE_CHECKING:
@@ -51,17 +52,13 @@ def write_mcap(run: ExportedRun, path: Path) -> list[Path]:
         raise CallerError(
             "MCAP needs the package mcap, which is not installed; pip install 'noack[mcap]'"
         ) from None
-    scratch = path.with_name(f".{path.name}.partial")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with scratch.open("wb") as file:
+        with new_file(path) as file:
             writer = Writer(file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
             writer.start(profile="", library="noack")
             _write(writer, run)
             writer.finish()  # type: ignore[no-untyped-call]
-        scratch.replace(path)
-    except OSError as error:
-        scratch.unlink(missing_ok=True)
+    except (OSError, ValueError) as error:
         raise MachineError(f"{path}: cannot be written: {why(error)}") from None
     return [path]
 

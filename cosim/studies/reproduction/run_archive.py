@@ -9,7 +9,6 @@ import hashlib
 import re
 import zipfile
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import IO, Annotated, Literal
 
@@ -31,7 +30,7 @@ from noack.config.loops import loops_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, MachineError, one_line, printable, why
-from noack.core.file_access import open_regular
+from noack.core.file_access import new_file, open_regular
 from noack.settings.named_file import PLACES, Sha256, file_tables
 
 MANIFEST = "archive.json"
@@ -77,25 +76,19 @@ def write_archive(run_dir: Path, path: Path) -> Manifest:
     scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
     if (outside := outside_files(scenario, run_dir)) is not None:
         raise CallerError(f"{run_dir}: its scenario names {outside}, outside the run directory")
-    scratch = path.with_name(f".{path.name}.partial")
     try:
         names = sorted(_names(run_dir, with_loops=True))
         files = {name: _entry(run_dir / name) for name in names}
         manifest = Manifest(scenario=scenario.name, kind=kind_of(run_dir), files=files)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with zipfile.ZipFile(scratch, "w") as archive:
+        with new_file(path) as target, zipfile.ZipFile(target, "w") as archive:
             content = manifest.model_dump_json(indent=1).encode()
             archive.writestr(_info(MANIFEST, len(content)), content)
             for name, entry in files.items():
                 with open_regular(run_dir / name) as source:
                     _copy_in(source, archive, _info(name, entry.bytes))
-        scratch.replace(path)
     except (OSError, ValueError) as error:
         reason = why(error) if isinstance(error, OSError) else str(error)
         raise MachineError(f"{path}: the archive cannot be written: {reason}") from None
-    finally:
-        with suppress(OSError):
-            scratch.unlink(missing_ok=True)
     return manifest
 
 
