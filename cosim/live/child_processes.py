@@ -15,6 +15,7 @@ from typing import IO
 from cosim.live.fork_server import ENVIRONMENT, ForkedProcess, ForkServer
 from cosim.live.remote_hosts import SSH_FAILED, RemoteStart, start_over_ssh
 from noack.core.errors import ExitStatus, MachineError
+from noack.core.file_access import open_append
 from noack.core.python_process import python_command
 from noack.protocol.topology import RECORDER
 from noack.runtime.join_ticket import Ticket
@@ -110,7 +111,7 @@ class ChildProcesses:
     def _start(self, role: str, *, live: bool) -> Child:
         arguments = ["--live"] if role == RECORDER and live else []
         try:
-            with (self._run_dir / "logs" / f"{role}.log").open("a") as log:
+            with os.fdopen(open_append(self._run_dir / "logs" / f"{role}.log"), "a") as log:
                 if role in self._hosts:
                     return start_over_ssh(role, self._hosts[role], self._invitation, log)
                 child = self._start_python(role, arguments, log)

@@ -33,6 +33,7 @@ from cosim.record.run_directory import (
     SUMMARY_FILE,
     finished_run,
     read_object,
+    refuse_links,
 )
 from cosim.record.run_ending import EndingFile, RunEnding
 from cosim.record.run_record import RunRecord, load_record
@@ -206,6 +207,7 @@ def reopen(run_dir: Path) -> Outcome:
     # A summary of several loops is failed if one of them failed; the others did not.
     if ending is None or has_loops(summary):
         ending = _ending(run_dir, read_object(run_dir / ENDING_FILE))
+    refuse_links(run_dir)
     unknown = RunEnding(run_dir, 0, ExitStatus.FAILED, "the launcher ended early")
     return finalize(ending or unknown, again=True)
 

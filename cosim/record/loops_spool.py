@@ -6,7 +6,6 @@ finished as that of a run of one loop.
 """
 
 import json
-import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -34,7 +33,7 @@ from noack.config.resolution import network_tables, resolved_loops, tables_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import MachineError, PeerError, why
-from noack.core.file_access import write_whole
+from noack.core.file_access import copy_whole, remove_folder, write_whole
 from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import LOOP, OWNER
 from noack.protocol.topology import LOOP_ROLES, RECORDER
@@ -103,13 +102,13 @@ def distribute_rows(
 
 def _make_directory(run_dir: Path, folder: Path, loop: Scenario, place: Mapping[str, int]) -> None:
     """Make the run directory of a loop; remove the spool of an interrupted attempt."""
-    shutil.rmtree(folder / SPOOL, ignore_errors=True)
+    remove_folder(folder / SPOOL)
     if (folder / LOOP_FILE).is_file():
         return
-    shutil.rmtree(folder, ignore_errors=True)
+    remove_folder(folder)
     (folder / "logs").mkdir(parents=True)
     write_scenario(loop, folder)
-    shutil.copyfile(run_dir / ENVIRONMENT_FILE, folder / ENVIRONMENT_FILE)
+    copy_whole(run_dir / ENVIRONMENT_FILE, folder / ENVIRONMENT_FILE)
     write_whole(folder / LOOP_FILE, json.dumps(place, indent=2))
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from noack.core.errors import CallerError, MachineError, why
-from noack.core.file_access import locked, read_regular, write_whole
+from noack.core.file_access import copy_whole, locked, read_regular, write_whole
 
 if TYPE_CHECKING:
     from noack.config.scenario import Scenario
@@ -98,7 +98,7 @@ def write_scenario(resolved: "Scenario", run_dir: Path) -> "Scenario":
         file = unchanged(table, place)
         name = f"{place.split('.')[0]}/{file.name}"
         (run_dir / name).parent.mkdir()
-        shutil.copyfile(file, run_dir / name)
+        copy_whole(file, run_dir / name)
         relative[place] = table.model_copy(update={"file": name})
         absolute[place] = table.model_copy(update={"file": str((run_dir / name).absolute())})
     write_whole(run_dir / SCENARIO_FILE, dumps(with_tables(resolved, relative)))
@@ -117,9 +117,8 @@ def read_object(path: Path) -> dict[str, Any]:
 def point_to_latest(run_dir: Path) -> None:
     """Link ``latest``, beside the run directory, to it; warn if this fails."""
     latest = run_dir.parent / LATEST
-    scratch = run_dir.parent / f".{LATEST}.{os.getpid()}"
+    scratch = run_dir.parent / f".{LATEST}.{os.urandom(8).hex()}"
     try:  # the link is optional, so its failure does not end the run
-        scratch.unlink(missing_ok=True)
         scratch.symlink_to(run_dir.name)
         scratch.replace(latest)
     except OSError as error:
@@ -176,6 +175,18 @@ def _loop_directory(run_dir: Path, loop: str) -> Path:
         few = ", ".join(names[:_MOST_NAMES]) + (", …" if len(names) > _MOST_NAMES else "")
         raise CallerError(f"--loop {loop}: {run_dir} has no such loop; its {len(names)} are {few}")
     return folder / loop
+
+
+def refuse_links(run_dir: Path) -> None:
+    """Raise CallerError if a run directory, whose record is to be completed, has symbolic links.
+
+    noack makes none there. In the directory of somebody else they might lead to files of the
+    user's, which would be overwritten or removed.
+    """
+    for folder, folders, files in os.walk(run_dir):
+        for name in (*folders, *files):
+            if (path := Path(folder, name)).is_symlink():
+                raise CallerError(f"{path}: is a symbolic link; a run directory has none")
 
 
 @contextmanager

@@ -6,6 +6,7 @@ can be stored even if the disk is full or no longer writable.
 
 import contextlib
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -13,6 +14,7 @@ from typing import Self
 
 from cosim.record.run_directory import ENDING_FILE
 from noack.core.errors import ExitStatus, MachineError, NoackError, why
+from noack.core.file_access import open_growing
 
 _RESERVED_BYTES = 4096
 
@@ -41,7 +43,7 @@ class EndingFile:
     def __init__(self, run_dir: Path) -> None:
         self._is_blank = True
         try:
-            self._file = (run_dir / ENDING_FILE).open("wb", buffering=0)
+            self._file = os.fdopen(open_growing(run_dir / ENDING_FILE), "wb", buffering=0)
             self._file.write(b" " * _RESERVED_BYTES)
         except OSError as error:
             raise MachineError(f"{run_dir}: the run cannot be written: {why(error)}") from None

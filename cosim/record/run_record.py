@@ -31,7 +31,7 @@ from noack.config.resolution import LoopMatrices, loop_of, network_tables, table
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, PeerError
-from noack.core.file_access import replacing
+from noack.core.file_access import PARTIAL, new_file
 from noack.protocol.machine_interface import RESTART
 from noack.protocol.record_tables import (
     CLOCK_TABLES,
@@ -266,10 +266,12 @@ def write_tables(
     from cosim.record.table_files import write_table
 
     folder.mkdir(exist_ok=True)
+    for scratch in folder.glob(f".*{PARTIAL}"):  # of a process that was killed
+        scratch.unlink(missing_ok=True)
     for table, batches in tables.items():
         write_table(folder / f"{table}.parquet", batches, types[table], loop)
-    with replacing(folder / _NOTICES_FILE) as file:
-        file.writelines(json.dumps(notice).encode() + b"\n" for notice in notices)
+    with new_file(folder / _NOTICES_FILE, make_folder=False) as file:
+        file.writelines(f"{json.dumps(notice)}\n".encode() for notice in notices)
 
 
 def read_notices(folder: Path) -> list[dict[str, Any]]:

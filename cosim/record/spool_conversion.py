@@ -1,7 +1,6 @@
 """Converts the spool of a run to its record: all spools merged, without duplicate rows."""
 
 import json
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from cosim.record.spool_merge import merged, spool_segments
 from noack.config.resolution import loop_of, network_tables, tables_of
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import MachineError, PeerError, why
+from noack.core.file_access import remove_folder
 from noack.protocol.record_tables import LOOP
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.runtime.control_messages import LogLine, parse_message
@@ -62,8 +62,8 @@ def remove_spool(run_dir: Path) -> None:
     try:
         if spool.is_dir():  # moved in one step, so that an incomplete spool is never read
             done = spool.with_name(f"{SPOOL}.done")
-            shutil.rmtree(done, ignore_errors=True)  # of an earlier attempt that was interrupted
-            shutil.rmtree(spool.rename(done), ignore_errors=True)
+            remove_folder(done)  # of an earlier attempt that was interrupted
+            remove_folder(spool.rename(done))
     except OSError as error:
         raise _kept(run_dir, error) from None
 

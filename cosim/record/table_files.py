@@ -26,7 +26,7 @@ from cosim.record.record_source import (
 from cosim.record.spool_merge import Segment
 from noack.config.resolution import LoopMatrices
 from noack.core.errors import CallerError, one_line
-from noack.core.file_access import replacing
+from noack.core.file_access import new_file
 from noack.protocol.record_tables import OWNER, entry_names
 
 _GROUP_ROWS = 2 * BATCH_ROWS
@@ -174,7 +174,7 @@ def write_table(
     options: dict[str, Any] = {"compression": "zstd", "use_dictionary": False}
     encodings = {name: _ENCODINGS[kind] for name, kind in _columns(dtype) if kind in _ENCODINGS}
     with (
-        replacing(path) as file,
+        new_file(path, make_folder=False) as file,
         pq.ParquetWriter(file, schema, column_encoding=encodings, **options) as writer,
     ):
         for rows in _regrouped(batches, dtype):

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from netem.capture.packet_blocks import Bytes, Events
 from netem.capture.pcapng import PcapngSection
 from netem.engine.relay_interface import LinkSpec
-from noack.core.errors import CallerError
+from noack.core.errors import CallerError, why
+from noack.core.file_access import open_growing
 from noack.runtime.address import text_of
 
 _STDOUT = 1
@@ -150,6 +151,6 @@ def _open(path: str | Path) -> int:
             )
         return os.dup(_STDOUT)
     try:
-        return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
-    except OSError as error:
-        raise CallerError(f"{path}: the capture cannot be opened: {error.strerror}") from None
+        return open_growing(Path(path), follow=True)
+    except (OSError, ValueError) as error:
+        raise CallerError(f"{path}: the capture cannot be opened: {why(error)}") from None

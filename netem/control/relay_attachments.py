@@ -17,7 +17,8 @@ from netem.control.live_screen import Screen
 from netem.control.statistics_thread import StatisticsThread
 from netem.engine.relay import Relay
 from netem.standard_error import say
-from noack.core.errors import CallerError
+from noack.core.errors import CallerError, why
+from noack.core.file_access import open_growing
 from noack.runtime.address import text_of
 from noack.runtime.json_log import LogFormat
 from noack.runtime.metrics_server import OPTION, metrics_server, require_package
@@ -150,9 +151,9 @@ def _statistics_lines(commands: CommandQueue, period_s: float, path: Path | None
     If a line cannot be written, a message on standard error reports it, and the relay continues.
     """
     try:
-        file = sys.stdout if path is None else path.open("w")
-    except OSError as error:
-        raise CallerError(f"--stats-file {path}: cannot be written ({error.strerror})") from None
+        file = sys.stdout if path is None else os.fdopen(open_growing(path, follow=True), "w")
+    except (OSError, ValueError) as error:
+        raise CallerError(f"--stats-file {path}: cannot be written ({why(error)})") from None
 
     def write(document: Statistics) -> None:
         try:

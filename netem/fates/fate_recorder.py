@@ -1,5 +1,6 @@
 """The tap that records a fate trace; it has its own thread."""
 
+import os
 import threading
 from collections.abc import Sequence
 from contextlib import suppress
@@ -17,6 +18,7 @@ from netem.fates.fate_trace import NUMBERS, SCHEMA, description
 from netem.relay_events import EVENT
 from netem.standard_error import say
 from noack.core.errors import CallerError
+from noack.core.file_access import open_growing, open_regular
 
 _FIELDS = {"arrival_ns": "t_ns"}
 """Fields of an event whose columns have another name."""
@@ -62,14 +64,18 @@ class FateRecorder:
         self._missed = 0
         self._unwritten = 0
         self._failed = False
-        with suppress(OSError), path.open("rb") as file:
-            if path.is_file() and file.read(len(_MAGIC)) not in (b"", _MAGIC):
+        with suppress(OSError, ValueError), open_regular(path) as file:
+            if file.read(len(_MAGIC)) not in (b"", _MAGIC):
                 raise CallerError(
                     f"--record-fates {path}: exists and is not a Parquet file; choose another name"
                 )
         try:
-            self._writer = pq.ParquetWriter(path, SCHEMA)
-        except OSError as error:
+            descriptor = open_growing(path, follow=True)
+            try:  # by its descriptor, as pyarrow would follow a link
+                self._writer = pq.ParquetWriter(f"/dev/fd/{descriptor}", SCHEMA)
+            finally:
+                os.close(descriptor)
+        except (OSError, ValueError) as error:
             raise CallerError(
                 f"--record-fates {path}: cannot be written ({_reason(error)})"
             ) from None
@@ -166,6 +172,6 @@ class FateRecorder:
         say(f"fate trace {self._path}: {what}; it cannot be replayed; the relay continues")
 
 
-def _reason(error: OSError) -> str:
+def _reason(error: OSError | ValueError) -> str:
     # Arrow's message ends with "[errno 28] No space left on device".
     return str(error).rpartition("] ")[2]

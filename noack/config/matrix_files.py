@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from noack.config.mat_file import matrices_as_npz
-from noack.core.file_access import replacing
+from noack.core.file_access import new_file
 from noack.core.linear_systems import Matrix
 from noack.protocol.wire_format import MAX_DIMENSION
 from noack.settings.named_file import NamedFile
@@ -131,14 +131,13 @@ def write_matrices(path: Path, matrices: Mapping[str, Matrix]) -> None:
     """Write matrices to an ``.npz`` or ``.mat`` file; raise ValueError for another suffix."""
     if path.suffix not in (NPZ, MAT):
         raise ValueError(_SUFFIXES)
-    with replacing(path) as file:
+    with new_file(path, make_folder=False) as file:
         if path.suffix == NPZ:
             np.savez(file, allow_pickle=False, **matrices)
-            return
-        from scipy.io import savemat  # imported here: it takes time and memory
+        else:
+            from scipy.io import savemat  # imported here: it takes time and memory
 
-        target: Any = file  # SciPy's types know names of files only
-        savemat(target, dict(matrices))
+            savemat(file, dict(matrices))  # type: ignore[arg-type] # accepts files, too
 
 
 _SUFFIXES = f"must end in {NPZ} (NumPy) or {MAT} (MATLAB)"

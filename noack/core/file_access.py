@@ -1,19 +1,20 @@
 """Files: atomic writing, reading of limited size, and advisory locks."""
 
+import errno
 import fcntl
 import os
-import secrets
+import shutil
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
 from noack.core.errors import CallerError, MachineError, printable, why
 
-SCRATCH = ".partial"
-"""Suffix of a file that is being written."""
-_NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+PARTIAL = ".partial"
+"""End of the names of files that are being written; they begin with a dot."""
+_NOT_REGULAR = "not a regular file"
 
 
 def require_suffix(path: Path, option: str, suffix: str) -> None:
@@ -22,48 +23,157 @@ def require_suffix(path: Path, option: str, suffix: str) -> None:
         raise CallerError(f"{option} {path}: the file's name must end in {suffix}")
 
 
-@contextmanager
-def replacing(path: Path) -> Iterator[IO[bytes]]:
-    """Yield a new file, which replaces ``path`` in one step at the end of the context.
-
-    If an exception ends the context, the new file is removed and ``path`` stays. The new file has a
-    random name beside ``path`` and is not a link, whatever other users have made in the folder.
-
-    Raises:
-        OSError: the file cannot be written.
-        ValueError: ``path`` is a folder or a device, which would be replaced too, or no name of a
-            file.
-
-    >>> with replacing(Path("results.csv")) as file:
-    ...     _ = file.write(b"events,20")
-    """
-    if path.exists() and not path.is_file():
-        raise ValueError("not a regular file")
-    scratch = path.parent / f".{secrets.token_hex(8)}{SCRATCH}"
-    descriptor = os.open(scratch, _NEW_FILE, 0o666)
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            yield file
-        scratch.replace(path)
-    except BaseException:
-        scratch.unlink(missing_ok=True)
-        raise
-
-
 def write_whole(path: Path, content: str | bytes, *, make_folder: bool = True) -> Path:
-    """Write a file, or replace it, in one step; return its path. See :func:`replacing`.
+    """Write a file, or replace it, in one step; return its path.
 
-    Text is written as UTF-8. Missing folders are created with ``make_folder``. Raise MachineError
-    if the file cannot be written, or is a folder or a device.
+    Text is written as UTF-8. Raise MachineError if :func:`new_file` fails.
     """
     try:
-        if make_folder:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as file:
+        with new_file(path, make_folder=make_folder) as file:
             file.write(content.encode() if isinstance(content, str) else content)
-    except (OSError, ValueError) as error:  # ValueError also: a name that no file can have
+    except (OSError, ValueError) as error:
         raise MachineError(printable(f"{path}: cannot be written: {why(error)}")) from None
     return path
+
+
+@contextmanager
+def new_file(path: Path, *, make_folder: bool = True, mode: int = 0o666) -> Iterator[IO[bytes]]:
+    """Open a file that appears under its name at the end; after an error, nothing is left of it.
+
+    Until then it has a random name in the same folder, where another user of the folder cannot have
+    put a link. An existing file, or a link, is replaced. Missing folders are created with
+    ``make_folder``. The umask applies to ``mode``.
+
+    Raises:
+        OSError, ValueError: it cannot be written, or the path is that of a folder, a FIFO or a
+            device, which would be replaced too; or its folder is a link of another user.
+    """
+    if path.exists() and not path.is_file():
+        raise OSError(_NOT_REGULAR)
+    if make_folder:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    with _folder(path.parent) as folder:
+        scratch, descriptor = _scratch_file(folder, mode)
+        try:
+            with os.fdopen(descriptor, "wb") as file:
+                yield file
+            os.replace(scratch, path.name, src_dir_fd=folder, dst_dir_fd=folder)
+        except BaseException:
+            with suppress(OSError):
+                os.unlink(scratch, dir_fd=folder)
+            raise
+
+
+def open_growing(path: Path, *, follow: bool = False) -> int:
+    """Open an empty file that has its name while it is written; return its descriptor.
+
+    A file of the user's own is overwritten. A link, another user's file, and a file with several
+    names is replaced. With ``follow``, a FIFO, a device or a link that is the user's own or root's
+    (``/dev/stdout``) is opened as it is.
+
+    Raises:
+        OSError, ValueError: it cannot be written, or is a folder, or a FIFO or a device without
+            ``follow``, or another user's; or its folder is a link of another user.
+    """
+    flags = os.O_WRONLY | os.O_CLOEXEC
+    with suppress(FileNotFoundError):
+        status = path.lstat()
+        is_link = stat.S_ISLNK(status.st_mode)
+        if stat.S_ISREG(status.st_mode):
+            if status.st_uid == os.geteuid() and status.st_nlink == 1:
+                descriptor = _open_alone(path, flags)
+                os.ftruncate(descriptor, 0)
+                return descriptor
+        elif follow and _is_trusted(status):
+            flags |= os.O_CREAT | os.O_TRUNC if is_link else os.O_NOFOLLOW
+            return os.open(path, flags, 0o666)
+        elif not is_link:
+            raise OSError(_NOT_REGULAR)
+    with _folder(path.parent) as folder:
+        scratch, descriptor = _scratch_file(folder, 0o666)
+        try:
+            os.replace(scratch, path.name, src_dir_fd=folder, dst_dir_fd=folder)
+        except BaseException:
+            os.close(descriptor)
+            os.unlink(scratch, dir_fd=folder)
+            raise
+    return descriptor
+
+
+def open_append(path: Path) -> int:
+    """Open a file, which is created if missing, to append to it; return its descriptor.
+
+    Raise OSError if it cannot be written, or is a link, has several names, or is no regular file.
+    """
+    return _open_alone(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+
+
+def copy_whole(source: Path, target: Path) -> None:
+    """Copy a regular file as :func:`new_file` writes; raise OSError or ValueError."""
+    with open_regular(source) as content, new_file(target, make_folder=False) as file:
+        shutil.copyfileobj(content, file)
+
+
+def remove_folder(path: Path) -> None:
+    """Remove a folder and what is in it; follow no link of another user. Errors are ignored."""
+    with suppress(OSError), _folder(path.parent) as folder:
+        shutil.rmtree(path.name, ignore_errors=True, dir_fd=folder)
+
+
+def _open_alone(path: Path, flags: int) -> int:
+    """Open a regular file that has one name, without following a link."""
+    descriptor = _open_regular(path, flags)
+    if os.fstat(descriptor).st_nlink > 1:
+        os.close(descriptor)
+        raise OSError("a hard link to another file")
+    return descriptor
+
+
+def _open_regular(path: Path, flags: int) -> int:
+    """Open a regular file; follow no link, and do not wait for the reader of a FIFO."""
+    more = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    try:
+        with _folder(path.parent) as folder:
+            descriptor = os.open(path.name, flags | more, 0o666, dir_fd=folder)
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.ENXIO):
+            raise OSError(_NOT_REGULAR) from None
+        raise
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(_NOT_REGULAR)
+    return descriptor
+
+
+def _scratch_file(folder: int, mode: int) -> tuple[str, int]:
+    """Create a file with a random name in an open folder; return its name and descriptor."""
+    name = f".{os.urandom(8).hex()}{PARTIAL}"
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+    return name, os.open(name, flags, mode, dir_fd=folder)
+
+
+@contextmanager
+def _folder(path: Path) -> Iterator[int]:
+    """Open a folder; raise OSError if it is a symbolic link that another user has made."""
+    flags = os.O_DIRECTORY | os.O_CLOEXEC | getattr(os, "O_PATH", os.O_RDONLY)
+    if path.is_symlink() and _is_trusted(path.lstat()):
+        descriptor = os.open(path, flags)
+    else:
+        try:
+            descriptor = os.open(path, flags | os.O_NOFOLLOW)
+        except NotADirectoryError:
+            if path.is_symlink():
+                raise OSError(f"{path} is a symbolic link of another user") from None
+            raise
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+def _is_trusted(status: os.stat_result) -> bool:
+    """Whether a link, FIFO or device was made by the user or by root."""
+    return status.st_uid in (0, os.geteuid())
 
 
 @contextmanager
@@ -72,7 +182,7 @@ def open_regular(path: Path) -> Iterator[IO[bytes]]:
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # so that a FIFO does not block
     try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise ValueError("not a regular file")
+            raise ValueError(_NOT_REGULAR)
         with open(descriptor, "rb", closefd=False) as file:
             yield file
     finally:
@@ -107,7 +217,12 @@ def lock(file: int | IO[Any], *, shared: bool = False, wait: bool = False) -> bo
 
 @contextmanager
 def locked(path: Path, *, shared: bool = False, wait: bool = False) -> Iterator[bool]:
-    """Lock a file, which is created if missing, while the context lasts; yields :func:`lock`."""
-    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK
-    with os.fdopen(os.open(path, flags, 0o666), "rb") as file:
-        yield lock(file, shared=shared, wait=wait)
+    """Lock a file, which is created if missing, while the context lasts; yields :func:`lock`.
+
+    Raise OSError if it cannot be opened, is a link, or is no regular file.
+    """
+    descriptor = _open_regular(path, os.O_WRONLY | os.O_CREAT)
+    try:
+        yield lock(descriptor, shared=shared, wait=wait)
+    finally:
+        os.close(descriptor)

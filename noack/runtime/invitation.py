@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from noack.core.errors import CallerError, PeerError, why
-from noack.core.file_access import open_regular, read_regular
+from noack.core.file_access import new_file, open_regular, read_regular
 from noack.runtime.address import Address, family_of, text_of
 from noack.runtime.join_ticket import Ticket, loads
 
@@ -47,17 +47,10 @@ def write_invitation(path: Path, ticket: Ticket) -> None:
     Raises:
         CallerError: it cannot be written.
     """
-    scratch = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        with suppress(FileNotFoundError):
-            scratch.unlink()
-        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-        with os.fdopen(os.open(scratch, flags, 0o600), "wb") as file:
+        with new_file(path, make_folder=False, mode=0o600) as file:
             file.write(_content(ticket))
-        scratch.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            scratch.unlink()
+    except (OSError, ValueError) as error:
         raise CallerError(f"{path}: the invitation cannot be written: {why(error)}") from None
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import IO, BinaryIO, NamedTuple
 
 from noack.core.errors import MachineError, why
-from noack.core.file_access import read_regular
+from noack.core.file_access import open_append, read_regular
 
 SPOOL = "spool"  # the spool's folder in the run directory
 KEPT_REPORT = "report"
@@ -85,7 +85,7 @@ class SpoolWriter:
     def _open(self, table: str) -> BinaryIO:
         file = self._files.get(table)
         if file is None:
-            file = self._files[table] = self._path(table).open("ab", buffering=0)
+            file = self._files[table] = _appended(self._path(table))
         return file
 
     def close(self) -> None:
@@ -93,6 +93,10 @@ class SpoolWriter:
         for file in self._files.values():
             file.close()
         self._files.clear()
+
+
+def _appended(path: Path) -> BinaryIO:
+    return os.fdopen(open_append(path), "ab", buffering=0)
 
 
 def _write_complete(file: BinaryIO, chunk: bytes) -> None:

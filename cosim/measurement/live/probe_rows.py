@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Self
 
 from noack.core.errors import CallerError, why
+from noack.core.file_access import open_growing
 
 
 class ProbeRows:
@@ -25,9 +26,8 @@ class ProbeRows:
         self._file: int | None = None
         if path is not None:
             try:
-                flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
-                self._file = os.open(path, flags, 0o666)
-            except OSError as error:
+                self._file = open_growing(path, follow=True)
+            except (OSError, ValueError) as error:
                 raise CallerError(f"--save {path}: cannot be written: {why(error)}") from None
 
     def add(self, *values: object) -> None:

@@ -26,7 +26,7 @@ from cosim.record.record_source import Rows
 from cosim.record.run_directory import SCENARIO_FILE, SUMMARY_FILE
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, MachineError, why
-from noack.core.file_access import replacing
+from noack.core.file_access import new_file
 from noack.protocol.record_tables import OWNER
 
 if TYPE_CHECKING:
@@ -53,8 +53,7 @@ def write_mcap(run: ExportedRun, path: Path) -> list[Path]:
             "MCAP needs the package mcap, which is not installed; pip install 'noack[mcap]'"
         ) from None
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as file:
+        with new_file(path) as file:
             writer = Writer(file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
             writer.start(profile="", library="noack")
             _write(writer, run)

@@ -1,5 +1,6 @@
 """A rerun recording as a file that is written while a run goes on."""
 
+import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Self
@@ -10,7 +11,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from cosim.output.viewer.pictures.picture import TIMELINE
-from noack.core.errors import MachineError
+from noack.core.errors import MachineError, why
+from noack.core.file_access import open_growing
 
 Floats = npt.NDArray[np.float64]
 Nanoseconds = npt.NDArray[np.int64]
@@ -46,9 +48,15 @@ class RecordingFile:
         self._open = True
         self._stream = rr.RecordingStream(APPLICATION_ID, recording_id=run_id)
         try:
-            self._stream.save(path, default_blueprint=layout, write_footer=indexed)
-        except RuntimeError as error:
-            raise ViewError(f"{path}: cannot create the recording: {error}") from None
+            descriptor = open_growing(path)
+            try:  # by its descriptor, as rerun would follow a link
+                own = f"/dev/fd/{descriptor}"
+                self._stream.save(own, default_blueprint=layout, write_footer=indexed)
+            finally:
+                os.close(descriptor)
+        except (OSError, RuntimeError) as error:
+            reason = why(error) if isinstance(error, OSError) else str(error)
+            raise ViewError(f"{path}: cannot create the recording: {reason}") from None
 
     def describe(self, title: str, static: dict[str, Any]) -> None:
         """Set the recording's title and its static data, by entity."""

@@ -23,7 +23,7 @@ from cosim.studies.campaign.campaign_grid import Point, row_type
 from cosim.studies.campaign.campaign_workers import Chunk
 from cosim.studies.campaign.worker_identity import arithmetic, difference
 from noack.core.errors import CallerError, MachineError, shortened, why
-from noack.core.file_access import SCRATCH, locked, write_whole
+from noack.core.file_access import PARTIAL, locked, write_whole
 
 RUNS, MANIFEST = "runs", "campaign.json"
 _LOCK = ".lock"
@@ -151,7 +151,7 @@ def opened(campaign: Campaign, base: Mapping[str, Any], store: Store) -> Iterato
             if not stack.enter_context(locked(folder / _LOCK)):
                 raise CallerError(f"{folder}: another noack uses this folder")
             made_by = _claim(folder, manifest)
-            for scratch in (folder / RUNS).glob(f"*/.*{SCRATCH}"):
+            for scratch in (folder / RUNS).glob(f"*/.*{PARTIAL}"):
                 scratch.unlink(missing_ok=True)
         except OSError as error:
             raise MachineError(f"{folder}: cannot be written: {why(error)}") from None

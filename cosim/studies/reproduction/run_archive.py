@@ -31,7 +31,7 @@ from noack.config.loops import loops_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, MachineError, one_line, printable, why
-from noack.core.file_access import open_regular, replacing
+from noack.core.file_access import new_file, open_regular
 from noack.settings.named_file import PLACES, Sha256, file_tables
 
 MANIFEST = "archive.json"
@@ -81,8 +81,7 @@ def write_archive(run_dir: Path, path: Path) -> Manifest:
         names = sorted(_names(run_dir, with_loops=True))
         files = {name: _entry(run_dir / name) for name in names}
         manifest = Manifest(scenario=scenario.name, kind=kind_of(run_dir), files=files)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as file, zipfile.ZipFile(file, "w") as archive:
+        with new_file(path) as target, zipfile.ZipFile(target, "w") as archive:
             content = manifest.model_dump_json(indent=1).encode()
             archive.writestr(_info(MANIFEST, len(content)), content)
             for name, entry in files.items():

@@ -9,7 +9,7 @@ import pytest
 
 from noack.core import file_access
 from noack.core.errors import MachineError
-from noack.core.file_access import locked, replacing, write_whole
+from noack.core.file_access import locked, new_file, write_whole
 
 
 def test_a_file_is_replaced_and_nothing_else_remains(tmp_path: Path) -> None:
@@ -57,8 +57,8 @@ def test_a_guessed_name_is_an_error(
 ) -> None:
     """If the random name were known, nothing that exists under it would be opened."""
     (precious := tmp_path / "precious").write_text("secret")
-    monkeypatch.setattr(file_access.secrets, "token_hex", lambda size: "guessed")
-    make(tmp_path / ".guessed.partial", precious)
+    monkeypatch.setattr(file_access.os, "urandom", bytes)
+    make(tmp_path / ".0000000000000000.partial", precious)
     with pytest.raises(MachineError, match="cannot be written: File exists"):
         write_whole(tmp_path / "a.txt", "text")
     assert precious.read_text() == "secret"
@@ -68,7 +68,7 @@ def test_a_failure_keeps_the_old_file_and_leaves_no_new_one(tmp_path: Path) -> N
     (path := tmp_path / "a.txt").write_text("old")
 
     def interrupted() -> None:
-        with replacing(path) as file:
+        with new_file(path) as file:
             file.write(b"half")
             raise KeyboardInterrupt
 
@@ -80,6 +80,6 @@ def test_a_failure_keeps_the_old_file_and_leaves_no_new_one(tmp_path: Path) -> N
 
 def test_a_lock_file_is_not_a_link(tmp_path: Path) -> None:
     (tmp_path / "lock").symlink_to(tmp_path / "target")
-    with pytest.raises(OSError, match="symbolic links"), locked(tmp_path / "lock"):
+    with pytest.raises(OSError, match="not a regular file"), locked(tmp_path / "lock"):
         pass
     assert not (tmp_path / "target").exists()

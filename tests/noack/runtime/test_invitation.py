@@ -115,7 +115,7 @@ def test_an_invitation_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     with pytest.raises(CallerError, match="the invitation cannot be written"):
         write_invitation(tmp_path / "no_folder" / "invitation.json", INVITED)
     (tmp_path / "folder").mkdir()
-    with pytest.raises(CallerError, match="the invitation cannot be written: Is a directory"):
+    with pytest.raises(CallerError, match="the invitation cannot be written: not a regular file"):
         write_invitation(tmp_path / "folder", INVITED)
     assert [one.name for one in tmp_path.iterdir()] == ["folder"]  # no file with the keys is left
 

@@ -73,17 +73,17 @@ def test_a_full_disk_gives_one_line_and_leaves_complete_files_only(
 ) -> None:
     plan, points = campaign
     store = Store(tmp_path / "out", points, plan.draws, plan.chunk)
-    replace, files = file_access.replacing, []
+    new_file, files = file_access.new_file, []
 
     @contextmanager
-    def fill(path: Path) -> Iterator[IO[bytes]]:
+    def fill(path: Path, **options: Any) -> Iterator[IO[bytes]]:
         files.append(path)
-        with replace(path) as file:
+        with new_file(path, **options) as file:
             yield file
             if len(files) == 5:
                 raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(file_access, "replacing", fill)
+    monkeypatch.setattr(file_access, "new_file", fill)
     with pytest.raises(MachineError) as found:
         run_campaign(store, alone)
     assert str(found.value).startswith(f"{store.folder}/runs/")
