@@ -73,7 +73,7 @@ class NetworkDiagram:
         """Return the view of the diagram."""
         return rrb.Spatial2DView(
             origin=DIAGRAM,
-            name=f"Packets (drawn {LEG_S:g} s a leg)",
+            name=f"Packets (animated {LEG_S:g} s per hop)",
             visual_bounds=rrb.VisualBounds2D(
                 x_range=[-1.9, _CONTROLLER + 1.9], y_range=[-1.7, -_LOW + 0.6]
             ),
