@@ -49,7 +49,8 @@ class LivePanel:
         self._live: LiveRun | None = None
         """The run that is shown, with its version and the number of its lines that are shown."""
         self._version = self._lines = 0
-        self._viewer = ""
+        self._viewer, self._is_offered = "", False
+        """Address of the viewer, and whether it is offered but not shown."""
         self._shows_viewer = False
         """Whether the viewer is shown without being asked for."""
         self._plan = ui.label()
@@ -117,6 +118,7 @@ class LivePanel:
     def remove_old_viewer(self) -> None:
         """Remove the viewer of a loop that has ended: loaded again it would find no server."""
         if self._live is not None and self._live.state not in ("starting", "running"):
+            self._is_offered = False
             self._frame.clear()
 
     async def _begin(self) -> None:
@@ -167,6 +169,8 @@ class LivePanel:
         if live.viewer and live.viewer != self._viewer:
             self._viewer = live.viewer
             self._offer_viewer(live.viewer)
+        if self._is_offered and live.state != "running":
+            self.remove_old_viewer()  # its server ends with the loop
         if live.verdict and live.run_dir is not None and not self._verdict.default_slot.children:
             name = live.run_dir.name
             with self._verdict:
@@ -188,6 +192,7 @@ class LivePanel:
         if self._shows_viewer:
             self._show_viewer(address)
             return
+        self._is_offered = True
         with self._frame:
             ui.label("This browser draws without a graphics card: the viewer would take the "
                      "processor from the loop and from this page.")  # fmt: skip
@@ -196,6 +201,7 @@ class LivePanel:
             )
 
     def _show_viewer(self, address: str) -> None:
+        self._is_offered = False
         self._frame.clear()
         with self._frame:
             ui.link("open the viewer in a tab of its own", address, new_tab=True)

@@ -131,8 +131,7 @@ class Session:
             await asyncio.sleep(_MARGIN_S)
             self.margin = await self._compute("margin", margin_of, scenario)
         except NoackError as error:
-            self.note = str(error)
-        self.pending = ""
+            self.note, self.pending = str(error), ""
         await self.on_drawn()
 
     async def _compute(self, what: str, function: Callable[[Scenario], T], scenario: Scenario) -> T:
@@ -146,6 +145,8 @@ class Session:
         self.pending = f"computing: {what}"
         waiting = asyncio.create_task(say_waiting())
         try:
-            return await self.calls.compute(function, scenario)
+            found = await self.calls.compute(function, scenario)
         finally:
             waiting.cancel()
+        self.pending = ""
+        return found

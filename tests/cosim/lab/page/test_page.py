@@ -78,6 +78,7 @@ def test_a_live_run_ends_with_a_verdict_and_is_the_selected_recorded_run(
     verdict = "document.querySelector('[aria-label=verdict]').innerText"
     page.wait("!!document.querySelector('[aria-label=verdict]')")
     lines = page.js(verdict).split("\n")
+    assert "show the viewer here" not in page.js(TEXT)  # its server has ended with the loop
     assert lines[0] == "completed 4 s"
     assert " transmissions (ideal loop: " in lines[1]
     assert lines[2].startswith("claims: ")

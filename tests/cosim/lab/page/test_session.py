@@ -37,6 +37,8 @@ def session_of(name: str, drawn: list[Session], calls: object = None, **settings
 
     async def on_drawn() -> None:
         drawn.append(found)
+        # What is there is not waited for any more.
+        assert found.guarantee is None or "certificate" not in found.pending
         await asyncio.sleep(0)  # as the browser's answer is awaited
 
     found = Session(cast("PageCalls", calls or Inline()), draft, on_drawn)
