@@ -248,9 +248,10 @@ def command(
                     status = function(*arguments, **options)
                 if sys.stdout is not None:  # closed by the shell: >&-
                     sys.stdout.flush()
-            except StopRequestError as error:
-                what = "; ".join([str(error), *getattr(error, "__notes__", ())])
-                status = failed(what, error.exit_status, who=NAME, as_json=as_json)
+            except KeyboardInterrupt as error:
+                stop = error if isinstance(error, StopRequestError) else StopRequestError()
+                what = "; ".join([str(stop), *getattr(error, "__notes__", ())])
+                status = failed(what, stop.exit_status, who=NAME, as_json=as_json)
             except NoackError as error:
                 status = failed(str(error), error.exit_status, who=NAME, as_json=as_json)
             except Exception as error:

@@ -138,6 +138,7 @@ def _open_regular(path: Path, flags: int) -> int:
     except OSError as error:
         if error.errno in (errno.ELOOP, errno.ENXIO):
             raise OSError(_NOT_REGULAR) from None
+        error.filename = str(path)
         raise
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)

@@ -1,30 +1,38 @@
 """Serves metrics over HTTP, for Prometheus and other readers of OpenMetrics.
 
-Each connection has a thread and a time limit. Of too many connections the oldest is closed, and the
-end of the server closes all: no reader keeps another one, or a run, waiting. Metrics are computed
-when they are read, for one reader at a time.
+One thread serves all readers: it waits for none of them, and computes one answer at a time. Reading
+a request and sending its answer have a time limit each, and there is a limit of readers. So many or
+slow readers keep neither others waiting nor the end. Metrics are computed when they are read.
 """
 
+import asyncio
+import http.client
+import io
 import socket
-import socketserver
-import threading
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any
-from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 from noack.core.errors import CallerError, MachineError, why
 from noack.runtime.address import Address, family_of, parse_address, text_of
+from noack.runtime.connection_gate import FirstBytes, TaskLimit, accepting
 
 if TYPE_CHECKING:
     from prometheus_client import Metric
 
 OPTION = "--metrics"
-_POLL_S = 0.2
-"""Time within which the server notices that it should end."""
-_CONNECTION_S = 5.0
-"""Time limit of a connection: for the whole request and its answer."""
-_MOST_CONNECTIONS = 16
+_REQUEST_S = 5.0
+"""Longest time for a request, from its connection on."""
+_ANSWER_S = 5.0
+"""Longest time for sending an answer."""
+_MOST_REQUEST_BYTES = 16_384
+_MOST_ANSWERS = 64
+"""Answers that are sent at once; then the oldest ends of the host that has the most."""
+_BACKLOG = 128
+_END_S = 2.0
+"""At the end: longest wait for an answer that is being computed."""
+_WRONG = b"HTTP/1.0 400 Bad Request\r\n\r\n"
+_BUSY = b"HTTP/1.0 503 Service Unavailable\r\n\r\n"
 
 
 def require_package() -> None:
@@ -38,73 +46,13 @@ def require_package() -> None:
         ) from None
 
 
-class _Server(socketserver.ThreadingMixIn, WSGIServer):
-    allow_reuse_address = True
-    daemon_threads = True
-    block_on_close = False
-
-    def __init__(self, *arguments: Any) -> None:
-        self._open: dict[socket.socket, threading.Timer] = {}
-        """The connections, the oldest first, each with the timer that ends it."""
-        self._lock = threading.Lock()
-        super().__init__(*arguments)
-
-    def server_bind(self) -> None:
-        """Bind, without asking a name server for the name of the host."""
-        socketserver.TCPServer.server_bind(self)
-        self.server_name, self.server_port = self.server_address[:2]  # type: ignore[assignment]
-        self.setup_environ()
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        """Serve a connection on a thread, for a limited time."""
-        timer = threading.Timer(_CONNECTION_S, _end, (request,))
-        timer.daemon = True
-        with self._lock:
-            if len(self._open) >= _MOST_CONNECTIONS:
-                oldest = next(iter(self._open))
-                self._open.pop(oldest).cancel()
-                _end(oldest)
-            self._open[request] = timer
-        timer.start()
-        super().process_request(request, client_address)
-
-    def close_request(self, request: Any) -> None:
-        """Close a connection."""
-        with self._lock:
-            timer = self._open.pop(request, None)
-        if timer is not None:
-            timer.cancel()
-        super().close_request(request)
-
-    def server_close(self) -> None:
-        """Stop listening, and end all connections."""
-        super().server_close()
-        with self._lock:
-            for request in self._open:
-                _end(request)
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """Ignore a reader that has left."""
-
-
-def _end(connection: socket.socket) -> None:
-    """End a connection, of which another thread reads or to which it writes."""
-    with suppress(OSError):
-        connection.shutdown(socket.SHUT_RDWR)
-
-
-class _Handler(WSGIRequestHandler):
-    def log_message(self, format: str, *arguments: Any) -> None:  # noqa: A002
-        """Log nothing."""
-
-
 @contextmanager
 def metrics_server(where: str, collect: "Callable[[], Iterable[Metric]]") -> Iterator[Address]:
     """Serve metrics within the context, at every path; yield the address.
 
     Args:
         where: ``HOST:PORT``; without a host it is the loopback, port 0 is any free one.
-        collect: returns the metrics; called in threads of the server, one at a time.
+        collect: returns the metrics; called in the server's thread.
 
     Raises:
         CallerError: the address is wrong or in use, or prometheus_client is not installed.
@@ -117,33 +65,75 @@ def metrics_server(where: str, collect: "Callable[[], Iterable[Metric]]") -> Ite
     address = parse_address(where, OPTION)
     registry = CollectorRegistry(auto_describe=False)
     registry.register(_Collector(collect))
-    family = type("_Family", (_Server,), {"address_family": family_of(address)})
+    app = make_wsgi_app(registry)
+    limit = TaskLimit(_MOST_ANSWERS)
+
+    async def answer(connection: socket.socket, request: bytes, host: str) -> None:
+        with limit.counted(host):
+            content = _answer(app, request)
+            async with asyncio.timeout(_ANSWER_S):
+                await asyncio.get_running_loop().sock_sendall(connection, content)
+            connection.shutdown(socket.SHUT_WR)
+
+    first = FirstBytes(_is_complete, _MOST_REQUEST_BYTES, _REQUEST_S, _WRONG, _BUSY)
+    with (
+        _listening(address) as listening,
+        accepting(listening, answer, first, name="metrics", patience_s=_END_S),
+    ):
+        yield listening.getsockname()[:2]
+
+
+@contextmanager
+def _listening(address: Address) -> Iterator[socket.socket]:
+    with socket.socket(family_of(address), socket.SOCK_STREAM) as listening:
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listening.bind(address)
+            listening.listen(_BACKLOG)
+        except (OSError, OverflowError) as error:
+            reason = why(error) if isinstance(error, OSError) else str(error)
+            kind = MachineError if isinstance(error, PermissionError) else CallerError
+            raise kind(f"{OPTION} {text_of(address)}: {reason}") from None
+        yield listening
+
+
+def _is_complete(request: bytes, _: object) -> bool | None:
+    """Whether a request is complete: up to the empty line after its headers."""
+    return True if b"\n\r\n" in request or b"\n\n" in request else None
+
+
+def _answer(app: Callable[..., Iterable[bytes]], request: bytes) -> bytes:
+    """Return the answer of a WSGI application to a request."""
+    line, _, rest = request.partition(b"\n")
+    words = line.decode("latin-1").split()
     try:
-        server = family(address, _Handler)
-    except (OSError, OverflowError) as error:
-        reason = why(error) if isinstance(error, OSError) else str(error)
-        kind = MachineError if isinstance(error, PermissionError) else CallerError
-        raise kind(f"{OPTION} {text_of(address)}: {reason}") from None
-    server.set_app(make_wsgi_app(registry))
-    thread = threading.Thread(
-        target=server.serve_forever, args=(_POLL_S,), name="metrics", daemon=True
-    )
-    thread.start()
-    try:
-        yield server.server_address[:2]
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
+        headers = http.client.parse_headers(io.BytesIO(rest))
+        method, target, version = words
+    except (ValueError, http.client.HTTPException):
+        return _WRONG
+    if not version.startswith("HTTP/"):
+        return _WRONG
+    path, _, query = target.partition("?")
+    environment = {"REQUEST_METHOD": method, "PATH_INFO": path, "QUERY_STRING": query}
+    for name in ("Accept", "Accept-Encoding"):
+        environment[f"HTTP_{name.upper().replace('-', '_')}"] = headers.get(name, "")
+    head: list[str] = []
+
+    def start(status: str, fields: list[tuple[str, str]]) -> None:
+        head.append(f"HTTP/1.0 {status}")
+        head.extend(f"{name}: {value}" for name, value in fields)
+
+    body = b"".join(app(environment, start))
+    head.append(f"Content-Length: {len(body)}")
+    return "\r\n".join([*head, "", ""]).encode("latin-1") + body
 
 
 class _Collector:
     """A collector of prometheus_client, which computes all metrics when they are read."""
 
     def __init__(self, collect: "Callable[[], Iterable[Metric]]") -> None:
-        self._collect, self._lock = collect, threading.Lock()
+        self._collect = collect
 
     def collect(self) -> "Iterable[Metric]":
         """Return the metrics."""
-        with self._lock:
-            return list(self._collect())
+        return self._collect()

@@ -70,7 +70,7 @@ def stop_reason(number: int) -> str:
 class StopRequestError(KeyboardInterrupt):
     """A signal asks the program to stop: what cleans up after Ctrl-C does so after each of them."""
 
-    def __init__(self, number: int) -> None:
+    def __init__(self, number: int = signal.SIGINT) -> None:
         super().__init__(stop_reason(number))
         self.exit_status = _ENDING[number]
 

@@ -189,17 +189,18 @@ def test_a_taken_port_is_reported(tmp_path: Path) -> None:
 
 
 def test_show_names_a_compilation(tmp_path: Path) -> None:
-    """With an empty cache, the emulator compiles before it is ready."""
+    """With an empty cache, the code of a capture is compiled before the emulator is ready."""
     environment = os.environ | {
         "XDG_CACHE_HOME": str(tmp_path / "cache"), "XDG_RUNTIME_DIR": str(tmp_path),
     }  # fmt: skip
     command = [*COMMAND, "--listen", ":0", "--to", ":9", "--control", "lab"]
+    command += ["--capture", str(tmp_path / "x.pcapng")]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment) as process:
         try:
             assert process.stderr is not None
             line = process.stderr.readline()
-            assert line.startswith("noack netem: compiling the relay for this machine, once; ")
-            assert "this takes about 15 s" in line
+            assert line.startswith("noack netem: compiling the capture for this machine, once; ")
+            assert "this takes about 10 s" in line
             os.kill(process.pid, signal.SIGSTOP)
             shown = subprocess.run(
                 [*COMMAND, "show"], env=environment, capture_output=True, text=True, check=False

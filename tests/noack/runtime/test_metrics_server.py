@@ -1,12 +1,13 @@
 """Metrics over HTTP, read by the parser of prometheus_client."""
 
+import select
 import socket
 import sys
-import time
+import threading
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager, suppress
 
 import pytest
 from prometheus_client import Metric
@@ -15,6 +16,7 @@ from prometheus_client.openmetrics.parser import text_string_to_metric_families
 from prometheus_client.parser import text_string_to_metric_families as prometheus_families
 
 from noack.core.errors import CallerError
+from noack.runtime import connection_gate
 from noack.runtime import metrics_server as servers
 from noack.runtime.address import Address
 from noack.runtime.metrics_server import metrics_server
@@ -24,6 +26,41 @@ OPENMETRICS = "application/openmetrics-text; version=1.0.0"
 
 def collect() -> Iterator[Metric]:
     yield GaugeMetricFamily("noack_test", "a value", 2.5)
+
+
+def collect_much() -> Iterator[Metric]:
+    """More than the kernel takes of an answer that is not read."""
+    yield GaugeMetricFamily("noack_test", "a" * 2**23, 2.5)
+
+
+def answered(reader: socket.socket) -> bytes:
+    """What a reader still gets, until the end of its connection."""
+    found = b""
+    with suppress(ConnectionResetError):
+        while part := reader.recv(2**20):
+            found += part
+    return found
+
+
+@contextmanager
+def slow_reader(address: Address) -> Iterator[threading.Thread]:
+    """Send a request of endless length, byte by byte; yield the thread, which ends with the
+    connection."""
+
+    def send() -> None:
+        with suppress(OSError):
+            while not select.select([connection], [], [], 0.01)[0]:
+                connection.send(b"G")
+
+    with socket.create_connection(address) as connection:
+        thread = threading.Thread(target=send)
+        thread.start()
+        try:
+            yield thread
+        finally:
+            with suppress(OSError):
+                connection.shutdown(socket.SHUT_RDWR)
+            thread.join()
 
 
 def read(address: Address, accept: str = OPENMETRICS, method: str = "GET") -> str:
@@ -61,66 +98,56 @@ def test_readers_that_send_nothing_or_garbage_do_not_stop_it(
     assert capfd.readouterr().err == ""
 
 
-STALLED = {
-    "before the request": b"",
-    "in the request line": b"GET /met",
-    "in a header": b"GET / HTTP/1.1\r\nHost: a",
-    "before the empty line": b"GET / HTTP/1.1\r\nHost: a\r\n",
-}
-
-
-@pytest.mark.parametrize("begun", STALLED.values(), ids=STALLED.keys())
-def test_a_reader_that_stalls_keeps_neither_another_reader_nor_the_end_waiting(
-    begun: bytes, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    "sent", [b"", b"GET /metr", b"GET / HTTP/1.1\r\nAccept: ", b"GET / HTTP/1.1\r\n\r\n"]
+)
+def test_readers_that_stall_keep_neither_others_nor_the_end_waiting(
+    monkeypatch: pytest.MonkeyPatch, sent: bytes
 ) -> None:
-    monkeypatch.setattr(servers, "_CONNECTION_S", 1e5)
-    with metrics_server(":0", collect) as address:
-        stalled = [socket.create_connection(address, 60) for _ in range(3)]
+    """Before the request, in its line, in its headers, and while the answer is sent."""
+    monkeypatch.setattr(servers, "_REQUEST_S", 3600.0)
+    monkeypatch.setattr(servers, "_ANSWER_S", 3600.0)
+    with ExitStack() as stack:
+        with metrics_server(":0", collect_much if sent.endswith(b"\n") else collect) as address:
+            stalled = [stack.enter_context(socket.create_connection(address)) for _ in range(30)]
+            for one in stalled:
+                one.sendall(sent)
+            assert "noack_test" in read(address)
         for one in stalled:
-            one.sendall(begun)
+            one.settimeout(60)
+            with suppress(ConnectionResetError):
+                while one.recv(65_536):
+                    pass
+
+
+def test_a_request_has_a_time_limit_however_it_arrives(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(servers, "_REQUEST_S", 0.0)
+    monkeypatch.setattr(connection_gate, "_CHECK_S", 0.01)
+    with metrics_server(":0", collect) as address, slow_reader(address) as thread:
+        thread.join()
+
+
+def test_beyond_the_limit_the_oldest_answer_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(servers, "_MOST_ANSWERS", 2)
+    monkeypatch.setattr(servers, "_ANSWER_S", 3600.0)
+    with metrics_server(":0", collect_much) as address, ExitStack() as stack:
+        readers = [stack.enter_context(socket.create_connection(address)) for _ in range(3)]
+        for one in readers:
+            one.settimeout(60)
+            one.sendall(b"GET / HTTP/1.1\r\n\r\n")
+            one.recv(1)
+        found = [len(answered(one)) for one in readers]
+        assert found[0] < found[1] == found[2]
+
+
+@pytest.mark.parametrize("sent", [b"\n\n", b"GET\r\n\r\n", b"\0 \0 \0\n\n", b"a" * 20_000])
+def test_what_is_no_request_is_refused(sent: bytes) -> None:
+    with metrics_server(":0", collect) as address, socket.create_connection(address) as reader:
+        reader.settimeout(60)
+        with suppress(ConnectionError):
+            reader.sendall(sent)
+            assert answered(reader) in (b"", b"HTTP/1.0 400 Bad Request\r\n\r\n")
         assert "noack_test" in read(address)
-    for one in stalled:  # the end of the server ended them
-        with one:
-            assert one.recv(1) == b""
-
-
-def test_a_reader_of_a_large_answer_that_stalls_does_not_keep_the_end_waiting() -> None:
-    def large() -> Iterator[Metric]:
-        family = GaugeMetricFamily("noack_test", "a value", labels=["name"])
-        for number in range(2_000):
-            family.add_metric([f"{number:09d}" * 1000], 1.0)
-        yield family
-
-    with metrics_server(":0", large) as address, socket.create_connection(address, 60) as one:
-        one.sendall(b"GET / HTTP/1.0\r\n\r\n")
-        assert one.recv(1) == b"H"  # the answer, 18 MB, has begun
-
-
-def test_a_connection_ends_at_its_time_limit_however_slowly_it_sends(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(servers, "_CONNECTION_S", 0.2)
-    with metrics_server(":0", collect) as address, socket.create_connection(address, 60) as one:
-
-        def send_slowly() -> None:
-            while True:  # until the server has ended the connection
-                one.sendall(b"G")
-                time.sleep(0.01)
-
-        with pytest.raises(ConnectionError):
-            send_slowly()
-
-
-def test_of_too_many_connections_the_oldest_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(servers, "_CONNECTION_S", 1e5)
-    monkeypatch.setattr(servers, "_MOST_CONNECTIONS", 3)
-    with metrics_server(":0", collect) as address, ExitStack() as stack:
-        several = [stack.enter_context(socket.create_connection(address, 60)) for _ in range(8)]
-        assert "noack_test" in read(address)
-        for one in several[:6]:
-            assert one.recv(1) == b""
-        several[-1].sendall(b"GET / HTTP/1.0\r\n\r\n")
-        assert several[-1].recv(1) == b"H"
 
 
 @pytest.mark.parametrize(("where", "message"), [
