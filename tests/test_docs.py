@@ -178,7 +178,7 @@ def test_links_and_paths_have_existing_targets(page: Path) -> None:
 
 
 def test_the_map_of_the_code_names_existing_files() -> None:
-    files = {path.name for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")}
+    files = {path.name for folder in (*FOLDERS, "native") for path in (ROOT / folder).rglob("*.py")}
     named = set(re.findall(r"`(\w+\.py)`", (ROOT / "ARCHITECTURE.md").read_text()))
     assert len(named) > 20
     assert named <= files

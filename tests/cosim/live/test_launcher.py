@@ -2,6 +2,7 @@
 
 import time
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, cast
 
 import pytest
@@ -101,7 +102,9 @@ class Case:
 
     def run(self, children: FakeChildren, coordinator: FakeCoordinator, **watch: Any) -> _Run:
         watcher = Watcher(**watch)
-        return _Run(self.ticket, self.run_dir, cast(Any, coordinator), children, watcher)
+        return _Run(
+            self.ticket, self.run_dir, cast(Any, coordinator), children, watcher, SimpleQueue()
+        )
 
     def result(self, code: int | None, now_s: float = 0.5, **failures: str) -> Failure | None:
         coordinator = FakeCoordinator(now_s, **failures)

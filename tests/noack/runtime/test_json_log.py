@@ -101,7 +101,7 @@ def test_a_mistake_is_an_object() -> None:
 
 
 def test_an_emulator_logs_json_lines(capfd: pytest.CaptureFixture[str]) -> None:
-    words = ["--listen", "192.0.2.1:9", "--to", "127.0.0.1:9", "--engine", "plain", "loss", "5%"]
+    words = ["--listen", "192.0.2.1:9", "--to", "127.0.0.1:9", "loss", "5%"]
     assert main([*words, "--log-format", "jsonl"]) == ExitStatus.CALLER
     (found,) = objects(capfd.readouterr().err)
     assert (found["level"], found["source"]) == ("error", "noack netem")
