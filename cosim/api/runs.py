@@ -418,7 +418,7 @@ def reproduce(path: Folder, *, run_code: bool = False, long: bool = False) -> "R
         path: an archive, written by :meth:`Run.archive` or ``noack archive``.
         run_code: run the code that the archive contains, if its plant, trigger or controller is a
             Python class or an FMU.
-        long: repeat a run of more than 20 million steps, too, which takes half an hour or more.
+        long: repeat a run of more than a million steps, too, which takes minutes and gigabytes.
 
     Returns:
         The result: ``bit_exact``; ``differences``, the first one of the run and of each loop;

@@ -89,6 +89,7 @@ class StoredTables(RecordSource):
                     f"{path}: has {metadata.num_rows:,} rows; a run of this scenario has at most "
                     f"{self._most_rows:,}"
                 )
+            _require_parts(path, metadata)
             _require_columns(path, schema, self.types[table])
             groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
             for column, _ in _columns(self.types[table]):
@@ -137,12 +138,20 @@ def group_segments(path: Path, dtype: RowType) -> Iterator[Segment]:
         CallerError: as :func:`read_table`.
     """
     with _readable(path), pq.ParquetFile(path) as file:
+        _require_parts(path, file.metadata)
         groups = file.num_row_groups
     for group in range(groups):
         inputs = _read_group(path, group, with_columns(dtype, ("input",)))["input"]
         if len(inputs):
             read = partial(_read_group, path, group, dtype)
             yield Segment(int(inputs.min()), int(inputs.max()), read)
+
+
+def _require_parts(path: Path, metadata: pq.FileMetaData) -> None:
+    """Raise CallerError if a part of a file has more rows than noack writes into one."""
+    rows = max((metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)), default=0)
+    if rows > _GROUP_ROWS:
+        raise CallerError(f"{path}: has {rows:,} rows in one part; noack writes {_GROUP_ROWS:,}")
 
 
 def _read_group(path: Path, group: int, dtype: RowType) -> Rows:
@@ -251,6 +260,8 @@ def _columns(dtype: RowType) -> Iterator[tuple[str, pa.DataType]]:
 
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
+    if path.exists() and not path.is_file():
+        raise CallerError(f"{path}: not a regular file")  # a FIFO would block
     try:
         yield
     except (OSError, pa.ArrowException, UnicodeDecodeError) as error:

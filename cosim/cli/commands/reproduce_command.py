@@ -26,7 +26,7 @@ def reproduce(
     ] = False,
     long: Annotated[
         bool,
-        typer.Option("--long", help="Repeat a run of more than 20 million steps, too."),
+        typer.Option("--long", help="Repeat a run of more than a million steps, too."),
     ] = False,
     into: Annotated[
         Path | None,

@@ -29,7 +29,7 @@ from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, MachineError, why
 from noack.settings.named_file import file_tables
 
-_MOST_STEPS = 20_000_000
+_MOST_STEPS = 1_000_000
 _US_PER_STEP = 100.0
 """Of simulation, record, summary and comparison together."""
 
@@ -70,7 +70,7 @@ def repeat_archive(
     Args:
         path: the archive.
         run_code: whether to execute the files of plants, triggers and controllers that it contains.
-        long: repeat a run of more than 20 million steps, too.
+        long: repeat a run of more than a million steps, too.
         into: folder, new or empty, for the unpacked run and its repetition; else they are deleted.
 
     Raises:

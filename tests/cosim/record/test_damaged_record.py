@@ -1,6 +1,7 @@
 """A damaged run directory: the readable part is read, the rest is reported in one line."""
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -93,3 +94,15 @@ def test_the_readable_part_of_a_damaged_spool_is_read(run_dir: Path) -> None:
     assert [notice["text"] for notice in finished.notices] == ["MANSD violated", "last"]
     assert summarise(finished, 0, "").to_json()["missing_by_table"] == {PLANT_STEP: 2}
     assert steps == len(finished[PLANT_STEP]) + 2
+
+
+def test_a_table_is_a_regular_file_in_parts_of_bounded_length(run_dir: Path) -> None:
+    path = run_dir / RECORD / f"{PLANT_STEP}.parquet"
+    table = pq.read_table(path)
+    pq.write_table(pa.concat_tables([table] * (40_000 // len(table))), path, row_group_size=10**6)
+    with pytest.raises(CallerError, match=r"rows in one part; noack writes 32,768"):
+        load_record(run_dir)
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(CallerError, match="not a regular file"):
+        load_record(run_dir)
