@@ -84,7 +84,6 @@ class Link:
         self._schedule = schedule
         self._reached_ns = -1
         self._rows: dict[int, int] = {}
-        self._free_rows: list[int] = []
         self._in_flight: list[_InFlight] = []
         self._put_in_flight = 0
         self._inputs = self._first_number = first_number
@@ -104,21 +103,10 @@ class Link:
         """Number of datagrams and copies in flight."""
         return int(self._state.core.in_flight)
 
-    @property
-    def delays(self) -> bool:
-        """Whether datagrams can be delayed."""
-        return self._state.tracks
-
     def flow(self, flow: int) -> Any:
         """The state of a flow, a ``noack_flow``; None if none of its datagrams has arrived."""
         row = self._rows.get(flow)
         return None if row is None else self._state.flow(row)
-
-    def forget(self, flow: int) -> None:
-        """Remove a flow that has ended and has no datagram in flight."""
-        row = self._rows.pop(flow, None)
-        if row is not None:
-            self._free_rows.append(row)
 
     def change(self, settings: LinkSettings) -> None:
         """Apply other settings; see native/link_change.c."""
@@ -184,7 +172,7 @@ class Link:
         """Decide for a flow's next packet; the next call overwrites the ``noack_decision``."""
         row = self._rows.get(flow)
         if row is None:
-            row = self._rows[flow] = self._free_rows.pop() if self._free_rows else len(self._rows)
+            row = self._rows[flow] = len(self._rows)
             self._state.start_flow(row, flow)
         return self._state.decide(row, size_bytes, now_ns)
 

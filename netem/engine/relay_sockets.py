@@ -22,13 +22,8 @@ _SO_SNDBUFFORCE = 32
 _SO_ATTACH_FILTER = 26
 _BPF_RETURN = 6
 _SO_TIMESTAMPNS = 35
-_MSG_ERRQUEUE = 0x2000
-_EXTENDED_ERROR = struct.Struct("=IB")
-"""Start of struct sock_extended_err: errno and origin."""
-_ICMP_ORIGINS = (2, 3)
 _RECVERR = ((socket.IPPROTO_IP, 11), (socket.IPPROTO_IPV6, 25))
 """Levels and options: IP_RECVERR, IPV6_RECVERR."""
-_ERROR_BYTES = 128
 
 Endpoint = socket.socket
 
@@ -141,22 +136,6 @@ def stamp_arrivals(endpoint: Endpoint) -> None:
     """Enable kernel timestamps of arrival, if the system supports them."""
     with suppress(OSError):
         endpoint.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-
-
-def icmp_errors(endpoint: Endpoint) -> list[int]:
-    """Empty a socket's error queue; return the errno of each ICMP error.
-
-    The compiled engine has its own version (:mod:`netem.engine.pump.error_queue`).
-    """
-    errors: list[int] = []
-    with suppress(OSError):
-        while sys.platform == "linux":
-            _, ancillary, _, _ = endpoint.recvmsg(0, _ERROR_BYTES, _MSG_ERRQUEUE)
-            for level, kind, data in ancillary:
-                if (level, kind) in _RECVERR and len(data) >= _EXTENDED_ERROR.size:
-                    error, origin = _EXTENDED_ERROR.unpack_from(data)
-                    errors += [error] if origin in _ICMP_ORIGINS else []
-    return errors
 
 
 def has_data(endpoint: Endpoint) -> bool:

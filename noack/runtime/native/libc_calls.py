@@ -35,7 +35,6 @@ syscall = _function("syscall", types.int64, *[types.int64] * 7)
 link_decide = _function("noack_link_decide", types.none, _word, *[types.int64] * 3, _word)
 link_leave = _function("noack_link_leave", types.int64, _word, *[types.int64] * 5)
 link_renew = _function("noack_link_renew", types.none, _word, _word, types.int64)
-link_touch = _function("noack_link_touch", types.int64, _word, types.int64)
 
 ECONNREFUSED = 111
 ENOMEM = 12
