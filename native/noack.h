@@ -291,6 +291,325 @@ void noack_philox(const int64_t counter[4], const int64_t key[2], int64_t words[
 void noack_uniforms(
     int64_t key0, int64_t key1, int64_t flow, int64_t packet, int64_t block, double uniform[2]);
 
+/* ---- Arithmetic in a fixed order: the same bits on every processor ----------------------------- */
+
+/* result = M v; M is (rows, columns). The result must not overlap v. */
+void noack_product(
+    int64_t rows, int64_t columns, const double *matrix, const double *vector, double *result);
+
+/* The Euclidean norm of a vector, without overflow of squares. */
+double noack_norm(int64_t count, const double *vector);
+
+/* result = e^M, (n, n); scratch: (10, n, n). See native/exponential.c. */
+void noack_exponential(int64_t n, const double *matrix, double *result, double *scratch);
+
+/* ---- A trigger rule, and its condition since the last event ------------------------------------ */
+
+typedef struct { /* noack.trigger.trigger_rule; with z = (x, e_s), the sensor transmits as soon as
+                    |P z|^2 > max(c e^(-rho (t - t_0)), f)^2 + |N z|^2 + eta */
+    double level, rate_per_s, floor; /* c, rho, f */
+    int64_t from_event; /* 1: t_0 is the last event, and c is |P z| just after it */
+    int64_t integrates; /* 1: the integral of |P z| since the last event is compared */
+    int64_t is_dynamic; /* 1: eta is Girard's dynamic variable */
+    double decay_per_s; /* of eta */
+    double initial;     /* eta at the start */
+    int64_t grid_ns;    /* the comparison counts at its multiples only; 0: always */
+    int64_t idle_ns;    /* it does not count before this time after an event */
+    int64_t shortest_ns, longest_ns; /* the next event is due at the latest after longest_ns */
+    int64_t forecasts; /* 1: each event computes the time of the next one */
+    double beta, alpha_per_s, forecast_floor; /* the threshold that it forecasts */
+    double growth_per_s, mismatch_per_s, disturbance_per_s;
+    int64_t up_rows, down_rows, gain_up_rows, gain_down_rows;
+    double *up, *down;           /* P and N, (rows, 2n) */
+    double *gain_up, *gain_down; /* of the rate of eta: |P_eta z|^2 - |N_eta z|^2 */
+    double *weight;          /* W of the norm that is recorded, (n, n); NULL: the identity */
+    double *forecast_weight; /* of the norm of x that a forecast begins with; NULL: likewise */
+} noack_trigger_rule;
+
+typedef struct { /* the condition since the last event */
+    double level;
+    int64_t since_ns, earliest_ns, latest_ns;
+    double auxiliary, rate; /* eta or the integral, and its rate at the last measurement */
+    int64_t measured_ns;
+    int64_t event_ns; /* of the last event; -1: none yet */
+} noack_trigger_state;
+
+/* ---- The machines of a loop: plant, sensor, controller ------------------------------------------ */
+
+enum {
+    NOACK_MAX_ENTRIES = 64, /* of a message's vector */
+    NOACK_MAX_ROW_WORDS = 1024,
+    NOACK_REJECTIONS = 10
+};
+
+enum noack_sequence { NOACK_NO_SEQUENCE = -1, NOACK_UNKNOWN_SEQUENCE = -2 };
+
+enum noack_flow_kind { /* noack.protocol.wire_format.Flow */
+    NOACK_MEASUREMENT = 1,
+    NOACK_UPDATE,
+    NOACK_ACTUATION,
+    NOACK_ACKNOWLEDGEMENT
+};
+
+enum noack_question { /* what Python must do before a step goes on; the step is then repeated */
+    NOACK_DONE,         /* nothing: the step is done */
+    NOACK_ASK_CHANGE,   /* other settings are due: set them, and change_ns */
+    NOACK_ASK_SIGNALS,  /* the disturbances or the noise of the next steps are missing */
+    NOACK_ASK_STATE,    /* advance the user's system: set x and z */
+    NOACK_ASK_DECISION, /* the user's trigger: set event, left and right */
+    NOACK_ASK_UPDATE,   /* the user's control law receives the state of an update */
+    NOACK_ASK_INPUT,    /* the user's control law: set u */
+    NOACK_ASK_ROOM,     /* there is no room for another update that waits for its acknowledgement */
+    NOACK_ROWS_FULL     /* a table of rows or notes must be emptied */
+};
+
+typedef struct { /* a message of the loop, decoded */
+    int64_t flow, loop, sequence, t_ns, entries;
+    double vector[64];
+} noack_message;
+
+typedef struct { /* what a machine receives of a flow */
+    int64_t flow;
+    int64_t entries;
+    int64_t newest;        /* sequence number of the newest message accepted; -1: none */
+    int64_t not_before_ns; /* earlier messages are stale */
+    int64_t accepted;
+    int64_t rejected[10]; /* by noack.protocol.wire_format.Rejection */
+} noack_reception;
+
+typedef struct { /* a table of numbers that depend on a step's number only */
+    int64_t width; /* 0: there are none */
+    int64_t first, rows;
+    double *values; /* (rows, width) of the steps from first on */
+} noack_signal;
+
+typedef struct { /* e^(H dt) for the dt that occurred lately; loops with the same H may share it */
+    int64_t n;
+    int64_t is_static; /* 1: H = 0 */
+    double *H;         /* (n, n) */
+    int64_t places;    /* a power of 2 */
+    int64_t *steps_ns; /* (places,) dt of each place; 0: free */
+    double *matrices;  /* (places, n, n) */
+    double *scratch;   /* (11, n, n) */
+} noack_transitions;
+
+typedef struct { /* the model between updates: dx/dt = H(x - x_r), x_r piecewise constant */
+    noack_transitions *transitions;
+    int64_t moves;      /* 1: some x_r is not 0 */
+    int64_t changes;    /* of x_r */
+    int64_t *since_ns;  /* (changes,) ascending */
+    int64_t *has_point; /* (changes + 1,) 0: x_r is 0 */
+    double *points;     /* (changes + 1, n) */
+} noack_model;
+
+typedef struct { /* what the machines of all roles have, first in each */
+    int64_t n, m;
+    int64_t phase_ns; /* time of the run at which the loop begins; other times are the loop's own */
+    int64_t step;     /* number of the next tick */
+    int64_t first_ns, period_ns; /* tick k is due at first_ns + k period_ns; 0: no ticks */
+    int64_t horizon_ns;          /* no tick is later */
+    int64_t first_number; /* of the messages */
+    int64_t inputs;       /* number of the next input */
+    int64_t reached_ns;   /* time up to which the present settings have been used; -1: none */
+    int64_t change_ns;    /* time from which other settings apply; INT64_MAX: none announced */
+    int64_t answered;     /* 1: Python has answered the question of this input */
+    int64_t observed;     /* 1: the observer has taken this input */
+    noack_reception received, acknowledgements;
+} noack_machine;
+
+enum noack_watchdog { NOACK_HOLD, NOACK_ZERO, NOACK_PREDICT };
+
+typedef struct { /* plant_server/plant.py makes it */
+    noack_machine machine;
+    /* settings */
+    int64_t internal;   /* entries of z, the user's system's own state */
+    int64_t is_user;    /* 1: Python advances x and z */
+    int64_t sources;    /* columns of Bd: m, or m + n if x is disturbed */
+    double *Ad, *Bd;    /* over a period, (n, n) and (n, sources) */
+    double *C;          /* (p, n); NULL: the identity */
+    int64_t p;
+    noack_signal at_input, at_state, noise; /* d of each step, w of each step, v by measurement */
+    int64_t measure_every;
+    int64_t reports_inputs; /* 1: a measurement has the inputs since the last one, too */
+    int64_t predictions;    /* N, inputs of an actuation */
+    int64_t carries_model;  /* 1: an actuation has x_c, too */
+    int64_t input_period_ns; /* of the controller */
+    int64_t watchdog, timeout_ns, notice_ns;
+    double *K;            /* (m, n), for NOACK_PREDICT, as is: */
+    noack_model fallback; /* dx/dt = H x */
+    /* state */
+    int64_t measurements;
+    double *x, *z;    /* (n,), (internal,) */
+    double *u;        /* (m,) held since the last step */
+    double *applied;  /* (sources,) the same, disturbed */
+    double *held;     /* (measure_every, m) the inputs since the last measurement */
+    double *inputs;   /* (N, m) of the newest actuation */
+    double *x_c;      /* (n,) of it */
+    int64_t newest_ns, newest_sequence;
+    int64_t fallback_sequence, fallback_ns; /* of the actuation that the fallback follows */
+    double *x_fallback;                     /* (n,) */
+    int64_t missing_ns; /* since when actuations have been reported missing; -1: they are not */
+    double *scratch;    /* (2n + m,) */
+} noack_plant;
+
+typedef struct { /* Luenberger: the gain is given. Kalman: it follows from P */
+    int64_t kind;   /* 0: none; 1: Luenberger; 2: Kalman */
+    int64_t p, steps; /* steps of the plant between two measurements */
+    double *Ad, *Bd, *C;
+    double *Q, *R;  /* (n, n), (p, p) */
+    double *gain;   /* (n, p) */
+    double *x, *P;  /* the state: (n,), (n, n) */
+    int64_t t_ns;   /* time of the estimate; -1: that of the first measurement */
+    double *scratch; /* (4 n n + 4 n p + 4 p p + 4n + 4p,) */
+} noack_observer;
+
+typedef struct { /* an update that was sent and is not acknowledged */
+    int64_t sequence, t_ns;
+} noack_sent;
+
+typedef struct { /* sensor_node/sensor.py makes it */
+    noack_machine machine;
+    /* settings */
+    noack_model model;
+    noack_trigger_rule rule;
+    int64_t is_user;      /* 1: the user's trigger decides */
+    int64_t acknowledged; /* 1: only an acknowledged update resets x_s */
+    int64_t timeout_ns;   /* of an acknowledgement */
+    int64_t plant_period_ns;
+    noack_observer observer;
+    /* state */
+    noack_trigger_state trigger;
+    double *x_s;        /* (n,) */
+    double *event_x;    /* (n,) x at the last event */
+    int64_t model_ns;
+    int64_t knows_state; /* 0: the first measurement is an event */
+    int64_t events;      /* number of the next one */
+    int64_t wait_ns;     /* time until which it waits for an acknowledgement; -1: it does not */
+    int64_t sent_count, sent_places;
+    noack_sent *sent; /* (sent_places,) oldest first */
+    double *sent_x;   /* (sent_places, n) */
+    /* the question to the user's trigger, and its answer */
+    double *x, *e_s;  /* (n,) the measured or estimated state; x_s - x */
+    int64_t first;    /* 1: it starts at x first */
+    int64_t event;
+    double left, right;
+    double *scratch; /* (6n + rows of the longest matrix of the rule + 8,) */
+} noack_sensor;
+
+typedef struct { /* controller_node/controller.py makes it */
+    noack_machine machine;
+    /* settings */
+    noack_model model;
+    double *K;         /* (m, n) */
+    int64_t has_point; /* 1: u = K(x_c - x_r) + u_r, else u = K x_c */
+    double *x_r, *u_r; /* (n,), (m,) */
+    double *safe_input; /* (m,) */
+    int64_t is_user;    /* 1: the user's control law gives u */
+    int64_t acknowledges;
+    int64_t predictions, carries_model; /* as of the plant */
+    /* state */
+    double *x_c; /* (n,) */
+    int64_t model_ns;
+    int64_t knows_state;
+    int64_t newest; /* number of the last update; NOACK_UNKNOWN_SEQUENCE after a restart */
+    double *x, *u;  /* (n,), (m,) the question to the user's law, and its answer */
+    int64_t asked_ns;
+    double *scratch; /* (3n + m,) */
+} noack_controller;
+
+typedef struct { /* what a machine does at an input: it writes a row, and may send a message */
+    int64_t sends; /* 1: there is a message */
+    noack_message message;
+    int64_t notes;     /* 1: a plant has written a note */
+    int64_t table;     /* enum noack_table_number, of the row */
+    int64_t words;     /* of the row */
+    int64_t row[1024]; /* integers, and the bits of doubles */
+} noack_output;
+
+typedef struct { /* plant: actuations are missing, or arrive again */
+    int64_t loop, t_ns;
+    int64_t since_ns; /* since when they were missing; -1: they are missing now */
+    int64_t newest_ns, newest_sequence;
+} noack_note;
+
+enum noack_role { NOACK_PLANT, NOACK_SENSOR, NOACK_CONTROLLER };
+
+enum noack_table_number { /* sensor: no ticks */
+    NOACK_TICKS,
+    NOACK_MESSAGES,
+    NOACK_ACKNOWLEDGEMENTS,
+    NOACK_TABLES
+};
+
+typedef struct { /* rows of a table of the record, packed as numpy has them */
+    int64_t prefix_bytes; /* 2: a row begins with the number of its loop */
+    int64_t row_bytes, places, count;
+    uint8_t *rows; /* (places, row_bytes) */
+} noack_table;
+
+typedef struct { /* the machines of one role, of all loops */
+    int64_t role, loops;
+    noack_plant *plants; /* (loops,) of this role; the others are NULL */
+    noack_sensor *sensors;
+    noack_controller *controllers;
+    int64_t *due_ns;    /* (loops,) next tick of each machine, in the run's time; INT64_MAX: none */
+    int64_t *heap;      /* (loops,) loops with a tick, by (due_ns, number); a heap */
+    int64_t heap_count;
+    noack_table tables[3];
+    noack_note *notes;
+    int64_t note_places, note_count;
+    noack_output output;
+    int64_t asking; /* the loop whose machine has asked */
+} noack_process;
+
+/* Return NULL, or what is wrong with the numbers of a process: all that the steps assume. */
+const char *noack_process_check(const noack_process *process);
+
+/* Find the first tick of each machine. */
+void noack_process_begin(noack_process *process);
+
+/* The next tick of all machines in the run's time; INT64_MAX: none. */
+int64_t noack_process_due_ns(const noack_process *process);
+
+/* A message arrives at now_ns, a time of the run; or the tick that is due is done. Return
+   NOACK_DONE, or a noack_question: after the answer the call is repeated. */
+int64_t noack_process_handle(
+    noack_process *process, const noack_message *message, int64_t now_ns);
+int64_t noack_process_tick(noack_process *process, int64_t now_ns);
+
+/* The machine of a loop. */
+noack_machine *noack_process_machine(const noack_process *process, int64_t loop);
+
+/* Steps of one machine; times are the loop's own. They return as above. */
+int64_t noack_plant_handle(
+    noack_plant *plant, const noack_message *message, int64_t now_ns, noack_output *output);
+int64_t noack_plant_tick(
+    noack_plant *plant, int64_t now_ns, noack_output *output, noack_note *note);
+int64_t noack_sensor_handle(
+    noack_sensor *sensor, const noack_message *message, int64_t now_ns, noack_output *output);
+int64_t noack_controller_handle(
+    noack_controller *controller, const noack_message *message, int64_t now_ns,
+    noack_output *output);
+int64_t noack_controller_tick(
+    noack_controller *controller, int64_t now_ns, noack_output *output);
+
+/* Parts of the steps, for other simulators and for tests. */
+void noack_trigger_start(
+    const noack_trigger_rule *rule, noack_trigger_state *state, int64_t n, int64_t t_ns,
+    const double *x, double *scratch);
+void noack_trigger_condition(
+    const noack_trigger_rule *rule, noack_trigger_state *state, int64_t n, int64_t t_ns,
+    const double *x, double *scratch);
+int64_t noack_trigger_test(
+    const noack_trigger_rule *rule, noack_trigger_state *state, int64_t n, int64_t t_ns,
+    const double *x, const double *e_s, double sides[2], double *scratch);
+double noack_forecast_ns(const noack_trigger_rule *rule, double size, double t_s);
+void noack_model_advance(
+    const noack_model *model, const double *x, int64_t from_ns, int64_t to_ns, double *result);
+const double *noack_transition(noack_transitions *transitions, int64_t dt_ns);
+void noack_observer_predict(noack_observer *observer, int64_t n, int64_t m, const double *u);
+void noack_observer_correct(noack_observer *observer, int64_t n, const double *y);
+
 /* ---- The relay: waits for, receives, decides, sends ------------------------------------------ */
 
 enum {
