@@ -261,7 +261,7 @@ def channel_of(
                 rows=loops,
                 restarted=start.is_restart,
                 decisions=[()] if network else (),
-            )  # fmt: skip
+            )
         )
     schedule = None if network else ChangeSchedule(resolved, lambda one: one.network.link)
     return Channel(
