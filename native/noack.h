@@ -610,6 +610,73 @@ const double *noack_transition(noack_transitions *transitions, int64_t dt_ns);
 void noack_observer_predict(noack_observer *observer, int64_t n, int64_t m, const double *u);
 void noack_observer_correct(noack_observer *observer, int64_t n, const double *y);
 
+/* ---- The clock of a run ------------------------------------------------------------------------ */
+
+typedef struct { /* noack.core.clock: simulated time since the run's epoch */
+    int64_t epoch_ns; /* reading of the coordinator's monotonic clock at simulated time 0 */
+    double speed;     /* simulated time per time of that clock */
+    int64_t slew_ppb; /* 0: this host has that clock; else noack.core.slewed_clock: */
+    int64_t since_ns, begun_ns, target_ns;
+} noack_clock;
+
+/* The simulated time at a reading of this host's monotonic clock. */
+int64_t noack_clock_at_ns(const noack_clock *clock, int64_t own_ns);
+
+/* ---- The wire format (docs/wire.md) ------------------------------------------------------------ */
+
+enum {
+    NOACK_HEADER_BYTES = 32,
+    NOACK_TAG_BYTES = 16,
+    NOACK_KEY_BYTES = 32,
+    NOACK_DATAGRAM_BYTES = 560 /* of 64 entries */
+};
+
+enum noack_examination { /* what a datagram is; first noack.protocol.wire_format.Rejection */
+    NOACK_BAD_LENGTH,
+    NOACK_BAD_VERSION,
+    NOACK_BAD_RUN,
+    NOACK_BAD_FLOW,
+    NOACK_BAD_LOOP,
+    NOACK_BAD_TAG,
+    NOACK_BAD_SOURCE,
+    NOACK_BAD_RANGE,
+    NOACK_STALE,
+    NOACK_NOT_FINITE,
+    NOACK_ACCEPTED,
+    NOACK_ENCRYPTED /* Python must open it */
+};
+
+typedef struct { /* what the datagrams of a run have in common */
+    int64_t run_id;    /* the bits of the unsigned number */
+    int64_t encrypted; /* 1: Python encrypts and decrypts the vectors, and makes the tags */
+    uint64_t keyed[8]; /* BLAKE2b's state after the key */
+} noack_wire;
+
+/* Set the key. */
+void noack_wire_key(noack_wire *wire, const uint8_t key[32]);
+
+/* The tag of at least one byte of content. */
+void noack_wire_tag(
+    const noack_wire *wire, int64_t size_bytes, const uint8_t *content, uint8_t tag[16]);
+
+/* Write the datagram of a message of at most 64 entries; return its size in bytes. If it is to be
+   encrypted, its vector is still readable, and its tag missing. */
+int64_t noack_wire_encode(const noack_wire *wire, const noack_message *message, uint8_t *datagram);
+
+/* The number in a header, not verified; -1: the datagram is too short. */
+int64_t noack_wire_loop(const uint8_t *datagram, int64_t size_bytes);
+int64_t noack_wire_flow(const uint8_t *datagram, int64_t size_bytes);
+
+/* Examine a datagram that may be one of a loop; return a noack_examination. opened: 1 if Python has
+   decrypted its vector in place. The message is complete if the datagram is accepted. */
+int64_t noack_wire_examine(
+    const noack_wire *wire, const noack_reception *reception, int64_t loop,
+    const uint8_t *datagram, int64_t size_bytes, int64_t from_peer, int64_t opened,
+    noack_message *message);
+
+/* Count a datagram as accepted or rejected. */
+void noack_wire_count(noack_reception *reception, int64_t found, const noack_message *message);
+
 /* ---- The relay: waits for, receives, decides, sends ------------------------------------------ */
 
 enum {
@@ -724,9 +791,8 @@ typedef struct { /* a row of the record's table netem_release */
 typedef struct { /* times are simulated and count from the relay's start, unless stated otherwise */
     int64_t links;
     int64_t epoll;
-    int64_t epoch_ns; /* the monotonic clock at the relay's start */
-    int64_t unix_ns;  /* Unix time at the relay's start */
-    double speed;     /* simulated time per time of the monotonic clock */
+    noack_clock clock; /* its epoch is the relay's start */
+    int64_t unix_ns;   /* Unix time at the relay's start */
     int64_t now_ns;   /* arrival of the current datagram, or its release time; never decreases */
     int64_t read_ns;  /* the last reading of the clock; never decreases */
     int64_t change_ns; /* time from which other settings apply */
