@@ -300,7 +300,7 @@ void noack_product(
 /* The Euclidean norm of a vector, without overflow of squares. */
 double noack_norm(int64_t count, const double *vector);
 
-/* result = e^M, (n, n); scratch: (10, n, n). See native/exponential.c. */
+/* result = e^M, (n, n); scratch: (10, n, n). See native/loop/exponential.c. */
 void noack_exponential(int64_t n, const double *matrix, double *result, double *scratch);
 
 /* ---- A trigger rule, and its condition since the last event ------------------------------------ */
@@ -357,6 +357,7 @@ enum noack_question { /* what Python must do before a step goes on; the step is 
     NOACK_ASK_SIGNALS,  /* the disturbances or the noise of the next steps are missing */
     NOACK_ASK_STATE,    /* advance the user's system: set x and z */
     NOACK_ASK_DECISION, /* the user's trigger: set event, left and right */
+    NOACK_ASK_RESTART,  /* the user's trigger begins again with an acknowledged event */
     NOACK_ASK_UPDATE,   /* the user's control law receives the state of an update */
     NOACK_ASK_INPUT,    /* the user's control law: set u */
     NOACK_ASK_ROOM,     /* there is no room for another update that waits for its acknowledgement */
@@ -390,7 +391,7 @@ typedef struct { /* e^(H dt) for the dt that occurred lately; loops with the sam
     int64_t places;    /* a power of 2 */
     int64_t *steps_ns; /* (places,) dt of each place; 0: free */
     double *matrices;  /* (places, n, n) */
-    double *scratch;   /* (11, n, n) */
+    double *scratch;   /* (10 n n + 3n,) */
 } noack_transitions;
 
 typedef struct { /* the model between updates: dx/dt = H(x - x_r), x_r piecewise constant */
@@ -419,11 +420,19 @@ typedef struct { /* what the machines of all roles have, first in each */
 
 enum noack_watchdog { NOACK_HOLD, NOACK_ZERO, NOACK_PREDICT };
 
+enum noack_system { /* what advances the state of a plant */
+    NOACK_LINEAR,
+    NOACK_USER, /* Python */
+    NOACK_FAILED /* nothing: the state stays as it is */
+};
+
+enum noack_observer_kind { NOACK_NO_OBSERVER, NOACK_LUENBERGER, NOACK_KALMAN };
+
 typedef struct { /* plant_server/plant.py makes it */
     noack_machine machine;
     /* settings */
     int64_t internal;   /* entries of z, the user's system's own state */
-    int64_t is_user;    /* 1: Python advances x and z */
+    int64_t system;     /* enum noack_system */
     int64_t sources;    /* columns of Bd: m, or m + n if x is disturbed */
     double *Ad, *Bd;    /* over a period, (n, n) and (n, sources) */
     double *C;          /* (p, n); NULL: the identity */
@@ -449,18 +458,18 @@ typedef struct { /* plant_server/plant.py makes it */
     int64_t fallback_sequence, fallback_ns; /* of the actuation that the fallback follows */
     double *x_fallback;                     /* (n,) */
     int64_t missing_ns; /* since when actuations have been reported missing; -1: they are not */
-    double *scratch;    /* (2n + m,) */
+    double *scratch;    /* (2n + 2m,) */
 } noack_plant;
 
 typedef struct { /* Luenberger: the gain is given. Kalman: it follows from P */
-    int64_t kind;   /* 0: none; 1: Luenberger; 2: Kalman */
-    int64_t p, steps; /* steps of the plant between two measurements */
+    int64_t kind;   /* enum noack_observer_kind */
+    int64_t p;
     double *Ad, *Bd, *C;
     double *Q, *R;  /* (n, n), (p, p) */
     double *gain;   /* (n, p) */
     double *x, *P;  /* the state: (n,), (n, n) */
     int64_t t_ns;   /* time of the estimate; -1: that of the first measurement */
-    double *scratch; /* (4 n n + 4 n p + 4 p p + 4n + 4p,) */
+    double *scratch; /* (3 n n + n p + p p + 2n + p,) */
 } noack_observer;
 
 typedef struct { /* an update that was sent and is not acknowledged */
@@ -493,7 +502,7 @@ typedef struct { /* sensor_node/sensor.py makes it */
     int64_t first;    /* 1: it starts at x first */
     int64_t event;
     double left, right;
-    double *scratch; /* (6n + rows of the longest matrix of the rule + 8,) */
+    double *scratch; /* (4n + rows of the rule's longest matrix,) */
 } noack_sensor;
 
 typedef struct { /* controller_node/controller.py makes it */
@@ -600,6 +609,9 @@ void noack_trigger_start(
 void noack_trigger_condition(
     const noack_trigger_rule *rule, noack_trigger_state *state, int64_t n, int64_t t_ns,
     const double *x, double *scratch);
+void noack_trigger_restart(
+    const noack_trigger_rule *rule, noack_trigger_state *state, int64_t n, int64_t t_ns,
+    const double *x, double *scratch);
 int64_t noack_trigger_test(
     const noack_trigger_rule *rule, noack_trigger_state *state, int64_t n, int64_t t_ns,
     const double *x, const double *e_s, double sides[2], double *scratch);
@@ -608,6 +620,8 @@ void noack_model_advance(
     const noack_model *model, const double *x, int64_t from_ns, int64_t to_ns, double *result);
 const double *noack_transition(noack_transitions *transitions, int64_t dt_ns);
 void noack_observer_predict(noack_observer *observer, int64_t n, int64_t m, const double *u);
+/* Compute the gain of the next measurement, of a Kalman filter. */
+void noack_observer_gain(noack_observer *observer, int64_t n);
 void noack_observer_correct(noack_observer *observer, int64_t n, const double *y);
 
 /* ---- The clock of a run ------------------------------------------------------------------------ */
