@@ -300,7 +300,7 @@ void noack_product(
 /* The Euclidean norm of a vector, without overflow of squares. */
 double noack_norm(int64_t count, const double *vector);
 
-/* result = e^M, (n, n); scratch: (10, n, n). See native/exponential.c. */
+/* result = e^M, (n, n); scratch: (10, n, n). See native/loop/exponential.c. */
 void noack_exponential(int64_t n, const double *matrix, double *result, double *scratch);
 
 /* ---- A trigger rule, and its condition since the last event ------------------------------------ */
@@ -357,6 +357,7 @@ enum noack_question { /* what Python must do before a step goes on; the step is 
     NOACK_ASK_SIGNALS,  /* the disturbances or the noise of the next steps are missing */
     NOACK_ASK_STATE,    /* advance the user's system: set x and z */
     NOACK_ASK_DECISION, /* the user's trigger: set event, left and right */
+    NOACK_ASK_RESTART,  /* the user's trigger begins again with an acknowledged event */
     NOACK_ASK_UPDATE,   /* the user's control law receives the state of an update */
     NOACK_ASK_INPUT,    /* the user's control law: set u */
     NOACK_ASK_ROOM,     /* there is no room for another update that waits for its acknowledgement */
@@ -390,7 +391,7 @@ typedef struct { /* e^(H dt) for the dt that occurred lately; loops with the sam
     int64_t places;    /* a power of 2 */
     int64_t *steps_ns; /* (places,) dt of each place; 0: free */
     double *matrices;  /* (places, n, n) */
-    double *scratch;   /* (11, n, n) */
+    double *scratch;   /* (10 n n + 3n,) */
 } noack_transitions;
 
 typedef struct { /* the model between updates: dx/dt = H(x - x_r), x_r piecewise constant */
@@ -419,11 +420,19 @@ typedef struct { /* what the machines of all roles have, first in each */
 
 enum noack_watchdog { NOACK_HOLD, NOACK_ZERO, NOACK_PREDICT };
 
+enum noack_system { /* what advances the state of a plant */
+    NOACK_LINEAR,
+    NOACK_USER, /* Python */
+    NOACK_FAILED /* nothing: the state stays as it is */
+};
+
+enum noack_observer_kind { NOACK_NO_OBSERVER, NOACK_LUENBERGER, NOACK_KALMAN };
+
 typedef struct { /* plant_server/plant.py makes it */
     noack_machine machine;
     /* settings */
     int64_t internal;   /* entries of z, the user's system's own state */
-    int64_t is_user;    /* 1: Python advances x and z */
+    int64_t system;     /* enum noack_system */
     int64_t sources;    /* columns of Bd: m, or m + n if x is disturbed */
     double *Ad, *Bd;    /* over a period, (n, n) and (n, sources) */
     double *C;          /* (p, n); NULL: the identity */
@@ -449,18 +458,18 @@ typedef struct { /* plant_server/plant.py makes it */
     int64_t fallback_sequence, fallback_ns; /* of the actuation that the fallback follows */
     double *x_fallback;                     /* (n,) */
     int64_t missing_ns; /* since when actuations have been reported missing; -1: they are not */
-    double *scratch;    /* (2n + m,) */
+    double *scratch;    /* (2n + 2m,) */
 } noack_plant;
 
 typedef struct { /* Luenberger: the gain is given. Kalman: it follows from P */
-    int64_t kind;   /* 0: none; 1: Luenberger; 2: Kalman */
-    int64_t p, steps; /* steps of the plant between two measurements */
+    int64_t kind;   /* enum noack_observer_kind */
+    int64_t p;
     double *Ad, *Bd, *C;
     double *Q, *R;  /* (n, n), (p, p) */
     double *gain;   /* (n, p) */
     double *x, *P;  /* the state: (n,), (n, n) */
     int64_t t_ns;   /* time of the estimate; -1: that of the first measurement */
-    double *scratch; /* (4 n n + 4 n p + 4 p p + 4n + 4p,) */
+    double *scratch; /* (3 n n + n p + p p + 2n + p,) */
 } noack_observer;
 
 typedef struct { /* an update that was sent and is not acknowledged */
@@ -493,7 +502,7 @@ typedef struct { /* sensor_node/sensor.py makes it */
     int64_t first;    /* 1: it starts at x first */
     int64_t event;
     double left, right;
-    double *scratch; /* (6n + rows of the longest matrix of the rule + 8,) */
+    double *scratch; /* (4n + rows of the rule's longest matrix,) */
 } noack_sensor;
 
 typedef struct { /* controller_node/controller.py makes it */
@@ -600,6 +609,9 @@ void noack_trigger_start(
 void noack_trigger_condition(
     const noack_trigger_rule *rule, noack_trigger_state *state, int64_t n, int64_t t_ns,
     const double *x, double *scratch);
+void noack_trigger_restart(
+    const noack_trigger_rule *rule, noack_trigger_state *state, int64_t n, int64_t t_ns,
+    const double *x, double *scratch);
 int64_t noack_trigger_test(
     const noack_trigger_rule *rule, noack_trigger_state *state, int64_t n, int64_t t_ns,
     const double *x, const double *e_s, double sides[2], double *scratch);
@@ -608,7 +620,76 @@ void noack_model_advance(
     const noack_model *model, const double *x, int64_t from_ns, int64_t to_ns, double *result);
 const double *noack_transition(noack_transitions *transitions, int64_t dt_ns);
 void noack_observer_predict(noack_observer *observer, int64_t n, int64_t m, const double *u);
+/* Compute the gain of the next measurement, of a Kalman filter. */
+void noack_observer_gain(noack_observer *observer, int64_t n);
 void noack_observer_correct(noack_observer *observer, int64_t n, const double *y);
+
+/* ---- The clock of a run ------------------------------------------------------------------------ */
+
+typedef struct { /* noack.core.clock: simulated time since the run's epoch */
+    int64_t epoch_ns; /* reading of the coordinator's monotonic clock at simulated time 0 */
+    double speed;     /* simulated time per time of that clock */
+    int64_t slew_ppb; /* 0: this host has that clock; else noack.core.slewed_clock: */
+    int64_t since_ns, begun_ns, target_ns;
+} noack_clock;
+
+/* The simulated time at a reading of this host's monotonic clock. */
+int64_t noack_clock_at_ns(const noack_clock *clock, int64_t own_ns);
+
+/* ---- The wire format (docs/wire.md) ------------------------------------------------------------ */
+
+enum {
+    NOACK_HEADER_BYTES = 32,
+    NOACK_TAG_BYTES = 16,
+    NOACK_KEY_BYTES = 32,
+    NOACK_DATAGRAM_BYTES = 560 /* of 64 entries */
+};
+
+enum noack_examination { /* what a datagram is; first noack.protocol.wire_format.Rejection */
+    NOACK_BAD_LENGTH,
+    NOACK_BAD_VERSION,
+    NOACK_BAD_RUN,
+    NOACK_BAD_FLOW,
+    NOACK_BAD_LOOP,
+    NOACK_BAD_TAG,
+    NOACK_BAD_SOURCE,
+    NOACK_BAD_RANGE,
+    NOACK_STALE,
+    NOACK_NOT_FINITE,
+    NOACK_ACCEPTED,
+    NOACK_ENCRYPTED /* Python must open it */
+};
+
+typedef struct { /* what the datagrams of a run have in common */
+    int64_t run_id;    /* the bits of the unsigned number */
+    int64_t encrypted; /* 1: Python encrypts and decrypts the vectors, and makes the tags */
+    uint64_t keyed[8]; /* BLAKE2b's state after the key */
+} noack_wire;
+
+/* Set the key. */
+void noack_wire_key(noack_wire *wire, const uint8_t key[32]);
+
+/* The tag of at least one byte of content. */
+void noack_wire_tag(
+    const noack_wire *wire, int64_t size_bytes, const uint8_t *content, uint8_t tag[16]);
+
+/* Write the datagram of a message of at most 64 entries; return its size in bytes. If it is to be
+   encrypted, its vector is still readable, and its tag missing. */
+int64_t noack_wire_encode(const noack_wire *wire, const noack_message *message, uint8_t *datagram);
+
+/* The number in a header, not verified; -1: the datagram is too short. */
+int64_t noack_wire_loop(const uint8_t *datagram, int64_t size_bytes);
+int64_t noack_wire_flow(const uint8_t *datagram, int64_t size_bytes);
+
+/* Examine a datagram that may be one of a loop; return a noack_examination. opened: 1 if Python has
+   decrypted its vector in place. The message is complete if the datagram is accepted. */
+int64_t noack_wire_examine(
+    const noack_wire *wire, const noack_reception *reception, int64_t loop,
+    const uint8_t *datagram, int64_t size_bytes, int64_t from_peer, int64_t opened,
+    noack_message *message);
+
+/* Count a datagram as accepted or rejected. */
+void noack_wire_count(noack_reception *reception, int64_t found, const noack_message *message);
 
 /* ---- The relay: waits for, receives, decides, sends ------------------------------------------ */
 
@@ -724,9 +805,8 @@ typedef struct { /* a row of the record's table netem_release */
 typedef struct { /* times are simulated and count from the relay's start, unless stated otherwise */
     int64_t links;
     int64_t epoll;
-    int64_t epoch_ns; /* the monotonic clock at the relay's start */
-    int64_t unix_ns;  /* Unix time at the relay's start */
-    double speed;     /* simulated time per time of the monotonic clock */
+    noack_clock clock; /* its epoch is the relay's start */
+    int64_t unix_ns;   /* Unix time at the relay's start */
     int64_t now_ns;   /* arrival of the current datagram, or its release time; never decreases */
     int64_t read_ns;  /* the last reading of the clock; never decreases */
     int64_t change_ns; /* time from which other settings apply */

@@ -65,12 +65,6 @@ typedef struct {
 
 static inline relay_scratch *scratch_of(const noack_relay *relay) { return relay->scratch; }
 
-/* clock.c: simulated nanoseconds since the relay's start. */
-int64_t clock_ns(int clock);
-int64_t relay_time_ns(const noack_relay *relay);
-int64_t simulated_ns_of(const noack_relay *relay, int64_t wall_ns);
-int64_t wall_ns_of(const noack_relay *relay, int64_t simulated_ns);
-
 /* store.c: delayed datagrams. */
 int64_t blocks_for(int64_t size_bytes);
 uint8_t *block_address(const noack_relay *relay, int64_t block);

@@ -1,0 +1,119 @@
+/* The controller: runs the model x_c, which only a delivered update resets (eq:ModCont).
+
+   At an update x_c <- e^(H(t - t_i)) x(t_i), so that a late update still restores x_c = x_s. At
+   every tick the controller sends the input of its control law: u = K(x_c - x_r) + u_r, unless the
+   user's law gives it. Before its first update it sends a declared safe input, unless x(0) is
+   given. The model's time advances with ticks and updates and never runs backward: an update older
+   than the last tick is propagated to the time of that tick, a newer one advances the model. */
+#include "loop.h"
+
+/* Updates lost between two; losses before a restart of the sensor are unknown. */
+static int64_t lost_between(int64_t newest, int64_t sequence) {
+    if (newest == NOACK_UNKNOWN_SEQUENCE)
+        return 0;
+    int restarted = floor_div(sequence, GENERATION) != floor_div(newest, GENERATION);
+    return restarted ? floor_mod(sequence, GENERATION) : sequence - newest - 1;
+}
+
+int64_t noack_controller_handle(
+    noack_controller *controller, const noack_message *message, int64_t now_ns,
+    noack_output *output) {
+    noack_machine *machine = &controller->machine;
+    int64_t n = machine->n, event_ns = message->t_ns;
+    int64_t model_ns = max_of(controller->model_ns, event_ns);
+    if (model_ns >= machine->change_ns)
+        return NOACK_ASK_CHANGE;
+    if (controller->is_user && !machine->answered) {
+        copy(n, message->vector, controller->x);
+        controller->asked_ns = event_ns;
+        return NOACK_ASK_UPDATE;
+    }
+    machine->answered = 0;
+    double *before = controller->scratch;
+    noack_model_advance(
+        &controller->model, controller->x_c, controller->model_ns, model_ns, before);
+    noack_model_advance(&controller->model, message->vector, event_ns, model_ns, controller->x_c);
+    controller->model_ns = machine->reached_ns = model_ns;
+    controller->knows_state = 1;
+    begin_row(output, NOACK_MESSAGES, machine, message->sequence, event_ns, now_ns);
+    put(output, model_ns);
+    put_reals(output, n, message->vector);
+    put_reals(output, n, before);
+    put_reals(output, n, controller->x_c);
+    put(output, lost_between(controller->newest, message->sequence));
+    controller->newest = message->sequence;
+    if (controller->acknowledges)
+        begin_message(output, NOACK_ACKNOWLEDGEMENT, message->sequence, event_ns);
+    return NOACK_DONE;
+}
+
+/* u = K(x - x_r) + u_r, or the answer of the user's law. */
+static void apply_law(noack_controller *controller, const double *x, double *u) {
+    int64_t n = controller->machine.n, m = controller->machine.m;
+    if (controller->is_user) {
+        copy(m, controller->u, u);
+        return;
+    }
+    if (!controller->has_point) {
+        noack_product(m, n, controller->K, x, u);
+        return;
+    }
+    double *from_point = controller->scratch + n;
+    for (int64_t k = 0; k < n; k++)
+        from_point[k] = x[k] - controller->x_r[k];
+    noack_product(m, n, controller->K, from_point, u);
+    for (int64_t k = 0; k < m; k++)
+        u[k] += controller->u_r[k];
+}
+
+/* Append the inputs for the times one period, two periods ... after the model's time. */
+static void append_predictions(noack_controller *controller, noack_output *output) {
+    const noack_machine *machine = &controller->machine;
+    int64_t n = machine->n, m = machine->m, t_ns = controller->model_ns;
+    double *x = controller->scratch + 2 * n, *u = controller->scratch + 3 * n;
+    copy(n, controller->x_c, x);
+    copy(m, output->message.vector, u);
+    for (int64_t k = 1; k < controller->predictions; k++) {
+        if (controller->knows_state) {
+            noack_model_advance(&controller->model, x, t_ns, t_ns + machine->period_ns, x);
+            t_ns += machine->period_ns;
+            apply_law(controller, x, u);
+        }
+        append(output, m, u);
+    }
+}
+
+int64_t noack_controller_tick(noack_controller *controller, int64_t now_ns, noack_output *output) {
+    noack_machine *machine = &controller->machine;
+    int64_t n = machine->n, m = machine->m;
+    int64_t t_ns = machine->first_ns + machine->step * machine->period_ns;
+    int64_t model_ns = max_of(t_ns, controller->model_ns);
+    if (model_ns >= machine->change_ns)
+        return NOACK_ASK_CHANGE;
+    double *x_c = controller->scratch;
+    noack_model_advance(&controller->model, controller->x_c, controller->model_ns, model_ns, x_c);
+    if (controller->is_user && controller->knows_state && !machine->answered) {
+        copy(n, x_c, controller->x);
+        controller->asked_ns = t_ns;
+        return NOACK_ASK_INPUT;
+    }
+    machine->answered = 0;
+    copy(n, x_c, controller->x_c);
+    controller->model_ns = machine->reached_ns = model_ns;
+    int64_t number = machine->first_number + machine->step++;
+    begin_row(output, NOACK_TICKS, machine, number, t_ns, now_ns);
+    begin_message(output, NOACK_ACTUATION, number, model_ns);
+    double *u = output->message.vector;
+    output->message.entries = m;
+    if (controller->knows_state)
+        apply_law(controller, controller->x_c, u);
+    else
+        copy(m, controller->safe_input, u);
+    put(output, model_ns);
+    put_reals(output, n, controller->x_c);
+    put_reals(output, m, u);
+    append_predictions(controller, output);
+    if (controller->carries_model)
+        append(output, n, controller->x_c);
+    return NOACK_DONE;
+}

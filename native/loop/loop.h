@@ -1,0 +1,73 @@
+/* What the steps of a loop's machines share. */
+#ifndef NOACK_LOOP_H
+#define NOACK_LOOP_H
+
+#include <string.h>
+
+#include "../core.h"
+
+#define GENERATION (INT64_C(1) << 40) /* noack.protocol.machine_interface.GENERATION */
+#define NO_TICK INT64_MAX
+
+static inline void copy(int64_t count, const double *source, double *result) {
+    memcpy(result, source, (size_t)count * sizeof *result);
+}
+
+/* The row of an output: integers, and the bits of doubles. */
+static inline void put(noack_output *output, int64_t number) {
+    output->row[output->words++] = number;
+}
+
+static inline void put_reals(noack_output *output, int64_t count, const double *values) {
+    memcpy(output->row + output->words, values, (size_t)count * sizeof *values);
+    output->words += count;
+}
+
+/* Begin a row with the columns that all tables have. */
+static inline void begin_row(
+    noack_output *output, int64_t table, noack_machine *machine, int64_t sequence, int64_t t_ns,
+    int64_t now_ns) {
+    output->sends = output->notes = output->words = 0;
+    output->table = table;
+    put(output, machine->inputs++);
+    put(output, sequence);
+    put(output, t_ns);
+    put(output, now_ns);
+}
+
+/* Begin the message of an output; its vector is still empty. */
+static inline void begin_message(
+    noack_output *output, int64_t flow, int64_t sequence, int64_t t_ns) {
+    output->sends = 1;
+    output->message.flow = flow;
+    output->message.sequence = sequence;
+    output->message.t_ns = t_ns;
+    output->message.entries = 0;
+}
+
+static inline void append(noack_output *output, int64_t count, const double *values) {
+    copy(count, values, output->message.vector + output->message.entries);
+    output->message.entries += count;
+}
+
+/* The time of tick k of a machine; NO_TICK: there is none. */
+static inline int64_t tick_ns(const noack_machine *machine) {
+    if (machine->period_ns == 0)
+        return NO_TICK;
+    int64_t t_ns = machine->first_ns + machine->step * machine->period_ns;
+    return t_ns <= machine->horizon_ns ? t_ns : NO_TICK;
+}
+
+/* The norm of M v; M is (rows, columns). image: (rows,) */
+static inline double image_norm(
+    int64_t rows, int64_t columns, const double *matrix, const double *vector, double *image) {
+    noack_product(rows, columns, matrix, vector, image);
+    return noack_norm(rows, image);
+}
+
+/* observer.c: advance x-hat to a measurement [y; u of the plant's steps since the last one]. */
+void observe(
+    noack_observer *observer, const noack_message *message, int64_t n, int64_t m,
+    int64_t plant_period_ns);
+
+#endif

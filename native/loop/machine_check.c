@@ -1,0 +1,229 @@
+/* Checks the numbers of a process once, where they enter the core: all that the steps assume. */
+#include <stddef.h>
+
+#include "loop.h"
+
+enum { MOST_LOOPS = 65535, MOST_PLACES = 1 << 20, MOST_EVERY = 1 << 20, MOST_ROWS = 1 << 16 };
+static const int64_t FAR_NS = INT64_C(1) << 62;
+static const int64_t MOST_NUMBER = INT64_MAX / 2;
+
+static int is_between(int64_t least, int64_t number, int64_t most) {
+    return least <= number && number <= most;
+}
+
+static const char *check_machine(const noack_machine *machine) {
+    if (!is_between(1, machine->n, NOACK_MAX_ENTRIES)
+        || !is_between(1, machine->m, NOACK_MAX_ENTRIES))
+        return "a machine has not 1 to 64 states and inputs";
+    if (!is_between(0, machine->phase_ns, FAR_NS) || !is_between(0, machine->horizon_ns, FAR_NS)
+        || !is_between(0, machine->first_ns, FAR_NS) || !is_between(0, machine->period_ns, FAR_NS))
+        return "a machine has a phase, a horizon or a period out of range";
+    if (!is_between(0, machine->step, MOST_NUMBER) || !is_between(0, machine->inputs, MOST_NUMBER)
+        || !is_between(0, machine->first_number, MOST_NUMBER)
+        || (machine->period_ns > 0 && machine->step > FAR_NS / machine->period_ns))
+        return "a machine has numbers out of range";
+    if (!is_between(0, machine->received.entries, NOACK_MAX_ENTRIES)
+        || machine->acknowledgements.entries != 0)
+        return "a machine receives vectors of more than 64 entries";
+    return NULL;
+}
+
+static const char *check_model(const noack_model *model, int64_t n) {
+    const noack_transitions *own = model->transitions;
+    if (own == NULL || own->n != n || own->H == NULL || own->steps_ns == NULL
+        || own->matrices == NULL || own->scratch == NULL)
+        return "a model has no matrices of its size";
+    if (!is_between(4, own->places, MOST_PLACES) || (own->places & (own->places - 1)) != 0)
+        return "a model's number of kept matrices is not a power of 2, from 4 on";
+    if (model->changes < 0 || model->has_point == NULL || model->points == NULL
+        || (model->changes > 0 && model->since_ns == NULL))
+        return "a model has no set points";
+    for (int64_t k = 1; k < model->changes; k++)
+        if (model->since_ns[k] < model->since_ns[k - 1])
+            return "the set points of a model are not in the order of time";
+    return NULL;
+}
+
+static const char *check_signal(const noack_signal *signal, int64_t width) {
+    if (signal->width == 0)
+        return NULL;
+    if (signal->width != width || !is_between(1, signal->rows, MOST_ROWS)
+        || !is_between(-MOST_NUMBER, signal->first, MOST_NUMBER) || signal->values == NULL)
+        return "a disturbance or a noise has another width than what it is added to";
+    return NULL;
+}
+
+static const char *check_plant(const noack_plant *plant) {
+    const noack_machine *machine = &plant->machine;
+    int64_t n = machine->n, m = machine->m;
+    if (machine->period_ns < 1 || plant->input_period_ns < 1)
+        return "a plant has no period";
+    if (!is_between(1, plant->measure_every, MOST_EVERY)
+        || !is_between(1, plant->p, n > 64 ? n : 64))
+        return "a plant has no measurement";
+    if (plant->C == NULL && plant->p != n)
+        return "a plant without C measures all states";
+    if (!is_between(NOACK_LINEAR, plant->system, NOACK_FAILED)
+        || !is_between(NOACK_HOLD, plant->watchdog, NOACK_PREDICT))
+        return "a plant has an unknown system or watchdog";
+    if (plant->system == NOACK_LINEAR && (plant->Ad == NULL || plant->Bd == NULL))
+        return "a linear plant has no matrices";
+    if (!is_between(0, plant->internal, NOACK_MAX_ROW_WORDS - 6 - 4 * NOACK_MAX_ENTRIES))
+        return "a plant's system has too many states of its own";
+    const char *wrong;
+    if ((wrong = check_signal(&plant->at_input, m)) != NULL
+        || (wrong = check_signal(&plant->at_state, n)) != NULL
+        || (wrong = check_signal(&plant->noise, plant->p)) != NULL)
+        return wrong;
+    if (plant->sources != m + plant->at_state.width)
+        return "a plant's input matrix has another number of columns than it has sources";
+    if (!is_between(1, plant->predictions, NOACK_MAX_ENTRIES)
+        || machine->received.entries != plant->predictions * m + (plant->carries_model ? n : 0))
+        return "a plant receives actuations of another size";
+    if (plant->p + (plant->reports_inputs ? plant->measure_every * m : 0) > NOACK_MAX_ENTRIES)
+        return "a measurement has more than 64 entries";
+    if (plant->x == NULL || (plant->z == NULL && plant->internal > 0) || plant->u == NULL
+        || plant->applied == NULL || plant->held == NULL || plant->inputs == NULL
+        || plant->scratch == NULL || (plant->carries_model && plant->x_c == NULL))
+        return "a plant has no state";
+    if (plant->watchdog != NOACK_PREDICT)
+        return NULL;
+    if (plant->K == NULL || plant->x_fallback == NULL || !plant->carries_model)
+        return "a watchdog that predicts has no model";
+    return check_model(&plant->fallback, n);
+}
+
+static const char *check_rule(const noack_trigger_rule *rule) {
+    const int64_t rows[] = {
+        rule->up_rows, rule->down_rows, rule->gain_up_rows, rule->gain_down_rows};
+    double *const matrices[] = {rule->up, rule->down, rule->gain_up, rule->gain_down};
+    for (int k = 0; k < 4; k++)
+        if (!is_between(0, rows[k], 4 * NOACK_MAX_ENTRIES) || (rows[k] > 0 && matrices[k] == NULL))
+            return "a trigger rule has no matrix";
+    if (!is_between(0, rule->grid_ns, FAR_NS) || !is_between(-FAR_NS, rule->idle_ns, FAR_NS)
+        || !is_between(0, rule->shortest_ns, FAR_NS) || !is_between(0, rule->longest_ns, FAR_NS))
+        return "a trigger rule has times out of range";
+    return NULL;
+}
+
+static const char *check_observer(const noack_observer *observer, const noack_machine *machine) {
+    if (observer->kind == NOACK_NO_OBSERVER)
+        return NULL;
+    if (observer->kind != NOACK_LUENBERGER && observer->kind != NOACK_KALMAN)
+        return "an observer is of an unknown kind";
+    int64_t inputs = machine->received.entries - observer->p;
+    if (observer->p < 1 || inputs < machine->m || inputs % machine->m != 0)
+        return "an observer receives measurements without the inputs applied";
+    if (observer->Ad == NULL || observer->Bd == NULL || observer->C == NULL
+        || observer->gain == NULL || observer->x == NULL || observer->scratch == NULL)
+        return "an observer has no model";
+    if (observer->kind == NOACK_KALMAN
+        && (observer->P == NULL || observer->Q == NULL || observer->R == NULL))
+        return "a Kalman filter has no covariances";
+    return NULL;
+}
+
+static const char *check_sensor(const noack_sensor *sensor) {
+    const noack_machine *machine = &sensor->machine;
+    const char *wrong;
+    if ((wrong = check_model(&sensor->model, machine->n)) != NULL
+        || (wrong = check_rule(&sensor->rule)) != NULL
+        || (wrong = check_observer(&sensor->observer, machine)) != NULL)
+        return wrong;
+    if (sensor->observer.kind == NOACK_NO_OBSERVER ? machine->received.entries != machine->n
+                                                   : sensor->plant_period_ns < 1)
+        return "a sensor receives measurements of another size";
+    if (sensor->x_s == NULL || sensor->event_x == NULL || sensor->x == NULL || sensor->e_s == NULL
+        || sensor->scratch == NULL)
+        return "a sensor has no state";
+    if (!sensor->acknowledged)
+        return NULL;
+    if (!is_between(0, sensor->sent_count, sensor->sent_places) || sensor->sent == NULL
+        || sensor->sent_x == NULL || !is_between(0, sensor->timeout_ns, FAR_NS))
+        return "a sensor with acknowledgements has no room for updates";
+    return NULL;
+}
+
+static const char *check_controller(const noack_controller *controller) {
+    const noack_machine *machine = &controller->machine;
+    int64_t n = machine->n, m = machine->m;
+    if (machine->period_ns < 1 || machine->received.entries != n)
+        return "a controller has no period, or receives updates of another size";
+    if (!is_between(1, controller->predictions, NOACK_MAX_ENTRIES)
+        || controller->predictions * m + (controller->carries_model ? n : 0) > NOACK_MAX_ENTRIES)
+        return "an actuation has more than 64 entries";
+    if (controller->K == NULL || controller->safe_input == NULL || controller->x_c == NULL
+        || controller->x == NULL || controller->u == NULL || controller->scratch == NULL
+        || (controller->has_point && (controller->x_r == NULL || controller->u_r == NULL)))
+        return "a controller has no state";
+    return check_model(&controller->model, n);
+}
+
+/* The words of a row that a machine writes into a table; 0: it writes none. */
+static int64_t row_words(const noack_process *process, int64_t loop, int64_t table) {
+    const noack_machine *machine = noack_process_machine(process, loop);
+    int64_t n = machine->n, m = machine->m;
+    if (process->role == NOACK_SENSOR) {
+        const noack_sensor *sensor = &process->sensors[loop];
+        if (table == NOACK_ACKNOWLEDGEMENTS)
+            return sensor->acknowledged ? 5 + 2 * n : 0;
+        int64_t observed =
+            sensor->observer.kind == NOACK_NO_OBSERVER ? 0 : machine->received.entries;
+        return table == NOACK_MESSAGES ? 8 + 2 * n + observed : 0;
+    }
+    if (table == NOACK_ACKNOWLEDGEMENTS)
+        return 0;
+    if (process->role == NOACK_CONTROLLER)
+        return table == NOACK_TICKS ? 5 + n + m : 6 + 3 * n;
+    const noack_plant *plant = &process->plants[loop];
+    if (table == NOACK_MESSAGES)
+        return 4 + machine->received.entries;
+    return 5 + n + m + (plant->predictions > 1) + plant->internal + plant->at_input.width
+           + plant->at_state.width;
+}
+
+static const char *check_tables(const noack_process *process, int64_t loop) {
+    for (int64_t k = 0; k < NOACK_TABLES; k++) {
+        const noack_table *table = &process->tables[k];
+        int64_t words = row_words(process, loop, k);
+        if (words == 0)
+            continue;
+        if (table->row_bytes != 8 * words + table->prefix_bytes || words > NOACK_MAX_ROW_WORDS
+            || (table->prefix_bytes != 0 && table->prefix_bytes != 2))
+            return "the rows of a table have another size than the machines write";
+        if (table->rows == NULL || !is_between(1, table->places, INT64_C(1) << 32)
+            || !is_between(0, table->count, table->places))
+            return "a table has no rows";
+    }
+    return NULL;
+}
+
+static const char *check_loop(const noack_process *process, int64_t loop) {
+    const char *wrong = check_machine(noack_process_machine(process, loop));
+    if (wrong != NULL || (wrong = check_tables(process, loop)) != NULL)
+        return wrong;
+    if (process->role == NOACK_PLANT)
+        return check_plant(&process->plants[loop]);
+    if (process->role == NOACK_SENSOR)
+        return check_sensor(&process->sensors[loop]);
+    return check_controller(&process->controllers[loop]);
+}
+
+const char *noack_process_check(const noack_process *process) {
+    if (!is_between(NOACK_PLANT, process->role, NOACK_CONTROLLER)
+        || !is_between(1, process->loops, MOST_LOOPS))
+        return "a process has no role or no loops";
+    if (process->due_ns == NULL || process->heap == NULL || process->notes == NULL
+        || !is_between(1, process->note_places, INT64_C(1) << 32)
+        || !is_between(0, process->note_count, process->note_places)
+        || (process->role == NOACK_PLANT && process->plants == NULL)
+        || (process->role == NOACK_SENSOR && process->sensors == NULL)
+        || (process->role == NOACK_CONTROLLER && process->controllers == NULL))
+        return "a process has no machines";
+    for (int64_t loop = 0; loop < process->loops; loop++) {
+        const char *wrong = check_loop(process, loop);
+        if (wrong != NULL)
+            return wrong;
+    }
+    return NULL;
+}

@@ -1,0 +1,134 @@
+/* The sensor's observer: it estimates x from measurements, under the inputs that the plant applied.
+
+   Luenberger: x <- Ad x + Bd u at every step of the plant; at a measurement x <- x + L(y - C x).
+   Kalman (1960): also P <- Ad P Ad' + Q; at a measurement S = C P C' + R, L = P C' S^-1, and, by
+   Bucy and Joseph, P <- (I - L C) P (I - L C)' + L R L'. Thus P stays symmetric and positive
+   semidefinite for any rounding error of L. */
+#include <math.h>
+
+#include "loop.h"
+
+/* result = A B, or A B' if transposed; A is (rows, inner), result (rows, columns). */
+static void multiply(
+    int64_t rows, int64_t inner, int64_t columns, const double *A, const double *B, int transposed,
+    double *result) {
+    for (int64_t i = 0; i < rows; i++)
+        for (int64_t j = 0; j < columns; j++) {
+            double total = -0.0;
+            for (int64_t k = 0; k < inner; k++)
+                total += A[i * inner + k] * (transposed ? B[j * inner + k] : B[k * columns + j]);
+            result[i * columns + j] = total;
+        }
+}
+
+static void swap_rows(int64_t columns, double *one, double *other) {
+    for (int64_t k = 0; k < columns; k++) {
+        double value = one[k];
+        one[k] = other[k];
+        other[k] = value;
+    }
+}
+
+/* Solve S X = B by elimination with partial pivoting; S is (p, p), B is (p, n) and becomes X. */
+static void solve(int64_t p, int64_t n, double *S, double *B) {
+    for (int64_t k = 0; k < p; k++) {
+        int64_t pivot = k;
+        for (int64_t i = k + 1; i < p; i++)
+            if (fabs(S[i * p + k]) > fabs(S[pivot * p + k]))
+                pivot = i;
+        if (pivot != k) {
+            swap_rows(p, S + k * p, S + pivot * p);
+            swap_rows(n, B + k * n, B + pivot * n);
+        }
+        for (int64_t i = k + 1; i < p; i++) {
+            double factor = S[i * p + k] / S[k * p + k];
+            for (int64_t j = k + 1; j < p; j++)
+                S[i * p + j] -= factor * S[k * p + j];
+            for (int64_t j = 0; j < n; j++)
+                B[i * n + j] -= factor * B[k * n + j];
+        }
+    }
+    for (int64_t i = p - 1; i >= 0; i--)
+        for (int64_t j = 0; j < n; j++) {
+            for (int64_t k = i + 1; k < p; k++)
+                B[i * n + j] -= S[i * p + k] * B[k * n + j];
+            B[i * n + j] /= S[i * p + i];
+        }
+}
+
+void noack_observer_predict(noack_observer *observer, int64_t n, int64_t m, const double *u) {
+    double *moved = observer->scratch, *pushed = moved + n;
+    noack_product(n, n, observer->Ad, observer->x, moved);
+    noack_product(n, m, observer->Bd, u, pushed);
+    for (int64_t k = 0; k < n; k++)
+        observer->x[k] = moved[k] + pushed[k];
+    if (observer->kind != NOACK_KALMAN)
+        return;
+    double *half = observer->scratch;
+    multiply(n, n, n, observer->Ad, observer->P, 0, half);
+    multiply(n, n, n, half, observer->Ad, 1, observer->P);
+    for (int64_t k = 0; k < n * n; k++)
+        observer->P[k] += observer->Q[k];
+}
+
+void noack_observer_gain(noack_observer *observer, int64_t n) {
+    if (observer->kind != NOACK_KALMAN)
+        return;
+    int64_t p = observer->p;
+    double *through = observer->scratch, *S = through + n * p; /* through: C P */
+    multiply(p, n, n, observer->C, observer->P, 0, through);
+    multiply(p, n, p, through, observer->C, 1, S);
+    for (int64_t k = 0; k < p * p; k++)
+        S[k] += observer->R[k];
+    solve(p, n, S, through);
+    for (int64_t i = 0; i < n; i++)
+        for (int64_t j = 0; j < p; j++)
+            observer->gain[i * p + j] = through[j * n + i];
+}
+
+/* P <- (I - L C) P (I - L C)' + L R L', made symmetric. */
+static void correct_covariance(noack_observer *observer, int64_t n) {
+    int64_t p = observer->p, size = n * n;
+    double *rest = observer->scratch, *half = rest + size, *one = half + size, *LR = one + size;
+    multiply(n, p, n, observer->gain, observer->C, 0, rest);
+    for (int64_t i = 0; i < n; i++)
+        for (int64_t j = 0; j < n; j++)
+            rest[i * n + j] = (i == j ? 1.0 : 0.0) - rest[i * n + j];
+    multiply(n, n, n, rest, observer->P, 0, half);
+    multiply(n, n, n, half, rest, 1, one);
+    multiply(n, p, p, observer->gain, observer->R, 0, LR);
+    multiply(n, p, n, LR, observer->gain, 1, half);
+    for (int64_t k = 0; k < size; k++)
+        one[k] += half[k];
+    for (int64_t i = 0; i < n; i++)
+        for (int64_t j = 0; j < n; j++)
+            observer->P[i * n + j] = 0.5 * (one[i * n + j] + one[j * n + i]);
+}
+
+void noack_observer_correct(noack_observer *observer, int64_t n, const double *y) {
+    int64_t p = observer->p;
+    noack_observer_gain(observer, n);
+    double *innovation = observer->scratch, *change = innovation + p;
+    noack_product(p, n, observer->C, observer->x, innovation);
+    for (int64_t k = 0; k < p; k++)
+        innovation[k] = y[k] - innovation[k];
+    noack_product(n, p, observer->gain, innovation, change);
+    for (int64_t k = 0; k < n; k++)
+        observer->x[k] += change[k];
+    if (observer->kind == NOACK_KALMAN)
+        correct_covariance(observer, n);
+}
+
+/* The inputs of steps that a missing measurement would have reported are unknown: the first known
+   input is used. */
+void observe(
+    noack_observer *observer, const noack_message *message, int64_t n, int64_t m,
+    int64_t plant_period_ns) {
+    int64_t t_ns = message->t_ns, known = (message->entries - observer->p) / m;
+    int64_t steps = observer->t_ns < 0 ? 0 : floor_div(t_ns - observer->t_ns, plant_period_ns);
+    const double *inputs = message->vector + observer->p;
+    for (int64_t before = steps; before > 0; before--)
+        noack_observer_predict(observer, n, m, inputs + m * max_of(known - before, 0));
+    noack_observer_correct(observer, n, message->vector);
+    observer->t_ns = t_ns;
+}

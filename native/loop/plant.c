@@ -1,0 +1,175 @@
+/* The plant: a system on a time grid, under held inputs.
+
+   At grid time t_k = k h the plant advances its system to t_k under the input held since t_(k-1).
+   Then it measures, and latches the newest actuation received; the input that is due of it is held
+   until t_(k+1). A late step has the same length h, and the plant catches up.
+
+   An actuation for the model time t carries N inputs, for t, t + h_c, ..., t + (N - 1) h_c, where
+   h_c is the period of the controller. Input j is applied from t + j h_c on, the last one until a
+   newer actuation arrives, or until the watchdog chooses the input: the newest actuation is too old
+   if t_k - t > timeout. Before the first actuation its time is 0. */
+#include "loop.h"
+
+static int has(const noack_signal *signal, int64_t step) {
+    return signal->width == 0 || (signal->first <= step && step < signal->first + signal->rows);
+}
+
+static const double *value(const noack_signal *signal, int64_t step) {
+    return signal->values + (step - signal->first) * signal->width;
+}
+
+int64_t noack_plant_handle(
+    noack_plant *plant, const noack_message *message, int64_t now_ns, noack_output *output) {
+    noack_machine *machine = &plant->machine;
+    int64_t m = machine->m, inputs = plant->predictions * m;
+    copy(inputs, message->vector, plant->inputs);
+    plant->newest_ns = message->t_ns;
+    plant->newest_sequence = message->sequence;
+    begin_row(output, NOACK_MESSAGES, machine, message->sequence, message->t_ns, now_ns);
+    put_reals(output, inputs, plant->inputs);
+    if (plant->carries_model) {
+        copy(machine->n, message->vector + inputs, plant->x_c);
+        put_reals(output, machine->n, plant->x_c);
+    }
+    return NOACK_DONE;
+}
+
+/* Advance the system over a period under the input held; remember this input. */
+static void advance(noack_plant *plant) {
+    int64_t n = plant->machine.n, m = plant->machine.m, kept = (plant->measure_every - 1) * m;
+    memmove(plant->held, plant->held + m, (size_t)kept * sizeof *plant->held);
+    copy(m, plant->u, plant->held + kept);
+    if (plant->system != NOACK_LINEAR)
+        return;
+    double *moved = plant->scratch, *pushed = moved + n;
+    noack_product(n, n, plant->Ad, plant->x, moved);
+    noack_product(n, plant->sources, plant->Bd, plant->applied, pushed);
+    for (int64_t k = 0; k < n; k++)
+        plant->x[k] = moved[k] + pushed[k];
+}
+
+/* A predictive actuator: u + K(e^(H(t - t_j)) x_c - x_c), the controller's input if no update has
+   arrived since the actuation of time t_j. The state is advanced over the plant's step each time.
+ */
+static void predict(noack_plant *plant, int64_t t_ns) {
+    int64_t n = plant->machine.n, m = plant->machine.m;
+    copy(m, plant->inputs, plant->u);
+    if (plant->newest_sequence == NOACK_NO_SEQUENCE)
+        return;
+    if (plant->newest_sequence != plant->fallback_sequence) {
+        plant->fallback_sequence = plant->newest_sequence;
+        plant->fallback_ns = plant->newest_ns;
+        copy(n, plant->x_c, plant->x_fallback);
+    }
+    noack_model_advance(
+        &plant->fallback, plant->x_fallback, plant->fallback_ns, t_ns, plant->x_fallback);
+    plant->fallback_ns = t_ns;
+    double *now = plant->scratch, *then = now + m;
+    noack_product(m, n, plant->K, plant->x_fallback, now);
+    noack_product(m, n, plant->K, plant->x_c, then);
+    for (int64_t k = 0; k < m; k++)
+        plant->u[k] = plant->inputs[k] + (now[k] - then[k]);
+}
+
+/* Choose the input from t_ns on; return its number in the newest actuation, -1: the watchdog's. */
+static int64_t choose_input(noack_plant *plant, int64_t t_ns) {
+    int64_t m = plant->machine.m, last = plant->predictions - 1;
+    if (t_ns - plant->newest_ns <= plant->timeout_ns) {
+        int64_t age = floor_div(t_ns - plant->newest_ns, plant->input_period_ns);
+        int64_t entry = min_of(max_of(age, 0), last);
+        copy(m, plant->inputs + entry * m, plant->u);
+        return entry;
+    }
+    if (plant->watchdog == NOACK_HOLD)
+        copy(m, plant->inputs + last * m, plant->u);
+    else if (plant->watchdog == NOACK_ZERO)
+        memset(plant->u, 0, (size_t)m * sizeof *plant->u);
+    else
+        predict(plant, t_ns);
+    return -1;
+}
+
+/* Note that actuations are missing, or that they arrive again. */
+static int64_t notice(noack_plant *plant, int64_t t_ns, noack_note *note) {
+    int is_missing = t_ns - plant->newest_ns > plant->notice_ns;
+    if (is_missing == (plant->missing_ns >= 0))
+        return 0;
+    note->t_ns = t_ns;
+    note->since_ns = plant->missing_ns;
+    note->newest_ns = plant->newest_ns;
+    note->newest_sequence = plant->newest_sequence;
+    plant->missing_ns = is_missing ? t_ns : -1;
+    return 1;
+}
+
+/* The input of the system: u + d, and w behind it. */
+static void disturb(noack_plant *plant, int64_t step) {
+    int64_t m = plant->machine.m;
+    copy(m, plant->u, plant->applied);
+    if (plant->at_input.width > 0) {
+        const double *d = value(&plant->at_input, step);
+        for (int64_t k = 0; k < m; k++)
+            plant->applied[k] += d[k];
+    }
+    if (plant->at_state.width > 0)
+        copy(plant->machine.n, value(&plant->at_state, step), plant->applied + m);
+}
+
+/* y = C x + v, and the inputs since the last measurement if they are reported. */
+static void measure(noack_plant *plant, int64_t t_ns, noack_output *output) {
+    int64_t number = plant->measurements++;
+    begin_message(output, NOACK_MEASUREMENT, number, t_ns);
+    double *y = output->message.vector;
+    if (plant->C == NULL)
+        copy(plant->p, plant->x, y);
+    else
+        noack_product(plant->p, plant->machine.n, plant->C, plant->x, y);
+    output->message.entries = plant->p;
+    if (plant->noise.width > 0) {
+        const double *v = value(&plant->noise, number);
+        for (int64_t k = 0; k < plant->p; k++)
+            y[k] += v[k];
+    }
+    if (plant->reports_inputs)
+        append(output, plant->measure_every * plant->machine.m, plant->held);
+}
+
+static void put_step(
+    noack_plant *plant, int64_t step, int64_t t_ns, int64_t now_ns, int64_t entry,
+    noack_output *output) {
+    noack_machine *machine = &plant->machine;
+    begin_row(output, NOACK_TICKS, machine, step, t_ns, now_ns);
+    put_reals(output, machine->n, plant->x);
+    put_reals(output, machine->m, plant->u);
+    put(output, plant->newest_sequence);
+    if (plant->predictions > 1)
+        put(output, entry);
+    put_reals(output, plant->internal, plant->z);
+    if (plant->at_input.width > 0)
+        put_reals(output, plant->at_input.width, value(&plant->at_input, step));
+    if (plant->at_state.width > 0)
+        put_reals(output, plant->at_state.width, value(&plant->at_state, step));
+}
+
+int64_t noack_plant_tick(
+    noack_plant *plant, int64_t now_ns, noack_output *output, noack_note *note) {
+    noack_machine *machine = &plant->machine;
+    int64_t step = machine->step, t_ns = machine->first_ns + step * machine->period_ns;
+    int measures = step % plant->measure_every == 0;
+    if (!has(&plant->at_input, step) || !has(&plant->at_state, step)
+        || (measures && !has(&plant->noise, plant->measurements)))
+        return NOACK_ASK_SIGNALS;
+    if (step > 0 && plant->system == NOACK_USER && !machine->answered)
+        return NOACK_ASK_STATE;
+    machine->answered = 0;
+    if (step > 0)
+        advance(plant);
+    int64_t entry = choose_input(plant, t_ns);
+    disturb(plant, step);
+    put_step(plant, step, t_ns, now_ns, entry, output);
+    output->notes = notice(plant, t_ns, note);
+    machine->step++;
+    if (measures)
+        measure(plant, t_ns, output);
+    return NOACK_DONE;
+}

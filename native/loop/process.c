@@ -1,0 +1,122 @@
+/* The machines of one role: an input goes to the machine of its loop, its row into a table.
+
+   Ticks are done in the order of their times, at equal times in the order of the loops. A loop
+   begins at its phase, a time of the run; its messages, rows and notes have the loop's own time. */
+#include "loop.h"
+
+noack_machine *noack_process_machine(const noack_process *process, int64_t loop) {
+    if (process->role == NOACK_PLANT)
+        return &process->plants[loop].machine;
+    if (process->role == NOACK_SENSOR)
+        return &process->sensors[loop].machine;
+    return &process->controllers[loop].machine;
+}
+
+static int64_t due_ns(const noack_process *process, int64_t loop) {
+    const noack_machine *machine = noack_process_machine(process, loop);
+    int64_t t_ns = tick_ns(machine);
+    return t_ns == NO_TICK ? NO_TICK : t_ns + machine->phase_ns;
+}
+
+static int comes_first(const noack_process *process, int64_t one, int64_t other) {
+    const int64_t *due = process->due_ns;
+    return due[one] < due[other] || (due[one] == due[other] && one < other);
+}
+
+/* Lower the entry at a place of the heap until none below comes before it. */
+static void lower(noack_process *process, int64_t place) {
+    int64_t *heap = process->heap, count = process->heap_count;
+    for (int64_t below; (below = 2 * place + 1) < count; place = below) {
+        if (below + 1 < count && comes_first(process, heap[below + 1], heap[below]))
+            below++;
+        if (!comes_first(process, heap[below], heap[place]))
+            return;
+        int64_t loop = heap[place];
+        heap[place] = heap[below];
+        heap[below] = loop;
+    }
+}
+
+void noack_process_begin(noack_process *process) {
+    process->heap_count = 0;
+    for (int64_t loop = 0; loop < process->loops; loop++) {
+        process->due_ns[loop] = due_ns(process, loop);
+        if (process->due_ns[loop] != NO_TICK)
+            process->heap[process->heap_count++] = loop;
+    }
+    for (int64_t place = process->heap_count / 2; place-- > 0;)
+        lower(process, place);
+}
+
+int64_t noack_process_due_ns(const noack_process *process) {
+    return process->heap_count == 0 ? NO_TICK : process->due_ns[process->heap[0]];
+}
+
+/* Set the next tick of the machine that has just done the first one of the heap. */
+static void next_tick(noack_process *process, int64_t loop) {
+    process->due_ns[loop] = due_ns(process, loop);
+    if (process->due_ns[loop] == NO_TICK)
+        process->heap[0] = process->heap[--process->heap_count];
+    lower(process, 0);
+}
+
+static int is_full(const noack_process *process, int64_t table) {
+    return process->tables[table].count == process->tables[table].places
+           || process->note_count == process->note_places;
+}
+
+/* Append the row of the output to its table, behind the number of the loop. */
+static void append_row(noack_process *process, int64_t loop) {
+    noack_table *table = &process->tables[process->output.table];
+    uint8_t *row = table->rows + table->count++ * table->row_bytes;
+    uint16_t number = (uint16_t)loop;
+    if (table->prefix_bytes > 0)
+        memcpy(row, &number, sizeof number);
+    memcpy(
+        row + table->prefix_bytes, process->output.row,
+        (size_t)(table->row_bytes - table->prefix_bytes));
+}
+
+/* Keep the outputs of a step that is done. */
+static int64_t conclude(noack_process *process, int64_t loop, int64_t question) {
+    process->asking = loop;
+    if (question != NOACK_DONE)
+        return question;
+    append_row(process, loop);
+    process->output.message.loop = loop;
+    if (process->output.notes)
+        process->notes[process->note_count++].loop = loop;
+    return NOACK_DONE;
+}
+
+int64_t noack_process_handle(noack_process *process, const noack_message *message, int64_t now_ns) {
+    int64_t loop = message->loop, acknowledges = message->flow == NOACK_ACKNOWLEDGEMENT;
+    if (is_full(process, acknowledges ? NOACK_ACKNOWLEDGEMENTS : NOACK_MESSAGES))
+        return NOACK_ROWS_FULL;
+    noack_output *output = &process->output;
+    now_ns -= noack_process_machine(process, loop)->phase_ns;
+    int64_t question;
+    if (process->role == NOACK_PLANT)
+        question = noack_plant_handle(&process->plants[loop], message, now_ns, output);
+    else if (process->role == NOACK_SENSOR)
+        question = noack_sensor_handle(&process->sensors[loop], message, now_ns, output);
+    else
+        question = noack_controller_handle(&process->controllers[loop], message, now_ns, output);
+    return conclude(process, loop, question);
+}
+
+int64_t noack_process_tick(noack_process *process, int64_t now_ns) {
+    if (is_full(process, NOACK_TICKS))
+        return NOACK_ROWS_FULL;
+    int64_t loop = process->heap[0], question;
+    noack_output *output = &process->output;
+    now_ns -= noack_process_machine(process, loop)->phase_ns;
+    if (process->role == NOACK_PLANT)
+        question = noack_plant_tick(
+            &process->plants[loop], now_ns, output, &process->notes[process->note_count]);
+    else
+        question = noack_controller_tick(&process->controllers[loop], now_ns, output);
+    if (question == NOACK_DONE)
+        next_tick(process, loop);
+    return conclude(process, loop, question);
+}

@@ -1,0 +1,184 @@
+/* The sensor: runs the model x_s in parallel to the plant and transmits at events (eq:ModSensor).
+
+   At a measurement: propagate x_s, test, send at most one state update. x_s is reset at every
+   event, whether or not the network delivers the update: nothing is acknowledged. Its time is the
+   time of the measurements: what it sends does not depend on when a datagram was read. With an
+   observer the estimate x-hat takes the place of x.
+
+   In the acknowledgement baseline only an acknowledged update resets x_s: at that of update k,
+   x_s <- e^(H(t - t_k)) x(t_k), which equals the controller's model then. After a transmission the
+   sensor waits for the acknowledgement until a timeout; then the current measurement is sent if the
+   rule still asks for it. The condition begins anew when an event is acknowledged. */
+#include "loop.h"
+
+/* Whether a measurement is an event, by the rule or by the user's trigger; or ask the latter. */
+static int64_t test(noack_sensor *sensor, int64_t t_ns, double sides[2]) {
+    int64_t n = sensor->machine.n;
+    if (!sensor->is_user)
+        return noack_trigger_test(
+            &sensor->rule, &sensor->trigger, n, t_ns, sensor->x, sensor->e_s, sides,
+            sensor->scratch + n);
+    sides[0] = sensor->left;
+    sides[1] = sensor->right;
+    return sensor->event;
+}
+
+static void start(noack_sensor *sensor, int64_t t_ns, const double *x) {
+    sensor->trigger.event_ns = t_ns;
+    copy(sensor->machine.n, x, sensor->event_x);
+    if (!sensor->is_user)
+        noack_trigger_start(
+            &sensor->rule, &sensor->trigger, sensor->machine.n, t_ns, x,
+            sensor->scratch + sensor->machine.n);
+}
+
+/* Write the row of a measurement; at an event send the update before it. */
+static void answer(
+    noack_sensor *sensor, const noack_message *message, const double *x_s, const double sides[2],
+    int64_t event, int64_t now_ns, noack_output *output) {
+    int64_t n = sensor->machine.n;
+    const double *weight = sensor->rule.weight;
+    double error = weight == NULL ? noack_norm(n, sensor->e_s)
+                                  : image_norm(n, n, weight, sensor->e_s, sensor->scratch + n);
+    begin_row(output, NOACK_MESSAGES, &sensor->machine, message->sequence, message->t_ns, now_ns);
+    put_reals(output, n, sensor->x);
+    put_reals(output, n, x_s);
+    put_reals(output, 1, &error);
+    put_reals(output, 2, sides);
+    put(output, event ? sensor->events : NOACK_NO_SEQUENCE);
+    if (sensor->observer.kind != NOACK_NO_OBSERVER)
+        put_reals(output, message->entries, message->vector);
+    if (event) {
+        begin_message(output, NOACK_UPDATE, sensor->events++, message->t_ns);
+        append(output, n, sensor->x);
+    }
+}
+
+static int64_t measured(
+    noack_sensor *sensor, const noack_message *message, int64_t now_ns, noack_output *output) {
+    noack_machine *machine = &sensor->machine;
+    int64_t n = machine->n, t_ns = message->t_ns, first = !sensor->knows_state;
+    double *x_s = sensor->scratch, sides[2];
+    if (first)
+        copy(n, sensor->x, x_s);
+    else
+        noack_model_advance(&sensor->model, sensor->x_s, sensor->model_ns, t_ns, x_s);
+    for (int64_t k = 0; k < n; k++)
+        sensor->e_s[k] = x_s[k] - sensor->x[k];
+    sensor->first = first;
+    if (sensor->is_user && !machine->answered)
+        return NOACK_ASK_DECISION;
+    if (first)
+        start(sensor, t_ns, sensor->x);
+    int64_t event = test(sensor, t_ns, sides) || first;
+    if (event)
+        start(sensor, t_ns, sensor->x);
+    answer(sensor, message, x_s, sides, event, now_ns, output);
+    copy(n, event ? sensor->x : x_s, sensor->x_s);
+    sensor->model_ns = machine->reached_ns = t_ns;
+    sensor->knows_state = 1;
+    return NOACK_DONE;
+}
+
+static int64_t measured_with_acknowledgements(
+    noack_sensor *sensor, const noack_message *message, int64_t now_ns, noack_output *output) {
+    noack_machine *machine = &sensor->machine;
+    int64_t n = machine->n, t_ns = message->t_ns, first = !sensor->knows_state;
+    double *x_s = sensor->scratch, sides[2];
+    if (sensor->sent_count == sensor->sent_places)
+        return NOACK_ASK_ROOM;
+    noack_model_advance(&sensor->model, sensor->x_s, first ? t_ns : sensor->model_ns, t_ns, x_s);
+    for (int64_t k = 0; k < n; k++)
+        sensor->e_s[k] = x_s[k] - sensor->x[k];
+    sensor->first = first;
+    if (sensor->is_user && !machine->answered)
+        return NOACK_ASK_DECISION;
+    if (first)
+        start(sensor, t_ns, sensor->x);
+    int64_t due = test(sensor, t_ns, sides), waits = t_ns < sensor->wait_ns;
+    int64_t event = first || (due && !waits);
+    if (event) {
+        noack_sent sent = {sensor->events, t_ns};
+        copy(n, sensor->x, sensor->sent_x + sensor->sent_count * n);
+        sensor->sent[sensor->sent_count++] = sent;
+        sensor->wait_ns = t_ns + sensor->timeout_ns;
+    }
+    answer(sensor, message, x_s, sides, event, now_ns, output);
+    copy(n, x_s, sensor->x_s);
+    sensor->model_ns = t_ns;
+    sensor->knows_state = 1;
+    return NOACK_DONE;
+}
+
+/* The place of an update that waits for its acknowledgement; sent_count if it does not. */
+static int64_t place_of(const noack_sensor *sensor, int64_t sequence) {
+    int64_t place = 0;
+    while (place < sensor->sent_count && sensor->sent[place].sequence != sequence)
+        place++;
+    return place;
+}
+
+/* Forget the oldest updates: those up to the acknowledged one. */
+static void forget(noack_sensor *sensor, int64_t count) {
+    int64_t n = sensor->machine.n, left = sensor->sent_count - count;
+    memmove(sensor->sent, sensor->sent + count, (size_t)left * sizeof *sensor->sent);
+    memmove(
+        sensor->sent_x, sensor->sent_x + count * n, (size_t)(left * n) * sizeof *sensor->sent_x);
+    sensor->sent_count = left;
+    if (left == 0)
+        sensor->wait_ns = -1;
+}
+
+/* An acknowledgement is newer than all before it. */
+static int64_t acknowledged(
+    noack_sensor *sensor, const noack_message *message, int64_t now_ns, noack_output *output) {
+    noack_machine *machine = &sensor->machine;
+    int64_t n = machine->n, t_ns = message->t_ns, place = place_of(sensor, message->sequence);
+    double *before = sensor->scratch;
+    int found = place < sensor->sent_count;
+    if (found && sensor->is_user && !machine->answered) {
+        sensor->trigger.event_ns = t_ns;
+        copy(n, sensor->sent_x + place * n, sensor->event_x);
+        return NOACK_ASK_RESTART;
+    }
+    copy(n, sensor->x_s, before);
+    if (found) {
+        const double *x = sensor->sent_x + place * n;
+        noack_model_advance(&sensor->model, x, t_ns, sensor->model_ns, sensor->x_s);
+        sensor->trigger.event_ns = t_ns;
+        copy(n, x, sensor->event_x);
+        if (!sensor->is_user)
+            noack_trigger_restart(&sensor->rule, &sensor->trigger, n, t_ns, x, sensor->scratch + n);
+        forget(sensor, place + 1);
+    }
+    begin_row(output, NOACK_ACKNOWLEDGEMENTS, machine, message->sequence, t_ns, now_ns);
+    put(output, sensor->model_ns);
+    put_reals(output, n, before);
+    put_reals(output, n, sensor->x_s);
+    return NOACK_DONE;
+}
+
+int64_t noack_sensor_handle(
+    noack_sensor *sensor, const noack_message *message, int64_t now_ns, noack_output *output) {
+    noack_machine *machine = &sensor->machine;
+    if (message->t_ns >= machine->change_ns && message->flow == NOACK_MEASUREMENT)
+        return NOACK_ASK_CHANGE;
+    int64_t question;
+    if (message->flow == NOACK_ACKNOWLEDGEMENT) {
+        question = acknowledged(sensor, message, now_ns, output);
+    } else {
+        if (sensor->observer.kind == NOACK_NO_OBSERVER) {
+            copy(machine->n, message->vector, sensor->x);
+        } else if (!machine->observed) {
+            observe(&sensor->observer, message, machine->n, machine->m, sensor->plant_period_ns);
+            copy(machine->n, sensor->observer.x, sensor->x);
+            machine->observed = 1;
+        }
+        question = sensor->acknowledged
+                       ? measured_with_acknowledgements(sensor, message, now_ns, output)
+                       : measured(sensor, message, now_ns, output);
+    }
+    if (question == NOACK_DONE)
+        machine->answered = machine->observed = 0;
+    return question;
+}

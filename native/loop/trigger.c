@@ -1,0 +1,149 @@
+/* The trigger: from each event a rule makes the condition of the next one, which measurements test.
+
+   Between two measurements the rate of Girard's dynamic variable is as it was at the first; the
+   integral of |P z| is formed by the trapezoidal rule. */
+#include <math.h>
+
+#include "loop.h"
+
+enum { HALVINGS = 80 };
+static const double LARGEST_EXPONENT = 700.0;
+
+/* z = (x, e_s); without e_s, (x, 0). */
+static void set_z(int64_t n, const double *x, const double *e_s, double *z) {
+    copy(n, x, z);
+    for (int64_t k = 0; k < n; k++)
+        z[n + k] = e_s == NULL ? 0.0 : e_s[k];
+}
+
+/* Whether the error may have reached the threshold tau_s after an event at t_s. */
+static int is_reached(const noack_trigger_rule *rule, double size, double t_s, double tau_s) {
+    double speed = rule->mismatch_per_s * size + rule->disturbance_per_s;
+    double exponent = rule->growth_per_s * tau_s;
+    if (LARGEST_EXPONENT < exponent)
+        exponent = LARGEST_EXPONENT;
+    /* The first two terms of the series where the third is below rounding. */
+    double grown = tau_s * (1 + exponent / 2);
+    if (exponent > 1e-8)
+        grown = expm1(exponent) / rule->growth_per_s;
+    double faded = rule->beta * exp(-rule->alpha_per_s * (t_s + tau_s));
+    return speed * grown >= (rule->forecast_floor > faded ? rule->forecast_floor : faded);
+}
+
+double noack_forecast_ns(const noack_trigger_rule *rule, double size, double t_s) {
+    double shortest_ns = (double)rule->shortest_ns, longest_ns = (double)rule->longest_ns;
+    double low_s = shortest_ns * 1e-9, high_s = longest_ns * 1e-9;
+    if (is_reached(rule, size, t_s, low_s))
+        return shortest_ns;
+    if (!is_reached(rule, size, t_s, high_s))
+        return longest_ns;
+    /* The error grows and the threshold does not, so there is one crossing. */
+    for (int k = 0; k < HALVINGS && floor(low_s * 1e9) != floor(high_s * 1e9); k++) {
+        double middle_s = (low_s + high_s) / 2;
+        if (is_reached(rule, size, t_s, middle_s))
+            high_s = middle_s;
+        else
+            low_s = middle_s;
+    }
+    return floor(low_s * 1e9);
+}
+
+void noack_trigger_condition(
+    const noack_trigger_rule *rule, noack_trigger_state *state, int64_t n, int64_t t_ns,
+    const double *x, double *scratch) {
+    double *z = scratch, *image = scratch + 2 * n;
+    state->level = rule->level;
+    state->since_ns = 0;
+    if (rule->from_event) {
+        set_z(n, x, NULL, z);
+        state->level = image_norm(rule->up_rows, 2 * n, rule->up, z, image);
+        state->since_ns = t_ns;
+    }
+    state->earliest_ns = t_ns + rule->idle_ns;
+    state->latest_ns = t_ns + rule->longest_ns;
+    if (rule->forecasts) {
+        const double *weight = rule->forecast_weight;
+        double size = weight == NULL ? noack_norm(n, x) : image_norm(n, n, weight, x, image);
+        state->latest_ns = t_ns + (int64_t)noack_forecast_ns(rule, size, (double)t_ns * 1e-9);
+    }
+}
+
+/* The rate of the auxiliary variable at z. */
+static double rate_at(const noack_trigger_rule *rule, int64_t n, const double *z, double *image) {
+    if (rule->integrates)
+        return image_norm(rule->up_rows, 2 * n, rule->up, z, image);
+    if (!rule->is_dynamic)
+        return 0.0;
+    double up = image_norm(rule->gain_up_rows, 2 * n, rule->gain_up, z, image);
+    double down = image_norm(rule->gain_down_rows, 2 * n, rule->gain_down, z, image);
+    return up * up - down * down;
+}
+
+/* The auxiliary variable after a time, from its rates at the first and the last time. */
+static double auxiliary_after(
+    const noack_trigger_rule *rule, double dt_s, double value, double first, double last) {
+    if (rule->integrates)
+        return value + dt_s * (first + last) / 2;
+    double decay = rule->decay_per_s;
+    double gained_s = decay > 0.0 ? -expm1(-decay * dt_s) / decay : dt_s;
+    return value * exp(-decay * dt_s) + gained_s * first;
+}
+
+void noack_trigger_restart(
+    const noack_trigger_rule *rule, noack_trigger_state *state, int64_t n, int64_t t_ns,
+    const double *x, double *scratch) {
+    noack_trigger_condition(rule, state, n, t_ns, x, scratch);
+    state->event_ns = t_ns;
+    if (rule->integrates)
+        state->auxiliary = state->rate = 0.0;
+}
+
+void noack_trigger_start(
+    const noack_trigger_rule *rule, noack_trigger_state *state, int64_t n, int64_t t_ns,
+    const double *x, double *scratch) {
+    noack_trigger_restart(rule, state, n, t_ns, x, scratch);
+    state->measured_ns = t_ns;
+    set_z(n, x, NULL, scratch);
+    state->rate = rate_at(rule, n, scratch, scratch + 2 * n);
+}
+
+/* Both sides of the comparison; without an integral, as square roots. */
+static void compare(
+    const noack_trigger_rule *rule, const noack_trigger_state *state, int64_t n, int64_t t_ns,
+    const double *z, double sides[2], double *image) {
+    double right = state->level, auxiliary = state->auxiliary;
+    if (rule->rate_per_s != 0.0)
+        right *= exp(-rule->rate_per_s * (double)(t_ns - state->since_ns) * 1e-9);
+    if (rule->floor > right)
+        right = rule->floor;
+    sides[0] = auxiliary;
+    sides[1] = right;
+    if (rule->integrates)
+        return;
+    int has_auxiliary = rule->is_dynamic && auxiliary > 0.0;
+    if (rule->down_rows > 0 || has_auxiliary) {
+        double down = image_norm(rule->down_rows, 2 * n, rule->down, z, image);
+        double parts[3] = {right, down, has_auxiliary ? sqrt(auxiliary) : 0.0};
+        sides[1] = noack_norm(3, parts);
+    }
+    sides[0] = image_norm(rule->up_rows, 2 * n, rule->up, z, image);
+}
+
+int64_t noack_trigger_test(
+    const noack_trigger_rule *rule, noack_trigger_state *state, int64_t n, int64_t t_ns,
+    const double *x, const double *e_s, double sides[2], double *scratch) {
+    double *z = scratch, *image = scratch + 2 * n;
+    set_z(n, x, e_s, z);
+    if (rule->integrates || rule->is_dynamic) {
+        double rate = rate_at(rule, n, z, image);
+        double dt_s = (double)(t_ns - state->measured_ns) * 1e-9;
+        state->auxiliary = auxiliary_after(rule, dt_s, state->auxiliary, state->rate, rate);
+        state->rate = rate;
+    }
+    state->measured_ns = t_ns;
+    compare(rule, state, n, t_ns, z, sides, image);
+    if (t_ns >= state->latest_ns)
+        return 1;
+    int counts = t_ns >= state->earliest_ns && (rule->grid_ns == 0 || t_ns % rule->grid_ns == 0);
+    return counts && sides[0] > sides[1];
+}
