@@ -110,6 +110,11 @@ static inline void copy_datagram(noack_datagram *to, const noack_datagram *from)
     memcpy(to, from, offsetof(noack_datagram, message.vector) + entries * sizeof(double));
 }
 
+/* wire.c: the header of a message's datagram; and the tests of an authentic datagram. */
+void wire_header(const noack_wire *wire, const noack_message *message, uint8_t *header);
+int64_t wire_examine_message(
+    const noack_reception *reception, int64_t from_peer, const noack_message *message);
+
 /* link.c: decide as noack_link_decide does, by a recorded decision unless it is NULL. */
 void link_repeat(
     noack_link *link, int64_t row, int64_t size_bytes, int64_t now_ns,

@@ -972,14 +972,15 @@ typedef struct {
     noack_loop_group *of_group; /* (groups,) */
     noack_loop_place *of_loop;  /* (loops,) */
     noack_channel *channel;
+    noack_wire wire;
     int64_t directions[5]; /* in which direction each flow crosses the network; -1: it does not */
     int64_t now_ns;
-    int64_t steps_left;         /* inputs of machines until it returns */
-    int64_t asking;             /* enum noack_role or NOACK_NETWORK: who asks */
-    int64_t asking_group;
-    int64_t sent_places;        /* a power of 2 */
+    int64_t steps_left;   /* inputs of machines until it returns */
+    int64_t asking;       /* enum noack_role or NOACK_NETWORK: who asks */
+    int64_t asking_group; /* of which group */
+    int64_t sent_places;  /* a power of 2 */
     int64_t sent_first, sent_count;
-    noack_sent_datagram *sent;  /* (sent_places,) a ring, in the order of sending */
+    noack_sent_datagram *sent; /* (sent_places,) a ring, in the order of sending */
 } noack_simulation;
 
 /* Return NULL, or what is wrong with the numbers of a simulation. */
@@ -995,48 +996,52 @@ typedef struct {
     int64_t begin, entries;
 } noack_columns;
 
+enum { NOACK_SETTINGS = NOACK_TABLES }; /* a kind of noack_recorded_table */
+
 typedef struct { /* rows of a table that a machine has written */
     int64_t kind;      /* enum noack_table_number; NOACK_SETTINGS: Python replays its rows */
-    int64_t row_bytes; /* from one row to the next */
+    int64_t row_bytes; /* without the number of the loop */
+    int64_t stride;    /* bytes from one row to the next */
     int64_t count;
-    const uint8_t *rows; /* (count, row_bytes), without the number of the loop */
-    noack_columns vector[3]; /* of a message: its entries, as places of bytes in a row */
+    const uint8_t *rows;
+    noack_columns vector[3]; /* the vector of a message: places of bytes in a row */
 } noack_recorded_table;
-
-enum { NOACK_SETTINGS = NOACK_TABLES }; /* a kind of noack_recorded_table */
 
 enum noack_replay_reason { /* besides NOACK_DONE and the questions of the machine */
     NOACK_REPLAY_SETTING = 64, /* the next input is a change of settings */
     NOACK_CANNOT_TAKE          /* the next input has values that no run has */
 };
 
-enum noack_difference_kind {
+enum noack_difference { /* of the record from its replay */
     NOACK_EQUAL,
     NOACK_TIME_RUNS_BACKWARD,
     NOACK_BEFORE_DEADLINE,
-    NOACK_OTHER_TABLE, /* the machine wrote a row of another table, or none */
+    NOACK_OTHER_TABLE, /* the machine wrote a row of another table */
     NOACK_ROW_DIFFERS
 };
 
-typedef struct { /* the replay of a machine, or of the channel */
+typedef struct { /* the replay of a machine, or of the network */
     int64_t role;           /* enum noack_role, or NOACK_NETWORK */
-    int64_t loop;           /* of the process */
-    noack_process *process; /* NULL: the channel's */
-    noack_channel *channel;
+    noack_process *process; /* of the machine, and the number of its loop there */
+    int64_t loop;
+    noack_channel *channel; /* of the network */
     noack_recorded_table tables[4];
-    int64_t count, next;
-    const int64_t *order; /* (count,) the inputs, as places among the rows of all tables */
+    int64_t count, next;  /* inputs, and the next one */
+    const int64_t *order; /* (count,) the inputs in order, as places among the rows of all tables */
     int64_t before_ns;    /* time of the input before */
-    int64_t difference;   /* enum noack_difference_kind of the first difference */
-    int64_t difference_at;   /* number of its input in the order */
-    int64_t other_ns;        /* the time before, or the deadline; INT64_MAX: none */
-    int64_t replayed_bytes;
-    uint8_t replayed[8192];  /* the row that the machine wrote */
-    /* what was sent; there is room for as many as inputs, or twice as many datagrams */
-    int64_t sent_width; /* words of a message: flow, sequence, time, and its vector */
-    int64_t sent_count;
-    int64_t *sent;      /* (count, sent_width) messages; or (2 count, 5) flow and head */
+    int64_t difference;   /* enum noack_difference: the first one */
+    int64_t difference_at; /* at which input */
+    int64_t other_ns;      /* the time before, or the deadline; INT64_MAX: there is none */
+    uint8_t replayed[8192]; /* the row that the machine wrote then */
+    /* What was sent. Of a message: flow, sequence number, time and vector. Of a datagram: flow and
+       head. There is room for a message of each input, or for two datagrams. */
+    int64_t sent_width, sent_count;
+    int64_t *sent; /* (count or 2 count, sent_width) */
 } noack_input_replay;
 
-/* Replay the next inputs. Return NOACK_DONE, or why Python is needed. */
+/* Return NULL, or what is wrong with the numbers of a replay. */
+const char *noack_replay_check(const noack_input_replay *replay);
+
+/* Replay the next inputs: compare each row bit for bit, and the times of ticks with the deadlines.
+   Return NOACK_DONE, or why Python is needed. */
 int64_t noack_replay_inputs(noack_input_replay *replay);
