@@ -31,7 +31,7 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import RECEIVES
 from noack.protocol.wire_format import Flow
-from noack.runtime.loop_machines import LoopMachines
+from noack.machines.loop_machines import LoopMachines
 
 Numbers = NDArray[np.int64]
 

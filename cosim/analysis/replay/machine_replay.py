@@ -21,7 +21,7 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import SENDS
 from noack.protocol.wire_format import Flow
-from noack.runtime.loop_machines import LoopMachines
+from noack.machines.loop_machines import LoopMachines
 from plant_server.plant import plant_of
 from sensor_node.sensor import sensor_of
 
