@@ -42,7 +42,7 @@ _ROLES: Mapping[str, Callable[..., LoopMachines]] = {
     "controller": controllers_of,
 }
 """In the order of ``noack_role``."""
-_INPUTS_PER_PROGRESS = 8192
+_INPUTS_PER_PROGRESS = 2048
 _SENT_PLACES = 64
 
 
