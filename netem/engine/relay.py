@@ -174,7 +174,7 @@ class Relay:
     def _relay_until(self, until_ns: int) -> None:
         """Relay datagrams, and pass their events to the taps."""
         relay = self._memory.core
-        relay.epoch_ns, relay.unix_ns = self._epoch_ns, self.began_unix_ns
+        relay.clock.epoch_ns, relay.unix_ns = self._epoch_ns, self.began_unix_ns
         while (reason := core.noack_relay_run(relay, until_ns)) != core.NOACK_HOUSEKEEPING:
             if reason == core.NOACK_NEW_CLIENT:
                 name = bytes(ffi.buffer(core.noack_relay_sender(relay), core.NOACK_NAME_BYTES))

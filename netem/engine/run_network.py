@@ -91,7 +91,8 @@ class RunNetwork:
             spin_ns: busy-wait for this time before a departure.
         """
         relay, clients = self._relay, self._memory.clients
-        relay.epoch_ns, relay.speed, relay.spin_ns = clock.epoch_ns, clock.speed, spin_ns
+        relay.spin_ns = spin_ns
+        clock.set_core(relay.clock)
         self._memory.sockets["fd"][1] = sender.fileno()
         for place, endpoint in zip((0, self._memory.first_path), receivers.values(), strict=False):
             stamp_arrivals(endpoint)

@@ -124,8 +124,7 @@ class RunProcess:
         epoch_ns, speed = begin["epoch_ns"], self.scenario.speed
         self.clock = RunClock(epoch_ns, speed)
         if (reference := self._reference) is not None:
-            fastest = 1 + reference.slew_ppb * 1e-9
-            self.clock = SlewedRunClock(epoch_ns, speed, reference.monotonic_ns, fastest)
+            self.clock = SlewedRunClock(epoch_ns, speed, reference.slewed)
         addresses: Mapping[str, Address] = begin["addresses"]
         self.updates.extend(begin.get("changes", ()))
         if not addresses.keys() >= set(LOOP_ROLES):
