@@ -42,6 +42,9 @@ class _Draw:
     def one_of(self, *choices: Any) -> Any:
         return choices[self.rng.integers(len(choices))]
 
+    def seed(self) -> int:
+        return int(self.rng.integers(1000))
+
     def between(self, low: float, high: float) -> float:
         return float(self.rng.uniform(low, high))
 
@@ -49,17 +52,16 @@ class _Draw:
         return self.rng.uniform(low, high, shape).tolist()
 
     def scenario(self, policy: str) -> Content:
-        n, m, acknowledged = self.n, self.m, self.chance(0.15)
-        A, B = self.rng.uniform(-1.5, 1.5, (n, n)), self.rng.uniform(-2, 2, (n, m))
-        P = solve_continuous_are(A, B, np.eye(n), np.eye(m))
+        acknowledged = self.chance(0.15)
+        A, B, K = self.model()
         self.rest = -np.linalg.solve(A, B)  # x = rest @ u is an equilibrium
         x_r = None if acknowledged or self.chance(0.5) else self.equilibrium()
         content: Content = {
             "name": "random",
             "mode": self.one_of("model", "model", "zoh"),
             "horizon_s": HORIZON_S,
-            "seeds": dict.fromkeys(("plant", "loss", "disturbance", "noise"), self.one_of(*range(99))),
-            "model": {"A": A.tolist(), "B": B.tolist(), "gain": (-B.T @ P).tolist()},
+            "seeds": {"plant": self.seed(), "loss": self.seed(), "noise": self.seed()},
+            "model": {"A": A.tolist(), "B": B.tolist(), "gain": K.tolist()},
             "plant": self.plant(),
             "trigger": self.trigger(policy),
             "network": self.network(acknowledged=acknowledged),
@@ -70,6 +72,15 @@ class _Draw:
         if not acknowledged and self.chance(0.35):
             content["changes"] = self.changes(content, x_r)
         return content
+
+    def model(self) -> tuple[Any, Any, Any]:
+        """Return Â, B̂ and the regulator's gain; without modes that hardly react to the input."""
+        while True:
+            A = self.rng.uniform(-1.5, 1.5, (self.n, self.n))
+            B = self.rng.uniform(-2, 2, (self.n, self.m))
+            K = -B.T @ solve_continuous_are(A, B, np.eye(self.n), np.eye(self.m))
+            if np.abs(K).max() < 10 and np.linalg.cond(A) < 100:
+                return A, B, K
 
     def equilibrium(self) -> Any:
         x_r = self.rest @ self.rng.uniform(-1, 1, self.m)
@@ -98,20 +109,20 @@ class _Draw:
     def trigger(self, policy: str, *, inner: bool = False) -> Content:
         between, n = self.between, self.n
         measured_s = self.every / self.rate_hz
-        size = between(0.04, 0.2)
+        size = between(0.02, 0.1)
         tables: dict[str, Content] = {
-            "decaying": {"beta": between(0.1, 0.5), "alpha_per_s": between(0.2, 1.0),
+            "decaying": {"beta": between(0.1, 0.3), "alpha_per_s": between(0.5, 2.0),
                          "floor": self.one_of(0.0, size)},
             "absolute": {"delta": size},
             "relative": {"sigma": between(0.1, 0.4)},
-            "mixed": {"sigma": between(0.05, 0.3), "epsilon": size},
+            "mixed": {"sigma": between(0.05, 0.2), "epsilon": size},
             "quadratic": {"Q": self.form(), "epsilon": size**2,
                           "period_s": self.one_of(1, 2, 3) * measured_s,
                           "heartbeat": self.one_of(0, 7)},
             "lyapunov": {"rate_per_s": between(0.1, 0.8)},
-            "dynamic": {"sigma": between(0.2, 0.8), "theta_s": self.one_of(0.003, 0.3, 1.0),
+            "dynamic": {"sigma": between(0.05, 0.4), "theta_s": self.one_of(0.003, 0.1, 1.0),
                         "decay_per_s": self.one_of(0.0, between(0.2, 2.0)),
-                        "eta_0": self.one_of(0.0, 0.5)},
+                        "eta_0": self.one_of(0.0, 0.1)},
             "send_on_area": {"delta_s": size / 10},
             "periodic": {"period_s": self.one_of(0.06, between(0.03, 0.2))},
             "self_triggered": {"beta": between(0.1, 0.5), "alpha_per_s": between(0.2, 1.0),
@@ -166,7 +177,7 @@ class _Draw:
             network |= {"protocol": "ack", "acknowledgements": self.direction()}
             if self.chance(0.5):
                 network["acknowledgements"]["timeout_s"] = self.between(0.03, 0.2)
-        elif self.chance(0.4):
+        elif self.chance(0.5):
             network["actuation"] = self.direction()
         return network
 
@@ -209,13 +220,13 @@ class _Draw:
         """Add a watchdog; some act often, since the timeout is short where actuations are lost."""
         kinds = ("hold", "zero", "model") if model else ("hold", "zero")
         content["plant"]["watchdog"] = {"policy": self.one_of(*kinds)}
-        if self.chance(0.3):
+        if self.chance(0.6):
             controller = content["controller"]
-            ticks = controller["predictions"] + self.one_of(0, 1, 3)
+            ticks = controller["predictions"] + self.one_of(0, 0, 1)
             content["plant"]["watchdog"]["timeout_s"] = ticks / controller["rate_hz"]
 
     def changes(self, content: Content, x_r: Any) -> list[Content]:
-        """Return changes of the trigger, the network and the set point, some on the plant's grid."""
+        """Return changes of trigger, network and set point, some on the plant's grid."""
         trigger, changes = content["trigger"], []
         for begin_s in (0.0, 0.7, 1.3)[self.one_of(0, 1) :]:
             key = _CHANGEABLE[trigger["policy"]]

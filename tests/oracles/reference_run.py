@@ -13,8 +13,6 @@ from noack.disturbances.disturbance_settings import SignalSource
 from tests.oracles.trigger_rules import Array, Rule
 from tests.oracles.whole_loop import Chance, Settings, held_input
 
-NEVER = -1
-
 
 def why_not(scenario: Scenario) -> str | None:
     """Return why the reference loop cannot run a scenario; None if it can."""
@@ -116,13 +114,12 @@ def chance_of(scenario: Scenario, packets: Any) -> Chance:
         source = SignalSource(scenario.timing.plant_period_ns, scenario.seeds.disturbance, name)
         pushes[one.at] += one.signal(steps, source)
     v = _noise(scenario, steps)
-    forward, reverse = (arrivals(packets, flow) for flow in (0, 1))
     return Chance(
-        d=lambda step: pushes["input"][step],
-        w=lambda step: pushes["state"][step],
-        noise=lambda number: v[number],
-        forward=lambda packet: forward[packet],
-        reverse=lambda packet: reverse[packet],
+        d=pushes["input"].__getitem__,
+        w=pushes["state"].__getitem__,
+        noise=v.__getitem__,
+        forward=arrivals(packets, 0),
+        reverse=arrivals(packets, 1),
     )
 
 
@@ -130,25 +127,22 @@ def _noise(scenario: Scenario, numbers: range) -> Array:
     """Return v of each measurement, (k, p)."""
     measurement, seed = scenario.plant.measurement, scenario.seeds.noise
     p = len(measurement.C or scenario.plant.initial_state)
-    stream: Callable[[str], tuple[str, str, str]] = lambda kind: ("plant", "measurement", kind)  # noqa: E731
-    normal = normals(seed, *stream("normal"), rows=numbers, width=p)
-    uniform = uniforms(seed, *stream("uniform"), rows=numbers, width=p)
+    normal, uniform = (
+        table(seed, "plant", "measurement", part, rows=numbers, width=p)
+        for part, table in (("normal", normals), ("uniform", uniforms))
+    )
     std, bound = measurement.noise_std or 0.0, measurement.noise_bound or 0.0
     return np.multiply(std, normal) + np.multiply(bound, 2 * uniform - 1)
 
 
-def arrivals(packets: Any, flow: int) -> Sequence[Sequence[int]]:
-    """Return when each packet of a flow arrives, in the order of their numbers.
+def arrivals(packets: Any, flow: int) -> Callable[[int], Sequence[int]]:
+    """Return when each packet of a flow arrives; a packet that is not on record is lost.
 
-    A packet with a flipped bit is rejected by its receiver.
+    A receiver rejects a packet with a flipped bit.
     """
-    rows = packets[packets["flow"] == flow]
-    rows = rows[np.argsort(rows["sequence"])]
-    assert (rows["sequence"] == np.arange(len(rows))).all()
-    times = [
-        [] if bit >= 0 else [release_ns, copy_ns]
-        for release_ns, copy_ns, bit in zip(
-            *(rows[name].tolist() for name in ("release_ns", "copy_ns", "bit")), strict=True
-        )
-    ]
-    return [[t_ns for t_ns in one if t_ns != NEVER] for one in times]
+    rows = packets[(packets["flow"] == flow) & (packets["bit"] < 0)]
+    arriving = {
+        packet: [t_ns for t_ns in times if t_ns >= 0]
+        for packet, *times in rows[["sequence", "release_ns", "copy_ns"]].tolist()
+    }
+    return lambda packet: arriving.get(packet, [])

@@ -14,7 +14,6 @@ chance is given: disturbances, noise, and the fate of each packet on the network
 
 import heapq
 import itertools
-import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -203,7 +202,7 @@ class Sensor:
             self.trigger.event(0, s.x0)
 
     def measure(self, number: int, t_ns: int, y: Array, u: Array) -> Array | None:
-        """Process a measurement, of y and the inputs since the last one; return x if it is an event."""
+        """Process a measurement y, with the inputs since the last one; return x at an event."""
         trigger, resets = self.trigger, self.s.acknowledgement_timeout_ns is None
         x = y if self.observer is None else self.estimate(number, y, u)
         trigger.use(in_force(self.s.rules, t_ns))
@@ -310,7 +309,7 @@ def run(s: Settings, chance: Chance) -> Rows:
         rows["netem_packet"].append({"flow": direction, "sequence": packet, "now_ns": t_ns})
         for arrival_ns in (chance.forward, chance.reverse)[direction](packet):
             if arrival_ns > t_ns:
-                at(arrival_ns, FORWARD + direction, leave, *datagram)
+                at(arrival_ns, (FORWARD, REVERSE)[direction], leave, *datagram)
             else:
                 leave(t_ns, *datagram)
 
