@@ -5,7 +5,7 @@ else: x, x̂, x_s, x_c, u, both sides of the trigger's comparison, events, times
 
 Numbers must agree to 1e-10 of the largest state, or value of their column, up to their time. Both
 round at 1e-16 in each of some 10⁴ operations, which the loop may amplify; the largest difference
-found is 2e-12. A comparison of the trigger that is decided by less may turn out differently: there
+found is 3e-12. A comparison of the trigger that is decided by less may turn out differently: there
 the comparison of the runs ends.
 """
 

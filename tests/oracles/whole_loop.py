@@ -291,7 +291,8 @@ def run(s: Settings, chance: Chance) -> Rows:
     rows: Rows = defaultdict(list)
     plant, sensor, controller = Plant(s, chance, rows), Sensor(s, rows), Controller(s, rows)
     queue: list[tuple[Any, ...]] = []
-    order, newest, packets = itertools.count(), defaultdict(lambda: NONE), [0, 0]
+    order, packets = itertools.count(), [0, 0]
+    newest: dict[Callable[..., None], int] = defaultdict(lambda: NONE)  # by receiver
 
     def at(t_ns: int, rank: int, action: Callable[..., None], *arguments: Any) -> None:
         heapq.heappush(queue, (t_ns, rank, next(order), action, arguments))
