@@ -129,3 +129,18 @@ def test_another_order_at_the_same_time_is_found(
     """E.g. ticks before datagrams, which have the rank 3."""
     monkeypatch.setattr(whole_loop, of, rank)
     require_a_difference(lambda settings: settings)
+
+
+def test_a_tie_ends_the_comparison_of_a_run_and_is_no_difference() -> None:
+    """δ becomes the ‖e_s‖ of an event, so that the comparison there is decided by rounding."""
+    ties = 0
+    for number in range(POLICIES.index("absolute"), RANDOM, len(POLICIES)):
+        content = random_scenario(number)
+        content.pop("changes", None)
+        measured = simulate(resolve(validate(content, "random")))["sensor_measurement"]
+        later = measured[measured["event"] > 0]
+        if not len(later):
+            continue
+        content["trigger"]["delta"] = float(later["compared"][0])
+        ties += Comparison(simulate(resolve(validate(content, "random")))).tie_ns is not None
+    assert ties > 0
