@@ -64,8 +64,9 @@ def test_only_the_median_of_the_added_delay_is_judged() -> None:
     rounds.missing |= {"C relay": "not built", "asyncio relay": "ended"}
     rows = relay_delay.added_rows(rounds)
     assert rows[0].value == 3.0
-    (judged,) = [row for row in rows if row.goal is not None]
+    judged, missing = [row for row in rows if row.goal is not None]
     assert (judged.name, judged.ratio, judged.holds) == ("ours: added one way, p50", 0.75, True)
+    assert (missing.name, missing.holds) == (judged.name, None)
 
 
 @pytest.mark.parametrize("refused", [None, "SCHED_FIFO is refused"])
