@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import psutil
 
-from benchmarks._report import Benchmark, Goal, MeasurementError, Peer, Row, say
+from benchmarks._report import Benchmark, Goal, MeasurementError, Peer, Row, median, say
 from benchmarks.soak.watch import Processes
 from cosim.record.run_directory import LATEST, LOOPS, SUMMARY_FILE, read_object
 from cosim.simulation.shared_network import simulate_loops
@@ -199,8 +199,8 @@ def figures(load_: Load, found: Measured, single_us: float) -> list[Row]:
 
 
 def memory(load_: Load, found: Measured) -> list[Row]:
-    """Return the private memory of the processes of one loop, at the end of its run."""
-    used = {role: found.memory_mib[role][-1] for role in LOOP_ROLES}
+    """Return the private memory of the processes of one loop: the median over its run."""
+    used = {role: median(found.memory_mib[role]) for role in LOOP_ROLES}
     name = f"{load_}: private memory of {', '.join(used)}"
     note = ", ".join(f"{role} {mib:.0f}" for role, mib in used.items())
     peer = Peer("as many Pythons that import numpy and zenoh", libraries_mib(len(used)))
