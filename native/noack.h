@@ -396,7 +396,6 @@ typedef struct { /* e^(H dt) for the dt that occurred lately; loops with the sam
 
 typedef struct { /* the model between updates: dx/dt = H(x - x_r), x_r piecewise constant */
     noack_transitions *transitions;
-    int64_t moves;      /* 1: some x_r is not 0 */
     int64_t changes;    /* of x_r */
     int64_t *since_ns;  /* (changes,) ascending */
     int64_t *has_point; /* (changes + 1,) 0: x_r is 0 */
@@ -451,7 +450,7 @@ typedef struct { /* plant_server/plant.py makes it */
     double *x, *z;    /* (n,), (internal,) */
     double *u;        /* (m,) held since the last step */
     double *applied;  /* (sources,) the same, disturbed */
-    double *held;     /* (measure_every, m) the inputs since the last measurement */
+    double *held;     /* (measure_every, m) the inputs since the last measurement, if reported */
     double *inputs;   /* (N, m) of the newest actuation */
     double *x_c;      /* (n,) of it */
     int64_t newest_ns, newest_sequence;
@@ -472,10 +471,6 @@ typedef struct { /* Luenberger: the gain is given. Kalman: it follows from P */
     double *scratch; /* (3 n n + n p + p p + 2n + p,) */
 } noack_observer;
 
-typedef struct { /* an update that was sent and is not acknowledged */
-    int64_t sequence, t_ns;
-} noack_sent;
-
 typedef struct { /* sensor_node/sensor.py makes it */
     noack_machine machine;
     /* settings */
@@ -495,8 +490,8 @@ typedef struct { /* sensor_node/sensor.py makes it */
     int64_t events;      /* number of the next one */
     int64_t wait_ns;     /* time until which it waits for an acknowledgement; -1: it does not */
     int64_t sent_count, sent_places;
-    noack_sent *sent; /* (sent_places,) oldest first */
-    double *sent_x;   /* (sent_places, n) */
+    int64_t *sent;  /* (sent_places,) numbers of the updates not acknowledged, oldest first */
+    double *sent_x; /* (sent_places, n) */
     /* the question to the user's trigger, and its answer */
     double *x, *e_s;  /* (n,) the measured or estimated state; x_s - x */
     int64_t first;    /* 1: it starts at x first */
@@ -875,6 +870,22 @@ void noack_client_remove(noack_relay *relay, int64_t row);
 
 /* The bucket of a time in a histogram: 32 for each doubling. */
 int64_t noack_bucket_of(int64_t t_ns);
+
+/* A capture (pcapng). An interface is a side of a link. */
+
+enum { NOACK_CAPTURE_BYTES = 600 }; /* of a block, beside its payload, at most */
+
+/* Return NULL, or what is wrong with the events of a batch: all that noack_capture_blocks assumes.
+   data_bytes: size of the batch's payloads. */
+const char *noack_capture_check(
+    const noack_event *events, int64_t count, int64_t data_bytes, int64_t interfaces);
+
+/* Write the events' blocks into out, which has room for count NOACK_CAPTURE_BYTES and the payloads;
+   return their bytes. missing: (interfaces,) events that are missing before these, which the next
+   block states, and which are 0 then; written: (interfaces,) counts the blocks. */
+int64_t noack_capture_blocks(
+    const noack_event *events, int64_t count, const uint8_t *data, int64_t *missing,
+    int64_t *written, uint8_t *out);
 
 /* ---- The network of a run, without sockets ----------------------------------------------------- */
 

@@ -36,7 +36,7 @@ class LoopMachines:
         rows: rows of each table until they must be taken; by default as many as suit the loops.
 
     Raises:
-        ValueError: the core refuses a machine's numbers.
+        ValueError: the core refuses a machine's numbers, or the loops' rows differ.
     """
 
     def __init__(
@@ -49,6 +49,8 @@ class LoopMachines:
     ) -> None:
         self.parts = tuple(parts)
         self.role = self.parts[0].role
+        if any(part.shape != self.parts[0].shape for part in self.parts):
+            raise ValueError(f"the rows of these {self.role.name}s have different columns")
         self.phases_ns = tuple(phases_ns or (0,) * len(self.parts))
         self.numbered = numbered
         self._memory = CoreMemory()
@@ -148,15 +150,25 @@ class LoopMachines:
         return outputs
 
     def handle(self, message: Message, now_ns: int) -> Sequence[Output]:
-        """Process a message that arrives at ``now_ns``; return what the machine does."""
+        """Process a message that arrives at ``now_ns``; return what the machine does.
+
+        Raises:
+            ValueError: the loop's machine does not receive such messages.
+        """
+        part, machine = self.parts[message.loop], self.machines[message.loop].machine
+        receptions = [machine.received]
+        if part.shape.acknowledged:
+            receptions.append(machine.acknowledgements)
+        entries = {reception.flow: reception.entries for reception in receptions}
+        if entries.get(message.flow) != len(message.vector):
+            raise ValueError(
+                f"this {self.role.name} receives no {message.flow.name.lower()} "
+                f"of {len(message.vector)} entries"
+            )
         given, self._message.loop = self._message, message.loop
         given.flow, given.sequence, given.t_ns = message.flow, message.sequence, message.t_ns
         given.entries = len(message.vector)
         given.vector[0 : given.entries] = message.vector.tolist()
-        machine = self.machines[message.loop].machine
-        expected = machine.received.entries if message.flow is self.role.receives else 0
-        if given.entries != expected:
-            raise ValueError(f"a message has {given.entries} entries, not {expected}")
         return self._outputs(
             lambda: int(core.noack_process_handle(self.core, self._message, now_ns))
         )
