@@ -871,6 +871,22 @@ void noack_client_remove(noack_relay *relay, int64_t row);
 /* The bucket of a time in a histogram: 32 for each doubling. */
 int64_t noack_bucket_of(int64_t t_ns);
 
+/* A capture (pcapng). An interface is a side of a link. */
+
+enum { NOACK_CAPTURE_BYTES = 600 }; /* of a block, beside its payload, at most */
+
+/* Return NULL, or what is wrong with the events of a batch: all that noack_capture_blocks assumes.
+   data_bytes: size of the batch's payloads. */
+const char *noack_capture_check(
+    const noack_event *events, int64_t count, int64_t data_bytes, int64_t interfaces);
+
+/* Write the events' blocks into out, which has room for count NOACK_CAPTURE_BYTES and the payloads;
+   return their bytes. missing: (interfaces,) events that are missing before these, which the next
+   block states, and which are 0 then; written: (interfaces,) counts the blocks. */
+int64_t noack_capture_blocks(
+    const noack_event *events, int64_t count, const uint8_t *data, int64_t *missing,
+    int64_t *written, uint8_t *out);
+
 /* ---- The network of a run, without sockets ----------------------------------------------------- */
 
 typedef struct { /* a datagram in the network */

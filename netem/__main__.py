@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from noack.runtime.signals import stoppable_imports
 
 with stoppable_imports():
-    from netem.duplex_link import network_of
+    from netem.channel import channel_of
     from netem.engine.run_network import RunNetwork
     from netem.run_relay import CoreShell, RelayShell
     from noack.core.errors import ExitStatus, NoackError
@@ -53,7 +53,7 @@ def _in_a_run(node: RunProcess) -> None:
 
     if node.follows_reference or not has_peer_sockets():
         node.run(
-            network_of(node.scenario, node.start, loops=loops or 1),
+            channel_of(node.scenario, node.start, loops=loops or 1),
             lambda endpoint, addresses: RelayShell(endpoint, ways(addresses), loops=loops),
         )
         return

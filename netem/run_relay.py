@@ -10,8 +10,8 @@ import select
 import socket
 from collections.abc import Sequence
 
+from netem.channel import Datagram
 from netem.engine.run_network import RunNetwork
-from netem.link_machine import Datagram
 from noack.core.clock import RunClock
 from noack.core.errors import PeerError
 from noack.protocol.machine_interface import Notice, Record
@@ -23,7 +23,7 @@ from noack.runtime.udp_sockets import MAX_UDP_BYTES, CountingSocket
 class RelayShell(CountingSocket[Datagram]):
     """The channel of a network: forwards each direction from its source to its destination.
 
-    Other senders are ignored. The flow is that of :mod:`netem.duplex_link`.
+    Other senders are ignored. The flow is that of :mod:`netem.channel`.
 
     Args:
         endpoint: the socket.

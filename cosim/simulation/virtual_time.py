@@ -42,7 +42,7 @@ _ROLES: Mapping[str, Callable[..., LoopMachines]] = {
     "controller": controllers_of,
 }
 """In the order of ``noack_role``."""
-_INPUTS_PER_PROGRESS = 8192
+_INPUTS_PER_PROGRESS = 2048
 _SENT_PLACES = 64
 
 
@@ -100,8 +100,10 @@ class VirtualRun:
         network: Network | None = None,
     ) -> None:
         self._scenario = scenario
-        self._groups = [*_groups(loops)]
-        phases = phases_ns(scenario)
+        self.groups: Sequence[Sequence[int]] = [*_groups(loops)]
+        """The numbers of the loops whose rows have the same columns."""
+        self.phases_ns = phases = phases_ns(scenario)
+        """When each loop begins."""
         self.machines = [
             {
                 role: make(
@@ -109,7 +111,7 @@ class VirtualRun:
                 )
                 for role, make in _ROLES.items()
             }
-            for numbers in self._groups
+            for numbers in self.groups
         ]
         """The machines of each group of loops whose rows have the same columns, by role."""
         self.channel = channel_of(scenario, loops=len(loops), network=network)
@@ -175,13 +177,13 @@ class VirtualRun:
     def _new_core(self, loops: int) -> Any:
         """Return the ``noack_simulation``."""
         key, flows = ffi.from_buffer("uint8_t[]", bytes(KEY_BYTES)), self._scenario.network.flows
-        numbers = [ffi.new("int64_t[]", one) for one in self._groups]
-        groups = ffi.new("noack_loop_group[]", len(self._groups))
+        numbers = [ffi.new("int64_t[]", one) for one in self.groups]
+        groups = ffi.new("noack_loop_group[]", len(self.groups))
         of_loop = ffi.new("noack_loop_place[]", loops)
         for number, (group, machines) in enumerate(zip(groups, self.machines, strict=True)):
             group.processes = [one.core for one in machines.values()]
             group.numbers = numbers[number]
-            for place, loop in enumerate(self._groups[number]):
+            for place, loop in enumerate(self.groups[number]):
                 of_loop[loop] = (number, place)
         simulation = ffi.new("noack_simulation *", {
             "groups": len(groups), "loops": loops, "of_group": groups, "of_loop": of_loop,
@@ -207,9 +209,9 @@ class VirtualRun:
 
     def _take(self, group: int, role: str) -> None:
         """Take the rows and notices of machines."""
-        machines, numbers = self.machines[group][role], np.array(self._groups[group])
+        machines, numbers = self.machines[group][role], np.array(self.groups[group])
         for table, rows in machines.take_rows():
-            if len(self._groups) > 1 and LOOP in (rows.dtype.names or ()):
+            if len(self.groups) > 1 and LOOP in (rows.dtype.names or ()):
                 rows[LOOP] = numbers[rows[LOOP]]
             self.record.extend(table, rows)
         for notice in machines.take_notices():
@@ -224,10 +226,10 @@ class VirtualRun:
 
     def _of_run(self, group: int, output: Record | Notice) -> Record | Notice:
         """Return an output of a group with the number that its loop has in the run."""
-        numbers = self._groups[group]
+        numbers = self.groups[group]
         if isinstance(output, Notice):
             return output if output.loop is None else output._replace(loop=numbers[output.loop])
-        if len(self._groups) == 1:
+        if len(self.groups) == 1:
             return output
         place, *row = output.row
         return Record(output.table, (numbers[place], *row))
@@ -265,9 +267,9 @@ def simulate_loops(scenario: Scenario, progress: Progress | None = None) -> Loop
     loops = [resolve(loop) for loop in loops_of(scenario)]
     run = _completed(scenario, loops, progress, numbered=True)
     of_network = {table: run.record.rows(table, dtype) for table, dtype in network_tables().items()}
-    by_loop = network_rows_by_loop(of_network, phases_ns(scenario))
+    by_loop = network_rows_by_loop(of_network, run.phases_ns)
     own = [dict[str, Rows]() for _ in loops]
-    for numbers in _groups(loops):
+    for numbers in run.groups:
         for table, dtype in tables_of(loops[numbers[0]]).items():
             if OWNER[table] != "netem":
                 rows = run.record.rows(table, np.dtype([(LOOP, "<u2"), *dtype.descr]))
@@ -302,10 +304,15 @@ def _completed(
 
 def _groups(loops: Sequence[Scenario]) -> Iterator[list[int]]:
     """Yield the numbers of the loops whose rows have the same columns."""
-    groups: dict[str, list[int]] = {}
+    groups: list[tuple[Mapping[str, np.dtype[np.void]], list[int]]] = []
     for number, loop in enumerate(loops):
-        groups.setdefault(repr(tables_of(loop)), []).append(number)
-    yield from groups.values()
+        types = tables_of(loop)
+        same = next((numbers for known, numbers in groups if known == types), None)
+        if same is None:
+            groups.append((types, [number]))
+        else:
+            same.append(number)
+    yield from (numbers for _, numbers in groups)
 
 
 def _split(

@@ -47,3 +47,7 @@ def test_random_links_run_clean() -> None:
 
 def test_links_of_any_numbers_are_refused_or_run_clean() -> None:
     run_tests("tests/fuzz/test_parsers.py", "-k", "link_numbers")
+
+
+def test_captures_of_any_events_are_refused_or_run_clean() -> None:
+    run_tests("tests/netem/capture/test_pcapng.py")

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from netem.duplex_link import network_of
 from netem.engine.run_network import RunNetwork
 from netem.run_relay import CoreShell, RelayShell
 from noack.config.resolution import resolve, tables_of
@@ -24,6 +23,7 @@ from noack.runtime.real_time_loop import run_loop
 from noack.runtime.telemetry import TelemetryBuffer
 from noack.runtime.udp_sockets import bind
 from tests.netem.engine.relays import PATIENCE_S, Received, drain, endpoints, name_of
+from tests.oracles.link import network_of
 
 SCENARIO = resolve(
     load(

@@ -11,10 +11,10 @@ from itertools import product
 
 import numpy as np
 
-from benchmarks._certificate_kinds import Bounds, Broken, Kind, Observed
 from noack.theory.certificate_terms import Constants, VoidError
 from noack.theory.kernel_bounds import NotDecayingError
 from tests.noack.theory.broken_certificates import MUTANTS
+from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.loops import (
     Flags,
     Steps,

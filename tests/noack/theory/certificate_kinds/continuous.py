@@ -1,6 +1,6 @@
 """The paper's conditions: continuous time, an instant network, and the bounds from its flow.
 
-The search for bad losses is that of :mod:`benchmarks._certificate_kinds.decaying`.
+The search for bad losses is that of :mod:`tests.noack.theory.certificate_kinds.decaying`.
 """
 
 from collections.abc import Callable
@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks._certificate_kinds import Bounds, Broken, Kind, Observed
-from benchmarks._certificate_kinds.decaying import bounds_of, search
 from noack.theory.certificate_terms import NetworkConditions, VoidError
 from noack.theory.kernel_bounds import NotDecayingError
 from tests.noack.theory.broken_flow import BROKEN_FLOWS
+from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
+from tests.noack.theory.certificate_kinds.decaying import bounds_of, search
 from tests.noack.theory.continuous_runs import ContinuousTrace, simulate_continuous_time
 from tests.noack.theory.loops import System, random_system
 

@@ -1,8 +1,8 @@
-"""The benchmark of the certificates with few loops: nothing is exceeded, and a mistake is."""
+"""Certificates of random loops: no bound is exceeded, and those of broken copies are."""
 
 import pytest
 
-from benchmarks.certificates import KINDS, examine
+from tests.noack.theory.certificate_kinds.comparison import KINDS, examine
 
 FEW = 6
 
@@ -17,7 +17,7 @@ def test_no_bound_of_a_random_loop_is_exceeded(name: str) -> None:
 
 @pytest.mark.parametrize("name", KINDS)
 def test_some_broken_copy_is_detected(name: str) -> None:
-    """Each one is detected by the benchmark, with more loops."""
+    """The command line of ``certificate_kinds`` detects each one, with more loops."""
     kind = KINDS[name]
     assert kind.broken
     assert any(examine(kind, range(FEW), broken).violated[""] for broken in kind.broken.values())

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks._certificate_kinds import Bounds, Broken, Kind, Observed
 from noack.theory.certificate_terms import VoidError
 from noack.theory.kernel_bounds import NotDecayingError
 from noack.theory.plant_gains import PlantGains
 from noack.theory.random_losses import moments
 from tests.noack.theory.broken_certificates import NoForcedResponse, NoMismatch
+from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.loops import STEPS, System, random_system, simulate, times_s
 
 _RUNS = 300
