@@ -248,7 +248,7 @@ def channel_of(
     resolved: Scenario, start: Start = BEGINNING, *, loops: int = 1, network: Network | None = None
 ) -> Channel:
     """Return the network of a resolved scenario; ``network`` replaces the link of the updates."""
-    links = []
+    links: list[LinkState] = []
     for flow in resolved.network.flows:
         settings, names = at_start(resolved.network.link_of(flow), link_name(flow), start)
         if network is not None and not links:

@@ -276,11 +276,11 @@ def simulate_loops(scenario: Scenario, progress: Progress | None = None) -> Loop
                 for number, of_loop in _split(rows, dtype, numbers):
                     own[number][table] = of_loop
     records = []
-    for number, (loop, rows, of_network_) in enumerate(zip(loops, own, by_loop, strict=True)):
-        rows = {table: (rows | of_network_)[table] for table in tables_of(loop)}
-        reports = _reports(run, rows, scenario, number)
+    for number, (loop, packets) in enumerate(zip(loops, by_loop, strict=True)):
+        tables = {table: (own[number] | packets)[table] for table in tables_of(loop)}
+        reports = _reports(run, tables, scenario, number)
         notices = run.record.notices(number)
-        records.append(RunRecord(loop, rows, notices, reports, "simulated", number=number))
+        records.append(RunRecord(loop, tables, notices, reports, "simulated", number=number))
     reports = {"netem": _report("netem", of_network, {"rejected": {}})}
     network = RunRecord(scenario, of_network, run.record.notices(), reports, "simulated")
     return LoopsRun(network, records)

@@ -251,7 +251,8 @@ def received_vectors(table: str, rows: Rows) -> tuple[NDArray[np.float64], list[
 def _recorded_table(table: str, rows: Rows) -> dict[str, Any]:
     """Return a ``noack_recorded_table``; it is valid while the rows live."""
     skipped, stride = _prefix_bytes(rows.dtype), rows.dtype.itemsize
-    fields, vector = rows.dtype.fields or {}, []
+    fields: Mapping[str, Any] = rows.dtype.fields or {}
+    vector: list[tuple[int, int]] = []
     if table in SETTINGS:
         kind = core.NOACK_SETTINGS
     elif table in _TIMERS:
