@@ -12,7 +12,7 @@ from netem.relay_events import EVENT
 from noack.core.core_library import core, dtype_of, ffi, pointer_to
 from noack.impairments.link_records import RecordedDecision
 from noack.impairments.link_settings import LinkSettings
-from noack.runtime.native.socket_structs import NAME_BYTES, SocketName, packed_name
+from noack.runtime.address import NAME_BYTES, SocketName, packed_name
 
 Array = NDArray[Any]
 CLIENT, SOCKET, SLOT = map(dtype_of, ("noack_client", "noack_socket", "noack_slot"))

@@ -6,12 +6,10 @@ sources stay in the queue of the first socket. They can neither displace nor del
 datagram, and the kernel's drop counters are exact for each queue. :class:`FloodWatch` limits how
 many datagrams from unknown sources are read.
 
-A datagram with a peer's forged address passes; only root can send one on the same machine. Systems
-other than Linux have no peer sockets.
+A datagram with a peer's forged address passes; only root can send one on the same machine.
 """
 
 import socket
-import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -48,10 +46,8 @@ def open_beside(endpoint: socket.socket, peers: Iterable[Address]) -> tuple[sock
 
     ``endpoint`` is a bound UDP socket; it still receives from all other sources. The sockets do not
     block, have receive buffers of its size and the order of the peers. There are none if the system
-    does not support it.
+    refuses them.
     """
-    if sys.platform != "linux":
-        return ()
     size_bytes = endpoint.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
     with ExitStack() as undo:
         beside = []
@@ -72,14 +68,6 @@ def open_beside(endpoint: socket.socket, peers: Iterable[Address]) -> tuple[sock
             return ()
         undo.pop_all()
     return tuple(beside)
-
-
-def has_peer_sockets() -> bool:
-    """Whether the system supports sockets for peers."""
-    with ExitStack() as stack:
-        endpoint = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-        endpoint.bind(("127.0.0.1", 0))
-        return bool([*map(stack.enter_context, open_beside(endpoint, [("127.0.0.1", 9)]))])
 
 
 @contextmanager
@@ -152,7 +140,8 @@ class SourceCount:
     def __init__(self, peers: Iterable[Address] = ()) -> None:
         self._peers = dict.fromkeys(peers, 0)
         self._others: Counter[Address] = Counter()
-        self._more = 0
+        self.more = 0
+        """Datagrams of other sources that have no count of their own."""
         self._last: Address | None = None
         self._run = 0
 
@@ -170,7 +159,7 @@ class SourceCount:
         self._forget(_REPORTED_SOURCES)
         named = [*self._peers.items(), *self._others.most_common()]
         found = {text_of(source): n for source, n in named if n}
-        return found | ({"others": self._more} if self._more else {})
+        return found | ({"others": self.more} if self.more else {})
 
     def _fold(self) -> None:
         if self._last is None:
@@ -186,5 +175,5 @@ class SourceCount:
     def _forget(self, most: int) -> None:
         """Keep the ``most`` frequent sources: forged ones must not fill the memory."""
         kept = Counter(dict(self._others.most_common(most)))
-        self._more += self._others.total() - kept.total()
+        self.more += self._others.total() - kept.total()
         self._others = kept
