@@ -930,3 +930,174 @@ void noack_client_remove(noack_relay *relay, int64_t row);
 
 /* The bucket of a time in a histogram: 32 for each doubling. */
 int64_t noack_bucket_of(int64_t t_ns);
+
+/* ---- The network of a run, without sockets ----------------------------------------------------- */
+
+typedef struct { /* a datagram in the network */
+    int64_t flow;       /* its direction times loops, and its loop */
+    int64_t size_bytes;
+    int64_t arrival_ns; /* at the socket; later than its handling: unknown */
+    int64_t bit;        /* the bit that the network has flipped; -1: none */
+    uint8_t head[32];   /* its first bytes */
+    noack_message message; /* what it carries, in a simulation */
+} noack_datagram;
+
+typedef struct { /* a delayed datagram or copy */
+    int64_t packet;
+    int64_t copy;
+    int64_t counts;  /* 1: it is the datagram's first intact copy */
+    int64_t delayed; /* 0: an overdue one was before it */
+    int64_t next;    /* next free place */
+    noack_datagram datagram;
+} noack_delayed;
+
+enum noack_channel_question { /* besides NOACK_ASK_CHANGE and NOACK_ROWS_FULL */
+    NOACK_ASK_OUTCOME = 16, /* the user's network: set outcome for the datagram in asked */
+    NOACK_ASK_PLACES        /* there is no room for more delayed datagrams */
+};
+
+typedef struct { /* both directions of the network of a run; each flow has the row of its loop */
+    int64_t loops;
+    int64_t directions;   /* 1 or 2 */
+    noack_link *links[2]; /* from the sensors; from the controllers */
+    int64_t is_scripted;  /* 1: Python decides for what comes from the sensors */
+    int64_t first_number; /* of the inputs, and of each flow's datagrams */
+    int64_t inputs;       /* number of the next input */
+    int64_t reached_ns;   /* arrival of the last datagram; -1: none */
+    int64_t change_ns;    /* time from which the first link has other settings; INT64_MAX: none */
+    int64_t answered;     /* 1: Python has decided for this datagram */
+    noack_recorded outcome;
+    noack_datagram asked;
+    int64_t asked_ns;
+    int64_t put; /* datagrams that have been delayed so far */
+    int64_t heap_count, places, free_place; /* free_place: -1: none */
+    noack_heap_entry *heap; /* (places,) */
+    noack_delayed *delayed; /* (places,) */
+    int64_t row_places, packet_count, release_count;
+    noack_packet_row *packets;   /* (row_places,) */
+    noack_release_row *releases; /* (row_places,) */
+    int64_t leaving_count; /* of the last input: what leaves at once */
+    noack_datagram leaving[2];
+} noack_channel;
+
+/* Return NULL, or what is wrong with the numbers of a channel: all that it assumes. */
+const char *noack_channel_check(const noack_channel *channel);
+
+/* Put the places from a number on into the list of free ones. */
+void noack_channel_add_places(noack_channel *channel, int64_t from);
+
+/* Time of the next departure; INT64_MAX: nothing is delayed. */
+int64_t noack_channel_due_ns(const noack_channel *channel);
+
+/* A datagram arrives, or what is due leaves; see leaving. Return NOACK_DONE, or a question: after
+   the answer the call is repeated. The datagram's flow is one of the channel. */
+int64_t noack_channel_handle(
+    noack_channel *channel, const noack_datagram *datagram, int64_t now_ns);
+int64_t noack_channel_release(noack_channel *channel, int64_t now_ns);
+
+/* Last departure time of each flow of a direction, (loops,); the caller fills it with -1. */
+void noack_channel_latest(const noack_channel *channel, int64_t direction, int64_t *latest_ns);
+
+/* ---- Simulation in virtual time ----------------------------------------------------------------- */
+
+typedef struct { /* loops whose rows have the same columns */
+    noack_process *processes[3]; /* by enum noack_role */
+    int64_t *numbers;            /* (loops,) of these loops in the run, ascending */
+} noack_loop_group;
+
+typedef struct {
+    int64_t group, place; /* place: its number in the group */
+} noack_loop_place;
+
+enum noack_destination { /* beyond enum noack_role */
+    NOACK_NETWORK = 3
+};
+
+typedef struct { /* a datagram that has been sent and not received */
+    int64_t to; /* enum noack_role, or NOACK_NETWORK */
+    noack_datagram datagram;
+} noack_sent_datagram;
+
+enum noack_simulation_reason { /* besides NOACK_DONE and the questions of who asks */
+    NOACK_ASK_SENT_PLACES = 32, /* there is no room for more datagrams that have been sent */
+    NOACK_STEPS_DONE            /* steps_left is 0 */
+};
+
+typedef struct {
+    int64_t groups, loops;
+    noack_loop_group *of_group; /* (groups,) */
+    noack_loop_place *of_loop;  /* (loops,) */
+    noack_channel *channel;
+    noack_wire wire;
+    int64_t directions[5]; /* in which direction each flow crosses the network; -1: it does not */
+    int64_t now_ns;
+    int64_t steps_left;   /* inputs of machines until it returns */
+    int64_t asking;       /* enum noack_role or NOACK_NETWORK: who asks */
+    int64_t asking_group; /* of which group */
+    int64_t sent_places;  /* a power of 2 */
+    int64_t sent_first, sent_count;
+    noack_sent_datagram *sent; /* (sent_places,) a ring, in the order of sending */
+} noack_simulation;
+
+/* Return NULL, or what is wrong with the numbers of a simulation. */
+const char *noack_simulation_check(const noack_simulation *simulation);
+
+/* Run until nothing is due up to until_ns. Return NOACK_DONE, or why Python is needed: after the
+   answer the call is repeated. */
+int64_t noack_simulate(noack_simulation *simulation, int64_t until_ns);
+
+/* ---- Replay of recorded inputs -------------------------------------------------------------------- */
+
+typedef struct {
+    int64_t begin, entries;
+} noack_columns;
+
+enum { NOACK_SETTINGS = NOACK_TABLES }; /* a kind of noack_recorded_table */
+
+typedef struct { /* rows of a table that a machine has written */
+    int64_t kind;      /* enum noack_table_number; NOACK_SETTINGS: Python replays its rows */
+    int64_t row_bytes; /* without the number of the loop */
+    int64_t stride;    /* bytes from one row to the next */
+    int64_t count;
+    const uint8_t *rows;
+    noack_columns vector[3]; /* the vector of a message: places of bytes in a row */
+} noack_recorded_table;
+
+enum noack_replay_reason { /* besides NOACK_DONE and the questions of the machine */
+    NOACK_REPLAY_SETTING = 64, /* the next input is a change of settings */
+    NOACK_CANNOT_TAKE          /* the next input has values that no run has */
+};
+
+enum noack_difference { /* of the record from its replay */
+    NOACK_EQUAL,
+    NOACK_TIME_RUNS_BACKWARD,
+    NOACK_BEFORE_DEADLINE,
+    NOACK_OTHER_TABLE, /* the machine wrote a row of another table */
+    NOACK_ROW_DIFFERS
+};
+
+typedef struct { /* the replay of a machine, or of the network */
+    int64_t role;           /* enum noack_role, or NOACK_NETWORK */
+    noack_process *process; /* of the machine, and the number of its loop there */
+    int64_t loop;
+    noack_channel *channel; /* of the network */
+    noack_recorded_table tables[4];
+    int64_t count, next;  /* inputs, and the next one */
+    const int64_t *order; /* (count,) the inputs in order, as places among the rows of all tables */
+    int64_t before_ns;    /* time of the input before */
+    int64_t difference;   /* enum noack_difference: the first one */
+    int64_t difference_at; /* at which input */
+    int64_t other_ns;      /* the time before, or the deadline; INT64_MAX: there is none */
+    uint8_t replayed[8192]; /* the row that the machine wrote then */
+    /* What was sent. Of a message: flow, sequence number, time and vector. Of a datagram: flow and
+       head. There is room for a message of each input, or for two datagrams. */
+    int64_t sent_width, sent_count;
+    int64_t *sent; /* (count or 2 count, sent_width) */
+} noack_input_replay;
+
+/* Return NULL, or what is wrong with the numbers of a replay. */
+const char *noack_replay_check(const noack_input_replay *replay);
+
+/* Replay the next inputs: compare each row bit for bit, and the times of ticks with the deadlines.
+   Return NOACK_DONE, or why Python is needed. */
+int64_t noack_replay_inputs(noack_input_replay *replay);

@@ -104,9 +104,8 @@ void noack_wire_tag(
     memcpy(tag, chain, NOACK_TAG_BYTES);
 }
 
-int64_t noack_wire_encode(const noack_wire *wire, const noack_message *message, uint8_t *datagram) {
+void wire_header(const noack_wire *wire, const noack_message *message, uint8_t *datagram) {
     uint16_t entries = (uint16_t)message->entries, loop = (uint16_t)message->loop;
-    int64_t content_bytes = VECTOR + 8 * message->entries;
     datagram[0] = 'N';
     datagram[1] = 'A';
     datagram[2] = wire->encrypted ? ENCRYPTED_VERSION : VERSION;
@@ -116,6 +115,11 @@ int64_t noack_wire_encode(const noack_wire *wire, const noack_message *message, 
     memcpy(datagram + RUN, &wire->run_id, 8);
     memcpy(datagram + SEQUENCE, &message->sequence, 8);
     memcpy(datagram + TIME, &message->t_ns, 8);
+}
+
+int64_t noack_wire_encode(const noack_wire *wire, const noack_message *message, uint8_t *datagram) {
+    int64_t content_bytes = VECTOR + 8 * message->entries;
+    wire_header(wire, message, datagram);
     memcpy(datagram + VECTOR, message->vector, 8 * (size_t)message->entries);
     if (!wire->encrypted)
         noack_wire_tag(wire, content_bytes, datagram, datagram + content_bytes);
@@ -158,8 +162,7 @@ static int has_tag(const noack_wire *wire, const uint8_t *datagram, int64_t cont
     return ((tag[0] ^ found[0]) | (tag[1] ^ found[1])) == 0;
 }
 
-/* The tests of an authentic datagram. */
-static int64_t examine_content(
+int64_t wire_examine_message(
     const noack_reception *reception, int64_t from_peer, const noack_message *message) {
     if (!from_peer)
         return NOACK_BAD_SOURCE;
@@ -190,7 +193,7 @@ int64_t noack_wire_examine(
     memcpy(&message->sequence, datagram + SEQUENCE, 8);
     memcpy(&message->t_ns, datagram + TIME, 8);
     memcpy(message->vector, datagram + VECTOR, 8 * (size_t)message->entries);
-    return examine_content(reception, from_peer, message);
+    return wire_examine_message(reception, from_peer, message);
 }
 
 void noack_wire_count(noack_reception *reception, int64_t found, const noack_message *message) {

@@ -108,7 +108,7 @@ static int64_t release_due(noack_relay *relay, int64_t until_ns) {
             return NOACK_LEAVING_FULL;
         if (!has_room(relay, slot->size_bytes))
             return NOACK_EVENTS_FULL;
-        heap_pop(relay);
+        heap_pop(relay->heap, &relay->heap_length);
         relay->now_ns = max_of(relay->now_ns, entry.release_ns);
         relay->clients[slot->client].in_flight--;
         departure *leaving = &own->leaving[own->leaving_count];
@@ -201,7 +201,7 @@ static void release(
     const uint8_t *data = own->buffers[own->batch_next];
     int64_t release_ns = copy ? decision->copy_ns : decision->release_ns;
     int64_t bit = copy ? decision->copy_bit : decision->bit;
-    int counts = copy ? decision->bit >= 0 && bit < 0 : bit < 0;
+    int counts = is_first_intact(decision, copy);
     int delayed = release_ns > relay->now_ns;
     int64_t number = -1;
     if (delayed || bit >= 0)
@@ -216,9 +216,9 @@ static void release(
         slot->counts = (uint8_t)counts;
         slot->fate = (uint8_t)decision->fate;
         relay->put++;
-        /* At equal times, datagrams leave in order of direction, then of arrival. */
-        int64_t order = ((direction & 1) << 62) + relay->put;
-        heap_push(relay, (noack_heap_entry){release_ns, order, number});
+        int64_t order = departure_order(direction & 1, relay->put);
+        noack_heap_entry entry = {release_ns, order, number};
+        heap_push(relay->heap, &relay->heap_length, entry);
         relay->clients[client].in_flight++;
         return;
     }

@@ -71,8 +71,6 @@ uint8_t *block_address(const noack_relay *relay, int64_t block);
 int64_t store_payload(noack_relay *relay, const uint8_t *data, int64_t size_bytes, int64_t bit);
 void copy_payload(const noack_relay *relay, int64_t slot, uint8_t *into);
 void free_payload(noack_relay *relay, int64_t slot);
-void heap_push(noack_relay *relay, noack_heap_entry entry);
-void heap_pop(noack_relay *relay);
 
 /* clients.c */
 void touch_clients(noack_relay *relay);

@@ -40,6 +40,13 @@ SEQUENCES, TIMES_NS = 2**63, 2**62
 """Upper limits of sequence numbers and times: they fit the record's columns, and sums of times do
 too. At 100,000 messages a second, 2⁶³ take three million years."""
 _HEADER = struct.Struct("<2sBBHHQQq")
+HEADER_ROW = np.dtype(
+    [
+        ("magic", "S2"), ("version", "u1"), ("flow", "u1"), ("dimension", "<u2"), ("loop", "<u2"),
+        ("run_id", "<u8"), ("sequence", "<u8"), ("t_ns", "<i8"),
+    ]
+)  # fmt: skip
+"""The same as a row of an array."""
 HEADER_BYTES = _HEADER.size
 FLOW_OFFSET = 3
 MAX_DATAGRAM_BYTES = HEADER_BYTES + 8 * MAX_DIMENSION + TAG_BYTES
