@@ -24,8 +24,7 @@ from noack.protocol.record_tables import (
     NETEM_SETTING,
     PACKET_HEAD_BYTES,
 )
-from noack.runtime.address import Address
-from noack.runtime.address import packed_name
+from noack.runtime.address import Address, packed_name
 from noack.runtime.real_time_loop import RowSink
 
 _ROWS = 256

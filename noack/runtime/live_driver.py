@@ -7,13 +7,15 @@ rows is full, if users' code is to answer, and for each datagram that is encrypt
 
 import socket
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 
 from noack.core.clock import RunClock
 from noack.core.core_library import core, ffi
+from noack.machines.loop_machines import LoopMachines
 from noack.protocol.datagram_seal import TAG_BYTES
+from noack.protocol.topology import ENDS, RECEIVES, SENDS, receiver_of, sender_to
 from noack.protocol.wire_format import (
     HEADER_BYTES,
     Flow,
@@ -23,12 +25,54 @@ from noack.protocol.wire_format import (
     rejected_of,
 )
 from noack.runtime.address import Address, SocketName, packed_name
-from noack.runtime.loop_machines import LoopMachines
+from noack.runtime.process_life import RunProcess
 from noack.runtime.real_time_loop import RecordSink
 from noack.runtime.udp_sockets import CountingSocket, errors_by_text
 
 _AT_ONCE_NS = -(2**63)
 """Do what is due, and do not wait."""
+
+
+def run_machines(process: RunProcess, machines: LoopMachines) -> None:
+    """Join the run, drive the machines of all loops to the horizon, and report.
+
+    Raises:
+        CallerError: the process's port is taken.
+        PeerError: the run never started, or the system refused a socket for a peer.
+    """
+    driver = LiveDriver(
+        machines, process.wire, admitted_ns=process.admitted_ns, spin_ns=process.spin_ns,
+        rest_ns=process.rest_ns,
+    )  # fmt: skip
+    with process.open_socket() as endpoint:
+        addresses = process.join(endpoint.getsockname()[:2])
+        channel = LoopChannel(
+            endpoint, driver, SENDS[process.role], by_loop=process.loop_count is not None,
+            **_ends(process, addresses),
+        )  # fmt: skip
+        process.run(driver, channel, machines)
+
+
+class _Ends(TypedDict):
+    """The other ends of a process's flows; see :class:`LoopChannel`."""
+
+    source: Address
+    destination: Address
+    acknowledged_by: Address | None
+    acknowledges_to: Address | None
+
+
+def _ends(process: RunProcess, addresses: Mapping[str, Address]) -> _Ends:
+    role, network, answer = process.role, process.scenario.network.flows, Flow.ACKNOWLEDGEMENT
+    answers = answer in network
+    return {
+        "source": addresses[sender_to(role, RECEIVES[role], network)],
+        "destination": addresses[receiver_of(role, SENDS[role], network)],
+        "acknowledged_by": (
+            addresses["netem"] if answers and role == ENDS[answer].receiver else None
+        ),
+        "acknowledges_to": addresses["netem"] if answers and role == ENDS[answer].sender else None,
+    }
 
 
 class LiveDriver:

@@ -152,7 +152,8 @@ class RunProcess:
     @cached_property
     def loops(self) -> Sequence[Scenario]:
         """The resolved scenario of each loop."""
-        return resolved_loops(self.scenario)
+        run = self.scenario  # which is resolved
+        return (run,) if run.loops is None else resolved_loops(run)
 
     @property
     def wire(self) -> Wire:

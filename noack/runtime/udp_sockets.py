@@ -5,7 +5,6 @@ import os
 import socket
 import struct
 from abc import ABC, abstractmethod
-from collections import Counter
 from collections.abc import Mapping, Sequence
 
 from noack.core.errors import CallerError, PeerError
@@ -19,7 +18,7 @@ _UNKNOWN_BYTES = 128 * 1024
 """Receive buffer for datagrams from unknown sources; the kernel doubles it. It holds about 300
 datagrams, as many as are read between two turns of housekeeping."""
 _READ_AT_ONCE = 4096
-"""Datagrams of that buffer read in one turn, and at the end: all of them, unless a flood goes on."""
+"""Datagrams of that buffer read in one turn, and at the end: all, unless a flood goes on."""
 _SO_MEMINFO = 55
 _MEMINFO_WORDS = 9
 _MEMINFO_DROPS = 8

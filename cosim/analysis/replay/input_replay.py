@@ -17,6 +17,7 @@ from netem.channel import NO_TIME_NS, Channel
 from noack.config.parameter_changes import ParameterChange, settings_of
 from noack.core.core_library import core, ffi, pointer_to
 from noack.core.errors import CallerError
+from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import Record
 from noack.protocol.record_tables import (
     CONTROLLER_STEP,
@@ -31,7 +32,6 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import RECEIVES
 from noack.protocol.wire_format import Flow
-from noack.runtime.loop_machines import LoopMachines
 
 Numbers = NDArray[np.int64]
 

@@ -14,6 +14,7 @@ from cosim.record.run_record import RunRecord
 from netem.channel import Channel, channel_of
 from noack.config.loops import loops_of
 from noack.config.scenario import Scenario
+from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import GENERATION, Start
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -21,7 +22,6 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import SENDS
 from noack.protocol.wire_format import Flow
-from noack.runtime.loop_machines import LoopMachines
 from plant_server.plant import plant_of
 from sensor_node.sensor import sensor_of
 
