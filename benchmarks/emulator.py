@@ -13,8 +13,8 @@ from contextlib import closing, suppress
 
 from benchmarks._report import Benchmark, Goal, Peer, Row, median, say
 from cosim.cli import find_scenario
+from netem.channel import channel_of
 from netem.engine.run_network import RunNetwork
-from netem.link_machine import update_link_of
 from netem.run_relay import CoreShell, RelayShell
 from noack.config.resolution import resolve, tables_of
 from noack.config.scenario_file import load
@@ -57,13 +57,15 @@ class Loop:
 
     def python(self) -> tuple[RelayShell, Relay]:
         """Open the emulator that is driven from Python, as by :mod:`.real_time_loop`."""
-        link, shell = update_link_of(self.scenario), RelayShell(self.endpoint, self.ways)
+        channel, shell = channel_of(self.scenario), RelayShell(self.endpoint, self.ways)
 
         def relay(count: int) -> None:
-            while link.counters.received < count:
+            while channel.links[0].counters.received < count:
                 readable, _, _ = select.select(shell.watched, (), (), 0.001)
                 message = shell.receive(readable[0]) if readable else None
-                for output in () if message is None else link.handle(message, self.clock.now_ns()):
+                if message is None:
+                    continue
+                for output in channel.handle(message, self.clock.now_ns()):
                     if isinstance(output, Record):
                         self.telemetry.append(output)
                     else:

@@ -21,7 +21,7 @@ from benchmarks._report import Benchmark, Goal, MeasurementError, Peer, Row, say
 from benchmarks._stolen_time import StolenTime, began_s, worst_p99_us
 from benchmarks.soak.watch import Processes
 from cosim.record.run_directory import LATEST, LOOPS, SUMMARY_FILE, read_object
-from cosim.simulation.shared_network import simulate_loops
+from cosim.simulation.virtual_time import simulate_loops
 from noack.config.scenario_file import load
 from noack.protocol.topology import LOOP_ROLES, WITH_DEADLINES
 

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from benchmarks._loss_check import Limits, outcomes_of, violations
 from benchmarks._report import Benchmark, Goal, Rounds, Row, say
-from netem.link_machine import Link
 from netem.link_state import LinkState
 from netem.words.words_to_settings import settings_of
 from noack.impairments.kept_loss import expected_loss
@@ -80,9 +79,11 @@ def speed_row(words: str = "loss 50% mansd 4") -> Row:
     say(f"speed of decisions, {words}")
     decider, link, rounds = (
         Decider(words),
-        Link(settings_of(words), 7, "relay", "forward"),
+        LinkState(settings_of(words), 7, "relay", "forward"),
         Rounds(),
     )
+
+    link.start_flow(0, 0)
 
     def decide_one_by_one() -> None:
         for _ in range(_BATCH // 20):

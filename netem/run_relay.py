@@ -8,8 +8,8 @@ datagrams leave from the port at which they arrived.
 import socket
 from collections.abc import Sequence
 
+from netem.channel import Datagram
 from netem.engine.run_network import RunNetwork
-from netem.link_machine import Datagram
 from noack.core.clock import RunClock
 from noack.protocol.wire_format import loop_number
 from noack.runtime.address import Address, SocketName
@@ -23,7 +23,7 @@ class NetworkChannel(CountingSocket):
     Args:
         endpoint: the process's socket.
         ways: source and destination of each direction.
-        network: the network; a datagram's flow is that of :mod:`netem.duplex_link`.
+        network: the network; a datagram's flow is that of :mod:`netem.channel`.
         clock: the run's clock.
         spin_ns: busy-wait for this time before a departure.
         loops: number of loops; None in a run of one loop without numbers.

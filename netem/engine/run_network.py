@@ -1,6 +1,6 @@
 """The network of a run, which itself waits for, receives and sends datagrams.
 
-It decides as :mod:`netem.link_machine` does, which replays its record: both call the core
+It decides as :mod:`netem.channel` does, which replays its record: both call the core
 (native/link.c), and both number these calls.
 """
 
@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from netem.channel import Datagram, at_start, due_settings, link_name
 from netem.engine.relay_memory import PACKET_ROW, Array, RelayDirection, RelayMemory, name_array
 from netem.engine.relay_sockets import stamp_arrivals
-from netem.link_machine import Datagram, at_start, due_settings, link_name
 from noack.config.parameter_changes import ChangeSchedule, ParameterChange
 from noack.config.scenario import Scenario
 from noack.core.clock import RunClock
@@ -117,7 +117,7 @@ class RunNetwork:
         return self._relay.heap[0].release_ns if self._relay.heap_length else None
 
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
-        """Accept a change; see :meth:`netem.link_machine.Link.announce`."""
+        """Accept a change; see :meth:`netem.channel.Channel.announce`."""
         outputs = self._schedule.announce(
             NETEM_SETTING, change, self._relay.inputs, now_ns, self._reached_ns
         )

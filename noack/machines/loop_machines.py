@@ -22,7 +22,7 @@ from noack.protocol.wire_format import Flow, Message
 
 Rows = NDArray[np.void]
 
-_ROWS = 1024
+_ROWS, _ROWS_OF_A_LOOP, _MOST_ROWS = 1024, 256, 16_384
 _NOTES = 256
 
 
@@ -33,7 +33,7 @@ class LoopMachines:
         parts: the machine of each loop.
         phases_ns: when each loop begins, in the run's time; by default 0.
         numbered: whether rows begin with the number of their loop.
-        rows: rows of each table until they must be taken.
+        rows: rows of each table until they must be taken; by default as many as suit the loops.
 
     Raises:
         ValueError: the core refuses a machine's numbers.
@@ -45,7 +45,7 @@ class LoopMachines:
         phases_ns: Sequence[int] | None = None,
         *,
         numbered: bool = False,
-        rows: int = _ROWS,
+        rows: int | None = None,
     ) -> None:
         self.parts = tuple(parts)
         self.role = self.parts[0].role
@@ -59,7 +59,8 @@ class LoopMachines:
         self._message = ffi.new("noack_message *")
         self._notes = np.zeros(_NOTES, dtype_of("noack_note"))
         self._tables: dict[int, Rows] = {}
-        self._fill_tables(rows)
+        most = min(_ROWS_OF_A_LOOP * len(self.parts), _MOST_ROWS)
+        self._fill_tables(rows or max(_ROWS, most))
         wrong = core.noack_process_check(self.core)
         if wrong != ffi.NULL:
             raise ValueError(f"{self.role.name}: {ffi.string(wrong).decode()}")

@@ -31,7 +31,9 @@ def test_links_of_any_numbers_are_refused_or_run_clean() -> None:
 
 
 def test_any_datagrams_are_read_clean() -> None:
-    run_tests("tests/fuzz/test_parsers.py", "tests/noack/protocol/test_wire_format.py", "-k", "wire")
+    run_tests(
+        "tests/fuzz/test_parsers.py", "tests/noack/protocol/test_wire_format.py", "-k", "wire"
+    )
 
 
 def test_the_live_driver_runs_clean() -> None:

@@ -18,8 +18,6 @@ from cosim.record.align import align_tables, identity_residual
 from cosim.record.recorded_changes import changes_of
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import Gathered, Shuttle, _report, simulate
-from netem.duplex_link import network_of
-from netem.link_machine import Datagram, update_link_of
 from noack.config.parameter_changes import ParameterChange
 from noack.config.resolution import loop_of, resolve, tables_of
 from noack.config.scenario import Scenario
@@ -41,6 +39,7 @@ from noack.protocol.wire_format import Flow, Message
 from plant_server.plant import plant_of
 from sensor_node.sensor import sensor_of
 from tests.cosim.record.changed_records import changed
+from tests.oracles.link import Datagram, network_of, update_link_of
 
 MS = 1_000_000
 SCENARIOS = Path(__file__).parents[3] / "scenarios"

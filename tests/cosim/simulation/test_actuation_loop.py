@@ -13,8 +13,7 @@ from cosim.analysis.loss_statistics import from_controller, unintended_losses
 from cosim.analysis.replay import replay
 from cosim.record.packet_outcomes import packet_outcomes
 from cosim.record.run_record import RunRecord
-from cosim.simulation.shared_network import simulate_loops
-from cosim.simulation.virtual_time import simulate
+from cosim.simulation.virtual_time import simulate, simulate_loops
 from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load, validate

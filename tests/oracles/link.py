@@ -1,21 +1,22 @@
-"""One direction of a link as a state machine: datagrams in, surviving datagrams out, maybe later.
+"""The network of a run in plain Python: datagrams in, surviving datagrams out, maybe later.
 
-It does not interpret payloads. The core decides (native/link.c): in a run of the loop, in
-simulation, in replay, and in the relay.
+The core decides for each packet (native/link.c). What follows from the decisions is stated here
+once more, for native/channel.c: rows, copies, flipped bits, and the order of departures.
 """
 
 import heapq
-from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from netem.channel import UPDATE_LINK, Datagram, at_start, due_settings, flipped, link_name
 from netem.link_state import LinkState
-from noack.config.parameter_changes import ChangeSchedule, ParameterChange
+from noack.config.parameter_changes import ChangeSchedule, FixedMachine, ParameterChange
 from noack.config.scenario import Scenario
 from noack.impairments.link_records import NEVER_NS, Counters, RecordedDecision
 from noack.impairments.link_settings import LinkSettings
-from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
+from noack.protocol.machine_interface import BEGINNING, Machine, Notice, Record, Start
 from noack.protocol.record_tables import (
     NETEM_PACKET,
     NETEM_RELEASE,
@@ -23,24 +24,6 @@ from noack.protocol.record_tables import (
     PACKET_HEAD_BYTES,
     Fate,
 )
-from noack.protocol.wire_format import Flow
-
-
-def link_name(flow: Flow) -> str:
-    """Return the name of the link of a flow; part of its random streams' names."""
-    return flow.name.lower()
-
-
-UPDATE_LINK = link_name(Flow.UPDATE)
-
-
-class Datagram(NamedTuple):
-    """A datagram of a flow; flows are numbered in the order of their first datagrams."""
-
-    flow: int
-    data: bytes
-    arrival_ns: int = 2**62
-    """Arrival at the socket, for the record; later than its handling: unknown."""
 
 
 class _InFlight(NamedTuple):
@@ -54,6 +37,9 @@ class _InFlight(NamedTuple):
     """Whether it is the datagram's first intact copy."""
     delayed: bool
     datagram: Datagram
+
+
+T = TypeVar("T", bound=Any)
 
 
 class Link:
@@ -204,13 +190,6 @@ class Link:
         )
 
 
-def flipped(data: bytes, bit: int) -> bytes:
-    """Return the data with one bit flipped; bit 0 is the least significant bit of byte 0."""
-    changed = bytearray(data)
-    changed[bit // 8] ^= 1 << (bit % 8)
-    return bytes(changed)
-
-
 def update_link_of(resolved: Scenario, start: Start = BEGINNING) -> Link:
     """Return the link from sensor to controller of a resolved scenario."""
     schedule = ChangeSchedule(resolved, lambda one: one.network.link)
@@ -229,26 +208,70 @@ def link_of(
     )  # fmt: skip
 
 
-def at_start(settings: LinkSettings, name: str, start: Start) -> tuple[LinkSettings, list[str]]:
-    """Return the settings of a link of a run, and the names of its random streams.
+class Duplex(FixedMachine):
+    """The machine of a network with a direction from the controller.
 
-    A restarted emulator does not know the losses before. Therefore its first datagrams pass
-    (see :class:`netem.link_state.LinkState`), and later ones are drawn from other random streams
-    than before.
+    If the forward direction is a link with a schedule of changes, its settings may change.
     """
-    if not start.is_restart:
-        return settings, [name]
-    settings = settings.model_copy(update={"first_delivered": True})
-    return settings, [name, f"again-{start.generation}"]
+
+    def __init__(
+        self,
+        forward: Machine[Datagram],
+        reverse: Machine[Datagram],
+        *,
+        first_number: int = 0,
+        loops: int = 1,
+    ) -> None:
+        self._links = (forward, reverse)
+        self._loops = loops
+        self._inputs = first_number
+
+    def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
+        """Accept a change of the forward direction; see :class:`Link`."""
+        forward = self._links[0]
+        if not isinstance(forward, Link):
+            return super().announce(change, now_ns)
+        return self._numbered(forward.announce(change, now_ns))
+
+    def next_deadline_ns(self) -> int | None:
+        """Time of the next departure in either direction; None: nothing is in flight."""
+        due = (link.next_deadline_ns() for link in self._links)
+        return min((t_ns for t_ns in due if t_ns is not None), default=None)
+
+    def on_timer(self, now_ns: int) -> Sequence[Datagram | Record | Notice]:
+        """Forward the datagram that is due; if one is due in each direction, the forward one."""
+        next_ns = self.next_deadline_ns()
+        link = next(link for link in self._links if link.next_deadline_ns() == next_ns)
+        return self._numbered(link.on_timer(now_ns))
+
+    def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
+        """Process a datagram; return it if it is neither lost nor delayed."""
+        if not 0 <= message.flow < 2 * self._loops:
+            raise ValueError(f"a network of two directions has no flow {message.flow}")
+        if isinstance(forward := self._links[0], Link):
+            forward.reach(now_ns)  # a change is due for both directions at the same datagram
+        return self._numbered(self._links[message.flow // self._loops].handle(message, now_ns))
+
+    def _numbered(self, outputs: Sequence[T]) -> list[T]:
+        """Number the inputs of both directions in one sequence; an input produces one row."""
+        number, self._inputs = self._inputs, self._inputs + 1
+        return [
+            output._replace(row=(number, *output.row[1:])) if isinstance(output, Record) else output
+            for output in outputs
+        ]
 
 
-def due_settings(
-    schedule: ChangeSchedule, present: LinkSettings, now_ns: int
-) -> Iterator[LinkSettings]:
-    """Yield the settings that replace the present ones before a datagram that arrives now."""
-    while (change := schedule.take(now_ns)) is not None:
-        first = present.first_delivered  # a restarted emulator has its own value
-        settings = change.prepared.model_copy(update={"first_delivered": first})
-        if settings != present:
-            present = settings
-            yield settings
+def network_of(
+    resolved: Scenario,
+    start: Start = BEGINNING,
+    forward: Machine[Datagram] | None = None,
+    loops: int = 1,
+) -> Machine[Datagram]:
+    """Return the network of a resolved scenario; ``forward`` replaces the link of the updates."""
+    forward = update_link_of(resolved, start) if forward is None else forward
+    _, *others = resolved.network.flows
+    if not others:
+        return forward
+    settings, name = resolved.network.link_of(others[0]), link_name(others[0])
+    reverse = link_of(settings, resolved.seeds.loss, name, start)
+    return Duplex(forward, reverse, first_number=start.first_number, loops=loops)
