@@ -1,8 +1,8 @@
 """A bare UDP ping through a bare relay, in C: the one-way latency of the kernel without noack.
 
 Three minimal processes (``ping.c``): a sender that sleeps until each datagram is due, a relay with
-two sockets, and a receiver. Relay and receiver block in ``recv``; the receiver reads the clock right
-after it.
+two sockets, and a receiver. Relay and receiver block in ``recv``; the receiver reads the clock
+right after it.
 """
 
 import argparse

@@ -637,6 +637,10 @@ typedef struct { /* noack.core.clock: simulated time since the run's epoch */
 /* The simulated time at a reading of this host's monotonic clock. */
 int64_t noack_clock_at_ns(const noack_clock *clock, int64_t own_ns);
 
+/* How long to wait on this host until simulated_ns has passed, or a little less, at any rate of the
+   clock. */
+int64_t noack_clock_wait_ns(const noack_clock *clock, int64_t simulated_ns);
+
 /* ---- The wire format (docs/wire.md) ------------------------------------------------------------ */
 
 enum {

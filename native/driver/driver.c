@@ -236,7 +236,7 @@ static int64_t do_ticks(noack_driver *driver) {
 /* Wall time until the next tick, or a little less; INT64_MAX: there is none. */
 static int64_t next_tick_ns(const noack_driver *driver, int64_t now_ns) {
     int64_t due_ns = noack_process_due_ns(driver->process);
-    return due_ns == INT64_MAX ? INT64_MAX : wait_ns_of(&driver->clock, due_ns - now_ns);
+    return due_ns == INT64_MAX ? INT64_MAX : noack_clock_wait_ns(&driver->clock, due_ns - now_ns);
 }
 
 /* Sleep until a socket has datagrams, a tick is near, or for wait_ns. Return the sockets to read as
@@ -304,10 +304,10 @@ int64_t noack_drive(noack_driver *driver, int64_t until_ns) {
         if (until_ns == INT64_MIN)
             return NOACK_DRIVEN;
         int64_t now_ns = run_time_ns(&driver->clock), tick_ns = next_tick_ns(driver, now_ns);
-        int64_t wait_ns = wait_ns_of(&driver->clock, until_ns - now_ns);
+        int64_t wait_ns = noack_clock_wait_ns(&driver->clock, until_ns - now_ns);
         if (now_ns >= until_ns) {
             if (tick_ns > QUIET_NS
-                || wait_ns_of(&driver->clock, now_ns - until_ns) >= MOST_PUT_OFF_NS)
+                || noack_clock_wait_ns(&driver->clock, now_ns - until_ns) >= MOST_PUT_OFF_NS)
                 return NOACK_DRIVEN;
             wait_ns = QUIET_NS;
         }

@@ -53,9 +53,9 @@ class RelayMemory:
         self.core: Any = ffi.new("noack_relay *", {
             "links": links, "epoll": self._epoll.fileno(), "clock": {"speed": 1.0},
             "change_ns": 2**63 - 1, "segment": segment, "segment_below": 2**16, "taps": taps,
-            "records": row_count > 0, "directions": self.directions, "event_count": len(self.events),
-            "data_bytes": len(self.data), "row_count": row_count, "free_slot": -1,
-            "free_block": -1,
+            "records": row_count > 0, "directions": self.directions,
+            "event_count": len(self.events), "data_bytes": len(self.data),
+            "row_count": row_count, "free_slot": -1, "free_block": -1,
         })  # fmt: skip
         """The relay, as the core's functions take it: a ``noack_relay``."""
         first = (self._scratch.ctypes.data + 63) // 64 * 64
