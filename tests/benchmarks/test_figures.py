@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from benchmarks import __main__ as all_benchmarks
-from benchmarks import demo_run, emulator, lateness, long_run, machines, plants, startup
+from benchmarks import demo_run, lateness, long_run, machines, plants, startup
 from benchmarks._report import MeasurementError, Rounds
 from benchmarks._runs import Line, execute, first_step_s
 from benchmarks._ticks import LOOPS
@@ -145,23 +145,3 @@ def test_a_plant_step_is_compared_with_its_period_and_a_linear_plant() -> None:
         assert p99.value is not None
         assert p50.value <= p99.value
         assert share.value == pytest.approx(p99.value / 20)  # per cent of a period of 2 ms
-
-
-@pytest.mark.parametrize("kind", ["core", "python"])
-def test_an_emulator_relays_and_records_every_datagram_of_the_bursts(
-    kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    reports, buffers = [], []
-    close, flush = emulator.RelayShell.close, emulator.TelemetryBuffer.flush
-    monkeypatch.setattr(
-        emulator.RelayShell, "close", lambda one: (reports.append(one.report()), close(one))
-    )
-    monkeypatch.setattr(
-        emulator.TelemetryBuffer, "flush", lambda one: (flush(one), buffers.append(one))
-    )
-    monkeypatch.setattr(emulator, "BURSTS", 2)
-    assert emulator.cpu_us(kind) > 0
-    assert sum(reports[0]["received_from"].values()) == 2 * emulator.BURST
-    assert 0 < reports[0]["sent"] < 2 * emulator.BURST
-    published = buffers[-1].totals()["netem_packet"]
-    assert published >= 2 * emulator.BURST - 256  # the rest is not yet a batch
