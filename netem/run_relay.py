@@ -67,16 +67,12 @@ class NetworkChannel(CountingSocket):
             for record in self._network.handle(message, max(now_ns, 0)):
                 sink.append(record)
 
-    def finish(self, now_ns: int, sink: RecordSink) -> None:
-        """Read the datagrams that still wait; add those that the network has received."""
-        super().finish(now_ns, sink)
-        for source, direction in self._directions.items():
-            received = self._network.received[direction] - self._passed_on[direction]
-            self._sources.add(source, received)
-
     def report(self) -> dict[str, object]:
         """Return the counters for the run's summary."""
         network = self._network
+        for source, direction in self._directions.items():
+            received = network.received[direction] - self._passed_on[direction]
+            self.count_received(source, received)
         rejected = {
             "source": self._foreign + network.refused, "loop": self._of_no_loop + network.of_no_loop
         }  # fmt: skip

@@ -169,8 +169,8 @@ class RunNetwork:
     @property
     def send_errors(self) -> Sequence[int]:
         """Numbers of datagrams that could not be sent or stored, by errno."""
-        counts: list[int] = sum(one.counts_of("errors") for one in self._directions).tolist()
-        return counts
+        counts = np.sum([one.counts_of("errors") for one in self._directions], axis=0)
+        return [int(count) for count in counts]
 
     def _drive(self, until_ns: int) -> int:
         """Relay until the core returns, and do what it needs; return the reason."""

@@ -268,16 +268,13 @@ class LoopChannel(CountingSocket):
         """Pass a datagram to the driver, which rejects all but those of the peers."""
         self._driver.take(data, source, sink)
 
-    def finish(self, now_ns: int, sink: RecordSink) -> None:
-        """Read the datagrams that still wait; add those that the driver has received."""
-        super().finish(now_ns, sink)
-        for peer, address in zip(self._driver.core.sources, self._expected, strict=False):
-            self._sources.add(address, peer.received)
-        self._sources.more += self._driver.core.foreign
-
     def report(self) -> dict[str, object]:
         """Counters, for the run's summary."""
         driver, own = self._driver, self._driver.core
+        for peer, address in zip(own.sources, self._expected, strict=False):
+            self.count_received(address, peer.received)
+        self._sources.add_others(own.foreign)
+        own.foreign = 0
         rejected = {reason.value: n for reason, n in driver.rejected.items()}
         return super().report() | {
             "sent": own.sent,

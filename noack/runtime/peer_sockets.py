@@ -140,8 +140,7 @@ class SourceCount:
     def __init__(self, peers: Iterable[Address] = ()) -> None:
         self._peers = dict.fromkeys(peers, 0)
         self._others: Counter[Address] = Counter()
-        self.more = 0
-        """Datagrams of other sources that have no count of their own."""
+        self._more = 0
         self._last: Address | None = None
         self._run = 0
 
@@ -153,13 +152,17 @@ class SourceCount:
         self._fold()
         self._last, self._run = source, datagrams
 
+    def add_others(self, datagrams: int) -> None:
+        """Count datagrams of sources that are not named."""
+        self._more += datagrams
+
     def report(self) -> dict[str, int]:
         """Datagrams by source; the rare sources together are ``others``."""
         self._fold()
         self._forget(_REPORTED_SOURCES)
         named = [*self._peers.items(), *self._others.most_common()]
         found = {text_of(source): n for source, n in named if n}
-        return found | ({"others": self.more} if self.more else {})
+        return found | ({"others": self._more} if self._more else {})
 
     def _fold(self) -> None:
         if self._last is None:
@@ -175,5 +178,5 @@ class SourceCount:
     def _forget(self, most: int) -> None:
         """Keep the ``most`` frequent sources: forged ones must not fill the memory."""
         kept = Counter(dict(self._others.most_common(most)))
-        self.more += self._others.total() - kept.total()
+        self._more += self._others.total() - kept.total()
         self._others = kept

@@ -207,11 +207,11 @@ class RunProcess:
         reached_ns: int | None = None
         try:
             reached_ns = self._drive(driver, channel, machine, telemetry)
+            channel.finish(self.clock.now_ns(), telemetry)
         except BaseException as error:
             self.fail(error)
             raise
         finally:
-            channel.finish(self.clock.now_ns(), telemetry)
             telemetry.flush()
             by_loop = telemetry.totals_by_loop()
             self.report = {

@@ -5,6 +5,7 @@ import os
 import socket
 import struct
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 from noack.core.errors import CallerError, PeerError
@@ -100,6 +101,7 @@ class CountingSocket(ABC):
             raise PeerError("the system refused to open a socket for each peer")
         endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _UNKNOWN_BYTES)
         self._flood, self._sources = FloodWatch(), SourceCount(peers)
+        self._counted: Counter[Address] = Counter()
         self._begins = True
 
     @abstractmethod
@@ -132,6 +134,11 @@ class CountingSocket(ABC):
             self._flood.left -= 1
         self.take(data, source, now_ns, sink)
         return True
+
+    def count_received(self, source: Address, total: int) -> None:
+        """Note how many datagrams the core has received from a peer so far."""
+        self._sources.add(source, total - self._counted[source])
+        self._counted[source] = total
 
     def report(self) -> dict[str, object]:
         """Counters, for the run's summary."""
