@@ -632,6 +632,10 @@ typedef struct { /* noack.core.clock: simulated time since the run's epoch */
 /* The simulated time at a reading of this host's monotonic clock. */
 int64_t noack_clock_at_ns(const noack_clock *clock, int64_t own_ns);
 
+/* How long to wait on this host until simulated_ns has passed, or a little less, at any rate of the
+   clock. */
+int64_t noack_clock_wait_ns(const noack_clock *clock, int64_t simulated_ns);
+
 /* ---- The wire format (docs/wire.md) ------------------------------------------------------------ */
 
 enum {
@@ -686,6 +690,61 @@ int64_t noack_wire_examine(
 
 /* Count a datagram as accepted or rejected. */
 void noack_wire_count(noack_reception *reception, int64_t found, const noack_message *message);
+
+/* ---- The live driver: waits, receives, drives the machines of a process, sends ------------------- */
+
+enum noack_driver_reason { /* why noack_drive returned; after what Python does, it is called again */
+    NOACK_DRIVEN,          /* the time has come, or a signal: housekeeping */
+    NOACK_DRIVER_ROWS,     /* a table of rows or notes must be emptied */
+    NOACK_DRIVER_QUESTION, /* a machine asks; question says what */
+    NOACK_DRIVER_OPEN,     /* decrypt the datagram in place; set opened */
+    NOACK_DRIVER_SEAL,     /* encrypt the datagram in place, and write its tag */
+    NOACK_DRIVER_NOTHING   /* within the driver only */
+};
+
+enum noack_opened { NOACK_NOT_OPENED, NOACK_OPENED, NOACK_NOT_AUTHENTIC };
+
+typedef struct { /* the other end of a flow */
+    int64_t name_bytes; /* 0: there is none */
+    uint8_t name[32];
+    int64_t received; /* datagrams from this address */
+} noack_peer;
+
+typedef struct { /* place 0 is the flow of every run, place 1 that of the acknowledgements */
+    noack_process *process;
+    noack_wire wire;
+    noack_clock clock;
+    int64_t spin_ns; /* time before a tick in which it does not sleep */
+    int64_t rest_ns; /* if a tick is nearer after others, it sleeps so long, to do several at once */
+    int64_t receiver_count;
+    int64_t receivers[2]; /* sockets; the first is read first */
+    int64_t sender;       /* socket, not connected */
+    noack_peer sources[2], destinations[2];
+    int64_t foreign; /* datagrams from other addresses */
+    int64_t sent;
+    int64_t errors[256]; /* datagrams that could not be sent, by errno */
+    int64_t question;    /* a noack_question */
+    int64_t opened;      /* a noack_opened, of the datagram: */
+    uint8_t *datagram;
+    int64_t datagram_bytes;
+    void *scratch; /* noack_driver_scratch_bytes() bytes, which are 0 at first */
+} noack_driver;
+
+int64_t noack_driver_scratch_bytes(void);
+
+/* Return NULL, or what is wrong with the numbers of a driver; its process has been checked. */
+const char *noack_driver_check(const noack_driver *driver);
+
+/* Prepare the scratch. */
+void noack_driver_open(noack_driver *driver);
+
+/* Work until a time of the run, or until Python is needed; return a noack_driver_reason. After
+   until_ns it goes on for a while if a tick is near. INT64_MIN: do what is due, and do not wait. */
+int64_t noack_drive(noack_driver *driver, int64_t until_ns);
+
+/* Add a datagram as if it had just been received. The driver must have driven all others. */
+void noack_driver_add_datagram(
+    noack_driver *driver, const uint8_t name[32], const uint8_t *data, int64_t size_bytes);
 
 /* ---- The relay: waits for, receives, decides, sends ------------------------------------------ */
 

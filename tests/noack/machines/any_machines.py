@@ -1,5 +1,6 @@
 """Random machines with every kind of setting: the same numbers make the same machine."""
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 from controller_node.controller import Controller
 from noack.controllers.controller_settings import ControlFailedError
 from noack.controllers.linear_feedback import LinearFeedback
+from noack.core.core_library import core, ffi
 from noack.core.linear_systems import Matrix, Vector, norm
 from noack.core.ordered_arithmetic import product
 from noack.impairments.loss_guarantee import (
@@ -319,3 +321,22 @@ def _plain(output: Output, numbered: bool) -> Any:
         return output.flow, output.sequence, output.t_ns, output.vector.tobytes()
     row = output.row[numbered:]
     return output.table, [np.asarray(entry).tobytes() for entry in row]
+
+
+def text_of(own: LoopMachines) -> str | None:
+    """What the core refuses; None if nothing."""
+    text = core.noack_process_check(own.core)
+    return None if text == ffi.NULL else ffi.string(text).decode()
+
+
+def set_number(own: LoopMachines, path: str, value: Any) -> None:
+    """Set a field of the process or, if it has none of that name, of its machine."""
+    first, *_ = re.split(r"[.\[]", path)
+    owner = own.core if hasattr(own.core, first) else own.machines[0]
+    *way, last = re.findall(r"\w+", path)
+    for name in way:
+        owner = owner[int(name)] if name.isdigit() else getattr(owner, name)
+    if last.isdigit():
+        owner[int(last)] = value
+    else:
+        setattr(owner, last, value)
