@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from noack.config.parameter_changes import ChangeSchedule
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, LossHistory, LossRule
-from noack.protocol.machine_interface import GENERATION, Notice
+from noack.protocol.machine_interface import Notice
 
 
 class LossCheck:
@@ -22,7 +22,7 @@ class LossCheck:
     def __init__(
         self, guarantee: LossGuarantee, schedule: ChangeSchedule | None, *, known_start: bool
     ) -> None:
-        self._schedule, self._phase_ns, self._follows = schedule, 0, False
+        self._schedule = schedule
         self._known_start = known_start
         self._guarantee = guarantee
         self._since_ns = 0
@@ -30,17 +30,18 @@ class LossCheck:
         self._history = LossHistory(self._further)
         self._newest_ns = 0
 
-    def follow(self, schedule: ChangeSchedule, phase_ns: int) -> None:
-        """Use announced changes whose times are those of the run; the loop begins at its phase."""
-        self._schedule, self._phase_ns, self._follows = schedule, phase_ns, True
-
     def reach(self, t_ns: int) -> None:
-        """Use the guarantee of the followed changes that is in force at a time of the loop."""
-        if self._schedule is not None and self._follows:
-            now = self._schedule.at(t_ns + self._phase_ns)
-            self.change(now.scenario.network.guarantee, now.since_ns - self._phase_ns)
+        """Use the guarantee that is in force at a time of the controller's model."""
+        if self._schedule is not None:
+            now = self._schedule.at(t_ns)
+            self._change(now.scenario.network.guarantee, now.since_ns)
 
-    def change(self, guarantee: LossGuarantee, since_ns: int) -> None:
+    @property
+    def counts_every_update(self) -> bool:
+        """Whether updates without a loss before them matter, too."""
+        return bool(self._further) or (self._schedule is not None and self._schedule.has_changes)
+
+    def _change(self, guarantee: LossGuarantee, since_ns: int) -> None:
         """Use another guarantee for what is sent from ``since_ns`` on."""
         if guarantee != self._guarantee:
             self._guarantee, self._since_ns = guarantee, since_ns
@@ -67,8 +68,7 @@ class LossCheck:
         """Compare with the largest limit in force since the update before."""
         allowed = _cap(self._guarantee)
         if losses > allowed and self._schedule is not None:
-            times_ns = newest_ns + self._phase_ns, now_ns + self._phase_ns
-            scenarios = self._schedule.between(*times_ns)
+            scenarios = self._schedule.between(newest_ns, now_ns)
             allowed = max(_cap(one.network.guarantee) for one in scenarios)
         if losses <= allowed:
             return ""
@@ -95,12 +95,6 @@ class LossCheck:
     @property
     def _longest(self) -> int:
         return max(window.packets for window in self._guarantee.windows)
-
-
-def lost_between(newest: int, sequence: int) -> int:
-    """The number of updates lost between two; losses before a restart of the sensor are unknown."""
-    restarted = sequence // GENERATION != newest // GENERATION
-    return sequence % GENERATION if restarted else sequence - newest - 1
 
 
 def _further(guarantee: LossGuarantee) -> tuple[LossRule, ...]:

@@ -500,6 +500,7 @@ typedef struct { /* sensor_node/sensor.py makes it */
     /* the question to the user's trigger, and its answer */
     double *x, *e_s;  /* (n,) the measured or estimated state; x_s - x */
     int64_t first;    /* 1: it starts at x first */
+    int64_t asked_ns; /* time of the measurement */
     int64_t event;
     double left, right;
     double *scratch; /* (4n + rows of the rule's longest matrix,) */

@@ -6,10 +6,10 @@ from functools import partial
 import numpy as np
 
 from noack.config.scenario import Scenario
-from noack.core.linear_systems import Matrix, Vector
+from noack.core.linear_systems import Matrix
 from noack.disturbances.disturbance_settings import Place, SignalSource
 
-_BLOCK = 256
+BLOCK = 256
 """Number of steps computed at once. A random value depends on its step's number only."""
 
 Signal = Callable[[range], Matrix]
@@ -17,22 +17,30 @@ Signal = Callable[[range], Matrix]
 
 
 class Disturbance:
-    """The sum of all disturbances at the input, and of all at the state."""
+    """The sum of all disturbances at the input, and of all at the state.
 
-    def __init__(self, at_input: list[Signal], at_state: list[Signal]) -> None:
-        self._parts = at_input, at_state
-        self._first = -1
-        self._d = self._w = np.zeros((0, 0))
+    Args:
+        at_input: disturbances of u.
+        at_state: disturbances of ẋ.
+        widths: their entries, m and n; 0 where there is no disturbance.
+    """
 
-    def __call__(self, step: int) -> tuple[Vector, Vector]:
-        """Return d, shape (m,), and w, shape (n,), of a step; shape (0,) without a disturbance."""
-        first = step - step % _BLOCK
-        if first != self._first:
-            self._first = first
-            steps = range(first, first + _BLOCK)
-            self._d, self._w = (_sum(signals, steps) for signals in self._parts)
-        # A slice is copied: its memory layout then equals that of a replay from another step.
-        return self._d[step - first].copy(), self._w[step - first].copy()
+    def __init__(
+        self, at_input: list[Signal], at_state: list[Signal], widths: tuple[int, int]
+    ) -> None:
+        self._parts, self.widths = (at_input, at_state), widths
+
+    def block(self, first: int) -> tuple[Matrix, Matrix]:
+        """Return d, shape (k, m), and w, (k, n), of the ``BLOCK`` steps from ``first`` on.
+
+        The shape is (k, 0) where there is no disturbance.
+        """
+        return self.values(range(first, first + BLOCK))
+
+    def values(self, steps: range) -> tuple[Matrix, Matrix]:
+        """Return d, shape (k, m), and w, (k, n), of some steps; see :meth:`block`."""
+        d, w = (_sum(signals, steps) for signals in self._parts)
+        return d, w
 
 
 def disturbance_of(resolved: Scenario) -> Disturbance | None:
@@ -44,7 +52,9 @@ def disturbance_of(resolved: Scenario) -> Disturbance | None:
         name = ("plant", "disturbance", str(number))
         source = SignalSource(resolved.timing.plant_period_ns, resolved.seeds.disturbance, name)
         signals[one.at].append(partial(one.signal, source=source))
-    return Disturbance(signals["input"], signals["state"])
+    n, m = resolved.model.dimensions
+    widths = m * bool(signals["input"]), n * bool(signals["state"])
+    return Disturbance(signals["input"], signals["state"], widths)
 
 
 def _sum(signals: list[Signal], steps: range) -> Matrix:

@@ -5,9 +5,7 @@ import numpy as np
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.random_streams import normals, uniforms
-
-_BLOCK = 256
-"""Number of measurements with noise computed at once."""
+from plant_server.disturbance_signal import BLOCK
 
 
 class MeasurementModel:
@@ -18,29 +16,17 @@ class MeasurementModel:
     """
 
     def __init__(self, C: Matrix | None, std: Vector, bound: Vector, seed: int) -> None:
-        self._C = C
-        self._std = std
-        self._bound = bound
-        self._seed = seed
-        self._noisy = bool(std.any() or bound.any())
-        self._first = -1
-        self._v = np.zeros((0, len(std)))
+        self.C = C
+        self._std, self._bound, self._seed = std, bound, seed
+        self.is_noisy = bool(std.any() or bound.any())
 
-    def __call__(self, x: Vector, number: int) -> Vector:
-        """Return y of a measurement, shape (p,)."""
-        y = x if self._C is None else self._C @ x
-        return y + self._noise(number) if self._noisy else y
-
-    def _noise(self, number: int) -> Vector:
-        first = number - number % _BLOCK
-        if first != self._first:
-            self._first = first
-            rows, width = range(first, first + _BLOCK), len(self._std)
-            name = ("plant", "measurement")
-            normal = normals(self._seed, *name, "normal", rows=rows, width=width)
-            unit = uniforms(self._seed, *name, "uniform", rows=rows, width=width)
-            self._v = self._std * normal + self._bound * (2.0 * unit - 1.0)
-        noise: Vector = self._v[number - first]
+    def noise(self, first: int, count: int = BLOCK) -> Matrix:
+        """Return v of the ``count`` measurements from number ``first`` on, (count, p)."""
+        rows, width = range(first, first + count), len(self._std)
+        name = ("plant", "measurement")
+        normal = normals(self._seed, *name, "normal", rows=rows, width=width)
+        unit = uniforms(self._seed, *name, "uniform", rows=rows, width=width)
+        noise: Matrix = self._std * normal + self._bound * (2.0 * unit - 1.0)
         return noise
 
 

@@ -1,158 +1,184 @@
 """The plant: a system on a time grid, under held inputs.
 
-At grid time t_k = k h the plant advances its system to t_k under the input held since t_{k−1}. Then
-it measures, and latches the newest actuation received; the input that is due of it is held until
-t_{k+1} (``input_buffer.py``). A late step has the same length h, and the plant catches up. The
-watchdog chooses the input when no actuation has been received for too long (``watchdog.py``). The
-scenario defines the system (``noack.plants``), its disturbance from t_k until t_{k+1}
-(``disturbance_signal.py``) and its measurement (``measurement.py``). If the system fails, x is NaN
+This file turns a scenario into the core's plant, whose steps are in native/loop/plant.c: at grid
+time t_k = k h the plant advances its system to t_k under the input held since t_{k−1}; then it
+measures, and latches the newest actuation received. The scenario defines the system
+(``noack.plants``), its disturbance from t_k until t_{k+1} (``disturbance_signal.py``), its
+measurement (``measurement.py``), and its watchdog (``watchdog.py``). If the system fails, x is NaN
 from then on, as in a plant that diverges, and a notice gives the reason.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
-from noack.core.linear_systems import Matrix, Vector
+from noack.core.core_library import core
+from noack.core.core_memory import CoreMemory, reals_at
+from noack.core.linear_systems import Matrix, discretise
+from noack.machines.loop_machines import LoopMachines
+from noack.machines.machine_parts import Role, set_machine
+from noack.plants.linear import LinearSystem
 from noack.plants.plant_settings import PlantStart
 from noack.plants.systems.plant_system import PlantSystem, SystemFailedError
-from noack.protocol.machine_interface import FAILED, Notice, Output, Record
-from noack.protocol.record_tables import PLANT_ACTUATION, PLANT_STEP
-from noack.protocol.wire_format import Flow, Message
-from plant_server.disturbance_signal import Disturbance, disturbance_of
-from plant_server.input_buffer import InputBuffer
+from noack.protocol.machine_interface import BEGINNING, FAILED, Notice, Start
+from noack.protocol.record_tables import NO_SEQUENCE, PLANT_ACTUATION, PLANT_STEP, RecordShape
+from noack.protocol.wire_format import Flow
+from plant_server.disturbance_signal import BLOCK, Disturbance, disturbance_of
 from plant_server.measurement import MeasurementModel, measurement_model_of
-from plant_server.watchdog import FALLBACK_NAMES, Fallback, PredictedInput, Watchdog, hold, zero
+from plant_server.watchdog import Watchdog, watchdog_notice, watchdog_of
+
+PLANT = Role("plant", "noack_plant", Flow.ACTUATION, (PLANT_STEP, PLANT_ACTUATION, None))
 
 
+@dataclass
 class Plant:
-    """The machine of the plant server.
+    """The plant of one loop.
 
     Args:
         system: the system to advance, at x(0).
-        watchdog: checks the age of the newest actuation.
+        inputs: m.
+        watchdog: what is applied if the newest actuation is too old.
         period_ns: step h.
         horizon_ns: no step is due after this time.
         measure_every: number of steps per measurement.
+        predictions: number of inputs of an actuation.
+        input_period_ns: time between them, the period of the controller.
         disturbance: is added to u and to ẋ; None if there is none.
         measuring: the measurement model; None if y = x.
         reports_inputs: whether a measurement also carries the inputs of the steps since the last
             measurement. These are the latched inputs, without the disturbance.
     """
 
-    def __init__(
-        self,
-        system: PlantSystem,
-        watchdog: Watchdog,
-        *,
-        period_ns: int,
-        horizon_ns: int,
-        measure_every: int = 1,
-        disturbance: Disturbance | None = None,
-        measuring: MeasurementModel | None = None,
-        reports_inputs: bool = False,
-    ) -> None:
-        self._system = system
-        self._disturbance = disturbance
-        self._measuring = measuring
-        self._reports_inputs = reports_inputs
-        self._watchdog = watchdog
-        self._period_ns = period_ns
-        self._horizon_ns = horizon_ns
-        self._measure_every = measure_every
-        self._inputs = 0
-        self._step = 0
-        self._measurements = 0
-        self._failed = False
-        self._x, self._z = system.x, system.z
-        self._predictive = len(watchdog.newest.inputs) > 1
-        self.u = watchdog.newest.u
-        self._applied_input = self.u
-        """The input of the system: u with its disturbance."""
-        self._held = [self.u] * measure_every
-        """The inputs since the last measurement; 0 before the first step."""
+    system: PlantSystem
+    inputs: int
+    period_ns: int
+    horizon_ns: int
+    watchdog: Watchdog = field(default_factory=Watchdog)
+    measure_every: int = 1
+    predictions: int = 1
+    input_period_ns: int = 1
+    disturbance: Disturbance | None = None
+    measuring: MeasurementModel | None = None
+    reports_inputs: bool = False
+
+    role = PLANT
+    schedule = None
+    counts_every_message = False
 
     @property
-    def x(self) -> Vector:
-        """The state, shape (n,)."""
-        return self._x
+    def shape(self) -> RecordShape:
+        """The sizes of the rows."""
+        d, w = (0, 0) if self.disturbance is None else self.disturbance.widths
+        return RecordShape(
+            len(self.system.x), self.inputs, predictive=self.watchdog.is_predictive,
+            predictions=self.predictions, internal=len(self.system.z),
+            disturbed_input=d > 0, disturbed_state=w > 0,
+        )  # fmt: skip
 
-    def next_deadline_ns(self) -> int | None:
-        """Grid time of the next step."""
-        t_ns = self._step * self._period_ns
-        return t_ns if t_ns <= self._horizon_ns else None
+    def fill(self, plant: Any, memory: CoreMemory) -> None:
+        """Fill a ``noack_plant`` at time 0."""
+        n, m, shape = len(self.system.x), self.inputs, self.shape
+        set_machine(
+            plant.machine, n=n, m=m, flow=Flow.ACTUATION,
+            entries=m * self.predictions + n * self.watchdog.is_predictive,
+            period_ns=self.period_ns, horizon_ns=self.horizon_ns,
+        )  # fmt: skip
+        sources = m + n * shape.disturbed_state
+        C = None if self.measuring is None else self.measuring.C
+        memory.fill(plant, {
+            "internal": shape.internal, "system": core.NOACK_USER, "sources": sources,
+            "C": C, "p": n if C is None else len(C),
+            "measure_every": self.measure_every, "reports_inputs": self.reports_inputs,
+            "predictions": self.predictions, "input_period_ns": self.input_period_ns,
+            "newest_sequence": NO_SEQUENCE, "fallback_sequence": NO_SEQUENCE, "missing_ns": -1,
+            "x": np.array(self.system.x), "z": np.array(self.system.z), "u": np.zeros(m),
+            "applied": np.zeros(sources), "held": np.zeros((self.measure_every, m)),
+            "inputs": np.zeros((self.predictions, m)), "x_c": np.zeros(n),
+            "x_fallback": np.zeros(n), "scratch": np.zeros(2 * n + 2 * m),
+        })  # fmt: skip
+        if isinstance(self.system, LinearSystem):
+            Ad, Bd = discretise(self.system.A, self.system.B, self.period_ns)
+            memory.fill(plant, {"system": core.NOACK_LINEAR, "Ad": Ad, "Bd": Bd})
+        self.watchdog.fill(plant, memory, self.period_ns)
+        widths = (0, 0) if self.disturbance is None else self.disturbance.widths
+        noisy = self.measuring is not None and self.measuring.is_noisy
+        for name, width in (
+            ("at_input", widths[0]), ("at_state", widths[1]), ("noise", plant.p * noisy),
+        ):  # fmt: skip
+            signal = getattr(plant, name)
+            signal.width, signal.rows, signal.first = width, BLOCK, -BLOCK
+            signal.values = memory.zeros(BLOCK * width)
 
-    def handle(self, message: Message, now_ns: int) -> Sequence[Output]:
-        """Receive an actuation; it is applied from the next step on."""
-        newest = self._watchdog.take(message.vector, message.t_ns, message.sequence)
-        further = (newest.inputs[1:].ravel(), newest.x_c)
-        row = (self._count(), message.sequence, message.t_ns, now_ns, newest.u)
-        return (Record(PLANT_ACTUATION, (*row, *(part for part in further if len(part)))),)
-
-    def on_timer(self, now_ns: int) -> Sequence[Output]:
-        """Make one step under the held input; measure; choose the input from now on."""
-        step, t_ns = self._step, self._step * self._period_ns
-        failed = self._advance(t_ns) if step > 0 else ()
-        self.u, entry, notices = self._watchdog.input(t_ns)
-        disturbed = self._disturb(step)
-        self._step += 1
-        newest = self._watchdog.newest.sequence
-        x, z = self._x, self._z
-        row: tuple[Any, ...] = (self._count(), step, t_ns, now_ns, x, self.u, newest)
-        if self._predictive:
-            row = (*row, entry)
-        if len(z) or disturbed:
-            row = (*row, *(part for part in (z, *disturbed) if len(part)))
-        record = Record(PLANT_STEP, row)
-        if step % self._measure_every:
-            return (record, *failed, *notices)
-        y = x if self._measuring is None else self._measuring(x, self._measurements)
-        if self._reports_inputs:
-            y = np.concatenate([y, *self._held])
-        measurement = Message(Flow.MEASUREMENT, self._measurements, t_ns, y)
-        self._measurements += 1
-        return (measurement, record, *failed, *notices)
-
-    def _advance(self, t_ns: int) -> Sequence[Notice]:
-        """Step the system to ``t_ns``."""
-        self._held = [*self._held[1:], self.u]
-        if self._failed:
+    def answer(self, question: int, plant: Any) -> Sequence[Notice]:
+        """Compute the disturbances and the noise of the next steps, or advance the system."""
+        if question == core.NOACK_ASK_SIGNALS:
+            self._set_signals(plant)
             return ()
+        assert question == core.NOACK_ASK_STATE
+        plant.machine.answered = 1
+        period_ns = self.period_ns
+        t_ns = plant.machine.step * period_ns
+        x, z = reals_at(plant.x, plant.machine.n), reals_at(plant.z, plant.internal)
+        applied = reals_at(plant.applied, plant.sources).copy()
         try:
-            self._system.advance(self._applied_input, t_ns - self._period_ns, self._period_ns)
-            self._x, self._z = self._system.x, self._system.z
+            self.system.advance(applied, t_ns - period_ns, period_ns)
         except SystemFailedError as error:
-            self._failed = True
-            self._x, self._z = np.full_like(self._x, np.nan), np.full_like(self._z, np.nan)
+            plant.system = core.NOACK_FAILED
+            x[:], z[:] = np.nan, np.nan
             return (Notice(t_ns, FAILED, str(error)),)
+        x[:], z[:] = self.system.x, self.system.z
         return ()
 
-    def _disturb(self, step: int) -> tuple[Vector, ...]:
-        """Set the disturbed input of a step; return the disturbances for the record."""
-        if self._disturbance is None:
-            self._applied_input = self.u
-            return ()
-        d, w = self._disturbance(step)
-        pushed = self.u + d if len(d) else self.u
-        self._applied_input = np.concatenate([pushed, w]) if len(w) else pushed
-        return d, w
+    def inspect(self, rows: NDArray[np.void]) -> Sequence[Notice]:
+        """Received actuations need no line in the log."""
+        return ()
 
-    def _count(self) -> int:
-        self._inputs += 1
-        return self._inputs - 1
+    def note(self, plant: Any, note: Any) -> Notice:
+        """Return the line about actuations that are missing, or arrive again."""
+        return watchdog_notice(self.watchdog, note)
+
+    def _set_signals(self, plant: Any) -> None:
+        step = plant.machine.step
+        first = step - step % BLOCK
+        if self.disturbance is not None:
+            blocks = self.disturbance.block(first)
+            for signal, values in zip((plant.at_input, plant.at_state), blocks, strict=True):
+                if signal.width:
+                    signal.first = first
+                    reals_at(signal.values, BLOCK, signal.width)[:] = values
+        if self.measuring is not None and plant.noise.width:
+            number = plant.measurements - plant.measurements % BLOCK
+            plant.noise.first = number
+            reals_at(plant.noise.values, BLOCK, plant.noise.width)[:] = self.measuring.noise(number)
 
 
-def plant_of(resolved: Scenario) -> Plant:
-    """Return the plant of a resolved scenario."""
+def plant_of(resolved: Scenario, start: Start = BEGINNING) -> LoopMachines:
+    """Return the plant of a resolved scenario as a machine; a plant cannot be restarted."""
+    return plants_of((resolved,))
+
+
+def plants_of(
+    loops: Sequence[Scenario], phases_ns: Sequence[int] | None = None, *, numbered: bool = False
+) -> LoopMachines:
+    """Return the plants of resolved loops as the machines of a process."""
+    return LoopMachines([_part(one) for one in loops], phases_ns, numbered=numbered)
+
+
+def _part(resolved: Scenario) -> Plant:
     return Plant(
         system_of(resolved),
-        _watchdog_of(resolved),
+        resolved.model.dimensions[1],
         period_ns=resolved.timing.plant_period_ns,
         horizon_ns=resolved.timing.horizon_ns,
+        watchdog=watchdog_of(resolved),
         measure_every=resolved.plant.measure_every,
+        predictions=resolved.controller.predictions,
+        input_period_ns=resolved.timing.controller_period_ns,
         disturbance=disturbance_of(resolved),
         measuring=measurement_model_of(resolved),
         reports_inputs=resolved.observer is not None,
@@ -175,21 +201,3 @@ def system_of(resolved: Scenario) -> PlantSystem:
         B = np.hstack([B, np.eye(loop.n)])
     start = PlantStart(np.array(plant.initial_state), loop.A, B, resolved.timing.plant_period_ns)
     return plant.system.system(start)
-
-
-def _watchdog_of(resolved: Scenario) -> Watchdog:
-    loop = loop_of(resolved)
-    fallbacks: dict[str, Fallback] = {
-        "hold": hold,
-        "zero": zero,
-        "model": PredictedInput(loop.H, loop.K, resolved.timing.plant_period_ns),
-    }
-    policy = resolved.plant.watchdog.policy
-    timing, predictions = resolved.timing, resolved.controller.predictions
-    return Watchdog(
-        InputBuffer(loop.m, predictions, timing.controller_period_ns),
-        timing.actuation_timeout_ns,
-        fallbacks[policy],
-        FALLBACK_NAMES[policy],
-        timing.missing_actuation_ns,
-    )

@@ -2,7 +2,7 @@
 
 At t_k the newest actuation is too old if t_k − t > timeout. Here t is the time of the model state
 x_c from which the actuation was computed; before the first actuation, t = 0. Until then its inputs
-are applied (:mod:`plant_server.input_buffer`). The policy then determines the input:
+are applied. The policy then determines the input (native/loop/plant.c):
 
 * ``hold``: the last input of the newest actuation;
 * ``zero``: 0;
@@ -12,64 +12,62 @@ are applied (:mod:`plant_server.input_buffer`). The policy then determines the i
   and u is the safe input, so the input is the safe input. With zero-order hold (H = 0) it is u.
 """
 
-from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
+from noack.config.resolution import loop_of
+from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
-from noack.core.linear_systems import Matrix, Propagator, Vector
-from noack.core.ordered_arithmetic import product
+from noack.core.core_library import core
+from noack.core.core_memory import CoreMemory
+from noack.core.linear_systems import Matrix
 from noack.protocol.machine_interface import Notice
 from noack.protocol.record_tables import NO_SEQUENCE
-from noack.protocol.wire_format import NO_VECTOR
-from plant_server.input_buffer import Actuation, InputBuffer
 
 NEVER_NS = 2**63 - 1
 """A timeout that no run reaches."""
-
-
-Fallback = Callable[[Actuation, int], Vector]
-"""A policy: newest actuation and a time in ns at which it is too old → the input, (m,)."""
-
-
-def hold(newest: Actuation, t_ns: int) -> Vector:
-    """Return the last input of the actuation, of any age."""
-    u: Vector = newest.inputs[-1]
-    return u
-
-
-def zero(newest: Actuation, t_ns: int) -> Vector:
-    """Return zero."""
-    return np.zeros_like(newest.u)
-
-
-class PredictedInput:
-    """The input of the controller's model H, propagated from the last model state received.
-
-    The state is advanced over the plant's step each time.
-    """
-
-    def __init__(self, H: Matrix, K: Matrix, period_ns: int) -> None:
-        self._propagate = Propagator(H, (period_ns,))
-        self._K = K
-        self._from = NO_SEQUENCE
-        self._t_ns = 0
-        self._x = NO_VECTOR
-
-    def __call__(self, newest: Actuation, t_ns: int) -> Vector:
-        """Return u + K(e^{H(t − t_j)} x_c − x_c) for an actuation of time t_j."""
-        if newest.sequence == NO_SEQUENCE:
-            return newest.u
-        if newest.sequence != self._from:
-            self._from, self._x, self._t_ns = newest.sequence, newest.x_c, newest.t_ns
-        self._x = self._propagate(self._x, t_ns - self._t_ns)
-        self._t_ns = t_ns
-        return newest.u + (product(self._K, self._x) - product(self._K, newest.x_c))
-
-
-FALLBACK_NAMES = {"hold": "held", "zero": "0", "model": "the model's"}
+INPUT_NAMES = {"hold": "held", "zero": "0", "model": "the model's"}
 """The input that each policy applies, in words."""
+_POLICIES = {
+    "hold": core.NOACK_HOLD, "zero": core.NOACK_ZERO, "model": core.NOACK_PREDICT,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Watchdog:
+    """Settings of a plant's watchdog."""
+
+    timeout_ns: int = NEVER_NS
+    """The policy chooses the input if the newest actuation is older."""
+    policy: str = "hold"
+    notice_ns: int = 0
+    """Age from which a notice reports it; at least the timeout."""
+    H: Matrix | None = None
+    """The controller's model, (n, n), of policy ``model``."""
+    K: Matrix | None = None
+    """Its gain, (m, n)."""
+
+    @property
+    def is_predictive(self) -> bool:
+        """Whether actuations carry the controller's model state."""
+        return self.policy == "model"
+
+    def fill(self, plant: Any, memory: CoreMemory, period_ns: int) -> None:
+        """Fill the watchdog of a ``noack_plant`` with this step."""
+        memory.fill(plant, {
+            "watchdog": _POLICIES[self.policy], "timeout_ns": self.timeout_ns,
+            "notice_ns": max(self.notice_ns, self.timeout_ns),
+            "carries_model": self.is_predictive, "K": self.K,
+        })  # fmt: skip
+        if self.H is not None:
+            memory.set_model(plant.fallback, memory.transitions(self.H, (period_ns,)))
+
+
+def watchdog_of(resolved: Scenario) -> Watchdog:
+    """Return the watchdog of a resolved scenario's plant."""
+    timing, policy, loop = resolved.timing, resolved.plant.watchdog.policy, loop_of(resolved)
+    model = (loop.H, loop.K) if policy == "model" else ()
+    return Watchdog(timing.actuation_timeout_ns, policy, timing.missing_actuation_ns, *model)
 
 
 def too_old(t_ns: Any, newest_ns: Any, timeout_ns: int) -> Any:
@@ -77,74 +75,16 @@ def too_old(t_ns: Any, newest_ns: Any, timeout_ns: int) -> Any:
     return t_ns - newest_ns > timeout_ns
 
 
-class Watchdog:
-    """Chooses the plant's input at each step, and reports when the newest actuation is too old.
-
-    Args:
-        buffer: has the newest actuation.
-        timeout_ns: the fallback chooses the input if the actuation is older.
-        fallback: the policy.
-        input_name: describes the input of the fallback in notices.
-        notice_ns: age from which a notice reports it; at least the timeout.
-    """
-
-    def __init__(
-        self,
-        buffer: InputBuffer,
-        timeout_ns: int = NEVER_NS,
-        fallback: Fallback = hold,
-        input_name: str = "held",
-        notice_ns: int = 0,
-    ) -> None:
-        self._buffer = buffer
-        self.take = buffer.take
-        self._timeout_ns = timeout_ns
-        self._fallback = fallback
-        self._input_name = input_name
-        self._notice_ns = max(notice_ns, timeout_ns)
-        self._noticed_ns: int | None = None
-
-    @property
-    def newest(self) -> Actuation:
-        """The newest actuation."""
-        return self._buffer.newest
-
-    def input(self, t_ns: int) -> tuple[Vector, int, tuple[Notice, ...]]:
-        """Return the input that is applied from ``t_ns`` on, shape (m,), and notices.
-
-        Between them is the number of the input in the newest actuation; −1: of the fallback.
-        """
-        newest_ns = self._buffer.newest.t_ns
-        if too_old(t_ns, newest_ns, self._timeout_ns):
-            u, entry = self._fallback(self._buffer.newest, t_ns), -1
-        else:
-            u, entry = self._buffer.due(t_ns)
-        if too_old(t_ns, newest_ns, self._notice_ns) == (self._noticed_ns is not None):
-            return u, entry, ()
-        return u, entry, (self._notice(t_ns),)
-
-    def _notice(self, t_ns: int) -> Notice:
-        """Report that actuations are missing, or that they arrive again."""
-        newest, noticed_ns = self._buffer.newest, self._noticed_ns
-        self._noticed_ns = t_ns if noticed_ns is None else None
-        if noticed_ns is not None:
-            return arrive_again(t_ns, noticed_ns)
-        none = newest.sequence == NO_SEQUENCE
-        return are_missing(t_ns, newest.t_ns, self._timeout_ns, self._input_name, none=none)
-
-
-def arrive_again(t_ns: int, noticed_ns: int) -> Notice:
-    """Return the notice of the first actuation after those reported missing at ``noticed_ns``."""
-    lasted_s = (t_ns - noticed_ns) / NS_PER_S
-    text = f"actuations arrive again; there was none in time for {lasted_s:.4g} s"
-    return Notice(t_ns, "watchdog", text)
-
-
-def are_missing(
-    t_ns: int, newest_ns: int, timeout_ns: int, input_name: str, *, none: bool
-) -> Notice:
-    """Return the notice of a newest actuation that is too old; ``none``: there is none."""
-    age_s, timeout_s = ((ns / NS_PER_S) for ns in (t_ns - newest_ns, timeout_ns))
+def watchdog_notice(watchdog: Watchdog, note: Any) -> Notice:
+    """Return the line for the log of a ``noack_note``."""
+    t_ns, since_ns, newest_ns = (int(note[name]) for name in ("t_ns", "since_ns", "newest_ns"))
+    if since_ns >= 0:
+        lasted_s = (t_ns - since_ns) / NS_PER_S
+        text = f"actuations arrive again; there was none in time for {lasted_s:.4g} s"
+        return Notice(t_ns, "watchdog", text)
+    age_s, timeout_s = ((ns / NS_PER_S) for ns in (t_ns - newest_ns, watchdog.timeout_ns))
+    none = note["newest_sequence"] == NO_SEQUENCE
     what = "no actuation for" if none else "the newest actuation is too old:"
-    text = f"{what} {age_s:.4g} s, {timeout_s:.4g} s allowed; the input is {input_name}"
+    name = INPUT_NAMES[watchdog.policy]
+    text = f"{what} {age_s:.4g} s, {timeout_s:.4g} s allowed; the input is {name}"
     return Notice(t_ns, "watchdog", text)

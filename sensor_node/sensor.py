@@ -1,35 +1,50 @@
 """The sensor: runs the model x_s in parallel to the plant and transmits at events (eq:ModSensor).
 
-At a measurement: propagate x_s → test → send at most one state update. x_s is reset at *every*
-event, whether or not the network delivers the update: nothing is acknowledged. In the
-acknowledgement baseline, only an acknowledged update resets x_s.
+This file turns a scenario into the core's sensor, whose steps are in native/loop/sensor.c. At a
+measurement: propagate x_s → test → send at most one state update. x_s is reset at *every* event,
+whether or not the network delivers the update: nothing is acknowledged. In the acknowledgement
+baseline, only an acknowledged update resets x_s.
+
+With an observer (``observer.py``) the trigger tests x̂ in place of x.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from noack.config.parameter_changes import ChangeSchedule, ParameterChange
+from noack.config.parameter_changes import ChangeSchedule, settings_key
 from noack.config.resolution import loop_of, policy_of, setpoint_of
 from noack.config.scenario import Scenario
-from noack.core.errors import CallerError
-from noack.core.linear_systems import Matrix, Vector, norm
-from noack.core.model_flow import ModelFlow
-from noack.core.ordered_arithmetic import product
-from noack.protocol.machine_interface import BEGINNING, Notice, Output, Record, Start
+from noack.core.core_library import core, ffi
+from noack.core.core_memory import CoreMemory, reals_at
+from noack.core.linear_systems import Matrix, Vector
+from noack.machines.loop_machines import LoopMachines
+from noack.machines.machine_parts import Role, set_machine, take_changes
+from noack.protocol.machine_interface import BEGINNING, Notice, Start
 from noack.protocol.record_tables import (
-    NO_SEQUENCE,
     SENSOR_ACKNOWLEDGEMENT,
     SENSOR_MEASUREMENT,
     SENSOR_SETTING,
+    RecordShape,
 )
-from noack.protocol.wire_format import Flow, Message
-from noack.trigger.trigger_policy import Policy, TriggerDecision, new_trigger
-from sensor_node.observing_sensor import ObservingSensor, observer_of
+from noack.protocol.wire_format import Flow
+from noack.trigger.core_rule import fill_rule, rule_rows
+from noack.trigger.trigger_policy import CodedPolicy, EventTrigger, Policy
+from sensor_node.observer import Observer, observer_of
+
+SENSOR = Role(
+    "sensor", "noack_sensor", Flow.MEASUREMENT,
+    (None, SENSOR_MEASUREMENT, SENSOR_ACKNOWLEDGEMENT), SENSOR_SETTING,
+)  # fmt: skip
+_SENT_PLACES = 64
 
 
+@dataclass
 class Sensor:
-    """The machine of the sensor node.
+    """The sensor of one loop.
 
     Its time is the time of the measurements: its output depends on the measured values and their
     times, not on when a datagram was read.
@@ -38,200 +53,208 @@ class Sensor:
         H: the matrix that the model integrates between updates, shape (n, n), per second.
         policy: the event-triggering policy.
         x0: x(0), if sensor and controller start from it; else None, and the first measurement is an
-            event.
+            event. With acknowledgements x_s is then 0, as x_c is, until an update is acknowledged.
+        inputs: m.
         period_ns: expected time between measurements, for precomputed matrices; others are
             possible.
         first_number: number of its first event and first input.
         setpoint: x_r, shape (n,); None is 0.
         schedule: the announced changes of its settings; None if they cannot change.
+        timeout_ns: how long to wait for an acknowledgement; None: updates are not acknowledged.
+        observer: estimates x from the measurements; None: they are x.
     """
 
-    def __init__(
-        self,
-        H: Matrix,
-        policy: Policy,
-        x0: Vector | None = None,
-        *,
-        period_ns: int | None = None,
-        first_number: int = 0,
-        setpoint: Vector | None = None,
-        schedule: ChangeSchedule | None = None,
-    ) -> None:
-        self._flow = ModelFlow(H, () if period_ns is None else (period_ns,), setpoint)
-        self._schedule = schedule
-        self._reached_ns = -1
-        self._trigger = new_trigger(policy)
-        self._weight = policy.weight
-        self._model_ns = 0
-        self._inputs = first_number
-        self._events = first_number
-        self.x_s = x0
-        if x0 is not None:
-            self._trigger.start(0, x0)
+    H: Matrix
+    policy: Policy
+    x0: Vector | None = None
+    inputs: int = 1
+    period_ns: int | None = None
+    first_number: int = 0
+    setpoint: Vector | None = None
+    schedule: ChangeSchedule | None = None
+    timeout_ns: int | None = None
+    observer: Observer | None = None
 
-    def next_deadline_ns(self) -> int | None:
-        """None: the sensor only reacts to messages."""
-        return None
+    role = SENSOR
 
-    def on_timer(self, now_ns: int) -> Sequence[Output]:
-        """Nothing is ever due."""
+    def __post_init__(self) -> None:
+        self._trigger: EventTrigger | None = None
+        if isinstance(self.policy, CodedPolicy):
+            self._trigger = self.policy.new_trigger()
+        self._points, self._since_ns = [self.setpoint], list[int]()
+
+    @property
+    def counts_every_message(self) -> bool:
+        """Whether the next measurement is the first of a restarted observer."""
+        return self.observer is not None and self.observer.restarted
+
+    @property
+    def shape(self) -> RecordShape:
+        """The sizes of the rows."""
+        observed = (0, 0) if self.observer is None else (self.observer.p, self.observer.reported)
+        return RecordShape(
+            len(self.H), self.inputs, acknowledged=self.timeout_ns is not None,
+            outputs=observed[0], inputs_reported=observed[1],
+        )  # fmt: skip
+
+    def fill(self, sensor: Any, memory: CoreMemory) -> None:
+        """Fill a ``noack_sensor`` at its start."""
+        n, own, steps_ns = len(self.H), self.observer, (self.period_ns or 0,)
+        self._memory = memory
+        set_machine(
+            sensor.machine, n=n, m=self.inputs, flow=Flow.MEASUREMENT,
+            entries=n if own is None else own.p + own.reported, first_number=self.first_number,
+        )  # fmt: skip
+        memory.set_model(sensor.model, memory.transitions(self.H, steps_ns), (), self._points)
+        start = np.zeros(n) if self.x0 is None else self.x0
+        memory.fill(sensor, {
+            "is_user": self._trigger is not None, "acknowledged": self.timeout_ns is not None,
+            "timeout_ns": self.timeout_ns or 0, "knows_state": self.x0 is not None,
+            "events": self.first_number, "wait_ns": -1,
+            "x_s": start, "event_x": np.zeros(n), "x": np.zeros(n), "e_s": np.zeros(n),
+        })  # fmt: skip
+        sensor.trigger.event_ns = -1
+        self._set_policy(sensor, self.policy)
+        sensor.trigger.auxiliary = sensor.rule.initial
+        if self.timeout_ns is not None:
+            self._make_room(sensor, _SENT_PLACES)
+        if own is not None:
+            own.fill(sensor, memory)
+        if self.x0 is not None:
+            self._start(sensor, 0, self.x0)
+
+    def answer(self, question: int, sensor: Any) -> Sequence[Notice]:
+        """Apply changes, let the user's trigger decide, or make room for sent updates."""
+        if question == core.NOACK_ASK_CHANGE:
+            for due in take_changes(self.schedule, sensor.machine):
+                setpoint, policy = due.prepared
+                self._set_point(sensor, due.since_ns, setpoint)
+                self._set_policy(sensor, policy)
+        elif question == core.NOACK_ASK_ROOM:
+            self._make_room(sensor, 2 * sensor.sent_places)
+        elif question == core.NOACK_ASK_RESTART:
+            assert self._trigger is not None
+            n = sensor.machine.n
+            self._trigger.restart(sensor.trigger.event_ns, reals_at(sensor.event_x, n).copy())
+            sensor.machine.answered = 1
+        else:
+            assert question == core.NOACK_ASK_DECISION
+            self._decide(sensor)
         return ()
 
-    def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
-        """Schedule a change; it takes effect at the first measurement at or after its time T.
+    def inspect(self, rows: NDArray[np.void]) -> Sequence[Notice]:
+        """Return a line at the first measurement of a restarted observer."""
+        if self.observer is None:
+            return ()
+        return self.observer.first_notice(int(rows["t_ns"][0]))
 
-        x_s follows the new set point from T itself on.
-        """
-        if self._schedule is None:
-            raise CallerError("this sensor's settings cannot be changed")
-        outputs = self._schedule.announce(
-            SENSOR_SETTING, change, self._inputs, now_ns, self._reached_ns
-        )
-        self._inputs += 1
-        return outputs
+    def note(self, sensor: Any, note: Any) -> Notice:
+        """A sensor asks for no lines."""
+        raise ValueError("a sensor writes no notes")
 
-    def _change(self, t_ns: int) -> None:
-        """Apply the changes that are due at a time."""
-        while self._schedule is not None and (due := self._schedule.take(t_ns)) is not None:
-            setpoint, policy = due.prepared
-            self._flow.change(due.since_ns, setpoint)
-            self._trigger.change(policy)
+    def _decide(self, sensor: Any) -> None:
+        """Ask the user's trigger about a measurement."""
+        trigger, n = self._trigger, sensor.machine.n
+        assert trigger is not None
+        x, e_s = reals_at(sensor.x, n).copy(), reals_at(sensor.e_s, n).copy()
+        t_ns = sensor.asked_ns
+        if sensor.first:
+            trigger.start(t_ns, x)
+        decision = trigger.test(t_ns, x, e_s)
+        if (decision.event or sensor.first) and not sensor.acknowledged:
+            trigger.start(t_ns, x)
+        sensor.event, sensor.left, sensor.right = decision
+        sensor.machine.answered = 1
 
-    def handle(self, message: Message, now_ns: int) -> Sequence[Output]:
-        """Process a measurement x(t); at an event, transmit it and reset x_s."""
-        t_ns, x = message.t_ns, message.vector
-        if self._schedule is not None and self._schedule.next_ns is not None:
-            self._change(t_ns)
-        first = self.x_s is None
-        x_s = x if self.x_s is None else self._flow(self.x_s, self._model_ns, t_ns)
-        if first:
+    def _start(self, sensor: Any, t_ns: int, x: Vector) -> None:
+        """Begin with the condition after an event at x, (n,)."""
+        if self._trigger is not None:
             self._trigger.start(t_ns, x)
-        e_s = x_s - x
-        decision = self._trigger.test(t_ns, x, e_s)
-        event = first or decision.event
-        if event:
-            self._trigger.start(t_ns, x)
-        self.x_s = x if event else x_s
-        self._model_ns = self._reached_ns = t_ns
-        return self._outputs(message, now_ns, x_s, e_s, decision, event=event)
-
-    def _outputs(
-        self, message: Message, now_ns: int, x_s: Vector, e_s: Vector,
-        decision: TriggerDecision, *, event: bool,
-    ) -> Sequence[Output]:  # fmt: skip
-        """Return the record of a measurement, and at an event the update before it."""
-        t_ns, x = message.t_ns, message.vector
-        row = (
-            self._count(), message.sequence, t_ns, now_ns, x, x_s,
-            norm(e_s if self._weight is None else product(self._weight, e_s)),
-            decision.left, decision.right, self._events if event else NO_SEQUENCE,
+            return
+        n = sensor.machine.n
+        reals_at(sensor.event_x, n)[:] = x
+        core.noack_trigger_start(
+            ffi.addressof(sensor.rule), ffi.addressof(sensor.trigger), n, t_ns, sensor.event_x,
+            sensor.scratch,
         )  # fmt: skip
-        record = Record(SENSOR_MEASUREMENT, row)
-        if not event:
-            return (record,)
-        self._events += 1
-        return (Message(Flow.UPDATE, self._events - 1, t_ns, x), record)
 
-    def _count(self) -> int:
-        self._inputs += 1
-        return self._inputs - 1
+    def _set_policy(self, sensor: Any, policy: Policy) -> None:
+        """Continue with a policy, as if it had been in force at the last event."""
+        n, memory = sensor.machine.n, self._memory
+        if isinstance(policy, CodedPolicy):
+            memory.fill(sensor.rule, {"weight": policy.weight})
+            sensor.scratch = memory.zeros(5 * n)
+            return
+        rule = policy.trigger_rule(n)
+        fill_rule(sensor.rule, rule, policy.weight, policy.initial_dynamic_variable, memory)
+        sensor.scratch = memory.zeros(4 * n + rule_rows(rule))
+        if sensor.trigger.event_ns >= 0:
+            core.noack_trigger_condition(
+                ffi.addressof(sensor.rule), ffi.addressof(sensor.trigger), n,
+                sensor.trigger.event_ns, sensor.event_x, sensor.scratch,
+            )  # fmt: skip
+
+    def _set_point(self, sensor: Any, since_ns: int, setpoint: Vector | None) -> None:
+        """Move x_r from ``since_ns`` on."""
+        if not np.array_equal(_or_zero(self._points[-1]), _or_zero(setpoint)):
+            self._points.append(setpoint)
+            self._since_ns.append(since_ns)
+            self._memory.set_model(
+                sensor.model, sensor.model.transitions, self._since_ns, self._points
+            )
+
+    def _make_room(self, sensor: Any, places: int) -> None:
+        """Provide room for updates that wait for their acknowledgement."""
+        n, count = sensor.machine.n, sensor.sent_count
+        sent = self._memory.keep(ffi.new("noack_sent[]", places))
+        x = self._memory.zeros(places * n)
+        if count:
+            ffi.memmove(sent, sensor.sent, ffi.sizeof("noack_sent") * count)
+            ffi.memmove(x, sensor.sent_x, 8 * n * count)
+        sensor.sent, sensor.sent_x, sensor.sent_places = sent, x, places
 
 
-class AcknowledgedSensor(Sensor):
-    """The machine of the sensor node, if updates are acknowledged.
+def _or_zero(setpoint: Vector | None) -> Vector:
+    return np.zeros(1) if setpoint is None else setpoint
 
-    At an acknowledgement of update k, x_s ← e^{H(t−t_k)} x(t_k) at the time t of the last
-    measurement; this equals the controller's model then. After a transmission the sensor waits for
-    the acknowledgement until a timeout. If the policy then still requires a transmission, it
-    transmits the current measurement. Nothing is transmitted twice. The policy's state since the
-    last event restarts when the event is acknowledged.
 
-    Args:
-        H, policy, period_ns, first_number: as for :class:`Sensor`.
-        x0: likewise; with None, the first measurement is an event, and x_s is 0, as x_c is, until
-            an update is acknowledged.
-        timeout_ns: how long to wait for an acknowledgement.
+def sensor_of(resolved: Scenario, start: Start = BEGINNING) -> LoopMachines:
+    """Return the sensor of a resolved scenario as a machine."""
+    return sensors_of((resolved,), start=start)
+
+
+def sensors_of(
+    loops: Sequence[Scenario],
+    phases_ns: Sequence[int] | None = None,
+    *,
+    start: Start = BEGINNING,
+    numbered: bool = False,
+) -> LoopMachines:
+    """Return the sensors of resolved loops as the machines of a process.
+
+    Of the plant's data they use at most x(0). After a restart, a sensor transmits its first
+    measurement.
     """
-
-    def __init__(
-        self,
-        H: Matrix,
-        policy: Policy,
-        x0: Vector | None = None,
-        *,
-        timeout_ns: int,
-        period_ns: int | None = None,
-        first_number: int = 0,
-    ) -> None:
-        super().__init__(H, policy, x0, period_ns=period_ns, first_number=first_number)
-        self._timeout_ns = timeout_ns
-        self._sent: dict[int, Vector] = {}
-        self._wait_until_ns: int | None = None
-        self._first = x0 is None
-        self.x_s: Vector = np.zeros(len(H)) if x0 is None else x0
-
-    def handle(self, message: Message, now_ns: int) -> Sequence[Output]:
-        """Process a measurement or an acknowledgement."""
-        if message.flow is Flow.ACKNOWLEDGEMENT:
-            return self._acknowledged(message, now_ns)
-        t_ns, x = message.t_ns, message.vector
-        first, self._first = self._first, False
-        if first:
-            self._model_ns = t_ns
-            self._trigger.start(t_ns, x)
-        self.x_s = x_s = self._flow(self.x_s, self._model_ns, t_ns)
-        self._model_ns = t_ns
-        e_s = x_s - x
-        decision = self._trigger.test(t_ns, x, e_s)
-        waits = self._wait_until_ns is not None and t_ns < self._wait_until_ns
-        event = first or (decision.event and not waits)
-        if event:
-            self._sent[self._events] = x
-            self._wait_until_ns = t_ns + self._timeout_ns
-        return self._outputs(message, now_ns, x_s, e_s, decision, event=event)
-
-    def _acknowledged(self, message: Message, now_ns: int) -> Sequence[Output]:
-        """Reset x_s to the acknowledged update; an acknowledgement is newer than all before it."""
-        event_ns, before = message.t_ns, self.x_s
-        x = self._sent.get(message.sequence)
-        if x is not None:
-            self.x_s = self._flow(x, event_ns, self._model_ns)
-            self._trigger.restart(event_ns, x)
-            self._sent = {k: sent for k, sent in self._sent.items() if k > message.sequence}
-            if not self._sent:
-                self._wait_until_ns = None
-        row = (
-            self._count(), message.sequence, event_ns, now_ns, self._model_ns, before, self.x_s,
-        )  # fmt: skip
-        return (Record(SENSOR_ACKNOWLEDGEMENT, row),)
+    results: dict[str, Any] = {}
+    parts = [_part(one, start, results.setdefault(settings_key(one), {})) for one in loops]
+    return LoopMachines(parts, phases_ns, numbered=numbered)
 
 
-def sensor_of(resolved: Scenario, start: Start = BEGINNING) -> Sensor | ObservingSensor:
-    """Return the sensor of a resolved scenario; of the plant's data it uses at most x(0).
-
-    After a restart, the sensor transmits its first measurement.
-    """
-    observer = observer_of(resolved, restarted=start.is_restart)
-    sensor = _sensor_without_observer(resolved, start)
-    if observer is None:
-        return sensor
-    return ObservingSensor(observer, sensor, restarted=start.is_restart)
-
-
-def _sensor_without_observer(resolved: Scenario, start: Start) -> Sensor:
-    loop, policy = loop_of(resolved), policy_of(resolved)
+def _part(resolved: Scenario, start: Start, results: dict[Any, Any]) -> Sensor:
+    loop, acknowledges = loop_of(resolved), resolved.protocol.acknowledges
     known = resolved.network.initial_sync == "known_state" and not start.is_restart
-    x0 = loop.x0 if known else None
-    period_ns, first = resolved.timing.measurement_period_ns, start.first_number
-    if resolved.protocol.acknowledges:
-        timeout_ns = resolved.timing.acknowledgement_timeout_ns
-        return AcknowledgedSensor(
-            loop.H, policy, x0, timeout_ns=timeout_ns, period_ns=period_ns, first_number=first
-        )
     return Sensor(
-        loop.H, policy, x0, period_ns=period_ns, first_number=first, setpoint=loop.setpoint,
-        schedule=ChangeSchedule(resolved, _prepared),
-    )  # fmt: skip
+        loop.H,
+        policy_of(resolved),
+        loop.x0 if known else None,
+        inputs=loop.m,
+        period_ns=resolved.timing.measurement_period_ns,
+        first_number=start.first_number,
+        setpoint=None if acknowledges else loop.setpoint,
+        schedule=None if acknowledges else ChangeSchedule(resolved, _prepared, results),
+        timeout_ns=resolved.timing.acknowledgement_timeout_ns if acknowledges else None,
+        observer=observer_of(resolved, restarted=start.is_restart),
+    )
 
 
 def _prepared(resolved: Scenario) -> tuple[Vector | None, Policy]:

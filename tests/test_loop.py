@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+from plant_server.input_buffer import InputBuffer
 from scipy.linalg import expm
 
 from controller_node.controller import Controller
@@ -31,7 +32,6 @@ from noack.protocol.record_tables import (
 from noack.protocol.topology import RECEIVES, SENDS, receiver_of
 from noack.protocol.wire_format import Decoder, Encoder, Flow, Message, Rejection
 from noack.trigger.decaying import DecayingTrigger
-from plant_server.input_buffer import InputBuffer
 from plant_server.plant import Plant
 from plant_server.watchdog import Watchdog
 from sensor_node.sensor import Sensor

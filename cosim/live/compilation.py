@@ -3,10 +3,11 @@
 from collections.abc import Collection
 
 from controller_node.controller_arrays import CONTROLLER_FLEET
-from noack.config.scenario import Scenario
-from noack.runtime.fleet.fleet_choice import prepare
 from plant_server.plant_arrays import PLANT_FLEET
 from sensor_node.sensor_arrays import SENSOR_FLEET
+
+from noack.config.scenario import Scenario
+from noack.runtime.fleet.fleet_choice import prepare
 
 _FLEETS = {"plant": PLANT_FLEET, "sensor": SENSOR_FLEET, "controller": CONTROLLER_FLEET}
 

@@ -66,6 +66,7 @@ static int64_t measured(
     for (int64_t k = 0; k < n; k++)
         sensor->e_s[k] = x_s[k] - sensor->x[k];
     sensor->first = first;
+    sensor->asked_ns = t_ns;
     if (sensor->is_user && !machine->answered)
         return NOACK_ASK_DECISION;
     if (first)
@@ -91,6 +92,7 @@ static int64_t measured_with_acknowledgements(
     for (int64_t k = 0; k < n; k++)
         sensor->e_s[k] = x_s[k] - sensor->x[k];
     sensor->first = first;
+    sensor->asked_ns = t_ns;
     if (sensor->is_user && !machine->answered)
         return NOACK_ASK_DECISION;
     if (first)

@@ -103,6 +103,11 @@ def scheduled(scenario: Scenario) -> list[ParameterChange]:
     ]
 
 
+def settings_key(resolved: Scenario) -> str:
+    """Return what loops have in common whose scenarios differ in their plants' draws only."""
+    return repr((resolved.model, resolved.trigger, resolved.controller, resolved.network))
+
+
 CHANGED = "change"  # level of the notice of a change
 
 
@@ -163,13 +168,19 @@ class AppliedParameters(NamedTuple):
 class ChangeSchedule:
     """The scenarios of a run in the order of time, as announced to a machine.
 
-    ``prepare`` computes the data that the machine needs of a scenario, before it is in force.
+    ``prepare`` computes the data that the machine needs of a scenario, before it is in force. Loops
+    whose scenarios differ in their draws only may share ``results``: what the changes so far, by
+    their numbers, have made of the scenario, and the data.
     """
 
     def __init__(
-        self, scenario: Scenario, prepare: Callable[[Scenario], Any] = lambda scenario: None
+        self,
+        scenario: Scenario,
+        prepare: Callable[[Scenario], Any] = lambda scenario: None,
+        results: dict[tuple[int, ...], tuple[Scenario, Any]] | None = None,
     ) -> None:
         self._prepare = prepare
+        self._results = {} if results is None else results
         self._all = [AppliedParameters(-(2**63), -1, {}, scenario, None)]
         self._taken = 1
         self.next_ns: int | None = None
@@ -193,8 +204,11 @@ class ChangeSchedule:
         first = bisect(every, (since_ns, change.number), key=lambda one: (one.since_ns, one.number))
         every.insert(first, entry)
         for place in range(first, len(every)):
-            scenario = changed(every[place - 1].scenario, every[place].settings)
-            prepared = self._prepare(scenario)
+            numbers = tuple(one.number for one in every[: place + 1])
+            if numbers not in self._results:
+                scenario = changed(every[place - 1].scenario, every[place].settings)
+                self._results[numbers] = scenario, self._prepare(scenario)
+            scenario, prepared = self._results[numbers]
             every[place] = every[place]._replace(scenario=scenario, prepared=prepared)
         self._all = every
         self._update_next()
@@ -208,6 +222,11 @@ class ChangeSchedule:
         self._taken += 1
         self._update_next()
         return found
+
+    @property
+    def has_changes(self) -> bool:
+        """Whether a change has been announced."""
+        return len(self._all) > 1
 
     @property
     def last(self) -> Scenario:

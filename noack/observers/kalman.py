@@ -6,12 +6,13 @@ symmetric and positive semidefinite for any rounding error of L.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import model_validator
 
+from noack.core.core_library import core, ffi
+from noack.core.core_memory import CoreMemory, reals_at
 from noack.core.linear_systems import Matrix, Vector
 from noack.observers.estimation_model import EstimationModel, NoiseVariances
 from noack.observers.observer_settings import ObserverSettings
@@ -104,15 +105,23 @@ class KalmanSettings(ObserverSettings):
         return np.asarray(np.linalg.solve(C @ predicted @ C.T + R, C @ predicted).T)
 
     def gains(self, assumed: EstimationModel) -> Iterator[Matrix]:
-        filter_ = self.estimator(assumed, np.zeros(len(assumed.Ad)))
+        memory, observer = CoreMemory(), ffi.new("noack_observer *")
+        (n, m), p = assumed.Bd.shape, len(assumed.C)
+        self.fill(observer, assumed, np.zeros(n), memory)
+        nothing = memory.zeros(max(p, m))
         while True:
-            yield filter_.gain
-            filter_.correct(np.zeros(len(assumed.C)))
+            core.noack_observer_gain(observer, n)
+            yield reals_at(observer.gain, n, p).copy()
+            core.noack_observer_correct(observer, n, nothing)
             for _ in range(assumed.steps):
-                filter_.predict(np.zeros(assumed.Bd.shape[1]))
+                core.noack_observer_predict(observer, n, m, nothing)
 
-    def estimator(self, assumed: EstimationModel, x: Vector) -> "KalmanObserver":
-        return KalmanObserver(assumed, x, np.diag(np.square(self.initial_std)))
+    def fill(self, observer: Any, assumed: EstimationModel, x: Vector, memory: CoreMemory) -> None:
+        super().fill(observer, assumed, x, memory)
+        memory.fill(observer, {
+            "kind": core.NOACK_KALMAN, "P": np.diag(np.square(self.initial_std)),
+            "Q": assumed.Q, "R": assumed.R,
+        })  # fmt: skip
 
 
 def _require_covariance(key: str, rows: Rows | None, *, definite: bool) -> None:
@@ -127,31 +136,3 @@ def _require_covariance(key: str, rows: Rows | None, *, definite: bool) -> None:
     # Rounding may leave a singular covariance with a small negative eigenvalue.
     if smallest < -1e-12 * np.abs(matrix).max():
         raise ValueError(f"observer.{key}: must be positive semidefinite")
-
-
-@dataclass
-class KalmanObserver:
-    """The filter, at x̂ and P before the first measurement."""
-
-    model: EstimationModel
-    x: Vector
-    covariance: Matrix
-
-    def predict(self, u: Vector) -> None:
-        Ad, Bd, Q = self.model.Ad, self.model.Bd, self.model.Q
-        self.x = Ad @ self.x + Bd @ u
-        self.covariance = Ad @ self.covariance @ Ad.T + Q
-
-    @property
-    def gain(self) -> Matrix:
-        """L of the next measurement, (n, p)."""
-        C, R, P = self.model.C, self.model.R, self.covariance
-        return np.asarray(np.linalg.solve(C @ P @ C.T + R, C @ P).T)
-
-    def correct(self, y: Vector) -> None:
-        C, R, P = self.model.C, self.model.R, self.covariance
-        L = self.gain
-        rest = np.eye(len(P)) - L @ C
-        self.x = self.x + L @ (y - C @ self.x)
-        P = rest @ P @ rest.T + L @ R @ L.T
-        self.covariance = 0.5 * (P + P.T)

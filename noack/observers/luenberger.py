@@ -5,13 +5,14 @@ the model, the error follows e(t_k) = (I − L C) Â^(T) e(t_(k−1)).
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import repeat
-from typing import ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import FiniteFloat, model_validator
 
+from noack.core.core_library import core
+from noack.core.core_memory import CoreMemory
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.observers.estimation_model import EstimationModel, NoiseVariances
@@ -87,20 +88,6 @@ class LuenbergerSettings(ObserverSettings):
     def gains(self, assumed: EstimationModel) -> Iterator[Matrix]:
         return repeat(np.array(self.gain))
 
-    def estimator(self, assumed: EstimationModel, x: Vector) -> "LuenbergerObserver":
-        return LuenbergerObserver(assumed, np.array(self.gain), x)
-
-
-@dataclass
-class LuenbergerObserver:
-    """The observer with the gain L, (n, p), at x̂ before the first measurement."""
-
-    model: EstimationModel
-    gain: Matrix
-    x: Vector
-
-    def predict(self, u: Vector) -> None:
-        self.x = self.model.Ad @ self.x + self.model.Bd @ u
-
-    def correct(self, y: Vector) -> None:
-        self.x = self.x + self.gain @ (y - self.model.C @ self.x)
+    def fill(self, observer: Any, assumed: EstimationModel, x: Vector, memory: CoreMemory) -> None:
+        super().fill(observer, assumed, x, memory)
+        memory.fill(observer, {"kind": core.NOACK_LUENBERGER, "gain": np.array(self.gain)})

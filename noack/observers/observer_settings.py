@@ -1,28 +1,16 @@
-"""The settings and the interface that every kind of observer has."""
+"""The settings that every kind of observer has; native/loop/observer.c is what it does."""
 
 from abc import abstractmethod
 from collections.abc import Iterator
-from typing import Any, ClassVar, Protocol, Self
+from typing import Any, ClassVar, Self
 
+import numpy as np
+
+from noack.core.core_memory import CoreMemory
 from noack.core.linear_systems import Matrix, Vector
 from noack.observers.estimation_model import EstimationModel, NoiseVariances
 from noack.settings.matrices import Row, require_length
 from noack.settings.section import ScenarioSection
-
-
-class StateObserver(Protocol):
-    """Estimates a state from measurements."""
-
-    x: Vector
-    """x̂, shape (n,)."""
-
-    def predict(self, u: Vector) -> None:
-        """Advance x̂ by a step of the plant under an input, shape (m,)."""
-        ...
-
-    def correct(self, y: Vector) -> None:
-        """Correct x̂ by a measurement, shape (p,)."""
-        ...
 
 
 class ObserverSettings(ScenarioSection):
@@ -67,6 +55,10 @@ class ObserverSettings(ScenarioSection):
     def gains(self, assumed: EstimationModel) -> Iterator[Matrix]:
         """Yield L of every measurement, (n, p), without end."""
 
-    @abstractmethod
-    def estimator(self, assumed: EstimationModel, x: Vector) -> StateObserver:
-        """Return the observer, at x̂ before the first measurement."""
+    def fill(self, observer: Any, assumed: EstimationModel, x: Vector, memory: CoreMemory) -> None:
+        """Fill all of a ``noack_observer`` but its kind, with x̂ before the first measurement."""
+        (n, n), p = assumed.Ad.shape, len(assumed.C)
+        memory.fill(observer, {
+            "p": p, "Ad": assumed.Ad, "Bd": assumed.Bd, "C": assumed.C, "x": x, "t_ns": -1,
+            "gain": np.zeros((n, p)), "scratch": np.zeros(3 * n * n + n * p + p * p + 2 * n + p),
+        })  # fmt: skip

@@ -28,6 +28,7 @@ class LinearSystem:
     """
 
     def __init__(self, A: Matrix, B: Matrix, x0: Vector, *, step_ns: int) -> None:
+        self.A, self.B = A, B
         self._advance = HeldInputPropagator(A, B)
         self._advance.step(step_ns)
         self.x = np.array(x0, dtype=np.float64)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from plant_server.input_buffer import InputBuffer
 from scipy.integrate import solve_ivp
 
 from noack.config.resolution import resolve
@@ -15,7 +16,6 @@ from noack.plants.linear import LinearSystem
 from noack.protocol.machine_interface import Record
 from noack.protocol.record_tables import PLANT_ACTUATION, PLANT_STEP, tables
 from noack.protocol.wire_format import Flow, Message
-from plant_server.input_buffer import InputBuffer
 from plant_server.plant import Plant, plant_of
 from plant_server.watchdog import Watchdog
 

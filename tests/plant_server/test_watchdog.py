@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from plant_server.input_buffer import InputBuffer
 from scipy.linalg import expm
 
 from noack.config.resolution import resolve
@@ -11,7 +12,6 @@ from noack.config.scenario_file import validate
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import PLANT_ACTUATION, PLANT_STEP, tables
 from noack.protocol.wire_format import Flow, Message
-from plant_server.input_buffer import InputBuffer
 from plant_server.plant import Plant, plant_of
 from plant_server.watchdog import Watchdog, hold, zero
 

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.linalg import expm, solve_discrete_are
+from sensor_node.observing_sensor import AppliedInputTracker
 
 from noack.config.resolution import resolve, tables_of
 from noack.config.scenario import Scenario
@@ -19,7 +20,6 @@ from noack.observers.observability import observer_gain, unobservable_mode
 from noack.protocol.machine_interface import Notice, Output, Record, Start
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT
 from noack.protocol.wire_format import Flow, Message
-from sensor_node.observing_sensor import AppliedInputTracker
 from sensor_node.sensor import sensor_of
 
 A = np.array([[0.0, 1.0], [4.0, -0.3]])

@@ -3,6 +3,9 @@
 from collections.abc import Mapping
 
 from controller_node.controller_arrays import CONTROLLER_FLEET
+from plant_server.plant_arrays import PLANT_FLEET
+from sensor_node.sensor_arrays import SENSOR_FLEET
+
 from noack.config.fleet_layout import FleetRole
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
@@ -10,8 +13,6 @@ from noack.protocol.datagram_seal import KEY_BYTES
 from noack.runtime.fleet.compiled_driver import kept_replay
 from noack.runtime.fleet.compiled_fleet import CompiledFleet
 from noack.runtime.fleet.fleet_replay import FleetReplay
-from plant_server.plant_arrays import PLANT_FLEET
-from sensor_node.sensor_arrays import SENSOR_FLEET
 
 _ROLES: Mapping[str, FleetRole] = {
     "plant": PLANT_FLEET,

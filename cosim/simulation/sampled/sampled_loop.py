@@ -15,7 +15,7 @@ from noack.config.scenario import Scenario
 from noack.config.state_estimation import assumed_model
 from noack.core import ordered_arithmetic
 from noack.core.errors import CallerError
-from noack.core.linear_systems import Matrix, Vector, discretise, transition
+from noack.core.linear_systems import Matrix, discretise, transition
 from noack.theory.run_conditions import network_delay_ns
 from noack.trigger import self_triggered_interval, trigger_arrays
 from noack.trigger.self_triggered_interval import Forecast
@@ -200,23 +200,20 @@ def pushes_of(resolved: Scenario) -> Matrix:
         return np.zeros((0, n))
     through = through_of(resolved)
     found = np.zeros((resolved.timing.horizon_ns // resolved.timing.plant_period_ns, n))
-    for step in range(len(found)):
-        d, w = disturbance(step)
-        for part, at in ((d, through[:, :m]), (w, through[:, m:])):
-            if len(part):
-                found[step] += at @ part
+    d, w = disturbance.values(range(len(found)))
+    for part, at in ((d, through[:, :m]), (w, through[:, m:])):
+        if part.shape[1]:
+            found += part @ at.T
     return found
 
 
 def noise_of(resolved: Scenario) -> Matrix:
     """Return the noise of each measurement, (measurements, p); (0, p) for none."""
     model = measurement_model_of(resolved)
-    if model is None or not resolved.plant.measurement.is_noisy:
+    if model is None or not model.is_noisy:
         return np.zeros((0, resolved.message_sizes.outputs))
-    nothing: Vector = np.zeros(resolved.model.dimensions[0])
     steps = resolved.timing.horizon_ns // resolved.timing.plant_period_ns
-    numbers = range(steps // resolved.plant.measure_every + 1)
-    return np.array([model(nothing, number) for number in numbers])
+    return model.noise(0, steps // resolved.plant.measure_every + 1)
 
 
 def _dense(matrix: Matrix | Numbers) -> Matrix:

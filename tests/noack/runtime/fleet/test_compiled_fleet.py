@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from controller_node.controller_arrays import CONTROLLER_FLEET
+from plant_server.plant_arrays import PLANT_FLEET
+from sensor_node.sensor_arrays import SENSOR_FLEET
 
 from controller_node.controller import controller_of
-from controller_node.controller_arrays import CONTROLLER_FLEET
 from noack.config.fleet_layout import FleetRole
 from noack.config.loops import phases_ns
 from noack.config.parameter_changes import ParameterChange
@@ -31,9 +33,7 @@ from noack.runtime.fleet.compiled_fleet import CompiledFleet
 from noack.runtime.fleet.fleet_choice import may_be_compiled
 from noack.runtime.fleet.fleet_replay import FleetReplay, replay_arguments
 from plant_server.plant import plant_of
-from plant_server.plant_arrays import PLANT_FLEET
 from sensor_node.sensor import sensor_of
-from sensor_node.sensor_arrays import SENSOR_FLEET
 
 Content = dict[str, Any]
 ROLES: dict[str, tuple[FleetRole, Callable[[Scenario], Machine[Message]]]] = {

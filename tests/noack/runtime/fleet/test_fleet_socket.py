@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from sensor_node.sensor_arrays import SENSOR_FLEET
 
 from noack.config.resolution import loop_of, resolved_loops
 from noack.config.scenario_file import validate
@@ -19,7 +20,6 @@ from noack.runtime.fleet.compiled_fleet import CompiledFleet
 from noack.runtime.fleet.fleet_socket import FLEET_BUFFER_BYTES, FleetSocket
 from noack.runtime.peer_sockets import enlarge_buffer, has_peer_sockets, open_beside
 from noack.runtime.udp_sockets import bind
-from sensor_node.sensor_arrays import SENSOR_FLEET
 
 RUN_ID, KEY = 7, bytes(range(32))
 EARLY = 9000

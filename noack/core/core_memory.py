@@ -1,0 +1,103 @@
+"""Memory of the core's structures: arrays that live as long as what points to them."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from noack.core.core_library import core, ffi
+from noack.core.linear_systems import Matrix, Vector
+from noack.core.matrix_exponential import SCRATCH_MATRICES
+
+_MOST_PLACES, _MOST_NUMBERS = 1024, 2**20
+
+
+class CoreMemory:
+    """Arrays that structures of the core point to.
+
+    >>> memory = CoreMemory()
+    >>> x = memory.reals([1.0, 2.0])
+    >>> x[1]
+    2.0
+    """
+
+    def __init__(self) -> None:
+        self._kept: list[Any] = []
+        self._transitions: dict[bytes, Any] = {}
+
+    def keep(self, owner: Any) -> Any:
+        """Keep an object alive as long as this memory; return it."""
+        self._kept.append(owner)
+        return owner
+
+    def reals(self, values: ArrayLike) -> Any:
+        """Return a pointer to a copy of numbers, ``double *``."""
+        return self._pointer(np.array(values, np.float64, order="C"), "double *")
+
+    def integers(self, values: ArrayLike) -> Any:
+        """Return a pointer to a copy of whole numbers, ``int64_t *``."""
+        return self._pointer(np.array(values, np.int64, order="C"), "int64_t *")
+
+    def zeros(self, count: int) -> Any:
+        """Return a pointer to zeros, ``double *``; memory is taken when it is first used."""
+        return self._pointer(np.zeros(max(count, 1)), "double *")
+
+    def transitions(self, H: Matrix, steps_ns: Iterable[int] = ()) -> Any:
+        """Return the ``noack_transitions *`` of H, (n, n); loops with the same H share it.
+
+        The matrices of ``steps_ns`` are computed at once, so that first deadlines are not delayed.
+        """
+        H = np.array(H, np.float64)
+        shared = self._transitions.get(H.tobytes())
+        if shared is None:
+            shared = self._transitions[H.tobytes()] = self._new_transitions(H)
+        if not shared.is_static:
+            for step_ns in steps_ns:
+                if step_ns > 0:
+                    core.noack_transition(shared, step_ns)
+        return shared
+
+    def set_model(
+        self,
+        model: Any,
+        transitions: Any,
+        since_ns: Iterable[int] = (),
+        points: Iterable[Vector | None] = (None,),
+    ) -> None:
+        """Fill a ``noack_model``: its set points x_r, and the times at which they change."""
+        since, known = list(since_ns), list(points)
+        n = transitions.n
+        model.transitions, model.changes = transitions, len(since)
+        model.moves = any(point is not None for point in known)
+        model.since_ns = self.integers(since or [0])
+        model.has_point = self.integers([point is not None for point in known])
+        model.points = self.reals([np.zeros(n) if point is None else point for point in known])
+
+    def fill(self, structure: Any, numbers: Mapping[str, Any]) -> None:
+        """Set fields of a structure; an array becomes a pointer to a copy of it."""
+        for name, number in numbers.items():
+            value = self.reals(number) if isinstance(number, np.ndarray) else number
+            setattr(structure, name, ffi.NULL if value is None else value)
+
+    def _new_transitions(self, H: Matrix) -> Any:
+        n = len(H)
+        fits = max(_MOST_NUMBERS // (n * n), 4)
+        places = min(_MOST_PLACES, 1 << fits.bit_length() - 1)
+        steps = self._pointer(np.zeros(places, np.int64), "int64_t *")
+        made = ffi.new("noack_transitions *", {"n": n, "is_static": not H.any(), "places": places})
+        made.H, made.steps_ns = self.reals(H), steps
+        made.matrices = self.zeros(places * n * n)
+        made.scratch = self.zeros(SCRATCH_MATRICES * n * n + 3 * n)
+        return self.keep(made)
+
+    def _pointer(self, array: NDArray[Any], kind: str) -> Any:
+        self._kept.append(array)
+        return ffi.cast(kind, array.ctypes.data)
+
+
+def reals_at(pointer: Any, *shape: int) -> NDArray[np.float64]:
+    """Return the numbers at a ``double *`` as an array, which shares their memory."""
+    count = int(np.prod(shape))
+    data = ffi.buffer(pointer, 8 * count)
+    return np.frombuffer(data, np.float64).reshape(shape)
