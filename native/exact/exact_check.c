@@ -2,7 +2,7 @@
    assume. */
 #include "exact.h"
 
-static const int64_t FAR_NS = INT64_C(1) << 61;
+static const int64_t NEVER_NS = INT64_C(1) << 62; /* longer times never end */
 enum { MOST_ROWS = 256, MOST_FATES = 1 << 30 };
 
 static int is_between(int64_t least, int64_t number, int64_t most) {
@@ -22,9 +22,9 @@ static const char *check_exact_rule(const noack_exact *exact) {
     if (!is_positive(rule->level) || !is_positive(rule->rate_per_s) || !is_positive(rule->floor)
         || !is_positive(rule->decay_per_s))
         return "a trigger rule has a threshold or a rate below 0";
-    if (!is_between(0, rule->grid_ns, FAR_NS) || !is_between(-FAR_NS, rule->idle_ns, FAR_NS)
-        || !is_between(0, rule->shortest_ns, FAR_NS)
-        || !is_between(rule->shortest_ns, rule->longest_ns, INT64_MAX))
+    if (!is_between(0, rule->grid_ns, NEVER_NS) || !is_between(-NEVER_NS, rule->idle_ns, NEVER_NS)
+        || !is_between(0, rule->shortest_ns, NEVER_NS)
+        || !is_between(rule->shortest_ns, rule->longest_ns, NEVER_NS))
         return "a trigger rule has times out of range";
     if (rule->integrates && (is_quadratic(exact) || rule->is_dynamic))
         return "a trigger rule integrates another norm than that of W e_s, or on a grid";

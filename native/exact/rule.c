@@ -6,6 +6,7 @@
 
 static const double GRID_SLACK = 1e-9; /* rounding of an event's time on the grid, of a period */
 static const double NS = 1e-9, PER_S = 1e9;
+static const int64_t NEVER_NS = INT64_C(1) << 62;
 
 static int64_t whole(double number) { /* defined for all numbers */
     return number >= 9e18 ? INT64_MAX / 2 : number > -9e18 ? (int64_t)number : -INT64_MAX / 2;
@@ -14,7 +15,7 @@ static int64_t whole(double number) { /* defined for all numbers */
 /* size is |x|_W, for forecasts; left is |P z|, for thresholds that begin at an event. */
 rule_span span_after(const exact_memory *memory, double t_s, double left, double size) {
     const noack_trigger_rule *rule = memory->rule;
-    double due_ns = rule->longest_ns == INT64_MAX ? INFINITY : (double)rule->longest_ns;
+    double due_ns = rule->longest_ns >= NEVER_NS ? INFINITY : (double)rule->longest_ns;
     double idle_ns = rule->idle_ns > 0 ? (double)rule->idle_ns : -INFINITY;
     rule_span span = {0.0, rule->level, -INFINITY, 0.0, 0.0, 0};
     if (rule->from_event) {
