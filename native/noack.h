@@ -893,8 +893,10 @@ void noack_exact_segments(
     const noack_exact *exact, const double *A, const double *B, int64_t count, double *t_s,
     double *states, double *auxiliaries, int64_t *events, double *values, int64_t *statuses);
 
-/* The states (count, 3, n) of a plant at ascending times after a state (3, n), without events in
-   between; NAN from a time on that a million polynomials do not reach. */
+/* The states (count, 3, n) of a plant at ascending times t_s, from the first start on. A start is a state
+   just after an event, (starts, 3, n), at an ascending time; the last one up to a time applies. NAN
+   where a million polynomials do not reach. */
 void noack_exact_sample(
-    const noack_exact *exact, const double *A, const double *B, const double *state, int64_t count,
-    const double *after_s, double *states);
+    const noack_exact *exact, const double *A, const double *B, int64_t starts,
+    const double *start_s, const double *start_states, int64_t count, const double *t_s,
+    double *states);

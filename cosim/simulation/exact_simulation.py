@@ -166,16 +166,18 @@ class ExactSimulation:
         return found
 
     def sample(
-        self, A: Matrix, B: Matrix, state: NDArray[np.float64], after_s: Vector
+        self, A: Matrix, B: Matrix, start_s: Vector, starts: NDArray[np.float64], t_s: Vector
     ) -> NDArray[np.float64]:
-        """Return the states, (k, 3, n), at ascending times after a state, (3, n), without events.
+        """Return the states, (k, 3, n), at ascending times from the first start on.
 
-        They are NaN where a plant is too fast to be followed.
+        A start is a state just after an event, (starts, 3, n), at an ascending time; the last one
+        up to a time applies. States are NaN where a plant is too fast to be followed.
         """
-        states = np.empty((len(after_s), 3, self.n))
-        arrays = [np.ascontiguousarray(part, np.float64) for part in (A, B, state, after_s)]
-        *plant, after = (pointer_to(array, "double *") for array in arrays)
+        states = np.empty((len(t_s), 3, self.n))
+        arrays = [np.ascontiguousarray(part, np.float64) for part in (A, B, start_s, starts, t_s)]
+        *known, times = (pointer_to(array, "double *") for array in arrays)
         core.noack_exact_sample(
-            self.core, *plant, len(after_s), after, pointer_to(states, "double *")
-        )
+            self.core, *known[:2], len(start_s), *known[2:], len(t_s), times,
+            pointer_to(states, "double *"),
+        )  # fmt: skip
         return states

@@ -4,6 +4,8 @@
    the last bits of a loop do not depend on the size chosen. */
 #include "exact.h"
 
+enum { CACHE_LINE = 8 }; /* doubles */
+
 #if defined(__x86_64__)
 static const exact_code *code_for(int64_t entries) {
     if (!__builtin_cpu_supports("avx2") || !__builtin_cpu_supports("fma"))
@@ -114,11 +116,12 @@ static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_m
     int64_t square = code->n * code->stride, n = exact->n, curve = TERMS * code->stride;
     int64_t blocks = blocks_of(rule, code);
     int64_t count = (3 * (TERMS + 1) + 9) * square + 9 * curve
-                    + 2 * blocks * (2 * square + code->stride + curve);
+                    + 2 * blocks * (2 * square + code->stride + curve) + CACHE_LINE;
     if (memory == NULL)
         return count;
     double *next = exact->scratch;
     memset(next, 0, (size_t)count * sizeof *next);
+    next += (0 - (uintptr_t)next / sizeof *next) % CACHE_LINE; /* vectors do not cross lines */
     memory->exact = exact;
     memory->rule = rule;
     memory->blocks = blocks;
@@ -140,10 +143,14 @@ static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_m
     memory->A_k = take(&next, (TERMS + 1) * square);
     memory->X_k = take(&next, (TERMS + 1) * square);
     double **curves[] = {
-        &memory->x_c, &memory->e_c, &memory->d, &memory->x, &memory->u, &memory->error,
-        &memory->weighted, &memory->x_scaled, &memory->u_scaled};
+        &memory->x_c, &memory->e_c, &memory->d, &memory->x, &memory->u, &memory->own_error,
+        &memory->own_weighted, &memory->x_scaled, &memory->u_scaled};
     for (int i = 0; i < 9; i++)
         *curves[i] = take(&next, curve);
+    memory->weighted = rule->weight == NULL ? memory->e_c : memory->own_weighted;
+    memory->is_static = 1;
+    for (int64_t i = 0; i < n * n; i++)
+        memory->is_static &= exact->H[i] == 0.0;
     if (memory->quadratic) {
         memory->form = take_form(
             &next, code, memory, n, rule->up_rows, rule->up, rule->down_rows, rule->down,
@@ -219,14 +226,23 @@ void noack_exact_segments(
 }
 
 void noack_exact_sample(
-    const noack_exact *exact, const double *A, const double *B, const double *state, int64_t count,
-    const double *after_s, double *states) {
+    const noack_exact *exact, const double *A, const double *B, int64_t starts,
+    const double *start_s, const double *start_states, int64_t count, const double *t_s,
+    double *states) {
     const exact_code *code = code_for(max_of(exact->n, exact->m));
-    double start[3 * NOACK_EXACT_ENTRIES] = {0};
+    int64_t n = exact->n;
     exact_memory memory = {0};
     lay_out(exact, code, &memory);
     code->prepare(&memory, A, B);
-    for (int64_t j = 0; j < 3 * exact->n; j++)
-        start[j / exact->n * code->stride + j % exact->n] = state[j];
-    code->sample(&memory, start, count, after_s, states);
+    for (int64_t start = 0, sampled = 0; start < starts; start++, start_states += 3 * n) {
+        double state[3 * NOACK_EXACT_ENTRIES] = {0};
+        int64_t end = sampled;
+        while (end < count && (start + 1 == starts || t_s[end] < start_s[start + 1]))
+            end++;
+        for (int64_t j = 0; j < 3 * n; j++)
+            state[j / n * code->stride + j % n] = start_states[j];
+        code->sample(
+            &memory, state, start_s[start], end - sampled, t_s + sampled, states + 3 * n * sampled);
+        sampled = end;
+    }
 }

@@ -48,6 +48,8 @@ typedef struct { /* memory of a simulation; arrays begin in the caller's scratch
     int64_t blocks;            /* of N rows each, of [P; N] and of [P_eta; N_eta] */
     int integrates, quadratic; /* what is compared; otherwise |W e_s| or nothing */
     int dynamic;
+    int is_static; /* H = 0: x_c and d stay as they are between events */
+    int apart;     /* d is not 0: the models differ */
     double grid_s;
     /* shared by all runs; matrices in column-major order, columns padded to a stride */
     double *H, *K, *H_k;
@@ -59,7 +61,9 @@ typedef struct { /* memory of a simulation; arrays begin in the caller's scratch
     double reach_s[DEGREES];    /* time over which a polynomial of each degree is accurate */
     double measured_s[DEGREES]; /* the same, at the accuracy of the measures */
     /* coefficients of curves */
-    double *x_c, *e_c, *d, *x, *u, *error, *weighted, *x_scaled, *u_scaled, *y, *w;
+    double *x_c, *e_c, *d, *x, *u, *x_scaled, *u_scaled, *y, *w;
+    double *error, *weighted; /* W e_s and W e_c; of equal curves one may be the other */
+    double *own_error, *own_weighted;
     double squares[2 * TERMS], g[MOST_TERMS], eta[MOST_TERMS];
 } exact_memory;
 
@@ -81,8 +85,8 @@ typedef struct {
     void (*prepare)(exact_memory *memory, const double *A, const double *B);
     void (*follow)(exact_memory *memory, exact_run *run);
     void (*sample)(
-        exact_memory *memory, const double *state, int64_t count, const double *after_s,
-        double *states);
+        exact_memory *memory, const double *state, double start_s, int64_t count,
+        const double *t_s, double *states);
 } exact_code;
 
 #if defined(__x86_64__)

@@ -74,12 +74,16 @@ static double safe_length(
     return length * (below / (below + above));
 }
 
-/* The first s in [0, end_s) from which |y(s)| >= c e^(-rs), NONE or UNRESOLVED. */
-static double first_exit(const double *curve, int p, const level_search *search, int most_steps) {
+/* The first s in [0, end_s) from which |y(s)| >= c e^(-rs), NONE or UNRESOLVED. ends_below: it is known
+   that h(end_s) < 0. */
+static double first_exit(
+    const double *curve, int p, const level_search *search, int ends_below, int most_steps) {
     const double ahead = 3.0, nearer = 0.6;
     vector_curve own = {curve, p};
     double rate = search->rate, end_s = search->end_s, s = 0.0, ahead_s = end_s;
-    double most = bend(curve, p, end_s);
+    double highest, most = bend(curve, p, end_s, &highest), lowest = level_at(search, end_s);
+    if (highest < lowest * lowest)
+        return NONE;
     lanes y = load(curve), dy = load(curve + STRIDE);
     if (search->backward)
         look(curve, p, search, s, &y, &dy);
@@ -92,6 +96,8 @@ static double first_exit(const double *curve, int p, const level_search *search,
             return NONE;
         double slope = rate * level + (size > 0.0 ? mixed / size : sqrt(speed));
         if (slope > (most + rate * rate * level) * (ahead_s - s)) {
+            if (ends_below && ahead_s == end_s)
+                return NONE;
             search_point at = {s, size - level, slope};
             s = ascend(look_at_norm, &own, search, at, ahead_s);
             if (s != NONE || ahead_s == end_s)
@@ -106,12 +112,12 @@ static double first_exit(const double *curve, int p, const level_search *search,
             s = least(s + step, ahead_s);
             if (s + ahead * step < nearer * ahead_s && !search->backward) {
                 ahead_s = s + ahead * step;
-                most = bend(curve, p, ahead_s);
+                most = bend(curve, p, ahead_s, &highest);
             }
         }
         if (s == ahead_s) {
             ahead_s = end_s;
-            most = bend(curve, p, ahead_s);
+            most = bend(curve, p, ahead_s, &highest);
         }
         look(curve, p, search, s, &y, &dy);
     }

@@ -9,47 +9,50 @@
 
 static const double CERTAINTY = 1e-10; /* the supremum exceeds the returned one by at most this */
 
+/* The sum over i <= p and j <= p of v_i W v_j/(2(i + j + 1)). */
+static inline __attribute__((always_inline)) double double_sum(
+    const double *vectors, int p, const double *weight, const double *inverse) {
+    lanes total = filled(0.0);
+    for (int i = 0; i <= p; i++) {
+        /* Two independent sums: a single one would stall on the latency of each addition. */
+        lanes v = load(vectors + i * STRIDE), more = filled(0.0);
+        lanes own = scale(v, 0.5 * inverse[2 * i + 1]);
+        int j = i + 1;
+        for (; j < p; j += 2) {
+            own = fma_scaled(load(vectors + j * STRIDE), inverse[i + j + 1], own);
+            more = fma_scaled(load(vectors + (j + 1) * STRIDE), inverse[i + j + 2], more);
+        }
+        if (j == p)
+            more = fma_scaled(load(vectors + p * STRIDE), inverse[i + p + 1], more);
+        own = add(own, more);
+        total = fma_lanes(weight == NULL ? own : times(weight, own), v, total);
+    }
+    return sum(total);
+}
+
 /* The integral of xQx + uRu over [0, s] of polynomials of degree p, exact up to rounding. With
    v_k = c_k s^k that of xQx is s times the sum of v_i Q v_j/(i + j + 1). */
 static double square_integrals(exact_memory *memory, int p, double s) {
     const double *inverse = memory->inverse, small_share = 1e-27;
     double *xs = memory->x_scaled, *us = memory->u_scaled, power = 1.0;
+    int u_terms = memory->is_static ? 0 : p; /* of a constant u */
     for (int k = 0; k <= p; k++, power *= s) {
         store(xs + k * STRIDE, scale(load(memory->x + k * STRIDE), power));
-        store(us + k * STRIDE, scale(load(memory->u + k * STRIDE), power));
+        if (k <= u_terms)
+            store(us + k * STRIDE, scale(load(memory->u + k * STRIDE), power));
     }
     /* The last coefficients often contribute nothing to the sum. */
-    lanes v = load(xs), w = load(us), x_total = filled(0.0), u_total = filled(0.0);
+    lanes v = load(xs), w = load(us);
     double negligible = small_share * (dot(v, v) + dot(w, w));
     for (; p > 1; p--) {
         v = load(xs + p * STRIDE);
-        w = load(us + p * STRIDE);
+        w = p <= u_terms ? load(us + p * STRIDE) : filled(0.0);
         if (dot(v, v) + dot(w, w) > negligible)
             break;
     }
-    for (int i = 0; i <= p; i++) {
-        /* Two independent sums: a single one would stall on the latency of each addition. */
-        v = load(xs + i * STRIDE);
-        w = load(us + i * STRIDE);
-        lanes x_sum = scale(v, 0.5 * inverse[2 * i + 1]), x_more = filled(0.0);
-        lanes u_sum = scale(w, 0.5 * inverse[2 * i + 1]), u_more = filled(0.0);
-        int j = i + 1;
-        for (; j < p; j += 2) {
-            x_sum = fma_scaled(load(xs + j * STRIDE), inverse[i + j + 1], x_sum);
-            u_sum = fma_scaled(load(us + j * STRIDE), inverse[i + j + 1], u_sum);
-            x_more = fma_scaled(load(xs + (j + 1) * STRIDE), inverse[i + j + 2], x_more);
-            u_more = fma_scaled(load(us + (j + 1) * STRIDE), inverse[i + j + 2], u_more);
-        }
-        if (j == p) {
-            x_more = fma_scaled(load(xs + p * STRIDE), inverse[i + p + 1], x_more);
-            u_more = fma_scaled(load(us + p * STRIDE), inverse[i + p + 1], u_more);
-        }
-        x_sum = add(x_sum, x_more);
-        u_sum = add(u_sum, u_more);
-        x_total = fma_lanes(memory->Q == NULL ? x_sum : times(memory->Q, x_sum), v, x_total);
-        u_total = fma_lanes(memory->R == NULL ? u_sum : times(memory->R, u_sum), w, u_total);
-    }
-    return 2.0 * s * (sum(x_total) + sum(u_total));
+    u_terms = u_terms < p ? u_terms : p;
+    return 2.0 * s
+           * (double_sum(xs, p, memory->Q, inverse) + double_sum(us, u_terms, memory->R, inverse));
 }
 
 /* |y(s)| e^(rate s) at or near a maximum to the right of low_s. */
@@ -83,7 +86,7 @@ static double climb(const double *curve, int p, double low_s, double high_s, dou
     return best;
 }
 
-/* The larger of best and the supremum of |y(s)| e^(rate s) growth over [0, end_s], or UNRESOLVED. The
+/* The larger of best, which is at least the value at end_s, and the supremum of |y(s)| e^(rate s) growth over [0, end_s], or UNRESOLVED. The
    value is attained, and the supremum exceeds it by at most the share CERTAINTY (values below 1e-150
    are ignored; values above 1e150 are infinite). A curve that stays close to one level, such as an
    oscillation, is searched again as the scalar |y|^2, in which cancelling terms vanish. */
@@ -97,7 +100,7 @@ static double raise_supremum(
             return best;
         double level = largest_of(best * (1.0 + CERTAINTY), smallest) / growth;
         level_search search = {level, rate, end_s, 0};
-        double s = first_exit(curve, p, &search, few_steps);
+        double s = first_exit(curve, p, &search, 1, few_steps);
         if (s == UNRESOLVED) {
             lanes signs = filled(1.0);
             squared(curve, p, 1, (const double *)&signs, memory->squares);
@@ -122,7 +125,7 @@ static double last_above(const double *curve, int p, double end_s, double level,
     if (largest(curve, p, end_s) <= square)
         return NONE;
     level_search back = {level, 0.0, end_s, 1};
-    double back_s = first_exit(curve, p, &back, MOST_STEPS);
+    double back_s = first_exit(curve, p, &back, 0, MOST_STEPS);
     return back_s < 0.0 ? back_s : end_s - back_s;
 }
 
@@ -131,7 +134,8 @@ static inline int is_within(models state, double limit, double level) {
     lanes x = subtract(state.x_c, state.e_c), e_s = add(state.e_c, state.d);
     if (level > 0.0)
         limit *= least(level, 1.0);
-    return dot(x, x) + dot(e_s, e_s) + dot(state.e_c, state.e_c) < limit * limit;
+    lanes squares = fma_lanes(x, x, fma_lanes(e_s, e_s, multiply(state.e_c, state.e_c)));
+    return sum(squares) < limit * limit;
 }
 
 /* The time on a piece at which the loop's norm exceeds a limit, at most end_s. */

@@ -28,26 +28,33 @@ static inline lanes weigh(const double *weight, lanes v) {
 
 /* Write the coefficients of degree begin to end; those of quadratic forms times a factor. */
 static void expand(exact_memory *memory, models state, double factor, int begin, int end) {
+    const lanes nothing = filled(0.0);
+    int apart = memory->apart, is_static = memory->is_static;
+    memory->error = apart ? memory->own_error : memory->weighted;
     for (int k = begin; k <= end; k++) {
         int64_t table = k * N * STRIDE, at = k * STRIDE;
-        lanes x_c = times(memory->H_k + table, state.x_c);
-        lanes e_c = add(
-            times(memory->A_k + table, state.e_c), times(memory->X_k + table, state.x_c));
-        lanes d = times(memory->H_k + table, state.d), x = subtract(x_c, e_c);
-        store(memory->x_c + at, x_c);
+        lanes x_c = nothing, d = nothing, e_c = times(memory->X_k + table, state.x_c);
+        e_c = add(times(memory->A_k + table, state.e_c), e_c);
+        if (k == 0 || !is_static) {
+            x_c = times(memory->H_k + table, state.x_c);
+            store(memory->x_c + at, x_c);
+            store(memory->u + at, times(memory->K, x_c));
+            if (apart)
+                d = times(memory->H_k + table, state.d);
+            store(memory->d + at, d);
+        }
+        lanes x = subtract(x_c, e_c), e_s = add(e_c, d);
         store(memory->e_c + at, e_c);
-        store(memory->d + at, d);
         store(memory->x + at, x);
-        store(memory->u + at, times(memory->K, x_c));
-        store(memory->weighted + at, weigh(memory->weight, e_c));
+        if (memory->weight != NULL)
+            store(memory->weighted + at, times(memory->weight, e_c));
         if (memory->quadratic) {
             int64_t place = at * memory->blocks;
-            lanes e_s = add(e_c, d);
             put_rows(memory->form, memory->blocks, x, e_s, factor, memory->y + place);
             if (memory->dynamic)
                 put_rows(memory->gain, memory->blocks, x, e_s, factor, memory->w + place);
-        } else
-            store(memory->error + at, weigh(memory->weight, add(e_c, d)));
+        } else if (apart)
+            store(memory->error + at, weigh(memory->weight, e_s));
     }
 }
 
@@ -105,7 +112,7 @@ static double find_event(
     level_search search = {level, phase->rate_per_s, window_s, 0};
     if (memory->integrates)
         return first_excess(memory->error, p, &search, &now->auxiliary);
-    return phase->compares ? first_exit(memory->error, p, &search, MOST_STEPS) : NONE;
+    return phase->compares ? first_exit(memory->error, p, &search, 0, MOST_STEPS) : NONE;
 }
 
 /* Raise a row's supremum by that of a piece; return 0 if it is UNRESOLVED. */
@@ -241,6 +248,7 @@ static void follow(exact_memory *memory, exact_run *run) {
         rule_phase phase = phase_at(memory, &span, t_s);
         double left_s = least(phase.until_s, horizon_s) - t_s, window_s = farthest_s;
         comparison now = comparison_at(memory, phase, state, auxiliary);
+        memory->apart = !agree;
         expand(memory, state, 1.0 / now.scale, 0, first_degree);
         if (phase.compares && !looked) {
             if (!is_within(state, LARGEST, phase.threshold)) {
@@ -264,7 +272,9 @@ static void follow(exact_memory *memory, exact_run *run) {
                                               * (now.scale * now.scale)
                                         : 0.0;
         state = state_at(memory, degree_for(memory->reach_s, spent_s), spent_s);
-        if (!is_within(state, LARGEST, threshold_after(&phase, spent_s))) {
+        int is_usual = phase.threshold > 1e-10 && phase.rate_per_s * spent_s < 1.0;
+        if (!(is_usual && is_within(state, 1e30, 1.0))
+            && !is_within(state, LARGEST, threshold_after(&phase, spent_s))) {
             status = NOACK_EXACT_DIVERGED;
             t_s += passed_at(memory, spent_s, LARGEST, &phase);
             break;
@@ -310,32 +320,32 @@ static void prepare(exact_memory *memory, const double *A, const double *B) {
     find_reaches(memory);
 }
 
-/* The states (count, 3, n) at ascending times after a state (3, n), without events in between;
-   NaN from a time on that no polynomial reaches. */
+/* The states (count, 3, n) at ascending times from a state (3, n) on, without events in between; NAN
+   where no polynomial reaches. */
 static void sample(
-    exact_memory *memory, const double *state, int64_t count, const double *after_s,
+    exact_memory *memory, const double *state, double start_s, int64_t count, const double *t_s,
     double *states) {
-    int64_t n = memory->exact->n;
+    int64_t n = memory->exact->n, pieces = 0, expanded = 0;
     models at = {load(state), load(state + STRIDE), load(state + 2 * STRIDE)};
-    double t_s = 0.0, farthest_s = memory->reach_s[DEGREES - 1];
-    int64_t pieces = 0, expanded = 0;
+    double farthest_s = memory->reach_s[DEGREES - 1];
+    memory->apart = 1;
     for (int64_t i = 0; i < count; i++, states += 3 * n) {
-        while (after_s[i] - t_s > farthest_s && farthest_s > 0.0 && pieces++ < MOST_PIECES) {
+        while (t_s[i] - start_s > farthest_s && farthest_s > 0.0 && pieces++ < MOST_PIECES) {
             if (!expanded)
                 expand(memory, at, 1.0, 0, HIGHEST);
             at = state_at(memory, HIGHEST, farthest_s);
-            t_s += farthest_s;
+            start_s += farthest_s;
             expanded = 0;
         }
         if (!expanded)
             expand(memory, at, 1.0, 0, HIGHEST);
         expanded = 1;
-        models there = state_at(memory, HIGHEST, after_s[i] - t_s);
-        int known = after_s[i] - t_s <= farthest_s;
+        double after_s = t_s[i] - start_s;
+        models there = state_at(memory, HIGHEST, after_s);
         for (int j = 0; j < n; j++) {
-            states[j] = known ? entry(there.x_c, j) : NAN;
-            states[n + j] = known ? entry(there.e_c, j) : NAN;
-            states[2 * n + j] = known ? entry(there.d, j) : NAN;
+            states[j] = after_s <= farthest_s ? entry(there.x_c, j) : NAN;
+            states[n + j] = after_s <= farthest_s ? entry(there.e_c, j) : NAN;
+            states[2 * n + j] = after_s <= farthest_s ? entry(there.d, j) : NAN;
         }
     }
 }

@@ -119,11 +119,22 @@ static inline models state_at(const exact_memory *memory, int p, double s) {
     models state = {
         load(memory->x_c + p * STRIDE), load(memory->e_c + p * STRIDE),
         load(memory->d + p * STRIDE)};
+    if (memory->is_static) {
+        state = (models){load(memory->x_c), state.e_c, load(memory->d)};
+        for (int k = p - 1; k >= 0; k--)
+            state.e_c = fma_scaled(state.e_c, s, load(memory->e_c + k * STRIDE));
+        return state;
+    }
     for (int k = p - 1; k >= 0; k--) {
         state.x_c = fma_scaled(state.x_c, s, load(memory->x_c + k * STRIDE));
         state.e_c = fma_scaled(state.e_c, s, load(memory->e_c + k * STRIDE));
-        state.d = fma_scaled(state.d, s, load(memory->d + k * STRIDE));
     }
+    if (!memory->apart) {
+        state.d = filled(0.0);
+        return state;
+    }
+    for (int k = p - 1; k >= 0; k--)
+        state.d = fma_scaled(state.d, s, load(memory->d + k * STRIDE));
     return state;
 }
 
@@ -139,15 +150,16 @@ static inline void value_and_slope(
     *slope = rise;
 }
 
-/* A bound on |y''| in [0, s]. Entry by entry, the sum of |c_k| s^k bounds |y|, and its derivatives
-   bound those of y; they do not decrease. */
-static inline double bend(const double *curve, int p, double s) {
+/* Bounds on |y''| and on |y|^2 in [0, s]. Entry by entry, the sum of |c_k| s^k bounds |y|, and its
+   derivatives bound those of y; they do not decrease. */
+static inline double bend(const double *curve, int p, double s, double *square) {
     lanes total = magnitude(load(curve + p * STRIDE)), slope = filled(0.0), half = slope;
     for (int k = p - 1; k >= 0; k--) {
         half = fma_scaled(half, s, slope);
         slope = fma_scaled(slope, s, total);
         total = fma_scaled(total, s, magnitude(load(curve + k * STRIDE)));
     }
+    *square = ROUNDED_UP * dot(total, total);
     return ROUNDED_UP * 2.0 * sqrt(dot(half, half));
 }
 
