@@ -102,7 +102,12 @@ void heap_push(noack_heap_entry *heap, int64_t *count, noack_heap_entry entry);
 /* Remove the first entry. */
 void heap_pop(noack_heap_entry *heap, int64_t *count);
 
-/* Copy what a datagram has: its message may have few entries. */
+/* Copy what a message has: it may have few entries. */
+static inline void copy_message(noack_message *to, const noack_message *from) {
+    memcpy(to, from, offsetof(noack_message, vector) + (size_t)from->entries * sizeof(double));
+}
+
+/* Copy what a datagram has. */
 static inline void copy_datagram(noack_datagram *to, const noack_datagram *from) {
     size_t entries = (size_t)from->message.entries;
     memcpy(to, from, offsetof(noack_datagram, message.vector) + entries * sizeof(double));

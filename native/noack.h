@@ -1061,6 +1061,40 @@ const char *noack_simulation_check(const noack_simulation *simulation);
    answer the call is repeated. */
 int64_t noack_simulate(noack_simulation *simulation, int64_t until_ns);
 
+/* ---- Many runs of a loop, from event to event ------------------------------------------------------ */
+
+typedef struct { /* the machines of one loop make the steps of all runs, one run after the other */
+    noack_plant *plant;
+    noack_sensor *sensor;
+    noack_controller *controller;
+    int64_t last;          /* number of the last step of the plant */
+    int64_t delay_ns;      /* of every delivered update */
+    int64_t known_start;   /* 1: sensor and controller start from x(0) */
+    const double *gains;   /* (measurements, n, p) of the observer; NULL: there is none */
+    const double *weight;  /* W, (n, n) */
+    const double *error_scale, *state_scale; /* (last + 1,) */
+    /* the runs; r is the number of updates that may be in flight */
+    int64_t runs, places;
+    int64_t *step; /* (runs,) of the event before; -1: a start that is no event */
+    double *x, *y, *x_s, *x_c; /* (runs, n) y: measured or estimated */
+    double *u, *u_next;        /* (runs, m) held, and of the newest actuation */
+    double *sent;              /* (runs, r) step of each update in flight, the oldest first; -1: none */
+    double *updates;           /* (runs, r, n) */
+    double *auxiliary;         /* (runs,) of the trigger */
+    /* of the segments since then */
+    uint8_t *is_event;         /* (runs,) 1: it ended by an event */
+    double *error, *state;     /* (runs,) largest scaled |W e_c| and |x|; infinite if the run diverged */
+    double *cost;              /* (runs,) the integral of |x|^2, as a sum over the steps */
+    int64_t *error_at, *state_at; /* (runs,) steps of the largest values */
+    double *scratch;           /* (3n,) */
+} noack_segments;
+
+/* Return NULL, or what is wrong with the machines or the lengths. */
+const char *noack_segments_check(const noack_segments *segments);
+
+/* Advance each run to its next event, at most to a step, (runs,). tests: 0: there are no events. */
+void noack_follow(noack_segments *segments, const int64_t *last, int64_t tests);
+
 /* ---- Replay of recorded inputs -------------------------------------------------------------------- */
 
 typedef struct {

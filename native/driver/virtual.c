@@ -87,8 +87,7 @@ static void send(noack_simulation *simulation, int64_t group, const noack_output
     noack_sent_datagram *sent = next_place(simulation);
     noack_datagram *datagram = &sent->datagram;
     int64_t direction = simulation->directions[message->flow];
-    size_t entries = (size_t)message->entries;
-    memcpy(&datagram->message, message, offsetof(noack_message, vector) + entries * sizeof(double));
+    copy_message(&datagram->message, message);
     datagram->message.loop = simulation->of_group[group].numbers[message->loop];
     datagram->bit = -1;
     sent->to = RECEIVER[message->flow];

@@ -66,6 +66,9 @@ static inline double image_norm(
     return noack_norm(rows, image);
 }
 
+/* plant.c: set the input of the system for a step: u + d, and w behind it. */
+void disturb(noack_plant *plant, int64_t step);
+
 /* observer.c: advance x-hat to a measurement [y; u of the plant's steps since the last one]. */
 void observe(
     noack_observer *observer, const noack_message *message, int64_t n, int64_t m,

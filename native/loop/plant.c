@@ -109,8 +109,7 @@ static int64_t notice(noack_plant *plant, int64_t t_ns, noack_note *note) {
     return 1;
 }
 
-/* The input of the system: u + d, and w behind it. */
-static void disturb(noack_plant *plant, int64_t step) {
+void disturb(noack_plant *plant, int64_t step) {
     int64_t m = plant->machine.m;
     copy(m, plant->u, plant->applied);
     if (plant->at_input.width > 0) {

@@ -16,8 +16,15 @@ import numpy as np
 from cosim.analysis.adversary.objective import Objective
 from cosim.analysis.adversary.sampled_flow import SampledFlow
 from cosim.analysis.adversary.sampled_run import SampledRun
-from cosim.simulation.sampled.loop_steps import Numbers, Runs, Scales
-from cosim.simulation.sampled.sampled_loop import SampledLoop, noise_of, pushes_of, through_of
+from cosim.simulation.sampled.sampled_loop import (
+    Numbers,
+    Runs,
+    SampledLoop,
+    Scales,
+    noise_of,
+    pushes_of,
+    through_of,
+)
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix, Vector
 from noack.disturbances.uniform import UniformDisturbance

@@ -1,29 +1,77 @@
-"""Makes the data of a scenario's loop for :mod:`cosim.simulation.sampled.loop_steps`."""
+"""Many runs of a scenario's loop as its processes run it, from event to event.
+
+The machines of the loop make the steps of all runs (native/driver/segments.c): at step k of the
+plant, in this order, x advances under the input held since step k − 1, and the newest actuation is
+latched. At every ``every``-th step y is measured (with an observer y = x̂), and the trigger tests
+it. After an event x_s = y. Then updates arrive, and the controller ticks, until step k + 1. Nothing
+is late.
+"""
 
 from copy import copy
-from functools import cache
 from itertools import islice
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.simulation.sampled import loop_steps
-from cosim.simulation.sampled.loop_steps import NO_TICK, Loop, Numbers, Rule, Runs, Scales, Scratch
-from noack.config.resolution import LoopMatrices, loop_of, policy_of
+from controller_node.controller import controller_of
+from noack.config.resolution import loop_of, policy_of
 from noack.config.scenario import Scenario
 from noack.config.state_estimation import assumed_model
-from noack.core import ordered_arithmetic
+from noack.core.core_library import core, ffi, pointer_to
 from noack.core.errors import CallerError
-from noack.core.linear_systems import Matrix, discretise, transition
+from noack.core.linear_systems import Matrix, Vector, discretise
 from noack.theory.run_conditions import network_delay_ns
-from noack.trigger import self_triggered_interval, trigger_arrays
-from noack.trigger.self_triggered_interval import Forecast
-from noack.trigger.trigger_rule import TriggerRule
 from plant_server.disturbance_signal import disturbance_of
 from plant_server.measurement import measurement_model_of
+from plant_server.plant import plant_of
+from sensor_node.sensor import sensor_of
 
 Stack = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+_POINTERS = {"i": "int64_t *", "f": "double *", "b": "uint8_t *"}
+
+
+class Scales(NamedTuple):
+    """What the values of a run are multiplied with, by the step, (K + 1,)."""
+
+    weight: Matrix
+    """W, (n, n)."""
+    error: Vector
+    state: Vector
+
+
+class Runs(NamedTuple):
+    """N runs, changed in place; r is the number of updates that may be in flight."""
+
+    step: Numbers
+    """The step of the event before, which is decided; −1 at a start that is no event, (N,)."""
+    x: Matrix
+    """(N, n), and the same for the next ones."""
+    y: Matrix
+    x_s: Matrix
+    x_c: Matrix
+    u: Matrix
+    """The held input, (N, m)."""
+    u_next: Matrix
+    """The newest actuation, (N, m)."""
+    sent: Matrix
+    """The step of each update in flight, the oldest first; −1 for none, (N, r)."""
+    updates: Stack
+    """Their states, (N, r, n)."""
+    auxiliary: Vector
+    """η, or the integral, (N,)."""
+    is_event: NDArray[np.bool_]
+    """Whether the run reached an event, not the last step, (N,)."""
+    error: Vector
+    """The largest scaled ‖W e_c‖ since the event before; infinite if the run diverged, (N,)."""
+    state: Vector
+    """The largest scaled ‖x‖, (N,)."""
+    cost: Vector
+    """∫‖x‖² dt, as a sum over the steps, (N,)."""
+    error_at: Numbers
+    """Step of the largest ‖W e_c‖, (N,)."""
+    state_at: Numbers
 
 
 class SampledLoop:
@@ -43,20 +91,46 @@ class SampledLoop:
                 "plant.watchdog.timeout_s: shorter than the time between two inputs; "
                 "give a time after which the watchdog acts on a failure only"
             )
-        policy, self.matrices = policy_of(resolved), loop_of(resolved)
-        self.resolved, n = resolved, self.matrices.n
+        self.matrices, n = loop_of(resolved), resolved.model.dimensions[0]
+        self.resolved = resolved
         self.last = timing.horizon_ns // timing.plant_period_ns
         self.step_s = timing.plant_period_ns * 1e-9
+        self.every = resolved.plant.measure_every
+        """Steps from one measurement to the next."""
         self.weight = np.eye(n) if self.matrices.weight is None else self.matrices.weight
         self.delay_ns = network_delay_ns(resolved, 0)
-        self._rule = rule_of(policy.trigger_rule(n))
-        self._first_auxiliary = policy.initial_dynamic_variable
-        self._loop = _loop(resolved, self.matrices, self.delay_ns)
+        self._first_auxiliary = policy_of(resolved).initial_dynamic_variable
         self._most_in_flight = self.delay_ns // timing.measurement_period_ns + 2
-        size = max(n, len(self._loop.C))
-        self._own = Scratch(
-            np.empty(n), np.empty(size), np.empty(2 * n), np.empty(2), np.empty(4 * n)
-        )
+        assumed, measurements = assumed_model(resolved), self.last // self.every + 1
+        self._C, self._gains = assumed.C, np.zeros((0, n, len(assumed.C)))
+        if resolved.observer is not None:
+            self._gains = _dense(
+                np.array([*islice(resolved.observer.gains(assumed), measurements)])
+            )
+        self._machines = (plant_of(resolved), sensor_of(resolved), controller_of(resolved))
+        self._set_causes(pushes_of(resolved), noise_of(resolved))
+
+    def _set_causes(self, push: Matrix, noise: Matrix) -> None:
+        """Make a plant with these disturbances and noise; it shares the state of the first one."""
+        matrices, (n, m) = self.matrices, self.resolved.model.dimensions
+        self._push, self._noise = push, noise
+        plant = ffi.new("noack_plant *", self._machines[0].machines[0])
+        B = discretise(matrices.A, matrices.B, self.resolved.timing.plant_period_ns)[1]
+        sources, pushes = B, np.zeros((self.last + 1, n))
+        if len(push):
+            sources, pushes[: len(push)] = np.hstack([B, np.eye(n)]), push
+        arrays = {"Bd": _dense(sources), "applied": np.zeros(m + n)}
+        for name, array in arrays.items():
+            setattr(plant, name, pointer_to(array, "double *"))
+        plant.sources, plant.at_input.width = sources.shape[1], 0
+        noises = _dense(noise)
+        for signal, values, given in (
+            (plant.at_state, pushes, len(push)), (plant.noise, noises, len(noise)),
+        ):  # fmt: skip
+            signal.width = values.shape[1] if given else 0
+            signal.first, signal.rows = 0, len(values)
+            signal.values = pointer_to(values, "double *")
+        self._plant, self._kept = plant, (arrays, pushes, noises)
 
     @property
     def known_start(self) -> bool:
@@ -76,37 +150,38 @@ class SampledLoop:
             given = observer.initial_estimate
             runs.y[0] = (x0 if known else np.zeros(n)) if given is None else np.array(given)
         if not known:
-            loop_steps.measure(self._loop, runs, 0, 0, self._own)
             runs.step[0] = 0
+            self.measure_at(runs)
             self.update(runs, np.array([True]))
         return runs
 
     @property
-    def every(self) -> int:
-        """Steps from one measurement to the next."""
-        return self._loop.every
-
-    @property
     def causes(self) -> tuple[Matrix, Matrix]:
         """The changes of x by the disturbance of each step, and the noise of each measurement."""
-        return self._loop.push, self._loop.noise
+        return self._push, self._noise
 
     def with_causes(self, push: Matrix, noise: Matrix) -> "SampledLoop":
         """Return this loop with other disturbances and noise."""
         changed = copy(self)
-        changed._loop = self._loop._replace(push=_dense(push), noise=_dense(noise))
+        changed._set_causes(push, noise)
         return changed
 
     def correction(self, numbers: Numbers) -> Stack:
         """Return the change of y by noise at each of k measurements, (k, n, p)."""
-        if len(self._loop.gains):
-            return self._loop.gains[numbers]
+        if len(self._gains):
+            return self._gains[numbers]
         return np.broadcast_to(np.eye(self.matrices.n), (len(numbers), *[self.matrices.n] * 2))
 
     def measure_at(self, runs: Runs) -> None:
-        """Measure, where the step of a run is one of a measurement; y is 0 before."""
+        """Measure, where the step of a run is one of a measurement; y is 0 or estimated before."""
         for i in np.flatnonzero(runs.step % self.every == 0).tolist():
-            loop_steps.measure(self._loop, runs, i, int(runs.step[i]) // self.every, self._own)
+            number = int(runs.step[i]) // self.every
+            noise = self._noise[number] if len(self._noise) else 0.0
+            if len(self._gains):
+                innovation = self._C @ (runs.x[i] - runs.y[i]) + noise
+                runs.y[i] += self._gains[number] @ innovation
+            else:
+                runs.y[i] = runs.x[i] + noise
 
     def empty(self, count: int) -> Runs:
         """Return runs at 0."""
@@ -132,58 +207,28 @@ class SampledLoop:
 
         Without ``tests`` there are no events.
         """
-        _compiled()(self._loop, self._rule, scales, runs, last, tests, self._own)
-
-
-@cache
-def _compiled() -> Any:
-    from cosim.simulation.compiled_runs import compile_kept
-
-    modules = (ordered_arithmetic, trigger_arrays, self_triggered_interval, loop_steps)
-    return compile_kept(loop_steps.follow, "sampled", modules)
-
-
-def rule_of(rule: TriggerRule) -> Rule:
-    """Return a trigger rule as numbers."""
-    trigger, matrices = np.zeros(1, trigger_arrays.TRIGGER), list[float]()
-    trigger_arrays.set_rule(trigger[0], rule, rule.weight, matrices)
-    forecast = Forecast(*map(float, rule.forecast or (0.0,) * len(Forecast._fields)))
-    return Rule(
-        trigger, np.array([*matrices, 0.0]), rule.forecast is not None, forecast,
-        float(rule.shortest_ns), float(rule.longest_ns),
-    )  # fmt: skip
-
-
-def _loop(resolved: Scenario, matrices: LoopMatrices, delay_ns: int) -> Loop:
-    timing, n, K = resolved.timing, matrices.n, matrices.K
-    period_ns, steps = timing.plant_period_ns, timing.horizon_ns // timing.plant_period_ns
-    A, B = discretise(matrices.A, matrices.B, period_ns)
-    assumed, measurements = assumed_model(resolved), steps // resolved.plant.measure_every + 1
-    gains = np.zeros((0, n, len(assumed.C)))
-    if resolved.observer is not None:
-        gains = np.array(list(islice(resolved.observer.gains(assumed), measurements)))
-    tick_ns, phase_ns = timing.controller_period_ns, timing.controller_phase_ns
-    step_ns = np.arange(steps + 1) * period_ns
-    last_tick_ns = (step_ns + period_ns - 1 - phase_ns) // tick_ns * tick_ns + phase_ns
-    ticks = (last_tick_ns >= step_ns) & (last_tick_ns >= phase_ns)
-    after_ns, tick = np.unique(last_tick_ns[ticks] - step_ns[ticks], return_inverse=True)
-    tick_of = np.full(steps + 1, NO_TICK)
-    tick_of[ticks] = tick
-    acts = np.searchsorted(np.where(ticks, last_tick_ns, step_ns), step_ns + delay_ns)
-    wait = acts - np.arange(steps + 1)
-    waits, age = np.unique(wait, return_inverse=True)
-    safe = resolved.controller.safe_input
-    known = resolved.network.initial_sync == "known_state"
-    return Loop(
-        period_ns, resolved.plant.measure_every, -1 if known else int(wait[0]), A, B,
-        pushes_of(resolved), _dense(assumed.Ad), _dense(assumed.Bd),
-        _dense(assumed.C), _dense(gains), noise_of(resolved),
-        transition(matrices.H, period_ns), tick_of,
-        _dense(np.array([K @ transition(matrices.H, int(s)) for s in after_ns])),
-        wait.astype(np.int64), age.astype(np.int64),
-        _dense(np.array([transition(matrices.H, int(s) * period_ns) for s in waits])),
-        np.zeros(matrices.m) if safe is None else np.array(safe, dtype=np.float64),
-    )  # fmt: skip
+        _, sensor, controller = (one.machines[0] for one in self._machines)
+        if len(self._gains):
+            sensor.observer.kind = core.NOACK_LUENBERGER
+        weight = _dense(scales.weight)
+        levels = [_dense(one) for one in (scales.error, scales.state)]
+        scratch = np.zeros(3 * self.matrices.n)
+        segments = ffi.new("noack_segments *", {
+            "plant": self._plant, "sensor": ffi.addressof(sensor),
+            "controller": ffi.addressof(controller), "last": self.last, "delay_ns": self.delay_ns,
+            "known_start": self.known_start, "runs": len(runs.step),
+            "places": runs.sent.shape[1], "weight": pointer_to(weight, "double *"),
+            "gains": pointer_to(self._gains, "double *") if len(self._gains) else ffi.NULL,
+            "error_scale": pointer_to(levels[0], "double *"),
+            "state_scale": pointer_to(levels[1], "double *"),
+            "scratch": pointer_to(scratch, "double *"),
+        })  # fmt: skip
+        for name, array in runs._asdict().items():
+            setattr(segments, name, pointer_to(array, _POINTERS[array.dtype.kind]))
+        if (wrong := core.noack_segments_check(segments)) != ffi.NULL:
+            raise ValueError(f"segments: {ffi.string(wrong).decode()}")
+        last = np.ascontiguousarray(last, np.int64)
+        core.noack_follow(segments, pointer_to(last, "int64_t *"), tests)
 
 
 def through_of(resolved: Scenario) -> Matrix:
