@@ -168,13 +168,13 @@ class Controller:
         """Call the control law; after its first failure, the input is the safe input."""
         m = controller.machine.m
         safe = np.zeros(m) if self.safe_input is None else self.safe_input
-        u, notices = None, ()
+        u, notices = None, list[Notice]()
         if not self._failed:
             try:
                 u = method(self.law)
             except ControlFailedError as error:
                 self._failed = True
-                notices = (Notice(controller.asked_ns, FAILED, str(error)),)
+                notices.append(Notice(controller.asked_ns, FAILED, str(error)))
         reals_at(controller.u, m)[:] = safe if u is None else u
         return notices
 
@@ -194,9 +194,7 @@ class Controller:
 
     def _set_point(self, controller: Any, setpoint: Setpoint | None) -> None:
         x_r, u_r = (None, None) if setpoint is None else setpoint
-        self._memory.fill(
-            controller, {"has_point": setpoint is not None, "x_r": x_r, "u_r": u_r}
-        )
+        self._memory.fill(controller, {"has_point": setpoint is not None, "x_r": x_r, "u_r": u_r})
 
 
 def law_of(resolved: Scenario) -> ControlLaw:
