@@ -2,6 +2,7 @@
 #define _GNU_SOURCE
 #include "core.h"
 
+#include <math.h>
 #include <time.h>
 
 enum { PPB = 1000000000 };
@@ -33,13 +34,19 @@ int64_t run_time_ns(const noack_clock *clock) {
     return noack_clock_at_ns(clock, clock_ns(CLOCK_MONOTONIC));
 }
 
-int64_t simulated_ns_of(const noack_clock *clock, int64_t wall_ns) {
-    return clock->speed == 1.0 ? wall_ns : (int64_t)((double)wall_ns * clock->speed);
+/* Truncate to a whole number, of 146 years at most. */
+static int64_t whole_ns(double time_ns) {
+    const double most = 4611686018427387904.0; /* 2^62 */
+    return (int64_t)fmin(fmax(time_ns, -most), most);
 }
 
-int64_t wait_ns_of(const noack_clock *clock, int64_t simulated_ns) {
+int64_t simulated_ns_of(const noack_clock *clock, int64_t wall_ns) {
+    return clock->speed == 1.0 ? wall_ns : whole_ns((double)wall_ns * clock->speed);
+}
+
+int64_t noack_clock_wait_ns(const noack_clock *clock, int64_t simulated_ns) {
     double fastest = 1.0 + (double)clock->slew_ppb / PPB, speed = clock->speed * fastest;
     if (speed == 1.0 || simulated_ns <= 0)
         return simulated_ns;
-    return (int64_t)((double)simulated_ns / speed);
+    return whole_ns((double)simulated_ns / speed);
 }

@@ -77,12 +77,10 @@ int64_t queue_serve(
     const noack_stage *stage, noack_queue *queue, int64_t *ring_ns, int64_t size_bytes);
 void queue_occupy(const noack_stage *stage, noack_queue *queue, int64_t *ring_ns, int64_t until_ns);
 
-/* clock.c: readings of a clock, and simulated times. A wait of wait_ns_of ends when the simulated
-   time has passed, or a little earlier. */
+/* clock.c: readings of a clock, and simulated times. */
 int64_t clock_ns(int clock);
 int64_t run_time_ns(const noack_clock *clock);
 int64_t simulated_ns_of(const noack_clock *clock, int64_t wall_ns);
-int64_t wait_ns_of(const noack_clock *clock, int64_t simulated_ns);
 
 /* guarantee.c */
 int counts_losses(const noack_link *link);

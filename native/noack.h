@@ -632,6 +632,10 @@ typedef struct { /* noack.core.clock: simulated time since the run's epoch */
 /* The simulated time at a reading of this host's monotonic clock. */
 int64_t noack_clock_at_ns(const noack_clock *clock, int64_t own_ns);
 
+/* How long to wait on this host until simulated_ns has passed, or a little less, at any rate of the
+   clock. */
+int64_t noack_clock_wait_ns(const noack_clock *clock, int64_t simulated_ns);
+
 /* ---- The wire format (docs/wire.md) ------------------------------------------------------------ */
 
 enum {
@@ -686,6 +690,61 @@ int64_t noack_wire_examine(
 
 /* Count a datagram as accepted or rejected. */
 void noack_wire_count(noack_reception *reception, int64_t found, const noack_message *message);
+
+/* ---- The live driver: waits, receives, drives the machines of a process, sends ------------------- */
+
+enum noack_driver_reason { /* why noack_drive returned; after what Python does, it is called again */
+    NOACK_DRIVEN,          /* the time has come, or a signal: housekeeping */
+    NOACK_DRIVER_ROWS,     /* a table of rows or notes must be emptied */
+    NOACK_DRIVER_QUESTION, /* a machine asks; question says what */
+    NOACK_DRIVER_OPEN,     /* decrypt the datagram in place; set opened */
+    NOACK_DRIVER_SEAL,     /* encrypt the datagram in place, and write its tag */
+    NOACK_DRIVER_NOTHING   /* within the driver only */
+};
+
+enum noack_opened { NOACK_NOT_OPENED, NOACK_OPENED, NOACK_NOT_AUTHENTIC };
+
+typedef struct { /* the other end of a flow */
+    int64_t name_bytes; /* 0: there is none */
+    uint8_t name[32];
+    int64_t received; /* datagrams from this address */
+} noack_peer;
+
+typedef struct { /* place 0 is the flow of every run, place 1 that of the acknowledgements */
+    noack_process *process;
+    noack_wire wire;
+    noack_clock clock;
+    int64_t spin_ns; /* time before a tick in which it does not sleep */
+    int64_t rest_ns; /* if a tick is nearer after others, it sleeps so long, to do several at once */
+    int64_t receiver_count;
+    int64_t receivers[2]; /* sockets; the first is read first */
+    int64_t sender;       /* socket, not connected */
+    noack_peer sources[2], destinations[2];
+    int64_t foreign; /* datagrams from other addresses */
+    int64_t sent;
+    int64_t errors[256]; /* datagrams that could not be sent, by errno */
+    int64_t question;    /* a noack_question */
+    int64_t opened;      /* a noack_opened, of the datagram: */
+    uint8_t *datagram;
+    int64_t datagram_bytes;
+    void *scratch; /* noack_driver_scratch_bytes() bytes, which are 0 at first */
+} noack_driver;
+
+int64_t noack_driver_scratch_bytes(void);
+
+/* Return NULL, or what is wrong with the numbers of a driver; its process has been checked. */
+const char *noack_driver_check(const noack_driver *driver);
+
+/* Prepare the scratch. */
+void noack_driver_open(noack_driver *driver);
+
+/* Work until a time of the run, or until Python is needed; return a noack_driver_reason. After
+   until_ns it goes on for a while if a tick is near. INT64_MIN: do what is due, and do not wait. */
+int64_t noack_drive(noack_driver *driver, int64_t until_ns);
+
+/* Add a datagram as if it had just been received. The driver must have driven all others. */
+void noack_driver_add_datagram(
+    noack_driver *driver, const uint8_t name[32], const uint8_t *data, int64_t size_bytes);
 
 /* ---- The relay: waits for, receives, decides, sends ------------------------------------------ */
 
@@ -1057,3 +1116,93 @@ const char *noack_replay_check(const noack_input_replay *replay);
 /* Replay the next inputs: compare each row bit for bit, and the times of ticks with the deadlines.
    Return NOACK_DONE, or why Python is needed. */
 int64_t noack_replay_inputs(noack_input_replay *replay);
+/* ---- Exact simulation in continuous time: native/exact/ ----------------------------------------
+
+   The loop of plant, sensor's model and controller's model, without sampling and without delay.
+   Times are in seconds. A state is (x_c, e_c, d) with e_c = x_c - x and d = x_s - x_c. */
+
+enum { NOACK_EXACT_ENTRIES = 64 }; /* most states, and most inputs */
+
+enum noack_exact_status { /* how a run ended */
+    NOACK_EXACT_OK,       /* at the horizon */
+    NOACK_EXACT_DIVERGED, /* the state, or its ratio to the threshold, exceeded 1e100 */
+    NOACK_EXACT_TOO_MANY_EVENTS, /* more than are allowed, or two at the same time */
+    NOACK_EXACT_UNDECIDED /* a million steps do not decide whether a curve reaches its threshold or
+                             a measured level, because it stays too close to it; or a million
+                             polynomials do not reach the horizon, because the plant is too fast; or
+                             no polynomial is accurate */
+};
+
+enum noack_exact_measure { /* what is measured between events */
+    NOACK_EXACT_ROW,       /* all of a noack_exact_row */
+    NOACK_EXACT_ERROR,     /* the supremum of |W e_c| e^(rt) */
+    NOACK_EXACT_STATE,     /* the supremum of |x| e^(rt) */
+    NOACK_EXACT_COST,      /* the integral of x'Qx + u'Ru */
+    NOACK_EXACT_TIMES      /* nothing but the times of events */
+};
+
+typedef struct { /* the measures of a run; NAN where a number is not defined */
+    int64_t transmissions, deliveries; /* until the end or the failure, as the next one: */
+    int64_t longest_loss_burst; /* largest number of consecutive losses */
+    double inter_event_min_s, inter_event_mean_s; /* NAN below two events */
+    double settling_s; /* the last time at which |x| > settle |x(0)|; NAN: at the horizon, too */
+    double cost;       /* integral of x'Qx + u'Ru over the horizon, u = K x_c */
+    double sup_e_c_scaled; /* supremum over the horizon of |W e_c| e^(rt), with the left limits at
+                              events; from event 0 on without a known start. Its relative error is
+                              at most 1e-10 (certified, not sampled) */
+    double final_norm;     /* |x| at the horizon */
+    double diverged_at_s;
+    int64_t status; /* unless it is NOACK_EXACT_OK, the measures of the whole run are NAN */
+} noack_exact_row;
+
+typedef struct { /* what the runs share; matrices in row-major order */
+    int64_t n, m;
+    double *H, *K;    /* (n, n) of both models between updates; (m, n) the gain */
+    double *Q, *R;    /* symmetric weights of the cost, (n, n) and (m, m); NULL: the identity */
+    noack_trigger_rule rule;
+    noack_link *link; /* with one flow; NULL: fates */
+    int64_t first_delivered; /* of a link */
+    int64_t fate_count;
+    uint8_t *fates; /* (fate_count,) 1: the update of this event arrives; later ones arrive */
+    double horizon_s;
+    int64_t known_start; /* 1: both models start from x(0); 0: from 0, with an event at t = 0 */
+    double settle;       /* share of |x(0)| */
+    int64_t most_events;
+    int64_t measure;       /* enum noack_exact_measure */
+    double fading_per_s;   /* r of the supremum, */
+    double fading_until_s; /* which is 0 from this time on */
+    /* The events of all runs: a row of event_places for each. */
+    int64_t event_places;
+    double *event_s;    /* (runs, event_places) */
+    uint8_t *delivered; /* likewise */
+    double *states;     /* (runs, event_places, 3, n) just before the event; NULL: not wanted */
+    double *scratch;    /* noack_exact_scratch() numbers */
+} noack_exact;
+
+/* Numbers of the scratch that n, m and the rule need; the other fields are not read. */
+int64_t noack_exact_scratch(const noack_exact *exact);
+
+/* Return NULL, or what is wrong: all that the functions below assume. The numbers of matrices and
+   states may be any. */
+const char *noack_exact_check(const noack_exact *exact);
+
+/* Run every draw; a row depends on what the runs share and on its own draw only. A is (runs, n, n), B
+   (runs, n, m), x0 (runs, n), keys (runs, stages of the link, 2). */
+void noack_exact_runs(
+    const noack_exact *exact, int64_t runs, const double *A, const double *B, const double *x0,
+    const int64_t *keys, noack_exact_row *rows);
+
+/* Follow a plant from each of count states, just after an event, to its next event or the horizon.
+   In: times t_s, states (count, 3, n), auxiliary variables eta. Out: the same at the end, and events
+   (1: an event, before its reset), values (of the measure), statuses. */
+void noack_exact_segments(
+    const noack_exact *exact, const double *A, const double *B, int64_t count, double *t_s,
+    double *states, double *auxiliaries, int64_t *events, double *values, int64_t *statuses);
+
+/* The states (count, 3, n) of a plant at ascending times t_s, from the first start on. A start is a state
+   just after an event, (starts, 3, n), at an ascending time; the last one up to a time applies. NAN
+   where a million polynomials do not reach. */
+void noack_exact_sample(
+    const noack_exact *exact, const double *A, const double *B, int64_t starts,
+    const double *start_s, const double *start_states, int64_t count, const double *t_s,
+    double *states);

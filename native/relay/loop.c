@@ -306,9 +306,10 @@ static int is_soon_due(const noack_relay *relay, int64_t until_ns) {
 /* Wait for a datagram or the next release time; return 0 if a signal interrupted it. */
 static int wait_for_datagrams(noack_relay *relay, int64_t until_ns) {
     relay_scratch *own = scratch_of(relay);
-    int64_t wait_ns = wait_ns_of(&relay->clock, until_ns - relay->read_ns);
+    int64_t wait_ns = noack_clock_wait_ns(&relay->clock, until_ns - relay->read_ns);
     if (relay->heap_length > 0) {
-        int64_t due_ns = wait_ns_of(&relay->clock, relay->heap[0].release_ns - relay->read_ns);
+        int64_t due_ns =
+            noack_clock_wait_ns(&relay->clock, relay->heap[0].release_ns - relay->read_ns);
         wait_ns = max_of(min_of(wait_ns, due_ns - relay->spin_ns), 0);
     }
     struct timespec limit = {wait_ns / NS_PER_S, wait_ns % NS_PER_S};

@@ -25,7 +25,7 @@ from netem.engine.relay_sockets import raise_file_limit, stamp_arrivals
 from noack.core.core_library import core, ffi
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings
-from noack.runtime.native.socket_structs import packed_name
+from noack.runtime.address import packed_name
 from noack.runtime.udp_sockets import drops_of
 
 _PERIOD_NS = 40_000_000

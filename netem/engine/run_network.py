@@ -5,7 +5,6 @@ It decides as :mod:`netem.channel` does, which replays its record: both call the
 """
 
 import socket
-from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -25,8 +24,7 @@ from noack.protocol.record_tables import (
     NETEM_SETTING,
     PACKET_HEAD_BYTES,
 )
-from noack.runtime.address import Address
-from noack.runtime.native.socket_structs import packed_name
+from noack.runtime.address import Address, packed_name
 from noack.runtime.real_time_loop import RowSink
 
 _ROWS = 256
@@ -92,7 +90,7 @@ class RunNetwork:
         """
         relay, clients = self._relay, self._memory.clients
         relay.spin_ns = spin_ns
-        clock.set_core(relay.clock)
+        self.set_clock(clock)
         self._memory.sockets["fd"][1] = sender.fileno()
         for place, endpoint in zip((0, self._memory.first_path), receivers.values(), strict=False):
             stamp_arrivals(endpoint)
@@ -105,6 +103,10 @@ class RunNetwork:
         for direction, destination in zip(self._directions, destinations, strict=False):
             direction.set_server(destination, core.NOACK_DESTINATION_NAME)
         self._directions[0].row.full = 1  # refuse other sources
+
+    def set_clock(self, clock: RunClock) -> None:
+        """Read the time as this clock does."""
+        clock.set_core(self._relay.clock)
 
     def close(self) -> None:
         """Close what it opened."""
@@ -165,13 +167,10 @@ class RunNetwork:
         return sum(int(one.counts_of("delays").sum()) for one in self._directions)
 
     @property
-    def send_errors(self) -> Mapping[int, int]:
-        """Number of datagrams that could not be sent or stored, by errno."""
-        counts: Counter[int] = Counter()
-        for direction in self._directions:
-            errors = direction.counts_of("errors")
-            counts.update({error: int(errors[error]) for error in np.flatnonzero(errors).tolist()})
-        return counts
+    def send_errors(self) -> Sequence[int]:
+        """Numbers of datagrams that could not be sent or stored, by errno."""
+        counts = np.sum([one.counts_of("errors") for one in self._directions], axis=0)
+        return [int(count) for count in counts]
 
     def _drive(self, until_ns: int) -> int:
         """Relay until the core returns, and do what it needs; return the reason."""

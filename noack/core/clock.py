@@ -40,14 +40,9 @@ class RunClock:
         """Let a ``noack_clock`` of the core read as this clock does, if it reads this host's."""
         clock.epoch_ns, clock.speed, clock.slew_ppb = self.epoch_ns, self.speed, 0
 
-    def wall_s_until(self, t_ns: int) -> float:
-        """Return the wall seconds until simulated time ``t_ns``; negative if it is in the past."""
-        wall_ns = self._monotonic_ns() - self.epoch_ns
-        return (t_ns / self.speed - wall_ns) * 1e-9
-
 
 class SlewedRunClock(RunClock):
-    """Simulated time tied to another host's clock, which may be faster than that of the waits.
+    """Simulated time tied to another host's clock, as this host knows it.
 
     Args:
         epoch_ns: the other clock's reading at simulated time 0.
@@ -64,12 +59,7 @@ class SlewedRunClock(RunClock):
         own_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         super().__init__(epoch_ns, speed, lambda: slewed.now_ns(own_ns()))
-        self._slewed, self._fastest = slewed, 1 + slewed.slew_ppb * 1e-9
-
-    def wall_s_until(self, t_ns: int) -> float:
-        """Return a wait that ends at ``t_ns`` or a little earlier, at any rate of the clock."""
-        wall_s = super().wall_s_until(t_ns)
-        return wall_s / self._fastest if wall_s > 0 else wall_s
+        self._slewed = slewed
 
     def set_core(self, clock: Any) -> None:
         """Let a ``noack_clock`` of the core read as this clock does, until the next estimate."""

@@ -221,9 +221,9 @@ class Decoder:
         if found == core.NOACK_ENCRYPTED:
             found = core.NOACK_BAD_TAG
             assert self._wire.seal is not None
-            vector = self._wire.seal.open(datagram, HEADER_BYTES)
-            if vector is not None:
-                readable = datagram[:HEADER_BYTES] + vector + datagram[-TAG_BYTES:]
+            content = self._wire.seal.open(datagram, HEADER_BYTES)
+            if content is not None:
+                readable = datagram[:HEADER_BYTES] + content + datagram[-TAG_BYTES:]
                 found = self._examine(readable, from_peer, opened=True)
         message = self._message
         core.noack_wire_count(self._reception, found, message)

@@ -51,3 +51,13 @@ def test_links_of_any_numbers_are_refused_or_run_clean() -> None:
 
 def test_captures_of_any_events_are_refused_or_run_clean() -> None:
     run_tests("tests/netem/capture/test_pcapng.py")
+
+
+def test_any_datagrams_are_read_clean() -> None:
+    run_tests(
+        "tests/fuzz/test_parsers.py", "tests/noack/protocol/test_wire_format.py", "-k", "wire"
+    )
+
+
+def test_the_live_driver_runs_clean() -> None:
+    run_tests("tests/noack/runtime/test_live_driver.py", "tests/noack/runtime/test_peer_sockets.py")

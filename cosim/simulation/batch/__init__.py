@@ -1,1 +1,1 @@
-"""Many runs of the paper's loop at once, each exact in continuous time, compiled."""
+"""Many exact runs of the paper's loop, each with its own plant, start and losses."""

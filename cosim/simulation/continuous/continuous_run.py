@@ -1,18 +1,29 @@
 """A run of the paper's loop in continuous time, for a given loss pattern."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.simulation.continuous.continuous_loop import ContinuousLoop, LoopState, Samples, reset
-from cosim.simulation.continuous.event_detector import DivergedError
+from cosim.simulation.continuous.continuous_loop import (
+    ContinuousLoop,
+    LoopState,
+    Samples,
+    reset,
+    signals,
+    vanished,
+    vanishes_s,
+)
+from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS, EventLog
+from noack.core.core_library import core
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 
 MAX_EVENTS = 100_000
+_PLACES = 512
+"""Room for events in the first attempt; each further one has four times as much."""
 
 
 class TooManyEventsError(CallerError):
@@ -38,6 +49,8 @@ class ContinuousRun:
     """Whether the update of each event arrived, (k,)."""
     diverged_at_s: float | None
     """Time at which the state exceeded 1e100, or None; the run is computed up to this time."""
+    starts: NDArray[np.float64]
+    """The core's states at the start and just after each event, (k + 1, 3, n)."""
 
     @cached_property
     def event_s(self) -> Vector:
@@ -60,19 +73,7 @@ class ContinuousRun:
             raise ValueError(f"times must lie in [0, {self.reached_s}] s")
         if (np.diff(t_s) < 0).any():
             raise ValueError("times must be in ascending order")
-        states = (self.start, *self.after)
-        bounds = np.searchsorted(t_s, self.event_s)
-        parts = [
-            self.system.sample(state, part)
-            for state, part in zip(states, np.split(t_s, bounds), strict=True)
-            if len(part)
-        ]
-        empty = np.empty((0, self.system.loop.n))
-        x, e_s, e_c = (
-            np.concatenate([empty, *(getattr(part, name) for part in parts)])
-            for name in ("x", "e_s", "e_c")
-        )
-        return Samples(t_s, x, e_s, e_c)
+        return self.system.follow(np.array([0.0, *self.event_s]), self.starts, t_s)
 
     def e_s_norm(self, samples: Samples) -> Vector:
         """‖W e_s‖ of samples, (k,)."""
@@ -97,8 +98,8 @@ def simulate_continuous(
     Args:
         system: the loop.
         horizon_s: end of the run.
-        delivered: whether the update of event i arrives. If a sequence is shorter than the number
-            of events, all updates after its end arrive.
+        delivered: whether the update of event i arrives, asked in the order of the events. If a
+            sequence is shorter than the number of events, all updates after its end arrive.
         known_start: sensor and controller start from x(0). Otherwise x_c = 0 and event 0 happens at
             t = 0, the paper's t_0; the paper assumes that it is delivered.
         x0: x(0), shape (n,); by default the loop's own.
@@ -106,58 +107,62 @@ def simulate_continuous(
 
     Raises:
         TooManyEventsError: more than ``max_events`` events, or two at the same time.
-        CallerError: the threshold decays below the smallest supported value before the horizon.
+        CallerError: the threshold decays below the smallest supported value before the horizon, or
+            the run cannot be decided.
     """
-    x = np.array(system.loop.x0 if x0 is None else x0, dtype=np.float64)
-    zero = np.zeros_like(x)
-    arrives = delivered if callable(delivered) else _pattern(delivered)
-    start = state = LoopState(0.0, x, zero, zero if known_start else -x)
-    before: list[LoopState] = []
-    after: list[LoopState] = []
-    fates: list[bool] = []
-    diverged_at_s, auxiliary = None, system.trigger.initial_dynamic_variable
-    event = None if known_start else start
+    loop, fates = system.loop, [] if callable(delivered) else list(delivered)
+    until_s = min(horizon_s, vanishes_s(system.trigger, loop.n))
+    x0, places = np.array(loop.x0 if x0 is None else x0, np.float64), min(_PLACES, max_events)
     while True:
-        if event is not None:
-            fates.append(bool(arrives(len(before))))
-            state = reset(event, fates[-1])
-            before.append(event)
-            after.append(state)
-        condition = system.condition(state)
-        if condition.integrates:
-            auxiliary = 0.0
-        try:
-            crossing = system.next_crossing(state, horizon_s, condition, auxiliary)
-            event, auxiliary = (None, 0.0) if crossing is None else crossing
-        except DivergedError as error:
-            diverged_at_s = error.t_s
+        if callable(delivered):
+            fates += [bool(delivered(event)) for event in range(len(fates), places)]
+        simulation = system.simulation(
+            until_s, known_start=known_start, most_events=places, delivered=np.array(fates, bool),
+            measure=core.NOACK_EXACT_TIMES,
+        )  # fmt: skip
+        rows, log = simulation.runs(
+            loop.A[None], loop.B[None], x0[None], places=places, states=True
+        )
+        row = rows[0]
+        full = row["status"] == TOO_MANY_EVENTS and row["transmissions"] == places
+        if not full or places == max_events:
             break
-        if event is None:
-            break
-        if len(before) >= max_events or (before and event.t_s <= before[-1].t_s):
-            too_many = TooManyEventsError(
-                f"trigger: event {len(before)} at {event.t_s:.9g} s is one too many: the events "
-                "accumulate; a stable loop, a larger threshold or a floor would keep them apart"
-            )
-            too_many.run = _finished(system, before[-1].t_s, start, before, after, fates)
-            raise too_many
-    return _finished(system, horizon_s, start, before, after, fates, diverged_at_s)
+        places = min(4 * places, max_events)
+    if row["status"] == OK and until_s < horizon_s:
+        raise vanished(until_s)
+    if row["status"] not in (OK, DIVERGED, TOO_MANY_EVENTS):
+        raise CallerError(
+            f"trigger: a million steps do not decide event {row['transmissions']}: an error stays "
+            "too close to its threshold, or the plant is too fast"
+        )
+    diverged_at_s = float(row["diverged_at_s"]) if row["status"] == DIVERGED else None
+    run = _run(system, horizon_s, x0, log, int(row["transmissions"]), diverged_at_s, known_start)
+    if row["status"] == TOO_MANY_EVENTS:
+        last_s = run.event_s[-1] if len(run.event_s) else 0.0
+        too_many = TooManyEventsError(
+            f"trigger: event {len(run.event_s)}, after {last_s:.9g} s, is one too many: the events "
+            "accumulate; a stable loop, a larger threshold or a floor would keep them apart"
+        )
+        too_many.run = replace(run, horizon_s=float(last_s))
+        raise too_many
+    return run
 
 
-def _finished(
-    system: ContinuousLoop,
-    horizon_s: float,
-    start: LoopState,
-    before: list[LoopState],
-    after: list[LoopState],
-    fates: list[bool],
-    diverged_at_s: float | None = None,
-) -> ContinuousRun:
-    delivered = np.array(fates, bool)
+def _run(
+    system: ContinuousLoop, horizon_s: float, x0: Vector, log: EventLog, events: int,
+    diverged_at_s: float | None, known_start: bool,
+) -> ContinuousRun:  # fmt: skip
+    """Read a run from its events."""
+    assert log.states is not None
+    delivered, zero = log.delivered[0, :events], np.zeros_like(x0)
+    times_s, states = log.event_s[0, :events].tolist(), log.states[0, :events]
+    before = tuple(map(LoopState, times_s, *signals(states)))
+    x_c, e_c, _ = np.moveaxis(states, 1, 0)
+    lost = ~delivered[:, None]
+    first = [x0, zero, zero] if known_start else [zero, zero - x0, zero]
+    after = np.stack([np.where(lost, x_c, x_c - e_c), lost * e_c, 0.0 - lost * e_c], axis=1)
     return ContinuousRun(
-        system, horizon_s, start, tuple(before), tuple(after), delivered, diverged_at_s
-    )
-
-
-def _pattern(delivered: Sequence[bool]) -> Callable[[int], bool]:
-    return lambda event: event >= len(delivered) or delivered[event]
+        system, horizon_s, LoopState(0.0, x0, zero, zero if known_start else -x0), before,
+        tuple(map(reset, before, delivered.tolist())), delivered, diverged_at_s,
+        np.concatenate([np.array(first)[None], after]),
+    )  # fmt: skip

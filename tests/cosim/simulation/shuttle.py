@@ -5,7 +5,7 @@ native/driver/virtual.c does the same with structures. Tests compare both; some 
 
 import heapq
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -150,19 +150,25 @@ class Shuttle:
         self.notices: list[dict[str, Any]] = []
 
     def run(self) -> None:
-        """Announce the scenario's changes; drive the machines until nothing is due."""
+        """Drive the machines until nothing is due."""
+        for _ in self.steps():
+            pass
+
+    def steps(self) -> Iterator[int]:
+        """Announce the scenario's changes, and drive the machines; yield the time of each step."""
         changes = scheduled(self.scenario)
         for role in CHANGEABLE:
             for change in changes:
-                self._emit(role, self.machines[role].announce(change, 0))  # type: ignore[attr-defined]
-        self._emit(RECORDER, [change_notice(change) for change in changes])
+                self.emit(role, self.machines[role].announce(change, 0))  # type: ignore[attr-defined]
+        self.emit(RECORDER, [change_notice(change) for change in changes])
         with np.errstate(all="ignore"):
             while due := self._next():
                 self._now_ns, rank, role = due
                 if rank == DATAGRAM_RANK:
                     self._receive(*self._sent.popleft())
                 else:
-                    self._emit(role, self.machines[role].on_timer(self._now_ns))
+                    self.emit(role, self.machines[role].on_timer(self._now_ns))
+                yield self._now_ns
 
     def record(self) -> RunRecord:
         """Return the record of a run of one loop."""
@@ -203,9 +209,10 @@ class Shuttle:
             loop = loop_number(data) or 0
             message = decoders[loop if loop < len(decoders) else 0].decode(data)
         if message is not None:
-            self._emit(role, self.machines[role].handle(message, self._now_ns))
+            self.emit(role, self.machines[role].handle(message, self._now_ns))
 
-    def _emit(self, role: str, outputs: Sequence[Any]) -> None:
+    def emit(self, role: str, outputs: Sequence[Any]) -> None:
+        """Keep the rows and notices of a machine, and send its messages."""
         for output in outputs:
             if isinstance(output, Record):
                 self.rows.setdefault(output.table, []).append(output.row)

@@ -1,0 +1,248 @@
+/* Exact simulation in continuous time: what Python calls.
+
+   A size of vectors that has code serves all smaller loops, which are padded with states that stay 0;
+   the last bits of a loop do not depend on the size chosen. */
+#include "exact.h"
+
+enum { CACHE_LINE = 8 }; /* doubles */
+
+#if defined(__x86_64__)
+static const exact_code *code_for(int64_t entries) {
+    if (!__builtin_cpu_supports("avx2") || !__builtin_cpu_supports("fma"))
+        return entries == 3 ? &exact_plain_3 : &exact_plain_64;
+    if (entries <= 2)
+        return &exact_fused_2;
+    if (entries <= 4)
+        return entries == 3 ? &exact_fused_3 : &exact_fused_4;
+    return entries <= 8 ? &exact_fused_8 : entries <= 16 ? &exact_fused_16 : &exact_fused_64;
+}
+#else
+static const exact_code *code_for(int64_t entries) {
+    if (entries <= 2)
+        return &exact_plain_2;
+    if (entries <= 4)
+        return entries == 3 ? &exact_plain_3 : &exact_plain_4;
+    return entries <= 8 ? &exact_plain_8 : entries <= 16 ? &exact_plain_16 : &exact_plain_64;
+}
+#endif
+
+void pad(int64_t rows, int64_t columns, const double *matrix, int64_t stride, double *result) {
+    for (int64_t j = 0; j < columns; j++, result += stride)
+        for (int64_t i = 0; i < stride; i++)
+            result[i] = i < rows ? matrix[i * columns + j] : 0.0;
+}
+
+int arrives(const noack_exact *exact, exact_run *run) {
+    noack_decision decision;
+    int delivered = 1;
+    if (exact->link != NULL) {
+        noack_link_decide(exact->link, 0, 1, 0, &decision);
+        delivered = decision.fate == NOACK_DELIVERED || decision.fate == NOACK_FORCED;
+        run->losses = decision.consecutive_losses;
+    } else {
+        if (run->row->transmissions < exact->fate_count)
+            delivered = exact->fates[run->row->transmissions] != 0;
+        run->losses = delivered ? 0 : run->losses + 1;
+    }
+    run->row->longest_loss_burst = max_of(run->row->longest_loss_burst, run->losses);
+    return delivered;
+}
+
+static int64_t blocks_of(const noack_trigger_rule *rule, const exact_code *code) {
+    int64_t rows = max_of(rule->up_rows + rule->down_rows, rule->gain_up_rows + rule->gain_down_rows);
+    return max_of(2, (rows + code->n - 1) / code->n);
+}
+
+/* Whether the rule compares |W e_s|, or its integral. */
+static int is_plain(const noack_exact *exact) {
+    const noack_trigger_rule *rule = &exact->rule;
+    int64_t n = exact->n;
+    if (rule->up_rows != n || rule->down_rows != 0)
+        return 0;
+    for (int64_t i = 0; i < n; i++)
+        for (int64_t j = 0; j < n; j++) {
+            double weight = rule->weight == NULL ? i == j : rule->weight[i * n + j];
+            if (rule->up[i * 2 * n + j] != 0.0 || rule->up[i * 2 * n + n + j] != weight)
+                return 0;
+        }
+    return 1;
+}
+
+int is_quadratic(const noack_exact *exact) {
+    const noack_trigger_rule *rule = &exact->rule;
+    return rule->up_rows > 0
+           && (!is_plain(exact) || rule->is_dynamic || rule->from_event || rule->grid_ns > 0);
+}
+
+/* Take the next count numbers of the scratch, which are 0. */
+static double *take(double **next, int64_t count) {
+    double *taken = *next;
+    *next += count;
+    return taken;
+}
+
+/* Take a matrix, or NULL for NULL. */
+static double *take_square(
+    double **next, const exact_code *code, int64_t n, const double *matrix) {
+    if (matrix == NULL)
+        return NULL;
+    double *taken = take(next, code->n * code->stride);
+    pad(n, n, matrix, code->stride, taken);
+    return taken;
+}
+
+/* Take [P; N] as (blocks, 2, N, N), and the signs of its rows. */
+static double *take_form(
+    double **next, const exact_code *code, const exact_memory *memory, int64_t n, int64_t up_rows,
+    const double *up, int64_t down_rows, const double *down, double **signs) {
+    int64_t square = code->n * code->stride;
+    double *form = take(next, memory->blocks * 2 * square);
+    *signs = take(next, memory->blocks * code->stride);
+    for (int64_t row = 0; row < up_rows + down_rows; row++) {
+        int64_t block = row / code->n, at = row % code->n;
+        const double *from = row < up_rows ? up + row * 2 * n : down + (row - up_rows) * 2 * n;
+        (*signs)[block * code->stride + at] = row < up_rows ? 1.0 : -1.0;
+        for (int64_t j = 0; j < n; j++) {
+            form[2 * block * square + j * code->stride + at] = from[j];
+            form[(2 * block + 1) * square + j * code->stride + at] = from[n + j];
+        }
+    }
+    return form;
+}
+
+/* Lay a simulation's memory out in the scratch, from next on; with exact->scratch NULL only count. */
+static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_memory *memory) {
+    const noack_trigger_rule *rule = &exact->rule;
+    int64_t square = code->n * code->stride, n = exact->n, curve = TERMS * code->stride;
+    int64_t blocks = blocks_of(rule, code);
+    int64_t count = (3 * (TERMS + 1) + 9) * square + 9 * curve
+                    + 2 * blocks * (2 * square + code->stride + curve) + CACHE_LINE;
+    if (memory == NULL)
+        return count;
+    double *next = exact->scratch;
+    memset(next, 0, (size_t)count * sizeof *next);
+    next += (0 - (uintptr_t)next / sizeof *next) % CACHE_LINE; /* vectors do not cross lines */
+    memory->exact = exact;
+    memory->rule = rule;
+    memory->blocks = blocks;
+    memory->quadratic = is_quadratic(exact);
+    memory->integrates = rule->integrates != 0;
+    memory->dynamic = memory->quadratic && rule->is_dynamic;
+    memory->grid_s = (double)rule->grid_ns * 1e-9;
+    memory->H = take_square(&next, code, n, exact->H);
+    memory->K = take(&next, square);
+    pad(exact->m, n, exact->K, code->stride, memory->K);
+    memory->weight = take_square(&next, code, n, rule->weight);
+    memory->forecast_weight = take_square(&next, code, n, rule->forecast_weight);
+    memory->Q = take_square(&next, code, n, exact->Q);
+    memory->R = take_square(&next, code, exact->m, exact->R);
+    memory->A = take(&next, square);
+    memory->B = take(&next, square);
+    memory->E = take(&next, square);
+    memory->H_k = take(&next, (TERMS + 1) * square);
+    memory->A_k = take(&next, (TERMS + 1) * square);
+    memory->X_k = take(&next, (TERMS + 1) * square);
+    double **curves[] = {
+        &memory->x_c, &memory->e_c, &memory->d, &memory->x, &memory->u, &memory->own_error,
+        &memory->own_weighted, &memory->x_scaled, &memory->u_scaled};
+    for (int i = 0; i < 9; i++)
+        *curves[i] = take(&next, curve);
+    memory->weighted = rule->weight == NULL ? memory->e_c : memory->own_weighted;
+    memory->is_static = 1;
+    for (int64_t i = 0; i < n * n; i++)
+        memory->is_static &= exact->H[i] == 0.0;
+    if (memory->quadratic) {
+        memory->form = take_form(
+            &next, code, memory, n, rule->up_rows, rule->up, rule->down_rows, rule->down,
+            &memory->form_signs);
+        memory->y = take(&next, blocks * curve);
+        memory->gain = take_form(
+            &next, code, memory, n, rule->gain_up_rows, rule->gain_up, rule->gain_down_rows,
+            rule->gain_down, &memory->gain_signs);
+        memory->w = take(&next, blocks * curve);
+    }
+    for (int k = 1; k <= 2 * TERMS; k++)
+        memory->inverse[k] = 1.0 / k;
+    code->share(memory);
+    return count;
+}
+
+int64_t noack_exact_scratch(const noack_exact *exact) {
+    return lay_out(exact, code_for(max_of(exact->n, exact->m)), NULL);
+}
+
+void noack_exact_runs(
+    const noack_exact *exact, int64_t runs, const double *A, const double *B, const double *x0,
+    const int64_t *keys, noack_exact_row *rows) {
+    const exact_code *code = code_for(max_of(exact->n, exact->m));
+    int64_t n = exact->n, m = exact->m, stages = exact->link == NULL ? 0 : exact->link->stage_count;
+    double state[3 * NOACK_EXACT_ENTRIES];
+    exact_memory memory = {0};
+    lay_out(exact, code, &memory);
+    for (int64_t number = 0; number < runs; number++) {
+        exact_run run = {.row = rows + number, .number = number, .state = state};
+        *run.row = (noack_exact_row){.inter_event_min_s = INFINITY};
+        if (exact->link != NULL)
+            noack_link_renew(exact->link, keys + number * stages * 2, exact->first_delivered);
+        code->prepare(&memory, A + number * n * n, B + number * n * m);
+        memset(state, 0, sizeof state);
+        for (int64_t i = 0; i < n; i++) {
+            if (exact->known_start)
+                state[i] = x0[number * n + i];
+            else
+                state[code->stride + i] = 0.0 - x0[number * n + i];
+        }
+        run.event = !exact->known_start;
+        run.auxiliary = memory.dynamic ? exact->rule.initial : 0.0;
+        code->follow(&memory, &run);
+    }
+}
+
+void noack_exact_segments(
+    const noack_exact *exact, const double *A, const double *B, int64_t count, double *t_s,
+    double *states, double *auxiliaries, int64_t *events, double *values, int64_t *statuses) {
+    const exact_code *code = code_for(max_of(exact->n, exact->m));
+    int64_t n = exact->n, stride = code->stride;
+    double state[3 * NOACK_EXACT_ENTRIES];
+    exact_memory memory = {0};
+    lay_out(exact, code, &memory);
+    code->prepare(&memory, A, B);
+    for (int64_t i = 0; i < count; i++, states += 3 * n) {
+        noack_exact_row row = {.inter_event_min_s = INFINITY};
+        exact_run run = {.row = &row, .stops = 1, .t_s = t_s[i], .state = state};
+        run.auxiliary = auxiliaries[i];
+        memset(state, 0, sizeof state);
+        for (int64_t j = 0; j < 3 * n; j++)
+            state[j / n * stride + j % n] = states[j];
+        code->follow(&memory, &run);
+        for (int64_t j = 0; j < 3 * n; j++)
+            states[j] = state[j / n * stride + j % n];
+        t_s[i] = run.t_s;
+        auxiliaries[i] = run.auxiliary;
+        events[i] = run.event;
+        values[i] = exact->measure == NOACK_EXACT_COST ? row.cost : row.sup_e_c_scaled;
+        statuses[i] = row.status;
+    }
+}
+
+void noack_exact_sample(
+    const noack_exact *exact, const double *A, const double *B, int64_t starts,
+    const double *start_s, const double *start_states, int64_t count, const double *t_s,
+    double *states) {
+    const exact_code *code = code_for(max_of(exact->n, exact->m));
+    int64_t n = exact->n;
+    exact_memory memory = {0};
+    lay_out(exact, code, &memory);
+    code->prepare(&memory, A, B);
+    for (int64_t start = 0, sampled = 0; start < starts; start++, start_states += 3 * n) {
+        double state[3 * NOACK_EXACT_ENTRIES] = {0};
+        int64_t end = sampled;
+        while (end < count && (start + 1 == starts || t_s[end] < start_s[start + 1]))
+            end++;
+        for (int64_t j = 0; j < 3 * n; j++)
+            state[j / n * code->stride + j % n] = start_states[j];
+        code->sample(
+            &memory, state, start_s[start], end - sampled, t_s + sampled, states + 3 * n * sampled);
+        sampled = end;
+    }
+}

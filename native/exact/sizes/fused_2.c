@@ -1,0 +1,5 @@
+#if defined(__x86_64__)
+#define FUSED
+#define N 2
+#include "../code.h"
+#endif

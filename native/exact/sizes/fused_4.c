@@ -1,0 +1,5 @@
+#if defined(__x86_64__)
+#define FUSED
+#define N 4
+#include "../code.h"
+#endif

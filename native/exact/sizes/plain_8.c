@@ -1,0 +1,4 @@
+#if !defined(__x86_64__)
+#define N 8
+#include "../code.h"
+#endif

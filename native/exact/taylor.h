@@ -1,0 +1,198 @@
+/* The loop between events as Taylor polynomials with a bound on the truncation error.
+
+   In the coordinates (x_c, e_c, d) with e_c = x_c - x and d = x_s - x_c = e_s - e_c,
+
+       x_c' = H x_c        d' = H d        e_c' = A e_c - E x_c        E = A + BK - H,
+
+   since A e_c - E x_c = H x_c - A x - BK x_c. Only e_c depends on the plant; x_c drives it. x_c and
+   d follow the models, which all plants share. x = x_c - e_c and e_s = e_c + d. After an event e_s
+   is exactly 0, since d = -e_c or both are 0. No small quantity is the difference of large ones: a
+   small mismatch E and the errors that it drives keep their relative accuracy.
+
+   The Taylor coefficients of degree k are H_k x_c, H_k d and A_k e_c + X_k x_c. Their tables are
+   computed once per plant:
+
+       H_k = H^k/k!    A_k = A^k/k!    X_(k+1) = (A X_k - E H_k)/(k + 1),  X_0 = 0.
+
+   Truncation error. The powers of G = [[H, 0], [-E/s, A]] have the blocks k! H_k, k! A_k and
+   k! X_k/s. After a time of at most w, the polynomial of degree p omits the sum over k > p of
+   G^k w^k/k! applied to (s x_c, e_c), and |G^(p+1+j)| <= |G^(p+1)| q z^j with z = |G^4|^(1/4) and
+   q = max over r < 4 of |G^r|/z^r. For z w <= (p + 2)/2 the sum is at most
+   2 q |G^(p+1)| w^(p+1)/(p + 1)!. It is kept below 2^-53, the rounding error of the state itself.
+   s = |E|/max(|A|, |H|) balances the blocks, so that the truncation error of the part that a small E
+   drives is relative to E. All norms are Frobenius norms, which bound the 2-norms from above. */
+#ifndef NOACK_EXACT_TAYLOR_H
+#define NOACK_EXACT_TAYLOR_H
+
+#include "lanes.h"
+
+static const double NEGLIGIBLE = 0x1p-53, ROUNDED_UP = 1.0 + 1e-9;
+static const double LESS_STRICT[DEGREES] = { /* (1e-12/2^-53)^(1/(p + 1)) */
+    6.178996568622248, 3.6723274229378378, 2.750419024561364, 2.2882747106619057,
+    2.0146481673225165, 1.8350137296621136, 1.708531253776262, 1.614865304156447,
+    1.5428148079652244, 1.4857258704959437, 1.4394069351299323};
+
+typedef struct {
+    lanes x_c, e_c, d;
+} models;
+
+static inline int degree_of(int i) { return 4 + 2 * i; }
+
+/* Fill a table with H^k/k!, k = 0 ... HIGHEST + 1. */
+static void powers(const double *H, double *table) {
+    memset(table, 0, N * STRIDE * sizeof *table);
+    for (int j = 0; j < N; j++)
+        table[j * STRIDE + j] = 1.0;
+    for (int k = 0; k <= HIGHEST; k++)
+        for (int j = 0; j < N; j++, table += STRIDE)
+            store(table + N * STRIDE, scale(times(H, load(table)), 1.0 / (k + 1)));
+}
+
+/* Fill a table with X_k, k = 0 ... HIGHEST + 1. */
+static void driven(const double *A, const double *E, const double *H_k, double *table) {
+    memset(table, 0, N * STRIDE * sizeof *table);
+    for (int k = 0; k <= HIGHEST; k++)
+        for (int j = 0; j < N; j++, table += STRIDE, H_k += STRIDE) {
+            lanes column = subtract(times(A, load(table)), times(E, load(H_k)));
+            store(table + N * STRIDE, scale(column, 1.0 / (k + 1)));
+        }
+}
+
+/* The squared Frobenius norm of a matrix. */
+static inline double square_sum(const double *matrix) {
+    lanes total = filled(0.0);
+    for (int j = 0; j < N; j++) {
+        lanes column = load(matrix + j * STRIDE);
+        total = fma_lanes(column, column, total);
+    }
+    return sum(total);
+}
+
+/* Compute the time over which the polynomial of each degree is accurate. */
+static void find_reaches(exact_memory *memory) {
+    const double *H_k = memory->H_k, *A_k = memory->A_k, *X_k = memory->X_k;
+    double widest = largest_of(square_sum(A_k + N * STRIDE), square_sum(H_k + N * STRIDE));
+    double mismatch = square_sum(memory->E), sizes[TERMS + 1];
+    /* s^-2; if E or both matrices are 0, any value is valid. */
+    double balance = widest > 0.0 && mismatch > 0.0 ? widest / mismatch : 1.0;
+    for (int k = 0; k <= TERMS; k++) {
+        int at = k * N * STRIDE;
+        double own = square_sum(H_k + at) + square_sum(A_k + at);
+        sizes[k] = sqrt(own + square_sum(X_k + at) * balance);
+    }
+    double z = sqrt(sqrt(24.0 * sizes[4])), q = 1.0;
+    if (z > 0.0) {
+        q = largest_of(largest_of(q, sizes[1] / z), 2.0 * sizes[2] / (z * z));
+        q = largest_of(q, 6.0 * sizes[3] / (z * z * z));
+    }
+    for (int i = 0; i < DEGREES; i++) {
+        int p = degree_of(i);
+        double left_out = 2.0 * q * sizes[p + 1];
+        memory->reach_s[i] = memory->measured_s[i] = left_out == 0.0 ? INFINITY : 0.0;
+        if (left_out != 0.0 && left_out < INFINITY) {
+            double most_s = z > 0.0 ? (p + 2) / (2.0 * z) : INFINITY;
+            double carried_s = exp(log(NEGLIGIBLE / left_out) / (p + 1));
+            memory->reach_s[i] = least(carried_s, most_s);
+            memory->measured_s[i] = least(carried_s * LESS_STRICT[i], most_s);
+        }
+    }
+}
+
+/* The lowest degree that is accurate over a window. */
+static inline int degree_for(const double *reach_s, double window_s) {
+    int i = 0;
+    while (i < DEGREES - 1 && !(window_s <= reach_s[i]))
+        i++;
+    return degree_of(i);
+}
+
+/* The sum over k <= p of c_k s^k. */
+static inline lanes value(const double *curve, int p, double s) {
+    lanes total = load(curve + p * STRIDE);
+    for (int k = p - 1; k >= 0; k--)
+        total = fma_scaled(total, s, load(curve + k * STRIDE));
+    return total;
+}
+
+/* The state at a time on a piece. */
+static inline models state_at(const exact_memory *memory, int p, double s) {
+    models state = {
+        load(memory->x_c + p * STRIDE), load(memory->e_c + p * STRIDE),
+        load(memory->d + p * STRIDE)};
+    if (memory->is_static) {
+        state = (models){load(memory->x_c), state.e_c, load(memory->d)};
+        for (int k = p - 1; k >= 0; k--)
+            state.e_c = fma_scaled(state.e_c, s, load(memory->e_c + k * STRIDE));
+        return state;
+    }
+    for (int k = p - 1; k >= 0; k--) {
+        state.x_c = fma_scaled(state.x_c, s, load(memory->x_c + k * STRIDE));
+        state.e_c = fma_scaled(state.e_c, s, load(memory->e_c + k * STRIDE));
+    }
+    if (!memory->apart) {
+        state.d = filled(0.0);
+        return state;
+    }
+    for (int k = p - 1; k >= 0; k--)
+        state.d = fma_scaled(state.d, s, load(memory->d + k * STRIDE));
+    return state;
+}
+
+/* The polynomial and its derivative. */
+static inline void value_and_slope(
+    const double *curve, int p, double s, lanes *value, lanes *slope) {
+    lanes total = load(curve + p * STRIDE), rise = filled(0.0);
+    for (int k = p - 1; k >= 0; k--) {
+        rise = fma_scaled(rise, s, total);
+        total = fma_scaled(total, s, load(curve + k * STRIDE));
+    }
+    *value = total;
+    *slope = rise;
+}
+
+/* Bounds on |y''| and on |y|^2 in [0, s]. Entry by entry, the sum of |c_k| s^k bounds |y|, and its
+   derivatives bound those of y; they do not decrease. */
+static inline double bend(const double *curve, int p, double s, double *square) {
+    lanes total = magnitude(load(curve + p * STRIDE)), slope = filled(0.0), half = slope;
+    for (int k = p - 1; k >= 0; k--) {
+        half = fma_scaled(half, s, slope);
+        slope = fma_scaled(slope, s, total);
+        total = fma_scaled(total, s, magnitude(load(curve + k * STRIDE)));
+    }
+    *square = ROUNDED_UP * dot(total, total);
+    return ROUNDED_UP * 2.0 * sqrt(dot(half, half));
+}
+
+/* A bound on |y|^2 in [0, s]. */
+static inline double largest(const double *curve, int p, double s) {
+    lanes total = magnitude(load(curve + p * STRIDE));
+    for (int k = p - 1; k >= 0; k--)
+        total = fma_scaled(total, s, magnitude(load(curve + k * STRIDE)));
+    return ROUNDED_UP * dot(total, total);
+}
+
+/* Write the coefficients of y'Sy, of degree 2p: the sum over i + j = k of c_i S c_j. A coefficient of
+   y is (blocks, N), and S is diagonal with as many signs. */
+static inline void squared(
+    const double *curve, int p, int64_t blocks, const double *signs, double *out) {
+    int64_t size = blocks * STRIDE;
+    for (int k = 0; k <= 2 * p; k++) {
+        lanes over_blocks = filled(0.0);
+        for (int64_t block = 0; block < blocks; block++) {
+            const double *c = curve + block * STRIDE;
+            lanes total = filled(0.0);
+            for (int i = k > p ? k - p : 0; i < (k + 1) / 2; i++)
+                total = fma_lanes(load(c + i * size), load(c + (k - i) * size), total);
+            total = add(total, total);
+            if (k % 2 == 0) {
+                lanes middle = load(c + k / 2 * size);
+                total = fma_lanes(middle, middle, total);
+            }
+            total = multiply(total, load(signs + block * STRIDE));
+            over_blocks = block == 0 ? total : add(over_blocks, total);
+        }
+        out[k] = sum(over_blocks);
+    }
+}
+
+#endif
