@@ -25,7 +25,7 @@ _PHASES = (
     ("conditions", RunClaims, "violations"),
     ("claims", RunClaims, "judge"),
     ("wait for the replay", finalize.ReplayProcess, "verdict"),
-    ("report", finalize, "_report"),
+    ("report", finalize, "_write_report"),
 )
 
 

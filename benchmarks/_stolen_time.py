@@ -9,8 +9,8 @@ import psutil
 from numpy.typing import NDArray
 
 from cosim.analysis.timing_statistics import lateness_us
-from cosim.record.run_directory import ENVIRONMENT_FILE, LOOPS, SUMMARY_FILE, read_object
-from cosim.record.run_record import load_record
+from cosim.record.run_directory import ENVIRONMENT_FILE, SUMMARY_FILE, read_object
+from cosim.record.run_record import load_run
 
 NOTHING = 0.005
 """A smaller share of all cores is not counted as taken; the kernel counts in steps of 10 ms."""
@@ -56,8 +56,7 @@ def worst_p99_us(run_dir: Path, role: str, seconds: NDArray[np.int64]) -> float:
     It is NaN if there are no such seconds.
     """
     found = []
-    for directory in sorted((run_dir / LOOPS).iterdir()):
-        record = load_record(directory)
+    for record in load_run(run_dir).loops:
         table = {"plant": "plant_step", "controller": "controller_step"}[role]
         second = record.columns(table, "t_ns")["t_ns"] // 10**9
         late_us = lateness_us(record, role)[np.isin(second, seconds)]

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 from benchmarks._report import Benchmark, Goal, MeasurementError, Peer, Row, say
 from benchmarks._stolen_time import StolenTime, began_s, worst_p99_us
 from benchmarks.soak.watch import Processes
-from cosim.record.run_directory import LATEST, LOOPS, SUMMARY_FILE, read_object
+from cosim.record.run_directory import LATEST
 from cosim.simulation.shared_network import simulate_loops
 from noack.config.scenario_file import load
 from noack.protocol.topology import LOOP_ROLES, WITH_DEADLINES
@@ -127,11 +127,9 @@ def run(load_: Load, folder: Path) -> Measured:
     if process.returncode != 0:
         found = network.get("exit", {}).get("reason", network.get("error"))
         raise MeasurementError(f"{load_.loops} loops at {load_.rate_hz:g} Hz: {found}")
-    directories = sorted((folder / LATEST / LOOPS).iterdir())
-    loops = [read_object(directory / SUMMARY_FILE) for directory in directories]
     quiet = stolen.quiet_seconds(began_s(folder / LATEST), load_.horizon_s)
     late_ms = {role: worst_p99_us(folder / LATEST, role, quiet) * 1e-3 for role in WITH_DEADLINES}
-    return Measured(network, loops, memory, cpu_s, end_s, len(quiet), late_ms)
+    return Measured(network, network["loops"], memory, cpu_s, end_s, len(quiet), late_ms)
 
 
 def _follow(

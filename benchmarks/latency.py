@@ -76,10 +76,10 @@ def measure(options: argparse.Namespace) -> list[Row]:
                 "run", "lane_following", "--set", f"horizon_s={case.round_s}",
                 *_LOSSLESS, *case.arguments,
             ).summary  # fmt: skip
-            found = summary["latency_us"]
+            found = summary["loops"][0]["latency_us"]
             figures = {"p50": found["p50"], "p99": found["p99"], "count": found["updates"]}
             rounds[name].add(OURS, figures)
-            for granted in (bare.granted, *summary["realtime"].values()):
+            for granted in (bare.granted, *summary["loops"][0]["realtime"].values()):
                 refused[name] |= _refused(granted) if case.asked else set()
     return [
         row

@@ -1,4 +1,4 @@
-"""Several loops on one network in virtual time: the fleets of a live run, without clocks.
+"""The loops of a run on one network in virtual time: the fleets of a live run, without clocks.
 
 The queues of the network couple the loops. A run with one loop computes what the run without
 [[loops]] does, bit for bit.
@@ -8,8 +8,7 @@ from typing import Any
 
 from controller_node.controller import controller_of
 from cosim.record.loop_rows import network_rows_by_loop
-from cosim.record.loops_run import LoopsRun
-from cosim.record.run_record import RunRecord
+from cosim.record.run_record import RecordedRun, RunRecord
 from cosim.simulation.virtual_time import Gathered, Progress, Shuttle, drive, reports_of
 from netem.duplex_link import network_of
 from noack.config.loops import loops_of, phases_ns
@@ -53,8 +52,8 @@ class _GatheredByLoop:
             self.loops[number].take(role, Record(output.table, tuple(row)))
 
 
-def simulate_loops(scenario: Scenario, progress: Progress | None = None) -> LoopsRun:
-    """Run a scenario with [[loops]] in virtual time; see :func:`simulate`.
+def simulate_loops(scenario: Scenario, progress: Progress | None = None) -> RecordedRun:
+    """Run the loops of a scenario in virtual time; see :func:`simulate`.
 
     Args:
         scenario: the scenario, not resolved; speed, ports and real-time settings have no effect.
@@ -79,10 +78,11 @@ def simulate_loops(scenario: Scenario, progress: Progress | None = None) -> Loop
         reports = reports_of(rows, shuttle, scenario, number)
         notices = gathered.loops[number].sorted_notices()
         rows = {table: rows[table] for table in tables_of(loops[number])}
-        records.append(RunRecord(loops[number], rows, notices, reports, "simulated", number=number))
+        shared = number if len(loops) > 1 else None
+        records.append(RunRecord(loops[number], rows, notices, reports, "simulated", number=shared))
     reports = reports_of(network_rows, shuttle, scenario)
     network = RunRecord(
         scenario, network_rows, gathered.network.sorted_notices(),
-        {"netem": reports["netem"]}, "simulated",
+        {"netem": reports["netem"]}, "simulated", is_network=True,
     )  # fmt: skip
-    return LoopsRun(network, records)
+    return RecordedRun(network, records)

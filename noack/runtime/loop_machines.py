@@ -1,4 +1,4 @@
-"""The machines of a process: that of one loop, those of several, or compiled ones of many."""
+"""The machines of a process: one for each loop, or compiled ones of many."""
 
 import secrets
 import socket
@@ -72,18 +72,16 @@ class _Loops:
 
     def __init__(self, process: RunProcess, new_machine: NewMachine) -> None:
         self._process, self._new_machine = process, new_machine
-        run = process.scenario
-        self._has_numbers = run.loops is not None
-        self.scenarios = resolved_loops(run) if self._has_numbers else (run,)
+        self.scenarios = resolved_loops(process.scenario)
 
-    def machine(self, most: int | None = None) -> Machine[Message]:
+    def machine(self, most: int | None = None) -> Fleet:
         """Return the machine of all loops, or of the first ones."""
         start, phases_ns = self._process.start, self._process.phases_ns[:most]
         machines = [
             self._new_machine(loop, start._replace(from_ns=start.from_ns - phase_ns))
             for loop, phase_ns in zip(self.scenarios, phases_ns, strict=False)
         ]
-        return Fleet(machines, phases_ns) if self._has_numbers else machines[0]
+        return Fleet(machines, phases_ns)
 
     def channel(self, endpoint: socket.socket, addresses: Mapping[str, Address]) -> MessageSocket:
         """Return the socket of all loops."""
@@ -129,7 +127,7 @@ class _Loops:
         *,
         key: bytes | None = None,
         not_before_ns: int = 0,
-    ) -> Decoder | FleetDecoder:
+    ) -> FleetDecoder:
         """Return the decoder of a flow of all loops, or of the first ones."""
         ticket, phases_ns = self._process.ticket, self._process.phases_ns[:most]
         encrypted = self._process.scenario.network.encrypted
@@ -145,4 +143,4 @@ class _Loops:
             )
             for number, (loop, phase_ns) in enumerate(zip(self.scenarios, phases_ns, strict=False))
         ]
-        return FleetDecoder(decoders) if self._has_numbers else decoders[0]
+        return FleetDecoder(decoders)

@@ -17,7 +17,7 @@ from typing import Any, Protocol, TypeVar, cast
 
 from noack.config.loops import loops_of, phases_ns
 from noack.config.parameter_changes import ReconfigurableMachine
-from noack.config.resolution import tables_of
+from noack.config.resolution import run_tables
 from noack.core.clock import NS_PER_S, RunClock, SlewedRunClock
 from noack.core.errors import CallerError, NoackError, PeerError, one_line
 from noack.protocol.machine_interface import BEGINNING, RESTART, Machine, Notice, Record, Start
@@ -177,7 +177,7 @@ class RunProcess:
             # Before the barrier: locking memory may take a tenth of a second.
             realtime(settings.enabled, settings.fifo_priority, place) as applied,
         ):
-            if self.scenario.loops is not None:
+            if len(self.phases_ns) > 1:
                 enlarge_buffer(endpoint, FLEET_BUFFER_BYTES)  # it may be late to the start
             channel = open_channel(endpoint, self.join(endpoint.getsockname()[:2]))
             telemetry = self._telemetry()
@@ -200,9 +200,7 @@ class RunProcess:
                     "channel": channel.report(),
                     "rows": telemetry.totals(),
                     "stored": telemetry.stored(),
-                    **(
-                        {"rows_by_loop": by_loop} if (by_loop := telemetry.totals_by_loop()) else {}
-                    ),
+                    "rows_by_loop": telemetry.totals_by_loop(),
                     "generation": self.start.generation,
                     "instance": self.plane.instance,
                     "reached_ns": reached_ns,
@@ -218,7 +216,7 @@ class RunProcess:
         return own_spool(self.ticket, self.role, self.plane.secret)
 
     def _telemetry(self) -> TelemetryBuffer:
-        tables = tables_of(self.scenario)
+        tables = run_tables(self.scenario)
         owned = {table: dtype for table, dtype in tables.items() if OWNER[table] == self.role}
         generation = self.start.generation
         return TelemetryBuffer(
@@ -231,7 +229,7 @@ class RunProcess:
 
     def _drive(self, machine: Machine[T], channel: Channel[T], telemetry: TelemetryBuffer) -> int:
         """Run the loop; return the simulated time up to which the machine has done its work."""
-        has_table = clock_table(self.role) in tables_of(self.scenario)
+        has_table = clock_table(self.role) in run_tables(self.scenario)
         if has_table or self._reference is not None:
             self._clock_record = ClockRecord(
                 self.role, self.start, self.clock, self._reference, has_table=has_table

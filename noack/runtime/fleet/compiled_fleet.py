@@ -16,7 +16,7 @@ from noack.config.parameter_changes import (
     ParameterChange,
     announcement_outputs,
 )
-from noack.config.resolution import loop_of, tables_of
+from noack.config.resolution import loop_of, run_tables, tables_of
 from noack.config.runtime_parameters import is_of_network_alone, text_of
 from noack.config.scenario import Scenario
 from noack.core.clock import RunClock
@@ -63,7 +63,11 @@ class CompiledFleet:
         run_id: int,
         key: bytes,
     ) -> None:
-        self._parts, self._own, tables = parts, parts.arrays, tables_of(run)
+        self._parts, self._own, tables = (
+            parts,
+            parts.arrays,
+            (run_tables(run) if run.loops else tables_of(run)),
+        )
         self._sends = SENDS[name]
         self._on_message, timer = role.on_message, role.on_timer
         self._on_timer = role.on_message if timer is None else timer

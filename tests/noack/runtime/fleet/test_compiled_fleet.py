@@ -12,7 +12,7 @@ from controller_node.controller_arrays import CONTROLLER_FLEET
 from noack.config.fleet_layout import FleetRole
 from noack.config.loops import phases_ns
 from noack.config.parameter_changes import ParameterChange
-from noack.config.resolution import resolved_loops, tables_of
+from noack.config.resolution import resolved_loops, run_tables
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
 from noack.core.errors import CallerError
@@ -67,7 +67,7 @@ class Pair:
     def __init__(self, name: str, run: Scenario) -> None:
         role, machine_of = ROLES[name]
         loops = resolved_loops(run)
-        self._tables = tables_of(run)
+        self._tables = run_tables(run)
         self._single = Fleet([*map(machine_of, loops)], phases_ns(run))
         self._compiled = compiled(name, run)
         self._compiled.use(compiled_driver(role, self._compiled.arguments))
