@@ -86,7 +86,6 @@ class VirtualRun:
     Args:
         scenario: the scenario of the run.
         loops: the resolved scenario of each loop.
-        numbered: whether the rows of a loop begin with its number.
         network: decides the fate of each update; by default the scenario's own network.
     """
 
@@ -95,7 +94,6 @@ class VirtualRun:
         scenario: Scenario,
         loops: Sequence[Scenario],
         *,
-        numbered: bool,
         network: Network | None = None,
     ) -> None:
         self._scenario = scenario
@@ -105,9 +103,7 @@ class VirtualRun:
         """When each loop begins."""
         self.machines = [
             {
-                role: make(
-                    [loops[k] for k in numbers], [phases[k] for k in numbers], numbered=numbered
-                )
+                role: make([loops[k] for k in numbers], [phases[k] for k in numbers], numbered=True)
                 for role, make in _ROLES.items()
             }
             for numbers in self.groups
@@ -210,7 +206,7 @@ class VirtualRun:
         """Take the rows and notices of machines."""
         machines, numbers = self.machines[group][role], np.array(self.groups[group])
         for table, rows in machines.take_rows():
-            if len(self.groups) > 1 and LOOP in (rows.dtype.names or ()):
+            if len(self.groups) > 1:
                 rows[LOOP] = numbers[rows[LOOP]]
             self.record.extend(table, rows)
         for notice in machines.take_notices():
@@ -237,34 +233,43 @@ class VirtualRun:
 def simulate(
     resolved: Scenario, network: Network | None = None, progress: Progress | None = None
 ) -> RunRecord:
-    """Run a scenario of one loop in virtual time, with the sampling of a live run.
+    """Run a resolved scenario of one loop in virtual time; see :func:`simulate_loops`.
 
     Args:
-        resolved: the resolved scenario; its speed, ports and real-time settings have no effect.
+        resolved: the scenario.
         network: decides the fate of each update; by default the scenario's own network, as in a
             live run.
+        progress: called with the simulated time.
+    """
+    if network is not None:
+        resolved.coverage.require_unchanging()
+    return _simulated(resolved, (resolved,), network, progress).loops[0]
+
+
+def simulate_loops(scenario: Scenario, progress: Progress | None = None) -> RecordedRun:
+    """Run the loops of a scenario in virtual time, with the sampling of a live run.
+
+    Args:
+        scenario: the scenario; speed, ports and real-time settings have no effect.
         progress: called with the simulated time.
 
     Returns:
         The record of the run; its reports have no entries about sockets or real-time settings.
     """
-    if network is not None:
-        resolved.coverage.require_unchanging()
-    run = _completed(resolved, (resolved,), progress, numbered=False, network=network)
-    rows = {table: run.record.rows(table, dtype) for table, dtype in tables_of(resolved).items()}
-    reports = _reports(run, rows, resolved)
-    return RunRecord(resolved, rows, run.record.notices(), reports, "simulated")
-
-
-def simulate_loops(scenario: Scenario, progress: Progress | None = None) -> RecordedRun:
-    """Run the loops of a scenario in virtual time; see :func:`simulate`.
-
-    Args:
-        scenario: the scenario, not resolved; speed, ports and real-time settings have no effect.
-        progress: called with the simulated time.
-    """
     loops = [resolve(loop) for loop in loops_of(scenario)]
-    run = _completed(scenario, loops, progress, numbered=True)
+    return _simulated(scenario, loops, None, progress)
+
+
+def _simulated(
+    scenario: Scenario,
+    loops: Sequence[Scenario],
+    network: Network | None,
+    progress: Progress | None,
+) -> RecordedRun:
+    run = VirtualRun(scenario, loops, network=network)
+    run.announce()
+    with np.errstate(all="ignore"):  # a diverging loop overflows and is recorded all the same
+        run.run(progress=progress)
     of_network = {table: run.record.rows(table, dtype) for table, dtype in network_tables().items()}
     by_loop = network_rows_by_loop(of_network, run.phases_ns)
     own = [dict[str, Rows]() for _ in loops]
@@ -282,25 +287,10 @@ def simulate_loops(scenario: Scenario, progress: Progress | None = None) -> Reco
         shared = number if len(loops) > 1 else None
         records.append(RunRecord(loop, tables, notices, reports, "simulated", number=shared))
     reports = {"netem": _report("netem", of_network, {"rejected": {}})}
-    notices = run.record.notices()
-    network = RunRecord(scenario, of_network, notices, reports, "simulated", is_network=True)
-    return RecordedRun(network, records)
-
-
-def _completed(
-    scenario: Scenario,
-    loops: Sequence[Scenario],
-    progress: Progress | None,
-    *,
-    numbered: bool,
-    network: Network | None = None,
-) -> VirtualRun:
-    """Return a run at its end."""
-    run = VirtualRun(scenario, loops, numbered=numbered, network=network)
-    run.announce()
-    with np.errstate(all="ignore"):  # a diverging loop overflows and is recorded all the same
-        run.run(progress=progress)
-    return run
+    common = RunRecord(
+        scenario, of_network, run.record.notices(), reports, "simulated", is_network=True
+    )
+    return RecordedRun(common, records)
 
 
 def _groups(loops: Sequence[Scenario]) -> Iterator[list[int]]:
@@ -321,7 +311,7 @@ def _split(
 ) -> Iterator[tuple[int, Rows]]:
     """Yield the number and the rows of each loop, without the column of its number."""
     loops = rows[LOOP]
-    order = np.argsort(loops, kind="stable")
+    order = np.argsort(loops, kind="stable") if len(numbers) > 1 else slice(None)
     counts = np.bincount(loops, minlength=max(numbers) + 1)
     data = rows.view(np.uint8).reshape(len(rows), rows.dtype.itemsize)[order, 2:]
     own = np.ascontiguousarray(data).view(dtype).reshape(-1)

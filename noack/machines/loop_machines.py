@@ -196,12 +196,10 @@ class LoopMachines:
         return [*records, *self.take_notices()]
 
     def _inspect(self, rows: Rows) -> None:
-        if not self.numbered:
+        if len(self.parts) == 1:
             self._keep_notices(0, self.parts[0].inspect(rows))
             return
-        if len(self.parts) > 1:
-            rows = self._notable(rows)
-        for row in rows:
+        for row in self._notable(rows):
             loop = int(row[LOOP])
             self._keep_notices(loop, self.parts[loop].inspect(row[None]))
 

@@ -111,7 +111,7 @@ def test_loops_of_different_sizes_on_one_network() -> None:
 
 def test_numbers_of_no_simulation_are_refused() -> None:
     resolved = resolve(load(SCENARIOS / "unstable_pendulum.toml", ["horizon_s=1.0"]))
-    run = VirtualRun(resolved, (resolved,), numbered=False)
+    run = VirtualRun(resolved, (resolved,))
     own = run.core
     for name, value in (("loops", 2), ("groups", 0), ("sent_places", 3), ("sent_count", -1)):
         before = getattr(own, name)

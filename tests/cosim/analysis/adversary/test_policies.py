@@ -15,7 +15,7 @@ from cosim.analysis.adversary.sampled_run import run_of
 from cosim.analysis.adversary.search_nodes import Pattern
 from cosim.analysis.adversary.worst_disturbance import bounds_of
 from cosim.record.run_record import RunRecord
-from cosim.simulation.sampled.sampled_loop import SampledLoop
+from cosim.simulation.sampled.sampled_loop import SampledLoop, Scales
 from cosim.simulation.virtual_time import simulate
 from noack.config.feature_kinds import POLICIES
 from noack.config.resolution import resolve
@@ -237,3 +237,12 @@ def test_no_signs_are_worse_than_those_found(
     found = find_worst(resolved, objective)
     assert found.value == pytest.approx(worst, rel=1e-9)
     assert not found.exact
+
+
+def test_causes_that_end_too_early_are_refused() -> None:
+    """The core checks what Python hands to it."""
+    loop = SampledLoop(scenario_of(EXAMPLES["mixed"]))
+    runs, one = loop.start(), np.ones(loop.last + 1)
+    short = loop.with_causes(np.zeros((0, 2)), np.zeros((3, 2)))
+    with pytest.raises(ValueError, match="do not reach"):
+        short.follow(runs, Scales(loop.weight, one, one), np.array([loop.last]))
