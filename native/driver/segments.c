@@ -58,7 +58,8 @@ static void load(noack_segments *segments, int64_t run) {
     copy(n, segments->x + run * n, plant->x);
     copy(m, segments->u + run * m, plant->u);
     copy(m, segments->u_next + run * m, plant->inputs);
-    memset(plant->held, 0, (size_t)(every * m) * sizeof *plant->held);
+    if (plant->reports_inputs)
+        memset(plant->held, 0, (size_t)(every * m) * sizeof *plant->held);
     plant->newest_ns = t_ns;
     plant->machine.step = step + 1;
     plant->measurements = step < 0 ? 0 : step / every + 1;
