@@ -156,7 +156,7 @@ def test_users_code_is_asked(content: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("encrypted", [False, True])
 def test_slow_users_code_leaves_time_for_datagrams_and_housekeeping(
-    content: dict[str, Any], encrypted: bool, tmp_path: Path
+    encrypted: bool, tmp_path: Path
 ) -> None:
     """Each step takes twice its time, so that the plant is late from the first step on."""
     (tmp_path / "slow.py").write_text(
@@ -165,11 +165,12 @@ def test_slow_users_code_leaves_time_for_datagrams_and_housekeeping(
         "    def start(self, x0): self.x = x0\n"
         "    def advance(self, u, t_s, dt_s): time.sleep(2 * dt_s)\n"
     )
-    system = {"kind": "python", "file": str(tmp_path / "slow.py"), "name": "Slow"}
-    plant = content["plant"] | {"system": system, "rate_hz": 500.0}
-    resolved = scenario(content, plant=plant)
+    system = f'{{kind="python", file="{tmp_path / "slow.py"}", name="Slow"}}'
+    settings = [f"plant.system={system}", 'plant.draw="nominal"', "horizon_s=1.0"]
+    resolved = resolve(load(SCENARIOS / "lane_following.toml", settings))
     with closing(Live("plant", [resolved], encrypted=encrypted)) as live:
-        live.send(Message(Flow.ACTUATION, 0, 0, np.array([1.0])))
+        inputs = np.zeros(resolved.message_sizes.entries(Flow.ACTUATION))
+        live.send(Message(Flow.ACTUATION, 0, 0, inputs))
         live.driver.drive(live.clock.now_ns() + 10_000_000, live.rows)
         steps = len(live.rows.tables[PLANT_STEP])
         assert 0 < steps < 250  # of 500 until the horizon
