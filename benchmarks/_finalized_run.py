@@ -26,7 +26,7 @@ _PHASES = (
     ("fidelity", finalize, "fidelity_for_summary"),
     ("conditions", RunClaims, "violations"),
     ("claims", RunClaims, "judge"),
-    ("report", finalize, "_report"),
+    ("report", finalize, "_write_report"),
 )
 
 

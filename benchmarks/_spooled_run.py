@@ -10,8 +10,10 @@ from pathlib import Path
 
 from cosim.live.simulated_run import simulate_run
 from cosim.record.environment import write_environment
+from cosim.record.loop_rows import with_loop
 from cosim.record.run_directory import RECORD
 from cosim.record.run_record import RunRecord, load_record
+from noack.config.resolution import run_tables
 from noack.config.scenario_file import load
 from noack.protocol.topology import RECORDER
 from noack.runtime.spool import SPOOL, SpoolWriter
@@ -22,13 +24,13 @@ _SETTINGS = ("trigger.floor=1e-3",)  # without a floor, the threshold vanishes w
 
 
 def spool(record: RunRecord, run_dir: Path) -> None:
-    """Spool all rows of a record."""
-    writer = SpoolWriter(run_dir / SPOOL, RECORDER)
+    """Spool all rows of a run of one loop."""
+    writer, types = SpoolWriter(run_dir / SPOOL, RECORDER), run_tables(record.scenario)
     for table in record.tables:
         first = 0
         for rows in record.source.batches(table):
             for place in range(0, len(rows), _BATCH_ROWS):
-                batch = rows[place : place + _BATCH_ROWS]
+                batch = with_loop(rows[place : place + _BATCH_ROWS], 0, types[table])
                 writer.append(table, first, batch.tobytes())
                 first += len(batch)
     writer.close()
@@ -37,7 +39,7 @@ def spool(record: RunRecord, run_dir: Path) -> None:
 def main(horizon_s: str, folder: str) -> None:
     """Simulate and spool a run."""
     scenario = load(SCENARIO, (*_SETTINGS, f"horizon_s={horizon_s}"))
-    run_dir = simulate_run(scenario, Path(folder), view=False).run_dir
+    run_dir = simulate_run(scenario, Path(folder)).run_dir
     write_environment(run_dir, "live")
     spool(load_record(run_dir), run_dir)
     shutil.rmtree(run_dir / RECORD)

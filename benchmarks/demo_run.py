@@ -13,12 +13,18 @@ from benchmarks._runs import noack
 
 def rows_of(summary: Mapping[str, Any]) -> list[Row]:
     """Return the rows of a demo run from its summary."""
-    late = summary["lateness_us"]["plant"]
+    (loop,) = summary["loops"]
+    late = loop["lateness_us"]["plant"]
     in_time = 100 * (1 - late["late_steps"] / late["steps"])
     nothing = Goal("==", 0)
     return [
-        Row("missing samples", summary["missing_samples"], "samples", goal=nothing),
-        Row("lost outside netem", summary["unintended_losses"], "datagrams", goal=nothing),
+        Row("missing samples", loop["missing_samples"], "samples", goal=nothing),
+        Row(
+            "lost outside netem",
+            loop["unintended_losses"],
+            "datagrams",
+            goal=nothing,
+        ),
         Row("plant steps within one period", in_time, "%", goal=Goal(">=", 99.9)),
         *(Row(f"plant lateness, {name}", late[name], "µs") for name in ("p50", "p99", "max")),
     ]

@@ -23,7 +23,7 @@ import psutil
 
 from benchmarks._report import Benchmark, Goal, MeasurementError, Peer, Row, median, say
 from benchmarks.soak.watch import Processes
-from cosim.record.run_directory import LATEST, LOOPS, SUMMARY_FILE, read_object
+from cosim.record.run_directory import LATEST
 from cosim.simulation.virtual_time import simulate_loops
 from noack.config.scenario_file import load
 from noack.protocol.topology import LOOP_ROLES, WITH_DEADLINES
@@ -135,9 +135,7 @@ def run(load_: Load, folder: Path) -> Measured:
     if process.returncode != 0:
         found = network.get("exit", {}).get("reason", network.get("error"))
         raise MeasurementError(f"{load_.loops} loops at {load_.rate_hz:g} Hz: {found}")
-    directories = sorted((folder / LATEST / LOOPS).iterdir())
-    loops = [read_object(directory / SUMMARY_FILE) for directory in directories]
-    return Measured(network, loops, memory, cpu_s, end_s)
+    return Measured(network, network["loops"], memory, cpu_s, end_s)
 
 
 def _follow(

@@ -42,7 +42,9 @@ def alone() -> Figures:
 def _lateness(summary: dict[str, Any]) -> Figures:
     if summary["exit"]["status"] != 0:
         raise MeasurementError(f"the run ended: {summary['exit']['reason']}")
-    return {role: summary["lateness_us"][role]["p99"] for role in ("plant", "controller")}
+    return {
+        role: summary["loops"][0]["lateness_us"][role]["p99"] for role in ("plant", "controller")
+    }
 
 
 class _Page:

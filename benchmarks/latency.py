@@ -72,9 +72,10 @@ def in_turn(case: Case, rounds: Rounds, pings: dict[str, Sequence[str]]) -> set[
         refused |= set(bare.refused)
     horizon = ("--set", f"horizon_s={case.round_s}")
     summary = noack("run", "lane_following", *horizon, *_LOSSLESS, *case.arguments).summary
-    found = summary["latency_us"]
+    (loop,) = summary["loops"]
+    found = loop["latency_us"]
     rounds.add(OURS, {"p50": found["p50"], "p99": found["p99"], "count": found["updates"]})
-    for granted in summary["realtime"].values():
+    for granted in loop["realtime"].values():
         refused |= {one for one, answer in granted.items() if answer.startswith("not permitted")}
     return refused
 

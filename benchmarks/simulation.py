@@ -16,21 +16,24 @@ import numpy as np
 
 from benchmarks._report import Benchmark, Goal, Peer, Row, median, say
 from benchmarks.batch import integrated
+from cosim.analysis.replay import replay
 from cosim.cli import find_scenario
 from cosim.simulation.batch.batch_interface import Population, setting_of
 from cosim.simulation.continuous.continuous_loop import continuous_loop_of
 from cosim.simulation.continuous.continuous_run import simulate_continuous
 from cosim.simulation.continuous.network_fates import network_fates
-from cosim.simulation.virtual_time import simulate
+from cosim.simulation.virtual_time import simulate, simulate_loops
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
-from noack.config.scenario_file import load
+from noack.config.scenario_file import load, validate
 from noack.theory.run_conditions import ideal_conditions
 from noack.theory.scenario_certificates import certify
 
 ROUNDS = 5
 _RTOL = 1e-10
 _AGREEMENT_S = 1e-8
+_LOOPS, _LOOPS_HZ, _LOOPS_S = 50, 50.0, 10.0
+_REPLAYED_S = 600.0
 
 
 def timed_ms(call: Callable[[], object]) -> float:
@@ -74,6 +77,33 @@ def sampled_row(scenario: Scenario) -> Row:
     return Row(name, median(taken), "ms", peer, Goal("<=", 1e-3))
 
 
+def loops_row(scenario: Scenario) -> Row:
+    """Many loops on one network in virtual time: CPU time of the whole simulation."""
+    content = scenario.model_dump(mode="json", exclude_none=True)
+    content |= {"horizon_s": _LOOPS_S, "loops": [{"name": "loop", "count": _LOOPS}]}
+    for part in ("plant", "controller"):
+        content[part] |= {"rate_hz": _LOOPS_HZ}
+    many = validate(content, "loops")
+    rates = []
+    for _ in range(ROUNDS):
+        begun_s = time.process_time()
+        simulate_loops(many)
+        rates.append(_LOOPS / (time.process_time() - begun_s))
+    name = f"{_LOOPS} loops at {_LOOPS_HZ:g} Hz: loops × runs of {_LOOPS_S:g} s per second of CPU"
+    return Row(name, median(rates), "/s", goal=Goal(">=", 3000))
+
+
+def replay_row(scenario: Scenario) -> Row:
+    """The replay of a long run, in memory."""
+    record = simulate(scenario.model_copy(update={"horizon_s": _REPLAYED_S}))
+    begun_s = time.process_time()
+    found = replay(record)
+    used_s = time.process_time() - begun_s
+    unjudged = None if found.bit_exact else "the replay is not bit-exact"
+    name = f"replay of {_REPLAYED_S:g} s, {found.inputs:,} inputs"
+    return Row(name, _REPLAYED_S / used_s, "× real time", goal=Goal(">=", 2000), unjudged=unjudged)
+
+
 def certificate_row(scenario: Scenario) -> Row:
     """A certificate, computed without caches."""
     conditions = ideal_conditions(scenario)
@@ -85,7 +115,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
     """Measure the paper's example."""
     scenario = resolve(load(find_scenario("lane_following"), ()))
     rows = []
-    for row in (continuous_row, sampled_row, certificate_row):
+    for row in (continuous_row, sampled_row, loops_row, replay_row, certificate_row):
         say(row.__name__)
         rows.append(row(scenario))
     return rows

@@ -20,10 +20,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
 
 def run_controllers(process: RunProcess) -> None:
     """Make the controller of each loop, and run them."""
-    numbered = process.loop_count is not None
-    machines = controllers_of(
-        process.loops, process.phases_ns, start=process.start, numbered=numbered
-    )
+    machines = controllers_of(process.loops, process.phases_ns, start=process.start, numbered=True)
     run_machines(process, machines)
 
 

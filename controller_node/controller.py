@@ -168,13 +168,13 @@ class Controller:
         """Call the control law; after its first failure, the input is the safe input."""
         m = controller.machine.m
         safe = np.zeros(m) if self.safe_input is None else self.safe_input
-        u, notices = None, ()
+        u, notices = None, list[Notice]()
         if not self._failed:
             try:
                 u = method(self.law)
             except ControlFailedError as error:
                 self._failed = True
-                notices = (Notice(controller.asked_ns, FAILED, str(error)),)
+                notices.append(Notice(controller.asked_ns, FAILED, str(error)))
         reals_at(controller.u, m)[:] = safe if u is None else u
         return notices
 

@@ -43,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
 
 def run_network(process: RunProcess) -> None:
     """Relay the datagrams of a run by the core."""
-    network = RunNetwork(process.scenario, process.start, process.loop_count)
+    network = RunNetwork(process.scenario, process.start, len(process.phases_ns))
     with process.open_socket() as endpoint:
         addresses = process.join(endpoint.getsockname()[:2])
         ways = [
@@ -52,7 +52,7 @@ def run_network(process: RunProcess) -> None:
         ]
         channel = NetworkChannel(
             endpoint, ways, network=network, clock=process.clock, spin_ns=process.spin_ns,
-            loops=process.loop_count,
+            loops=len(process.phases_ns),
         )  # fmt: skip
         process.run(network, channel, network)
 

@@ -42,12 +42,12 @@ class NetworkChannel(CountingSocket):
         network: RunNetwork,
         clock: RunClock,
         spin_ns: int = 0,
-        loops: int | None = None,
+        loops: int = 1,
     ) -> None:
         self._directions = {source: number for number, (source, _) in enumerate(ways)}
         destinations = [destination for _, destination in ways]
         super().__init__(endpoint, destinations[0], list(self._directions))
-        self._loops, self._reads_loop = loops or 1, loops is not None
+        self._loops = loops
         self._foreign = self._of_no_loop = 0
         self._network, self._passed_on = network, [0, 0]
         receivers = dict(zip(self._directions, self.peer_sockets, strict=True))
@@ -56,7 +56,7 @@ class NetworkChannel(CountingSocket):
     def take(self, data: bytes, source: SocketName, now_ns: int, sink: RecordSink) -> None:
         """Pass on a datagram that a peer sent before its socket was open; count others."""
         direction = self._directions.get(source[:2])
-        loop = loop_number(data) if self._reads_loop else 0
+        loop = loop_number(data)
         if direction is None:
             self._foreign += 1
         elif loop is None or loop >= self._loops:

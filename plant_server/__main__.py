@@ -20,8 +20,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
 
 def run_plants(process: RunProcess) -> None:
     """Make the plant of each loop, and run them."""
-    numbered = process.loop_count is not None
-    machines = plants_of(process.loops, process.phases_ns, numbered=numbered)
+    machines = plants_of(process.loops, process.phases_ns, numbered=True)
     run_machines(process, machines)
 
 

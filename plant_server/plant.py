@@ -88,7 +88,7 @@ class Plant:
             entries=m * self.predictions + n * self.watchdog.is_predictive,
             period_ns=self.period_ns, horizon_ns=self.horizon_ns,
         )  # fmt: skip
-        sources = m + n * shape.disturbed_state
+        sources, shown = m + n * shape.disturbed_state, self.measure_every * self.reports_inputs
         C = None if self.measuring is None else self.measuring.C
         memory.fill(plant, {
             "internal": shape.internal, "system": core.NOACK_USER, "sources": sources,
@@ -97,7 +97,7 @@ class Plant:
             "predictions": self.predictions, "input_period_ns": self.input_period_ns,
             "newest_sequence": NO_SEQUENCE, "fallback_sequence": NO_SEQUENCE, "missing_ns": -1,
             "x": np.array(self.system.x), "z": np.array(self.system.z), "u": np.zeros(m),
-            "applied": np.zeros(sources), "held": np.zeros((self.measure_every * self.reports_inputs, m)),
+            "applied": np.zeros(sources), "held": np.zeros((shown, m)),
             "inputs": np.zeros((self.predictions, m)), "x_c": np.zeros(n),
             "x_fallback": np.zeros(n), "scratch": np.zeros(2 * n + 2 * m),
         })  # fmt: skip

@@ -20,8 +20,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
 
 def run_sensors(process: RunProcess) -> None:
     """Make the sensor of each loop, and run them."""
-    numbered = process.loop_count is not None
-    machines = sensors_of(process.loops, process.phases_ns, start=process.start, numbered=numbered)
+    machines = sensors_of(process.loops, process.phases_ns, start=process.start, numbered=True)
     run_machines(process, machines)
 
 

@@ -63,6 +63,12 @@ class Watched:
                 found.append(f"{role}: {count} vary from {least} to {most} after the warm-up")
         return found
 
+    @property
+    def loop(self) -> Mapping[str, Any]:
+        """The summary of the loop; empty without a summary."""
+        found: Mapping[str, Any] = next(iter(self.summary.get("loops", ())), {})
+        return found
+
     def as_json(self) -> dict[str, Any]:
         """Return everything, for ``--json``."""
         counts = {count: list(self.range_of(count)) for count in ("fds", "sockets", "threads")}
@@ -92,9 +98,15 @@ class Result:
     disk_bytes: int
     """Size of the run directory at the end of the loop."""
     watched: Mapping[str, Watched]
-    summary: Mapping[str, Any]
+    summary: dict[str, Any]
     faults: Sequence[str] = field(default_factory=list)
     """Descriptions of all faults."""
+
+    @property
+    def loop(self) -> Mapping[str, Any]:
+        """The summary of the loop; empty without a summary."""
+        found: Mapping[str, Any] = next(iter(self.summary.get("loops", ())), {})
+        return found
 
     def as_json(self) -> dict[str, Any]:
         """Return everything, for ``--json``."""
@@ -110,7 +122,7 @@ class Result:
             "end_peak_kib": dict(self.end_peak_kib),
             "disk_bytes": self.disk_bytes,
             "processes": {role: watched.as_json() for role, watched in self.watched.items()},
-            "summary": {key: self.summary.get(key) for key in kept},
+            "summary": {key: (self.summary | self.loop).get(key) for key in kept},
             "faults": list(self.faults),
         }
 
@@ -147,8 +159,8 @@ def print_result(console: Console, result: Result) -> None:
 
 
 def _lines(result: Result) -> list[str]:
-    replay = result.summary.get("replay") or {}
-    lateness = result.summary.get("lateness_us") or {}
+    replay = result.loop.get("replay") or {}
+    lateness = result.loop.get("lateness_us") or {}
     late = ", ".join(
         f"{role} {figures['p50']:.0f}/{figures['p99']:.0f}/{figures['max']:.0f}"
         for role, figures in lateness.items()
@@ -156,7 +168,7 @@ def _lines(result: Result) -> list[str]:
     )
     peaks = ", ".join(f"{role} {kib / 1024:,.0f}" for role, kib in result.end_peak_kib.items())
     return [
-        f"longest loss burst: {result.summary.get('longest_loss_burst')}",
+        f"longest loss burst: {result.loop.get('longest_loss_burst')}",
         f"replayed at the end: {replay.get('inputs') or 0:,} inputs, bit exact: "
         f"{replay.get('bit_exact')}",
         f"lateness, p50/p99/max in µs (reported, not judged): {late or 'unknown'}",

@@ -244,19 +244,21 @@ def ended_badly(
             {"controller": {"stale": delivered_out_of_order}} if delivered_out_of_order else {},
         ),
     ):
-        if summary[key] != right:
-            faults.append(f"{key}: {summary[key]}")
-    bursts = [one for one in summary["assumption_violations"] if one["cause"] == "dropouts"]
+        if (value := summary["loops"][0][key]) != right:
+            faults.append(f"{key}: {value}")
+    bursts = [
+        one for one in summary["loops"][0]["assumption_violations"] if one["cause"] == "dropouts"
+    ]
     if bursts:
         faults.append(f"assumption_violations: {bursts}")
-    replay = summary["replay"] or {}
+    replay = summary["loops"][0]["replay"] or {}
     if not (replay.get("bit_exact") and replay.get("complete")):
         faults.append(f"the replay: {replay}")
     faults += [
         f"claim violated since {claim['since_s']} s: {claim['what']} ({claim['source']})"
-        for claim in summary["claims"]
+        for claim in summary["loops"][0]["claims"]
         if claim["verdict"] == "violated"
     ]
-    if not summary["claims"]:
+    if not summary["loops"][0]["claims"]:
         faults.append("no claim was judged")
     return faults

@@ -1,10 +1,9 @@
 """Compares the linearisation of a non-linear plant with the model that its loop uses."""
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cosim.analysis.summary_model import LinearisationPart, NoLinearisationPart
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.core.errors import NoackError
@@ -13,7 +12,7 @@ from noack.plants.systems.plant_linearisation import linearise
 from noack.plants.systems.plant_system import PlantSystem
 from plant_server.plant import system_of
 
-Linearisation = dict[str, Any]
+Linearisation = LinearisationPart | NoLinearisationPart
 
 _EXACT = 1e-3
 """Tolerance for an entry with a half-width of 0, as the linearisation uses finite differences."""
@@ -44,20 +43,20 @@ def linearisation(resolved: Scenario) -> Linearisation | None:
     except NoackError:  # a user's plant: its code fails, or it does not accept this x(0)
         A, B = np.full((n, n), np.nan), np.full((n, m), np.nan)
     if not (np.isfinite(A).all() and np.isfinite(B).all()):
-        return {"A": None}
+        return NoLinearisationPart(A=None)
     off_A, off_B = A - loop.A_model, B - loop.B_model
     poles = np.linalg.eigvals(A + B @ loop.K)
     in_box: bool | None = None
     if plant.uncertainty_A is not None or plant.uncertainty_B is not None:
         in_box = _within(off_A, plant.uncertainty_A) and _within(off_B, plant.uncertainty_B)
-    return {
-        "A": A.tolist(),
-        "B": B.tolist(),
-        "eigenvalues": [[float(pole.real), float(pole.imag)] for pole in poles],
-        "off_A": off_A.tolist(),
-        "off_B": off_B.tolist(),
-        "in_box": in_box,
-    }
+    return LinearisationPart(
+        A=A.tolist(),
+        B=B.tolist(),
+        eigenvalues=[[float(pole.real), float(pole.imag)] for pole in poles],
+        off_A=off_A.tolist(),
+        off_B=off_B.tolist(),
+        in_box=in_box,
+    )
 
 
 def _within(off: Matrix, halfwidth: ArrayLike | None) -> bool:
@@ -67,16 +66,16 @@ def _within(off: Matrix, halfwidth: ArrayLike | None) -> bool:
 
 def linearisation_rows(found: Linearisation) -> tuple[tuple[str, str], ...]:
     """Return a linearisation as text: quantities and their values."""
-    if found["A"] is None:
+    if isinstance(found, NoLinearisationPart):
         return (("the plant, linearised", "none: x is not its whole state, or it is not smooth"),)
-    slowest = max(real for real, _ in found["eigenvalues"])
+    slowest = max(real for real, _ in found.eigenvalues)
     worst, where = max(
         (abs(entry), f"{name}[{i}, {j}]")
-        for name in "AB"
-        for i, row in enumerate(found[f"off_{name}"], 1)
+        for name, off in (("A", found.off_A), ("B", found.off_B))
+        for i, row in enumerate(off, 1)
         for j, entry in enumerate(row, 1)
     )
-    box = {True: ", inside the box", False: ", outside the box", None: ""}[found["in_box"]]
+    box = {True: ", inside the box", False: ", outside the box", None: ""}[found.in_box]
     return (
         ("the plant, linearised: poles of A + BK", f"up to {slowest:.3g} /s"),
         ("  largest difference to the model", f"{where}, by {worst:.3g}{box}"),

@@ -1,4 +1,4 @@
-"""The summary of a run, computed from its record."""
+"""The summary of a loop, computed from its record."""
 
 import math
 from collections import Counter
@@ -22,6 +22,7 @@ from cosim.analysis.summary_model import (
     AssumptionPart,
     ChangePart,
     ExitPart,
+    LoopSummary,
     RestartPart,
     RunSummary,
 )
@@ -29,7 +30,7 @@ from cosim.analysis.timing_statistics import latency, lateness
 from cosim.record.divergence import Divergence, divergence
 from cosim.record.packet_outcomes import packet_outcomes
 from cosim.record.recorded_changes import changes_of
-from cosim.record.run_record import RunRecord
+from cosim.record.run_record import RunRecord, no_such_loop
 from noack.config.runtime_parameters import text_of
 from noack.core.clock import NS_PER_S
 from noack.core.errors import ExitStatus
@@ -37,14 +38,14 @@ from noack.impairments.kept_loss import expected_loss
 from noack.protocol.machine_interface import FAILED, RESTART
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
+    NETEM_PACKET,
     PLANT_STEP,
+    UPDATES,
     Fate,
+    effective,
 )
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.theory.assumptions import assumptions
-
-Summary = dict[str, Any]
-"""The content of ``summary.json``: :class:`~cosim.analysis.summary_model.RunSummary` as JSON."""
 
 
 @dataclass(frozen=True)
@@ -54,31 +55,41 @@ class Outcome:
     run_dir: Path
     status: ExitStatus
     reason: str
-    summary: Summary
+    summary: RunSummary
+
+
+def outcome_of_loop(outcome: Outcome, loop: str | None) -> Outcome:
+    """Return the outcome of a loop of a run; without a name, that of the run.
+
+    Raises:
+        CallerError: there is no such loop.
+    """
+    if loop is None:
+        return outcome
+    names = [one.name for one in outcome.summary.loops]
+    if loop not in names:
+        raise no_such_loop(loop, names)
+    summary = outcome.summary.of_loop(loop)
+    status = ExitStatus(summary.exit.status)
+    return Outcome(outcome.run_dir, status, summary.exit.reason, summary)
 
 
 @np.errstate(all="ignore")  # a diverging run overflows and has a summary all the same
-def summarise(
-    record: RunRecord, exit_status: int, reason: str, startup_s: float | None = None
-) -> RunSummary:
-    """Return the summary of a run, without the results of replay, fidelity and claims.
+def summarise(record: RunRecord, exit_status: int, reason: str, phase_ns: int = 0) -> LoopSummary:
+    """Return the summary of a loop, without the results of replay, fidelity and claims.
 
-    ``startup_s`` is the wall time from the launch to simulated time 0; None if unknown.
+    ``exit_status`` and ``reason`` are those of the run; the loop may have failed nevertheless.
     """
     scenario, live = record.scenario, record.kind == "live"
     missing, lost, diverged = missing_rows(record), unintended_losses(record), _divergence(record)
     if exit_status == ExitStatus.OK and (why := _why_failed(record, missing, diverged)):
         exit_status, reason = ExitStatus.FAILED, why
     signals = SignalStatistics(record)
-    return RunSummary(
-        kind=record.kind,
-        startup_s=startup_s,
-        scenario=scenario.name,
+    return LoopSummary(
+        name=scenario.name,
+        number=record.number or 0,
+        phase_s=phase_ns / NS_PER_S,
         mode=scenario.mode,
-        mansd=scenario.network.mansd,
-        constraints=[one.text() for one in scenario.network.constraints],
-        horizon_s=scenario.horizon_s,
-        speed=scenario.speed,
         reached_s=_seconds(record.last_ns(PLANT_STEP)) or 0.0,
         **_transmissions(record),
         **signals.for_summary(),
@@ -123,11 +134,26 @@ def _transmissions(record: RunRecord) -> dict[str, Any]:
         "drops_by_cause": drops_by_cause(outcomes),
         "forced_deliveries": int((outcomes.fate == Fate.FORCED).sum()),
         "longest_loss_burst": max(outcomes.longest_loss_burst(), longest),
+        **_delays(record),
         "loss_bursts": {str(n): count for n, count in sorted(Counter(bursts).items())},
         **from_controller(record),
         "inter_event_min_s": _or_none(np.min, intervals_s),
         "inter_event_median_s": _or_none(np.median, intervals_s),
         "inter_delivery_median_s": _or_none(np.median, np.diff(deliveries["t_ns"]) * 1e-9),
+    }
+
+
+def _delays(record: RunRecord) -> dict[str, Any]:
+    """The times of the effectively delivered updates in the network."""
+    packets = record.columns(
+        NETEM_PACKET, "now_ns", "release_ns", "flow", "fate",
+        where=lambda rows: (rows["flow"] == UPDATES) & effective(rows["fate"]),
+    )  # fmt: skip
+    delays_s = (packets["release_ns"] - packets["now_ns"]) / NS_PER_S
+    return {
+        "link_share": None,  # of the network's bytes, which the record of the loop does not have
+        "delay_mean_s": _or_none(np.mean, delays_s),
+        "delay_max_s": _or_none(np.max, delays_s),
     }
 
 

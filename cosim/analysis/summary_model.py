@@ -5,7 +5,17 @@ from collections.abc import Mapping
 from enum import StrEnum
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
+
+from noack.core.errors import ExitStatus
 
 
 def _or_none(value: Any) -> Any:
@@ -269,24 +279,20 @@ class RestartPart(SummaryPart):
 
 
 class ExitPart(SummaryPart):
-    """How the run ended."""
+    """How the run, or a loop, ended."""
 
-    status: Count
+    status: Annotated[Count, AfterValidator(lambda status: int(ExitStatus(status)))]
     reason: str
 
 
-class RunSummary(SummaryPart):
-    """The content of ``summary.json``."""
+class LoopSummary(SummaryPart):
+    """A loop of the run; times are its own, which are 0 at its phase."""
 
-    kind: Literal["live", "simulated"]
-    startup_s: Real
-    scenario: Text
+    name: Text
+    number: Count
+    phase_s: float
+    """Time of the run at which the loop begins."""
     mode: str
-    mansd: Count
-    constraints: list[str] = []
-    """Further constraints of the guarantee, in the words of the settings."""
-    horizon_s: float
-    speed: float
     reached_s: float
     events: Count
     deliveries: Count
@@ -296,6 +302,11 @@ class RunSummary(SummaryPart):
     forced_deliveries: Count
     longest_loss_burst: Count
     loss_bursts: Counts = {}
+    link_share: Real
+    """Share of the bytes that the network forwarded."""
+    delay_mean_s: Real
+    """Mean time of a forwarded datagram in the network."""
+    delay_max_s: Real
     acknowledgements: FlowPart | None = None
     actuations: FlowPart | None = None
     """Only if they cross the network."""
@@ -326,6 +337,7 @@ class RunSummary(SummaryPart):
     disturbances: list[DisturbancePart]
     diverged_at_s: Real
     replay: ReplayPart | None = None
+    """Of its processes; with the network, if no other loop shares it."""
     linearisation: LinearisationPart | NoLinearisationPart | None = None
     fidelity: FidelityPart | NoFidelityPart | None = None
     conditions: ConditionsPart | None = None
@@ -339,19 +351,107 @@ class RunSummary(SummaryPart):
             raise ValueError("a live run has a latency")
         return self
 
-    def with_results(self, **results: Any) -> "RunSummary":
+    def with_results(self, **results: Any) -> "LoopSummary":
         """Return the summary with more of its fields set."""
-        return RunSummary.model_validate(dict(self) | results)
+        return LoopSummary.model_validate(dict(self) | results)
+
+    def to_json(self) -> dict[str, Any]:
+        """The summary as JSON."""
+        return self.model_dump(mode="json")
+
+
+class InFlightPart(SummaryPart):
+    """Datagrams inside the network: those that wait, are sent or are delayed."""
+
+    mean: float
+    """Over the time that the run reached."""
+    max: Count
+    width_s: float
+    """Width of the intervals of the two lists."""
+    mean_by_interval: list[float]
+    max_by_interval: list[Count]
+
+
+class NetworkPart(SummaryPart):
+    """The network of all loops, in the direction of the updates."""
+
+    datagrams: Count
+    forwarded: Count
+    """Of these, some may still be in the network at the end of the run."""
+    forced_deliveries: Count
+    drops_by_cause: Counts
+    longest_loss_burst: Count
+    rate_bps: Count | None
+    """The lowest rate of its bottlenecks; None without one."""
+    utilisation: Real
+    """Share of this rate that the datagrams used that left until the end of the run, with their
+    overhead; with a duplication before the bottleneck, their copies, too."""
+    in_flight: InFlightPart
+    replay: ReplayPart | None = None
+    """Only if several loops share the network."""
+
+
+class DeadlinesPart(SummaryPart):
+    """The deadlines of a process, over all loops."""
+
+    steps: Count
+    late_steps: Count
+    """Late by more than a period."""
+    max_us: Real
+    """Largest lateness, in wall µs."""
+
+
+class RunSummary(SummaryPart):
+    """The content of ``summary.json``: the network, and an entry for each loop."""
+
+    kind: Literal["live", "simulated"]
+    startup_s: Real
+    scenario: Text
+    mansd: Count
+    constraints: list[str] = []
+    """Further constraints of the guarantee, in the words of the settings."""
+    horizon_s: float
+    speed: float
+    reached_s: float
+    network: NetworkPart
+    loops: Annotated[list[LoopSummary], Field(min_length=1)]
+    """In the order of their numbers."""
+    changes: list[ChangePart]
+    """The changes of settings during the run, in the time of the run."""
+    deadlines: dict[Text, DeadlinesPart] = Field(default_factory=dict)
+    """By process; empty for a simulated run."""
+    exit: ExitPart
+
+    @model_validator(mode="after")
+    def _numbers_ascend(self) -> Self:
+        numbers = [one.number for one in self.loops]
+        if numbers != sorted(set(numbers)):
+            raise ValueError("the numbers of the loops ascend")
+        return self
+
+    def of_loop(self, name: str) -> "RunSummary":
+        """Return the summary with one loop only; it ended as this loop did.
+
+        Raises:
+            KeyError: there is no loop of this name.
+        """
+        for loop in self.loops:
+            if loop.name == name:
+                only = {"loops": [loop], "exit": loop.exit, "changes": loop.changes}
+                scenario = self.scenario if len(self.loops) == 1 else name
+                return self.model_copy(
+                    update=only | {"scenario": scenario, "reached_s": loop.reached_s}
+                )
+        raise KeyError(name)
 
     def to_json(self) -> dict[str, Any]:
         """The content of ``summary.json``."""
         return self.model_dump(mode="json")
 
 
-def can_be_shown(summary: Mapping[str, Any]) -> bool:
-    """Return whether a file contains a complete summary of this version."""
+def read_summary(content: Mapping[str, Any]) -> RunSummary | None:
+    """Return a summary from its JSON; None if it is not complete, or of another version."""
     try:
-        RunSummary.model_validate(summary)
+        return RunSummary.model_validate(content)
     except ValidationError:
-        return False
-    return True
+        return None

@@ -3,10 +3,10 @@
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from cosim.analysis.loops_summary import has_loops
-from cosim.output.loops_tables import claims_line, network_rows
+from cosim.output.network_table import network_rows
 
 if TYPE_CHECKING:
+    from cosim.analysis.summary_model import RunSummary
     from cosim.api.runs import Run
 
 _OF_NETWORK = 3
@@ -15,37 +15,32 @@ _OF_NETWORK = 3
 def run_facts(run: "Run") -> list[tuple[str, str]]:
     """Return what a run was, how it ended, and its results, as names and values."""
     found = run.summary
-    ended = f"at {found['reached_s']:g} s of {found['horizon_s']:g} s: {run.reason}"
+    ended = f"at {found.reached_s:g} s of {found.horizon_s:g} s: {run.reason}"
+    verdicts = Counter(str(claim.verdict) for loop in found.loops for claim in loop.claims)
+    is_one = len(found.loops) == 1
     return [
-        ("run", f"{found['scenario']}, {_mode(run)}, {found['kind']}, M − 1 = {found['mansd']}"),
+        ("run", f"{found.scenario}, {_mode(found)}, {found.kind}, M − 1 = {found.mansd}"),
         ("ended", ended),
-        *(_of_loops(run) if has_loops(found) else _of_one_loop(run)),
+        *(_of_loop(found) if is_one else network_rows(found)[:_OF_NETWORK]),
+        ("claims", ", ".join(f"{n} {verdict}" for verdict, n in verdicts.items()) or "none"),
         ("directory", str(run.directory)),
     ]
 
 
-def _mode(run: "Run") -> str:
-    found = run.summary
-    if has_loops(found):
-        return f"{len(found['loops'])} loops"
-    return "model-based" if found["mode"] == "model" else "zero-order hold"
+def _mode(found: "RunSummary") -> str:
+    if len(found.loops) > 1:
+        return f"{len(found.loops)} loops"
+    return "model-based" if found.loops[0].mode == "model" else "zero-order hold"
 
 
-def _of_loops(run: "Run") -> list[tuple[str, str]]:
-    rows = network_rows(run.summary)[:_OF_NETWORK]
-    return [*rows, ("claims", claims_line(run.summary).partition(": ")[2])]
-
-
-def _of_one_loop(run: "Run") -> list[tuple[str, str]]:
-    found = run.summary
+def _of_loop(found: "RunSummary") -> list[tuple[str, str]]:
+    (loop,) = found.loops
     events = (
-        f"{found['events']}; {found['deliveries']} received, {found['drops']} lost, "
-        f"longest loss burst {found['longest_loss_burst']}"
+        f"{loop.events}; {loop.deliveries} received, {loop.drops} lost, "
+        f"longest loss burst {loop.longest_loss_burst}"
     )
-    norms = (found["initial_state_norm"], found["final_state_norm"])
-    verdicts = Counter(claim["verdict"] for claim in run.claims)
+    norms = (loop.initial_state_norm, loop.final_state_norm)
     return [
         ("events", events),
         ("‖x‖", " → ".join("unknown" if norm is None else f"{norm:.3g}" for norm in norms)),
-        ("claims", ", ".join(f"{n} {verdict}" for verdict, n in verdicts.items()) or "none"),
     ]

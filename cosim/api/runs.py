@@ -12,8 +12,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cosim.api.scenarios import Source, load
-from cosim.record.loops_run import loop_directories
-from cosim.record.run_directory import RECORD, REPORT_FILE, SCENARIO_FILE, chosen_run
+from cosim.record.run_directory import (
+    RECORD,
+    REPORT_FILE,
+    SCENARIO_FILE,
+    chosen_run,
+    file_of_loop,
+)
+from noack.config.resolution import run_tables
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError, ExitStatus
 from noack.core.row_display import as_html, as_text
@@ -25,8 +31,9 @@ if TYPE_CHECKING:
     from cosim.analysis.fidelity import Fidelity
     from cosim.analysis.replay import Replay
     from cosim.analysis.run_summary import Outcome
+    from cosim.analysis.summary_model import Claim, RunSummary
     from cosim.output.report.run_figures import RunFigure
-    from cosim.record.run_record import RunRecord
+    from cosim.record.run_record import RecordedRun, RunRecord
     from cosim.studies.comparison.run_comparison import RunComparison
     from cosim.studies.reproduction.run_repetition import Repetition
 
@@ -44,16 +51,22 @@ class Run:
     """The run directory; ``docs/record.md`` describes its content."""
 
     def __init__(
-        self, directory: Path, finalize: "Callable[[], Outcome]", temporary: Path | None = None
+        self,
+        directory: Path,
+        finalize: "Callable[[], Outcome]",
+        temporary: Path | None = None,
+        loop: str | None = None,
     ) -> None:
-        self.directory = directory
+        self.directory, self._loop = directory, loop
         self._conclude = finalize
         if temporary is not None:
             weakref.finalize(self, shutil.rmtree, temporary, ignore_errors=True)
 
     @property
-    def summary(self) -> dict[str, Any]:
-        """The results of the run: ``summary.json``; ``docs/record.md`` documents its keys.
+    def summary(self) -> "RunSummary":
+        """The results of the run, such as ``summary.loops[0].events``; see ``docs/record.md``.
+
+        ``summary.to_json()`` is the content of ``summary.json``.
 
         For a simulated run in a temporary folder, the summary and the verdicts of the claims are
         computed at the first access to this property, or to one that depends on it. This takes
@@ -72,39 +85,37 @@ class Run:
         return self._outcome.reason
 
     @property
-    def claims(self) -> list[dict[str, Any]]:
-        """The claims about the run, each with its ``verdict``: held, violated or void.
-
-        Those of several loops have the name of their ``loop``.
-        """
-        of_loops = [
-            {"loop": name} | claim for name, one in self.loops.items() for claim in one.claims
-        ]
-        return of_loops or self.summary.get("claims") or []
+    def claims(self) -> "list[Claim]":
+        """The claims about all loops, each with its ``verdict``: held, violated or void."""
+        return [claim for loop in self.summary.loops for claim in loop.claims]
 
     @property
     def loops(self) -> "Mapping[str, Run]":
-        """The loops of a scenario with [[loops]], each as a run, by name; empty without.
+        """The loops of the run, each as a run, by name; their times are their own.
 
-        The run of all loops has the ``tables``, the ``plot`` and the ``replay`` of the network that
-        they share; ``samples``, ``events`` and ``fidelity`` are of one loop.
+        ``samples``, ``events`` and ``fidelity`` are of one loop: the only one of the run, or one of
+        these.
         """
-        from cosim.analysis.loops_summary import has_loops
+        return {name: self._of(name) for name in self._run.names if self._loop in (None, name)}
 
-        if not has_loops(self.summary):  # computing it finalises the loops, too
-            return {}
-        folders = loop_directories(self.directory, self._record.scenario)
-        return {one.name: Run(one, partial(_reopen_loop, one, self)) for one in folders}
+    def _of(self, loop: str) -> "Run":
+        from cosim.analysis.run_summary import outcome_of_loop
+
+        return Run(self.directory, lambda: outcome_of_loop(self._outcome, loop), loop=loop)
 
     @property
     def scenario(self) -> Scenario:
-        """The resolved scenario, with numbers in place of model names and random draws."""
-        return self._record.scenario
+        """The resolved scenario, with numbers in place of model names and random draws.
+
+        That of a run of several loops has them as [[loops]].
+        """
+        is_one = self._loop is not None or len(self._run.loops) == 1
+        return self._record.scenario if is_one else self._run.scenario
 
     @property
     def tables(self) -> tuple[str, ...]:
         """Names of the record's tables."""
-        return tuple(self._record.tables)
+        return tuple(run_tables(self._run.scenario))
 
     def table(self, name: str) -> "pa.Table":
         """Return a table of the record, one row per input of a machine.
@@ -115,19 +126,22 @@ class Run:
         Returns:
             The table with the columns of ``docs/record.md``: times in nanoseconds of simulated
             time, and one column per entry of a vector (``x_1``, ``x_2``, …). The first column is
-            ``t_s``, the time ``t_ns`` in seconds.
+            ``t_s``, the time ``t_ns`` in seconds; the tables of plant, sensor and controller have
+            the number of the ``loop``. Of a loop of ``loops``, the rows of this loop.
 
         Raises:
             NoackError: there is no such table, or its file is damaged.
         """
         from cosim.record.data_frames import with_seconds
-        from cosim.record.table_files import read_table
+        from cosim.record.table_files import arrow_table, read_table
 
         if name not in self.tables:
             known = ", ".join(self.tables)
             raise CallerError(f'"{name}": the record has no such table; it has {known}')
+        if self._loop is not None:
+            return with_seconds(arrow_table(self._record[name]))
         path = self.directory / RECORD / f"{name}.parquet"
-        return with_seconds(read_table(path, self._record.tables[name]))
+        return with_seconds(read_table(path, run_tables(self._run.scenario)[name]))
 
     def samples(self) -> "pa.Table":
         """Return plant, sensor and controller side by side, one row per measurement.
@@ -141,7 +155,7 @@ class Run:
         """
         from cosim.record.data_frames import samples
 
-        return samples(self._record_of_loop)
+        return samples(self._record)
 
     def events(self) -> "pa.Table":
         """Return the sensor's transmissions, one row each.
@@ -155,7 +169,7 @@ class Run:
         """
         from cosim.record.data_frames import events
 
-        return events(self._record_of_loop)
+        return events(self._record)
 
     def plot(self, figure: str = "states") -> "Figure":
         """Draw a figure of the report.
@@ -163,7 +177,7 @@ class Run:
         Args:
             figure: states, errors, state-norm, input or inter-event; for a live run also lateness
                 or latency, and on hosts with different clocks clocks. Certified bounds are drawn
-                next to the bounded quantity. Of several loops: network, loops or map.
+                next to the bounded quantity. Of loops that share a network: network, loops or map.
 
         Raises:
             NoackError: the run has no such figure.
@@ -203,7 +217,7 @@ class Run:
             for name, draw in self._pictures(bounded=True).items():
                 yield name, draw().figure
 
-        return save_figures(drawn(), self.directory / REPORT_FILE, files)
+        return save_figures(drawn(), self.directory / file_of_loop(REPORT_FILE, self._loop), files)
 
     def save_tables(self, folder: Folder) -> list[Path]:
         """Write the tables of the summary: :func:`noack.save_tables` of this run.
@@ -223,7 +237,7 @@ class Run:
         """
         from cosim.live.finalize import run_report
 
-        return run_report(self.directory, again=True)
+        return run_report(self.directory, self._loop, again=True)
 
     def export(self, path: Folder, *, certificates: bool = True) -> list[Path]:
         """Write the run for other programs; return the written files.
@@ -240,7 +254,7 @@ class Run:
         from cosim.output.export.export_formats import export_run
 
         self.summary  # noqa: B018  # of a temporary run, it is computed now
-        return export_run(self.directory, Path(path), certificates=certificates)
+        return export_run(self.directory, Path(path), loop=self._loop, certificates=certificates)
 
     def archive(self, path: Folder) -> Path:
         """Write the run as one file, which :func:`noack.reproduce` repeats; return its path.
@@ -260,9 +274,9 @@ class Run:
         Returns:
             The result: ``bit_exact``, ``first_difference``, ``gaps``, and more.
         """
-        from cosim.analysis.replay import replay
+        from cosim.analysis.replay.run_replay import replay_run
 
-        return replay(self._record)
+        return replay_run(self._run, self._loop)
 
     def fidelity(self) -> "Fidelity":
         """Compare the run with the ideal loop in continuous time, effect by effect.
@@ -275,14 +289,14 @@ class Run:
         """
         from cosim.analysis.fidelity import compute_fidelity
 
-        return compute_fidelity(self._record_of_loop)
+        return compute_fidelity(self._record)
 
     def _pictures(self, *, bounded: bool) -> "Mapping[str, Callable[[], RunFigure]]":
         """Return functions that draw the figures, by name; ``bounded`` with certified bounds."""
-        if self._record.is_network:
-            from cosim.output.report.loops_page import loops_pictures
+        if self._loop is None and len(self._run.loops) > 1:
+            from cosim.output.report.network_figures import network_pictures
 
-            drawn = loops_pictures(self._record, self.directory, self.summary)
+            drawn = network_pictures(self._run, self.summary)
             return {name: partial(drawn.__getitem__, name) for name in drawn}
         from cosim.output.report.run_figures import pictures
 
@@ -293,17 +307,14 @@ class Run:
         return self._conclude()
 
     @cached_property
+    def _run(self) -> "RecordedRun":
+        from cosim.record.run_record import load_run
+
+        return load_run(self.directory)
+
+    @cached_property
     def _record(self) -> "RunRecord":
-        from cosim.record.run_record import load_record
-
-        return load_record(self.directory, network=True)
-
-    @property
-    def _record_of_loop(self) -> "RunRecord":
-        if self._record.is_network:
-            one = next(iter(self.loops))
-            raise CallerError(f'a run of several loops: take one of them, e.g. run.loops["{one}"]')
-        return self._record
+        return self._run.loop(self._loop)
 
     @cached_property
     def _envelopes(self) -> list[Any]:
@@ -320,13 +331,6 @@ class Run:
         from cosim.api.run_facts import run_facts
 
         return as_html(run_facts(self))
-
-
-def _reopen_loop(folder: Path, _: Run) -> "Outcome":
-    """Return the outcome of a loop; the run of all loops holds their temporary folder."""
-    from cosim.live.finalize import reopen
-
-    return reopen(folder)
 
 
 def simulate(scenario: Source, *, runs: Folder | None = None) -> Run:
@@ -352,8 +356,8 @@ def simulate(scenario: Source, *, runs: Folder | None = None) -> Run:
 
     loaded = load(scenario)
     with _folder(runs) as (folder, temporary):
-        ending = simulate_run(loaded, folder, view=temporary is None)
-        made = Run(ending.run_dir, lambda: finalize(ending, report=False), temporary)
+        ending, view = simulate_run(loaded, folder), temporary is None
+        made = Run(ending.run_dir, lambda: finalize(ending, report=False, view=view), temporary)
     if temporary is None:
         made.summary  # noqa: B018  # writes it into the run directory
     return made
@@ -388,7 +392,7 @@ def run(scenario: Source, *, runs: Folder | None = None, progress: bool = False)
         console = PatientConsole(stderr=True, quiet=not progress)
         with progress_line(console, loaded) as watcher:
             ending = launch(loaded, folder, watcher=watcher)
-        outcome = finalize(ending, report=False)
+        outcome = finalize(ending, report=False, view=temporary is None)
         return Run(ending.run_dir, lambda: outcome, temporary)
 
 

@@ -105,7 +105,7 @@ RunArgument = Annotated[
 ]
 LoopOption = Annotated[
     str | None,
-    typer.Option("--loop", metavar="NAME", help="The loop of this name, in a run of several."),
+    typer.Option("--loop", metavar="NAME", help="Only the loop of this name."),
 ]
 SetOption = Annotated[
     list[str] | None,

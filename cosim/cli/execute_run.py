@@ -102,24 +102,23 @@ def _served_metrics(scenario: "Scenario", where: str) -> "Iterator[Watcher]":
 def warn_of_violations(scenario: "Scenario") -> None:
     """Print the assumptions of Theorem 2 that the scenario violates, on standard error.
 
-    For several loops: also what may go wrong at the bottleneck that they share. Raise CallerError
-    if a bottleneck cannot carry the datagrams that must pass.
+    Loops that share a network: also what may go wrong at their bottleneck. Raise CallerError if a
+    bottleneck cannot carry the datagrams that must pass.
     """
     from noack.config.link_load import link_loads, load_warnings, require_capacity
-    from noack.config.loops import loop_scenario
+    from noack.config.loops import loop_names, loop_scenario, loop_sections
     from noack.config.resolution import resolve
     from noack.theory.assumptions import AssumptionStatus, assumptions
 
-    alone = {"": scenario}
     require_capacity(scenario)
-    if scenario.loops is not None:
-        for line in load_warnings(link_loads(scenario), scenario):
-            print(f"noack: warning: {line}", file=sys.stderr)
-        alone = {f"{one.name}: ": loop_scenario(scenario, one) for one in scenario.loops}
-    for name, loop in alone.items():
-        for one in assumptions(resolve(loop)):
+    shares = len(loop_names(scenario)) > 1
+    for line in load_warnings(link_loads(scenario), scenario) if shares else ():
+        print(f"noack: warning: {line}", file=sys.stderr)
+    for section in loop_sections(scenario):
+        whose = f"{section.name}: " if shares else ""
+        for one in assumptions(resolve(loop_scenario(scenario, section))):
             if one.verdict == AssumptionStatus.VIOLATED and one.source == "Theorem 2":
-                print(f"noack: warning: {name}violated: {one.what}: {one.why}", file=sys.stderr)
+                print(f"noack: warning: {whose}violated: {one.what}: {one.why}", file=sys.stderr)
 
 
 def warn_of_other_runs() -> None:
@@ -159,7 +158,7 @@ def _finalize_run(ending: "RunEnding", output: RunOutput) -> int:
         outcome = finalize(ending, report=output.report)
     log_end(outcome.status, outcome.reason, outcome.run_dir)
     if output.json:
-        print_json(outcome.summary)
+        print_json(outcome.summary.to_json())
     else:
         print_outcome(console(), outcome, verbose=output.verbose)
     return outcome.status

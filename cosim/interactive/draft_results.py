@@ -35,7 +35,7 @@ class DraftResults:
         Raises:
             NoackError: the scenario is wrong, or has several loops.
         """
-        if draft.scenario.loops is not None:
+        if draft.scenario.loops:
             raise CallerError("loops: only one loop can be explored; noack.simulate takes several")
         self.draft = draft
         self._found: dict[str, object] = {}

@@ -158,7 +158,7 @@ def threshold_at(resolved: Scenario, t_s: Vector) -> Vector | None:
 
 
 def key_numbers(facts: dict[str, object], cut: str = "") -> Numbers:
-    """Return the key numbers of a summary, which has the keys of ``summary.json``.
+    """Return the key numbers of a summary, which has the keys of a loop in ``summary.json``.
 
     Args:
         facts: the summary.

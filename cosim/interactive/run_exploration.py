@@ -43,8 +43,9 @@ def simulate_sampled(scenario: Scenario) -> Exploration:
         NoackError: the scenario is wrong, or has several loops.
     """
     with tempfile.TemporaryDirectory(prefix="noack-") as folder:
-        outcome = finalize(simulate_run(scenario, Path(folder), view=False), report=False)
-        record = load_record(outcome.run_dir)
+        ending = simulate_run(scenario, Path(folder))
+        outcome = finalize(ending, report=False, view=False)
+        record, (loop,) = load_record(outcome.run_dir), outcome.summary.loops
         sampled, sent, resolved = samples(record), events(record), record.scenario
         known = align_tables(record).since_delivery(resolved)
     n = len(resolved.model.state_names or ()) or resolved.model.dimensions[0]
@@ -59,7 +60,7 @@ def simulate_sampled(scenario: Scenario) -> Exploration:
         resolved, SAMPLED, t_s[kept], x[kept], x_s[kept], x_c[kept], e_s_norm[kept],
         e_c_norm[kept], threshold, _column(sent, "t_s"),
         sent["received"].to_numpy(zero_copy_only=False).astype(np.bool_),
-        outcome.summary.get("diverged_at_s"), key_numbers(outcome.summary),
+        loop.diverged_at_s, key_numbers(loop.to_json()),
     )  # fmt: skip
 
 

@@ -1,143 +1,107 @@
-"""The end of a run: its record completed, its summary and report written."""
+"""The end of a run: its record completed, its summary, report and recording written."""
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import replace
-from functools import partial
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cosim.analysis.claims.claim_definition import Envelope
 from cosim.analysis.claims.claims_by_part import RunClaims
 from cosim.analysis.fidelity import fidelity_for_summary
-from cosim.analysis.loops_over_time import worst_loop
-from cosim.analysis.loops_summary import LoopsSummary, has_loops, is_complete
 from cosim.analysis.loss_statistics import list_violations
 from cosim.analysis.model_comparison import linearisation
+from cosim.analysis.network_summary import summarise_run
 from cosim.analysis.replay import replay
-from cosim.analysis.run_summary import Outcome, Summary, summarise
-from cosim.analysis.summary_model import ReplayPart, RunSummary, SummaryPart
-from cosim.live.finalize_loops import exit_after_replay, finalize_loops
+from cosim.analysis.run_summary import Outcome, summarise
+from cosim.analysis.summary_model import (
+    ExitPart,
+    LoopSummary,
+    ReplayPart,
+    RunSummary,
+    read_summary,
+)
+from cosim.live.process_pool import interrupts_held, processes
+from cosim.live.progress import work_bar
 from cosim.live.replay_process import ReplayProcess
-from cosim.record.decimate import is_long
-from cosim.record.loops_run import loop_directories
 from cosim.record.run_directory import (
     ENDING_FILE,
     RECORD,
     RECORDING_FILE,
     REPORT_FILE,
+    REPORTS_FILE,
     SCENARIO_FILE,
     SUMMARY_FILE,
+    file_of_loop,
     finished_run,
     read_object,
     refuse_links,
 )
-from cosim.record.run_ending import EndingFile, RunEnding
-from cosim.record.run_record import RunRecord, load_record
+from cosim.record.run_ending import RunEnding
+from cosim.record.run_record import RecordedRun, RunRecord, load_run
 from cosim.record.spool_conversion import finish_record
-from noack.config.scenario_file import MOST_RECORDED_BYTES, load
+from noack.config.loops import phases_ns
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.file_access import write_whole
+from noack.core.python_process import cores
 from noack.runtime.spool import SPOOL
 
 _FEW_LOOPS = 4
 """The reports of up to so many loops are written at the end of the run."""
+_MANY_STEPS = 50_000
+"""Loops with fewer steps of the plant, all together, are judged in less time than processes
+start."""
 
 
 @np.errstate(all="ignore")
 def finalize(
-    ending: RunEnding, *, report: bool = True, again: bool = False, loops: int = 1
+    ending: RunEnding, *, report: bool = True, view: bool = True, again: bool = False
 ) -> Outcome:
-    """Complete the record of a run; write its summary and report.
+    """Complete the record of a run; write its summary, its report and its recording.
 
     Args:
         ending: how the run ended.
         report: whether to write the report.
+        view: whether to write the recording, unless the recorder of the run has written it.
         again: an earlier attempt may have been interrupted.
-        loops: number of loops of the run, of which this is one.
 
     Raises:
         CallerError: the run is still under way.
         MachineError: record or summary cannot be written.
     """
     run_dir = ending.run_dir
-    with _with_reason(ending), finished_run(run_dir), ExitStack() as stack:
+    with _with_reason(ending), finished_run(run_dir):
         if not (scenario_file := run_dir / SCENARIO_FILE).exists():
             raise MachineError(f"{scenario_file}: no such file")  # the run directory was replaced
         unfinished = (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir()
-        sections = None
-        if loops == 1:
-            sections = load(scenario_file, most_bytes=MOST_RECORDED_BYTES).loops
-        if sections is not None:
-            count = sum(section.count for section in sections)
-            few = report and count <= _FEW_LOOPS
-            of_loop = partial(finalize, report=few, again=again, loops=count)
-            network, shared = finalize_loops(ending, of_loop, unfinished=unfinished)
-            return _finalize_loops(network, shared, ending, report=report)
-        record = finish_record(run_dir) if unfinished else load_record(run_dir)
-        replaying = stack.enter_context(ReplayProcess(record, run_dir))
-        # A stopped recorder has no time to write the recording of a long run.
-        needed = unfinished or (record.kind == "live" and is_long(record.scenario))
-        shown = record.number is None or (report and not unfinished)
-        if shown and (needed or (again and record.kind == "live")):
-            from cosim.output.viewer.run_view import write_view
-
-            # The recording of an earlier attempt may be complete.
-            with suppress(*(() if needed else (MachineError,))):
-                write_view(record, run_dir, ending.run_id)
-        summary = summarise(record, int(ending.status), ending.reason, ending.startup_s)
-        _write_summary(run_dir, summary)
-        # Written again with the results below, so that none of them can cost the summary.
-        claims = RunClaims(record)
-        summary = _with_results(record, claims, summary, replaying, loops)
+        # A recorder that completed its recording writes the reports afterwards.
+        is_shown = all((run_dir / name).is_file() for name in (REPORTS_FILE, RECORDING_FILE))
+        with work_bar("the record of the run") as show:
+            run = finish_record(run_dir, show) if unfinished else load_run(run_dir)
+        summary = _judged(run, ending)
         _write_summary(run_dir, summary)
         status, reason = ExitStatus(summary.exit.status), summary.exit.reason
-        if (ending.status, ending.reason) != (status, reason):
-            _correct_ending(replace(ending, status=status, reason=reason))
-        content = summary.to_json()
+        if view and (again or not is_shown):
+            with _is_optional(run_dir / RECORDING_FILE):
+                _write_recording(run, summary, run_dir, None)
         if report:
-            with _report_is_optional(run_dir):
-                _report(record, content, run_dir, claims)
-    return Outcome(run_dir, status, reason, content)
-
-
-def _finalize_loops(
-    network: RunRecord, summary: LoopsSummary, ending: RunEnding, *, report: bool
-) -> Outcome:
-    """Write summary, report and recording of a run of several loops, which are finalised."""
-    _write_summary(ending.run_dir, summary)
-    status, reason = ExitStatus(summary.exit.status), summary.exit.reason
-    content = summary.model_dump(mode="json")
-    if report:
-        with _report_is_optional(ending.run_dir):
-            _loops_report(network, content, ending.run_dir)
-        try:
-            from cosim.output.viewer.loops_view import write_loops_view
-
-            write_loops_view(network, content, ending.run_dir, ending.run_id)
-        except Exception as error:  # likewise
-            print(f"noack: warning: no {RECORDING_FILE}: {error}", file=sys.stderr)
-    return Outcome(ending.run_dir, status, reason, content)
+            names = run.names if 1 < len(run.names) <= _FEW_LOOPS else []
+            for name in (*names, None):
+                with _is_optional(run_dir / file_of_loop(REPORT_FILE, name)):
+                    _write_report(run, summary, run_dir, name)
+    return Outcome(run_dir, status, reason, summary)
 
 
 @contextmanager
-def _report_is_optional(run_dir: Path) -> Iterator[None]:
-    """Warn if the report cannot be written, whatever the error is: the run is not affected."""
+def _is_optional(path: Path) -> Iterator[None]:
+    """Warn if a file cannot be written, whatever the error is: the run is not affected."""
     try:
         yield
     except Exception as error:
-        (run_dir / REPORT_FILE).unlink(missing_ok=True)
-        print(f"noack: warning: no {REPORT_FILE}: {error}", file=sys.stderr)
-
-
-def _correct_ending(ending: RunEnding) -> None:
-    """Let the launcher's file agree with the summary."""
-    if (ending.run_dir / ENDING_FILE).is_file():
-        with suppress(MachineError), EndingFile(ending.run_dir) as file:
-            file.store(ending.status, ending.reason, ending.startup_s)
+        path.unlink(missing_ok=True)
+        print(f"noack: warning: no {path.name}: {error}", file=sys.stderr)
 
 
 @contextmanager
@@ -151,7 +115,7 @@ def _with_reason(ending: RunEnding) -> Iterator[None]:
         raise MachineError(f"the run failed: {ending.reason}\n{error}") from None
 
 
-def _write_summary(run_dir: Path, summary: SummaryPart) -> None:
+def _write_summary(run_dir: Path, summary: RunSummary) -> None:
     try:
         text = summary.model_dump_json(indent=2)
         write_whole(run_dir / SUMMARY_FILE, text, make_folder=False)
@@ -159,39 +123,120 @@ def _write_summary(run_dir: Path, summary: SummaryPart) -> None:
         raise MachineError(f"{error}; try `noack summary {run_dir}` later") from None
 
 
+def _judged(run: RecordedRun, ending: RunEnding) -> RunSummary:
+    """Judge every loop and the network; return the summary of the run."""
+    loops, replayed = len(run.loops), None
+    with _judged_loops(run, ending) as found, work_bar(f"claims of {loops} loops") as show:
+        if run.kind == "live" and loops > 1:
+            replayed = _replay(run.network)
+        judged = []
+        for one in found:
+            judged.append(one)
+            show(len(judged) / loops)
+    summary = _summary(run, ending, judged)
+    if replayed is None:
+        return summary
+    network = summary.network.model_copy(update={"replay": replayed})
+    end = _exit_after_replay(summary.exit, replayed)
+    return summary.model_copy(update={"network": network, "exit": end})
+
+
+def _summary(run: RecordedRun, ending: RunEnding, loops: Sequence[LoopSummary]) -> RunSummary:
+    end = ExitPart(status=int(ending.status), reason=ending.reason)
+    return summarise_run(run.network, loops, end, ending.startup_s)
+
+
+@contextmanager
+def _judged_loops(run: RecordedRun, ending: RunEnding) -> Iterator[Iterable[LoopSummary]]:
+    """Yield the summaries of the loops; those of a long run come from a process for each core."""
+    timing, loops = run.scenario.timing, len(run.loops)
+    workers = min(cores(), loops)
+    if workers < 2 or loops * timing.horizon_ns // timing.plant_period_ns < _MANY_STEPS:
+        records = list(run.loops)
+        plain = [_loop_summary(run, record, ending) for record in records]
+        # Written again with the results, so that none of them can cost the summary.
+        _write_summary(ending.run_dir, _summary(run, ending, plain))
+        yield (
+            _with_results(record, one, ending.run_dir, loops)
+            for record, one in zip(records, plain, strict=True)
+        )
+        return
+    with processes(workers) as pool:
+        with interrupts_held():
+            found = [pool.submit(_judged_stored_loop, ending, number) for number in range(loops)]
+        yield (one.result() for one in found)
+
+
+@np.errstate(all="ignore")
+def _judged_stored_loop(ending: RunEnding, number: int) -> LoopSummary:
+    run = _stored_run(ending.run_dir)
+    record = run.loops[number]
+    summary = _loop_summary(run, record, ending)
+    return _with_results(record, summary, ending.run_dir, len(run.loops))
+
+
+_stored_run = cache(load_run)
+"""The run of a worker process."""
+
+
+def _loop_summary(run: RecordedRun, record: RunRecord, ending: RunEnding) -> LoopSummary:
+    phase_ns = phases_ns(run.scenario)[record.number or 0]
+    return summarise(record, int(ending.status), ending.reason, phase_ns)
+
+
 def _with_results(
-    record: RunRecord, claims: RunClaims, summary: RunSummary, replaying: ReplayProcess, loops: int
-) -> RunSummary:
+    record: RunRecord, summary: LoopSummary, run_dir: Path, loops: int
+) -> LoopSummary:
     """Add the results of replay, fidelity and claims; a failure of one is a line or a warning."""
-    results: dict[str, Any] = {"fidelity": fidelity_for_summary(record, loops)}
-    try:
-        results["linearisation"] = linearisation(record.scenario)
-    except Exception as error:  # likewise
-        print(f"noack: warning: the plant was not linearised: {error!r}", file=sys.stderr)
-    try:
-        violations = list_violations(summary.assumption_violations, claims.violations())
-        longest = summary.longest_loss_burst
-        if summary.unintended_losses:
-            longest = max(longest, int(claims.conditions["dropouts"] or 0))
-        results |= {
-            "conditions": claims.conditions,
-            "claims": claims.judge(),
-            "judged_until_s": claims.judged_until_s,
-            "assumption_violations": violations,
-            "longest_loss_burst": longest,
-        }
-    except Exception as error:  # likewise
-        print(f"noack: warning: the claims were not judged: {error!r}", file=sys.stderr)
-    if record.kind == "live":
+    with ReplayProcess(record, run_dir) as replaying:
+        results: dict[str, Any] = {"fidelity": fidelity_for_summary(record, loops)}
         try:
-            results["replay"] = replaying.verdict() or replay(record).verdict()
-        except Exception as error:  # the run itself did not fail
-            results["replay"] = {"bit_exact": None, "error": repr(error)}
-        results["exit"] = exit_after_replay(summary.exit, ReplayPart(**results["replay"]))
+            results["linearisation"] = linearisation(record.scenario)
+        except Exception as error:  # likewise
+            print(f"noack: warning: the plant was not linearised: {error!r}", file=sys.stderr)
+        try:
+            results |= _claim_results(record, summary)
+        except Exception as error:  # likewise
+            print(f"noack: warning: the claims were not judged: {error!r}", file=sys.stderr)
+        if record.kind == "live":
+            verdict = replaying.verdict()
+            replayed = _replay(record) if verdict is None else ReplayPart(**verdict)
+            results |= {"replay": replayed, "exit": _exit_after_replay(summary.exit, replayed)}
     return summary.with_results(**results)
 
 
-def reopen(run_dir: Path) -> Outcome:
+def _claim_results(record: RunRecord, summary: LoopSummary) -> dict[str, Any]:
+    claims = RunClaims(record)
+    longest = summary.longest_loss_burst
+    if summary.unintended_losses:
+        longest = max(longest, int(claims.conditions["dropouts"] or 0))
+    return {
+        "conditions": claims.conditions,
+        "claims": claims.judge(),
+        "judged_until_s": claims.judged_until_s,
+        "assumption_violations": list_violations(
+            summary.assumption_violations, claims.violations()
+        ),
+        "longest_loss_burst": longest,
+    }
+
+
+def _replay(record: RunRecord) -> ReplayPart:
+    try:
+        return ReplayPart(**replay(record).verdict())
+    except Exception as error:  # the run itself did not fail
+        return ReplayPart(bit_exact=None, error=repr(error))
+
+
+def _exit_after_replay(end: ExitPart, replayed: ReplayPart) -> ExitPart:
+    """How a run ended, given its replay: a run that cannot be replayed failed."""
+    if end.status != ExitStatus.OK or replayed.bit_exact is not None:
+        return end
+    why = replayed.error or "the record has no inputs"
+    return ExitPart(status=int(ExitStatus.FAILED), reason=f"the run cannot be replayed: {why}")
+
+
+def reopen(run_dir: Path, *, view: bool = True) -> Outcome:
     """Return the outcome of an earlier run; complete its record and summary if necessary.
 
     Raises:
@@ -199,21 +244,19 @@ def reopen(run_dir: Path) -> Outcome:
     """
     if not (run_dir / SCENARIO_FILE).is_file():
         raise CallerError(f"{run_dir}: not a run directory (no {SCENARIO_FILE})")
-    summary = read_object(run_dir / SUMMARY_FILE)
-    ending = _ending(run_dir, summary)
+    summary = read_summary(read_object(run_dir / SUMMARY_FILE))
     # A process that was frozen may have spooled rows after the end.
-    if ending is not None and is_complete(summary) and not (run_dir / SPOOL).is_dir():
-        return Outcome(run_dir, ending.status, ending.reason, summary)
-    # A summary of several loops is failed if one of them failed; the others did not.
-    if ending is None or has_loops(summary):
-        ending = _ending(run_dir, read_object(run_dir / ENDING_FILE))
+    if summary is not None and not (run_dir / SPOOL).is_dir():
+        status = ExitStatus(summary.exit.status)
+        return Outcome(run_dir, status, summary.exit.reason, summary)
+    ending = _ending(run_dir, read_object(run_dir / ENDING_FILE))
     refuse_links(run_dir)
     unknown = RunEnding(run_dir, 0, ExitStatus.FAILED, "the launcher ended early")
-    return finalize(ending or unknown, again=True)
+    return finalize(ending or unknown, view=view, again=True)
 
 
 def _ending(run_dir: Path, found: Mapping[str, Any]) -> RunEnding | None:
-    """Return how a run ended by its summary or its launcher's file; None if it is not there."""
+    """Return how a run ended by its launcher's file; None if it is not there."""
     with suppress(LookupError, TypeError, ValueError):
         status, reason = ExitStatus(found["exit"]["status"]), str(found["exit"]["reason"])
         return RunEnding(run_dir, 0, status, reason, found["startup_s"])
@@ -221,57 +264,48 @@ def _ending(run_dir: Path, found: Mapping[str, Any]) -> RunEnding | None:
 
 
 @np.errstate(all="ignore")
-def run_report(run_dir: Path, *, again: bool = False) -> Path:
-    """Return the path of an earlier run's report; write it if it is missing, or ``again``.
+def run_report(run_dir: Path, loop: str | None = None, *, again: bool = False) -> Path:
+    """Return the path of an earlier run's report, or of the report of one of its loops.
+
+    It is written if it is missing, or ``again``.
 
     Raises:
-        CallerError: it is not a run directory, or the run is still under way.
+        CallerError: it is not a run directory, the run is still under way, or there is no such
+            loop.
         MachineError: the report cannot be written.
     """
-    outcome, path = reopen(run_dir), run_dir / REPORT_FILE
+    outcome, run = reopen(run_dir), load_run(run_dir)
+    if loop is not None:
+        run.number_of(loop)  # refuses an unknown name
+    path = run_dir / file_of_loop(REPORT_FILE, loop)
     if path.is_file() and not again:
         return path
-    record = load_record(run_dir, network=True)
-    if record.is_network:
-        return _loops_report(record, outcome.summary, run_dir)
-    return _report(record, outcome.summary, run_dir, RunClaims(record))
+    return _write_report(run, outcome.summary, run_dir, loop)
 
 
-def write_recording(run_dir: Path) -> None:
+def write_recording(run_dir: Path, loop: str | None = None) -> None:
     """Write the recording of an earlier run, or of one of its loops.
 
     Raises:
-        CallerError: it is not a run directory, or the run is still under way.
+        CallerError: it is not a run directory, the run is still under way, or there is no such
+            loop.
         MachineError: the recording cannot be written.
     """
-    outcome, record = reopen(run_dir), load_record(run_dir, network=True)
-    run_id = (record.number or 0) + 1  # the viewer knows recordings by it
-    if record.is_network:
-        from cosim.output.viewer.loops_view import write_loops_view
-
-        write_loops_view(record, outcome.summary, run_dir, run_id)
-    else:
-        from cosim.output.viewer.run_view import write_view
-
-        write_view(record, run_dir, run_id)
+    outcome, run = reopen(run_dir, view=False), load_run(run_dir)
+    if loop is not None:
+        run.number_of(loop)  # refuses an unknown name
+    _write_recording(run, outcome.summary, run_dir, loop)
 
 
-def _report(record: RunRecord, summary: Summary, run_dir: Path, claims: RunClaims) -> Path:
+def _write_recording(
+    run: RecordedRun, summary: RunSummary, run_dir: Path, loop: str | None
+) -> None:
+    from cosim.output.viewer.run_view import write_view  # imports rerun
+
+    write_view(run, summary, run_dir, loop)
+
+
+def _write_report(run: RecordedRun, summary: RunSummary, run_dir: Path, loop: str | None) -> Path:
     from cosim.output.report.report_page import write_report  # imports matplotlib
 
-    return write_report(record, summary, run_dir, _envelopes(claims))
-
-
-def _loops_report(network: RunRecord, summary: Summary, run_dir: Path) -> Path:
-    from cosim.output.report.loops_page import write_loops_report  # imports matplotlib
-
-    number = worst_loop(run_dir, summary["loops"]).number
-    worst = load_record(loop_directories(run_dir, network.scenario)[number])
-    return write_loops_report(network, summary, run_dir, _envelopes(RunClaims(worst)))
-
-
-def _envelopes(claims: RunClaims) -> Sequence[Envelope]:
-    try:
-        return claims.envelopes()
-    except Exception:  # the report is useful without them
-        return []
+    return write_report(run, summary, run_dir, loop)

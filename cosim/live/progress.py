@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
+from noack.config.loops import loop_names
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.runtime.join_ticket import DEFAULT_SESSION
@@ -84,9 +85,8 @@ class _RunProgress:
         )
 
     @property
-    def _loops(self) -> int | None:
-        loops = self._scenario.loops
-        return None if loops is None else sum(one.count for one in loops)
+    def _loops(self) -> int:
+        return len(loop_names(self._scenario))
 
     def started(self, run_dir: Path) -> None:
         """Begin the bar."""
@@ -219,10 +219,10 @@ def search_status() -> Iterator[Callable[[str], Callable[[str, int, float], None
         yield named
 
 
-def progress_text(report: Mapping[str, Any], horizon_s: float, loops: int | None = None) -> str:
+def progress_text(report: Mapping[str, Any], horizon_s: float, loops: int = 1) -> str:
     """The recorder's progress report as one line; ``loops`` is the number of loops."""
     norm = "-" if report["x_norm"] is None else f"{report['x_norm']:.3g}"
-    of_loops = "" if loops is None else f"{loops} loops  "
+    of_loops = f"{loops} loops  " if loops > 1 else ""
     return (
         f"{report['t_s']:.1f}/{horizon_s:g} s  {of_loops}events {report['events']}  "
         f"delivered {report['deliveries']}  longest loss burst {report['longest_loss_burst']}  "

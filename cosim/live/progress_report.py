@@ -23,7 +23,7 @@ _MOST_LINES = 30
 class ProgressReport:
     """Fields of :class:`noack.runtime.control_messages.RunProgress`.
 
-    In a run of several loops they are those of all loops together; ‖x‖ is the largest.
+    They are those of all loops together; ‖x‖ is the largest.
     """
 
     def __init__(self, live: str | None) -> None:
@@ -51,7 +51,9 @@ class ProgressReport:
         if table == SENSOR_MEASUREMENT:
             fields["t_s"] = int(rows["t_ns"][-1]) / NS_PER_S
             fields["events"] += int((rows["event"] >= 0).sum())
-            newest = rows["x"] if LOOP in (rows.dtype.names or ()) else rows["x"][-1:]
+            # Of each loop, the newest state in the batch.
+            _, from_end = np.unique(rows[LOOP][::-1], return_index=True)
+            newest = rows["x"][len(rows) - 1 - from_end]
             fields["x_norm"] = float(np.linalg.norm(newest, axis=1).max())
         elif table == CONTROLLER_DELIVERY:
             fields["deliveries"] += len(rows)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from cosim.live.telemetry_recorder import Recorder
 from cosim.record.decimate import is_long
-from cosim.record.run_directory import active_run
+from cosim.record.run_directory import RECORDING_FILE, active_run
 from noack.core.errors import ExitStatus, MachineError
 from noack.protocol.machine_interface import RESTART, Notice
 from noack.protocol.topology import RECORDER
@@ -20,7 +20,7 @@ from noack.runtime.process_life import RunProcess
 
 if TYPE_CHECKING:
     from cosim.output.viewer.live_viewer import LiveView
-    from cosim.output.viewer.loops_recording import LoopsRecording
+    from cosim.output.viewer.network_recording import NetworkRecording
     from cosim.output.viewer.recording import RunView
 
 _POLL_S = 0.02
@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
 
 def _record(process: RunProcess, live_view: "LiveView | None") -> None:
     """Record a run to its end."""
-    run_dir, run_id = Path(process.ticket.run_dir), process.ticket.run_id
+    run_dir = Path(process.ticket.run_dir)
     # A live view is ready when the run begins. The libraries of a recording take half a second to
     # load: the other processes do not wait for them.
     view = _open_view(process, live_view) if live_view else None
@@ -57,9 +57,8 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
     if process.replaces is not None:
         recorder.note(Notice(process.start.from_ns, RESTART, f"restarted: {process.replaces}"))
     process.join(None)
-    # A restarted recorder writes the view at the end; the launcher writes that of a long run, and
-    # that of a run of several loops.
-    unseen = process.scenario.loops is not None or is_long(process.scenario)
+    # The launcher writes the view of a restarted recorder, of a long run, and of several loops.
+    unseen = len(process.phases_ns) > 1 or is_long(process.scenario)
     if view is not None or not (process.start.is_restart or unseen):
         try:
             view = view or _open_view(process, None)
@@ -77,26 +76,21 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
     if silent := recorder.without_report:
         print_to_stderr(f"noack recorder: no report from {', '.join(silent)}")
     recorder.show()
-    record = recorder.finish()
+    recorder.finish()
     try:
         if view is not None:
             view.close()
     except MachineError as error:
         print_to_stderr(f"noack recorder: {error}; the numeric record is complete")
-    if recorder.view_is_incomplete and not unseen and record is not None:
-        from cosim.output.viewer.run_view import write_view
-
-        write_view(record, run_dir, run_id)
+    if recorder.view_is_incomplete or unseen:
+        (run_dir / RECORDING_FILE).unlink(missing_ok=True)  # the launcher writes another one
+    recorder.report()
     if recorder.lost is not None:
         raise recorder.lost
 
 
-def _open_view(process: RunProcess, live_view: "LiveView | None") -> "RunView | LoopsRecording":
+def _open_view(process: RunProcess, live_view: "LiveView | None") -> "RunView | NetworkRecording":
     scenario, run_id, run_dir = process.scenario, process.ticket.run_id, process.ticket.run_dir
-    if scenario.loops is not None:
-        from cosim.output.viewer.loops_recording import open_loops_view
-
-        return open_loops_view(scenario, Path(run_dir), run_id, live_view)
     from cosim.output.viewer.run_view import open_view
 
     return open_view(scenario, Path(run_dir), run_id, live_view)

@@ -31,7 +31,7 @@ class ReplayProcess:
     def __init__(self, record: RunRecord, run_dir: Path) -> None:
         self._process: subprocess.Popen[bytes] | None = None
         if record.kind != "live" or record.number is not None:
-            return  # the loops of a run have a process for each core
+            return  # loops that share a network have a process for each core
         if record.count(PLANT_STEP) < _LEAST_STEPS:
             return
         with suppress(OSError):  # the run is replayed in this process then

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
-from cosim.live.loops_monitor import Finding, LoopsMonitor
+from cosim.live.claim_monitor import ClaimMonitor, Finding
 from cosim.live.process_tokens import ProcessTokens
 from cosim.live.progress_report import ProgressReport
 from cosim.live.telemetry_store import TelemetryStore
 from cosim.record.process_reports import report_of, write_reports
-from cosim.record.run_record import Rows, RunRecord
-from cosim.record.spool_conversion import finish_record
+from cosim.record.run_record import Rows
+from noack.config.loops import loop_names
 from noack.config.parameter_changes import ParameterChange, change_notice
 from noack.config.runtime_parameters import is_of_loss_alone
 from noack.config.scenario import Scenario
@@ -29,15 +29,14 @@ from noack.runtime.telemetry import first_row
 from noack.runtime.zenoh_session import header_of
 
 if TYPE_CHECKING:
-    from cosim.output.viewer.loops_feed import LoopsFeed
-    from cosim.output.viewer.loops_recording import LoopsRecording
+    from cosim.output.viewer.network_recording import NetworkRecording
     from cosim.output.viewer.recording import RunView
-    from cosim.output.viewer.table_feed import ViewFeed
+    from cosim.output.viewer.run_feed import LoopFeed, NetworkFeed
 
 _POLL_FOR_S = 0.2
 _WAITING_BATCHES = 4096
 """A minute of batches; each place of the ring takes 256 bytes once it has been used."""
-_WAITING_BATCHES_OF_LOOPS = 512
+_LEAST_BATCHES = 512
 """Some seconds of batches, each with some hundred kilobytes; a lost one is sent again."""
 _ROWS_IN_FLIGHT_S = 0.3
 
@@ -58,15 +57,15 @@ class Recorder:
         self._plane = plane
         self._store = TelemetryStore(scenario, run_dir, plane.instance, start)
         self._scenario = scenario
-        self._feed: ViewFeed | LoopsFeed | None = None
+        self._feed: LoopFeed | NetworkFeed | None = None
         self.lost: MachineError | None = None
         """Why some stored rows are no longer on disk; known at the end."""
-        self._monitor = LoopsMonitor(scenario)
+        self._monitor = ClaimMonitor(scenario)
         self._blind_reported = self._monitoring_ended = False
         session, key = plane.session, plane.key
         self._batches = session.declare_subscriber(
             key("telemetry", "*", "*"),
-            RingChannel(_WAITING_BATCHES if scenario.loops is None else _WAITING_BATCHES_OF_LOOPS),
+            RingChannel(max(_WAITING_BATCHES // len(loop_names(scenario)), _LEAST_BATCHES)),
         )
         self._report_queries = session.declare_queryable(key("report", "*"), FifoChannel(64))
         self._tokens = ProcessTokens(plane, restarted=start.is_restart)
@@ -90,18 +89,11 @@ class Recorder:
         reported = {report["process"] for report in self._reports.values()}
         return [role for role in LOOP_ROLES if role not in reported]
 
-    def show_in(self, view: "RunView | LoopsRecording") -> None:
+    def show_in(self, view: "RunView | NetworkRecording") -> None:
         """Show the telemetry in a view, from the first batch that is handled afterwards."""
-        from cosim.output.viewer.recording import RunView
+        from cosim.output.viewer.run_feed import feed_of
 
-        if isinstance(view, RunView):
-            from cosim.output.viewer.table_feed import ViewFeed
-
-            self._feed = ViewFeed(self._scenario, view)
-        else:
-            from cosim.output.viewer.loops_feed import LoopsFeed
-
-            self._feed = LoopsFeed(self._scenario, view, self._progress.add_warning)
+        self._feed = feed_of(self._scenario, view, self._progress.add_warning)
 
     def poll(self) -> bool:
         """Handle messages that have arrived; return whether there may be more.
@@ -157,12 +149,8 @@ class Recorder:
         for role, content in self._store.acknowledgements():
             self._plane.acknowledge_rows(role, content)
 
-    def finish(self) -> RunRecord | None:
-        """Write the record and complete the view; the launcher writes the records of several loops.
-
-        Raises:
-            MachineError: the record cannot be written; the spool is kept.
-        """
+    def finish(self) -> None:
+        """Complete spool and view; the launcher writes the record."""
         self._monitor_assumptions(self._monitor.end)
         self._publish_progress()
         try:
@@ -170,14 +158,19 @@ class Recorder:
         except MachineError as error:
             self.lost = error
         self._store.close()
-        write_reports(self._run_dir, self._reports.values())
-        record = finish_record(self._run_dir) if self._scenario.loops is None else None
         if self._feed is not None:
             try:
                 self._feed.advance(final=True)
             except MachineError as error:
                 self.give_up_view(error)
-        return record
+
+    def report(self) -> None:
+        """Write the final reports of the processes, as the last step.
+
+        Raises:
+            MachineError: they cannot be written.
+        """
+        write_reports(self._run_dir, self._reports.values())
 
     def abandon(self) -> None:
         """Keep the spool as it is."""

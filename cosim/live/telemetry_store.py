@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cosim.record.run_record import Rows
-from noack.config.resolution import tables_of
+from noack.config.resolution import run_tables
 from noack.config.scenario import Scenario
 from noack.core.errors import PeerError
 from noack.protocol.machine_interface import GENERATION, Notice, Start
@@ -36,7 +36,7 @@ class TelemetryStore:
     """
 
     def __init__(self, scenario: Scenario, run_dir: Path, instance: str, start: Start) -> None:
-        self.types = tables_of(scenario)
+        self.types = run_tables(scenario)
         """Row type of each table."""
         self._folder = run_dir / SPOOL
         self._writer = SpoolWriter(self._folder, instance if start.is_restart else RECORDER)

@@ -1,13 +1,14 @@
 """Table of assumptions: those of the paper for a scenario, or those of a certificate."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from noack.theory.assumptions import AssumptionStatus
+from cosim.analysis.summary_model import AssumptionPart
+from noack.theory.assumptions import Assumption, AssumptionStatus
 
 _COLOURS: dict[str, str] = {
     AssumptionStatus.HOLDS: "green",
@@ -18,11 +19,11 @@ _COLOURS: dict[str, str] = {
 }
 
 
-def print_assumptions(console: Console, assumptions: Sequence[Mapping[str, str]]) -> None:
+def print_assumptions(console: Console, assumptions: Sequence[Assumption | AssumptionPart]) -> None:
     """Print assumptions with their verdicts."""
     table = Table.grid(padding=(0, 2))
     for one in assumptions:
-        source = one["source"] if one["source"].startswith("(") else f"({one['source']})"
-        text = escape(f"{one['what']} {source}: {one['why']}")
-        table.add_row(Text(one["verdict"], _COLOURS.get(one["verdict"], "")), text)
+        source = one.source if one.source.startswith("(") else f"({one.source})"
+        text = escape(f"{one.what} {source}: {one.why}")
+        table.add_row(Text(one.verdict, _COLOURS.get(one.verdict, "")), text)
     console.print(table)

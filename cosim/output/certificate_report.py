@@ -32,9 +32,9 @@ def print_certificates(console: Console, found: Certificates) -> None:
     if (outside := outside_box(found.scenario)) is not None:
         console.print(f"[yellow]the box certificates do not cover this plant:[/] {outside}")
     console.print("assumptions of the certificates for the schedule:")
-    print_assumptions(console, [a._asdict() for a in found.schedule.assumptions])
+    print_assumptions(console, found.schedule.assumptions)
     console.print("assumptions of the paper's theorems:")
-    print_assumptions(console, [a._asdict() for a in assumptions(found.scenario)])
+    print_assumptions(console, assumptions(found.scenario))
     print_unlimited(console, found.unlimited, found.unpredictable)
     for sentence in (*_in_words(found), *_stability_in_words(found)):
         console.print(sentence, markup=False, highlight=False)

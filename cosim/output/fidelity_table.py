@@ -1,13 +1,13 @@
 """Tables of a run's fidelity: its difference from the ideal loop, effect by effect."""
 
 from collections.abc import Iterator
-from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from cosim.analysis.fidelity import Fidelity, SignalDifference, is_against
+from cosim.analysis.summary_model import FidelityPart, NoFidelityPart
 from noack.core.number_format import NONE, percent
 
 
@@ -49,21 +49,21 @@ def print_fidelity(console: Console, fidelity: Fidelity) -> None:
     console.print(f"[{colour}]{escape(fidelity.verdict)}[/]", highlight=False)
 
 
-def summary_rows(fidelity: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
+def summary_rows(fidelity: FidelityPart | NoFidelityPart | None) -> Iterator[tuple[str, str]]:
     """Yield the rows of fidelity for the table of a run."""
     if fidelity is None:
         return
-    if fidelity["reason"] is not None:
-        yield "difference to the ideal loop", f"not compared: {fidelity['reason']}"
+    if isinstance(fidelity, NoFidelityPart):
+        yield "difference to the ideal loop", f"not compared: {fidelity.reason}"
         return
-    scale = fidelity["rms_x_live"]
-    of_x = f" ({100 * fidelity['rms_x'] / scale:.2g} % of x)" if scale else ""
-    yield "difference to the ideal loop, RMS", f"{fidelity['rms_x']:.3g}{of_x}"
-    for name, share in fidelity["shares"].items():
+    scale = fidelity.rms_x_live
+    of_x = f" ({100 * fidelity.rms_x / scale:.2g} % of x)" if scale else ""
+    yield "difference to the ideal loop, RMS", f"{fidelity.rms_x:.3g}{of_x}"
+    for name, share in fidelity.shares.items():
         if name != "residual":
             against = " (partly cancels the other effects)" if is_against(share) else ""
             yield f"  {name.replace('_', ' ')}", percent(share) + against
-    yield "  residual, RMS", f"{100 * fidelity['explained_relative']:.2g} % of the difference"
+    yield "  residual, RMS", f"{100 * fidelity.explained_relative:.2g} % of the difference"
 
 
 def _by_state(fidelity: Fidelity) -> Table:

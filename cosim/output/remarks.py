@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from cosim.analysis.claims.observed_conditions import CAUSES
-from cosim.analysis.run_summary import Summary
+from cosim.analysis.summary_model import FidelityPart, LoopSummary, RunSummary
 from cosim.output.run_tables import away, changes_in
 from noack.theory.assumptions import AssumptionStatus
 
@@ -20,65 +20,66 @@ class Remark(NamedTuple):
     """Whether a guarantee was broken."""
 
 
-def remarks(summary: Summary) -> Iterator[Remark]:
-    """Yield the remarks on a run, the severe ones first; none if all went well."""
-    violations = summary["assumption_violations"]
+def remarks(summary: RunSummary) -> Iterator[Remark]:
+    """Yield the remarks on one loop, the severe ones first; none if all went well."""
+    (loop,) = summary.loops
+    violations = loop.assumption_violations
     for one in violations[:_MOST]:
-        where = f"t = {one['t_s']:.3f} s (reported by {one['process']})"
-        severe = one["cause"] not in CAUSES  # the guarantee, or a change
-        yield Remark(f"assumption violated at {where}: {one['what']}", severe=severe)
+        where = f"t = {one.t_s:.3f} s (reported by {one.process})"
+        severe = one.cause not in CAUSES  # the guarantee, or a change
+        yield Remark(f"assumption violated at {where}: {one.what}", severe=severe)
     if len(violations) > _MOST:
         yield Remark(f"{len(violations) - _MOST} more violations of this kind", severe=True)
-    if (summary.get("replay") or {}).get("bit_exact") is False:
+    if loop.replay is not None and loop.replay.bit_exact is False:
         yield Remark("the replay of the run differs from its record", severe=True)
-    yield from map(Remark, _warnings(summary))
+    yield from map(Remark, _warnings(summary, loop))
 
 
-def has_clocks(summary: Summary) -> bool:
+def has_clocks(loop: LoopSummary) -> bool:
     """Whether bounds of clocks' errors are recorded, as of a run on several hosts."""
-    return (summary.get("conditions") or {}).get("clock_error_s") is not None
+    return loop.conditions is not None and loop.conditions.clock_error_s is not None
 
 
-def _warnings(summary: Summary) -> Iterator[str]:
-    for one in summary["assumptions"]:
-        if one["verdict"] == AssumptionStatus.VIOLATED:
-            yield f"assumption violated: {one['what']} ({one['source']}): {one['why']}"
-    late = summary["lateness_us"].get("plant")
-    if late and late["late_steps"] > _MOST_LATE * late["steps"]:
-        share = 100 * late["late_steps"] / late["steps"]
+def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
+    for one in loop.assumptions:
+        if one.verdict == AssumptionStatus.VIOLATED:
+            yield f"assumption violated: {one.what} ({one.source}): {one.why}"
+    late = loop.lateness_us.get("plant")
+    if late and late.late_steps > _MOST_LATE * late.steps:
+        share = 100 * late.late_steps / late.steps
         yield f"the plant missed {share:.0f} % of its deadlines: lower speed or plant.rate_hz"
-    first, last = summary["initial_state_norm"], summary["final_state_norm"]
+    first, last = loop.initial_state_norm, loop.final_state_norm
     grew = first is not None and last is not None and last > _MOST_GROWTH * first > 0
-    if grew and summary["diverged_at_s"] is None:  # else it is the reason why the run ended
+    if grew and loop.diverged_at_s is None:  # else it is the reason why the run ended
         yield f"‖x‖ grew from {first:.3g} to {last:.3g} during the run"
-    if (summary.get("fidelity") or {}).get("explained") is False:
+    if isinstance(loop.fidelity, FidelityPart) and not loop.fidelity.explained:
         yield "sampling, delay and hold do not explain the difference to the ideal loop"
-    if summary["missing_samples"]:
-        where = ", ".join(f"{n} of {t}" for t, n in summary["missing_by_table"].items())
-        yield f"{summary['missing_samples']} samples are missing from the record: {where}"
-    if summary["unintended_losses"]:
-        where = ", ".join(f"{n} on {leg}" for leg, n in summary["unintended_losses_by_leg"].items())
-        lost = f"{summary['unintended_losses']} datagrams were lost elsewhere"
-        if has_clocks(summary):
+    if loop.missing_samples:
+        where = ", ".join(f"{n} of {t}" for t, n in loop.missing_by_table.items())
+        yield f"{loop.missing_samples} samples are missing from the record: {where}"
+    if loop.unintended_losses:
+        where = ", ".join(f"{n} on {leg}" for leg, n in loop.unintended_losses_by_leg.items())
+        lost = f"{loop.unintended_losses} datagrams were lost elsewhere"
+        if has_clocks(loop):
             yield f"{lost} (kernel, or between the hosts; firewalls must pass the ports): {where}"
         else:
             yield f"{lost} (kernel): {where}"
-    for one in summary["restarts"]:
-        yield f"{one['process']} was restarted, {away(one)}; claims are void from then on"
-    for when, what in changes_in(summary):
+    for restart in loop.restarts:
+        yield f"{restart.process} was restarted, {away(restart)}; claims are void from then on"
+    for when, what in changes_in(loop.changes):
         yield f"{when}: {what}"
-    for role, reasons in summary["rejected_datagrams"].items():
+    for role, reasons in loop.rejected_datagrams.items():
         counts = ", ".join(f"{reason.replace('_', ' ')} {n}" for reason, n in reasons.items())
         yield f"{role} rejected datagrams: {counts}"
     # Claims are void because this machine was late.
-    causes = {one["cause"] for one in summary["assumption_violations"]} & {"delay", "hold"}
-    if causes and summary["kind"] == "live" and not summary["restarts"]:
-        late = "A host or the network between hosts" if has_clocks(summary) else "This machine"
+    causes = {one.cause for one in loop.assumption_violations} & {"delay", "hold"}
+    if causes and summary.kind == "live" and not loop.restarts:
+        what = "A host or the network between hosts" if has_clocks(loop) else "This machine"
         yield (
-            f"{late} was late, so some claims were not judged to the end. To allow more "
+            f"{what} was late, so some claims were not judged to the end. To allow more "
             "lateness, raise certificate.late_periods."
         )
-    if has_clocks(summary) and (summary.get("replay") or {}).get("complete") is False:
+    if has_clocks(loop) and loop.replay is not None and not loop.replay.complete:
         yield (
             "the record is incomplete. A process that could not reach the recorder prints the "
             "folder of the rest; add it: noack collect RUN_DIRECTORY HOST:FOLDER"

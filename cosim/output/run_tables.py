@@ -1,7 +1,7 @@
 """Tables of a run: key numbers, timing, claims."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 from rich.console import Console
 from rich.markup import escape
@@ -9,7 +9,20 @@ from rich.table import Table
 from rich.text import Text
 
 from cosim.analysis.model_comparison import linearisation_rows
-from cosim.analysis.run_summary import Summary
+from cosim.analysis.summary_model import (
+    ChangePart,
+    Claim,
+    DisturbancePart,
+    EstimationPart,
+    FidelityPart,
+    FlowPart,
+    LoopSummary,
+    Quantiles,
+    ReplayPart,
+    RestartPart,
+    RunSummary,
+    WatchdogPart,
+)
 from cosim.output.assumptions_table import print_assumptions
 from cosim.output.fidelity_table import summary_rows
 from netem.words.words_to_settings import settings_of
@@ -17,33 +30,41 @@ from noack.core.number_format import NONE, duration, number, ratio, seconds, who
 
 Numbers = tuple[tuple[str, str], ...]
 """Quantities and their values, as text."""
-Claims = Sequence[dict[str, Any]]
-_QUANTILES = ("p50", "p99", "p999", "max")
+Claims = Sequence[Claim]
 TIMING_HEADINGS = ("p50", "p99", "p99.9", "max", "count", "missed")
 
 
-def print_details(console: Console, summary: Summary) -> None:
-    """Print everything that a summary has: numbers, timing, assumptions, claims."""
-    console.print(number_table(summary, key_numbers(summary)))
-    if summary["lateness_us"]:  # none in virtual time
-        console.print(_timing_table(summary))
-        _print_realtime(console, summary["realtime"])
+def print_details(console: Console, summary: RunSummary) -> None:
+    """Print everything that the summary of one loop has: numbers, timing, assumptions, claims."""
+    (loop,) = summary.loops
+    console.print(number_table(run_title(summary), key_numbers(summary)))
+    if loop.lateness_us:  # none in virtual time
+        console.print(_timing_table(loop))
+        _print_realtime(console, loop.realtime)
     console.print("the paper's assumptions for this scenario:")
-    print_assumptions(console, summary["assumptions"])
-    print_claims(console, summary)
+    print_assumptions(console, loop.assumptions)
+    print_claims(console, loop.claims)
 
 
-def run_title(summary: Summary) -> str:
-    """Return the title of a run's tables: scenario, mode and cap."""
-    mode = "model-based" if summary["mode"] == "model" else "zero-order hold"
-    kind = "" if summary["kind"] == "live" else f", {summary['kind']}"
-    further = "".join(f", {constraint}" for constraint in summary.get("constraints", ()))
-    return f"{summary['scenario']}, {mode}, M − 1 = {summary['mansd']}{further}{kind}"
+def run_title(summary: RunSummary) -> str:
+    """Return the title of the tables of one loop: scenario, mode and cap."""
+    (loop,) = summary.loops
+    kind = "" if summary.kind == "live" else summary.kind
+    return title_of(summary.scenario, loop.mode, summary.mansd, summary.constraints, kind)
 
 
-def number_table(summary: Summary, rows: Numbers) -> Table:
-    """Return a run's numbers as a table; its title names scenario, mode and cap."""
-    table = Table(title=escape(run_title(summary)))
+def title_of(
+    scenario: str, mode: str, mansd: int, constraints: Sequence[str] = (), kind: str = ""
+) -> str:
+    """Return the title of the tables of a run of one loop; ``kind`` is empty for a live run."""
+    name = "model-based" if mode == "model" else "zero-order hold"
+    further = "".join(f", {one}" for one in (*constraints, kind) if one)
+    return f"{scenario}, {name}, M − 1 = {mansd}{further}"
+
+
+def number_table(title: str, rows: Numbers) -> Table:
+    """Return a run's numbers as a table."""
+    table = Table(title=escape(title))
     table.add_column("quantity")
     table.add_column("value", justify="right")
     for row in rows:
@@ -51,198 +72,199 @@ def number_table(summary: Summary, rows: Numbers) -> Table:
     return table
 
 
-def short_numbers(summary: Summary) -> Numbers:
-    """Return the most important numbers of a run, for 80 columns."""
-    fidelity = summary.get("fidelity")
-    compared = fidelity is not None and fidelity["reason"] is None
-    actuations = summary.get("actuations")
+def short_numbers(summary: RunSummary) -> Numbers:
+    """Return the most important numbers of one loop, for 80 columns."""
+    (loop,) = summary.loops
+    compared = isinstance(loop.fidelity, FidelityPart)
     return (
-        _lost(summary),
-        *([_lost_of("actuations", actuations)] if actuations is not None else ()),
-        longest_burst(summary, summary["longest_loss_burst"]),
-        _forced(summary),
-        *_intervals(summary),
-        *_norms(summary),
-        *_lateness(summary),
-        *_other_clocks(summary),
-        *_replay_rows(summary.get("replay")),
-        *([next(summary_rows(fidelity))] if compared else ()),
+        lost_row(loop.drops, loop.deliveries),
+        *([_lost_of("actuations", loop.actuations)] if loop.actuations is not None else ()),
+        longest_burst(summary.mansd, summary.constraints, loop.longest_loss_burst),
+        _forced(loop),
+        *_intervals(loop),
+        *_norms(loop),
+        *_lateness(loop),
+        *_other_clocks(loop),
+        *_replay_rows(loop.replay),
+        *([next(summary_rows(loop.fidelity))] if compared else ()),
     )
 
 
-def loss_and_interval_rows(summary: Summary) -> Numbers:
-    """Return losses, the longest loss burst, and inter-event times."""
+def key_numbers(summary: RunSummary) -> Numbers:
+    """Return all numbers of one loop."""
+    (loop,) = summary.loops
     return (
-        _lost(summary),
-        longest_burst(summary, summary["longest_loss_burst"]),
-        *_intervals(summary),
+        ("transmissions", str(loop.events)),
+        ("deliveries", str(loop.deliveries)),
+        *_losses(summary, loop),
+        *_intervals(loop),
+        *_norms(loop),
+        *_record(loop),
+        *_watchdog(loop.watchdog),
+        *(linearisation_rows(found) if (found := loop.linearisation) else ()),
+        *_estimation(loop.estimation),
+        *_disturbances(loop.disturbances),
+        *_replay_rows(loop.replay),
+        *summary_rows(loop.fidelity),
     )
 
 
-def key_numbers(summary: Summary) -> Numbers:
-    """Return all numbers of a run."""
-    return (
-        ("transmissions", str(summary["events"])),
-        ("deliveries", str(summary["deliveries"])),
-        *_losses(summary),
-        *_intervals(summary),
-        *_norms(summary),
-        *_record(summary),
-        *_watchdog(summary["watchdog"]),
-        *(linearisation_rows(found) if (found := summary.get("linearisation")) else ()),
-        *_estimation(summary["estimation"]),
-        *_disturbances(summary["disturbances"]),
-        *_replay_rows(summary.get("replay")),
-        *summary_rows(summary.get("fidelity")),
-    )
-
-
-def _losses(summary: Summary) -> Iterator[tuple[str, str]]:
-    yield _forced(summary)
-    yield _lost(summary)
-    if (rate := summary["loss_expected"]) is not None:
+def _losses(summary: RunSummary, loop: LoopSummary) -> Iterator[tuple[str, str]]:
+    yield _forced(loop)
+    yield lost_row(loop.drops, loop.deliveries)
+    if (rate := loop.loss_expected) is not None:
         yield "  expected loss rate with the cap", f"{100 * rate:.3g} %"
-    causes = summary["drops_by_cause"]
+    causes = loop.drops_by_cause
     if set(causes) - {"dropped"}:
         for cause, count in causes.items():
             yield f"  of these {cause.replace('_', ' ')}", str(count)
-    for name in ("acknowledgements", "actuations"):
-        if (sent := summary.get(name)) is not None:
-            yield name, str(sent["sent"])
+    flows = {"acknowledgements": loop.acknowledgements, "actuations": loop.actuations}
+    for name, sent in flows.items():
+        if sent is not None:
+            yield name, str(sent.sent)
             yield _lost_of(name, sent)
-            yield f"longest loss burst of {name}", str(sent["longest_loss_burst"])
-    yield longest_burst(summary, summary["longest_loss_burst"])
-    causes = [one["cause"] for one in summary["assumption_violations"]]
-    yield "loss bursts beyond M − 1", str(causes.count("dropouts"))
-    for constraint in summary.get("constraints", ()):
-        yield f"violations of {constraint}", str(causes.count(constraint))
+            yield f"longest loss burst of {name}", str(sent.longest_loss_burst)
+    yield longest_burst(summary.mansd, summary.constraints, loop.longest_loss_burst)
+    violated = [one.cause for one in loop.assumption_violations]
+    yield "loss bursts beyond M − 1", str(violated.count("dropouts"))
+    for constraint in summary.constraints:
+        yield f"violations of {constraint}", str(violated.count(constraint))
 
 
-def _lost_of(name: str, sent: Mapping[str, int]) -> tuple[str, str]:
-    return f"{name} lost", f"{sent['lost']} ({ratio(sent['lost'], sent['sent'])})"
+def _lost_of(name: str, sent: FlowPart) -> tuple[str, str]:
+    return f"{name} lost", f"{sent.lost} ({ratio(sent.lost, sent.sent)})"
 
 
-def _lost(summary: Summary) -> tuple[str, str]:
-    lost = summary["drops"]
-    return "lost in the network", f"{lost} ({ratio(lost, lost + summary['deliveries'])})"
+def lost_row(lost: int, delivered: int) -> tuple[str, str]:
+    """Return the row of the lost updates."""
+    return "lost in the network", f"{lost} ({ratio(lost, lost + delivered)})"
 
 
-def longest_burst(summary: Summary, longest: int) -> tuple[str, str]:
+def longest_burst(cap: int, constraints: Sequence[str], longest: int) -> tuple[str, str]:
     """Return the row of the longest loss burst, with the most consecutive losses allowed."""
-    cap = summary["mansd"]
-    words = [f"mansd {cap}", *summary.get("constraints", ())]
+    words = [f"mansd {cap}", *constraints]
     limit = settings_of(" ".join(words)).longest_burst
     if limit != cap:
         return f"longest loss burst (at most {limit} allowed)", str(longest)
     return f"longest loss burst (cap M − 1 = {cap})", str(longest)
 
 
-def _forced(summary: Summary) -> tuple[str, str]:
-    return "deliveries forced by the guarantee", str(summary["forced_deliveries"])
+def _forced(loop: LoopSummary) -> tuple[str, str]:
+    return "deliveries forced by the guarantee", str(loop.forced_deliveries)
 
 
-def _intervals(summary: Summary) -> Iterator[tuple[str, str]]:
-    yield "shortest inter-event time", seconds(summary["inter_event_min_s"])
-    yield "median inter-event time", seconds(summary["inter_event_median_s"])
-    yield "median time between deliveries", seconds(summary["inter_delivery_median_s"])
+def _intervals(loop: LoopSummary) -> Numbers:
+    return interval_rows(
+        loop.inter_event_min_s, loop.inter_event_median_s, loop.inter_delivery_median_s
+    )
 
 
-def _norms(summary: Summary) -> Iterator[tuple[str, str]]:
-    yield "‖x‖ at the start", number(summary["initial_state_norm"])
-    yield "‖x‖ at the end", number(summary["final_state_norm"])
-    errors = (summary["sup_e_s_norm"], summary["sup_e_c_norm"])
+def interval_rows(
+    shortest_s: float | None, median_s: float | None, delivered_s: float | None
+) -> Numbers:
+    """Return the rows of the inter-event times, and of the median time between deliveries."""
+    return (
+        ("shortest inter-event time", seconds(shortest_s)),
+        ("median inter-event time", seconds(median_s)),
+        ("median time between deliveries", seconds(delivered_s)),
+    )
+
+
+def _norms(loop: LoopSummary) -> Iterator[tuple[str, str]]:
+    yield "‖x‖ at the start", number(loop.initial_state_norm)
+    yield "‖x‖ at the end", number(loop.final_state_norm)
+    errors = (loop.sup_e_s_norm, loop.sup_e_c_norm)
     yield "maximum ‖e_s‖, ‖e_c‖", ", ".join(map(number, errors))
 
 
-def _record(summary: Summary) -> Iterator[tuple[str, str]]:
-    yield "numerical check of x_c − x_s (I1)", number(summary["identity_residual_relative"])
-    if (until_s := summary.get("judged_until_s")) is not None:
+def _record(loop: LoopSummary) -> Iterator[tuple[str, str]]:
+    yield "numerical check of x_c − x_s (I1)", number(loop.identity_residual_relative)
+    if (until_s := loop.judged_until_s) is not None:
         yield "claims checked until", seconds(until_s)
-    yield "missing samples", str(summary["missing_samples"])
-    yield "lost elsewhere (kernel)", str(summary["unintended_losses"])
-    yield from _clocks(summary)
-    for one in summary["restarts"]:
-        yield f"{one['process']} was restarted", away(one)
-    yield from changes_in(summary)
+    yield "missing samples", str(loop.missing_samples)
+    yield "lost elsewhere (kernel)", str(loop.unintended_losses)
+    yield from _clocks(loop)
+    for one in loop.restarts:
+        yield f"{one.process} was restarted", away(one)
+    yield from changes_in(loop.changes)
 
 
-def _clocks(summary: Summary) -> Iterator[tuple[str, str]]:
+def _clocks(loop: LoopSummary) -> Iterator[tuple[str, str]]:
     """Yield the largest bound of a clock's error, if it is recorded."""
-    error_s = (summary.get("conditions") or {}).get("clock_error_s")
+    error_s = None if loop.conditions is None else loop.conditions.clock_error_s
     if error_s is not None:
         yield "largest bound of a clock's error", duration(error_s)
 
 
-def _other_clocks(summary: Summary) -> Iterator[tuple[str, str]]:
+def _other_clocks(loop: LoopSummary) -> Iterator[tuple[str, str]]:
     """Yield the same of a run on hosts with different clocks."""
-    if (summary.get("conditions") or {}).get("clock_error_s"):
-        yield from _clocks(summary)
+    if loop.conditions is not None and loop.conditions.clock_error_s:
+        yield from _clocks(loop)
 
 
-def _lateness(summary: Summary) -> Iterator[tuple[str, str]]:
+def _lateness(loop: LoopSummary) -> Iterator[tuple[str, str]]:
     """Yield the latency of updates and the missed deadlines of a live run."""
-    if latency := summary["latency_us"]:
-        quantiles = " / ".join(whole(latency[key]) for key in ("p50", "p99"))
+    if latency := loop.latency_us:
+        quantiles = " / ".join(whole(one) for one in (latency.p50, latency.p99))
         yield "sensor-to-controller latency p50 / p99", f"{quantiles} µs"
-    if late := summary["lateness_us"]:
-        worst = max(late, key=lambda role: late[role]["late_steps"])
-        missed, steps = late[worst]["late_steps"], late[worst]["steps"]
+    if late := loop.lateness_us:
+        worst = max(late, key=lambda role: late[role].late_steps)
+        missed, steps = late[worst].late_steps, late[worst].steps
         if missed:
             yield "most deadlines missed", f"{worst}, {missed} of {steps}"
         else:
             yield "deadlines missed", "none"
 
 
-def changes_in(summary: Summary) -> Iterator[tuple[str, str]]:
-    """Yield the changes during the run, each with its time."""
-    for one in summary["changes"]:
-        yield f"changed at {one['t_s']:.3f} s", one["what"]
+def changes_in(changes: Sequence[ChangePart]) -> Iterator[tuple[str, str]]:
+    """Yield changes of settings during the run, each with its time."""
+    for one in changes:
+        yield f"changed at {one.t_s:.3f} s", one.what
 
 
-def interval_of(claim: dict[str, Any]) -> str:
+def interval_of(claim: Claim) -> str:
     """Return the interval of a claim; empty for the whole run."""
-    from_s, until_s = claim["from_s"], claim["until_s"]
+    from_s, until_s = claim.from_s, claim.until_s
     if from_s == 0 and until_s is None:
         return ""
     return f"from {from_s:.3f} s " + ("on" if until_s is None else f"to {until_s:.3f} s")
 
 
-def away(restart: dict[str, Any]) -> str:
+def away(restart: RestartPart) -> str:
     """Return the interval in which a process was down, and the reason."""
-    since, until = (seconds(restart[key]) for key in ("last_s", "first_s"))
-    why = (restart["what"] or "").partition(": ")[2]
-    when = f"at {until}" if restart["last_s"] is None else f"down from {since} to {until}"
+    since, until = seconds(restart.last_s), seconds(restart.first_s)
+    why = (restart.what or "").partition(": ")[2]
+    when = f"at {until}" if restart.last_s is None else f"down from {since} to {until}"
     return f"{when}: {why}" if why else when
 
 
-def _watchdog(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    if trips := found["trips"]:
+def _watchdog(found: WatchdogPart) -> Iterator[tuple[str, str]]:
+    if trips := found.trips:
         times = "once" if trips == 1 else f"{trips} times"
-        first, total = seconds(found["first_s"]), seconds(found["total_s"])
+        first, total = seconds(found.first_s), seconds(found.total_s)
         yield "watchdog: newest actuation too old", f"{times}, first at {first}, {total} in total"
-        yield "  policy applied", found["policy"]
+        yield "  policy applied", found.policy
 
 
-def _estimation(found: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
+def _estimation(found: EstimationPart | None) -> Iterator[tuple[str, str]]:
     if found is not None:
-        what = f"estimated ({found['observer']})" if found["observer"] else "measured with noise"
-        errors = (found["max"], found["sup_e_c_norm"])
+        what = f"estimated ({found.observer})" if found.observer else "measured with noise"
+        errors = (found.max, found.sup_e_c_norm)
         yield (
-            f"state {what}: RMS ‖x̂ − x‖ in the second half", number(found["rms_second_half"])
+            f"state {what}: RMS ‖x̂ − x‖ in the second half", number(found.rms_second_half)
         )  # fmt: skip
-        yield "  predicted for an exact model", number(found["expected_rms"])
+        yield "  predicted for an exact model", number(found.expected_rms)
         yield "maximum ‖x̂ − x‖, ‖x_c − x‖", ", ".join(map(number, errors))
 
 
-def _disturbances(found: list[dict[str, Any]]) -> Iterator[tuple[str, str]]:
+def _disturbances(found: Sequence[DisturbancePart]) -> Iterator[tuple[str, str]]:
     for one in found:
-        sizes = f"{number(one['rms'])}, {number(one['max'])}"
-        yield f"disturbance at the {one['at']}: RMS, maximum", sizes
+        sizes = f"{number(one.rms)}, {number(one.max)}"
+        yield f"disturbance at the {one.at}: RMS, maximum", sizes
 
 
-def print_claims(console: Console, summary: Summary) -> None:
-    """Print the claims about a run and their verdicts."""
-    claims = summary.get("claims")
+def print_claims(console: Console, claims: Claims) -> None:
+    """Print the claims about a loop and their verdicts."""
     if not claims:
         return
     table = Table(title="claims checked against this run")
@@ -251,7 +273,7 @@ def print_claims(console: Console, summary: Summary) -> None:
     for (*cells, verdict), colour in claim_rows(claims):
         table.add_row(*map(escape, cells), Text(verdict, colour))
     console.print(table)
-    if any(claim["ratio"] is not None for claim in claims):
+    if any(claim.ratio is not None for claim in claims):
         console.print(
             "[dim]share used: largest share of the bound reached during the run; 100 % is normal "
             "for a bound that is computed from the run itself. Sources: (I1) and certificates, "
@@ -259,8 +281,8 @@ def print_claims(console: Console, summary: Summary) -> None:
         )
     sources: dict[tuple[str, str], list[str]] = {}
     for claim in claims:
-        if claim["verdict"] != "held" and claim["why"]:
-            sources.setdefault((claim["verdict"], claim["why"]), []).append(claim["source"])
+        if claim.verdict != "held" and claim.why:
+            sources.setdefault((claim.verdict, claim.why), []).append(claim.source)
     for (verdict, why), of in sources.items():
         text = f"{verdict}: {'; '.join(dict.fromkeys(of))}: {why}"
         console.print(text, highlight=False, markup=False)
@@ -284,14 +306,14 @@ def claim_rows(claims: Claims) -> Iterator[ClaimRow]:
     """Yield the rows of the table of claims."""
     has_interval = "interval" in claim_headings(claims)
     for claim in claims:
-        since = "" if claim["since_s"] is None else f" since {claim['since_s']:.3f} s"
+        since = "" if claim.since_s is None else f" since {claim.since_s:.3f} s"
         cells = (
-            claim["source"], claim["bound"],
+            claim.source, claim.bound,
             *([interval_of(claim)] if has_interval else []),
-            NONE if claim["ratio"] is None else f"{100 * claim['ratio']:.3g} %",
-            claim["verdict"] + since,
+            NONE if claim.ratio is None else f"{100 * claim.ratio:.3g} %",
+            claim.verdict + since,
         )  # fmt: skip
-        yield ClaimRow(cells, _CLAIM_COLOURS[claim["verdict"]])
+        yield ClaimRow(cells, _CLAIM_COLOURS[claim.verdict])
 
 
 _CLAIM_COLOURS = {
@@ -299,36 +321,40 @@ _CLAIM_COLOURS = {
 }  # fmt: skip
 
 
-def _replay_rows(verdict: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
+def _replay_rows(verdict: ReplayPart | None) -> Iterator[tuple[str, str]]:
     if verdict is None:
         return
-    if verdict["bit_exact"] is None:
+    if verdict.bit_exact is None:
         word = "not possible"
-    elif verdict["bit_exact"]:
-        word = f"bit-exact, {verdict['inputs']:,} inputs"
+    elif verdict.bit_exact:
+        word = f"bit-exact, {verdict.inputs:,} inputs"
     else:
-        first = verdict["first_difference"]
-        word = f"differs: {first['table']}, row {first['row']}, {first['column']}"
-    yield "replay", word if verdict.get("complete", True) else f"{word} (record incomplete)"
+        first = verdict.first_difference
+        word = f"differs: {first.table}, row {first.row}, {first.column}"
+    yield "replay", word if verdict.complete else f"{word} (record incomplete)"
 
 
-def _timing_table(summary: Summary) -> Table:
+def _timing_table(loop: LoopSummary) -> Table:
     table = Table(title="timing in µs of wall time (missed: deadlines missed)")
     for heading in ("", *TIMING_HEADINGS):
         table.add_column(heading, justify="right" if heading else "left")
-    for row in timing_rows(summary):
+    for row in timing_rows(loop):
         table.add_row(*row)
     return table
 
 
-def timing_rows(summary: Summary) -> Iterator[tuple[str, ...]]:
+def timing_rows(loop: LoopSummary) -> Iterator[tuple[str, ...]]:
     """Yield the lateness of each process, and the latency; their columns: TIMING_HEADINGS."""
-    for role, late in summary["lateness_us"].items():
-        counts = str(late["steps"]), str(late["late_steps"])
-        yield f"{role} lateness", *(whole(late[key]) for key in _QUANTILES), *counts
-    if latency := summary["latency_us"]:
-        quantiles = (whole(latency[key]) for key in _QUANTILES)
-        yield "sensor-to-controller latency", *quantiles, str(latency["updates"]), ""
+    for role, late in loop.lateness_us.items():
+        counts = str(late.steps), str(late.late_steps)
+        yield f"{role} lateness", *map(whole, _quantiles(late)), *counts
+    if latency := loop.latency_us:
+        quantiles = map(whole, _quantiles(latency))
+        yield "sensor-to-controller latency", *quantiles, str(latency.updates), ""
+
+
+def _quantiles(found: Quantiles) -> tuple[float | None, ...]:
+    return found.p50, found.p99, found.p999, found.max
 
 
 def _print_realtime(console: Console, realtime: dict[str, dict[str, str]]) -> None:

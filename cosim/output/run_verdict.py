@@ -1,9 +1,9 @@
-"""Terminal output at the end of a run: a verdict of three lines, a table, the run's files."""
+"""Terminal output at the end of a run: a verdict of three lines, tables, the run's files."""
 
 import shutil
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,11 +11,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.text import Text
 
-from cosim.analysis.loops_summary import has_loops
-from cosim.analysis.run_summary import Outcome, Summary
-from cosim.output.loops_tables import claims_line, print_loops
+from cosim.analysis.run_summary import Outcome
+from cosim.analysis.summary_model import Claim, ExitPart, FidelityPart, RunSummary
+from cosim.output.network_table import print_loops
 from cosim.output.remarks import remarks
-from cosim.output.run_tables import number_table, print_details, short_numbers
+from cosim.output.run_tables import number_table, print_details, run_title, short_numbers
 from cosim.record.run_directory import RECORDING_FILE, REPORT_FILE
 from noack.core.errors import ExitStatus
 from noack.runtime.life_cycle import HORIZON
@@ -35,37 +35,45 @@ class VerdictLine(NamedTuple):
     """Name of a style of rich."""
 
 
-def verdict(summary: Summary) -> tuple[VerdictLine, ...]:
-    """Return how the run ended, its transmissions, its claims; of several loops not the second."""
-    if has_loops(summary):
-        return ending_line(summary), VerdictLine(claims_line(summary), NEUTRAL)
-    return ending_line(summary), VerdictLine(_transmissions(summary), NEUTRAL), _claims(summary)
+def verdict(summary: RunSummary) -> tuple[VerdictLine, ...]:
+    """Return how the run ended, the transmissions of its loops, and their claims."""
+    loops = summary.loops
+    events, delivered = (
+        sum(getattr(one, key) for one in loops) for key in ("events", "deliveries")
+    )
+    ideal = None
+    if len(loops) == 1 and isinstance(found := loops[0].fidelity, FidelityPart):
+        ideal = found.events_ideal
+    return (
+        ending_line(summary.exit, summary.reached_s, summary.horizon_s),
+        transmission_line(events, delivered, ideal),
+        _claims([claim for one in loops for claim in one.claims]),
+    )
 
 
-def ending_line(summary: Summary) -> VerdictLine:
-    """Return how a run ended, of one loop or several."""
-    end, reached = summary["exit"], f"{summary['reached_s']:g} s"
-    reached_of = f"{reached} of {summary['horizon_s']:g} s"
-    if end["status"] == ExitStatus.OK:
-        why = "" if end["reason"] == HORIZON else f": {end['reason']}"
+def ending_line(end: ExitPart, reached_s: float, horizon_s: float) -> VerdictLine:
+    """Return how a run ended."""
+    reached = f"{reached_s:g} s"
+    reached_of = f"{reached} of {horizon_s:g} s"
+    if end.status == ExitStatus.OK:
+        why = "" if end.reason == HORIZON else f": {end.reason}"
         return VerdictLine(f"completed {reached}{why}", GOOD)
-    if end["status"] == ExitStatus.FAILED:
-        return VerdictLine(f"failed after {reached_of}: {end['reason']}", BAD)
-    return VerdictLine(f"stopped after {reached_of}: {end['reason']}", DOUBTFUL)
+    if end.status == ExitStatus.FAILED:
+        return VerdictLine(f"failed after {reached_of}: {end.reason}", BAD)
+    return VerdictLine(f"stopped after {reached_of}: {end.reason}", DOUBTFUL)
 
 
-def _transmissions(summary: Summary) -> str:
-    ideal = (summary.get("fidelity") or {}).get("events_ideal")
+def transmission_line(events: int, deliveries: int, ideal: int | None = None) -> VerdictLine:
+    """Return the numbers of transmissions and deliveries, and that of the ideal loop."""
     beside = "" if ideal is None else f" (ideal loop: {ideal})"
-    return f"{summary['events']} transmissions{beside}, {summary['deliveries']} delivered"
+    return VerdictLine(f"{events} transmissions{beside}, {deliveries} delivered", NEUTRAL)
 
 
-def _claims(summary: Summary) -> VerdictLine:
+def _claims(claims: Sequence[Claim]) -> VerdictLine:
     """Count the claims by verdict, each with its first reason."""
-    claims = summary.get("claims") or []
     if not claims:
         return VerdictLine("claims: none", NEUTRAL)
-    counts = Counter(claim["verdict"] for claim in claims)
+    counts = Counter(str(claim.verdict) for claim in claims)
     parts, style = [f"claims: {counts['held']} of {len(claims)} held"], GOOD
     for name, colour in _CLAIMS.items():
         if counts[name]:
@@ -74,11 +82,11 @@ def _claims(summary: Summary) -> VerdictLine:
     return VerdictLine(", ".join(parts), style)
 
 
-def _reason(claims: list[dict[str, str]], name: str) -> str:
+def _reason(claims: Sequence[Claim], name: str) -> str:
     """Return the first reason of a verdict, in brackets; with it, unless void, which claims."""
-    concerned = [claim for claim in claims if claim["verdict"] == name]
-    why = next((claim["why"] for claim in concerned if claim["why"]), "")
-    what = [] if name == "void" else list(dict.fromkeys(claim["what"] for claim in concerned))
+    concerned = [claim for claim in claims if claim.verdict == name]
+    why = next((claim.why for claim in concerned if claim.why), "")
+    what = [] if name == "void" else list(dict.fromkeys(claim.what for claim in concerned))
     more = [f"{len(what) - _NAMED} more"] if len(what) > _NAMED else []
     which = "; ".join([*what[:_NAMED], *more])
     return f" ({': '.join(filter(None, (which, why)))})" if which or why else ""
@@ -89,36 +97,35 @@ def print_outcome(console: Console, outcome: Outcome, *, verbose: bool = False) 
 
     Args:
         console: console for the output.
-        outcome: outcome of the run.
+        outcome: outcome of the run, or of one of its loops.
         verbose: print all tables instead of the key numbers.
     """
     summary = outcome.summary
-    if has_loops(summary):
-        ending = ending_line(summary)
-        console.print(Text(ending.text, ending.style), soft_wrap=True)
-        print_loops(console, summary, verbose=verbose)
-        one = f"{_program()} summary {outcome.run_dir} --loop NAME"
-        console.print(f"one loop       {one}", highlight=False, soft_wrap=True)
-        if (report := outcome.run_dir / REPORT_FILE).is_file():
-            console.print(f"report         {report}", highlight=False, soft_wrap=True)
-        console.print(f"run directory  {outcome.run_dir}", highlight=False, soft_wrap=True)
-        return
     for line in verdict(summary):
         console.print(Text(line.text, line.style), soft_wrap=True)
+    if len(summary.loops) > 1:
+        print_loops(console, summary, verbose=verbose)
+    else:
+        _print_loop(console, summary, verbose=verbose)
+    for where in _where(outcome, verbose=verbose):
+        console.print(where, highlight=False, soft_wrap=True, markup=False)
+
+
+def _print_loop(console: Console, summary: RunSummary, *, verbose: bool) -> None:
     if verbose:
         print_details(console, summary)
     else:
-        console.print(number_table(summary, short_numbers(summary)))
+        console.print(number_table(run_title(summary), short_numbers(summary)))
     for remark in remarks(summary):
         start = f"[{BAD}]" if remark.severe else "[bold yellow]warning:[/] "
         console.print(start + escape(remark.text), highlight=False, soft_wrap=True)
-    for where in _where(outcome, verbose=verbose):
-        console.print(where, highlight=False, soft_wrap=True, markup=False)
 
 
 def _where(outcome: Outcome, *, verbose: bool) -> Iterator[str]:
     """Yield the files of a run, or one line with the commands that show them."""
     run_dir, report = outcome.run_dir, outcome.run_dir / REPORT_FILE
+    if len(outcome.summary.loops) > 1:
+        yield f"one loop: {_program()} summary {run_dir} --loop NAME"
     if not verbose:
         page = f"{report} and " if report.is_file() else ""
         yield f"more: {page}{_program()} summary {run_dir} --verbose"

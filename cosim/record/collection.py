@@ -17,7 +17,6 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from cosim.record.loops_run import loop_directories
 from cosim.record.record_source import Rows
 from cosim.record.run_directory import (
     ENVIRONMENT_FILE,
@@ -26,9 +25,8 @@ from cosim.record.run_directory import (
     finished_run,
     read_object,
 )
-from cosim.record.run_record import RunRecord, load_record
-from noack.config.resolution import tables_of
-from noack.config.scenario import Scenario
+from cosim.record.run_record import RunRecord, load_run
+from noack.config.resolution import run_tables
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, MachineError, NoackError, PeerError, why
 from noack.protocol.machine_interface import GENERATION
@@ -128,7 +126,7 @@ def _take(kept: Path, run_dir: Path, source: str) -> list[str]:
         PeerError: a file is not of a process that kept its secret there.
     """
     processes = {one.writer: one for one in _joined(run_dir)}
-    types = tables_of(load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES))
+    types = run_tables(load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES))
     roles = set()
     for path in sorted(kept.glob("*.*")):
         table, _, writer = path.name.partition(".")
@@ -237,12 +235,10 @@ def _require_consistent(before_dir: Path, after_dir: Path, source: str) -> None:
 
 
 def _records(run_dir: Path) -> Iterator[RunRecord]:
-    """Yield the records of a run: that of the network too, with several loops."""
-    record = load_record(run_dir, network=True)
-    yield record
-    scenario: Scenario = record.scenario
-    if scenario.loops is not None:
-        yield from map(load_record, loop_directories(run_dir, scenario))
+    """Yield the records of a run: of the network, and of each loop."""
+    run = load_run(run_dir)
+    yield run.network
+    yield from run.loops
 
 
 def _contains(before: RunRecord, after: RunRecord, table: str) -> bool:

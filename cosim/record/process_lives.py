@@ -90,10 +90,11 @@ class _Counts:
             )
             self.hole_ns = int(before)
         self._input, self._now_ns = int(inputs[-1]), int(now_ns[-1])
-        for of in np.unique(inputs // GENERATION).tolist():
-            numbers = inputs[inputs // GENERATION == of] % GENERATION
+        first, last = (int(number) // GENERATION for number in (inputs[0], inputs[-1]))
+        for of in [first] if first == last else np.unique(inputs // GENERATION).tolist():
+            own = inputs if first == last else inputs[inputs // GENERATION == of]
             newest, count = self._numbers.get(of, (-1, 0))
-            self._numbers[of] = max(newest, int(numbers.max())), count + len(numbers)
+            self._numbers[of] = max(newest, int(own[-1]) % GENERATION), count + len(own)
 
     @property
     def missing_inputs(self) -> int:
@@ -110,6 +111,9 @@ def lives_of(
     """Return the generations of one process from its tables; ``reports`` are by generation."""
     counts = [_Counts(generation, tables) for generation in numbers.begun]
     for part in slices(source, tables, width_ns, _COLUMNS):
+        if len(counts) == 1:
+            counts[0].add(part)
+            continue
         places = {table: numbers.places(rows) for table, rows in part.items()}
         for i, count in enumerate(counts):
             count.add({table: rows[places[table] == i] for table, rows in part.items()})

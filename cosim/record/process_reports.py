@@ -2,7 +2,7 @@
 
 import contextlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -65,17 +65,64 @@ def add_kept_reports(run_dir: Path) -> None:
         write_reports(run_dir, [*known, *kept])
 
 
-def read_reports(
-    run_dir: Path, source: RecordSource
-) -> tuple[dict[str, dict[str, Any]], list[dict[str, Any]]]:
-    """Return the reports of the last process of each role, and those of earlier processes."""
+Entries = Sequence[tuple[str, Any]]
+"""Roles with their reports, which may be damaged."""
+
+
+def report_entries(run_dir: Path) -> Entries:
+    """Return the reports in a run directory; none if a killed recorder wrote no complete file."""
     try:
         content = read_object(run_dir / REPORTS_FILE)
         entries = [(role, content[role]) for role in LOOP_ROLES if role in content]
-        entries += [(one["process"], one) for one in content.get(_EARLIER, ())]
-    # A killed recorder wrote no report or an incomplete one.
+        return entries + [(one["process"], one) for one in content.get(_EARLIER, ())]
     except (LookupError, TypeError):
-        return {}, []
+        return []
+
+
+def entries_of_loop(entries: Entries, number: int) -> Entries:
+    """Return the reports as of one loop: with its own rows, and its own counters of datagrams."""
+    found = []
+    for role, report in entries:
+        with contextlib.suppress(LookupError, TypeError, ValueError, AttributeError):  # damaged
+            found.append((role, _of_loop(report, number)))
+    return found
+
+
+def _of_loop(report: dict[str, Any], number: int) -> dict[str, Any]:
+    written = dict(report["rows"])
+    for table, by_loop in report.get("rows_by_loop", {}).items():
+        written[table] = by_loop[number] if number < len(by_loop) else 0
+    channel = dict(report["channel"])
+    of_loops = channel.pop("loops", [])
+    channel |= of_loops[number] if number < len(of_loops) else {}
+    answers = channel.get("acknowledgements")
+    if answers and "loops" in answers:
+        channel["acknowledgements"] = answers["loops"][number]
+    rest = {key: value for key, value in report.items() if key not in ("rows_by_loop", "stored")}
+    return rest | {"rows": written, "channel": channel}
+
+
+def joint_reports(
+    network: Mapping[str, dict[str, Any]], loops: Sequence[Mapping[str, dict[str, Any]]]
+) -> dict[str, Any]:
+    """Return the reports of a run from those of its loops; the emulator's are of all loops."""
+    found: dict[str, Any] = {role: network[role] for role in ("netem",) if role in network}
+    for role in [one for one in loops[0] if one != "netem"]:
+        of_loops = [one[role] for one in loops]
+        tables = dict.fromkeys(table for one in of_loops for table in one["rows"])
+        by_loop = {table: [one["rows"].get(table, 0) for one in of_loops] for table in tables}
+        found[role] = of_loops[0] | {
+            "rows": {table: sum(counts) for table, counts in by_loop.items()},
+            "rows_by_loop": by_loop,
+            "channel": {"loops": [one["channel"] for one in of_loops]},
+        }
+    return found
+
+
+def valid_reports(
+    entries: Entries, source: RecordSource
+) -> tuple[dict[str, dict[str, Any]], list[dict[str, Any]]]:
+    """Return the reports of the last process of each role, and those of earlier processes."""
     reports: dict[str, dict[str, Any]] = {}
     earlier: list[dict[str, Any]] = []
     for role, entry in entries:

@@ -16,6 +16,7 @@ from noack.core.file_access import copy_whole, locked, read_regular, write_whole
 
 if TYPE_CHECKING:
     from noack.config.scenario import Scenario
+    from noack.settings.named_file import FileSettings
 
 DEFAULT_RUNS = Path("runs")
 """Folder for run directories, relative to the current folder."""
@@ -29,14 +30,9 @@ ENDING_FILE = "ending.json"
 SUMMARY_FILE = "summary.json"
 REPORT_FILE = "report.html"
 RECORD = "record"
-LOOPS = "loops"
-"""Folder of the run directories of the loops, in a run of several."""
-LOOP_FILE = "loop.json"
-"""In the run directory of a loop: its number in the run, and its phase."""
 LATEST = "latest"
-_MOST_NAMES = 12
 _LOCK = ".lock"
-_MOST_JSON_BYTES = 64 * 2**20
+_MOST_JSON_BYTES = 256 * 2**20
 LEAST_FREE_BYTES = 16 * 1024 * 1024
 
 
@@ -76,11 +72,12 @@ def _require_utf8(path: Path) -> None:
         raise CallerError(f"{path}: the name of a folder is not UTF-8; rename it") from None
 
 
-def write_scenario(resolved: "Scenario", run_dir: Path) -> "Scenario":
+def write_scenario(scenario: "Scenario", run_dir: Path) -> "Scenario":
     """Write the scenario of a run into its directory, with the files that the run executes.
 
     The copies allow a replay after a file has changed, and the directory can be moved. The file of
-    a plant is copied to ``plant/``, that of a trigger to ``trigger/``, and so on.
+    a plant is copied to ``plant/``, that of a trigger to ``trigger/``, and so on. The names of the
+    files of an entry of [[loops]] begin with ``loops_0_``, and so on.
 
     Returns:
         The scenario for the run's processes, which use the copies.
@@ -90,19 +87,31 @@ def write_scenario(resolved: "Scenario", run_dir: Path) -> "Scenario":
         MachineError, OSError: the directory cannot be written.
     """
     # The command line needs this module for shell completion, and not the settings.
+    from noack.config.loops import with_loop_tables
     from noack.config.scenario_file import dumps
     from noack.settings.named_file import file_tables, unchanged, with_tables
 
-    relative, absolute = {}, {}
-    for place, table in file_tables(resolved):
-        file = unchanged(table, place)
-        name = f"{place.split('.')[0]}/{file.name}"
-        (run_dir / name).parent.mkdir()
-        copy_whole(file, run_dir / name)
-        relative[place] = table.model_copy(update={"file": name})
-        absolute[place] = table.model_copy(update={"file": str((run_dir / name).absolute())})
-    write_whole(run_dir / SCENARIO_FILE, dumps(with_tables(resolved, relative)))
-    return with_tables(resolved, absolute)
+    common = dict(file_tables(scenario))
+
+    def copied(within: str, one: "Scenario", folder: str) -> dict[str, "FileSettings"]:
+        found = {}
+        for place, table in file_tables(one):
+            if within and table == common.get(place):
+                continue  # the entry does not set it
+            file = unchanged(table, f"{within}{place}")
+            name = f"{place.split('.')[0]}/{within.replace('.', '_')}{file.name}"
+            if not (run_dir / name).is_file():
+                (run_dir / name).parent.mkdir(exist_ok=True)
+                copy_whole(file, run_dir / name)
+            found[place] = table.model_copy(update={"file": f"{folder}{name}"})
+        return found
+
+    def located(folder: str) -> "Scenario":
+        moved = with_loop_tables(scenario, lambda place, one: copied(f"{place}.", one, folder))
+        return with_tables(moved, copied("", scenario, folder))
+
+    write_whole(run_dir / SCENARIO_FILE, dumps(located("")))
+    return located(f"{run_dir.absolute()}/")
 
 
 def read_object(path: Path) -> dict[str, Any]:
@@ -149,32 +158,32 @@ def latest_run(runs: Path) -> Path:
     return run_dir
 
 
-def chosen_run(run_dir: Path | None, runs: Path, loop: str | None = None) -> Path:
+def chosen_run(run_dir: Path | None, runs: Path) -> Path:
     """Return the given run directory, or the newest below ``runs`` if none is given.
-
-    Of a run of several loops, it is the directory of the ``loop`` of this name, if one is given.
 
     Raises:
         CallerError: as :func:`latest_run`, which also resolves a given ``latest``; or the path is
-            not UTF-8; or there is no such loop.
+            not UTF-8.
     """
     _require_utf8(run_dir or runs)
     if run_dir is None:
         run_dir = latest_run(runs)
     elif run_dir.name == LATEST and run_dir.is_symlink():
         run_dir = latest_run(run_dir.parent)
-    return run_dir if loop is None else _loop_directory(run_dir, loop)
+    return run_dir
 
 
-def _loop_directory(run_dir: Path, loop: str) -> Path:
-    folder = run_dir / LOOPS
-    if not folder.is_dir():
-        raise CallerError(f"--loop {loop}: {run_dir} is no run of several loops")
-    names = sorted(one.name for one in folder.iterdir() if one.is_dir())
-    if loop not in names:
-        few = ", ".join(names[:_MOST_NAMES]) + (", …" if len(names) > _MOST_NAMES else "")
-        raise CallerError(f"--loop {loop}: {run_dir} has no such loop; its {len(names)} are {few}")
-    return folder / loop
+def file_of_loop(file: str, loop: str | None) -> str:
+    """Return the name of a loop's own report or recording, such as ``report-NAME.html``."""
+    base, dot, ending = file.rpartition(".")
+    return file if loop is None else f"{base}-{loop}{dot}{ending}"
+
+
+def loop_of_file(name: str, file: str) -> str | None:
+    """Return the loop of a report or recording from its name; None for that of the run."""
+    base, dot, ending = file.rpartition(".")
+    inner = name.removeprefix(f"{base}-").removesuffix(f"{dot}{ending}")
+    return inner if name == file_of_loop(file, inner) else None
 
 
 def refuse_links(run_dir: Path) -> None:

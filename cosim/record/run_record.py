@@ -1,4 +1,4 @@
-"""The numeric record of a run: written as Parquet, read back batch by batch.
+"""The numeric record of a run, of one or more loops: written as Parquet, read batch by batch.
 
 ``RUN/record/TABLE.parquet`` is the authoritative record; ``docs/record.md`` documents the columns.
 """
@@ -7,14 +7,20 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cosim.record.environment import Kind, kind_of
+from cosim.record.loop_rows import LoopTables, NetworkRows, count_of, with_loop
 from cosim.record.process_lives import Life, LifeNumbers, generations, lives_of
-from cosim.record.process_reports import read_reports
+from cosim.record.process_reports import (
+    entries_of_loop,
+    joint_reports,
+    report_entries,
+    valid_reports,
+)
 from cosim.record.record_source import (
     BATCH_ROWS,
     DerivedRows,
@@ -25,26 +31,37 @@ from cosim.record.record_source import (
     with_columns,
 )
 from cosim.record.record_source import Rows as Rows
-from cosim.record.run_directory import LOOP_FILE, LOOPS, RECORD, SCENARIO_FILE, read_object
-from noack.config.loops import loop_scenario
-from noack.config.resolution import LoopMatrices, loop_of, network_tables, tables_of
+from cosim.record.run_directory import RECORD, REPORTS_FILE, SCENARIO_FILE
+from noack.config.loops import loop_names, loop_scenario, loop_sections, loops_of, phases_ns
+from noack.config.resolution import (
+    LoopMatrices,
+    loop_of,
+    network_tables,
+    resolve,
+    run_tables,
+    tables_of,
+)
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, PeerError
-from noack.core.file_access import PARTIAL, new_file
+from noack.core.file_access import PARTIAL, new_file, write_whole
 from noack.protocol.machine_interface import RESTART
 from noack.protocol.record_tables import (
     CLOCK_TABLES,
+    LOOP,
     NO_SEQUENCE,
     OWNER,
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
 from noack.protocol.topology import LOOP_ROLES
-from noack.protocol.wire_format import MAX_LOOPS
 from noack.runtime.control_messages import LogLine, parse_message
 
+if TYPE_CHECKING:
+    from cosim.record.table_files import StoredTables
+
 _NOTICES_FILE = "notices.jsonl"
+_MOST_NAMES = 12
 _ROWS_PER_STEP, _MORE_ROWS = 4, 100_000
 """A table has at most this number of rows per step of the loops, and more for restarts."""
 _CLOCK_EXCHANGE_NS = 20_000_000
@@ -58,16 +75,17 @@ class _Notice(LogLine):
 
 
 class RunRecord:
-    """The record of one run, or of the network that several loops share.
+    """The record of one loop of a run, or of the run's network.
 
     Args:
-        scenario: the resolved scenario; that of the network has [[loops]].
+        scenario: the resolved scenario of the loop; that of the run for the network.
         rows: the rows of each table, in the order of the machine's inputs, or where to read them.
         notices: the lines of the run's log, each with t_ns, level, text and process.
         reports: each process's final report; a process that died has none.
         kind: live or simulated.
         earlier: the final reports of processes that were restarted later.
-        number: the number of the loop in a run of several loops; None in a run of one.
+        number: the number of the loop among those that share its network; None if it is alone.
+        is_network: whether it is the record of the network, for all loops.
     """
 
     def __init__(
@@ -79,21 +97,18 @@ class RunRecord:
         kind: Kind = "live",
         earlier: Sequence[dict[str, Any]] = (),
         number: int | None = None,
+        *,
+        is_network: bool = False,
     ) -> None:
-        self.scenario = scenario
+        self.scenario, self.is_network = scenario, is_network
         self.number = number
         self.notices = notices
         self.reports = reports
         self.earlier = earlier
         self.kind: Kind = kind
         self.source = rows if isinstance(rows, RecordSource) else RowsInMemory(rows)
-        self.tables = network_tables() if self.is_network else tables_of(scenario)
+        self.tables = network_tables() if is_network else tables_of(scenario)
         self._lives: dict[str, list[Life]] = {}
-
-    @property
-    def is_network(self) -> bool:
-        """Whether it is the record of the network that several loops share."""
-        return self.scenario.loops is not None
 
     @cached_property
     def loop(self) -> LoopMatrices:
@@ -192,16 +207,122 @@ class RunRecord:
         return BATCH_ROWS * period_ns
 
 
-def load_record(run_dir: Path, *, network: bool = False) -> RunRecord:
-    """Read the record of a run directory.
+class RecordedRun:
+    """The record of a run: of its network, and of each of its loops.
 
     Args:
-        run_dir: the run directory.
-        network: return the record of the network, if several loops share it.
+        network: the tables of the network, for all loops, in the time of the run.
+        loops: the record of each loop, in the order of their numbers.
+    """
+
+    def __init__(self, network: RunRecord, loops: Sequence[RunRecord]) -> None:
+        self.network, self.loops = network, loops
+        self.scenario, self.kind = network.scenario, network.kind
+
+    @cached_property
+    def names(self) -> list[str]:
+        """The names of the loops."""
+        return loop_names(self.scenario)
+
+    def number_of(self, name: str | None) -> int:
+        """Return the number of the loop of a name; of the only loop without a name.
+
+        Raises:
+            CallerError: there is no such loop, or no name and several loops.
+        """
+        if name is None and len(self.names) == 1:
+            return 0
+        if name in self.names:
+            return self.names.index(name)
+        raise no_such_loop(name, self.names)
+
+    def loop(self, name: str | None = None) -> RunRecord:
+        """Return the record of a loop; see :meth:`number_of`."""
+        return self.loops[self.number_of(name)]
+
+
+def no_such_loop(name: str | None, names: Sequence[str]) -> CallerError:
+    """Return the error for a name that none of a run's loops has, or for no name of several."""
+    few = ", ".join(names[:_MOST_NAMES]) + (", …" if len(names) > _MOST_NAMES else "")
+    if name is None:
+        return CallerError(
+            f"the run has {len(names)} loops: take one with --loop NAME, in Python "
+            f"run.loops[NAME]; they are {few}"
+        )
+    return CallerError(f"--loop {name}: the run has no such loop; it has {few}")
+
+
+def alone(record: RunRecord) -> RecordedRun:
+    """Return the record of a run whose only loop has the network for itself."""
+    network = RunRecord(
+        record.scenario, record.source, [], record.reports, record.kind, record.earlier,
+        is_network=True,
+    )  # fmt: skip
+    return RecordedRun(network, [record])
+
+
+class _StoredLoops(Sequence[RunRecord]):
+    """The loops of a run directory, each read when it is used."""
+
+    def __init__(self, run_dir: Path, network: RunRecord, stored: "StoredTables") -> None:
+        self._network, self._stored = network, stored
+        self._loops, self._phases_ns = loops_of(network.scenario), phases_ns(network.scenario)
+        self._entries, self._notices = report_entries(run_dir), read_notices(run_dir / RECORD)
+
+    def __len__(self) -> int:
+        return len(self._loops)
+
+    @overload
+    def __getitem__(self, number: int) -> RunRecord: ...
+    @overload
+    def __getitem__(self, number: slice) -> list[RunRecord]: ...
+    def __getitem__(self, number: int | slice) -> RunRecord | list[RunRecord]:
+        if isinstance(number, slice):
+            return [self[one] for one in range(len(self))[number]]
+        number = range(len(self))[number]
+        loop = resolve(self._loops[number])
+        is_alone, rows = len(self) == 1, self._network.source
+        entries = entries_of_loop(self._entries, number)
+        if not is_alone:
+            own = self._shared.of_loop(number)
+            entries = [(role, self._of_network(one, own)) for role, one in entries]
+            rows = RowsInMemory(own)
+        source = LoopTables(number, tables_of(loop), self._stored, rows)
+        reports, earlier = valid_reports(entries, source)
+        notices = [
+            {key: value for key, value in notice.items() if key != LOOP}
+            for notice in self._notices
+            if notice.get(LOOP, number) == number
+        ]
+        number_of_loop = None if is_alone else number
+        kind = self._network.kind
+        return RunRecord(loop, source, notices, reports, kind, earlier, number_of_loop)
+
+    @cached_property
+    def _shared(self) -> NetworkRows:
+        tables = {table: self._network[table] for table in self._network.tables}
+        return NetworkRows(tables, self._phases_ns)
+
+    def _of_network(self, report: Any, own: Mapping[str, Rows]) -> Any:
+        """Return a report about the rows of the network as one about those of a loop.
+
+        Rows of the network that are missing in the record are missing in every loop.
+        """
+        if not isinstance(report, dict) or not isinstance(report.get("rows"), dict):
+            return report  # damaged
+        generation, written = report.get("generation", 0), dict(report["rows"])
+        for table in written.keys() & own.keys():
+            others = self._shared.count(table, generation) - count_of(own[table], generation)
+            written[table] = written[table] - others if type(written[table]) is int else None
+        return report | {"rows": written}
+
+
+def load_run(run_dir: Path) -> RecordedRun:
+    """Read the record of a run directory.
 
     Raises:
-        CallerError: the path is no run directory, or the record is unfinished or damaged; or it is
-            that of a run of several loops.
+        CallerError: the path is no run directory, or the record is unfinished, damaged, or of an
+            earlier version of noack.
     """
     # Imported here because pyarrow takes 0.1 s: a run does not wait for it.
     from cosim.record.table_files import StoredTables
@@ -214,16 +335,25 @@ def load_record(run_dir: Path, *, network: bool = False) -> RunRecord:
             f"{run_dir}: has no numeric record; `noack summary` finalises an interrupted run"
         )
     scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
-    if scenario.loops is not None and not network:
-        one = run_dir / LOOPS / scenario.loops[0].names[0]
-        raise CallerError(f"{run_dir}: a run of several loops; name one of them, e.g. {one}")
-    tables = tables_of(scenario) if scenario.loops is None else network_tables()
-    rows = StoredTables(folder, tables, _ROWS_PER_STEP * steps_of(scenario) + _MORE_ROWS)
-    reports, earlier = read_reports(run_dir, rows)
-    number = read_object(run_dir / LOOP_FILE).get("number")
-    number = number if isinstance(number, int) and 0 <= number < MAX_LOOPS else None
-    notices = read_notices(folder)
-    return RunRecord(scenario, rows, notices, reports, kind_of(run_dir), earlier, number)
+    most_rows = _ROWS_PER_STEP * steps_of(scenario) + _MORE_ROWS
+    of_network = network_tables()
+    types = {table: one for table, one in run_tables(scenario).items() if table not in of_network}
+    stored, shared = (StoredTables(folder, one, most_rows) for one in (types, of_network))
+    reports, earlier = valid_reports(report_entries(run_dir), shared)
+    notices = [notice for notice in read_notices(folder) if LOOP not in notice]
+    network = RunRecord(
+        scenario, shared, notices, reports, kind_of(run_dir), earlier, is_network=True
+    )
+    return RecordedRun(network, _StoredLoops(run_dir, network, stored))
+
+
+def load_record(run_dir: Path, loop: str | None = None) -> RunRecord:
+    """Read the record of the only loop of a run directory, or of the loop of a name.
+
+    Raises:
+        CallerError: as :func:`load_run`, or there is no such loop.
+    """
+    return load_run(run_dir).loop(loop)
 
 
 def steps_of(scenario: Scenario) -> int:
@@ -232,44 +362,72 @@ def steps_of(scenario: Scenario) -> int:
     A step is the shortest period of a loop's processes; a table of a record has at most a few rows
     for each.
     """
-    loops = [(1, scenario)]
-    if scenario.loops is not None:
-        loops = [(one.count, loop_scenario(scenario, one)) for one in scenario.loops]
     exchange_ns = round(scenario.speed * _CLOCK_EXCHANGE_NS)
     return sum(
-        count * (timing.horizon_ns // min(
+        section.count * (timing.horizon_ns // min(
             timing.plant_period_ns, timing.controller_period_ns, max(exchange_ns, 1)
         ) + 1)
-        for count, timing in ((count, loop.timing) for count, loop in loops)
+        for section in loop_sections(scenario)
+        for timing in [loop_scenario(scenario, section).timing]
     )  # fmt: skip
 
 
-def write_record(record: RunRecord, run_dir: Path) -> None:
-    """Write a record's tables and notices into its run directory.
+def write_run(run: RecordedRun, run_dir: Path) -> None:
+    """Write the tables, the notices and the reports of a run into its directory.
 
     Raises:
-        OSError: they cannot be written.
+        OSError, NoackError: they cannot be written.
     """
-    tables = {table: record.source.batches(table) for table in record.tables}
-    loop = None if record.is_network else record.loop
-    write_tables(run_dir / RECORD, tables, record.tables, loop, record.notices)
+    types = run_tables(run.scenario)
+
+    def rows(table: str) -> Iterator[Rows]:
+        if OWNER[table] == "netem":
+            yield from run.network.source.batches(table)
+            return
+        for number, record in enumerate(run.loops):
+            if table in record.tables:
+                for batch in record.source.batches(table):
+                    yield with_loop(batch, number, types[table])
+
+    common = list(run.network.notices)
+    of_loops = [
+        notice | {LOOP: number}
+        for number, record in enumerate(run.loops)
+        for notice in record.notices
+        if notice not in common
+    ]
+    notices = sorted([*common, *of_loops], key=lambda notice: int(notice["t_ns"]))
+    reports = joint_reports(run.network.reports, [record.reports for record in run.loops])
+    write_whole(run_dir / REPORTS_FILE, json.dumps(reports, indent=2), make_folder=False)
+    tables = ((table, rows(table)) for table in types)
+    write_tables(run_dir / RECORD, tables, types, vector_names(run.scenario), notices)
+
+
+def vector_names(scenario: Scenario) -> dict[str, Sequence[str]]:
+    """Return the names of states and inputs, if they are the same in all loops."""
+    models = [resolve(loop_scenario(scenario, one)).model for one in loop_sections(scenario)]
+    names = {(one.state_names or (), one.input_names or ()) for one in models}
+    if len(names) > 1:
+        return {}
+    ((states, inputs),) = names
+    return {"state_names": states, "input_names": inputs}
 
 
 def write_tables(
     folder: Path,
-    tables: Mapping[str, Iterable[Rows]],
+    tables: Iterable[tuple[str, Iterable[Rows]]],
     types: Mapping[str, np.dtype[np.void]],
-    loop: LoopMatrices | None,
+    names: Mapping[str, Sequence[str]],
     notices: Iterable[Mapping[str, Any]],
 ) -> None:
-    """Write tables, with the names of the loop's states and inputs, and the run's log."""
+    """Write tables, with the names of states and inputs, and the run's log."""
     from cosim.record.table_files import write_table
 
     folder.mkdir(exist_ok=True)
     for scratch in folder.glob(f".*{PARTIAL}"):  # of a process that was killed
         scratch.unlink(missing_ok=True)
-    for table, batches in tables.items():
-        write_table(folder / f"{table}.parquet", batches, types[table], loop)
+    for table, batches in tables:
+        write_table(folder / f"{table}.parquet", batches, types[table], names)
     with new_file(folder / _NOTICES_FILE, make_folder=False) as file:
         file.writelines(f"{json.dumps(notice)}\n".encode() for notice in notices)
 

@@ -1,7 +1,7 @@
 """Converts the spool of a run to its record: all spools merged, without duplicate rows."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +10,16 @@ import numpy as np
 from cosim.record.process_reports import add_kept_reports
 from cosim.record.record_source import Rows
 from cosim.record.run_directory import RECORD, SCENARIO_FILE
-from cosim.record.run_record import RunRecord, load_record, read_notices, write_tables
+from cosim.record.run_record import (
+    RecordedRun,
+    load_run,
+    read_notices,
+    vector_names,
+    write_tables,
+)
 from cosim.record.spool_merge import merged, spool_segments
-from noack.config.resolution import loop_of, network_tables, tables_of
+from noack.config.loops import loop_names
+from noack.config.resolution import has_loop, run_tables
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import MachineError, PeerError, why
 from noack.core.file_access import remove_folder
@@ -20,36 +27,65 @@ from noack.protocol.record_tables import LOOP
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.runtime.control_messages import LogLine, parse_message
 from noack.runtime.log_lines import stored_lines
-from noack.runtime.spool import SPOOL
+from noack.runtime.spool import SPOOL, spool_files
+
+_BLOCK_BYTES = 128 * 1024 * 1024
+"""Rows of several loops that are sorted at once."""
 
 
-def finish_record(run_dir: Path) -> RunRecord:
-    """Convert a run's spool to its record, and remove the spool; see :func:`convert_spool`."""
-    add_kept_reports(run_dir)
-    convert_spool(run_dir)
-    remove_spool(run_dir)
-    return load_record(run_dir, network=True)
+def finish_record(run_dir: Path, show: Callable[[float], None] = lambda share: None) -> RecordedRun:
+    """Convert a run's spool to its record, and remove the spool.
 
-
-def convert_spool(run_dir: Path) -> None:
-    """Convert a run's spool to its record.
-
-    It merges all spools and removes duplicate rows. Of a run with [[loops]], it converts the part
-    of the network; see :func:`cosim.record.loops_spool.finish_run_record`.
+    All spools are merged, without duplicate rows. An interrupted attempt can be repeated. ``show``
+    is called with the completed share.
 
     Raises:
         MachineError: the record cannot be written; the spool is kept.
     """
+    add_kept_reports(run_dir)
+    _convert(run_dir, show)
+    remove_spool(run_dir)
+    return load_run(run_dir)
+
+
+def _convert(run_dir: Path, show: Callable[[float], None]) -> None:
     scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
-    is_network = scenario.loops is not None
-    types = network_tables() if is_network else tables_of(scenario)
-    spool, folder = run_dir / SPOOL, run_dir / RECORD
-    tables = {table: recorded_rows(run_dir, table, dtype) for table, dtype in types.items()}
-    notices = [one for one in _notices(folder, spool) if one.get(LOOP) is None]
+    types, loops = run_tables(scenario), len(loop_names(scenario))
+
+    def tables() -> Iterator[tuple[str, Iterator[Rows]]]:
+        for place, (table, dtype) in enumerate(types.items()):
+            show(place / len(types))
+            yield table, _by_loop(run_dir, table, dtype, loops)
+
+    notices = _notices(run_dir / RECORD, run_dir / SPOOL, loops)
     try:
-        write_tables(folder, tables, types, None if is_network else loop_of(scenario), notices)
+        write_tables(run_dir / RECORD, tables(), types, vector_names(scenario), notices)
     except OSError as error:
         raise _kept(run_dir, error) from None
+
+
+def _by_loop(run_dir: Path, table: str, dtype: np.dtype[np.void], loops: int) -> Iterator[Rows]:
+    """Yield the rows of a table from an earlier record and from the spool, loop after loop.
+
+    Of many loops, as many are sorted at once as fit into memory; one loop is never in memory as a
+    whole.
+    """
+    if not has_loop(table):
+        yield from _recorded(run_dir, table, dtype, None)
+        return
+    path = run_dir / RECORD / f"{table}.parquet"
+    paths = [*spool_files(run_dir / SPOOL, table), *([path] if path.is_file() else [])]
+    all_bytes = sum(one.stat().st_size for one in paths)
+    at_once = max(loops * _BLOCK_BYTES // max(all_bytes, _BLOCK_BYTES), 1)
+    for first in range(0, loops, at_once):
+        block = range(first, min(first + at_once, loops))
+        rows = _recorded(run_dir, table, dtype, block)
+        if len(block) == 1:
+            yield from rows
+            continue
+        whole = np.concatenate([np.zeros(0, dtype), *rows])
+        whole = whole[np.argsort(whole[LOOP], kind="stable")]
+        yield from np.split(whole, np.flatnonzero(np.diff(whole[LOOP])) + 1)
 
 
 def remove_spool(run_dir: Path) -> None:
@@ -75,16 +111,19 @@ def _kept(run_dir: Path, error: OSError) -> MachineError:
     )
 
 
-def recorded_rows(run_dir: Path, table: str, dtype: np.dtype[np.void]) -> Iterator[Rows]:
-    """Yield the rows of a table from an earlier record and from the spool."""
+def _recorded(
+    run_dir: Path, table: str, dtype: np.dtype[np.void], loops: range | None
+) -> Iterator[Rows]:
+    """Yield the rows of a table, of some loops, in the order of their inputs."""
     from cosim.record.table_files import group_segments
 
     path = run_dir / RECORD / f"{table}.parquet"
     recorded = group_segments(path, dtype) if path.is_file() else ()
-    yield from merged([*recorded, *spool_segments(run_dir / SPOOL, table, dtype)], dtype)
+    segments = [*recorded, *spool_segments(run_dir / SPOOL, table, dtype)]
+    yield from merged(segments, dtype, loops)
 
 
-def _notices(folder: Path, spool: Path) -> list[dict[str, Any]]:
+def _notices(folder: Path, spool: Path, loops: int) -> list[dict[str, Any]]:
     notices = read_notices(folder)
     known = {json.dumps(notice, sort_keys=True) for notice in notices}
     for role in (*LOOP_ROLES, RECORDER):
@@ -92,6 +131,8 @@ def _notices(folder: Path, spool: Path) -> list[dict[str, Any]]:
             try:
                 notice = parse_message(LogLine, line) | {"process": role}
             except PeerError:  # damaged
+                continue
+            if notice.get(LOOP, 0) not in range(loops):  # damaged
                 continue
             if (text := json.dumps(notice, sort_keys=True)) not in known:
                 known.add(text)

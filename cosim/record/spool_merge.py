@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cosim.record.record_source import BATCH_ROWS, Rows
+from noack.protocol.record_tables import LOOP
 from noack.runtime.spool import chunks_in, spool_files
 
 _SEGMENT_BYTES = 1024 * 1024
@@ -46,24 +48,39 @@ def spool_segments(spool: Path, table: str, dtype: np.dtype[np.void]) -> Iterato
             yield Segment(low, high, partial(_read, path, begin, end, dtype))
 
 
-def merged(segments: Iterable[Segment], dtype: np.dtype[np.void]) -> Iterator[Rows]:
-    """Yield the rows in the order of the machine's inputs, without duplicates.
+def merged(
+    segments: Iterable[Segment], dtype: np.dtype[np.void], loops: range | None = None
+) -> Iterator[Rows]:
+    """Yield the rows in the order of the machines' inputs, without duplicates.
 
-    Of several rows with the same input, the first one is taken.
+    Of several rows with the same input of a loop, the first one is taken. With ``loops``, the rows
+    of other loops are left out.
     """
     ordered = sorted(segments, key=lambda one: one.first)
     waiting: list[Rows] = []
     for segment, after in zip(ordered, [*ordered[1:], None], strict=False):
-        waiting.append(segment.read())
+        read = segment.read()
+        if loops is not None:
+            read = read[(read[LOOP] >= loops.start) & (read[LOOP] < loops.stop)]
+        waiting.append(read)
         if after is not None and sum(map(len, waiting)) < BATCH_ROWS:
             continue
         rows = np.concatenate([np.zeros(0, dtype), *waiting])
-        _, which = np.unique(rows["input"], return_index=True)
-        rows = rows[which]
+        rows = rows[_first_places(rows)]
         ready = len(rows) if after is None else int(np.searchsorted(rows["input"], after.first))
         if ready:
             yield rows[:ready]
         waiting = [rows[ready:]]
+
+
+def _first_places(rows: Rows) -> NDArray[np.intp]:
+    """Return the places of the rows in the order of their inputs, without duplicates."""
+    if LOOP not in (rows.dtype.names or ()):
+        return np.unique(rows["input"], return_index=True)[1]
+    order = np.lexsort((rows[LOOP], rows["input"]))  # stable
+    inputs, loops = rows["input"][order], rows[LOOP][order]
+    repeats = (inputs[1:] == inputs[:-1]) & (loops[1:] == loops[:-1])
+    return np.asarray(order[np.append(True, ~repeats)[: len(order)]])
 
 
 def _read(path: Path, begin: int, end: int, dtype: np.dtype[np.void]) -> Rows:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -24,13 +24,18 @@ from cosim.record.record_source import (
     with_columns,
 )
 from cosim.record.spool_merge import Segment
-from noack.config.resolution import LoopMatrices
 from noack.core.errors import CallerError, one_line
 from noack.core.file_access import new_file
-from noack.protocol.record_tables import OWNER, entry_names
+from noack.protocol.record_tables import LOOP, OWNER, entry_names
+from noack.protocol.wire_format import MAX_LOOPS
 
 _GROUP_ROWS = 2 * BATCH_ROWS
-_ENCODINGS = {pa.int64(): "DELTA_BINARY_PACKED", pa.float64(): "BYTE_STREAM_SPLIT"}
+_LEAST_GROUP_ROWS = 4096
+_ENCODINGS = {
+    pa.int64(): "DELTA_BINARY_PACKED",
+    pa.uint16(): "DELTA_BINARY_PACKED",
+    pa.float64(): "BYTE_STREAM_SPLIT",
+}
 """Of numbers that follow each other in equal steps, and of numbers of similar size."""
 RowType = np.dtype[np.void]
 
@@ -53,6 +58,9 @@ class StoredTables(RecordSource):
         super().__init__(types)
         self._folder, self._most_rows = folder, most_rows
         self._whole: dict[str, Rows] = {}
+        self._groups: dict[str, list[_Group]] = {}
+        self._newest: tuple[tuple[str, int], Rows] | None = None
+        """The group of several loops that was read last."""
         self._counts = {table: self._check(table) for table in types}
 
     def whole(self, table: str) -> Rows:
@@ -75,6 +83,39 @@ class StoredTables(RecordSource):
         else:
             yield from read_batches(self.path(table), with_columns(self.types[table], columns))
 
+    def of_loop(self, table: str, number: int, columns: Sequence[str] = ()) -> Iterator[Rows]:
+        """Read the rows of a loop in order; of a table without loops, all rows."""
+        path, dtype = self.path(table), self.types[table]
+        if LOOP not in (dtype.names or ()):
+            yield from self.batches(table, columns)
+            return
+        for place, group in enumerate(self._groups[table]):
+            if group.first == number == group.last:
+                yield from _read_batches(path, [place], with_columns(dtype, columns))
+            elif group.first <= number <= group.last:
+                rows = self._mixed(table, place)
+                chosen = rows[rows[LOOP] == number]
+                yield chosen[[*columns]] if columns else chosen
+
+    def count_of_loop(self, table: str, number: int) -> int:
+        """Return the number of rows of a loop; of a table without loops, of all rows."""
+        if LOOP not in (self.types[table].names or ()):
+            return self.count(table)
+        return sum(
+            group.rows
+            if group.first == number == group.last
+            else int((self._mixed(table, place)[LOOP] == number).sum())
+            for place, group in enumerate(self._groups[table])
+            if group.first <= number <= group.last
+        )
+
+    def _mixed(self, table: str, place: int) -> Rows:
+        """Read a group with rows of several loops; the loops are usually read in turn."""
+        key = table, place
+        if self._newest is None or self._newest[0] != key:
+            self._newest = key, _read_group(self.path(table), place, self.types[table])
+        return self._newest[1]
+
     def path(self, table: str) -> Path:
         """Return the file of a table."""
         return self._folder / f"{table}.parquet"
@@ -92,12 +133,31 @@ class StoredTables(RecordSource):
             _require_parts(path, metadata)
             _require_columns(path, schema, self.types[table])
             groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
+            self._groups[table] = [_group(one, metadata) for one in groups]
             for column, _ in _columns(self.types[table]):
                 place = metadata.schema.names.index(column)
                 found = [group.column(place).statistics for group in groups]
                 if any(one is not None and one.null_count for one in found):
                     raise CallerError(f"{path}: column {column} has holes")
             return int(metadata.num_rows)
+
+
+class _Group(NamedTuple):
+    """A row group of a file."""
+
+    rows: int
+    first: int
+    """Lowest number of a loop."""
+    last: int
+    """Highest number of a loop."""
+
+
+def _group(group: Any, metadata: pq.FileMetaData) -> _Group:
+    names = metadata.schema.names
+    found = group.column(names.index(LOOP)).statistics if LOOP in names else None
+    if found is None or not found.has_min_max:
+        return _Group(group.num_rows, 0, MAX_LOOPS)
+    return _Group(group.num_rows, int(found.min), int(found.max))
 
 
 def read_table(path: Path, dtype: RowType) -> pa.Table:
@@ -121,10 +181,15 @@ def read_batches(path: Path, dtype: RowType) -> Iterator[Rows]:
     Raises:
         CallerError: as :func:`read_table`.
     """
+    yield from _read_batches(path, None, dtype)
+
+
+def _read_batches(path: Path, groups: Sequence[int] | None, dtype: RowType) -> Iterator[Rows]:
+    """Yield the rows of some groups of a file, by default of all."""
     names = [column for column, _ in _columns(dtype)]
     with _readable(path), pq.ParquetFile(path) as file:
         _require_columns(path, file.schema_arrow, dtype)
-        for group in range(file.num_row_groups):
+        for group in range(file.num_row_groups) if groups is None else groups:
             # A reader of several groups would keep the memory of all of them to the end.
             for batch in file.iter_batches(BATCH_ROWS, row_groups=[group], columns=names):
                 batch.validate(full=True)
@@ -165,19 +230,17 @@ def _read_group(path: Path, group: int, dtype: RowType) -> Rows:
 
 
 def write_table(
-    path: Path, batches: Iterable[Rows], dtype: RowType, loop: LoopMatrices | None
+    path: Path, batches: Iterable[Rows], dtype: RowType, names: Mapping[str, Sequence[str]]
 ) -> None:
-    """Write a table's file from batches of rows, in row groups of ``_GROUP_ROWS``.
+    """Write a table's file from batches of rows, those of each loop in turn.
 
-    ``loop`` names states and inputs; the tables of the network have none.
+    ``names`` are those of states and inputs, if they are the same in all loops.
 
     Raises:
         OSError: the file cannot be written.
     """
     metadata = {"noack_table": path.stem, "process": OWNER[path.stem]}
-    if loop is not None:
-        metadata["state_names"] = json.dumps(loop.state_names)
-        metadata["input_names"] = json.dumps(loop.input_names)
+    metadata |= {key: json.dumps(value) for key, value in names.items()}
     schema = pa.schema(list(_columns(dtype))).with_metadata(metadata)
     # A dictionary, the default, takes twice the time and the space.
     options: dict[str, Any] = {"compression": "zstd", "use_dictionary": False}
@@ -190,11 +253,23 @@ def write_table(
             writer.write_table(pa.table(_arrays(rows), schema=schema))
 
 
+def arrow_table(rows: Rows) -> pa.Table:
+    """Return rows as a table with a column for each entry of a vector."""
+    return pa.table(_arrays(rows))
+
+
 def _regrouped(batches: Iterable[Rows], dtype: RowType) -> Iterator[Rows]:
-    """Yield the same rows in batches of ``_GROUP_ROWS``; only the last one may be shorter."""
+    """Yield the same rows in batches of at most ``_GROUP_ROWS``.
+
+    A loop with enough rows begins a batch of its own; so it can be read alone.
+    """
     waiting: list[Rows] = []
     count = 0
     for batch in batches:
+        begins = count and LOOP in (dtype.names or ()) and waiting[-1][LOOP][-1:] != batch[LOOP][:1]
+        if count >= _LEAST_GROUP_ROWS and begins:
+            yield np.concatenate(waiting)
+            waiting, count = [], 0
         waiting.append(batch)
         count += len(batch)
         if count >= _GROUP_ROWS:
@@ -271,6 +346,11 @@ def _readable(path: Path) -> Iterator[None]:
 def _require_columns(path: Path, schema: pa.Schema, dtype: RowType) -> None:
     for column, kind in _columns(dtype):
         found = schema.get_all_field_indices(column)
+        if not found and column == LOOP:
+            raise CallerError(
+                f"{path}: has no column {LOOP}: an earlier version of noack recorded this run, "
+                "which this version does not read"
+            )
         if not found:
             raise CallerError(f"{path}: has no column {column}, which this scenario's runs have")
         if len(found) > 1 or schema.field(found[0]).type != kind:

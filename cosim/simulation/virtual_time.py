@@ -14,8 +14,7 @@ import numpy as np
 
 from controller_node.controller import controllers_of
 from cosim.record.loop_rows import network_rows_by_loop
-from cosim.record.loops_run import LoopsRun
-from cosim.record.run_record import Rows, RunRecord
+from cosim.record.run_record import RecordedRun, Rows, RunRecord
 from netem.channel import RUN_ID, Network, channel_of
 from noack.config.loops import loops_of, phases_ns
 from noack.config.parameter_changes import change_notice, scheduled
@@ -257,8 +256,8 @@ def simulate(
     return RunRecord(resolved, rows, run.record.notices(), reports, "simulated")
 
 
-def simulate_loops(scenario: Scenario, progress: Progress | None = None) -> LoopsRun:
-    """Run a scenario with [[loops]] in virtual time; see :func:`simulate`.
+def simulate_loops(scenario: Scenario, progress: Progress | None = None) -> RecordedRun:
+    """Run the loops of a scenario in virtual time; see :func:`simulate`.
 
     Args:
         scenario: the scenario, not resolved; speed, ports and real-time settings have no effect.
@@ -280,10 +279,12 @@ def simulate_loops(scenario: Scenario, progress: Progress | None = None) -> Loop
         tables = {table: (own[number] | packets)[table] for table in tables_of(loop)}
         reports = _reports(run, tables, scenario, number)
         notices = run.record.notices(number)
-        records.append(RunRecord(loop, tables, notices, reports, "simulated", number=number))
+        shared = number if len(loops) > 1 else None
+        records.append(RunRecord(loop, tables, notices, reports, "simulated", number=shared))
     reports = {"netem": _report("netem", of_network, {"rejected": {}})}
-    network = RunRecord(scenario, of_network, run.record.notices(), reports, "simulated")
-    return LoopsRun(network, records)
+    notices = run.record.notices()
+    network = RunRecord(scenario, of_network, notices, reports, "simulated", is_network=True)
+    return RecordedRun(network, records)
 
 
 def _completed(

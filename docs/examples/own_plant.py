@@ -67,7 +67,7 @@ for name in ("paper", "schedule", "paper_box", "schedule_box"):
 run = noack.simulate(scenario)
 print(run)
 for claim in run.claims:
-    print(f"{claim['verdict']:<9} {claim['what']}, by {claim['source']}")
+    print(f"{claim.verdict:<9} {claim.what}, by {claim.source}")
 
 # %%
 run.plot("states").savefig("own_plant.svg")
@@ -87,6 +87,6 @@ for case in (scenario, harsh):
     t_s, angle = samples["t_s"].to_numpy(), samples["x_1"].to_numpy()
     settled_s = t_s[np.abs(angle) > 0.01].max()
     print(
-        f"M - 1 = {case.network.mansd}: {run.summary['events']} events, "
-        f"{run.summary['deliveries']} received, upright after {settled_s:.2f} s"
+        f"M - 1 = {case.network.mansd}: {run.summary.loops[0].events} events, "
+        f"{run.summary.loops[0].deliveries} received, upright after {settled_s:.2f} s"
     )

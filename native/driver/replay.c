@@ -9,6 +9,7 @@
 enum { TABLES = 4, SEQUENCE = 8, TIME = 16, NOW = 24, SENT_HEADER = 3, SENT_DATAGRAM = 5 };
 enum { PACKET_FLOW = 32, PACKET_SIZE = 80, PACKET_HEAD = 88, MOST_BYTES = 65535 };
 static const int64_t FAR_NS = INT64_C(1) << 62;
+static const int64_t EARLIEST_NS = -3600 * NS_PER_S; /* by a clock that is off */
 
 static int is_between(int64_t least, int64_t number, int64_t most) {
     return least <= number && number <= most;
@@ -111,7 +112,7 @@ static int64_t replay_packet(noack_input_replay *replay, const uint8_t *recorded
         .bit = -1,
     };
     memcpy(datagram.head, recorded + PACKET_HEAD, NOACK_HEAD_BYTES);
-    if (!is_between(0, now_ns, LATEST_NS)
+    if (!is_between(EARLIEST_NS, now_ns, LATEST_NS)
         || !is_between(0, datagram.flow, channel->directions * channel->loops - 1))
         return NOACK_CANNOT_TAKE;
     return noack_channel_handle(channel, &datagram, now_ns);

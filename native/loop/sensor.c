@@ -54,41 +54,30 @@ static void answer(
     }
 }
 
+/* x_s at a measurement: at the first one it is x, or 0 until an update is acknowledged. */
+static void advance_model(const noack_sensor *sensor, int64_t t_ns, double *x_s) {
+    if (sensor->knows_state)
+        noack_model_advance(&sensor->model, sensor->x_s, sensor->model_ns, t_ns, x_s);
+    else
+        copy(sensor->machine.n, sensor->acknowledged ? sensor->x_s : sensor->x, x_s);
+}
+
+/* Keep an update until it is acknowledged, and wait for that. */
+static void keep_sent(noack_sensor *sensor, int64_t t_ns) {
+    int64_t n = sensor->machine.n;
+    copy(n, sensor->x, sensor->sent_x + sensor->sent_count * n);
+    sensor->sent[sensor->sent_count++] = sensor->events;
+    sensor->wait_ns = t_ns + sensor->timeout_ns;
+}
+
 static int64_t measured(
     noack_sensor *sensor, const noack_message *message, int64_t now_ns, noack_output *output) {
     noack_machine *machine = &sensor->machine;
     int64_t n = machine->n, t_ns = message->t_ns, first = !sensor->knows_state;
     double *x_s = sensor->scratch, sides[2];
-    if (first)
-        copy(n, sensor->x, x_s);
-    else
-        noack_model_advance(&sensor->model, sensor->x_s, sensor->model_ns, t_ns, x_s);
-    for (int64_t k = 0; k < n; k++)
-        sensor->e_s[k] = x_s[k] - sensor->x[k];
-    sensor->first = first;
-    sensor->asked_ns = t_ns;
-    if (sensor->is_user && !machine->answered)
-        return NOACK_ASK_DECISION;
-    if (first)
-        start(sensor, t_ns, sensor->x);
-    int64_t event = test(sensor, t_ns, sides) || first;
-    if (event)
-        start(sensor, t_ns, sensor->x);
-    answer(sensor, message, x_s, sides, event, now_ns, output);
-    copy(n, event ? sensor->x : x_s, sensor->x_s);
-    sensor->model_ns = machine->reached_ns = t_ns;
-    sensor->knows_state = 1;
-    return NOACK_DONE;
-}
-
-static int64_t measured_with_acknowledgements(
-    noack_sensor *sensor, const noack_message *message, int64_t now_ns, noack_output *output) {
-    noack_machine *machine = &sensor->machine;
-    int64_t n = machine->n, t_ns = message->t_ns, first = !sensor->knows_state;
-    double *x_s = sensor->scratch, sides[2];
-    if (sensor->sent_count == sensor->sent_places)
+    if (sensor->acknowledged && sensor->sent_count == sensor->sent_places)
         return NOACK_ASK_ROOM;
-    noack_model_advance(&sensor->model, sensor->x_s, first ? t_ns : sensor->model_ns, t_ns, x_s);
+    advance_model(sensor, t_ns, x_s);
     for (int64_t k = 0; k < n; k++)
         sensor->e_s[k] = x_s[k] - sensor->x[k];
     sensor->first = first;
@@ -97,16 +86,15 @@ static int64_t measured_with_acknowledgements(
         return NOACK_ASK_DECISION;
     if (first)
         start(sensor, t_ns, sensor->x);
-    int64_t due = test(sensor, t_ns, sides), waits = t_ns < sensor->wait_ns;
-    int64_t event = first || (due && !waits);
-    if (event) {
-        copy(n, sensor->x, sensor->sent_x + sensor->sent_count * n);
-        sensor->sent[sensor->sent_count++] = sensor->events;
-        sensor->wait_ns = t_ns + sensor->timeout_ns;
-    }
+    int64_t due = test(sensor, t_ns, sides), waits = sensor->acknowledged && t_ns < sensor->wait_ns;
+    int64_t event = first || (due && !waits), resets = event && !sensor->acknowledged;
+    if (resets)
+        start(sensor, t_ns, sensor->x);
+    else if (event)
+        keep_sent(sensor, t_ns);
     answer(sensor, message, x_s, sides, event, now_ns, output);
-    copy(n, x_s, sensor->x_s);
-    sensor->model_ns = t_ns;
+    copy(n, resets ? sensor->x : x_s, sensor->x_s);
+    sensor->model_ns = machine->reached_ns = t_ns;
     sensor->knows_state = 1;
     return NOACK_DONE;
 }
@@ -175,9 +163,7 @@ int64_t noack_sensor_handle(
             copy(machine->n, sensor->observer.x, sensor->x);
             machine->observed = 1;
         }
-        question = sensor->acknowledged
-                       ? measured_with_acknowledgements(sensor, message, now_ns, output)
-                       : measured(sensor, message, now_ns, output);
+        question = measured(sensor, message, now_ns, output);
     }
     if (question == NOACK_DONE)
         machine->answered = machine->observed = 0;

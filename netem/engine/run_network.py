@@ -41,17 +41,17 @@ class RunNetwork:
     Args:
         resolved: the resolved scenario.
         start: where in the run it begins.
-        loops: number of the run's loops; None in a run of one loop without numbers.
+        loops: number of the run's loops.
     """
 
-    def __init__(self, resolved: Scenario, start: Start, loops: int | None = None) -> None:
-        self._loops = loops or 1
+    def __init__(self, resolved: Scenario, start: Start, loops: int = 1) -> None:
+        self._loops = loops
         self._memory = RelayMemory(1, row_count=_ROWS)
         while len(self._memory.clients) < self._loops:
             self._memory.add_clients()
         self._relay, clients = self._memory.core, self._memory.clients
         self._relay.inputs = self._relay.first_number = start.first_number
-        self._relay.loops, self._relay.by_loop = self._loops, loops is not None
+        self._relay.loops, self._relay.by_loop = self._loops, 1
         flows = np.arange(self._loops)
         clients["number"][flows] = clients["place"][flows] = flows
         network = resolved.network

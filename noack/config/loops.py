@@ -1,4 +1,4 @@
-"""The loops of a scenario: many loops on one network, each an ordinary scenario.
+"""The loops of a scenario: one or more loops on one network, each an ordinary scenario.
 
 The number of a loop is its place in :func:`loops_of`. A loop begins at its phase: its time 0 is
 that time of the run.
@@ -33,16 +33,24 @@ _KINDS: Mapping[str, tuple[str, ...]] = {
 """The tables of a loop, each with the keys that make it replace the table of the top level."""
 
 
+def loop_sections(scenario: "Scenario") -> tuple[LoopSection, ...]:
+    """Return the entries of [[loops]]; a scenario without has one, which changes nothing."""
+    return scenario.loops or (LoopSection(name=scenario.name),)
+
+
+def loop_names(scenario: "Scenario") -> list[str]:
+    """Return the names of the loops, in the order of their numbers."""
+    return [name for section in loop_sections(scenario) for name in section.names]
+
+
 def loops_of(scenario: "Scenario") -> "tuple[Scenario, ...]":
-    """Return one scenario per loop, not yet resolved; the scenario itself if it has no [[loops]].
+    """Return one scenario per loop, not yet resolved.
 
     The first loop has the seeds of the run; those of the others are drawn from these and the loop's
     number. So a run with one entry of [[loops]] computes what the run without it does.
     """
-    if scenario.loops is None:
-        return (scenario,)
     found: list[Scenario] = []
-    for section in scenario.loops:
+    for section in loop_sections(scenario):
         entry = loop_scenario(scenario, section)
         for name in section.names:
             seeds = _seeds(scenario, section, len(found))
@@ -52,9 +60,7 @@ def loops_of(scenario: "Scenario") -> "tuple[Scenario, ...]":
 
 def phases_ns(scenario: "Scenario") -> tuple[int, ...]:
     """Return when each loop begins: the time of the run at which the time of the loop is 0."""
-    if scenario.loops is None:
-        return (0,)
-    given = [section.phase for section in scenario.loops for _ in range(section.count)]
+    given = [section.phase for section in loop_sections(scenario) for _ in section.names]
     phases = []
     for number, (phase, loop) in enumerate(zip(given, loops_of(scenario), strict=True)):
         if phase is None:
@@ -74,10 +80,8 @@ def with_loop_tables(
     returns the new tables by their places, e.g. ``plant.system``; only those of tables that the
     entry sets itself are used.
     """
-    if scenario.loops is None:
-        return scenario
     sections = []
-    for place, section in enumerate(scenario.loops):
+    for place, section in enumerate(scenario.loops or ()):
         update: dict[str, Any] = {}
         changed = change(f"loops.{place}", loop_scenario(scenario, section))
         for path, table in changed.items():
@@ -86,7 +90,7 @@ def with_loop_tables(
             if (own := getattr(section, part)) is not None and (not inner or inner in own):
                 update[part] = own | {inner: content} if inner else content
         sections.append(section.model_copy(update=update))
-    return scenario.model_copy(update={"loops": tuple(sections)})
+    return scenario.model_copy(update={"loops": tuple(sections) or None})
 
 
 def loop_scenario(scenario: "Scenario", section: LoopSection) -> "Scenario":

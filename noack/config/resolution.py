@@ -4,13 +4,13 @@ The result is again a scenario: the resolved scenario. Running it repeats the ru
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Literal
 
 import numpy as np
 
 from noack.config.feature_kinds import AnyObserver
-from noack.config.loops import loop_scenario, loops_of
+from noack.config.loops import loop_scenario, loop_sections, loops_of
 from noack.config.named_models import NAMED_MODELS
 from noack.config.scenario import Scenario
 from noack.config.sections.model_section import ModelSection
@@ -19,7 +19,15 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, discretise, transition
 from noack.core.random_streams import stream
 from noack.observers.observability import unobservable_mode
-from noack.protocol.record_tables import OWNER, entry_names, tables
+from noack.protocol.record_tables import (
+    CLOCK_TABLES,
+    LOOP,
+    OWNER,
+    RecordShape,
+    entry_names,
+    largest,
+    tables,
+)
 from noack.settings.matrices import rows_of
 from noack.trigger.policy_settings import ModelMatrices
 from noack.trigger.trigger_policy import Policy
@@ -60,19 +68,23 @@ class LoopMatrices:
 
 
 def resolve(scenario: Scenario) -> Scenario:
-    """Return the scenario with matrices and numbers in place of names and random draws.
+    """Return a scenario of one loop with matrices and numbers in place of names and random draws.
 
     Raises:
         CallerError: the numbers are so large that one step of the plant or model is not finite; an
             observer is set, but an unstable mode is unobservable in the measurement; or a module
-            that the plant needs is not installed; or the scenario has [[loops]], see
-            :func:`noack.config.loops.loops_of`.
+            that the plant needs is not installed; or the scenario has more than one loop, see
+            :func:`resolved_loops`.
     """
-    if scenario.loops is not None:
+    loops = loops_of(scenario)
+    if len(loops) > 1:
         raise CallerError(
-            f"{scenario.name}: it has several loops; give one loop: a scenario without "
-            "[[loops]], such as loops/NAME/scenario.toml in a run directory"
+            f"{scenario.name}: it has {len(loops)} loops; give a scenario of one loop"
         )
+    return _resolved(loops[0])
+
+
+def _resolved(scenario: Scenario) -> Scenario:
     scenario.plant.system.require_installed()
     model = _explicit_model(scenario.model)
     A, B = np.array(model.A), np.array(model.B)
@@ -103,12 +115,37 @@ def resolve(scenario: Scenario) -> Scenario:
 
 
 def resolved_loops(scenario: Scenario) -> tuple[Scenario, ...]:
-    """Return the resolved scenario of each loop of a run; that of the run without [[loops]].
+    """Return the resolved scenario of each loop of a run.
 
     Raises:
         CallerError: as :func:`resolve`.
     """
-    return tuple(map(resolve, loops_of(scenario)))
+    return tuple(map(_resolved, loops_of(scenario)))
+
+
+def resolve_run(scenario: Scenario) -> Scenario:
+    """Return the scenario of a run as its directory has it; running it repeats the run's draws.
+
+    A scenario without [[loops]] is resolved. In an entry of [[loops]], the model and the observer
+    become numbers; the draws of its loops follow from the seeds.
+
+    Raises:
+        CallerError: as :func:`resolve`.
+    """
+    resolved = resolved_loops(scenario)
+    if not scenario.loops:
+        return resolved[0]
+    sections, first = [], 0
+    for section in scenario.loops:
+        loop, first = resolved[first], first + section.count
+        tables = {"model": loop.model, "observer": loop.observer}
+        update = {
+            part: table.model_dump(mode="json", exclude_none=True)
+            for part, table in tables.items()
+            if table is not None
+        }
+        sections.append(section.model_copy(update=update))
+    return scenario.model_copy(update={"loops": tuple(sections)})
 
 
 def loop_of(resolved: Scenario) -> LoopMatrices:
@@ -151,22 +188,18 @@ def setpoint_of(resolved: Scenario) -> tuple[Vector, Vector] | None:
 
 
 def tables_of(resolved: Scenario) -> Mapping[str, np.dtype[np.void]]:
-    """Return the row types of the tables in runs of a resolved scenario.
+    """Return the row types of the tables of a loop, from its resolved scenario."""
+    return tables(**asdict(shape_of(resolved)))
 
-    In a run with [[loops]], the rows of the network are those of all loops; each other row begins
-    with the number of its loop.
 
-    Raises:
-        CallerError: the loops have rows of different sizes.
-    """
-    if resolved.loops is not None:
-        return _tables_of_loops(resolved)
+def shape_of(resolved: Scenario) -> RecordShape:
+    """Return the sizes of a loop's vectors in the record."""
     n, m = resolved.model.dimensions
-    acknowledged, predictive = resolved.protocol.acknowledges, resolved.message_sizes.is_predictive
-    internal = len(resolved.plant.system.internal_names)
     disturbed = {one.at for one in resolved.plant.disturbances}
-    return tables(
-        n, m, acknowledged=acknowledged, predictive=predictive, internal=internal,
+    return RecordShape(
+        n, m, acknowledged=resolved.protocol.acknowledges,
+        predictive=resolved.message_sizes.is_predictive,
+        internal=len(resolved.plant.system.internal_names),
         predictions=resolved.controller.predictions,
         disturbed_input="input" in disturbed, disturbed_state="state" in disturbed,
         outputs=0 if resolved.observer is None else resolved.message_sizes.outputs,
@@ -180,8 +213,22 @@ def network_tables() -> Mapping[str, np.dtype[np.void]]:
     return {table: dtype for table, dtype in tables(1, 1).items() if OWNER[table] == "netem"}
 
 
-def _tables_of_loops(scenario: Scenario) -> Mapping[str, np.dtype[np.void]]:
-    first, *others = (tables_of(loop_scenario(scenario, one)) for one in scenario.loops or ())
+def run_tables(scenario: Scenario) -> Mapping[str, np.dtype[np.void]]:
+    """Return the row types of the tables of a run, as its processes send them.
+
+    The rows of the network are those of all loops; each other row of a machine begins with the
+    number of its loop. Vectors have the largest size of all loops.
+    """
+    shapes = {shape_of(loop_scenario(scenario, one)) for one in loop_sections(scenario)}
+    return {
+        table: np.dtype([(LOOP, "<u2"), *dtype.descr]) if has_loop(table) else dtype
+        for table, dtype in tables(**asdict(largest(shapes))).items()
+    }
+
+
+def require_equal_sizes(scenario: Scenario) -> None:
+    """Raise CallerError if the vectors of a live run's loops have different sizes."""
+    first, *others = (shape_of(loop_scenario(scenario, one)) for one in loop_sections(scenario))
     for place, one in enumerate(others, 1):
         if one != first:
             raise CallerError(
@@ -189,10 +236,11 @@ def _tables_of_loops(scenario: Scenario) -> Mapping[str, np.dtype[np.void]]:
                 "a live run have the same numbers of states, inputs and outputs (`noack simulate` "
                 "allows different ones)"
             )
-    return {
-        table: dtype if OWNER[table] == "netem" else np.dtype([("loop", "<u2"), *dtype.descr])
-        for table, dtype in first.items()
-    }
+
+
+def has_loop(table: str) -> bool:
+    """Whether each row of a table in the record of a run has the number of its loop."""
+    return OWNER[table] != "netem" and table not in CLOCK_TABLES
 
 
 def _observer(scenario: Scenario, model: ModelSection) -> AnyObserver | None:

@@ -85,7 +85,7 @@ class Scenario(ScenarioSection):
             ("network", f"{_said(self.network.loss, 'model')}; M − 1 = {self.network.mansd}"),
             ("horizon", f"{self.horizon_s:g} s"),
         ]
-        if self.loops is not None:
+        if self.loops:
             loops = (
                 one.name if one.count == 1 else f"{one.count} x {one.name}" for one in self.loops
             )

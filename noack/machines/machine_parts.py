@@ -42,8 +42,11 @@ class MachinePart(Protocol):
     """The description of one loop's machine, and what only Python can do for it."""
 
     role: Role
-    schedule: ChangeSchedule | None
-    """The announced changes of its settings; None if they cannot change."""
+
+    @property
+    def schedule(self) -> ChangeSchedule | None:
+        """The announced changes of its settings; None if they cannot change."""
+        ...
 
     @property
     def counts_every_message(self) -> bool:

@@ -7,8 +7,8 @@ columns here; live runs, simulation and replay fill the same tables. Everything 
 nominal, ``now_ns`` actual.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import astuple, dataclass
 from enum import IntEnum
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -38,7 +38,7 @@ PACKET_HEAD_BYTES = 32
 """Leading bytes of each datagram that the network emulator records without interpreting them."""
 
 LOOP = "loop"
-"""First column of the tables that the processes of several loops send: the number of the loop."""
+"""First column of the tables of plant, sensor and controller: the number of the loop."""
 
 LOST_NS = -1
 """Stands for a bound that is lost, in the column of the bounds of a clock's error."""
@@ -268,9 +268,14 @@ CLOCK_TABLES = tuple(table.name for table in TABLES if table.name == clock_table
 """Tables of what the processes, not their machines, record: they are no input of a machine."""
 
 
+def largest(shapes: Iterable[RecordShape]) -> RecordShape:
+    """Return the largest of each size."""
+    return RecordShape(*map(max, zip(*map(astuple, shapes), strict=True)))
+
+
 @lru_cache
 def tables(n: int, m: int, **more: int) -> Mapping[str, np.dtype[np.void]]:
-    """Return the row types of a run's tables; ``more`` has other sizes of :class:`RecordShape`."""
+    """Return the row types of a loop's tables; ``more`` has further sizes of `RecordShape`."""
     shape = RecordShape(n, m, **more)  # type: ignore[arg-type]
     return {
         table.name: np.dtype([*_fields((*COMMON, *table.columns), shape)])

@@ -46,10 +46,7 @@ def run_machines(process: RunProcess, machines: LoopMachines) -> None:
     )  # fmt: skip
     with process.open_socket() as endpoint:
         addresses = process.join(endpoint.getsockname()[:2])
-        channel = LoopChannel(
-            endpoint, driver, SENDS[process.role], by_loop=process.loop_count is not None,
-            **_ends(process, addresses),
-        )  # fmt: skip
+        channel = LoopChannel(endpoint, driver, SENDS[process.role], **_ends(process, addresses))
         process.run(driver, channel, machines)
 
 
@@ -193,6 +190,7 @@ class LiveDriver:
         return {
             "accepted": sum(one.accepted for one in reports),
             "rejected": {reason: n for reason, n in by_reason.items() if n},
+            "loops": [reception_report(one) for one in reports],
         }
 
     def _each_machine(self) -> list[Any]:
@@ -239,7 +237,6 @@ class LoopChannel(CountingSocket):
         destination: where the flow that it sends goes to.
         acknowledged_by: where acknowledgements come from; None: it receives none.
         acknowledges_to: where they go to; None: it sends none.
-        by_loop: whether the report has the counters of each loop.
 
     Raises:
         PeerError: the system refused a socket for a peer.
@@ -255,11 +252,10 @@ class LoopChannel(CountingSocket):
         destination: Address,
         acknowledged_by: Address | None = None,
         acknowledges_to: Address | None = None,
-        by_loop: bool = False,
     ) -> None:
         sources = [source] if acknowledged_by is None else [source, acknowledged_by]
         super().__init__(endpoint, destination, sources)
-        self._driver, self._sends, self._by_loop = driver, sends, by_loop
+        self._driver, self._sends = driver, sends
         self._expected = sources
         self._is_acknowledged = acknowledged_by is not None
         driver.open(endpoint, self.peer_sockets, sources, (destination, acknowledges_to))
@@ -282,6 +278,6 @@ class LoopChannel(CountingSocket):
             "sends": self._sends.name.lower(),
             "accepted": driver.accepted,
             "rejected": self.rejected(rejected),
-            **({"loops": driver.reports()} if self._by_loop else {}),
+            "loops": driver.reports(),
             **({"acknowledgements": driver.acknowledgements()} if self._is_acknowledged else {}),
         }

@@ -17,7 +17,7 @@ from typing import Any, Protocol
 
 from noack.config.loops import loops_of, phases_ns
 from noack.config.parameter_changes import ParameterChange
-from noack.config.resolution import resolved_loops, tables_of
+from noack.config.resolution import resolved_loops, run_tables
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S, RunClock, SlewedRunClock
 from noack.core.errors import CallerError, NoackError, PeerError, one_line
@@ -144,16 +144,10 @@ class RunProcess:
             self._reference.poll()
         return self.stopping
 
-    @property
-    def loop_count(self) -> int | None:
-        """Number of loops whose datagrams carry their number; None in a run without [[loops]]."""
-        return None if self.scenario.loops is None else len(self.phases_ns)
-
     @cached_property
     def loops(self) -> Sequence[Scenario]:
         """The resolved scenario of each loop."""
-        run = self.scenario  # which is resolved
-        return (run,) if run.loops is None else resolved_loops(run)
+        return resolved_loops(self.scenario)
 
     @property
     def wire(self) -> Wire:
@@ -213,7 +207,6 @@ class RunProcess:
             raise
         finally:
             telemetry.flush()
-            by_loop = telemetry.totals_by_loop()
             self.report = {
                 "pid": os.getpid(),
                 "ended": self.ended,
@@ -221,7 +214,7 @@ class RunProcess:
                 "channel": channel.report(),
                 "rows": telemetry.totals(),
                 "stored": telemetry.stored(),
-                **({"rows_by_loop": by_loop} if by_loop else {}),
+                "rows_by_loop": telemetry.totals_by_loop(),
                 "generation": self.start.generation,
                 "instance": self.plane.instance,
                 "reached_ns": reached_ns,
@@ -237,7 +230,7 @@ class RunProcess:
         return own_spool(self.ticket, self.role, self.plane.secret)
 
     def _telemetry(self) -> TelemetryBuffer:
-        tables = tables_of(self.scenario)
+        tables = run_tables(self.scenario)
         owned = {table: dtype for table, dtype in tables.items() if OWNER[table] == self.role}
         generation = self.start.generation
         return TelemetryBuffer(
@@ -256,7 +249,7 @@ class RunProcess:
         telemetry: TelemetryBuffer,
     ) -> int:
         """Run the loop; return the simulated time up to which the machines have done their work."""
-        has_table = clock_table(self.role) in tables_of(self.scenario)
+        has_table = clock_table(self.role) in run_tables(self.scenario)
         if has_table or self._reference is not None:
             self._clock_record = ClockRecord(
                 self.role, self.start, self.clock, self._reference, has_table=has_table

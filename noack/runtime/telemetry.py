@@ -155,7 +155,7 @@ class TelemetryBuffer:
         return dict(self._published)
 
     def totals_by_loop(self) -> dict[str, list[int]]:
-        """Rows published so far of each loop, up to the last with rows; empty without [[loops]]."""
+        """Rows published so far of each loop, up to the last with rows."""
         return {table: counts.tolist() for table, counts in self._by_loop.items()}
 
     def store_all(self) -> None:

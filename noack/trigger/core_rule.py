@@ -57,7 +57,7 @@ def rule_rows(rule: TriggerRule) -> int:
     """Return the rows of a rule's longest matrix; at least the number of states."""
     dynamic, n = rule.dynamic_variable, rule.form.up.shape[1] // 2
     matrices = [*rule.form, *(() if dynamic is None else dynamic.gain)]
-    return max(n, *map(len, matrices))
+    return int(max(n, *map(len, matrices)))
 
 
 def _whole_ns(t_ns: float) -> int:

@@ -60,10 +60,10 @@ def main() -> int:
         if not console.is_terminal:
             console.width = _WIDTH
         console.print(table_of(run))
-        held = sum(claim["verdict"] == "held" for claim in run.summary["claims"])
-        number = len(run.summary["claims"])
+        held = sum(claim["verdict"] == "held" for claim in run.summary["loops"][0]["claims"])
+        number = len(run.summary["loops"][0]["claims"])
         print(f"claims: {held} of {number} held, the others void with their reason")
-        late = {role: run.summary["lateness_us"][role]["p99"] for role in LOOP_ROLES}
+        late = {role: run.summary["loops"][0]["lateness_us"][role]["p99"] for role in LOOP_ROLES}
         print("lateness p99:", ", ".join(f"{role} {us:.0f} µs" for role, us in late.items()))
         wrong = [f"{name}: {line}" for name, check in CHECKS.items() for line in check(run)]
     for line in wrong:

@@ -61,19 +61,22 @@ def nothing_is_lost(run: Attacked) -> Iterator[str]:
 
 def the_loop_computes_what_it_should(run: Attacked) -> Iterator[str]:
     """Replay gives the recorded outputs, and (I1) holds to rounding."""
-    if not (run.summary["replay"]["bit_exact"] and run.summary["replay"]["complete"]):
+    if not (
+        run.summary["loops"][0]["replay"]["bit_exact"]
+        and run.summary["loops"][0]["replay"]["complete"]
+    ):
         yield f"replay: {run.summary['replay']}"
-    if not run.summary["identity_residual_max"] < 1e-11:
+    if not run.summary["loops"][0]["identity_residual_max"] < 1e-11:
         yield f"identity residual {run.summary['identity_residual_max']}"
 
 
 def no_claim_is_violated(run: Attacked) -> Iterator[str]:
     """No claim is violated; claims may be void because of deadlines missed on a busy machine."""
-    claims = run.summary["claims"]
+    claims = run.summary["loops"][0]["claims"]
     if not any("state" in claim["what"] and claim["certified"] is not None for claim in claims):
         yield "no envelope of the state is claimed"
     yield from (str(claim) for claim in claims if claim["verdict"] == "violated")
-    violations = run.summary["assumption_violations"]
+    violations = run.summary["loops"][0]["assumption_violations"]
     yield from (str(one) for one in violations if one["cause"] == "dropouts")
 
 

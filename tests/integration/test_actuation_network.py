@@ -39,9 +39,9 @@ def record(finished: Finished) -> RunRecord:
 
 def test_the_run_is_complete_and_replayed_bit_for_bit(finished: Finished) -> None:
     summary = finished.summary
-    assert summary["replay"]["bit_exact"]
-    assert summary["replay"]["complete"]
-    assert summary["unintended_losses"] == summary["missing_samples"] == 0
+    assert summary["loops"][0]["replay"]["bit_exact"]
+    assert summary["loops"][0]["replay"]["complete"]
+    assert summary["loops"][0]["unintended_losses"] == summary["loops"][0]["missing_samples"] == 0
     reports = json.loads((finished.run_dir / "reports.json").read_text())
     roles = {reports[role]["channel"]["local"]: role for role in reports}
     sources = reports["plant"]["channel"]["received_from"]
@@ -49,7 +49,10 @@ def test_the_run_is_complete_and_replayed_bit_for_bit(finished: Finished) -> Non
 
 
 def test_actuations_are_lost_within_their_guarantee(finished: Finished, record: RunRecord) -> None:
-    found, outcomes = finished.summary["actuations"], packet_outcomes(record, Flow.ACTUATION)
+    found, outcomes = (
+        finished.summary["loops"][0]["actuations"],
+        packet_outcomes(record, Flow.ACTUATION),
+    )
     assert found["sent"] == len(record[CONTROLLER_STEP])
     assert found["lost"] > 0.2 * found["sent"]
     assert found["longest_loss_burst"] == outcomes.longest_loss_burst() <= 3
@@ -92,8 +95,8 @@ def restarted(tmp_path_factory: pytest.TempPathFactory) -> Finished:
 
 def test_restarted_processes_go_on_with_lossy_actuations(restarted: Finished) -> None:
     assert restarted.status == 130, restarted.stderr
-    assert restarted.summary["replay"]["bit_exact"]
-    assert {one["process"] for one in restarted.summary["restarts"]} == set(RESTARTED)
+    assert restarted.summary["loops"][0]["replay"]["bit_exact"]
+    assert {one["process"] for one in restarted.summary["loops"][0]["restarts"]} == set(RESTARTED)
     record = load_record(restarted.run_dir)
     steps, actuations = record[CONTROLLER_STEP], record[PLANT_ACTUATION]
     # The plant applies inputs of the restarted controller, through the restarted emulator.
@@ -108,9 +111,11 @@ def test_restarted_processes_go_on_with_lossy_actuations(restarted: Finished) ->
 
 
 def test_claims_of_a_restarted_run_are_judged(restarted: Finished) -> None:
-    found = restarted.summary["actuations"]
+    found = restarted.summary["loops"][0]["actuations"]
     assert found["lost"] > 0.2 * found["sent"]
-    claims = restarted.summary["claims"]
+    claims = restarted.summary["loops"][0]["claims"]
     assert claims
     assert {claim["verdict"] for claim in claims} <= {"held", "void", "not applicable"}
-    assert restarted.summary["assumption_violations"]  # e.g. the input of a dead controller was old
+    assert restarted.summary["loops"][0][
+        "assumption_violations"
+    ]  # e.g. the input of a dead controller was old

@@ -136,8 +136,8 @@ def test_processes_with_other_clocks_carry_a_run(
         _, stderr = process.communicate(timeout=live.PATIENCE_S)
         assert process.returncode == 0, stderr
     summary, record = run.finished()
-    assert summary["missing_samples"] == summary["unintended_losses"] == 0
-    assert summary["replay"]["bit_exact"]  # type: ignore[index]
+    assert summary["loops"][0]["missing_samples"] == summary["loops"][0]["unintended_losses"] == 0
+    assert summary["loops"][0]["replay"]["bit_exact"]  # type: ignore[index]
     assert len(record["plant_step"]) == HORIZON_S * live.RATE_HZ + 1
     for table in ("plant_step", "controller_step"):  # nobody begins before the common epoch
         assert (record[table]["now_ns"] >= record[table]["t_ns"]).all()
@@ -148,7 +148,7 @@ def test_processes_with_other_clocks_carry_a_run(
         assert (np.abs(known["offset_ns"] - true_ns) <= known["error_ns"]).all()
         assert (np.diff(rows["now_ns"]) >= 0).all()
         assert (known["error_ns"] > 0).all() == (OWNER[table] in away)
-    (largest_s,) = {summary["conditions"]["clock_error_s"]}  # type: ignore[index]
+    (largest_s,) = {summary["loops"][0]["conditions"]["clock_error_s"]}  # type: ignore[index]
     assert 0 < largest_s < 1
 
 
@@ -168,7 +168,7 @@ def test_a_lost_bound_voids_all_claims_within_a_second(stack: ExitStack, tmp_pat
     assert len(lost) > 0
     since_s = max(lost["t_ns"].min(), 0) / NS_PER_S
     assert since_s <= answered_ns / NS_PER_S + 1
-    claims = summary["claims"]
+    claims = summary["loops"][0]["claims"]
     assert isinstance(claims, list)
     assert "held" not in {claim["verdict"] for claim in claims}
     why = "the bound of the error of controller's clock was lost"
@@ -178,7 +178,7 @@ def test_a_lost_bound_voids_all_claims_within_a_second(stack: ExitStack, tmp_pat
     assert void_s == pytest.approx(since_s, abs=1e-9)
     assert "controller clock lost" in {
         one["cause"]
-        for one in summary["assumption_violations"]  # type: ignore[attr-defined]
+        for one in summary["loops"][0]["assumption_violations"]  # type: ignore[attr-defined]
     }
     texts = [one["text"] for one in record.notices if one["process"] == "controller"]
     assert any(

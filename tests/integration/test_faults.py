@@ -33,9 +33,9 @@ def test_a_killed_recorder_is_named_and_no_recorded_row_is_lost(start: Start) ->
         rows = record[table]
         assert len(rows) > 10
         assert np.array_equal(rows["sequence"], np.arange(len(rows)))
-    assert finished.summary["missing_samples"] == 0
-    assert finished.summary["replay"]["bit_exact"]
-    assert finished.summary["replay"]["complete"]  # the others kept their final reports
+    assert finished.summary["loops"][0]["missing_samples"] == 0
+    assert finished.summary["loops"][0]["replay"]["bit_exact"]
+    assert finished.summary["loops"][0]["replay"]["complete"]  # the others kept their final reports
     assert (finished.run_dir / "recording.rrd").stat().st_size > 0
     assert reason in (finished.run_dir / "report.html").read_text()
     assert not (finished.run_dir / "spool").exists()
@@ -50,9 +50,9 @@ def test_a_frozen_recorder_is_named_and_no_row_is_lost(start: Start) -> None:
     finished = running.finish()
     assert finished.status == 1
     assert finished.summary["exit"]["reason"] == "recorder stopped responding"
-    assert finished.summary["missing_samples"] == 0
-    assert finished.summary["unintended_losses"] == 0
-    assert finished.summary["replay"]["bit_exact"]
+    assert finished.summary["loops"][0]["missing_samples"] == 0
+    assert finished.summary["loops"][0]["unintended_losses"] == 0
+    assert finished.summary["loops"][0]["replay"]["bit_exact"]
     steps = load_record(finished.run_dir)["plant_step"]
     # Rows exist up to the end of the lease: two seconds since the last keep-alive.
     assert len(steps) > 1.5 * 4 * live.RATE_HZ
@@ -84,7 +84,10 @@ def test_what_a_late_plant_sends_after_the_horizon_is_received(tmp_path: Path) -
             time.sleep(2.8)
             plant.send_signal(signal.SIGCONT)
             finished = running.finish()
-        lost = finished.summary["unintended_losses"] + finished.summary["missing_samples"]
+        lost = (
+            finished.summary["loops"][0]["unintended_losses"]
+            + finished.summary["loops"][0]["missing_samples"]
+        )
         steps = load_record(finished.run_dir)["plant_step"]
         was_late = (steps["now_ns"] - steps["t_ns"]).max() > 1e9
         if was_late and not lost and finished.status == 0:

@@ -68,10 +68,10 @@ def test_the_loop_outlives_the_coordinator(start: Start, by_hand: ByHand) -> Non
     outcome = reopen(run_dir)
     assert outcome.status == 1
     assert outcome.reason == "the launcher ended early"
-    assert outcome.summary["reached_s"] == horizon_s
-    assert outcome.summary["missing_samples"] == 0
-    replay = outcome.summary["replay"]
+    assert outcome.summary.reached_s == horizon_s
+    assert outcome.summary.loops[0].missing_samples == 0
+    replay = outcome.summary.loops[0].replay
     assert replay is not None
-    assert replay["bit_exact"]
+    assert replay.bit_exact
     steps = load_record(run_dir)["plant_step"]
     assert np.array_equal(steps["sequence"], np.arange(horizon_s * live.RATE_HZ + 1))

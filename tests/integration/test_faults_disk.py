@@ -110,7 +110,7 @@ def test_a_run_on_a_disk_that_fills_up_can_be_finalised_later(
     summary = json.loads((run_dir / "summary.json").read_text())
     assert summary["exit"] == {"status": 1, "reason": reason}
     assert reason in (run_dir / "report.html").read_text()
-    missing = summary["missing_samples"]
+    missing = summary["loops"][0]["missing_samples"]
     # Fill the disk before the summary is written, then before the report is written.
     for path in (run_dir / "summary.json", run_dir / "report.html"):
         path.unlink()
@@ -120,7 +120,7 @@ def test_a_run_on_a_disk_that_fills_up_can_be_finalised_later(
         reopen(run_dir)
     small.fill(but_bytes=1 << 16)
     again = reopen(run_dir)
-    assert (again.reason, again.summary["missing_samples"]) == (reason, missing)
+    assert (again.reason, again.summary.loops[0].missing_samples) == (reason, missing)
     warning = capsys.readouterr().err
     assert warning.startswith(f"noack: warning: no report.html: {run_dir}")
     assert warning.endswith("No space left on device\n")

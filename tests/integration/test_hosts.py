@@ -98,8 +98,8 @@ def test_two_hosts_carry_a_run(start: Start, hosts: TwoHosts, tmp_path: Path, ip
     stdout, stderr = ended(recording)
     assert recording.returncode == 0, stderr
     summary = json.loads(stdout)
-    assert summary["missing_samples"] == summary["unintended_losses"] == 0
-    assert summary["replay"]["bit_exact"]
+    assert summary["loops"][0]["missing_samples"] == summary["loops"][0]["unintended_losses"] == 0
+    assert summary["loops"][0]["replay"]["bit_exact"]
     tables = load_record((tmp_path / "runs" / "latest").resolve())
     assert len(tables["plant_step"]) == 4 * live.RATE_HZ + 1
     assert not (tmp_path / "invitation.json").exists()
@@ -193,11 +193,11 @@ def test_rows_of_a_host_that_was_cut_off_are_collected(
     stdout, stderr = ended(collecting)
     assert collecting.returncode == 0, stderr
     summary = json.loads(stdout)
-    assert summary["replay"]["bit_exact"]
-    assert summary["replay"]["complete"]
+    assert summary["loops"][0]["replay"]["bit_exact"]
+    assert summary["loops"][0]["replay"]["complete"]
     assert len(load_record(run_dir)["controller_step"]) == 8 * live.RATE_HZ
     again = start(0, "collect", str(run_dir), str(folder), "--json")
-    assert json.loads(ended(again)[0])["replay"] == summary["replay"]
+    assert json.loads(ended(again)[0])["replay"] == summary["loops"][0]["replay"]
 
 
 def test_a_host_that_comes_back_loses_no_row(start: Start, hosts: TwoHosts, tmp_path: Path) -> None:
@@ -219,10 +219,10 @@ def test_a_host_that_comes_back_loses_no_row(start: Start, hosts: TwoHosts, tmp_
     stdout, stderr = ended(recording)
     assert recording.returncode == 0, stderr
     summary = json.loads(stdout)
-    assert summary["replay"]["complete"]
-    assert summary["replay"]["bit_exact"]
-    assert summary["unintended_losses"] > 0
-    verdicts = {one["verdict"] for one in summary["claims"]}
+    assert summary["loops"][0]["replay"]["complete"]
+    assert summary["loops"][0]["replay"]["bit_exact"]
+    assert summary["loops"][0]["unintended_losses"] > 0
+    verdicts = {one["verdict"] for one in summary["loops"][0]["claims"]}
     assert "void" in verdicts
     assert "violated" not in verdicts
     steps = load_record((tmp_path / "runs" / "latest").resolve())["controller_step"]
@@ -300,8 +300,8 @@ def test_a_run_starts_its_processes_on_another_host(
     stdout, stderr = ended(run)
     assert run.returncode == 0, stderr
     summary = json.loads(stdout)
-    assert summary["missing_samples"] == 0
-    assert summary["replay"]["bit_exact"]
+    assert summary["loops"][0]["missing_samples"] == 0
+    assert summary["loops"][0]["replay"]["bit_exact"]
     run_dir = (tmp_path / "runs" / "latest").resolve()
     reports = json.loads((run_dir / "reports.json").read_text())
     places = {role: reports[role]["channel"]["local"].rpartition(":")[0] for role in LOOP_ROLES}

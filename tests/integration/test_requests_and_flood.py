@@ -67,15 +67,15 @@ def test_a_run_is_changed_twice_and_survives_a_flood(
     summary, record = finished.summary, load_record(finished.run_dir)
     assert finished.status == 143, finished.stderr
     assert summary["exit"]["reason"] == "stopped on request (SIGTERM)"
-    until_s = summary["judged_until_s"]
+    until_s = summary["loops"][0]["judged_until_s"]
     assert 0 < until_s <= summary["reached_s"] + 0.1
-    assert all((claim["since_s"] or 0.0) <= until_s for claim in summary["claims"])
-    assert [one for one in summary["claims"] if one["verdict"] == "violated"] == []
-    assert summary["missing_samples"] == summary["unintended_losses"] == 0
-    assert summary["replay"]["bit_exact"]
-    assert summary["replay"]["complete"]
-    assert summary["identity_residual_relative"] < 1e-9
-    assert set(summary["realtime"]) == set(LOOP_ROLES)
+    assert all((claim["since_s"] or 0.0) <= until_s for claim in summary["loops"][0]["claims"])
+    assert [one for one in summary["loops"][0]["claims"] if one["verdict"] == "violated"] == []
+    assert summary["loops"][0]["missing_samples"] == summary["loops"][0]["unintended_losses"] == 0
+    assert summary["loops"][0]["replay"]["bit_exact"]
+    assert summary["loops"][0]["replay"]["complete"]
+    assert summary["loops"][0]["identity_residual_relative"] < 1e-9
+    assert set(summary["loops"][0]["realtime"]) == set(LOOP_ROLES)
     assert running.left_behind() == []
 
     assert [one["t_s"] for one in summary["changes"]] == [first["from_s"], second["from_s"]]
@@ -85,7 +85,7 @@ def test_a_run_is_changed_twice_and_survives_a_flood(
     assert len(changes) == 2
     assert all("; requested at " in text for text in changes)
     if not any(one.late for one in changes_of(record)):  # a late change is a recorded violation
-        causes = {one["cause"] for one in summary["assumption_violations"]}
+        causes = {one["cause"] for one in summary["loops"][0]["assumption_violations"]}
         assert not causes & {"dropouts", "change"}
     assert [*(tmp_path / f"noack-{os.getuid()}" / "runs").iterdir()] == []
 
@@ -97,4 +97,4 @@ def test_a_run_is_changed_twice_and_survives_a_flood(
         assert channel["rejected"][SHED] > 1000
         assert channel["lost_in_kernel"] == 0
         assert len(channel["received_from"]) <= 17
-    assert summary["rejected_datagrams"].keys() == set(LOOP_ROLES)
+    assert summary["loops"][0]["rejected_datagrams"].keys() == set(LOOP_ROLES)

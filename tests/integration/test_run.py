@@ -53,7 +53,10 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     for _ in range(10):
         runs = tmp_path_factory.mktemp("runs")
         found = run_scenario(runs, *settings(speed=5.0, horizon_s=20.0), "--report")
-        if found.status or max(late["max"] for late in found.summary["lateness_us"].values()) < 1e5:
+        if (
+            found.status
+            or max(late["max"] for late in found.summary["loops"][0]["lateness_us"].values()) < 1e5
+        ):
             break
     return found
 
@@ -74,15 +77,16 @@ def record(request: pytest.FixtureRequest) -> RunRecord:
 
 def test_a_run_completes_with_a_complete_summary(finished: Finished) -> None:
     assert finished.status == 0, finished.stderr
-    assert finished.summary.keys() >= SUMMARY_KEYS
+    (loop,) = finished.summary["loops"]
+    assert finished.summary.keys() | loop.keys() >= SUMMARY_KEYS
     assert finished.summary["exit"] == {"status": 0, "reason": "horizon"}
-    assert finished.summary["missing_samples"] == 0
-    assert finished.summary["unintended_losses"] == 0
-    violations = finished.summary["assumption_violations"]
+    assert finished.summary["loops"][0]["missing_samples"] == 0
+    assert finished.summary["loops"][0]["unintended_losses"] == 0
+    violations = finished.summary["loops"][0]["assumption_violations"]
     assert "dropouts" not in {one["cause"] for one in violations}  # deadlines may be missed
-    assert finished.summary["rejected_datagrams"] == {}
+    assert finished.summary["loops"][0]["rejected_datagrams"] == {}
     for role in ("plant", "sensor", "controller", "netem"):
-        assert finished.summary["lateness_us"][role].keys() == {
+        assert finished.summary["loops"][0]["lateness_us"][role].keys() == {
             "p50", "p99", "p999", "max", "steps", "late_steps",
         }  # fmt: skip
 
@@ -221,14 +225,14 @@ def test_the_run_is_replayed_bit_for_bit(live: RunRecord, finished: Finished) ->
     assert found.gaps == []
     assert found.inputs == sum(len(live[table]) for table in tables(1, 1))
     assert all(leg.compared == leg.received > 0 for leg in found.messages)
-    assert finished.summary["replay"] == found.verdict() | {"error": None}
+    assert finished.summary["loops"][0]["replay"] == found.verdict() | {"error": None}
     assert finished.summary["kind"] == live.kind == "live"
 
 
 def test_fidelity_explains_the_difference_to_the_ideal_loop(
     finished: Finished,
 ) -> None:
-    fidelity = finished.summary["fidelity"]
+    fidelity = finished.summary["loops"][0]["fidelity"]
     assert fidelity["reason"] is None
     # All effects together explain the run up to rounding: 1e-14 of x, relative to a few per cent.
     assert fidelity["explained_relative"] < 1e-6
@@ -250,7 +254,7 @@ def test_the_recording_shows_the_record(finished: Finished, live: RunRecord) -> 
         batch = chunk.to_record_batch()
         if blueprint.TIMELINE in batch.schema.names:
             rows[chunk.entity_path.removeprefix("/")] += batch.num_rows
-    summary = finished.summary
+    (summary,) = finished.summary["loops"]
     assert rows[blueprint.FORCED] == summary["forced_deliveries"]
     assert rows[blueprint.RECEPTION] == summary["deliveries"] - summary["forced_deliveries"]
     assert rows[blueprint.DROP] == summary["drops"]
@@ -262,13 +266,13 @@ def test_the_recording_shows_the_record(finished: Finished, live: RunRecord) -> 
 
 def test_no_claim_with_checked_assumptions_is_violated(finished: Finished) -> None:
     """After missed deadlines, certificates are void and state time and cause."""
-    claims = [c for c in finished.summary["claims"] if c["source"] in OWN_CLAIMS]
+    claims = [c for c in finished.summary["loops"][0]["claims"] if c["source"] in OWN_CLAIMS]
     assert {c["source"] for c in claims} >= {"(I1)", "certificate", "box certificate"}
     for claim in claims:
         assert claim["verdict"] in ("held", "void"), claim
         assert (claim["since_s"] is None) == (claim["verdict"] == "held")
         assert claim["verdict"] == "held" or claim["why"]
-    conditions = finished.summary["conditions"]
+    conditions = finished.summary["loops"][0]["conditions"]
     mansd = finished.summary["mansd"]
     assert 0 < conditions["dropouts"] <= mansd
     assert conditions["delay_s"] >= conditions["sampling_s"] / 2 > 0

@@ -1,6 +1,6 @@
 """Replays machines from their recorded rows, generation by generation, up to the first gap."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
@@ -48,16 +48,20 @@ class MachineReplay:
 
     def take(self, part: Slice) -> None:
         """Replay the next part of the record."""
-        places = {table: self._numbers.places(part[table]) for table in self._tables}
-        several = len(self._lives) > 1
         self.newest = []
-        for i, life in enumerate(self._lives):
-            owned = {
-                table: part[table][places[table] == i] if several else part[table]
-                for table in self._tables
-            }
+        for owned, life in zip(self._by_life(part), self._lives, strict=True):
             if any(map(len, owned.values())):
                 self.newest += life.take(owned)
+
+    def _by_life(self, part: Slice) -> Iterator[Slice]:
+        """Yield the rows of each generation."""
+        owned = {table: part[table] for table in self._tables}
+        if len(self._lives) == 1:
+            yield owned
+            return
+        places = {table: self._numbers.places(rows) for table, rows in owned.items()}
+        for i in range(len(self._lives)):
+            yield {table: rows[places[table] == i] for table, rows in owned.items()}
 
     @property
     def results(self) -> tuple[ProcessReplay, ...]:

@@ -31,22 +31,22 @@ def check(
     """
     from cosim.output.assumptions_table import print_assumptions
     from noack.config.link_load import require_capacity
+    from noack.config.loops import loop_names
     from noack.config.resolution import resolve
     from noack.config.scenario_file import dumps as scenario_toml
     from noack.theory.assumptions import assumptions
 
     loaded = cli.load_scenario(scenario, settings)
-    if loaded.loops is not None:
+    if len(loop_names(loaded)) > 1:
         return _check_loops(loaded, json=json)
     resolved = resolve(loaded)
     _make_trigger(resolved)
     require_capacity(loaded)
-    verdicts = [assumption._asdict() for assumption in assumptions(resolved)]
     console = cli.console()
     console.width -= len(_COMMENT)
     with console.capture() as captured:  # printed last: the plant may be rejected
         console.print("the paper's assumptions for this scenario:")
-        print_assumptions(console, verdicts)
+        print_assumptions(console, assumptions(resolved))
         _print_plant(console, resolved)
     if json:
         cli.print_json(resolved.model_dump(mode="json"))

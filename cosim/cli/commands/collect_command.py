@@ -41,7 +41,7 @@ def collect(
         outcome = replace(merged, run_dir=run_dir)
         print_to_stderr(f"noack: {source}: took what {', '.join(roles) or 'no process'} kept")
     if json:
-        cli.print_json(outcome.summary)
+        cli.print_json(outcome.summary.to_json())
     else:
         print_outcome(cli.console(), outcome)
     return ExitStatus.OK

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 @cli.command(cli.RUNS, 80, [
     ("noack compare runs/A runs/B", "key numbers, and a page with the curves overlaid"),
     ("noack compare runs/A runs/B runs/C --out overlay.png", "the overlay as a picture"),
+    ("noack compare runs/A:left runs/A:right", "two loops of a run"),
     ("noack compare runs/A runs/B --json", "as JSON"),
 ])  # fmt: skip
 def compare(
@@ -23,7 +24,7 @@ def compare(
         list[Path],
         typer.Argument(
             metavar="RUN...",
-            help="Two to seven run directories, live or simulated.",
+            help="Two to seven run directories, live or simulated; RUN:NAME is a loop.",
             autocompletion=completion.run_directories,
         ),
     ],

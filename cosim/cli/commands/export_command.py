@@ -41,11 +41,12 @@ def export(
     from cosim.live.progress import PatientConsole
     from cosim.output.export.export_formats import export_run
 
-    chosen = chosen_run(run_dir, runs, loop)
+    chosen = chosen_run(run_dir, runs)
     reopen(chosen)
-    path = out or Path(f"{chosen.resolve().name}{file_format.suffix}")
+    name = chosen.resolve().name if loop is None else loop
+    path = out or Path(f"{name}{file_format.suffix}")
     with PatientConsole(stderr=True).status("exporting"):
-        written = export_run(chosen, path, file_format, certificates=certificates)
+        written = export_run(chosen, path, file_format, loop=loop, certificates=certificates)
     if json:
         cli.print_json({"files": [str(one) for one in written]})
     else:

@@ -38,9 +38,9 @@ def fidelity(
     from cosim.output.report.signal_figures import fidelity_figure
     from cosim.record.run_record import load_record
 
-    path = chosen_run(run_dir, runs, loop)
+    path = chosen_run(run_dir, runs)
     with PatientConsole(stderr=True).status("comparing"):
-        found = compute_fidelity(load_record(path))
+        found = compute_fidelity(load_record(path, loop))
         if out is not None:
             save_drawn(lambda: fidelity_figure(found), out, width)
     if json:

@@ -17,15 +17,15 @@ def replay(
     json: cli.JsonOption = False,
 ) -> int:
     """Replay a run's recorded inputs; compare the outputs bit for bit."""
-    from cosim.analysis.replay import replay as replay_record
     from cosim.analysis.replay.replay_table import print_replay
+    from cosim.analysis.replay.run_replay import replay_run
     from cosim.live.progress import PatientConsole
     from cosim.record.environment import changed_since
-    from cosim.record.run_record import load_record
+    from cosim.record.run_record import load_run
 
-    path = chosen_run(run_dir, runs, loop)
+    path = chosen_run(run_dir, runs)
     with PatientConsole(stderr=True).status("replaying"):
-        found = replay_record(load_record(path, network=True))
+        found = replay_run(load_run(path), loop)
     changed = changed_since(path)
     if json:
         cli.print_json(found.document() | {"changed_since": changed})

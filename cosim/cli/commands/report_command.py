@@ -31,10 +31,13 @@ def report(
     from cosim.live.finalize import run_report
     from cosim.output.figure_format import figure_files
 
-    chosen = chosen_run(run_dir, runs, loop)
+    chosen = chosen_run(run_dir, runs)
     figure_files(figure_format, width)  # refuses a wrong width before anything is drawn
-    path = run_report(chosen, again=again)
-    figures = [] if figure_format is None else open_run(chosen).save_figures(figure_format, width)
+    path, figures = run_report(chosen, loop, again=again), []
+    if figure_format is not None:
+        opened = open_run(chosen)
+        shown = opened if loop is None else opened.loops[loop]
+        figures = shown.save_figures(figure_format, width)
     if json:
         written = {"figures": [str(one) for one in figures]} if figures else {}
         cli.print_json({"report": str(path)} | written)

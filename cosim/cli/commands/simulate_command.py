@@ -1,6 +1,6 @@
 """``noack simulate``: a run in virtual time."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from cosim.cli import command as cli
 from cosim.cli.execute_run import RunOutput, finalize_run, warn_of_violations
@@ -10,7 +10,6 @@ from noack.core.number_format import number
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from cosim.analysis.run_summary import Summary
     from cosim.simulation.continuous.continuous_run import ContinuousRun
     from noack.config.scenario import Scenario
 
@@ -44,7 +43,7 @@ def simulate(
     from cosim.live.simulated_run import simulate_run
 
     with simulation_bar(PatientConsole(stderr=True), loaded.horizon_s) as progress:
-        ending = simulate_run(loaded, runs, progress=progress)
+        ending = simulate_run(loaded, runs, progress)
     return finalize_run(ending, RunOutput(report, verbose, json))
 
 
@@ -67,23 +66,39 @@ def _simulate_continuously(scenario: "Scenario", *, json: bool) -> int:
     return ExitStatus(found["exit"]["status"])
 
 
-def _print_run(console: "Console", run: "ContinuousRun", found: "Summary") -> None:
+def _print_run(console: "Console", run: "ContinuousRun", found: dict[str, Any]) -> None:
     """Print how the run ended, its key numbers, and its first 40 events."""
     import numpy as np
     from rich.table import Table
     from rich.text import Text
 
-    from cosim.output.run_tables import loss_and_interval_rows, number_table
-    from cosim.output.run_verdict import verdict
+    from cosim.analysis.summary_model import ExitPart
+    from cosim.output.run_tables import (
+        interval_rows,
+        longest_burst,
+        lost_row,
+        number_table,
+        title_of,
+    )
+    from cosim.output.run_verdict import ending_line, transmission_line
 
-    for line in verdict(found)[:2]:  # without claims
+    ending = ending_line(ExitPart(**found["exit"]), found["reached_s"], found["horizon_s"])
+    for line in (ending, transmission_line(found["events"], found["deliveries"])):
         console.print(Text(line.text, line.style), soft_wrap=True)
+    mansd = found["mansd"]
     rows = (
-        *loss_and_interval_rows(found),
+        lost_row(found["drops"], found["deliveries"]),
+        longest_burst(mansd, (), found["longest_loss_burst"]),
+        *interval_rows(
+            found["inter_event_min_s"],
+            found["inter_event_median_s"],
+            found["inter_delivery_median_s"],
+        ),
         ("‖x‖ at the start", number(found["initial_state_norm"])),
         ("‖x‖ at the end", number(found["final_state_norm"])),
     )
-    console.print(number_table(found, rows))
+    title = title_of(found["scenario"], found["mode"], mansd, (), found["kind"])
+    console.print(number_table(title, rows))
     table = Table(title="events")
     for heading in ("event", "t, s", "inter-event time, s", "fate", "‖x‖", "‖e_c‖ before"):
         table.add_column(heading, justify="right")

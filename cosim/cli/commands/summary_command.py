@@ -24,13 +24,14 @@ def summary(
 
     Exit status 0: the summary was shown, also that of a failed run.
     """
+    from cosim.analysis.run_summary import outcome_of_loop
     from cosim.live.finalize import reopen
     from cosim.output.run_result_tables import summary_tables
     from cosim.output.run_verdict import print_outcome
 
-    outcome = reopen(chosen_run(run_dir, runs, loop))
+    outcome = outcome_of_loop(reopen(chosen_run(run_dir, runs)), loop)
     if json:
-        cli.print_json(outcome.summary)
+        cli.print_json(outcome.summary.to_json())
     else:
         print_outcome(cli.console(), outcome, verbose=verbose)
     cli.write_tables(summary_tables(outcome.summary), tables, json=json)

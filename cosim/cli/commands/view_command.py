@@ -7,7 +7,7 @@ import typer
 
 from cosim.cli import command as cli
 from cosim.cli import completion
-from cosim.record.run_directory import RECORDING_FILE, chosen_run
+from cosim.record.run_directory import RECORDING_FILE, SCENARIO_FILE, chosen_run, file_of_loop
 from noack.core.errors import ExitStatus
 
 
@@ -34,14 +34,14 @@ def view(
 ) -> int:
     """Show a run in the rerun viewer.
 
-    A missing recording, as of one of several loops, is written first.
+    A missing recording, as that of one loop alone, is written first.
     """
     from cosim.output.viewer.live_viewer import view_recording
 
-    path = chosen_run(recording, runs, loop)
-    path = path / RECORDING_FILE if path.is_dir() else path
-    if path.name == RECORDING_FILE and path.parent.is_dir() and not path.is_file():
-        _write(path.parent)
+    path = chosen_run(recording, runs)
+    path = path / file_of_loop(RECORDING_FILE, loop) if path.is_dir() else path
+    if (path.parent / SCENARIO_FILE).is_file() and not path.is_file():
+        _write(path.parent, loop)
     if json:
         cli.print_json({"recording": str(path), "exists": path.is_file()})
         return ExitStatus.OK if path.is_file() else ExitStatus.CALLER
@@ -49,9 +49,9 @@ def view(
     return ExitStatus.OK
 
 
-def _write(run_dir: Path) -> None:
+def _write(run_dir: Path, loop: str | None) -> None:
     from cosim.live.finalize import write_recording
     from cosim.live.progress import PatientConsole
 
     with PatientConsole(stderr=True).status("writing the recording"):
-        write_recording(run_dir)
+        write_recording(run_dir, loop)

@@ -47,7 +47,7 @@ def opened(directory: Path, width_in: float) -> Opened:
         for name in _FIGURES:
             with suppress(NoackError):
                 figures.append(inline(run.plot(name), f"run-{name}", f"figure: {name}"))
-    claims = [(str(one["verdict"]), f"{one['what']} ({one['source']})") for one in run.claims]
+    claims = [(str(one.verdict), f"{one.what} ({one.source})") for one in run.claims]
     lines = [(line.text, line.style) for line in verdict(run.summary)]
     return Opened(lines, run_facts(run), claims, figures)
 

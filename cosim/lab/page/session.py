@@ -102,7 +102,7 @@ class Session:
         self.mistakes, self.note = [], ""
         try:
             scenario = self.draft.scenario
-            if scenario.loops is not None:
+            if scenario.loops:
                 self.run, self.note = None, "a scenario of several loops: run it live"
                 return
             if (why := why_not_exact(scenario)) is None:

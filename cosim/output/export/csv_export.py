@@ -9,8 +9,7 @@ from pyarrow import csv
 
 from cosim.output.export.exported_run import ExportedRun
 from cosim.record.data_frames import events, samples, with_seconds
-from cosim.record.run_directory import RECORD
-from cosim.record.table_files import read_table
+from cosim.record.table_files import arrow_table
 from noack.core.file_access import write_whole
 
 
@@ -25,15 +24,14 @@ def write_csv(run: ExportedRun, folder: Path) -> list[Path]:
         buffer = io.BytesIO()
         csv.write_csv(_with_hex(table), buffer)
         written.append(write_whole(folder / f"{name}.csv", buffer.getvalue()))
-    for loop in run.loops():
+    for loop in run.inner:
         written += write_csv(loop, folder / loop.name)
     return written
 
 
 def _tables(run: ExportedRun) -> Iterator[tuple[str, pa.Table]]:
-    for name, rows in run.record.tables.items():
-        path = run.directory / RECORD / f"{name}.parquet"
-        yield name, with_seconds(read_table(path, rows))
+    for name in run.record.tables:
+        yield name, with_seconds(arrow_table(run.record[name]))
     if not run.record.is_network:
         yield "samples", samples(run.record)
         yield "events", events(run.record)

@@ -20,7 +20,12 @@ class ExportFormat(StrEnum):
 
 
 def export_run(
-    run_dir: Path, path: Path, kind: ExportFormat | None = None, *, certificates: bool = True
+    run_dir: Path,
+    path: Path,
+    kind: ExportFormat | None = None,
+    *,
+    loop: str | None = None,
+    certificates: bool = True,
 ) -> list[Path]:
     """Export a run; return the written files.
 
@@ -28,6 +33,7 @@ def export_run(
         run_dir: the run directory, which has a summary.
         path: the file, or for CSV the folder.
         kind: the format; by default that of the path's ending.
+        loop: name of the loop to export; by default the whole run.
         certificates: whether a file of MATLAB has the certificates of each loop.
 
     Raises:
@@ -42,7 +48,7 @@ def export_run(
     if found is None or found.suffix not in ("", path.suffix):
         expected = "a folder, .mat or .mcap" if kind is None else found and found.suffix
         raise CallerError(f"{path}: an export is written to {expected}")
-    run = exported_run(run_dir)
+    run = exported_run(run_dir, loop)
     if found is ExportFormat.MAT:
         from cosim.output.export.mat_export import write_mat
 

@@ -55,7 +55,7 @@ def _content(run: ExportedRun, *, certificates: bool) -> dict[str, Any]:
     found["environment"] = run.environment
     if record.is_network:
         found["loops"] = {
-            loop.name: _content(loop, certificates=certificates) for loop in run.loops()
+            loop.name: _content(loop, certificates=certificates) for loop in run.inner
         }
         return found
     for name, table in (("samples", samples(record)), ("events", events(record))):

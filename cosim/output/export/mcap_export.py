@@ -76,10 +76,10 @@ def _write(writer: "Writer", run: ExportedRun) -> None:
             writer.add_attachment(0, 0, name, media, (run.directory / name).read_bytes())
     _write_log(writer, run)
     _write_tables(writer, run, [*record.tables])
-    for loop in run.loops():
+    for loop in run.inner:
         own = [table for table in loop.record.tables if OWNER[table] != "netem"]
         _write_tables(writer, loop, own)
-    for one in [*run.loops()] or [run]:
+    for one in run.inner or [run]:
         _write_errors(writer, one)
 
 

@@ -3,24 +3,35 @@
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+from urllib.parse import quote
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from cosim.analysis.claims.claims_by_part import RunClaims
 from cosim.analysis.fidelity import is_against
-from cosim.analysis.summary_model import ReplayDifference
+from cosim.analysis.over_time import WorstLoop, worst_loop
+from cosim.analysis.summary_model import RunSummary
+from cosim.output.network_table import CAPTION, HEADINGS, badness, loop_row, network_rows
 from cosim.output.remarks import remarks
 from cosim.output.report.figure_files import inline
+from cosim.output.report.network_figures import network_pictures
 from cosim.output.report.run_figures import Envelope, RunFigure, pictures
 from cosim.output.run_tables import TIMING_HEADINGS, interval_of, key_numbers, timing_rows
 from cosim.output.run_verdict import BAD, GOOD, NEUTRAL, verdict
-from cosim.record.run_directory import ENVIRONMENT_FILE, REPORT_FILE, SCENARIO_FILE, read_object
-from cosim.record.run_record import RunRecord
+from cosim.record.run_directory import (
+    ENVIRONMENT_FILE,
+    REPORT_FILE,
+    SCENARIO_FILE,
+    file_of_loop,
+    read_object,
+)
+from cosim.record.run_record import RecordedRun, RunRecord
 from noack.config.scenario import Scenario
 from noack.core.file_access import write_whole
-from noack.core.number_format import number, percent
+from noack.core.number_format import number, percent, seconds
 
 _NONE = "–"
 TIMING_FIGURES = ("lateness", "latency", "clocks")
@@ -32,19 +43,11 @@ _TONES = {
 }  # fmt: skip
 
 
+@np.errstate(all="ignore")  # a run may diverge
 def write_report(
-    record: RunRecord,
-    summary: Mapping[str, Any],
-    run_dir: Path,
-    envelopes: Sequence[Envelope] = (),
+    run: RecordedRun, summary: RunSummary, run_dir: Path, loop: str | None = None
 ) -> Path:
-    """Write the report of a run; replace an existing one.
-
-    Args:
-        record: the run's record.
-        summary: the run's summary.
-        run_dir: the run's directory.
-        envelopes: certified bounds, drawn with the quantities that they bound.
+    """Write the report of a run, or of one of its loops; replace an existing one.
 
     Returns:
         The report's path.
@@ -52,51 +55,108 @@ def write_report(
     Raises:
         MachineError: the report cannot be written.
     """
-    drawings = pictures(record, envelopes, timed=summary["kind"] == "live")
-    scenario_toml = (run_dir / SCENARIO_FILE).read_text(encoding="utf-8")
-    environment = read_object(run_dir / ENVIRONMENT_FILE)
-    figures = [draw() for draw in drawings.values()]
-    html = page(record.scenario, summary, figures, scenario_toml, environment)
-    return write_whole(run_dir / REPORT_FILE, html)
+    shown = summary if loop is None else summary.of_loop(loop)
+    worst = worst_loop(shown.loops)
+    record = run.loops[worst.number]
+    drawings = pictures(record, envelopes_of(record), timed=shown.kind == "live")
+    html = page(
+        record.scenario,
+        shown,
+        [draw() for draw in drawings.values()],
+        (run_dir / SCENARIO_FILE).read_text(encoding="utf-8"),
+        read_object(run_dir / ENVIRONMENT_FILE),
+        None if len(shown.loops) == 1 else _network_part(run, shown, run_dir, worst),
+    )
+    return write_whole(run_dir / file_of_loop(REPORT_FILE, loop), html)
+
+
+def envelopes_of(record: RunRecord) -> Sequence[Envelope]:
+    """Return the certified bounds of a loop, to be drawn with the quantities that they bound."""
+    try:
+        return RunClaims(record).envelopes()
+    except Exception:  # the figures are useful without them
+        return []
+
+
+class _NetworkPart(NamedTuple):
+    """What the report of several loops has besides that of the worst one."""
+
+    description: str
+    rows: Sequence[tuple[str, str]]
+    figures: Sequence[RunFigure]
+    worst: str
+    worst_why: str
+    caption: str
+    headings: Sequence[str]
+    loops: Sequence[tuple[str | None, Sequence[str]]]
+    """Of each loop, the worst first: the address of its report, and its row."""
+
+
+def _network_part(
+    run: RecordedRun, summary: RunSummary, run_dir: Path, worst: WorstLoop
+) -> _NetworkPart:
+    loops = sorted(summary.loops, key=badness, reverse=True)
+    loop = summary.loops[worst.number]
+    begin = f"Its time starts {seconds(loop.phase_s)} after that of the run."
+    return _NetworkPart(
+        description=run.scenario.description,
+        rows=network_rows(summary),
+        figures=list(network_pictures(run, summary).values()),
+        worst=f"{loop.name} (number {loop.number})",
+        worst_why=f"{worst.why[:1].upper()}{worst.why[1:]}. {begin}",
+        caption=CAPTION,
+        headings=HEADINGS,
+        loops=[(_link(run_dir, one.name), loop_row(one)) for one in loops],
+    )
+
+
+def _link(run_dir: Path, name: str) -> str | None:
+    """Return the address of a loop's report; None if it is not written."""
+    file = file_of_loop(REPORT_FILE, name)
+    return quote(file) if (run_dir / file).is_file() else None
 
 
 def page(
     scenario: Scenario,
-    summary: Mapping[str, Any],
+    summary: RunSummary,
     figures: Sequence[RunFigure],
     scenario_toml: str,
     environment: Mapping[str, Any],
+    network: _NetworkPart | None = None,
 ) -> str:
     """Return the report of a run as HTML; everything but figures is escaped.
 
     Args:
-        scenario: the resolved scenario.
-        summary: the content of ``summary.json``.
-        figures: the run's figures, in order.
-        scenario_toml: the resolved scenario, as stored in the run directory.
+        scenario: the resolved scenario of the only loop, or of the worst one.
+        summary: the summary of the run.
+        figures: the figures of this loop, in order.
+        scenario_toml: the scenario of the run, as stored in the run directory.
         environment: the content of ``environment.json``; empty if there is none.
+        network: what is shown of all loops, if there are several.
     """
-    content = dict(summary)
-    lines, remarks_shown = verdict(content), [remark.text for remark in remarks(content)]
+    one = summary.of_loop(summary.loops[0].name if network is None else scenario.name)
+    (loop,) = one.loops
+    lines, remarks_shown = verdict(summary), [remark.text for remark in remarks(one)]
     styles = {line.style for line in lines} - {NEUTRAL}
-    tone = "bad" if BAD in styles else "good" if styles == {GOOD} and not remarks_shown else "doubt"
-    replay = summary.get("replay") or {}
+    is_good = styles == {GOOD} and (network is not None or not remarks_shown)
+    # These have their own sections.
+    rest = one.model_copy(
+        update={"loops": [loop.model_copy(update={"fidelity": None, "replay": None})]}
+    )
     return templates().get_template("report.html.jinja").render(
         scenario=scenario,
         summary=summary,
+        one=loop,
+        network=network,
         verdict_lines=[line.text for line in lines],
-        verdict_tone=tone,
+        verdict_tone="bad" if BAD in styles else "good" if is_good else "doubt",
         remarks=remarks_shown,
-        # These have their own sections.
-        key_numbers=key_numbers({**summary, "fidelity": None, "replay": None}),
+        key_numbers=key_numbers(rest),
         parameters=list(_parameters(scenario)),
         figures=figures,
         timing_figures=TIMING_FIGURES,
-        timing=list(timing_rows(content)),
+        timing=list(timing_rows(loop)),
         timing_headings=TIMING_HEADINGS,
-        replay=replay,
-        replay_difference=replay.get("bit_exact") is False
-        and ReplayDifference(**replay["first_difference"]),
         scenario_toml=scenario_toml,
         environment=environment,
         environment_rows=environment_rows(environment),

@@ -5,18 +5,22 @@ requests to a running viewer can. The web viewer accepts a protobuf message
 ``ViewerControlRequest``, the window accepts the requests of rerun's client.
 """
 
-import json
 import re
 import subprocess
 import time
 from pathlib import Path
 from typing import IO, Any
 
-from cosim.analysis.loops_over_time import worst_loop
-from cosim.analysis.loops_summary import has_loops
+from cosim.analysis.over_time import worst_loop
+from cosim.analysis.summary_model import read_summary
 from cosim.output.viewer.pictures.picture import TIMELINE
 from cosim.output.viewer.rerun_program import logged_port
-from cosim.record.run_directory import LOOPS, SUMMARY_FILE
+from cosim.record.run_directory import (
+    RECORDING_FILE,
+    SUMMARY_FILE,
+    loop_of_file,
+    read_object,
+)
 from noack.core.clock import NS_PER_S
 
 _RETRY_S = 0.25
@@ -38,22 +42,18 @@ _SCRIPT = """<script>
 def opening_time_ns(recording: Path) -> int | None:
     """Return the time of the largest ‖e_c‖ from the recording's summary; None without a summary.
 
-    Of several loops, it is that of the worst one.
+    In the recording of the run, it is that of the worst loop.
     """
-    run_dir, begin_s = recording.parent, 0.0
-    try:
-        summary = _summary(run_dir)
-        if has_loops(summary):
-            worst = summary["loops"][worst_loop(run_dir, summary["loops"]).number]
-            summary, begin_s = _summary(run_dir / LOOPS / worst["name"]), worst["phase_s"]
-        at_s: float = summary["sup_e_c_at_s"]
-        return round((begin_s + at_s) * NS_PER_S)
-    except (OSError, ValueError, KeyError, TypeError):
+    name = loop_of_file(recording.name, RECORDING_FILE)
+    summary = read_summary(read_object(recording.parent / SUMMARY_FILE))
+    if summary is None or name not in (None, *(one.name for one in summary.loops)):
         return None
-
-
-def _summary(run_dir: Path) -> Any:
-    return json.loads((run_dir / SUMMARY_FILE).read_text(encoding="utf-8"))
+    loops = {one.number: one for one in summary.loops if name in (None, one.name)}
+    loop = loops[worst_loop([*loops.values()]).number]
+    if loop.sup_e_c_at_s is None:
+        return None
+    begin_s = loop.phase_s if name is None else 0.0
+    return round((begin_s + loop.sup_e_c_at_s) * NS_PER_S)
 
 
 def script_to_open_at(t_ns: int) -> bytes:

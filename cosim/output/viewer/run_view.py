@@ -2,21 +2,29 @@
 
 import errno
 import os
+import secrets
 from pathlib import Path
 from shutil import disk_usage
 
+import numpy as np
+
+from cosim.analysis.over_time import loops_over_time, worst_loop
+from cosim.analysis.summary_model import RunSummary
 from cosim.output.viewer.live_viewer import LiveView
-from cosim.output.viewer.pictures.network_picture import LEG_S, NetworkDiagram
+from cosim.output.viewer.network_recording import ERROR, PICTURED, SIZE, NetworkRecording
+from cosim.output.viewer.pictures.network_picture import NetworkDiagram
 from cosim.output.viewer.pictures.picture_choice import picture_of
 from cosim.output.viewer.recording import RunView
 from cosim.output.viewer.recording_file import ViewError
-from cosim.output.viewer.table_feed import ViewFeed
+from cosim.output.viewer.recording_text import about
+from cosim.output.viewer.table_feed import ViewFeed, log_level
 from cosim.record.decimate import is_long
 from cosim.record.environment import Kind
-from cosim.record.run_directory import RECORDING_FILE
-from cosim.record.run_record import RunRecord
-from noack.config.resolution import loop_of
+from cosim.record.run_directory import RECORDING_FILE, file_of_loop
+from cosim.record.run_record import RecordedRun, RunRecord
+from noack.config.resolution import loop_of, resolved_loops
 from noack.config.scenario import Scenario
+from noack.core.clock import NS_PER_S
 from noack.protocol.topology import LOOP_ROLES
 
 _INDEXED_S = 120.0
@@ -27,18 +35,31 @@ _SPARE_BYTES = 4 * 2**20
 
 
 def open_view(
+    scenario: Scenario, run_dir: Path, run_id: int, live: LiveView | None
+) -> RunView | NetworkRecording:
+    """Create the recording of a run, which is written while the run goes on."""
+    loops = resolved_loops(scenario)
+    if len(loops) > 1:
+        shown = dict(enumerate(loops)) if len(loops) <= PICTURED else {}
+        return NetworkRecording(
+            scenario, run_dir, run_id, shown, worst=None, kind="live", live=live
+        )
+    return loop_view(loops[0], run_dir / RECORDING_FILE, run_id, live)
+
+
+def loop_view(
     scenario: Scenario,
-    run_dir: Path,
+    path: Path,
     run_id: int,
-    live: LiveView | None,
+    live: LiveView | None = None,
     kind: Kind = "live",
     *,
     at_once: bool = False,
 ) -> RunView:
-    """Create the recording of a run; it is written afterwards, at once or during the run."""
+    """Create the recording of one loop; it is written afterwards, at once or during the run."""
     loop = loop_of(scenario)
     return RunView(
-        run_dir / RECORDING_FILE,
+        path,
         run_id=f"{run_id:016x}",
         title=f"{scenario.name} ({scenario.mode})",
         about=about(scenario, kind),
@@ -56,21 +77,57 @@ def open_view(
     )
 
 
-def write_view(record: RunRecord, run_dir: Path, run_id: int) -> None:
-    """Write a run's recording from its record; that of a long run shows extremes only."""
-    scenario = record.scenario
-    columns = record.slice_columns if is_long(scenario) else None
-    require_space(run_dir)
-    with open_view(scenario, run_dir, run_id, None, record.kind, at_once=True) as view:
-        feed_record(ViewFeed(scenario, view, columns), record, run_dir)
-
-
-def feed_record(feed: ViewFeed, record: RunRecord, run_dir: Path) -> None:
-    """Pass a record to the view, part by part, while there is space in its folder.
+def write_view(run: RecordedRun, summary: RunSummary, run_dir: Path, loop: str | None) -> None:
+    """Write the recording of a run, or of one of its loops, from its record and its summary.
 
     Raises:
-        ViewError: there is no more space, or the recording cannot be written.
+        ViewError: the recording cannot be written.
     """
+    require_space(run_dir)
+    run_id = secrets.randbits(64)  # the viewer knows recordings by it
+    if loop is None and len(run.loops) > 1:
+        _write_network_view(run, summary, run_dir, run_id)
+        return
+    write_loop_view(run.loop(loop), run_dir / file_of_loop(RECORDING_FILE, loop), run_id)
+
+
+def write_loop_view(record: RunRecord, path: Path, run_id: int) -> None:
+    """Write the recording of one loop; that of a long run shows extremes only."""
+    require_space(path.parent)
+    with loop_view(record.scenario, path, run_id, None, record.kind, at_once=True) as view:
+        _feed_record(record, view, path.parent)
+
+
+def _write_network_view(run: RecordedRun, summary: RunSummary, run_dir: Path, run_id: int) -> None:
+    over_time, worst = loops_over_time(run), worst_loop(summary.loops)
+    few = len(run.loops) <= PICTURED
+    records = {
+        number: run.loops[number] for number in (range(len(run.loops)) if few else [worst.number])
+    }
+    loops = {number: record.scenario for number, record in records.items()}
+    with NetworkRecording(
+        run.scenario, run_dir, run_id, loops, worst=worst, kind=run.kind
+    ) as whole:
+        flying = summary.network.in_flight
+        largest = np.array(flying.max_by_interval, np.float64)
+        queue_ns = (np.arange(len(largest)) + 0.5) * flying.width_s * NS_PER_S
+        whole.queue(queue_ns.astype(np.int64), largest, np.array(flying.mean_by_interval))
+        middles_ns = (over_time.middles_s * NS_PER_S).astype(np.int64)
+        whole.norms(ERROR, middles_ns, over_time.errors)
+        whole.norms(SIZE, middles_ns, over_time.states)
+        whole.map(over_time.errors)
+        ends_s, shares = over_time.shares()
+        whole.share(((ends_s - ends_s[0] / 2) * NS_PER_S).astype(np.int64), shares)
+        for notice in run.network.notices:
+            whole.log(int(notice["t_ns"]), log_level(notice), str(notice["text"]))
+        for number, record in records.items():
+            _feed_record(record, whole.views[number], run_dir)
+
+
+def _feed_record(record: RunRecord, view: RunView, run_dir: Path) -> None:
+    """Pass a record to a view, part by part, while there is space in its folder."""
+    columns = record.slice_columns if is_long(record.scenario) else None
+    feed = ViewFeed(record.scenario, view, columns)
     for i, part in enumerate(record.slices()):
         require_space(run_dir)
         if i:
@@ -87,37 +144,3 @@ def require_space(run_dir: Path) -> None:
     if disk_usage(run_dir).free < _SPARE_BYTES:
         path = run_dir / RECORDING_FILE
         raise ViewError(f"{path}: cannot write the recording: {os.strerror(errno.ENOSPC)}")
-
-
-def about(scenario: Scenario, kind: Kind = "live") -> str:
-    """Return the viewer's text about a run, in Markdown."""
-    network = scenario.network
-    late = {
-        "live": "* **Lateness**: wall time between a deadline and the process's action.",
-        "simulated": "* The run was **simulated** in virtual time: no deadline was missed.",
-    }[kind]
-    hold = "a model of the plant" if scenario.mode == "model" else "a zero-order hold"
-    return f"""# {scenario.name}
-
-{scenario.description}
-
-Sensor and controller run **{hold}** between updates. The sensor transmits when
-{scenario.trigger.description}.
-The network ({network.loss.model.replace("_", "-")} loss) guarantees:
-{network.guarantee.meaning}.
-{scenario.protocol.summary}
-
-* A finished run opens at its largest ‖e_c‖. **Colours** explains the colours.
-* **Picture**: the plant (solid), the sensor's model (outline) and the controller's model (dashed
-  outline). Play the run to animate it.
-* **Packets**: each update in flight. A lost one falls; a forced delivery is a diamond. A flight
-  takes microseconds but is animated as {LEG_S:g} s per hop, so x_c jumps before the dot arrives.
-* **States**: the plant's x, the sensor's model x_s (reset {scenario.protocol.reset}), the
-  controller's model x_c (reset by each delivery). Where x_c differs from the other two, packets
-  were lost.
-* **Intervals**: time since the previous transmission, and since the previous delivery.
-* **Errors**: e_s = x_s − x with its threshold; e_c = x_c − x with two bounds, one from identity
-  (I1) and the certified one. No process of the loop can measure e_c. The certified bound holds
-  while no process is later than the certificate allows (see the claims of the summary).
-{late}
-"""

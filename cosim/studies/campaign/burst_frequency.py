@@ -46,7 +46,7 @@ def burst_frequency(scenario: Scenario, metrics: Mapping[Metric, Vector]) -> Bur
     from scipy.stats import binomtest
 
     network = scenario.network
-    if network.enforce_mansd or scenario.loops is not None:
+    if network.enforce_mansd or scenario.loops:
         return None
     bursts, packets = metrics["longest_loss_burst"], metrics["transmissions"]
     finished = np.isfinite(bursts)

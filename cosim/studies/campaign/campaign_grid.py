@@ -17,10 +17,10 @@ from cosim.simulation.batch.batch_interface import ROW, Setting, run_batch, sett
 from cosim.simulation.continuous.network_fates import timeless
 from cosim.studies.campaign.campaign_file import LOOPS, Campaign, Value, scales_loops
 from cosim.studies.campaign.campaign_workers import Work
-from cosim.studies.campaign.loops_draws import LoopsWork
 from cosim.studies.campaign.metrics import certified_error
 from cosim.studies.campaign.random_draws import Box, box_of
 from cosim.studies.campaign.sampled_draws import SampledWork, in_virtual_time
+from cosim.studies.campaign.shared_network_draws import SharedNetworkWork
 from noack.config import toml_file
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
@@ -115,7 +115,7 @@ def grid(campaign: Campaign, path: Path) -> list[Point]:
         except (CallerError, ValueError) as error:
             raise CallerError(f"{source}: {error}") from None
         points.append(Point(number, place, labels, values, scenario, certified, work))
-    if len({point.scenario.loops is None for point in points}) > 1:
+    if len({type(point.work) for point in points}) > 1:
         raise CallerError(f"{path}: axes: either all grid points have loops, or none has")
     _require_effects(campaign, points, path)
     entries = (entry.name for point in points for entry in point.scenario.loops or ())
@@ -125,14 +125,14 @@ def grid(campaign: Campaign, path: Path) -> list[Point]:
 
 
 def _with_entries(point: Point, names: tuple[str, ...]) -> Point:
-    assert isinstance(point.work, LoopsWork)
+    assert isinstance(point.work, SharedNetworkWork)
     return replace(point, work=replace(point.work, entries=names))
 
 
 def row_type(points: Sequence[Point]) -> np.dtype[np.void]:
     """Return the type of the rows of runs."""
     work = points[0].work
-    return work.row_type if isinstance(work, LoopsWork) else ROW
+    return work.row_type if isinstance(work, SharedNetworkWork) else ROW
 
 
 def _scaled(entries: Any, value: Any, source: str) -> list[dict[str, Any]]:
@@ -188,12 +188,12 @@ def _work(campaign: Campaign, scenario: Scenario) -> tuple[Work, float | None]:
         "settle": metrics.settle,
         "most_events": metrics.most_events,
     }
-    if scenario.loops is not None:
+    if scenario.loops:
         if campaign.time != "sampled":
-            raise CallerError('loops: a network that several loops share needs time = "sampled"')
+            raise CallerError('loops: a network that loops share needs time = "sampled"')
         judges = "loops_claims_held" in campaign.measured_metrics
         measured |= {"judges": judges, "count_from_s": metrics.count_from_s}
-        work = LoopsWork(in_virtual_time(scenario), campaign.seed, **measured)
+        work = SharedNetworkWork(in_virtual_time(scenario), campaign.seed, **measured)
         return work, None
     resolved = resolve(scenario)
     if campaign.time == "sampled":

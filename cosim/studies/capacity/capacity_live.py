@@ -13,14 +13,12 @@ import numpy as np
 
 from cosim.live.finalize import finalize
 from cosim.live.launcher import launch
-from cosim.record.loops_run import loop_directories
-from cosim.record.run_directory import SUMMARY_FILE, read_object
-from cosim.record.run_record import RunRecord, load_record
+from cosim.record.run_record import load_run
 from cosim.studies.campaign.campaign_summary import GridPointResult
 from cosim.studies.campaign.draw_statistics import Estimate
-from cosim.studies.campaign.loops_draws import LoopsWork
 from cosim.studies.campaign.metrics import Metric, measured
 from cosim.studies.campaign.random_draws import seeds_of
+from cosim.studies.campaign.shared_network_draws import SharedNetworkWork
 from cosim.studies.capacity.capacity_criteria import LIMITS
 from cosim.studies.capacity.capacity_plan import DISTURBANCE, LOOPS, OWN, POLICY, CapacityPlan
 from noack.core.errors import CallerError
@@ -84,19 +82,18 @@ def live_point(
 
 def _live_point(found: GridPointResult, folder: Path) -> LivePoint:
     point, work = found.point, found.point.work
-    assert isinstance(work, LoopsWork)
+    assert isinstance(work, SharedNetworkWork)
     name = f"{point.labels[POLICY]}-{point.labels[LOOPS]}"
     scenario = point.scenario.model_copy(update={"seeds": seeds_of(work.seed, 0), "name": name})
-    outcome = finalize(launch(scenario, folder), report=False)
-    records = _records(outcome.run_dir, scenario)
+    outcome = finalize(launch(scenario, folder), report=False, view=False)
     rows = np.zeros(1, work.row_type)
-    work.measure_loops(records, rows[0])
+    work.measure_loops(load_run(outcome.run_dir).loops, rows[0])
     columns = {column: rows[column] for column in work.row_type.names or ()}
     values = {key: float(value[0]) for key, value in measured(columns, None).items()}
     judged: list[Metric] = ["transmissions", *LIMITS.values()]
     return LivePoint(
         point.labels[POLICY], int(point.labels[LOOPS]), outcome.run_dir, int(outcome.status),
-        outcome.reason, _unintended(outcome.run_dir, scenario),
+        outcome.reason, sum(one.unintended_losses for one in outcome.summary.loops),
         {metric: values[metric] for metric in [*judged, "delay_max_s"]},
         {metric: prediction_interval(found.estimates[metric]) for metric in judged},
     )  # fmt: skip
@@ -108,12 +105,3 @@ def prediction_interval(one: Estimate) -> tuple[float, float]:
         return -math.inf, math.inf
     halfwidth = one.halfwidth * math.sqrt(one.finite + 1)
     return one.mean - halfwidth, one.mean + halfwidth
-
-
-def _records(run_dir: Path, scenario: Any) -> list[RunRecord]:
-    return [load_record(one) for one in loop_directories(run_dir, scenario)]
-
-
-def _unintended(run_dir: Path, scenario: Any) -> int:
-    summaries = [read_object(one / SUMMARY_FILE) for one in loop_directories(run_dir, scenario)]
-    return sum(int(one.get("unintended_losses") or 0) for one in summaries)

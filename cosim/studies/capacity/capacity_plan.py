@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cosim.studies.campaign.campaign_file import Axis, Campaign, Metrics
-from cosim.studies.campaign.loops_draws import cost_of
+from cosim.studies.campaign.shared_network_draws import cost_of
 from cosim.studies.capacity.loop_mixture import Kind, smallest_mixture
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from cosim.studies.campaign.campaign_grid import Point
 from cosim.studies.campaign.chunk_store import Store
-from cosim.studies.campaign.loops_draws import LoopsWork
+from cosim.studies.campaign.shared_network_draws import SharedNetworkWork
 from cosim.studies.capacity.capacity_plan import CapacityPlan
 from noack.core.clock import NS_PER_S
 
@@ -35,7 +35,7 @@ def cpu_per_loop_s(points: Sequence[Point]) -> float:
     """Return the processor time that a loop of a run takes, in seconds."""
     point = min(points, key=lambda one: abs(_loops(one) - _MEASURED_LOOPS))
     work, loops = point.work, _loops(point)
-    assert isinstance(work, LoopsWork)
+    assert isinstance(work, SharedNetworkWork)
     step_s = work.scenario.timing.plant_period_ns / NS_PER_S
     steps = max(_MEASURED_STEPS // loops, 10)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from cosim.analysis.run_summary import Summary
+from cosim.analysis.summary_model import FidelityPart, LoopSummary, RunSummary
 from cosim.live.finalize import reopen
 from cosim.record.run_directory import chosen_run
 from cosim.record.run_record import RunRecord, load_record
@@ -30,15 +30,21 @@ class ComparedRun(NamedTuple):
 
     label: str
     directory: Path
-    summary: Summary
+    summary: RunSummary
+    """Of one loop."""
     record: RunRecord
 
     @property
     def title(self) -> str:
         """The scenario and its kind of run, as text."""
-        mode = "model-based" if self.summary["mode"] == "model" else "zero-order hold"
-        kind = self.summary.get("kind", "live")
-        return f"{self.summary['scenario']}, {mode}, {kind}, M − 1 = {self.summary['mansd']}"
+        one = self.summary
+        mode = "model-based" if self.loop.mode == "model" else "zero-order hold"
+        return f"{one.scenario}, {mode}, {one.kind}, M − 1 = {one.mansd}"
+
+    @property
+    def loop(self) -> LoopSummary:
+        """The summary of the loop."""
+        return self.summary.loops[0]
 
 
 class KeyNumber(NamedTuple):
@@ -79,7 +85,7 @@ class RunComparison:
     def numbers(self) -> list[KeyNumber]:
         """The key numbers that at least one of the runs has."""
         found = {
-            name: tuple(value(run.summary) for run in self.runs) for name, value in _NUMBERS.items()
+            name: tuple(value(run.loop) for run in self.runs) for name, value in _NUMBERS.items()
         }
         apart = [_distance(self.runs[0].record, run.record) for run in self.runs]
         found["distance in x to A, RMS"] = tuple(rms for rms, _ in apart)
@@ -152,7 +158,7 @@ def compare_runs(directories: Sequence[Path]) -> RunComparison:
     """Open runs and compare them.
 
     Args:
-        directories: two to seven run directories, live or simulated.
+        directories: two to seven run directories, live or simulated; ``RUN:NAME`` is a loop.
 
     Raises:
         CallerError: there are fewer than two or more than seven, one is not a run directory, or the
@@ -163,12 +169,7 @@ def compare_runs(directories: Sequence[Path]) -> RunComparison:
             f"give 2 to {len(LABELS)} run directories to compare, not {len(directories)}; "
             "`noack fidelity` compares one with the ideal loop"
         )
-    runs = tuple(
-        ComparedRun(label, path, reopen(path).summary, load_record(path))
-        for label, path in zip(
-            LABELS, (chosen_run(one, one.parent) for one in directories), strict=False
-        )
-    )
+    runs = tuple(map(_compared, LABELS, directories))
     first = runs[0].record.loop.n
     for run in runs[1:]:
         if run.record.loop.n != first:
@@ -179,36 +180,51 @@ def compare_runs(directories: Sequence[Path]) -> RunComparison:
     return RunComparison(runs)
 
 
-def _claims(verdict: str) -> Callable[[Summary], int]:
-    return lambda summary: sum(one["verdict"] == verdict for one in summary.get("claims") or ())
+def _compared(label: str, given: Path) -> ComparedRun:
+    """Open a run of one loop, or a loop of a run: ``RUN:NAME``."""
+    folder, colon, name = given.name.partition(":")
+    loop = name if colon and not given.exists() else None
+    path = given if loop is None else given.with_name(folder)
+    path = chosen_run(path, path.parent)
+    outcome, record = reopen(path), load_record(path, loop)
+    shown = path if loop is None else given
+    return ComparedRun(label, shown, outcome.summary.of_loop(record.scenario.name), record)
 
 
-def _missed(summary: Summary) -> int | None:
-    late = summary["lateness_us"]
-    return sum(one["late_steps"] for one in late.values()) if late else None
+def _claims(verdict: str) -> Callable[[LoopSummary], int]:
+    return lambda loop: sum(one.verdict == verdict for one in loop.claims)
 
 
-def _loss_rate(summary: Summary) -> float:
-    return float(100 * summary["drops"] / max(summary["drops"] + summary["deliveries"], 1))
+def _missed(loop: LoopSummary) -> int | None:
+    late = loop.lateness_us
+    return sum(one.late_steps for one in late.values()) if late else None
 
 
-_NUMBERS: dict[str, Callable[[Summary], float | None]] = {
-    "simulated time, s": lambda s: s["reached_s"],
-    "transmissions": lambda s: s["events"],
-    "ideal loop: transmissions": lambda s: (s.get("fidelity") or {}).get("events_ideal"),
-    "deliveries": lambda s: s["deliveries"],
-    "forced by the guarantee": lambda s: s["forced_deliveries"],
-    "lost in the network": lambda s: s["drops"],
+def _loss_rate(loop: LoopSummary) -> float:
+    return float(100 * loop.drops / max(loop.drops + loop.deliveries, 1))
+
+
+def _ideal(loop: LoopSummary) -> int | None:
+    return loop.fidelity.events_ideal if isinstance(loop.fidelity, FidelityPart) else None
+
+
+_NUMBERS: dict[str, Callable[[LoopSummary], float | None]] = {
+    "simulated time, s": lambda s: s.reached_s,
+    "transmissions": lambda s: s.events,
+    "ideal loop: transmissions": lambda s: _ideal(s),
+    "deliveries": lambda s: s.deliveries,
+    "forced by the guarantee": lambda s: s.forced_deliveries,
+    "lost in the network": lambda s: s.drops,
     "loss rate, %": _loss_rate,
-    "longest loss burst": lambda s: s["longest_loss_burst"],
-    "shortest inter-event time, s": lambda s: s["inter_event_min_s"],
-    "median inter-event time, s": lambda s: s["inter_event_median_s"],
-    "median time between deliveries, s": lambda s: s["inter_delivery_median_s"],
-    "‖x‖ at the end": lambda s: s["final_state_norm"],
-    "largest ‖e_s‖": lambda s: s["sup_e_s_norm"],
-    "largest ‖e_c‖": lambda s: s["sup_e_c_norm"],
-    "latency p50, µs": lambda s: (s["latency_us"] or {}).get("p50"),
-    "latency p99, µs": lambda s: (s["latency_us"] or {}).get("p99"),
+    "longest loss burst": lambda s: s.longest_loss_burst,
+    "shortest inter-event time, s": lambda s: s.inter_event_min_s,
+    "median inter-event time, s": lambda s: s.inter_event_median_s,
+    "median time between deliveries, s": lambda s: s.inter_delivery_median_s,
+    "‖x‖ at the end": lambda s: s.final_state_norm,
+    "largest ‖e_s‖": lambda s: s.sup_e_s_norm,
+    "largest ‖e_c‖": lambda s: s.sup_e_c_norm,
+    "latency p50, µs": lambda s: None if s.latency_us is None else s.latency_us.p50,
+    "latency p99, µs": lambda s: None if s.latency_us is None else s.latency_us.p99,
     "deadlines missed": _missed,
     "claims held": _claims("held"),
     "claims violated": _claims("violated"),

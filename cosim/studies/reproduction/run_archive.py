@@ -20,8 +20,6 @@ from cosim.record.environment import Kind, kind_of
 from cosim.record.run_directory import (
     ENDING_FILE,
     ENVIRONMENT_FILE,
-    LOOP_FILE,
-    LOOPS,
     RECORD,
     REPORTS_FILE,
     SCENARIO_FILE,
@@ -37,7 +35,7 @@ from noack.settings.named_file import PLACES, Sha256, file_tables
 MANIFEST = "archive.json"
 SUFFIX = ".noack.zip"
 _FILES = {
-    SCENARIO_FILE, ENVIRONMENT_FILE, REPORTS_FILE, ENDING_FILE, SUMMARY_FILE, LOOP_FILE
+    SCENARIO_FILE, ENVIRONMENT_FILE, REPORTS_FILE, ENDING_FILE, SUMMARY_FILE
 }  # fmt: skip
 _FOLDERS = {RECORD, "logs", *(place.split(".")[0] for place in PLACES)}
 _MOST_ENTRIES = 1_000_000
@@ -59,7 +57,7 @@ class Manifest(BaseModel):
     """The content of ``archive.json``."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    format: Literal["noack run archive 1"] = "noack run archive 1"
+    format: Literal["noack run archive 2"] = "noack run archive 2"
     scenario: str
     kind: Kind
     files: dict[str, Entry]
@@ -78,7 +76,7 @@ def write_archive(run_dir: Path, path: Path) -> Manifest:
     if (outside := outside_files(scenario, run_dir)) is not None:
         raise CallerError(f"{run_dir}: its scenario names {outside}, outside the run directory")
     try:
-        names = sorted(_names(run_dir, with_loops=True))
+        names = sorted(_names(run_dir))
         files = {name: _entry(run_dir / name) for name in names}
         manifest = Manifest(scenario=scenario.name, kind=kind_of(run_dir), files=files)
         with new_file(path) as target, zipfile.ZipFile(target, "w") as archive:
@@ -129,16 +127,13 @@ def outside_files(scenario: Scenario, folder: Path) -> str | None:
     return None
 
 
-def _names(folder: Path, *, with_loops: bool = False) -> Iterator[str]:
+def _names(folder: Path) -> Iterator[str]:
     """Yield the files of a run directory that an archive has, as POSIX paths relative to it."""
     for path in folder.iterdir():
         if path.name in _FILES:
             yield path.name
         elif path.name in _FOLDERS and path.is_dir():
             yield from (f"{path.name}/{inner.name}" for inner in path.iterdir() if inner.is_file())
-        elif with_loops and path.name == LOOPS and path.is_dir():
-            for loop in path.iterdir():
-                yield from (f"{LOOPS}/{loop.name}/{name}" for name in _names(loop))
 
 
 def _entry(path: Path) -> Entry:
@@ -172,9 +167,8 @@ def _checked_entries(
         parts = name.split("/")
         if not all(_PART.fullmatch(part) and part not in (".", "..") for part in parts):
             raise CallerError(f"{path}: {shown}: not the name of a file in a run directory")
-        inner = parts[2:] if parts[0] == LOOPS else parts
         if name != MANIFEST and not (
-            (len(inner) == 1 and inner[0] in _FILES) or (len(inner) == 2 and inner[0] in _FOLDERS)
+            (len(parts) == 1 and parts[0] in _FILES) or (len(parts) == 2 and parts[0] in _FOLDERS)
         ):
             raise CallerError(f"{path}: {shown}: an archive has no such file")
         if name in found:

@@ -9,18 +9,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cosim.analysis.loops_summary import has_loops
 from cosim.analysis.replay import replay
 from cosim.analysis.replay.replay_result import difference, rows_differ
 from cosim.analysis.summary_model import ReplayDifference
 from cosim.live.finalize import finalize, reopen
 from cosim.live.simulated_run import simulate_run
-from cosim.output.loops_tables import network_rows
+from cosim.output.network_table import network_rows
 from cosim.record.environment import Kind, all_changes_since, kind_of
-from cosim.record.loops_run import loop_directories
 from cosim.record.record_source import Slice
 from cosim.record.run_directory import SCENARIO_FILE
-from cosim.record.run_record import RunRecord, load_record, steps_of
+from cosim.record.run_record import RecordedRun, RunRecord, load_run, steps_of
 from cosim.studies.comparison.run_comparison import compare_runs
 from cosim.studies.reproduction.run_archive import MANIFEST, outside_files, unpack
 from noack.config.loops import loops_of
@@ -87,14 +85,15 @@ def repeat_archive(
         if not long:
             _require_short(path, scenario)
         try:
-            recorded = _directories(archived)
+            recorded = load_run(archived)
         except CallerError as error:
             raise CallerError(f"{path}: {str(error).removeprefix(f'{archived}/')}") from None
-        ending = simulate_run(scenario, folder / "repeated", view=False)
-        finalize(ending, report=False)
-        pairs = zip(recorded, _directories(ending.run_dir), strict=True)
+        ending = simulate_run(scenario, folder / "repeated")
+        finalize(ending, report=False, view=False)
+        repeated = load_run(ending.run_dir)
         compare = _replayed if manifest.kind == "live" else _repeated
-        found = [compare(*pair) for pair in pairs]
+        pairs = zip(_named(recorded), _named(repeated), strict=True)
+        found = [compare(name, one, other) for (name, one), (_, other) in pairs]
         return Repetition(
             scenario=manifest.scenario,
             kind=manifest.kind,
@@ -155,26 +154,26 @@ def _scenario(path: Path, archived: Path, *, run_code: bool) -> Scenario:
     return scenario
 
 
-def _directories(run_dir: Path) -> list[tuple[str, Path]]:
-    """Return the run directory and those of its loops, each with a name."""
-    scenario = load_record(run_dir, network=True).scenario
-    loops = [] if scenario.loops is None else loop_directories(run_dir, scenario)
-    return [("", run_dir), *((f"loop {one.name}: ", one) for one in loops)]
+def _named(run: RecordedRun) -> Iterator[tuple[str, RunRecord]]:
+    """Yield the records of the loops with their names, and that of a network that they share."""
+    if len(run.loops) == 1:  # its record has the rows of the network
+        yield "", run.loops[0]
+        return
+    yield "", run.network
+    for name, record in zip(run.names, run.loops, strict=True):
+        yield f"loop {name}: ", record
 
 
-def _replayed(archived: tuple[str, Path], _: tuple[str, Path]) -> _Compared:
-    name, run_dir = archived
-    found = replay(load_record(run_dir, network=True))
+def _replayed(name: str, archived: RunRecord, _: RunRecord) -> _Compared:
+    found = replay(archived)
     first = found.first_difference
     gaps = [f"{name}{gap}" for gap in found.gaps]
     return _Compared(found.inputs, [] if first is None else [f"{name}{first}"], gaps)
 
 
-def _repeated(archived: tuple[str, Path], repeated: tuple[str, Path]) -> _Compared:
-    name = archived[0]
-    records = [load_record(run_dir, network=True) for _, run_dir in (archived, repeated)]
-    first = first_difference(*records)
-    count = sum(records[0].count(table) for table in records[0].tables)
+def _repeated(name: str, archived: RunRecord, repeated: RunRecord) -> _Compared:
+    first = first_difference(archived, repeated)
+    count = sum(archived.count(table) for table in archived.tables)
     return _Compared(count, [] if first is None else [f"{name}{first}"], [])
 
 
@@ -209,8 +208,8 @@ def _in_table(table: str, before: int, recorded: Slice, again: Slice) -> ReplayD
 
 def _numbers(archived: Path, repeated: Path) -> list[tuple[str, ...]]:
     """Return the key numbers that differ, as text."""
-    summaries = [reopen(one).summary for one in (archived, repeated)]
-    if all(map(has_loops, summaries)):
+    summaries = [reopen(one, view=False).summary for one in (archived, repeated)]
+    if len(summaries[0].loops) > 1:
         first, second = (dict(network_rows(one)) for one in summaries)
         rows = [(name, value, second.get(name, "-")) for name, value in first.items()]
         return [row for row in rows if row[1] != row[2]]

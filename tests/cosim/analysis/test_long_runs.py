@@ -14,7 +14,7 @@ from cosim.analysis.run_summary import summarise
 from cosim.record import run_record
 from cosim.record.align import align_tables
 from cosim.record.run_directory import write_scenario
-from cosim.record.run_record import RunRecord, load_record, write_record
+from cosim.record.run_record import RunRecord, alone, load_record, write_run
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
@@ -86,7 +86,7 @@ def test_slices_are_the_tables_in_order(
     record: RunRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_scenario(record.scenario, tmp_path)
-    write_record(record, tmp_path)
+    write_run(alone(record), tmp_path)
     monkeypatch.setattr(run_record, "BATCH_ROWS", PART_ROWS)
     stored = load_record(tmp_path)
     parts = list(stored.slices())

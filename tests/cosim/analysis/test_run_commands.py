@@ -30,7 +30,7 @@ def noack(*arguments: str | Path) -> Result:
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
     scenario = load(LANE, ["horizon_s=1", "plant.rate_hz=50", "controller.rate_hz=50"])
-    finalize(simulate_run(scenario, folder, view=False), report=False)
+    finalize(simulate_run(scenario, folder), report=False, view=False)
     return folder
 
 

@@ -12,8 +12,8 @@ import pytest
 from rich.console import Console
 
 import noack
-from cosim.analysis.run_summary import Outcome, summarise
-from cosim.analysis.summary_model import RunSummary, can_be_shown
+from cosim.analysis.run_summary import Outcome
+from cosim.analysis.summary_model import LoopSummary, NetworkPart, RunSummary, read_summary
 from cosim.live.finalize import finalize, reopen
 from cosim.live.simulated_run import simulate_run
 from cosim.output.report.report_page import page
@@ -24,6 +24,7 @@ from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
 from noack.core.errors import ExitStatus
+from tests.cosim.summaries import summary_of, with_values
 
 HUGE = 10**400
 DELETED = object()
@@ -80,15 +81,14 @@ def record() -> RunRecord:
 
 @pytest.fixture(scope="module")
 def summary(record: RunRecord) -> dict[str, Any]:
-    found: dict[str, Any] = summarise(record, 0, "horizon").to_json() | FULL
-    return found
+    return summary_of(record, **FULL).to_json()
 
 
 def test_full_summary_can_be_shown(record: RunRecord, summary: dict[str, Any]) -> None:
-    assert can_be_shown(summary)
+    full = read_summary(summary)
+    assert full is not None
     for replayed in ({"bit_exact": True, "inputs": 4}, {"bit_exact": None, "error": "empty"}, None):
-        assert can_be_shown(summary | {"replay": replayed})
-        show(record, summary | {"replay": replayed})
+        show(record, with_values(full, replay=replayed))
 
 
 def test_a_damaged_summary_is_shown_or_detected(record: RunRecord, summary: dict[str, Any]) -> None:
@@ -96,19 +96,19 @@ def test_a_damaged_summary_is_shown_or_detected(record: RunRecord, summary: dict
     for place in places(summary):
         for value in VALUES if place[0] != "exit" else ():  # which is read first (test_finalize)
             damaged = changed(summary, place, value)
-            if can_be_shown(damaged):
-                show(record, damaged)
+            if (found := read_summary(damaged)) is not None:
+                show(record, found)
                 shown += 1
     assert shown > 100  # numbers that may be missing, keys that are not shown
 
 
 def test_a_damaged_summary_is_written_again(tmp_path: Path) -> None:
     scenario = noack.load("double_integrator", {"horizon_s": 0.2})
-    outcome = finalize(simulate_run(scenario, tmp_path, view=False), report=False)
+    outcome = finalize(simulate_run(scenario, tmp_path), report=False, view=False)
     path = outcome.run_dir / SUMMARY_FILE
-    path.write_text(json.dumps(outcome.summary | {"restarts": 5, "kind": [[[[]]]]}))
+    path.write_text(json.dumps(outcome.summary.to_json() | {"changes": 5, "kind": [[[[]]]]}))
     assert reopen(outcome.run_dir) == outcome
-    assert json.loads(path.read_text()) == outcome.summary
+    assert json.loads(path.read_text()) == outcome.summary.to_json()
 
 
 @pytest.mark.parametrize("content", ["[" * 100_000, "{" * 100_000, "7", '{"kind": []}'])
@@ -146,7 +146,7 @@ def changed(summary: dict[str, Any], place: tuple[Any, ...], value: Any) -> dict
     return found
 
 
-def show(record: RunRecord, summary: dict[str, Any]) -> None:
+def show(record: RunRecord, summary: RunSummary) -> None:
     """Every function that reads a summary."""
     outcome = Outcome(Path("run"), ExitStatus.OK, "horizon", summary)
     print_outcome(Console(file=io.StringIO()), outcome)
@@ -160,4 +160,5 @@ def test_the_docs_list_every_key() -> None:
     text = (Path(__file__).parents[3] / "docs" / "record.md").read_text(encoding="utf-8")
     rows = [line.split(" | ")[0] for line in text[text.index("\n## The summary") :].splitlines()]
     keys = [key for row in rows if row.startswith("| `") for key in re.findall(r"`(\w+)`", row)]
-    assert sorted(keys) == sorted(RunSummary.model_fields)
+    expected = [*RunSummary.model_fields, *NetworkPart.model_fields, *LoopSummary.model_fields]
+    assert sorted(keys) == sorted(expected)

@@ -14,9 +14,11 @@ from cosim.analysis.loss_statistics import list_violations
 from cosim.analysis.run_summary import summarise
 from cosim.live.progress import progress_line
 from cosim.live.telemetry_recorder import Recorder
+from cosim.record.loop_rows import with_loop
 from cosim.record.run_directory import SCENARIO_FILE
 from cosim.record.run_record import RunRecord, load_record
-from noack.config.resolution import resolve
+from cosim.record.spool_conversion import finish_record
+from noack.config.resolution import resolve, run_tables
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import dumps, load
 from noack.core.errors import MachineError
@@ -57,7 +59,15 @@ def send(plane: FakePlane, record: RunRecord, until_ns: int, sent: dict[str, int
         if len(rows):
             header = json.dumps({"first": first, "rows": len(rows)}).encode()
             key = f"t/{OWNER[table]}/{table}"
-            plane.put("telemetry", Sample(key, rows.tobytes(), header))
+            sent_rows = with_loop(rows, 0, run_tables(record.scenario)[table])
+            plane.put("telemetry", Sample(key, sent_rows.tobytes(), header))
+
+
+def recorded(recorder: Recorder, run_dir: Path) -> RunRecord:
+    """The record after the end of the recorder."""
+    recorder.finish()
+    recorder.report()
+    return finish_record(run_dir).loop()
 
 
 def test_the_recorder_reports_a_violation_once_and_records_it(
@@ -73,7 +83,7 @@ def test_the_recorder_reports_a_violation_once_and_records_it(
     line = f"void (assumption violated) from 0.506 s on: {cause}"
     void = [report["warnings"] for report in plane.reports]
     assert void == [[]] * 5 + [[line]] * 6
-    notices = recorder.finish().notices
+    notices = recorded(recorder, tmp_path).notices
     assert notices == [{"t_ns": 506_000_000, "level": "void", "text": line, "process": "recorder"}]
     assert load_record(tmp_path).notices == notices
 
@@ -93,7 +103,7 @@ def test_a_violation_found_at_the_end_is_reported(run: RunRecord, tmp_path: Path
     recorder = recorder_of(run.scenario, tmp_path, plane)
     send(plane, run, 1_200_000_000, {})
     recorder.poll()
-    (notice,) = recorder.finish().notices
+    (notice,) = recorded(recorder, tmp_path).notices
     assert [report["warnings"] for report in plane.reports] == [[notice["text"]]]
 
 
@@ -109,7 +119,7 @@ def test_missing_rows_are_reported_as_an_unknown_result(run: RunRecord, tmp_path
     assert plane.reports[-1]["warnings"] == [
         "claims are checked after the run only: telemetry is missing or arrived out of order"
     ]
-    assert recorder.finish().notices == []
+    assert recorded(recorder, tmp_path).notices == []
 
 
 @pytest.mark.parametrize("terminal", [True, False])
@@ -138,7 +148,7 @@ def test_rows_whose_file_is_deleted_are_not_confirmed(run: RunRecord, tmp_path: 
     (tmp_path / "spool" / "plant_step.recorder").unlink()
     with pytest.raises(MachineError, match=r"plant_step\.recorder: was deleted or moved"):
         recorder.acknowledge()
-    record = recorder.finish()  # the rest of it is stored
+    record = recorded(recorder, tmp_path)  # the rest of it is stored
     assert not len(record["plant_step"])
     assert len(record["sensor_measurement"]) == len(run["sensor_measurement"])
     assert "plant_step.recorder: was deleted or moved" in str(recorder.lost)
@@ -151,4 +161,4 @@ def test_nothing_is_reported_after_the_stop(run: RunRecord, tmp_path: Path) -> N
     send(plane, run, 1_200_000_000, {})
     recorder.poll()
     recorder.show()
-    assert recorder.finish().notices == []
+    assert recorded(recorder, tmp_path).notices == []

@@ -33,22 +33,21 @@ def test_samples_are_the_aligned_record(simulated: noack.Run) -> None:
             np.testing.assert_array_equal(samples[f"{name}_{i + 1}"].to_numpy(), states[:, i])
     e_c = np.hypot(*(samples[f"x_c_{i}"].to_numpy() - samples[f"x_{i}"].to_numpy() for i in (1, 2)))
     np.testing.assert_allclose(e_c, samples["e_c_norm"].to_numpy())
-    assert (samples["event"].to_numpy() >= 0).sum() == simulated.summary["events"]
+    assert (samples["event"].to_numpy() >= 0).sum() == simulated.summary.loops[0].events
 
 
 def test_event_counts_agree_with_the_summary(simulated: noack.Run) -> None:
-    events, summary = simulated.events(), simulated.summary
-    assert events.num_rows == summary["events"]
-    assert sum(events["received"].to_pylist()) == summary["deliveries"]
+    events, (summary,) = simulated.events(), simulated.summary.loops
+    assert events.num_rows == summary.events
+    assert sum(events["received"].to_pylist()) == summary.deliveries
     fates = Counter(events["fate"].to_pylist())
-    assert fates["forced"] == summary["forced_deliveries"] > 0
+    assert fates["forced"] == summary.forced_deliveries > 0
     assert fates["dropped"] > 0
-    assert {fate: n for fate, n in fates.items() if fate not in ("delivered", "forced")} == summary[
-        "drops_by_cause"
-    ]
+    lost = {fate: n for fate, n in fates.items() if fate not in ("delivered", "forced")}
+    assert lost == summary.drops_by_cause
     intervals_s = events["interval_s"].to_numpy()
     assert np.isnan(intervals_s[0])
-    assert intervals_s[1:].min() == pytest.approx(summary["inter_event_min_s"])
+    assert intervals_s[1:].min() == pytest.approx(summary.inter_event_min_s)
 
 
 def test_stale_and_in_flight_updates_are_marked(scenario: noack.Scenario) -> None:
@@ -61,7 +60,7 @@ def test_stale_and_in_flight_updates_are_marked(scenario: noack.Scenario) -> Non
     fates = Counter(run.events()["fate"].to_pylist())
     assert (
         fates["delivered_out_of_order"]
-        == run.summary["drops_by_cause"]["delivered_out_of_order"]
+        == run.summary.loops[0].drops_by_cause["delivered_out_of_order"]
         > 0
     )
     assert fates["in_flight"] == crossed.in_flight.sum()

@@ -19,12 +19,14 @@ import noack
 def test_a_run_gives_its_results(simulated: noack.Run) -> None:
     assert simulated.ok
     assert simulated.reason == "horizon"
-    assert simulated.summary == json.loads((simulated.directory / "summary.json").read_text())
-    assert simulated.claims == simulated.summary["claims"] != []
+    written = json.loads((simulated.directory / "summary.json").read_text())
+    assert simulated.summary.to_json() == written
+    (loop,) = simulated.summary.loops
+    assert simulated.claims == loop.claims != []
     assert simulated.scenario.plant.draw == "given"
     for shown in (repr(simulated), simulated._repr_html_()):
         assert "own_system" in shown
-        assert str(simulated.summary["events"]) in shown
+        assert str(loop.events) in shown
     assert len(repr(simulated).splitlines()) < 10
 
 
@@ -35,16 +37,22 @@ def test_a_run_of_several_loops_has_each_loop_as_a_run() -> None:
     assert run.ok
     assert "3 loops" in repr(run)
     assert list(run.loops) == ["fast-1", "fast-2", "held"]
-    events = {name: one.summary["events"] for name, one in run.loops.items()}
-    assert events == {one["name"]: one["events"] for one in run.summary["loops"]}
+    events = {name: one.summary.loops[0].events for name, one in run.loops.items()}
+    assert events == {one.name: one.events for one in run.summary.loops}
     assert sum(events.values()) == len(run.table("netem_packet"))
-    assert {claim["loop"] for claim in run.claims} == set(run.loops)
+    assert run.claims == [claim for one in run.loops.values() for claim in one.claims]
+    steps = run.table("plant_step")["loop"].to_pylist()
+    assert steps == sorted(steps)
+    assert set(steps) == {0, 1, 2}
+    assert run.loops["fast-2"].table("plant_step").num_rows == steps.count(1)
     held = run.loops["held"]
     assert held.scenario.mode == "zoh"
     assert len(held.events()) == events["held"]
-    assert held.loops == {}
+    assert list(held.loops) == ["held"]
     assert isinstance(run.plot("loops"), Figure)
-    with pytest.raises(noack.NoackError, match=r'take one of them, e\.g\. run\.loops\["fast-1"\]'):
+    with pytest.raises(
+        noack.NoackError, match=r"3 loops: take one .* they are fast-1, fast-2, held"
+    ):
         run.samples()
 
 
@@ -78,7 +86,7 @@ def test_a_run_of_the_api_has_an_ordinary_run_directory(
 def test_a_live_run_gives_its_results(scenario: noack.Scenario) -> None:
     run = noack.run(noack.with_settings(scenario, {"horizon_s": 0.5}))
     assert run.ok
-    assert run.summary["kind"] == "live"
+    assert run.summary.kind == "live"
     assert isinstance(run.plot("latency"), Figure)
     assert run.table("plant_step").num_rows == 250 + 1
 

@@ -43,7 +43,7 @@ def test_a_shipped_scenario_runs_from_the_command_line_and_in_the_library(
     assert simulated.exit_code == 0, simulated.output
     assert json.loads(simulated.stdout)["exit"]["status"] == 0
     assert noack.simulate(scenario).ok
-    if scenario.loops is None:
+    if not scenario.loops:
         assert noack.explore(scenario).run.t_s[-1] == pytest.approx(0.2)
 
 

@@ -12,6 +12,7 @@ import pytest
 import cosim.live.finalize
 from cosim.live.finalize import finalize, reopen
 from cosim.record.environment import write_environment
+from cosim.record.loop_rows import with_loop
 from cosim.record.process_reports import write_reports
 from cosim.record.run_directory import (
     ENDING_FILE,
@@ -21,11 +22,11 @@ from cosim.record.run_directory import (
     SUMMARY_FILE,
 )
 from cosim.record.run_ending import EndingFile, RunEnding
-from cosim.record.run_record import load_record, write_record
+from cosim.record.run_record import alone, load_record, write_run
 from cosim.record.spool_conversion import finish_record
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve
+from noack.config.resolution import resolve, run_tables
 from noack.config.scenario_file import dumps, load
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.protocol.record_tables import PLANT_STEP
@@ -44,13 +45,13 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_environment(folder, "live")
     reports = {role: report | {"realtime": {}} for role, report in record.reports.items()}
     (folder / REPORTS_FILE).write_text(json.dumps(reports))
-    write_record(record, folder)
+    write_run(alone(record), folder)
     return folder
 
 
 @pytest.fixture(autouse=True)
 def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cosim.live.finalize, "_report", lambda *_: None)
+    monkeypatch.setattr(cosim.live.finalize, "_write_report", lambda *_: None)
 
 
 @pytest.fixture
@@ -83,11 +84,11 @@ def summary_of(run_dir: Path) -> dict[str, Any]:
 
 
 def test_the_summary_holds_the_replay(whole: Path) -> None:
-    replayed = summary_of(whole)["replay"]
+    replayed = summary_of(whole)["loops"][0]["replay"]
     assert replayed["bit_exact"]
     assert replayed["complete"]
     assert replayed["inputs"] > 1500
-    assert reopen(whole).summary == summary_of(whole)
+    assert reopen(whole).summary.to_json() == summary_of(whole)
 
 
 def test_a_run_directory_that_was_deleted_is_not_created_again(
@@ -117,11 +118,11 @@ def test_the_reason_is_told_if_the_run_directory_was_replaced(tmp_path: Path) ->
 def test_a_difference_in_the_replay_does_not_fail_the_run(run_dir: Path) -> None:
     record = load_record(run_dir)
     record[PLANT_STEP]["u"][9, 0] = np.nan
-    write_record(record, run_dir)
+    write_run(alone(record), run_dir)
     outcome = finalize(ended_well(run_dir), report=False)
     assert outcome.status == ExitStatus.OK
-    assert outcome.summary["replay"]["bit_exact"] is False
-    first = summary_of(run_dir)["replay"]["first_difference"]
+    assert outcome.summary.to_json() == summary_of(run_dir)
+    first = summary_of(run_dir)["loops"][0]["replay"]["first_difference"]
     assert (first["table"], first["row"], first["column"]) == (PLANT_STEP, 9, "u_1")
 
 
@@ -145,7 +146,7 @@ def test_a_run_that_cannot_be_replayed_fails(
 def test_a_run_whose_record_is_lost_fails(run_dir: Path) -> None:
     record = load_record(run_dir)
     no_rows = {table: record[table][:0] for table in record.tables}
-    write_record(changed(record, no_rows, reports={}), run_dir)
+    write_run(alone(changed(record, no_rows, reports={})), run_dir)
     (run_dir / REPORTS_FILE).unlink()  # the total number of rows is unknown
     outcome = finalize(ended_well(run_dir), report=False)
     assert outcome.status == ExitStatus.FAILED
@@ -157,13 +158,13 @@ def test_a_run_whose_rows_are_missing_fails(run_dir: Path, cut: slice) -> None:
     record = load_record(run_dir)
     steps = record[PLANT_STEP]
     lost = len(steps[cut])
-    write_record(changed(record, {PLANT_STEP: np.delete(steps, cut)}), run_dir)
+    write_run(alone(changed(record, {PLANT_STEP: np.delete(steps, cut)})), run_dir)
     with EndingFile(run_dir) as file:
         file.store(ExitStatus.OK, "horizon", 1.5)
     outcome = finalize(ended_well(run_dir), report=False)
     assert outcome.status == ExitStatus.FAILED
     stored = json.loads((run_dir / ENDING_FILE).read_text())
-    assert stored["exit"] == {"status": 1, "reason": outcome.reason}
+    assert stored["exit"] == {"status": 0, "reason": "horizon"}  # the launcher saw no fault
     assert outcome.reason == f"rows are missing from the record: {lost:,} of plant_step"
     stopped = RunEnding(run_dir, 0, ExitStatus.INTERRUPTED, "stopped by the user (SIGINT)")
     assert finalize(stopped, report=False).status == ExitStatus.INTERRUPTED
@@ -171,7 +172,7 @@ def test_a_run_whose_rows_are_missing_fails(run_dir: Path, cut: slice) -> None:
 
 def test_a_run_with_more_rows_than_were_reported_fails(run_dir: Path) -> None:
     reports = json.loads((run_dir / REPORTS_FILE).read_text())
-    reports["plant"]["rows"][PLANT_STEP] -= 7
+    reports["plant"]["rows_by_loop"][PLANT_STEP][0] -= 7
     (run_dir / REPORTS_FILE).write_text(json.dumps(reports))
     outcome = finalize(ended_well(run_dir), report=False)
     assert (outcome.status, outcome.reason) == (
@@ -189,15 +190,15 @@ def test_an_interrupted_replay_leaves_a_summary(
     monkeypatch.setattr(cosim.live.finalize, "replay", interrupted)
     with pytest.raises(KeyboardInterrupt):
         reopen(run_dir)
-    assert summary_of(run_dir)["replay"] is None
-    assert reopen(run_dir).summary["replay"] is None
+    assert summary_of(run_dir)["loops"][0]["replay"] is None
+    assert reopen(run_dir).summary.loops[0].replay is None
 
 
 @pytest.mark.parametrize("end", [None, {"status": 99, "reason": ""}])
 def test_a_damaged_summary_is_written_again(whole: Path, end: Any) -> None:
     before = summary_of(whole)
     (whole / SUMMARY_FILE).write_text(json.dumps(before | {"exit": end}))
-    assert reopen(whole).summary == before
+    assert reopen(whole).summary.to_json() == before
 
 
 def test_the_stored_ending_is_used_without_a_summary(run_dir: Path) -> None:
@@ -209,7 +210,7 @@ def test_the_stored_ending_is_used_without_a_summary(run_dir: Path) -> None:
         file.store(ExitStatus.TERMINATED, "stopped by SIGTERM", 1.5)
     outcome = reopen(run_dir)
     assert (outcome.status, outcome.reason) == (143, "stopped by SIGTERM")
-    assert outcome.summary["startup_s"] == 1.5
+    assert outcome.summary.startup_s == 1.5
     (run_dir / SUMMARY_FILE).write_text("damaged")
     assert reopen(run_dir).reason == "stopped by SIGTERM"
 
@@ -223,7 +224,7 @@ def test_an_error_of_the_launcher_is_stored_as_the_end(run_dir: Path) -> None:
 
 def test_rows_that_are_spooled_after_the_end_are_merged(whole: Path) -> None:
     record = load_record(whole)
-    steps = record[PLANT_STEP]
+    steps = with_loop(record[PLANT_STEP], 0, run_tables(record.scenario)[PLANT_STEP])
     writer = SpoolWriter(whole / SPOOL, "plant")
     late = steps[-30:].copy()
     late["input"] += 30
@@ -262,7 +263,7 @@ def test_an_interrupted_finalisation_is_completed(whole: Path) -> None:
     with patch("json.dumps", full), pytest.raises(MachineError, match="No space"):
         finish_record(whole)
     assert notices.read_text() == before
-    assert finish_record(whole).notices
+    assert finish_record(whole).loop().notices
     assert not [*whole.glob(f"{SPOOL}*")]
     (whole / SUMMARY_FILE).unlink()
     (whole / RECORDING_FILE).write_bytes(b"cut")

@@ -11,6 +11,7 @@ import pytest
 from cosim.live import coordinator
 from cosim.live.telemetry_recorder import Recorder
 from cosim.record.run_directory import SCENARIO_FILE
+from cosim.record.spool_conversion import finish_record
 from noack.config.resolution import resolve
 from noack.config.scenario_file import dumps, validate
 from noack.protocol.record_tables import PLANT_STEP
@@ -71,5 +72,7 @@ def test_the_recorder_ignores_invalid_telemetry_and_stores_the_rest(
         assert bad.error is not None
     plane.put("telemetry", Sample("t/plant/plant_step", row, header))
     recorder.poll()
-    assert len(recorder.finish()[PLANT_STEP]) == 1
+    recorder.finish()
+    recorder.report()
+    assert len(finish_record(tmp_path).loop()[PLANT_STEP]) == 1
     assert capsys.readouterr().err.count("ignored an invalid telemetry message") == 1

@@ -16,7 +16,7 @@ from cosim.live.replay_process import ReplayProcess
 from cosim.record.environment import write_environment
 from cosim.record.run_directory import SUMMARY_FILE, write_scenario
 from cosim.record.run_ending import RunEnding
-from cosim.record.run_record import load_record, write_record
+from cosim.record.run_record import alone, load_record, write_run
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
@@ -33,7 +33,7 @@ def run_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     record[PLANT_STEP]["u"][9, 0] += 1.0
     write_scenario(record.scenario, tmp_path)
     write_environment(tmp_path, "live")
-    write_record(record, tmp_path)
+    write_run(alone(record), tmp_path)
     monkeypatch.setattr(cosim.live.replay_process, "_LEAST_STEPS", 10)
     return tmp_path
 
@@ -58,7 +58,7 @@ def test_the_replay_of_a_run_is_not_lost_with_its_process(
 
     monkeypatch.setattr(cosim.live.finalize, "ReplayProcess", Killed)
     finalize(RunEnding(run_dir, 0, ExitStatus.OK, "horizon"), report=False)
-    found = json.loads((run_dir / SUMMARY_FILE).read_text())["replay"]
+    found = json.loads((run_dir / SUMMARY_FILE).read_text())["loops"][0]["replay"]
     assert found["first_difference"]["row"] == 9
 
 

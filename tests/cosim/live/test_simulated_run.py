@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,13 +9,14 @@ import rerun.chunk
 from typer.testing import CliRunner, Result
 
 import cosim.live.finalize
+from cosim.analysis.summary_model import RunSummary
 from cosim.cli import app
 from cosim.live.simulated_run import simulate_run
 from cosim.output.viewer import blueprint
 from cosim.output.viewer.opening_time import opening_time_ns
 from cosim.record.align import align_tables
 from cosim.record.environment import write_environment
-from cosim.record.run_record import RunRecord, load_record
+from cosim.record.run_record import RecordedRun, load_record
 from cosim.simulation.virtual_time import Progress, simulate
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
@@ -61,11 +61,11 @@ def reported(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     """Run directories for which a report would be written."""
     written: list[Path] = []
 
-    def report(record: RunRecord, summary: Any, run_dir: Path, claims: Any) -> Path:
+    def report(run: RecordedRun, summary: RunSummary, run_dir: Path, loop: str | None) -> Path:
         written.append(run_dir)
         return run_dir / "report.html"
 
-    monkeypatch.setattr(cosim.live.finalize, "_report", report)
+    monkeypatch.setattr(cosim.live.finalize, "_write_report", report)
     return written
 
 
@@ -92,10 +92,11 @@ def test_the_summary_names_the_kind_of_run(runs: Path) -> None:
     summary = json.loads((runs / "latest" / "summary.json").read_text())
     assert summary["kind"] == "simulated"
     assert summary["exit"] == {"status": 0, "reason": "horizon"}
-    assert summary["replay"] is None
-    assert summary["reached_s"] == 2.0
-    assert summary["lateness_us"] == summary["realtime"] == {}
-    assert summary["latency_us"] is summary["startup_s"] is None
+    (loop,) = summary["loops"]
+    assert loop["replay"] is summary["network"]["replay"] is None
+    assert summary["reached_s"] == loop["reached_s"] == 2.0
+    assert loop["lateness_us"] == loop["realtime"] == {}
+    assert loop["latency_us"] is summary["startup_s"] is None
     shown = noack("summary", "--runs", str(runs))
     assert shown.exit_code == 0
     assert "simulated" in shown.stdout
@@ -124,14 +125,15 @@ def test_the_recording_of_a_simulated_run_has_no_lateness(runs: Path) -> None:
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device")])
 def test_an_interrupted_simulation_leaves_no_run_directory(
-    tmp_path: Path, error: BaseException
+    tmp_path: Path, error: BaseException, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def broken(resolved: Scenario, *, progress: Progress | None) -> RunRecord:
+    def broken(scenario: Scenario, progress: Progress | None) -> RecordedRun:
         raise error
 
+    monkeypatch.setattr("cosim.live.simulated_run.simulate_loops", broken)
     expected = MachineError if isinstance(error, OSError) else type(error)
     with pytest.raises(expected):
-        simulate_run(load(PATH, SHORT), tmp_path, broken)
+        simulate_run(load(PATH, SHORT), tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -152,14 +154,14 @@ def test_the_view_opens_at_the_largest_controller_error(runs: Path) -> None:
     joined = align_tables(record)
     e_c = np.where(joined.since_delivery(record.scenario), joined.e_c_norm, -1.0)
     summary = json.loads((run_dir / "summary.json").read_text())
-    assert summary["sup_e_c_norm"] == e_c.max()
+    assert summary["loops"][0]["sup_e_c_norm"] == e_c.max()
     assert opening_time_ns(run_dir / "recording.rrd") == joined.t_ns[e_c.argmax()]
 
 
 def test_a_recorded_scenario_may_exceed_the_size_limit_of_scenarios(tmp_path: Path) -> None:
     (tmp_path / "long.txt").write_text("10" * 200_000)
     trace = f'network.loss={{model="trace",file="{tmp_path}/long.txt"}}'
-    ending = simulate_run(load(PATH, (*SHORT, trace)), tmp_path, view=False)
+    ending = simulate_run(load(PATH, (*SHORT, trace)), tmp_path)
     assert load_record(ending.run_dir).scenario.network.loss.model == "scripted"
     with pytest.raises(CallerError, match=r"scenario.toml: cannot be read: larger than 1 MiB$"):
         load(ending.run_dir / "scenario.toml")

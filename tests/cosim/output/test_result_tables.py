@@ -59,9 +59,9 @@ def test_tables_of_a_run_compile_and_have_its_numbers(tmp_path: Path) -> None:
     ]), ResultTable("empty", "", KEY_VALUE, [])]  # fmt: skip
     written = save_tables(tables, tmp_path)
     numbers = dict(rows_of(tmp_path / "numbers.csv"))
-    assert numbers["transmissions"] == str(run.summary["events"])
+    assert numbers["transmissions"] == str(run.summary.loops[0].events)
     shortest_s = float(numbers["shortest inter-event time [s]"])
-    assert shortest_s == pytest.approx(run.summary["inter_event_min_s"], abs=5e-4)
+    assert shortest_s == pytest.approx(run.summary.loops[0].inter_event_min_s, abs=5e-4)
     assert len(rows_of(tmp_path / "claims.csv")) == 1 + len(run.claims)
     names = [path.name for path in written if path.suffix == ".tex"]
     body = "\n\n".join(rf"\input{{{name}}}" for name in names)
@@ -116,4 +116,4 @@ def test_the_tables_of_several_loops_are_written(tmp_path: Path) -> None:
     run = noack.simulate(noack.load("shared_bottleneck", {"horizon_s": 0.2}))
     run.save_tables(tmp_path)
     rows = rows_of(tmp_path / "loops.csv")
-    assert [row[0] for row in rows[1:]] == [loop["name"] for loop in run.summary["loops"]]
+    assert [row[0] for row in rows[1:]] == [loop.name for loop in run.summary.loops]

@@ -12,11 +12,13 @@ from typer.testing import CliRunner
 
 import noack
 from cosim.analysis.run_summary import Outcome
+from cosim.analysis.summary_model import FidelityPart
 from cosim.cli import app
 from cosim.live.finalize import reopen
 from cosim.output.remarks import remarks
 from cosim.output.run_tables import short_numbers
 from cosim.output.run_verdict import print_outcome, verdict
+from tests.cosim.summaries import with_values
 
 RED = "\x1b[1;31m"
 
@@ -32,23 +34,28 @@ def printed(outcome: Outcome, *, verbose: bool = False, **changed: Any) -> str:
     """The output on a terminal of 80 columns, colours included."""
     file = io.StringIO()
     console = Console(file=file, width=80, force_terminal=True, color_system="standard")
-    print_outcome(console, replace(outcome, summary=outcome.summary | changed), verbose=verbose)
+    print_outcome(
+        console, replace(outcome, summary=with_values(outcome.summary, **changed)), verbose=verbose
+    )
     return file.getvalue()
 
 
 def claim(verdict: str, why: str = "", what: str = "a") -> dict[str, Any]:
     return {"what": what, "source": "b", "bound": "c", "ratio": 1.0, "since_s": 1.0, "why": why,
-            "verdict": verdict}  # fmt: skip
+            "verdict": verdict, "certified": 1.0, "observed": 1.0, "from_s": 0.0,
+            "until_s": None}  # fmt: skip
 
 
 def test_a_completed_run_prints_a_verdict_a_table_and_where_to_find_more(outcome: Outcome) -> None:
     summary = outcome.summary
     lines = [line.text for line in verdict(summary)]
-    claims = len(summary["claims"])
+    (loop,) = summary.loops
+    assert isinstance(loop.fidelity, FidelityPart)
+    claims = len(loop.claims)
     assert lines == [
         "completed 20 s",
-        f"{summary['events']} transmissions (ideal loop: {summary['fidelity']['events_ideal']}), "
-        f"{summary['deliveries']} delivered",
+        f"{loop.events} transmissions (ideal loop: {loop.fidelity.events_ideal}), "
+        f"{loop.deliveries} delivered",
         f"claims: {claims} of {claims} held",
     ]
     text = printed(outcome)
@@ -82,22 +89,22 @@ def test_verbose_prints_all_tables_without_warnings(outcome: Outcome) -> None:
 def test_the_first_line_states_how_the_run_ended(
     outcome: Outcome, status: int, reason: str, message: str
 ) -> None:
-    first, *_ = verdict(outcome.summary | {"exit": {"status": status, "reason": reason}})
+    first, *_ = verdict(with_values(outcome.summary, exit={"status": status, "reason": reason}))
     assert first.text == message
     assert (first.style == "bold red") == (status == 1)
 
 
 def test_claims_that_did_not_hold_are_counted_with_a_reason(outcome: Outcome) -> None:
     claims = [claim("held"), claim("void", "late"), claim("not applicable", "ideal")]
-    line = verdict(outcome.summary | {"claims": claims})[2]
+    line = verdict(with_values(outcome.summary, claims=claims))[2]
     assert line.text == "claims: 1 of 3 held, 1 void (late), 1 not applicable (a: ideal)"
-    worse = verdict(outcome.summary | {"claims": [*claims, claim("violated", what="b")]})[2]
+    worse = verdict(with_values(outcome.summary, claims=[*claims, claim("violated", what="b")]))[2]
     assert worse.text.startswith("claims: 1 of 4 held, 1 violated (b), 1 void (late)")
     assert worse.style == "bold red"
     many = [claim("not applicable", "ideal", name) for name in "abcde"]
-    line = verdict(outcome.summary | {"claims": many})[2]
+    line = verdict(with_values(outcome.summary, claims=many))[2]
     assert line.text == "claims: 0 of 5 held, 5 not applicable (a; b; c; 2 more: ideal)"
-    assert verdict(outcome.summary | {"claims": []})[2].text == "claims: none"
+    assert verdict(with_values(outcome.summary, claims=[]))[2].text == "claims: none"
 
 
 def test_a_broken_guarantee_is_shown_as_an_error(outcome: Outcome) -> None:
@@ -130,10 +137,11 @@ def test_a_run_across_hosts_names_the_firewall_the_network_and_what_to_collect(
     }  # fmt: skip
 
     def texts(clock_error_s: float | None) -> str:
-        conditions = {"clock_error_s": clock_error_s}
-        return "\n".join(one.text for one in remarks(outcome.summary | found | {
-            "conditions": conditions,
-        }))  # fmt: skip
+        conditions = dict.fromkeys(("dropouts", "sampling_s", "delay_s", "hold_s", "start_s"))
+        summary = with_values(
+            outcome.summary, conditions=conditions | {"clock_error_s": clock_error_s}, **found
+        )
+        return "\n".join(one.text for one in remarks(summary))
 
     assert "lost elsewhere (kernel, or between the hosts; firewalls must pass" in texts(1e-4)
     assert "A host or the network between hosts was late" in texts(1e-4)
@@ -162,21 +170,23 @@ def test_summary_prints_the_short_form_and_all_tables_on_request(outcome: Outcom
     assert short.splitlines()[:3] == [line.text for line in verdict(outcome.summary)]
     assert len(short.splitlines()) <= 25 < len(long.splitlines())
     assert long.splitlines()[:3] == short.splitlines()[:3]
-    assert json.loads(noack_summary("--json")) == outcome.summary
+    assert json.loads(noack_summary("--json")) == outcome.summary.to_json()
 
 
 def test_a_live_run_has_latency_and_deadlines_in_its_table(outcome: Outcome) -> None:
     late = {"p50": 1.0, "p99": 2.0, "p999": 3.0, "max": 4.0, "steps": 100, "late_steps": 0}
     lateness = {"plant": late, "sensor": late | {"late_steps": 7}}
     latency = {"p50": 600.4, "p99": 900.0, "p999": 1.0, "max": 1.0, "updates": 3}
-    rows = dict(short_numbers(outcome.summary | {"lateness_us": lateness, "latency_us": latency}))
+    rows = dict(
+        short_numbers(with_values(outcome.summary, lateness_us=lateness, latency_us=latency))
+    )
     assert rows["most deadlines missed"] == "sensor, 7 of 100"
-    punctual = outcome.summary | {"lateness_us": {"plant": late}}
+    punctual = with_values(outcome.summary, lateness_us={"plant": late}, latency_us=latency)
     assert dict(short_numbers(punctual))["deadlines missed"] == "none"
     assert rows["sensor-to-controller latency p50 / p99"] == "600 / 900 µs"
 
 
 def test_the_longest_burst_is_shown_with_the_limit_of_all_rules(outcome: Outcome) -> None:
     assert "longest loss burst (cap M − 1 = 4)" in dict(short_numbers(outcome.summary))
-    limited = outcome.summary | {"constraints": ["atmost 3 in 8"]}
-    assert "longest loss burst (at most 3 allowed)" in dict(short_numbers(limited))  # type: ignore[arg-type]
+    limited = with_values(outcome.summary, constraints=["atmost 3 in 8"])
+    assert "longest loss burst (at most 3 allowed)" in dict(short_numbers(limited))

@@ -13,11 +13,12 @@ import pytest
 from cosim.analysis.loss_statistics import missing_rows
 from cosim.record.collection import collect
 from cosim.record.environment import write_environment
+from cosim.record.loop_rows import with_loop
 from cosim.record.run_directory import PROCESSES_FILE, REPORTS_FILE, write_scenario
-from cosim.record.run_record import RunRecord, load_record, write_record
+from cosim.record.run_record import Rows, RunRecord, alone, load_record, write_run
 from cosim.record.spool_conversion import finish_record
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve
+from noack.config.resolution import resolve, run_tables
 from noack.config.scenario_file import validate
 from noack.core.errors import CallerError, MachineError, NoackError, PeerError
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP
@@ -53,8 +54,13 @@ def run_dir(whole: RunRecord, tmp_path: Path) -> Path:
     (found / PROCESSES_FILE).write_text(json.dumps(joined))
     tables = {table: whole[table] for table in whole.tables}
     tables[CONTROLLER_STEP] = tables[CONTROLLER_STEP][:100]
-    write_record(RunRecord(whole.scenario, tables, [], reports), found)
+    write_run(alone(RunRecord(whole.scenario, tables, [], reports)), found)
     return found
+
+
+def stored(record: RunRecord, table: str) -> Rows:
+    """The rows of a table as its process stores them."""
+    return with_loop(record[table], 0, run_tables(record.scenario)[table])
 
 
 class Kept:
@@ -62,7 +68,7 @@ class Kept:
 
     def __init__(self, folder: Path, whole: RunRecord, role: str = "controller") -> None:
         self.folder, self.role = folder, role
-        self.ticks = whole[CONTROLLER_STEP][100:].copy()
+        self.ticks = stored(whole, CONTROLLER_STEP)[100:]
         self.report = whole.reports["controller"] | {"instance": WRITER[role], "generation": 0}
         self.spool = OwnSpool(folder, role, SECRETS[role], RUN)
 
@@ -95,10 +101,10 @@ def test_kept_rows_complete_the_record_also_twice(
 ) -> None:
     kept.keep()
     for _ in range(2):
-        record, roles = collect(run_dir, str(kept.folder), finish_record)
+        _, roles = collect(run_dir, str(kept.folder), finish_record)
         assert roles == ["controller"]
-        assert not +missing_rows(record)
         again = load_record(run_dir)
+        assert not +missing_rows(again)
         for table in whole.tables:
             assert again[table].tobytes() == whole[table].tobytes(), table
         assert [path.name for path in run_dir.parent.iterdir()] == ["run"]
@@ -115,14 +121,14 @@ def test_a_truncated_file_gives_its_complete_batches(run_dir: Path, kept: Kept) 
 
 def other_role(kept: Kept, whole: RunRecord) -> None:
     kept.keep()
-    kept.add(PLANT_STEP, whole[PLANT_STEP])
+    kept.add(PLANT_STEP, stored(whole, PLANT_STEP))
 
 
 def other_process(kept: Kept, whole: RunRecord) -> None:
     """Named after a process of another host, whose secret is not known here."""
     kept.keep()
     out = SpoolWriter(kept.folder / SPOOL, WRITER["plant"])
-    out.append(PLANT_STEP, 0, whole[PLANT_STEP].tobytes())
+    out.append(PLANT_STEP, 0, stored(whole, PLANT_STEP).tobytes())
     out.append("key", 0, b"guessed")
     out.close()
 
@@ -144,7 +150,7 @@ def other_generation(kept: Kept, whole: RunRecord) -> None:
 
 
 def changed(kept: Kept, whole: RunRecord) -> None:
-    rows = whole[CONTROLLER_STEP].copy()
+    rows = stored(whole, CONTROLLER_STEP)
     rows["u"][50] += 1.0
     rows["input"][0] -= 1  # so that the batch comes before the recorded one
     kept.add(CONTROLLER_STEP, rows)

@@ -18,7 +18,7 @@ from noack.core.errors import CallerError
 from noack.protocol.record_tables import PLANT_STEP
 from noack.runtime.log_lines import notices_of
 from noack.runtime.spool import SPOOL, SpoolWriter
-from tests.fuzz.parsers.record import NOTICE, files
+from tests.fuzz.parsers.record import NOTICE, files, spooled
 
 
 @pytest.fixture
@@ -79,7 +79,7 @@ def test_an_invalid_report_is_ignored(run_dir: Path, report: object) -> None:
 
 def test_the_readable_part_of_a_damaged_spool_is_read(run_dir: Path) -> None:
     record = load_record(run_dir)
-    rows, steps = record[PLANT_STEP], len(record[PLANT_STEP])
+    rows, steps = spooled(record, PLANT_STEP), len(record[PLANT_STEP])
     (run_dir / RECORD / f"{PLANT_STEP}.parquet").unlink()
     writer = SpoolWriter(run_dir / SPOOL, "recorder")
     writer.append(PLANT_STEP, 0, rows[:2].tobytes())
@@ -88,7 +88,7 @@ def test_the_readable_part_of_a_damaged_spool_is_read(run_dir: Path) -> None:
     for number, line in enumerate(["[]", "{", json.dumps(NOTICE | {"text": "last"})]):
         writer.append(notices_of("netem"), number, line.encode())
     writer.close()
-    finished = finish_record(run_dir)
+    finished = finish_record(run_dir).loop()
     kept = [*rows["input"][:2].tolist(), *rows["input"][4:].tolist()]
     assert finished[PLANT_STEP]["input"].tolist() == kept
     assert [notice["text"] for notice in finished.notices] == ["MANSD violated", "last"]

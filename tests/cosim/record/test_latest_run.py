@@ -10,10 +10,11 @@ import pytest
 from cosim.api.runs import open_run
 from cosim.record.run_directory import (
     LATEST,
-    LOOPS,
     SCENARIO_FILE,
     chosen_run,
+    file_of_loop,
     latest_run,
+    loop_of_file,
     new_run_dir,
     point_to_latest,
 )
@@ -93,13 +94,6 @@ def test_a_folder_whose_name_is_not_utf_8_is_refused(tmp_path: Path) -> None:
             refused()
 
 
-def test_a_loop_is_chosen_by_its_name(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        (tmp_path / "run" / LOOPS / name).mkdir(parents=True)
-    assert chosen_run(tmp_path / "run", tmp_path, "b") == tmp_path / "run" / LOOPS / "b"
-    for run, loop, what in (
-        ("run", "c", "no such loop; its 2 are a, b"),
-        ("run/loops/a", "a", "no r"),
-    ):
-        with pytest.raises(CallerError, match=f"--loop {loop}: .*{what}"):
-            chosen_run(tmp_path / run, tmp_path, loop)
+def test_the_files_of_a_loop_have_its_name() -> None:
+    for name in (None, "a", "b-1"):
+        assert loop_of_file(file_of_loop("report.html", name), "report.html") == name

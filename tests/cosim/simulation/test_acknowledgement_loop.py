@@ -15,7 +15,7 @@ from cosim.analysis.summary_model import ClaimVerdict
 from cosim.live.simulated_run import simulate_run
 from cosim.output.all_certificates import Certificates
 from cosim.record.align import align_tables
-from cosim.record.run_record import RunRecord, load_record, write_record
+from cosim.record.run_record import RunRecord, alone, load_record, write_run
 from cosim.simulation.continuous.continuous_loop import continuous_loop_of
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
@@ -271,7 +271,7 @@ def test_a_record_is_unchanged_by_writing_and_reading(messy: RunRecord, tmp_path
     loaded = load_record(ending.run_dir)
     assert loaded.tables.keys() == messy.tables.keys()
     assert all(loaded[table].tobytes() == messy[table].tobytes() for table in messy.tables)
-    write_record(loaded, ending.run_dir)
+    write_run(alone(loaded), ending.run_dir)
     scenario = load(ending.run_dir / "scenario.toml")
     assert scenario == messy.scenario
     assert 'protocol = "ack"' in dumps(scenario)

@@ -7,8 +7,7 @@ import pytest
 
 from cosim.analysis.replay import replay
 from cosim.record.loop_rows import network_rows_by_loop
-from cosim.record.loops_run import LoopsRun
-from cosim.record.run_record import RunRecord
+from cosim.record.run_record import RecordedRun, RunRecord
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from noack.config.loops import loops_of, phases_ns
 from noack.config.parameter_changes import LATE
@@ -39,7 +38,7 @@ def short(content: Content) -> Content:
     return content
 
 
-def run(content: Content, *loops: Content) -> LoopsRun:
+def run(content: Content, *loops: Content) -> RecordedRun:
     return simulate_loops(validate(content | {"loops": list(loops)}, "here"))
 
 

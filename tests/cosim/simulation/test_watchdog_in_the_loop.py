@@ -15,6 +15,7 @@ from noack.config.resolution import resolve
 from noack.config.scenario_file import load
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_ACTUATION, PLANT_STEP
 from tests.cosim.live.outage import CASES, SCENARIOS, row, with_outage
+from tests.cosim.summaries import summary_of
 
 DOCS = Path(__file__).parents[3] / "docs"
 
@@ -61,7 +62,7 @@ def test_the_beginning_and_end_of_a_trip_are_reported(run: RunRecord) -> None:
         "policy": run.scenario.plant.watchdog.policy, "timeout_s": pytest.approx(0.1), "trips": 1,
         "first_s": pytest.approx(1.1), "total_s": pytest.approx(0.302),
     }  # fmt: skip
-    shown = dict(key_numbers(summary | {"replay": None, "fidelity": None}))
+    shown = dict(key_numbers(summary_of(run)))
     assert shown["watchdog: newest actuation too old"] == (
         "once, first at 1.100 s, 0.302 s in total"
     )

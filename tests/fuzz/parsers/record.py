@@ -13,23 +13,25 @@ import numpy as np
 import pyarrow.parquet as pq
 from rich.console import Console
 
+from cosim.analysis.network_summary import summarise_run
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import Outcome, summarise
+from cosim.analysis.summary_model import ExitPart, LoopSummary
 from cosim.live.finalize import reopen
 from cosim.output.run_verdict import print_outcome
 from cosim.record.environment import changed_since, environment
+from cosim.record.loop_rows import with_loop
 from cosim.record.run_directory import (
     ENVIRONMENT_FILE,
     RECORD,
-    REPORTS_FILE,
     SCENARIO_FILE,
     SUMMARY_FILE,
 )
 from cosim.record.run_ending import RunEnding
-from cosim.record.run_record import load_record, write_record
+from cosim.record.run_record import Rows, RunRecord, alone, load_record, write_run
 from cosim.record.spool_conversion import finish_record
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve
+from noack.config.resolution import resolve, run_tables
 from noack.config.scenario_file import dumps, validate
 from noack.runtime.log_lines import notices_of
 from noack.runtime.spool import SPOOL, SpoolWriter
@@ -63,6 +65,11 @@ KNOWN = Vocabulary(
 )  # fmt: skip
 
 
+def spooled(record: RunRecord, table: str) -> Rows:
+    """The rows of a table as its process spools them."""
+    return with_loop(record[table], 0, run_tables(record.scenario)[table])
+
+
 @cache
 def files(acknowledged: bool, live: bool) -> Mapping[str, bytes]:
     """Return the files of a recorded run, by name."""
@@ -80,16 +87,20 @@ def files(acknowledged: bool, live: bool) -> Mapping[str, bytes]:
         role: {**report, "pid": 1, "realtime": {"sched_fifo": "applied"}} if live else report
         for role, report in record.reports.items()
     }
-    (folder / REPORTS_FILE).write_text(json.dumps(reports))
     kind = "live" if live else "simulated"
-    summary = summarise(record, 0, "finished").to_json()
-    summary |= {"replay": replay(record).verdict(), "claims": [CLAIM], "fidelity": FIDELITY}
+    run = alone(
+        RunRecord(resolved, record.source, record.notices, reports, "live" if live else "simulated")
+    )
+    own = summarise(run.loop(), 0, "finished").to_json()
+    own |= {"replay": replay(record).verdict(), "claims": [CLAIM], "fidelity": FIDELITY}
+    end, loop = ExitPart(status=0, reason="finished"), LoopSummary.model_validate(own)
+    summary = summarise_run(run.network, [loop], end).to_json()
     (folder / SUMMARY_FILE).write_text(json.dumps(summary))
     (folder / ENVIRONMENT_FILE).write_text(json.dumps(environment(kind) | {"command": []}))
-    write_record(record, folder)
+    write_run(run, folder)
     writer = SpoolWriter(folder / SPOOL, "recorder")
     for table in record.tables:
-        rows = record[table]
+        rows = spooled(record, table)
         for begin in range(0, len(rows), 4):
             writer.append(table, begin, rows[begin : begin + 4].tobytes())
     for number in range(2):
@@ -163,22 +174,23 @@ def _spool(choices: Choices, name: str, data: bytes) -> bytes:
 def _show(run_dir: Path) -> None:
     """Process an existing summary as `noack summary` does."""
 
-    def finalize(ending: RunEnding, *, again: bool) -> Outcome:
+    def finalize(ending: RunEnding, *, view: bool, again: bool) -> Outcome:
+        assert view
         assert again
         assert isinstance(ending.reason, str)
-        return Outcome(run_dir, ending.status, ending.reason, {})
+        return Outcome(run_dir, ending.status, ending.reason, None)  # type: ignore[arg-type]
 
     with patch("cosim.live.finalize.finalize", finalize):
         outcome = reopen(run_dir)
     changed_since(run_dir)
-    if outcome.summary:
+    if outcome.summary is not None:
         print_outcome(Console(file=io.StringIO(), width=80), outcome)
 
 
 def _read(run_dir: Path) -> None:
     """Read a run directory as the commands on runs do."""
     cut_short = (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir()
-    record = finish_record(run_dir) if cut_short else load_record(run_dir)
+    record = finish_record(run_dir).loop() if cut_short else load_record(run_dir)
     json.loads(summarise(record, 0, "finished").model_dump_json())
     found = replay(record)
     json.dumps(found.verdict())

@@ -10,7 +10,8 @@ import numpy as np
 
 from cosim.live.telemetry_recorder import Recorder
 from cosim.record.run_directory import SCENARIO_FILE
-from noack.config.resolution import resolve, tables_of
+from cosim.record.spool_conversion import finish_record
+from noack.config.resolution import resolve, run_tables
 from noack.config.scenario_file import dumps, validate
 from noack.protocol.record_tables import OWNER
 from noack.runtime.log_lines import NOTICES, batch_of
@@ -28,7 +29,7 @@ REPORT = {
     "rows": {"plant_step": 4, "plant_actuation": 0, "notices": 1}, "generation": 0,
     "instance": "one",
 }  # fmt: skip
-_TYPES = tables_of(RESOLVED)
+_TYPES = run_tables(RESOLVED)
 HEADER = {"first": 0, "rows": 4, "generation": 0}
 KNOWN = Vocabulary(
     (*REPORT, *HEADER, *NOTICE, *OWNER, "accepted", "rejected"), (*OWNER, "horizon", "violation")
@@ -63,7 +64,9 @@ def one_input(data: bytes) -> None:
     assert isinstance(recorder.finished, bool)
     assert all(query.answered == 1 for query in queries), "a report has no answer"
     # The record contains the valid part of the messages.
-    record = recorder.finish()
+    recorder.finish()
+    recorder.report()
+    record = finish_record(run_dir).loop()
     assert set(record.tables) >= {"plant_step"}
 
 

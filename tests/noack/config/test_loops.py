@@ -127,5 +127,5 @@ def test_a_mistake_is_one_line(
 
 
 def test_only_single_loops_are_resolved(content: dict[str, Any]) -> None:
-    with pytest.raises(CallerError, match="it has several loops"):
-        resolve(with_loops(content, {"name": "a"}))
+    with pytest.raises(CallerError, match="it has 2 loops; give a scenario of one loop"):
+        resolve(with_loops(content, {"name": "a"}, {"name": "b"}))

@@ -211,7 +211,7 @@ def restarted_sensor(make: Make) -> RunRecord:
     ("violate", "at", "why"),
     [
         (deaf("controller", 10, 14), 12, "4 consecutive updates lost, 2 allowed"),
-        (deaf("network", 10, 14), 12, "4 consecutive updates lost, 2 allowed"),
+        (deaf("netem", 10, 14), 12, "4 consecutive updates lost, 2 allowed"),
         (losing(10, 12, 14, constraint=IN_WINDOW), 14, "3 of 6 consecutive updates lost"),
         (losing(10, 12, 19, constraint=RECOVERY), 12, "only 1 delivered between two bursts"),
         (delayed(lambda n: 33 if n == 7 else 0), 7, "an update took effect after 0.04 s, 0.01 s"),

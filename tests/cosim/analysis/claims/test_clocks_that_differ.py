@@ -6,13 +6,12 @@ and ages.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import pytest
 
-import cosim.simulation.virtual_time
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.claims.condition_reader import read_conditions
 from cosim.analysis.replay import replay
@@ -23,6 +22,7 @@ from noack.config.scenario import Scenario
 from noack.protocol.machine_interface import Machine
 from noack.theory.run_conditions import allowed_conditions
 from tests.cosim.analysis.claims.conftest import Make
+from tests.cosim.simulation.shuttle import shuttled
 
 MS = 1_000_000
 PPB = 10**9
@@ -54,15 +54,11 @@ class OtherClock:
 
 
 def simulated(scenario: Scenario, clocks: dict[str, tuple[int, int]]) -> RunRecord:
-    """Simulate with the offset in ns and the drift in ppb of the clock of each maker's machine."""
-    module = cosim.simulation.virtual_time
-    builds = {name: getattr(module, name) for name in clocks}
-
-    def wrapped(name: str) -> Any:
-        return lambda *args, **more: OtherClock(builds[name](*args, **more), *clocks[name])
-
-    with patch.multiple(module, **{name: wrapped(name) for name in clocks}):
-        return simulate(scenario)
+    """Simulate with the offset in ns and the drift in ppb of the clock of each role."""
+    wraps = {
+        role: partial(OtherClock, offset_ns=at, drift_ppb=by) for role, (at, by) in clocks.items()
+    }
+    return shuttled(scenario, wraps=wraps)
 
 
 def certified(record: RunRecord) -> dict[str, ClaimVerdict]:
@@ -83,7 +79,7 @@ def test_no_claim_is_violated_whatever_the_clocks(make: Make, delay_s: float) ->
         most_ns = int(rng.choice([5, 50])) * MS
         clocks = {
             name: (int(rng.integers(-most_ns, most_ns)), int(rng.integers(-100_000, 100_000)))
-            for name in ("controller_of", "network_of", "sensor_of")
+            for name in ("controller", "netem", "sensor")
         }
         record = simulated(scenario, clocks)
         claims = ClaimEvaluation(record).judge()
@@ -96,7 +92,7 @@ def test_no_claim_is_violated_whatever_the_clocks(make: Make, delay_s: float) ->
 @pytest.mark.parametrize("offset_ns", [40 * MS, -40 * MS])
 def test_a_clock_that_is_off_is_a_measured_age_of_the_input(make: Make, offset_ns: int) -> None:
     scenario = make(certificate={"late_periods": 0})
-    record = simulated(scenario, {"controller_of": (offset_ns, 0)})
+    record = simulated(scenario, {"controller": (offset_ns, 0)})
     found, exact = read_conditions(record), read_conditions(simulate(scenario))
     hold_s, exact_s = found.hold.largest(), exact.hold.largest()
     assert hold_s is not None
@@ -110,9 +106,7 @@ def test_the_networks_and_the_sensors_clocks_enter_no_condition(make: Make) -> N
     """Without a delay in the network, only ``now_ns`` of their rows differs."""
     scenario = make()
     exact = simulate(scenario)
-    record = simulated(
-        scenario, {"network_of": (50 * MS, 100_000), "sensor_of": (-50 * MS, -100_000)}
-    )
+    record = simulated(scenario, {"netem": (50 * MS, 100_000), "sensor": (-50 * MS, -100_000)})
     assert ClaimEvaluation(record).judge() == ClaimEvaluation(exact).judge()
     for found, expected in zip(
         read_conditions(record)[:5], read_conditions(exact)[:5], strict=True

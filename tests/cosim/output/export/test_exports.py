@@ -17,6 +17,7 @@ import noack
 from cosim.cli import app
 from cosim.output.export.mat_export import save_mat
 from cosim.output.viewer.rerun_program import start_rerun
+from noack.config.loops import phases_ns
 from noack.core.errors import CallerError
 
 SCENARIO: dict[str, Any] = {
@@ -68,7 +69,7 @@ def test_a_mat_file_has_the_record(run: noack.Run, tmp_path: Path) -> None:
     assert found["plant_step"]["t_ns"].dtype == np.int64
     assert np.array_equal(found["samples"]["e_c_norm"], run.samples()["e_c_norm"], equal_nan=True)
     assert list(np.atleast_1d(found["events"]["fate"])) == run.events()["fate"].to_pylist()
-    assert found["summary"]["events"] == run.summary["events"]
+    assert found["summary"]["loops"]["events"] == run.summary.loops[0].events
     assert found["loop"]["A"].shape == (4, 4)
     assert found["certificates"]["none"].startswith("changes: needs settings that stay the same")
     assert run.export(path)[0].read_bytes() == path.read_bytes()
@@ -156,9 +157,9 @@ def test_several_loops_have_their_names(loops: noack.Run, tmp_path: Path) -> Non
     found = messages(loops.export(tmp_path / "a.mcap")[0])
     name, loop = list(loops.loops.items())[-1]
     steps = loop.table("plant_step")["now_ns"].to_pylist()
-    place = json.loads((loop.directory / "loop.json").read_text())
-    times = [log - place["phase_ns"] for log, *_ in found[f"/{name}/plant/step"]]
-    assert place["phase_ns"] > 0
+    phase_ns = phases_ns(loops.scenario)[-1]
+    times = [log - phase_ns for log, *_ in found[f"/{name}/plant/step"]]
+    assert phase_ns > 0
     assert times == steps
     assert len(found["/netem/packet"]) == loops.table("netem_packet").num_rows
     mat = loadmat(loops.export(tmp_path / "a.mat", certificates=False)[0], simplify_cells=True)
@@ -188,7 +189,7 @@ def test_csv_files_have_the_tables(run: noack.Run, tmp_path: Path) -> None:
     names = {Path(file).stem for file in json.loads(done.stdout)["files"]}
     assert names == {*run.tables, "samples", "events"}
     found = csv.read_csv(tmp_path / "csv/plant_step.csv")
-    assert found.equals(run.table("plant_step"))
+    assert found.equals(run.loops[run.scenario.name].table("plant_step"))
 
 
 def test_another_ending_is_refused(run: noack.Run, tmp_path: Path) -> None:

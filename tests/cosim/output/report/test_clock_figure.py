@@ -3,7 +3,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.analysis.run_summary import summarise
 from cosim.output.report.clock_figure import ClockErrors, clock_errors
 from cosim.output.report.run_figures import pictures
 from cosim.output.run_tables import key_numbers, short_numbers
@@ -13,6 +12,7 @@ from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER, clock_tab
 from tests.cosim.output.report.conftest import scenario_of
 from tests.cosim.output.report.test_page import shown
 from tests.cosim.record.changed_records import changed
+from tests.cosim.summaries import summary_of, with_values
 
 ALLOWED_US, SENSOR_NS, MS = 1000.0, 63_200, 1_000_000
 FIRST_LOST = 7
@@ -68,10 +68,15 @@ def test_one_clock_has_no_figure(clocked: RunRecord) -> None:
 
 
 def test_the_page_and_both_tables_have_the_number(clocked: RunRecord) -> None:
-    conditions = {"clock_error_s": SENSOR_NS * 1e-9}
+    conditions: dict[str, float | None] = dict.fromkeys(
+        ("dropouts", "sampling_s", "delay_s", "hold_s", "start_s")
+    )
+    conditions["clock_error_s"] = SENSOR_NS * 1e-9
     row = ("largest bound of a clock's error", "63.2 µs")
-    summary = summarise(clocked, 0, "horizon").to_json() | {"conditions": conditions}
+    summary = summary_of(clocked, conditions=conditions)
     assert row in key_numbers(summary)
     assert row in short_numbers(summary)
-    assert row[0] not in dict(short_numbers(summary | {"conditions": {"clock_error_s": 0.0}}))
+    assert row[0] not in dict(
+        short_numbers(with_values(summary, conditions=conditions | {"clock_error_s": 0.0}))
+    )
     assert row[1] in shown(clocked, conditions=conditions)

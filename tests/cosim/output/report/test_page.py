@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
 from cosim.analysis.replay.replay_result import difference
-from cosim.analysis.run_summary import summarise
+from cosim.analysis.summary_model import RunSummary
 from cosim.cli import app
 from cosim.live import finalize as concluding
 from cosim.output.report import figure_files, report_page
@@ -22,11 +22,12 @@ from cosim.output.report.report_page import page, write_report
 from cosim.output.report.run_figures import BOUNDED, pictures
 from cosim.record.run_directory import REPORT_FILE
 from cosim.record.run_ending import RunEnding
-from cosim.record.run_record import RunRecord
+from cosim.record.run_record import RunRecord, alone
 from noack.config.scenario_file import dumps as scenario_toml
 from noack.core.errors import ExitStatus, MachineError
 from tests.cosim.output.report.conftest import HOSTILE, make_record, scenario_of
 from tests.cosim.record.changed_records import changed
+from tests.cosim.summaries import summary_of
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
 FIGURES = ["states", "errors", "state-norm", "input", "inter-event", "losses"]
@@ -78,11 +79,11 @@ class Page(HTMLParser):
         return [attributes["id"] or "" for _, attributes in self.tags if "id" in attributes]
 
 
-def written(record: RunRecord, run_dir: Path, **more: Any) -> tuple[Page, dict[str, Any]]:
+def written(record: RunRecord, run_dir: Path, **more: Any) -> tuple[Page, RunSummary]:
     """Write a report and check it."""
     (run_dir / "scenario.toml").write_text(scenario_toml(record.scenario), encoding="utf-8")
-    summary = summarise(record, 0, "horizon").to_json() | more
-    html = write_report(record, summary, run_dir).read_text(encoding="utf-8")
+    summary = summary_of(record, **more)
+    html = write_report(alone(record), summary, run_dir).read_text(encoding="utf-8")
     assert html.startswith("<!DOCTYPE html>")
     parsed = Page(html)
     check(parsed, html)
@@ -91,7 +92,7 @@ def written(record: RunRecord, run_dir: Path, **more: Any) -> tuple[Page, dict[s
 
 def shown(record: RunRecord, **more: Any) -> str:
     """The text of a report without figures, which take most of the time."""
-    html = page(record.scenario, summarise(record, 0, "horizon").to_json() | more, [], "", {})
+    html = page(record.scenario, summary_of(record, **more), [], "", {})
     found = Page(html)
     check(found, html)
     return found.text
@@ -142,9 +143,9 @@ def test_the_report_of_a_live_run_is_complete(record: RunRecord, tmp_path: Path)
             assert str(claim[key]) in parsed.text
     for number in ("2.5", "0.4371", "17.5 %", "t = 3.25 s", "0.011"):
         assert number in parsed.text
-    for assumption in summary["assumptions"]:
-        assert assumption["what"] in parsed.text
-        assert assumption["why"] in parsed.text
+    for assumption in summary.loops[0].assumptions:
+        assert assumption.what in parsed.text
+        assert assumption.why in parsed.text
     assert scenario_toml(record.scenario) in parsed.text
     claims = "claims: 1 of 3 held, 1 violated (controller error), 1 void (7 consecutive losses)"
     assert claims in parsed.text
@@ -172,7 +173,7 @@ def test_user_text_is_escaped(content: dict[str, Any], tmp_path: Path) -> None:
         ],
         assumptions=[dict.fromkeys(("what", "source", "verdict", "why"), HOSTILE)],
         assumption_violations=[dict.fromkeys(("process", "cause", "what"), HOSTILE) | {"t_s": 1.0}],
-        fidelity=dict.fromkeys(fidelity()) | {"reason": HOSTILE},
+        fidelity={"reason": HOSTILE},
         replay={"bit_exact": None, "error": HOSTILE},
         rejected_datagrams={HOSTILE: {HOSTILE: 3}},
         missing_samples=1,
@@ -216,7 +217,7 @@ def test_the_difference_to_the_ideal_loop_is_explained(record: RunRecord) -> Non
     assert "the residual is 40 % of the difference, which is too large" in text
     assert "They agree up to event 7" in text
     assert "negative share" not in text
-    nothing = dict.fromkeys(fidelity()) | {"reason": "the run diverged"}
+    nothing = {"reason": "the run diverged"}
     assert "Not compared with the ideal loop: the run diverged." in shown(record, fidelity=nothing)
 
 

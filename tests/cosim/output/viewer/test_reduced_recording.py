@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from cosim.live.finalize import finalize
 from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.recording_file import ViewError
-from cosim.output.viewer.run_view import write_view
+from cosim.output.viewer.run_view import write_loop_view
 from cosim.record import decimate, run_record
 from cosim.record.environment import write_environment
 from cosim.record.run_directory import RECORDING_FILE, write_scenario
 from cosim.record.run_ending import RunEnding
-from cosim.record.run_record import RunRecord, write_record
+from cosim.record.run_record import RunRecord, alone, write_run
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
@@ -69,7 +69,7 @@ def test_each_envelope_holds_all_samples_of_its_bin(
     record = with_peaks(simulate(resolve(load(scenario, ["horizon_s=20"]))))
     write_scenario(record.scenario, tmp_path)
     write_environment(tmp_path, "live")
-    write_record(record, tmp_path)
+    write_run(alone(record), tmp_path)
     steps = record.count(PLANT_STEP)
     monkeypatch.setattr(decimate, "_MOST_STEPS", steps // 2)
     monkeypatch.setattr(run_record, "BATCH_ROWS", PART_STEPS)
@@ -93,5 +93,5 @@ def test_no_recording_is_written_on_a_full_disk(
     scenario = resolve(load(find_shipped("lane_following", "scenarios"), ["horizon_s=0.1"]))
     monkeypatch.setattr("cosim.output.viewer.run_view.disk_usage", lambda _: Mock(free=1 << 20))
     with pytest.raises(ViewError, match="No space left"):
-        write_view(simulate(scenario), tmp_path, 1)
+        write_loop_view(simulate(scenario), tmp_path / RECORDING_FILE, 1)
     assert not [*tmp_path.iterdir()]

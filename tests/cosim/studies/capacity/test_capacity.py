@@ -16,7 +16,7 @@ from cosim.studies.campaign.campaign_run import run_campaign
 from cosim.studies.campaign.campaign_summary import summarise
 from cosim.studies.campaign.campaign_workers import alone
 from cosim.studies.campaign.chunk_store import Store
-from cosim.studies.campaign.loops_draws import used_up
+from cosim.studies.campaign.shared_network_draws import used_up
 from cosim.studies.capacity import capacity_plan as plans
 from cosim.studies.capacity.capacity_criteria import (
     PolicyCapacity,

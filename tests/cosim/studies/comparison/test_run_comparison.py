@@ -44,12 +44,12 @@ def number(found: RunComparison, name: str) -> KeyNumber:
 def test_numbers_are_those_of_the_summaries_with_differences_to_the_first_run(
     found: RunComparison,
 ) -> None:
-    events = tuple(run.summary["events"] for run in found.runs)
+    events = tuple(run.loop.events for run in found.runs)
     assert number(found, "transmissions").values == events
     assert number(found, "transmissions").differences == (0, *(n - events[0] for n in events[1:]))
     for run, share in zip(found.runs, number(found, "loss rate, %").values, strict=True):
-        crossed = run.summary["drops"] + run.summary["deliveries"]
-        assert share == pytest.approx(100 * run.summary["drops"] / crossed)
+        crossed = run.loop.drops + run.loop.deliveries
+        assert share == pytest.approx(100 * run.loop.drops / crossed)
 
 
 def test_the_distance_is_over_the_common_times(found: RunComparison) -> None:

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from cosim.analysis.claims.assumption_monitor import AssumptionMonitor
-from cosim.live.loops_monitor import MOST_CHECKED, Finding, LoopsMonitor
-from cosim.record.loops_run import LoopsRun
-from cosim.record.run_record import Rows, RunRecord
+from cosim.live.claim_monitor import MOST_CHECKED, ClaimMonitor, Finding
+from cosim.record.run_record import RecordedRun, Rows, RunRecord
 from cosim.simulation.virtual_time import simulate_loops
 from noack.config.loops import phases_ns
-from noack.config.resolution import tables_of
+from noack.config.resolution import run_tables, tables_of
 from noack.config.scenario_file import validate
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import LOOP, NETEM_PACKET, OWNER
@@ -35,11 +34,11 @@ def content(content: Content) -> Content:
     return content
 
 
-def live_rows(run: LoopsRun) -> Iterator[tuple[str, Rows]]:
+def live_rows(run: RecordedRun) -> Iterator[tuple[str, Rows]]:
     """Yield the rows as the processes send them: those of all loops mixed, batch by batch."""
     network = run.network
     every = {NETEM_PACKET: network[NETEM_PACKET]}
-    for table, dtype in tables_of(network.scenario).items():
+    for table, dtype in run_tables(network.scenario).items():
         if OWNER[table] != "netem":
             of_loops = [numbered(one, i, table, dtype) for i, one in enumerate(run.loops)]
             every[table] = np.concatenate(of_loops)
@@ -59,7 +58,7 @@ def numbered(record: RunRecord, number: int, table: str, dtype: np.dtype[np.void
     return rows
 
 
-def found_by(monitor: LoopsMonitor, run: LoopsRun) -> list[Finding]:
+def found_by(monitor: ClaimMonitor, run: RecordedRun) -> list[Finding]:
     found: list[Finding] = []
     for table, rows in live_rows(run):
         monitor.take(table, rows)
@@ -70,7 +69,7 @@ def found_by(monitor: LoopsMonitor, run: LoopsRun) -> list[Finding]:
 def test_each_loop_is_checked_as_by_its_own_monitor(content: Content) -> None:
     run = simulate_loops(validate(content, "here"))
     scenario = run.network.scenario
-    found = found_by(LoopsMonitor(scenario), run)
+    found = found_by(ClaimMonitor(scenario), run)
     voids = 0
     for number, (record, phase_ns) in enumerate(zip(run.loops, phases_ns(scenario), strict=True)):
         alone = AssumptionMonitor(record.scenario)
@@ -96,7 +95,7 @@ def test_a_diverging_loop_is_named_once_also_among_many(content: Content) -> Non
             content["horizon_s"] = 4.0
             del content["network"]["impairments"]
         run = simulate_loops(validate(content, "here"))
-        monitor = LoopsMonitor(run.network.scenario)
+        monitor = ClaimMonitor(run.network.scenario)
         assert (monitor.stopped is not None) == many
         found = [one for one in found_by(monitor, run) if one.notice.level == "diverges"]
         (only,) = found
@@ -112,7 +111,7 @@ def test_a_diverging_loop_is_named_once_also_among_many(content: Content) -> Non
 
 def test_missing_rows_end_the_check_of_assumptions(content: Content) -> None:
     run = simulate_loops(validate(content, "here"))
-    monitor = LoopsMonitor(run.network.scenario)
+    monitor = ClaimMonitor(run.network.scenario)
     monitor.stop("telemetry is missing")
     assert {one.notice.level for one in found_by(monitor, run)} == {"diverges"}
     assert monitor.stopped == "telemetry is missing"

@@ -1,4 +1,4 @@
-"""The recording of a run of several loops: its network, all loops together, and some in detail.
+"""The recording of a run of loops that share a network: all of them together, some in detail.
 
 Entities besides those of the loops, which are below ``loops/NAME`` (:mod:`blueprint`):
 
@@ -29,7 +29,7 @@ from matplotlib import colormaps
 from matplotlib.image import imsave
 from numpy.typing import NDArray
 
-from cosim.analysis.loops_over_time import QUANTILES, WorstLoop, quantiles
+from cosim.analysis.over_time import QUANTILES, WorstLoop, quantiles
 from cosim.output.palette import CONTROLLER, LOST, NETWORK, SERIES
 from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.live_viewer import LiveView
@@ -38,12 +38,12 @@ from cosim.output.viewer.pictures.picture import panel
 from cosim.output.viewer.pictures.picture_choice import picture_of
 from cosim.output.viewer.recording import LoopView
 from cosim.output.viewer.recording_file import Nanoseconds, RecordingFile
-from cosim.output.viewer.run_view import about
+from cosim.output.viewer.recording_text import about
 from cosim.record.decimate import Reals, is_long
 from cosim.record.environment import Kind
 from cosim.record.run_directory import RECORDING_FILE
-from noack.config.loops import loops_of, phases_ns
-from noack.config.resolution import loop_of, resolved_loops
+from noack.config.loops import loop_names, phases_ns
+from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 
 PICTURED = 12
@@ -58,7 +58,7 @@ _ROW_PIXELS = 600
 """Least height of the map in pixels."""
 
 
-class LoopsRecording(RecordingFile):
+class NetworkRecording(RecordingFile):
     """Writes the recording.
 
     Args:
@@ -85,7 +85,7 @@ class LoopsRecording(RecordingFile):
         kind: Kind,
         live: LiveView | None = None,
     ) -> None:
-        self.names = [one.name for one in loops_of(run)]
+        self.names = loop_names(run)
         animated = len(shown) <= _ANIMATED and not is_long(run)
         pages = {
             number: _LoopPage(self.names[number], loop, animated=animated)
@@ -176,15 +176,6 @@ to the right.
             if self._live is not None:
                 self._live.finish()
                 self._live = None
-
-
-def open_loops_view(
-    run: Scenario, run_dir: Path, run_id: int, live: LiveView | None
-) -> LoopsRecording:
-    """Create the recording of a live run, which is written during the run."""
-    loops = resolved_loops(run)
-    shown = dict(enumerate(loops)) if len(loops) <= PICTURED else {}
-    return LoopsRecording(run, run_dir, run_id, shown, worst=None, kind="live", live=live)
 
 
 class _LoopPage:

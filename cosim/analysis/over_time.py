@@ -1,15 +1,14 @@
 """The loops of a run over time: the errors and states of each, and its share of the network."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.analysis.summary_model import Claim, LoopSummary
 from cosim.record.align import aligned_parts
-from cosim.record.run_directory import LOOPS, SUMMARY_FILE, read_object
-from cosim.record.run_record import Rows, RunRecord
+from cosim.record.run_record import RecordedRun, Rows
 from noack.config.loops import phases_ns
 from noack.config.scenario import Scenario
 from noack.core.errors import ExitStatus
@@ -52,14 +51,11 @@ class LoopsOverTime(NamedTuple):
         return ends_s, sums / np.where(sums.sum(axis=0) > 0, sums.sum(axis=0), np.nan)
 
 
-def loops_over_time(network: RunRecord, loops: Iterable[RunRecord]) -> LoopsOverTime:
-    """Return how the loops of a run went, from the records of the network and of each loop.
-
-    The loops are read one after the other.
-    """
-    horizon_ns, phases = network.scenario.timing.horizon_ns, phases_ns(network.scenario)
-    found = empty_over_time(network.scenario)
-    for number, (record, phase_ns) in enumerate(zip(loops, phases, strict=True)):
+def loops_over_time(run: RecordedRun) -> LoopsOverTime:
+    """Return how the loops of a run went; their records are read one after the other."""
+    horizon_ns, phases = run.scenario.timing.horizon_ns, phases_ns(run.scenario)
+    found = empty_over_time(run.scenario)
+    for number, (record, phase_ns) in enumerate(zip(run.loops, phases, strict=True)):
         with np.errstate(all="ignore"):  # a loop may diverge
             for part in aligned_parts(record):
                 aligned = part.aligned
@@ -67,12 +63,12 @@ def loops_over_time(network: RunRecord, loops: Iterable[RunRecord]) -> LoopsOver
                 np.fmax.at(found.states[number], place, row_norms(aligned.x))
                 common = aligned.since_delivery(record.scenario)
                 np.fmax.at(found.errors[number], place[common], aligned.e_c_norm[common])
-    add_link_bytes(found.link_bytes, network[NETEM_PACKET], horizon_ns)
+    add_link_bytes(found.link_bytes, run.network[NETEM_PACKET], horizon_ns)
     return found
 
 
 def empty_over_time(scenario: Scenario) -> LoopsOverTime:
-    """Return the quantities of a run of several loops of which nothing is known yet."""
+    """Return the quantities of a run of which nothing is known yet."""
     loops = len(phases_ns(scenario))
     errors, states = np.full((2, loops, INTERVALS), np.nan)
     edges_s = np.linspace(0, scenario.horizon_s, INTERVALS + 1)
@@ -110,36 +106,35 @@ class WorstLoop(NamedTuple):
     """What makes it the worst."""
 
 
-def worst_loop(run_dir: Path, loops: Sequence[Mapping[str, Any]]) -> WorstLoop:
-    """Return the worst loop, from the entries of the loops in the run's summary.
+def worst_loop(loops: Sequence[LoopSummary]) -> WorstLoop:
+    """Return the worst loop of a run.
 
     That is a loop that failed; else the one that came nearest to, or exceeded, a certified bound of
     ‖e_c‖ or ‖x‖; without such bounds, the one with the largest ‖e_c‖.
     """
     for loop in loops:
-        if loop["exit"]["status"] != ExitStatus.OK:
-            return WorstLoop(loop["number"], str(loop["exit"]["reason"]))
-    used = [_share_used(run_dir / LOOPS / loop["name"]) for loop in loops]
+        if loop.exit.status != ExitStatus.OK:
+            return WorstLoop(loop.number, loop.exit.reason)
+    used = [_share_used(loop.claims) for loop in loops]
     if max(used) > 0:
-        number = int(np.argmax(used))
-        text = f"largest share of a certified bound of ‖e_c‖ or ‖x‖: {100 * used[number]:.3g} %"
-        return WorstLoop(number, text)
-    errors = [-1.0 if loop["sup_e_c_norm"] is None else loop["sup_e_c_norm"] for loop in loops]
-    number = int(np.argmax(errors))
-    text = f"largest ‖e_c‖, {shown(errors[number])}; no loop has a certified bound"
-    return WorstLoop(number, text)
+        place = int(np.argmax(used))
+        text = f"largest share of a certified bound of ‖e_c‖ or ‖x‖: {100 * used[place]:.3g} %"
+        return WorstLoop(loops[place].number, text)
+    errors = [-1.0 if loop.sup_e_c_norm is None else loop.sup_e_c_norm for loop in loops]
+    place = int(np.argmax(errors))
+    text = f"largest ‖e_c‖, {shown(errors[place])}; no loop has a certified bound"
+    return WorstLoop(loops[place].number, text)
 
 
-def _share_used(run_dir: Path) -> float:
+def _share_used(claims: Sequence[Claim]) -> float:
     """Return the largest share of a certified bound that a loop reached; 0 without a bound."""
-    claims = read_object(run_dir / SUMMARY_FILE).get("claims", [])
     return max(
         (
-            claim["ratio"]
+            claim.ratio
             for claim in claims
-            if "certificate" in claim["source"]
-            and claim["ratio"] is not None
-            and claim["bound"].startswith(("‖e_c‖ ≤", "‖x‖ ≤"))
+            if "certificate" in claim.source
+            and claim.ratio is not None
+            and claim.bound.startswith(("‖e_c‖ ≤", "‖x‖ ≤"))
         ),
         default=0.0,
     )

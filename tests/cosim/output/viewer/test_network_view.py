@@ -1,14 +1,15 @@
 """The recording of several loops: few are all shown, of many the quantiles and the worst."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from cosim.analysis.loops_over_time import INTERVALS, QUANTILES, loops_over_time
-from cosim.analysis.loops_summary import in_flight
+from cosim.analysis.network_summary import summarise_run
+from cosim.analysis.over_time import INTERVALS, QUANTILES, loops_over_time
+from cosim.analysis.run_summary import summarise
+from cosim.analysis.summary_model import ExitPart, LoopSummary
 from cosim.output.viewer import blueprint as bp
-from cosim.output.viewer.loops_recording import (
+from cosim.output.viewer.network_recording import (
     ERROR,
     MAP,
     QUEUE,
@@ -17,48 +18,43 @@ from cosim.output.viewer.loops_recording import (
     map_pixels,
     usual_largest,
 )
-from cosim.output.viewer.loops_view import write_loops_view
+from cosim.output.viewer.run_view import write_view
 from cosim.record.align import align_tables
 from cosim.record.environment import write_environment
-from cosim.record.loops_run import LoopsRun, write_loops
 from cosim.record.run_directory import RECORDING_FILE, write_scenario
+from cosim.record.run_record import RecordedRun, write_run
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate_loops
 from noack.config.scenario_file import load
-from noack.protocol.record_tables import NETEM_PACKET
 from tests.cosim.output.viewer.test_viewer import Chunks, of_views, read, series
 
 MAX_BYTES = 3_000_000
 
 
-def shown(folder: Path, count: int) -> tuple[LoopsRun, list[dict[str, Any]], Chunks]:
+def shown(folder: Path, count: int) -> tuple[RecordedRun, list[LoopSummary], Chunks]:
     """Simulate loops, and read their recording; the last loop but one is the worst."""
     settings = ["horizon_s=0.4", f'loops=[{{ name = "p", count = {count} }}]']
     scenario = load(find_shipped("shared_bottleneck", "scenarios"), settings)
     run = simulate_loops(write_scenario(scenario, folder))
     write_environment(folder, "simulated")
-    write_loops(run, folder)
-    horizon_ns = scenario.timing.horizon_ns
-    loops: list[dict[str, Any]] = [
-        {
-            "name": record.scenario.name, "number": i, "sup_e_c_norm": float(i == count - 2),
-            "exit": {"status": 0, "reason": "horizon"},
-        }
+    write_run(run, folder)
+    loops = [
+        summarise(record, 0, "horizon").model_copy(update={"sup_e_c_norm": float(i == count - 2)})
         for i, record in enumerate(run.loops)
-    ]  # fmt: skip
-    flying = in_flight(run.network[NETEM_PACKET], horizon_ns, horizon_ns).model_dump()
-    write_loops_view(run.network, {"loops": loops, "network": {"in_flight": flying}}, folder, 9)
+    ]
+    end = ExitPart(status=0, reason="horizon")
+    write_view(run, summarise_run(run.network, loops, end), folder, None)
     return run, loops, read(folder / RECORDING_FILE)
 
 
 def test_of_few_loops_each_is_recorded_in_the_time_of_the_run(tmp_path: Path) -> None:
     run, loops, found = shown(tmp_path, 3)
-    over_time = loops_over_time(run.network, run.loops)
+    over_time = loops_over_time(run)
     _, errors = series(found, ERROR)
     largest = np.nanmax(over_time.errors, axis=1)
     np.testing.assert_allclose(10 ** np.nanmax(errors, axis=0), largest, rtol=1e-9)
     for loop, record in zip(loops, run.loops, strict=True):
-        folder = bp.loop_path(loop["name"])
+        folder = bp.loop_path(loop.name)
         aligned = align_tables(record)
         t_ns, states = series(found, f"{folder}/{bp.state_path('angle')}")
         np.testing.assert_array_equal(states[:, 0], aligned.x[:, 0])
@@ -70,7 +66,7 @@ def test_of_few_loops_each_is_recorded_in_the_time_of_the_run(tmp_path: Path) ->
 
 def test_of_many_loops_quantiles_a_map_and_the_worst_are_recorded(tmp_path: Path) -> None:
     run, _, found = shown(tmp_path, 100)
-    over_time = loops_over_time(run.network, run.loops)
+    over_time = loops_over_time(run)
     assert {one.split("/")[1] for one in found if one.startswith("loops/")} == {"p-099"}
     for entity, values in ((ERROR, over_time.errors), (SIZE, over_time.states)):
         t_ns, drawn = series(found, entity)

@@ -9,9 +9,9 @@ import pytest
 from cosim.analysis.run_summary import summarise
 from cosim.simulation.virtual_time import simulate_loops
 from cosim.studies.campaign.campaign_grid import grid, row_type
-from cosim.studies.campaign.loops_draws import LOOPS_ROW, LoopsWork
 from cosim.studies.campaign.random_draws import seeds_of
 from cosim.studies.campaign.sampled_draws import in_virtual_time
+from cosim.studies.campaign.shared_network_draws import LOOPS_ROW, SharedNetworkWork
 from noack.config.scenario_file import load
 from noack.core.errors import CallerError
 from tests.cosim.studies.campaign.conftest import Write
@@ -20,10 +20,10 @@ SCENARIO = Path(__file__).parents[4] / "scenarios" / "shared_bottleneck.toml"
 AXIS = {"name": "number", "key": "loops", "values": [1, 3]}
 
 
-def work(*overrides: str, **settings: Any) -> LoopsWork:
+def work(*overrides: str, **settings: Any) -> SharedNetworkWork:
     scenario = in_virtual_time(load(SCENARIO, ["horizon_s=2.0", *overrides]))
     measured: dict[str, Any] = {"Q": None, "R": None, "settle": 0.5, "most_events": 1000}
-    return LoopsWork(scenario, 7, **measured | settings)
+    return SharedNetworkWork(scenario, 7, **measured | settings)
 
 
 def test_a_row_agrees_with_the_summaries_of_the_loops() -> None:
@@ -58,7 +58,7 @@ def test_the_number_of_loops_is_an_axis(write: Write, plan: dict[str, Any]) -> N
     _, points = _points(write(plan, axes=[AXIS], **sampled))
     assert [point.scenario.loops[0].count for point in points] == [1, 3]
     assert row_type(points) == LOOPS_ROW
-    assert [type(point.work) for point in points] == [LoopsWork, LoopsWork]
+    assert [type(point.work) for point in points] == [SharedNetworkWork, SharedNetworkWork]
     with pytest.raises(CallerError, match='needs time = "sampled"'):
         _points(write(plan, axes=[AXIS], **sampled | {"time": "continuous"}))
     some = {"name": "some", "variants": {"one": {"mode": "zoh"}, "two": {"loops": 2}}}

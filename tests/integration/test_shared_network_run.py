@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from cosim.analysis.replay import replay
-from cosim.output.loops_tables import network_rows
+from cosim.analysis.summary_model import read_summary
+from cosim.output.network_table import network_rows
 from cosim.record.packet_outcomes import updates_in
-from cosim.record.run_record import RunRecord, load_record
+from cosim.record.run_record import RunRecord, load_record, load_run
 from noack.config.loops import phases_ns
 from noack.protocol.record_tables import NETEM_PACKET, PLANT_STEP, Fate
 from tests.integration import conftest as live
@@ -69,7 +70,7 @@ def finished(scenario: Path, tmp_path_factory: pytest.TempPathFactory) -> live.F
 
 
 def record_of(run: live.Finished, name: str) -> RunRecord:
-    return load_record(run.run_dir / "loops" / name)
+    return load_record(run.run_dir, name)
 
 
 def loop_of(run: live.Finished, name: str) -> dict[str, Any]:
@@ -104,7 +105,7 @@ def test_the_diverging_loop_is_named_during_the_run(finished: live.Finished) -> 
 def test_the_loops_compete_for_the_bottleneck_and_the_guarantee_holds_for_each(
     finished: live.Finished,
 ) -> None:
-    network = load_record(finished.run_dir, network=True)
+    network = load_run(finished.run_dir).network
     packets = network[NETEM_PACKET]
     assert np.array_equal(np.unique(packets["flow"]), [0, 1, 2])
     assert (packets["fate"] == Fate.OVERFLOWED).any()
@@ -116,8 +117,8 @@ def test_the_loops_compete_for_the_bottleneck_and_the_guarantee_holds_for_each(
 
 
 def test_each_loop_and_the_network_are_replayed_bit_by_bit(finished: live.Finished) -> None:
-    assert finished.summary["replay"]["bit_exact"] is True
-    network = replay(load_record(finished.run_dir, network=True))
+    assert finished.summary["network"]["replay"]["bit_exact"] is True
+    network = replay(load_run(finished.run_dir).network)
     assert network.bit_exact
     for name in NAMES:
         found = replay(record_of(finished, name))
@@ -130,7 +131,9 @@ def test_the_summary_counts_the_missed_deadlines_of_all_loops(finished: live.Fin
     found = finished.summary["deadlines"]["plant"]
     assert (found["steps"], found["late_steps"]) == (3 * 401, (late_ns > 20_000_000).sum())
     assert found["max_us"] == pytest.approx(late_ns.max() / 1e3 / 2)  # twice as fast
-    rows = dict(network_rows(finished.summary))
+    summary = read_summary(finished.summary)
+    assert summary is not None
+    rows = dict(network_rows(summary))
     assert (rows["deadlines missed"] == "none") == (
         not any(one["late_steps"] for one in finished.summary["deadlines"].values())
     )
@@ -138,7 +141,7 @@ def test_the_summary_counts_the_missed_deadlines_of_all_loops(finished: live.Fin
 
 def test_loops_begin_at_their_phases(finished: live.Finished) -> None:
     """An update's time is that of its loop; the network records the time of the run."""
-    network = load_record(finished.run_dir, network=True)
+    network = load_run(finished.run_dir).network
     phases, packets = phases_ns(network.scenario), network[NETEM_PACKET]
     assert len(set(phases)) == 3
     for flow, phase_ns in enumerate(phases):
@@ -182,7 +185,7 @@ def test_restarted_processes_serve_all_loops_again(scenario: Path, tmp_path: Pat
         running.process.send_signal(signal.SIGINT)
         run = running.finish()
     assert run.status == 130
-    assert run.summary["replay"]["bit_exact"] is True
+    assert run.summary["network"]["replay"]["bit_exact"] is True
     for name in NAMES:
         record = record_of(run, name)
         assert replay(record).bit_exact

@@ -37,12 +37,12 @@ class Finding(NamedTuple):
     """For the log of the run: the name of the loop, and the time of the run."""
 
 
-class LoopsMonitor:
-    """Reports each violated assumption of each loop once; with [[loops]], diverging loops, too."""
+class ClaimMonitor:
+    """Reports each violated assumption and each divergence of a loop once."""
 
     def __init__(self, scenario: Scenario) -> None:
         loops = resolved_loops(scenario)
-        self._names = None if scenario.loops is None else [one.name for one in loops]
+        self._names = [one.name for one in loops]
         self._phases_ns = phases_ns(scenario)
         self._stopped: str | None = None
         self._until_s = np.inf
@@ -50,7 +50,7 @@ class LoopsMonitor:
         self._monitors = [AssumptionMonitor(one) for one in checked]
         if not checked:
             self.stop(f"the run has {len(loops)} loops; up to {MOST_CHECKED} are checked during it")
-        self._growth = GrowthMonitor(loops) if scenario.loops is not None else None
+        self._growth = GrowthMonitor(loops)
         self._found: list[Finding] = []
         self._waiting: dict[str, list[Rows]] = {}
         self._due: list[int] = []
@@ -75,7 +75,7 @@ class LoopsMonitor:
 
     def take(self, table: str, rows: Rows) -> None:
         """Add rows of a table, in their order."""
-        if self._growth is not None and table == SENSOR_MEASUREMENT:
+        if table == SENSOR_MEASUREMENT:
             for loop, t_ns, text in self._growth.take(rows[LOOP], rows["t_ns"], rows["x"]):
                 if self._of_run_s(loop, t_ns) < self._until_s:
                     self._add(loop, t_ns, "diverges", "diverges", text)
@@ -118,10 +118,9 @@ class LoopsMonitor:
 
     def _add(self, loop: int, t_ns: int, level: str, what: str, why: str) -> None:
         own = f"{what} from {t_ns / NS_PER_S:.3f} s on: {why}"
-        if self._names is None:
-            self._found.append(Finding(Notice(t_ns, level, own), own))
-            return
-        of_run = f"{self._names[loop]}: {what} from {self._of_run_s(loop, t_ns):.3f} s on: {why}"
+        of_run = f"{what} from {self._of_run_s(loop, t_ns):.3f} s on: {why}"
+        if len(self._names) > 1:
+            of_run = f"{self._names[loop]}: {of_run}"
         self._found.append(Finding(Notice(t_ns, level, own, loop), of_run))
 
     def _of_run_s(self, loop: int, t_ns: int) -> float:

@@ -1,4 +1,6 @@
-"""Feeds the recording of several loops while they run, thinned so that a viewer keeps up.
+"""Feeds the recording of a run while it goes on.
+
+That of several loops is thinned so that a viewer keeps up.
 
 The loops that are shown in detail have a feed each, and share a part of the recorder's time. All
 loops together are shown as in the finished recording: largest values in intervals of the run. What
@@ -12,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from cosim.analysis.loops_over_time import INTERVALS, add_link_bytes, empty_over_time, places
-from cosim.analysis.loops_summary import counts_inside, times_inside
-from cosim.output.viewer.loops_recording import ERROR, SIZE, LoopsRecording
+from cosim.analysis.network_summary import counts_inside, times_inside
+from cosim.analysis.over_time import INTERVALS, add_link_bytes, empty_over_time, places
+from cosim.output.viewer.network_recording import ERROR, SIZE, NetworkRecording
+from cosim.output.viewer.recording import RunView
 from cosim.output.viewer.table_feed import LAG_S, SHOWN, ViewFeed, log_level
 from cosim.record.loop_rows import rows_by_loop
 from cosim.record.run_record import Rows
@@ -41,8 +44,31 @@ _LONGEST_NS = 2**50
 """Longer than any run; 2**13 loops have keys of 63 bits."""
 
 
-class LoopsFeed:
-    """Passes the rows of all loops to their recording.
+def feed_of(
+    scenario: Scenario, view: RunView | NetworkRecording, warn: Callable[[str], None]
+) -> "LoopFeed | NetworkFeed":
+    """Return what passes the rows of a run to its recording."""
+    if isinstance(view, NetworkRecording):
+        return NetworkFeed(scenario, view, warn)
+    return LoopFeed(scenario, view)
+
+
+class LoopFeed:
+    """Passes the rows of a run of one loop to its recording."""
+
+    def __init__(self, scenario: Scenario, view: RunView) -> None:
+        (loop,) = resolved_loops(scenario)
+        self._feed, self._phases_ns = ViewFeed(loop, view), phases_ns(scenario)
+        self.log, self.advance = self._feed.log, self._feed.advance
+
+    def add(self, table: str, rows: Rows) -> None:
+        """Add rows that follow the previously added ones."""
+        for _, own in rows_by_loop(table, rows, self._phases_ns):
+            self._feed.add(table, own)
+
+
+class NetworkFeed:
+    """Passes the rows of loops that share a network to their recording.
 
     Args:
         scenario: the scenario of the run.
@@ -51,7 +77,7 @@ class LoopsFeed:
     """
 
     def __init__(
-        self, scenario: Scenario, view: LoopsRecording, warn: Callable[[str], None]
+        self, scenario: Scenario, view: NetworkRecording, warn: Callable[[str], None]
     ) -> None:
         loops = resolved_loops(scenario)
         self._view, self._warn = view, warn
@@ -133,7 +159,9 @@ class LoopsFeed:
 class _AllLoops:
     """Shows the norms and shares of all loops, and the network, interval by interval."""
 
-    def __init__(self, scenario: Scenario, loops: Sequence[Scenario], view: LoopsRecording) -> None:
+    def __init__(
+        self, scenario: Scenario, loops: Sequence[Scenario], view: NetworkRecording
+    ) -> None:
         self._view, self._horizon_ns = view, scenario.timing.horizon_ns
         self._period_ns = loops[0].timing.controller_period_ns
         self._loops = [loop_of(one) for one in loops]

@@ -5,30 +5,32 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.analysis.loops_over_time import INTERVALS, loops_over_time, quantiles
-from cosim.analysis.loops_summary import counts_inside, times_inside
+from cosim.analysis.network_summary import counts_inside, times_inside
+from cosim.analysis.over_time import INTERVALS, loops_over_time, quantiles
 from cosim.output.viewer import blueprint as bp
-from cosim.output.viewer.loops_feed import LoopsFeed
-from cosim.output.viewer.loops_recording import ERROR, MAP, QUEUE, SHARE, SIZE, open_loops_view
+from cosim.output.viewer.network_recording import ERROR, MAP, QUEUE, SHARE, SIZE, NetworkRecording
+from cosim.output.viewer.run_feed import NetworkFeed
+from cosim.output.viewer.run_view import open_view
 from cosim.record.align import align_tables
-from cosim.record.loops_run import LoopsRun
 from cosim.record.run_directory import RECORDING_FILE
+from cosim.record.run_record import RecordedRun
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate_loops
 from noack.config.scenario_file import load
 from noack.protocol.machine_interface import Notice
 from noack.protocol.record_tables import NETEM_PACKET
-from tests.cosim.live.test_loops_monitor import live_rows
+from tests.cosim.live.test_claim_monitor import live_rows
 from tests.cosim.output.viewer.test_viewer import Chunks, read, series
 
 
-def shown(folder: Path, count: int, *settings: str) -> tuple[LoopsRun, Chunks, list[str]]:
+def shown(folder: Path, count: int, *settings: str) -> tuple[RecordedRun, Chunks, list[str]]:
     """Simulate loops, and pass their rows on as in a live run; read the recording."""
     given = ["horizon_s=2.0", f'loops=[{{ name = "p", count = {count} }}]', *settings]
     run = simulate_loops(load(find_shipped("shared_bottleneck", "scenarios"), given))
     scenario, said = run.network.scenario, list[str]()
-    with open_loops_view(scenario, folder, 9, None) as view:
-        feed = LoopsFeed(scenario, view, said.append)
+    with open_view(scenario, folder, 9, None) as view:
+        assert isinstance(view, NetworkRecording)
+        feed = NetworkFeed(scenario, view, said.append)
         for table, rows in live_rows(run):
             feed.add(table, rows)
             feed.advance()
@@ -41,7 +43,7 @@ def shown(folder: Path, count: int, *settings: str) -> tuple[LoopsRun, Chunks, l
 @pytest.mark.parametrize("phase", ["0.0", "0.3"])
 def test_all_loops_are_shown_as_from_the_record(tmp_path: Path, count: int, phase: str) -> None:
     run, found, said = shown(tmp_path, count, f"controller.phase={phase}")
-    expected = loops_over_time(run.network, run.loops)
+    expected = loops_over_time(run)
     for entity, values in ((ERROR, expected.errors), (SIZE, expected.states)):
         t_ns, drawn = series(found, entity)
         assert (np.diff(t_ns) > 0).all()
@@ -81,10 +83,10 @@ def test_few_loops_are_shown_in_detail(tmp_path: Path) -> None:
 def test_loops_in_detail_that_cannot_keep_up_are_given_up_and_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cosim.output.viewer.loops_feed._TURN_S", -1.0)  # one loop a turn
-    monkeypatch.setattr("cosim.output.viewer.loops_feed._NAMED_S", 0.05)
-    monkeypatch.setattr("cosim.output.viewer.loops_feed._PATIENCE_S", 0.5)
-    monkeypatch.setattr("cosim.output.viewer.loops_feed._SHARE", 1e-4)
+    monkeypatch.setattr("cosim.output.viewer.run_feed._TURN_S", -1.0)  # one loop a turn
+    monkeypatch.setattr("cosim.output.viewer.run_feed._NAMED_S", 0.05)
+    monkeypatch.setattr("cosim.output.viewer.run_feed._PATIENCE_S", 0.5)
+    monkeypatch.setattr("cosim.output.viewer.run_feed._SHARE", 1e-4)
     _, found, said = shown(tmp_path, 3)
     assert "in detail end here" in said[-1]
     assert len(series(found, ERROR)[0]) == INTERVALS

@@ -1,4 +1,4 @@
-"""Runs of a campaign with several loops on one network, in virtual time.
+"""Runs of a campaign whose loops share a network, in virtual time.
 
 Numbers of transmissions and deliveries are those of all loops; the cost is the mean over the loops.
 Times, errors and loss bursts are those of the worst loop.
@@ -39,7 +39,7 @@ LOOPS_ROW = np.dtype(
         ),
     ]
 )  # fmt: skip
-"""The row of a run of several loops.
+"""The row of a run of loops that share a network.
 
 cost_worst: the largest cost of a loop. loops_failed: share of the loops that diverged or exceeded
 the largest number of events. loops_claims_held: share of the loops of which every claim held.
@@ -54,8 +54,8 @@ _OF_ALL: Mapping[str, Callable[[NDArray[Any]], Any]] = {
 
 
 @dataclass(frozen=True)
-class LoopsWork(SampledWork):
-    """Computes draws of a grid point with several loops; the scenario has [[loops]].
+class SharedNetworkWork(SampledWork):
+    """Computes draws of a grid point of a scenario with [[loops]].
 
     Loop k of draw i has the same plant, initial state and phase for any number of loops.
     """

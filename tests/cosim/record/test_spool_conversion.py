@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from cosim.record.environment import write_environment
-from cosim.record.loops_run import LoopsRun, loop_directories
-from cosim.record.loops_spool import finish_run_record
 from cosim.record.run_directory import REPORTS_FILE, write_scenario
-from cosim.record.run_record import Rows, RunRecord, load_record
+from cosim.record.run_record import RecordedRun, Rows, RunRecord, load_run
+from cosim.record.spool_conversion import finish_record
 from cosim.simulation.virtual_time import simulate_loops
-from noack.config.resolution import network_tables, tables_of
+from noack.config.resolution import network_tables, run_tables
 from noack.config.scenario_file import validate
 from noack.core.errors import MachineError
 from noack.protocol.machine_interface import Notice
@@ -26,7 +25,7 @@ LOOPS = 3
 
 
 @pytest.fixture
-def shared(content: dict[str, Any]) -> LoopsRun:
+def shared(content: dict[str, Any]) -> RecordedRun:
     content["horizon_s"] = 2.0
     content["plant"] |= {"rate_hz": 100.0, "initial_state_halfwidth": [0.5, 0.5]}
     content["controller"] = {"rate_hz": 100.0}
@@ -36,10 +35,10 @@ def shared(content: dict[str, Any]) -> LoopsRun:
     return simulate_loops(validate(content, "here"))
 
 
-def mixed_rows(shared: LoopsRun) -> Mapping[str, Rows]:
+def mixed_rows(shared: RecordedRun) -> Mapping[str, Rows]:
     """All rows by table, as the processes emit them: with the loop's number, in order of time."""
     found = {}
-    for table, dtype in tables_of(shared.network.scenario).items():
+    for table, dtype in run_tables(shared.scenario).items():
         if table in network_tables():
             found[table] = shared.network[table]
             continue
@@ -69,7 +68,7 @@ def spool(run_dir: Path, table: str, rows: Rows, *, writer: str = "recorder") ->
     out.close()
 
 
-def opened(shared: LoopsRun, run_dir: Path) -> Path:
+def opened(shared: RecordedRun, run_dir: Path) -> Path:
     run_dir.mkdir()
     write_scenario(shared.network.scenario, run_dir)
     write_environment(run_dir, "live")
@@ -82,12 +81,12 @@ def same_rows(one: RunRecord, other: RunRecord, *but: str) -> None:
             assert one[table].tobytes() == other[table].tobytes(), table
 
 
-def records(run_dir: Path, shared: LoopsRun) -> list[RunRecord]:
-    return [load_record(one) for one in loop_directories(run_dir, shared.network.scenario)]
+def records(run_dir: Path) -> list[RunRecord]:
+    return list(load_run(run_dir).loops)
 
 
 def test_every_row_and_line_reaches_the_record_of_its_loop(
-    shared: LoopsRun, tmp_path: Path
+    shared: RecordedRun, tmp_path: Path
 ) -> None:
     run_dir = opened(shared, tmp_path / "run")
     for table, rows in mixed_rows(shared).items():
@@ -98,20 +97,20 @@ def test_every_row_and_line_reaches_the_record_of_its_loop(
     out.append(notices_of("plant"), 0, b"damaged")
     out.append(PLANT_STEP, 10**6, b"damaged")
     out.close()
-    network = finish_run_record(run_dir)
+    network = finish_record(run_dir).network
     same_rows(network, shared.network)
-    for record, expected in zip(records(run_dir, shared), shared.loops, strict=True):
+    for record, expected in zip(records(run_dir), shared.loops, strict=True):
         same_rows(record, expected)
         assert (record.kind, record.number, record.scenario) == (
             "live", expected.number, expected.scenario,
         )  # fmt: skip
-    lines = [[line["text"] for line in one.notices] for one in records(run_dir, shared)]
+    lines = [[line["text"] for line in one.notices] for one in records(run_dir)]
     assert lines == [["all"], ["mine", "all"], ["all"]]
     assert [line["text"] for line in network.notices] == ["all"]
     assert not (run_dir / SPOOL).exists()
 
 
-def test_a_line_of_no_loop_of_the_run_is_left_out(shared: LoopsRun, tmp_path: Path) -> None:
+def test_a_line_of_no_loop_of_the_run_is_left_out(shared: RecordedRun, tmp_path: Path) -> None:
     run_dir = opened(shared, tmp_path / "run")
     out = SpoolWriter(run_dir / SPOOL, "recorder")
     for number, loop in enumerate((-1, LOOPS, True, 1.0, "1", 2**70, [1])):
@@ -120,14 +119,14 @@ def test_a_line_of_no_loop_of_the_run_is_left_out(shared: LoopsRun, tmp_path: Pa
     out.append(notices_of("plant"), 10, b"[" * 100_000)
     out.append(notices_of("plant"), 11, json.dumps(Notice(5, "info", "own", 2).line()).encode())
     out.close()
-    network = finish_run_record(run_dir)
-    lines = [[line["text"] for line in one.notices] for one in records(run_dir, shared)]
+    network = finish_record(run_dir).network
+    lines = [[line["text"] for line in one.notices] for one in records(run_dir)]
     assert lines == [[], [], ["own"]]
     assert not network.notices
 
 
 def test_an_interrupted_attempt_is_repeated_and_later_rows_are_added(
-    shared: LoopsRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    shared: RecordedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run_dir = opened(shared, tmp_path / "run")
     rows = mixed_rows(shared)
@@ -135,16 +134,16 @@ def test_an_interrupted_attempt_is_repeated_and_later_rows_are_added(
     for table, found in rows.items():
         spool(run_dir, table, found[: len(found) // 2])
     with monkeypatch.context() as patch:
-        patch.setattr("cosim.record.loops_spool._spool_network", _fail)
+        patch.setattr("cosim.record.table_files.write_table", _fail)
         with pytest.raises(MachineError, match="is kept in"):
-            finish_run_record(run_dir)
-    finish_run_record(run_dir)
-    counts = [one.count(PLANT_STEP) for one in records(run_dir, shared)]
+            finish_record(run_dir)
+    finish_record(run_dir)
+    counts = [one.count(PLANT_STEP) for one in records(run_dir)]
     assert sum(counts) == len(rows[PLANT_STEP]) // 2
     for table, found in later.items():  # a process that was frozen spools its rows after the end
         spool(run_dir, table, found, writer="frozen")
-    same_rows(finish_run_record(run_dir), shared.network)
-    for record, expected in zip(records(run_dir, shared), shared.loops, strict=True):
+    same_rows(finish_record(run_dir).network, shared.network)
+    for record, expected in zip(records(run_dir), shared.loops, strict=True):
         same_rows(record, expected)
 
 
@@ -152,7 +151,9 @@ def _fail(*_: object) -> None:
     raise OSError(28, "No space left on device")
 
 
-def test_a_loops_reports_count_its_own_rows_and_datagrams(shared: LoopsRun, tmp_path: Path) -> None:
+def test_a_loops_reports_count_its_own_rows_and_datagrams(
+    shared: RecordedRun, tmp_path: Path
+) -> None:
     """A row of the network that is missing is missing in every loop."""
     run_dir = opened(shared, tmp_path / "run")
     rows = dict(mixed_rows(shared))
@@ -174,8 +175,8 @@ def test_a_loops_reports_count_its_own_rows_and_datagrams(shared: LoopsRun, tmp_
     }
     content = {"plant": plant, "netem": netem, "earlier": [plant | {"process": "plant"}]}
     (run_dir / REPORTS_FILE).write_text(json.dumps(content))
-    finish_run_record(run_dir)
-    for number, record in enumerate(records(run_dir, shared)):
+    finish_record(run_dir)
+    for number, record in enumerate(records(run_dir)):
         report = record.reports["plant"]
         assert report["rows"] == {PLANT_STEP: steps[number], "plant_actuation": 0}
         assert report["channel"] == own[number]

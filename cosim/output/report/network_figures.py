@@ -1,4 +1,4 @@
-"""The figures of a run of several loops: the network, and the errors and states of all loops."""
+"""The figures of loops that share a network: the network, the errors and states of all loops."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,10 +10,14 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from cosim.analysis.loops_over_time import LoopsOverTime, quantiles
+from cosim.analysis.over_time import LoopsOverTime, loops_over_time, quantiles
+from cosim.analysis.summary_model import RunSummary
 from cosim.output import palette
 from cosim.output.report import axes as draw
 from cosim.output.report.figure_style import NotebookFigure, printed, styled
+from cosim.output.report.run_figures import RunFigure
+from cosim.record.run_record import RecordedRun
+from noack.core.number_format import number
 
 NAMED = len(palette.SERIES)
 """Up to so many loops have a curve each, in a colour of its own; more are drawn as bands."""
@@ -158,3 +162,50 @@ def _curves(axes: Axes, t_s: Reals, values: Reals, names: Sequence[str]) -> None
         dashed = {"color": printed(palette.LOST), "linestyle": (0, (3, 1.5)), "linewidth": 1.0}
         shown += draw.line(axes, t_s, found[_LARGEST], "largest", **dashed)
     draw.legend(axes, shown)
+
+
+def network_pictures(run: RecordedRun, summary: RunSummary) -> dict[str, RunFigure]:
+    """Draw the figures of all loops, by name.
+
+    Raises:
+        CallerError: a table of the record is damaged.
+    """
+    figures = _figures(loops_over_time(run), summary)
+    return {figure.name: figure for figure in figures}
+
+
+def _figures(over_time: LoopsOverTime, summary: RunSummary) -> list[RunFigure]:
+    names = [loop.name for loop in summary.loops]
+    flying = summary.network.in_flight
+    queue = QueueLength(flying.width_s, flying.mean_by_interval, flying.max_by_interval)
+    drawn = (
+        "Each loop has a curve."
+        if len(names) <= NAMED
+        else "Bands: quantiles over the loops; dashed: the largest value."
+    )
+    stayed = np.array([loop.diverged_at_s is None for loop in summary.loops])
+    left = "" if stayed.all() else " A loop that diverged leaves the range of the axis."
+    order = "" if len(names) <= MOST_ROWS else " Loops are numbered from 0, as in the scenario."
+    largest = over_time.errors[np.isfinite(over_time.errors)].max(initial=0.0)
+    return [
+        RunFigure(
+            "network", network_figure(over_time, names, queue),
+            "Above: datagrams that wait, are sent or are delayed in the network. Below: each "
+            f"loop's share of the bytes that left it. {drawn}",
+            f"Above, the number of datagrams in the network over time, up to {flying.max}. "
+            f"Below, the shares of {len(names)} loops in the bytes that the network forwarded.",
+        ),
+        RunFigure(
+            "loops", norms_figure(over_time, names, stayed),
+            "Largest error ‖e_c‖ of the controller's model, and largest norm ‖x‖ of the plant's "
+            f"state, in each of {len(over_time.middles_s)} intervals. {drawn}{left}",
+            f"Norms of {len(names)} loops over time on logarithmic axes; ‖e_c‖ is at most "
+            f"{number(largest)}.",
+        ),
+        RunFigure(
+            "map", error_map(over_time, names, stayed),
+            "Largest ‖e_c‖ of each loop in each interval; no colour before its first delivery."
+            f"{order}",
+            f"A row of colours for each of {len(names)} loops: ‖e_c‖ over time.",
+        ),
+    ]  # fmt: skip

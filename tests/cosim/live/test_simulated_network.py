@@ -1,4 +1,4 @@
-"""A simulated run of several loops: its directories, its summary, and the commands that read it."""
+"""A simulated run of several loops: its record, its summary, and the commands that read it."""
 
 import json
 import re
@@ -6,10 +6,14 @@ import tomllib
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner, Result
 
-from cosim.analysis.loops_over_time import (
+from cosim.analysis.network_summary import in_flight
+from cosim.analysis.over_time import (
     INTERVALS,
     QUANTILES,
     LoopsOverTime,
@@ -17,16 +21,17 @@ from cosim.analysis.loops_over_time import (
     quantiles,
     worst_loop,
 )
-from cosim.analysis.loops_summary import in_flight, is_complete
+from cosim.analysis.summary_model import ExitPart, read_summary
 from cosim.cli import app
-from cosim.output.loops_tables import loop_row, network_rows
-from cosim.output.report.loops_figures import error_map, norms_figure
+from cosim.live.finalize import reopen
+from cosim.output.network_table import loop_row, network_rows
+from cosim.output.report.network_figures import error_map, norms_figure
 from cosim.output.viewer.opening_time import opening_time_ns
 from cosim.record.align import align_tables
-from cosim.record.run_record import load_record
+from cosim.record.run_record import load_record, load_run
 from noack.config.resolution import network_tables
 from noack.core.number_format import number as written
-from noack.protocol.record_tables import NETEM_PACKET
+from noack.protocol.record_tables import NETEM_PACKET, PLANT_STEP
 
 PATH = Path(__file__).parents[3] / "scenarios" / "shared_bottleneck.toml"
 LOOPS = 11
@@ -50,72 +55,79 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return (folder / "latest").resolve()
 
 
-def test_each_loop_is_a_run_directory_of_its_own(run_dir: Path) -> None:
-    loops = sorted(path.name for path in (run_dir / "loops").iterdir())
-    assert loops == [*(f"pendulum-{i:02}" for i in range(1, 11)), "periodic"]
-    one = run_dir / "loops" / "pendulum-07"
-    assert (one / "scenario.toml").read_text().startswith('name = "pendulum-07"')
-    assert json.loads((one / "loop.json").read_text())["number"] == 6
-    whole = load_record(run_dir, network=True)
-    assert set(whole.tables) == set(network_tables())
-    packets = [load_record(path).count(NETEM_PACKET) for path in (run_dir / "loops").iterdir()]
-    assert sum(packets) == whole.count(NETEM_PACKET) > 50
+def test_the_record_has_each_loop(run_dir: Path) -> None:
+    run = load_run(run_dir)
+    assert run.names == [*(f"pendulum-{i:02}" for i in range(1, 11)), "periodic"]
+    one = load_record(run_dir, "pendulum-07")
+    assert (one.scenario.name, one.number) == ("pendulum-07", 6)
+    assert set(run.network.tables) == set(network_tables())
+    packets = [record.count(NETEM_PACKET) for record in run.loops]
+    assert sum(packets) == run.network.count(NETEM_PACKET) > 50
+    steps = pq.read_table(run_dir / "record" / f"{PLANT_STEP}.parquet")
+    assert steps["loop"].type == pa.uint16()
+    assert steps["loop"].to_pylist() == [
+        number for number, one in enumerate(run.loops) for _ in range(one.count(PLANT_STEP))
+    ]
+    for number, record in enumerate(run.loops):
+        own = steps.filter(pc.equal(steps["loop"], number))
+        assert own["x_1"].to_pylist() == record[PLANT_STEP]["x"][:, 0].tolist()
 
 
 def test_processes_finalise_the_loops_of_a_long_run_alike(
     run_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    paths = [run_dir / "summary.json", *sorted(run_dir.glob("loops/*/summary.json"))]
-    before = [path.read_text() for path in paths]
-    for path in paths:
-        path.unlink()
-    monkeypatch.setattr("cosim.live.finalize_loops._MANY_STEPS", 1)
-    monkeypatch.setattr("cosim.live.finalize_loops.cores", lambda: 2)
+    path = run_dir / "summary.json"
+    before = path.read_text()
+    path.unlink()
+    monkeypatch.setattr("cosim.live.finalize._MANY_STEPS", 1)
+    monkeypatch.setattr("cosim.live.finalize.cores", lambda: 2)
     assert noack("summary", run_dir).exit_code == 0
-    assert [path.read_text() for path in paths] == before
+    assert path.read_text() == before
 
 
 def test_the_summary_adds_up(run_dir: Path) -> None:
     summary = json.loads((run_dir / "summary.json").read_text())
-    assert is_complete(summary)
-    assert not is_complete(summary | {"loops": summary["loops"][1:]})
+    typed = read_summary(summary)
+    assert typed is not None
+    assert read_summary(summary | {"loops": summary["loops"][::-1]}) is None
     network, loops = summary["network"], summary["loops"]
     assert [one["number"] for one in loops] == [*range(LOOPS)]
     assert sum(one["link_share"] for one in loops) == pytest.approx(1)
-    stopped, failed = ({"status": status, "reason": ""} for status in (130, 1))
-    assert "failed" not in loop_row(loops[0] | {"exit": stopped})[-1]
-    assert "failed" in loop_row(loops[0] | {"exit": failed})[-1]
+    stopped, failed = (ExitPart(status=status, reason="") for status in (130, 1))
+    assert "failed" not in loop_row(typed.loops[0].model_copy(update={"exit": stopped}))[-1]
+    assert "failed" in loop_row(typed.loops[0].model_copy(update={"exit": failed}))[-1]
     for one in loops:
-        alone = json.loads((run_dir / "loops" / one["name"] / "summary.json").read_text())
-        assert one["events"] == alone["events"] == one["deliveries"] + one["drops"]
-        assert sum(one["claims"].values()) == len(alone["claims"])
+        record = load_record(run_dir, one["name"])
+        assert one["events"] == len(record.events()) == one["deliveries"] + one["drops"]
     assert sum(one["events"] for one in loops) == network["datagrams"]
     assert sum(network["drops_by_cause"].values()) == sum(one["drops"] for one in loops)
     # Little's law: the mean number in the network is the rate times the mean time in it.
     times_s = sum(one["deliveries"] * (one["delay_mean_s"] or 0.0) for one in loops)
     assert network["in_flight"]["mean"] == pytest.approx(times_s / 3, rel=0.02)
     # A run that was stopped at half of its horizon.
-    assert (
-        f"({network['datagrams'] / 1.5:.4g} /s)" in network_rows(summary | {"reached_s": 1.5})[0][1]
-    )
+    stopped_run = typed.model_copy(update={"reached_s": 1.5})
+    assert f"({network['datagrams'] / 1.5:.4g} /s)" in network_rows(stopped_run)[0][1]
 
 
 def test_commands_read_the_run_and_its_loops(run_dir: Path) -> None:
-    loop = run_dir / "loops" / "periodic"
-    for path in (run_dir, loop):
-        shown = noack("summary", path)
+    loop = (run_dir, "--loop", "periodic")
+    for words in ((run_dir,), loop):
+        shown = noack("summary", *words)
         assert shown.exit_code == 0, shown.output
-        replayed = noack("replay", path, "--json")
+        replayed = noack("replay", *words, "--json")
         assert replayed.exit_code == 0, replayed.output
         assert json.loads(replayed.stdout)["gaps"] == []
+    refused = noack("summary", run_dir, "--loop", "x")
+    assert (refused.exit_code, refused.stderr.count("\n")) == (2, 1)
+    assert "--loop x: the run has no such loop; it has pendulum-01, " in refused.stderr
     shown = noack("summary", run_dir).stdout
     assert "bottleneck" in shown
-    assert re.search(r"^claims of all loops: [1-9]\d* held", shown, re.MULTILINE)
-    assert noack("report", loop).exit_code == 0
+    assert re.search(r"^claims: [1-9]\d* of \d+ held", shown, re.MULTILINE)
+    assert noack("report", *loop).exit_code == 0
     page = run_dir / "report.html"
     before = page.read_text()
     assert noack("report", run_dir, "--again").exit_code == 0
-    link = '<a href="loops/periodic/report.html">periodic</a>'
+    link = '<a href="report-periodic.html">periodic</a>'
     assert link not in before
     assert link in page.read_text()
 
@@ -132,22 +144,18 @@ def test_the_whole_says_why_claims_are_void_and_that_watchdogs_acted(
     words = [setting, watchdog] if setting == LOST else [setting]
     assert simulated(tmp_path, "horizon_s=2", *words).exit_code == 0
     loops = json.loads((tmp_path / "latest/summary.json").read_text())["loops"]
-    for one in loops:
-        own = json.loads((tmp_path / "latest/loops" / one["name"] / "summary.json").read_text())
-        assert one["watchdog_trips"] == own["watchdog"]["trips"]
-        void = {claim["why"] for claim in own["claims"] if claim["verdict"] == "void"}
-        assert sorted(one["void_because"]) == sorted(void)
-    trips = sum(one["watchdog_trips"] for one in loops)
-    reasons = {why for one in loops for why in one["void_because"]}
+    trips = sum(one["watchdog"]["trips"] for one in loops)
+    claims = [claim for one in loops for claim in one["claims"]]
+    reasons = {claim["why"] for claim in claims if claim["verdict"] == "void"}
     assert trips if setting == LOST else reasons
     shown = noack("summary", tmp_path / "latest").stdout
     assert (f"{trips} times, in {LOOPS} loops" in shown) == (setting == LOST)
-    assert shown.count("void: ") == min(len(reasons), 3)
+    assert len(re.findall("^void: ", shown, re.MULTILINE)) == min(len(reasons), 3)
 
 
 @pytest.mark.parametrize("loop", [None, "periodic"])
 def test_a_missing_recording_is_written_when_it_is_viewed(run_dir: Path, loop: str | None) -> None:
-    path = (run_dir if loop is None else run_dir / "loops" / loop) / "recording.rrd"
+    path = run_dir / ("recording.rrd" if loop is None else f"recording-{loop}.rrd")
     path.unlink(missing_ok=True)
     done = noack("view", run_dir, "--json", *(() if loop is None else ("--loop", loop)))
     assert json.loads(done.stdout) == {"recording": str(path), "exists": True}
@@ -155,21 +163,20 @@ def test_a_missing_recording_is_written_when_it_is_viewed(run_dir: Path, loop: s
 
 
 def test_the_loops_over_time(run_dir: Path) -> None:
-    summary = json.loads((run_dir / "summary.json").read_text())
-    network = load_record(run_dir, network=True)
-    records = [load_record(run_dir / "loops" / one["name"]) for one in summary["loops"]]
-    found = loops_over_time(network, records)
+    summary = reopen(run_dir).summary
+    whole = load_run(run_dir)
+    network, found = whole.network, loops_over_time(whole)
     assert found.errors.shape == found.states.shape == (LOOPS, INTERVALS)
-    for number, one in enumerate(summary["loops"]):
-        assert np.nanmax(found.errors[number]) == one["sup_e_c_norm"]
+    for number, one in enumerate(summary.loops):
+        assert np.nanmax(found.errors[number]) == one.sup_e_c_norm
     # The view opens where the worst loop has its largest error.
-    worst = worst_loop(run_dir, summary["loops"]).number
+    worst = worst_loop(summary.loops).number
     opened_ns = opening_time_ns(run_dir / "recording.rrd")
     assert opened_ns is not None
     at = np.searchsorted(found.edges_s, opened_ns * 1e-9, "right") - 1
-    assert found.errors[worst, at] == summary["loops"][worst]["sup_e_c_norm"]
+    assert found.errors[worst, at] == summary.loops[worst].sup_e_c_norm
     # Loop 6 alone, interval by interval; its time begins at its phase.
-    phase_ns, run = round(1e9 * summary["loops"][6]["phase_s"]), align_tables(records[6])
+    phase_ns, run = round(1e9 * summary.loops[6].phase_s), align_tables(whole.loops[6])
     assert phase_ns > 0
     edges_ns = np.linspace(0, 3e9, INTERVALS + 1)
     for i in (0, 50, 199):
@@ -229,25 +236,29 @@ def test_a_loop_that_diverged_does_not_hide_the_others() -> None:
     assert everything.vmax == values.max()
 
 
-def test_the_worst_loop(tmp_path: Path) -> None:
+def test_the_worst_loop(run_dir: Path) -> None:
     """A loop that failed, else the largest share of a certified bound, else the largest ‖e_c‖."""
     loops = [
-        {"name": name, "number": i, "sup_e_c_norm": error, "exit": {"status": 0, "reason": ""}}
-        for i, (name, error) in enumerate((("a", 0.1), ("b", None), ("c", 0.3)))
+        loop.model_copy(update={"claims": [], "sup_e_c_norm": error})
+        for loop, error in zip(reopen(run_dir).summary.loops, (0.1, None, 0.3), strict=False)
     ]
-    assert worst_loop(tmp_path, loops).number == 2
-    (tmp_path / "loops" / "b").mkdir(parents=True)
+    assert worst_loop(loops).number == 2
+    claim = reopen(run_dir).summary.loops[0].claims[0]
     claims = [
-        {"source": "(I1)", "bound": "‖e_c‖ ≤ 1", "ratio": 7.0},
-        {"source": "certificate", "bound": "‖e_c‖ ≤ 1", "ratio": 0.25},
-        {"source": "certificate", "bound": "none", "ratio": None},
+        claim.model_copy(update={"source": source, "bound": bound, "ratio": ratio})
+        for source, bound, ratio in (
+            ("(I1)", "‖e_c‖ ≤ 1", 7.0),
+            ("certificate", "‖e_c‖ ≤ 1", 0.25),
+            ("certificate", "none", None),
+        )
     ]
-    (tmp_path / "loops" / "b" / "summary.json").write_text(json.dumps({"claims": claims}))
-    worst = worst_loop(tmp_path, loops)
+    loops[1] = loops[1].model_copy(update={"claims": claims})
+    worst = worst_loop(loops)
     assert worst.number == 1
     assert worst.why.endswith(": 25 %")
-    loops[0]["exit"] = {"status": 1, "reason": "diverged"}
-    assert worst_loop(tmp_path, loops) == (0, "diverged")
+    failed = ExitPart(status=1, reason="diverged")
+    loops[0] = loops[0].model_copy(update={"exit": failed})
+    assert worst_loop(loops) == (0, "diverged")
 
 
 def test_a_loop_that_diverges_is_named_and_the_others_go_on(tmp_path: Path) -> None:
@@ -264,23 +275,20 @@ def test_a_loop_that_diverges_is_named_and_the_others_go_on(tmp_path: Path) -> N
     assert [(one["t_s"], one["what"]) for one in summary["changes"]] == [(1.5, "network.mansd = 1")]
     assert [one["exit"]["status"] for one in summary["loops"]] == [0, 0, 1]
     assert summary["reached_s"] == 3
-    for name in ("calm-1", "calm-2"):
-        assert json.loads((tmp_path / f"latest/loops/{name}/summary.json").read_text())[
-            "exit"]["status"] == 0  # fmt: skip
     # Finalised again, it is the same; and the tables show all numbers in 80 columns.
     path = tmp_path / "latest/summary.json"
     path.unlink()
     shown = noack("summary", path.parent).stdout.splitlines()
     assert json.loads(path.read_text()) == summary
     # Certificates do not cover actuations that are lost without a bound; other claims are judged.
-    assert re.match(r"claims of all loops: \d+ held", shown[1])
+    assert re.match(r"claims: \d+ of \d+ held", shown[2])
     (row,) = [line for line in shown if line.startswith(" wild")]
     assert written(summary["loops"][2]["sup_e_c_norm"]) in row
     sent = sum(one["actuations"]["sent"] for one in summary["loops"])
     assert sent == pytest.approx(3 * 3 * 100, abs=6)
     assert any(f" {sent} (" in line for line in shown)
     assert any(re.search(r"changed at 1.500 s .* network.mansd = 1 ", line) for line in shown)
-    table = [line for line in shown if not line.startswith(("one loop", "report", "run dir"))]
+    table = [line for line in shown if not line.startswith(("one loop", "more: ", "claims"))]
     assert max(map(len, table)) <= 80
 
 

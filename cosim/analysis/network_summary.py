@@ -1,0 +1,180 @@
+"""The summary of a run: its network, and the summaries of its loops."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.analysis.run_summary import change_parts
+from cosim.analysis.summary_model import (
+    DeadlinesPart,
+    ExitPart,
+    InFlightPart,
+    LatenessPart,
+    LoopSummary,
+    NetworkPart,
+    RunSummary,
+)
+from cosim.record.run_record import Rows, RunRecord
+from noack.core.clock import NS_PER_S
+from noack.core.errors import ExitStatus
+from noack.impairments.feature import Impairment
+from noack.impairments.kinds.duplicate import Duplicate
+from noack.impairments.kinds.rate import Rate
+from noack.protocol.record_tables import NETEM_PACKET, Fate
+
+_BINS = 200
+_MOST_NAMED = 3
+_COLUMNS = ("now_ns", "flow", "fate", "release_ns", "copy_ns", "size_bytes")
+
+
+def summarise_run(
+    network: RunRecord,
+    loops: Sequence[LoopSummary],
+    end: ExitPart,
+    startup_s: float | None = None,
+) -> RunSummary:
+    """Return the summary of a run, from the record of its network and the summaries of its loops.
+
+    ``end`` is how the run ended; a run that completed has failed if one of its loops failed.
+    ``startup_s`` is the wall time from the launch to simulated time 0; None if unknown.
+    """
+    scenario = network.scenario
+    packets = network.columns(
+        NETEM_PACKET, *_COLUMNS, where=lambda rows: rows["flow"] < len(loops)
+    )  # the others are of the other direction
+    forwarded_bytes = np.bincount(
+        packets["flow"], np.where(packets["release_ns"] >= 0, packets["size_bytes"], 0), len(loops)
+    )
+    shares = forwarded_bytes / max(forwarded_bytes.sum(), 1)
+    reached_s = min(one.reached_s for one in loops)
+    return RunSummary(
+        kind=network.kind,
+        startup_s=startup_s,
+        scenario=scenario.name,
+        mansd=scenario.network.mansd,
+        constraints=[one.text() for one in scenario.network.constraints],
+        horizon_s=scenario.horizon_s,
+        speed=scenario.speed,
+        reached_s=reached_s,
+        network=_network_part(network, packets, loops, reached_s),
+        loops=[
+            one.model_copy(update={"link_share": float(share)})
+            for one, share in zip(loops, shares, strict=True)
+        ],
+        changes=change_parts(network),
+        deadlines=_deadlines([one.lateness_us for one in loops]),
+        exit=end if end.status != ExitStatus.OK else _end(end, loops),
+    )
+
+
+def _deadlines(lateness_us: Sequence[Mapping[str, LatenessPart]]) -> dict[str, DeadlinesPart]:
+    return {
+        role: DeadlinesPart(
+            steps=sum(one[role].steps for one in lateness_us),
+            late_steps=sum(one[role].late_steps for one in lateness_us),
+            max_us=max(
+                (one[role].max or 0.0 for one in lateness_us if one[role].steps), default=None
+            ),
+        )
+        for role in lateness_us[0]
+    }
+
+
+def _end(end: ExitPart, loops: Sequence[LoopSummary]) -> ExitPart:
+    failed = [one for one in loops if one.exit.status != ExitStatus.OK]
+    if not failed:
+        return end
+    if len(loops) == 1:
+        return loops[0].exit
+    named = [f"{one.name} {_brief(one)}" for one in failed[:_MOST_NAMED]]
+    more = len(failed) - len(named)
+    shown = ", ".join(named) + (f" and {more} more" if more else "")
+    reason = f"{len(failed)} of {len(loops)} loops failed ({shown})"
+    return ExitPart(status=int(ExitStatus.FAILED), reason=reason)
+
+
+def _brief(loop: LoopSummary) -> str:
+    if loop.diverged_at_s is not None:
+        return f"diverged at {loop.diverged_at_s + loop.phase_s:.2f} s"
+    return f"failed: {loop.exit.reason}"
+
+
+def _network_part(
+    network: RunRecord, packets: Rows, loops: Sequence[LoopSummary], reached_s: float
+) -> NetworkPart:
+    fates, stages = packets["fate"], network.scenario.network.impairments
+    rates = [one for one in stages if isinstance(one, Rate)]
+    slowest = min(rates, key=lambda one: one.rate_bps, default=None)
+    reached_ns = max(round(reached_s * NS_PER_S), 1)
+    return NetworkPart(
+        datagrams=len(packets),
+        forwarded=int((packets["release_ns"] >= 0).sum()),
+        forced_deliveries=int((fates == Fate.FORCED).sum()),
+        drops_by_cause=dict(sum((Counter(one.drops_by_cause) for one in loops), Counter())),
+        longest_loss_burst=max(one.longest_loss_burst for one in loops),
+        rate_bps=None if slowest is None else slowest.rate_bps,
+        utilisation=(
+            None if slowest is None else _utilisation(packets, slowest, stages, reached_ns)
+        ),
+        in_flight=in_flight(packets, network.scenario.timing.horizon_ns, reached_ns),
+    )
+
+
+def _utilisation(
+    packets: Rows, bottleneck: Rate, stages: Sequence[Impairment], until_ns: int
+) -> float:
+    """Return the share of a bottleneck's rate that was used until a time."""
+    copied = any(isinstance(one, Duplicate) for one in stages[: stages.index(bottleneck)])
+    left = [packets[name] for name in (("release_ns", "copy_ns") if copied else ("release_ns",))]
+    times = sum(((at_ns >= 0) & (at_ns <= until_ns)).astype(np.int64) for at_ns in left)
+    bits = (bottleneck.line_bits(packets["size_bytes"]) * times).sum()
+    return float(bits / bottleneck.rate_bps / until_ns * NS_PER_S)
+
+
+def in_flight(packets: Rows, horizon_ns: int, reached_ns: int) -> InFlightPart:
+    """Return how many datagrams were inside the network, in intervals of equal width."""
+    inside = times_inside(packets)
+    means, largest = counts_inside(*inside, np.linspace(0, horizon_ns, _BINS + 1))
+    (mean,), _ = counts_inside(*inside, np.array([0.0, reached_ns]))
+    return InFlightPart(
+        mean=float(mean),
+        max=int(largest.max()),
+        width_s=horizon_ns / _BINS / NS_PER_S,
+        mean_by_interval=means.round(6).tolist(),
+        max_by_interval=largest.tolist(),
+    )
+
+
+def times_inside(packets: Rows) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return when each delayed datagram, or its copy, came into the network, and when it left."""
+    begins, ends = [], []
+    for column in ("release_ns", "copy_ns"):
+        delayed = packets[packets[column] > packets["now_ns"]]
+        begins.append(delayed["now_ns"])
+        ends.append(delayed[column])
+    return np.concatenate(begins), np.concatenate(ends)
+
+
+def counts_inside(
+    begin_ns: NDArray[np.int64], end_ns: NDArray[np.int64], edges_ns: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return mean and largest number of datagrams in the network between the edges, (k + 1,)."""
+    begin_ns, end_ns = np.sort(begin_ns), np.sort(end_ns)
+    # The number of datagrams at t is the number of begins minus the number of ends up to t; its
+    # integral from 0 to t is the sum of the times since each begin, minus that since each end.
+    integral = _time_since(begin_ns, edges_ns) - _time_since(end_ns, edges_ns)
+    first_ns, last_ns = (edges_ns[place].astype(np.int64) for place in (slice(-1), -1))
+    new_ns = begin_ns[(begin_ns > first_ns[0]) & (begin_ns < last_ns)]
+    at_ns = np.unique(np.concatenate([new_ns, first_ns]))
+    counts = np.searchsorted(begin_ns, at_ns, "right") - np.searchsorted(end_ns, at_ns, "right")
+    largest = np.maximum.reduceat(counts, np.searchsorted(at_ns, first_ns))
+    return np.diff(integral) / np.diff(edges_ns), largest
+
+
+def _time_since(moments_ns: NDArray[np.int64], at_ns: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the sum over the moments before each time of the time since then."""
+    before = np.searchsorted(moments_ns, at_ns, "right")
+    sums = np.append(0.0, np.cumsum(moments_ns, dtype=np.float64))
+    return np.asarray(before * at_ns - sums[before])

@@ -1,0 +1,54 @@
+"""The replay of a run: its network, and each of its loops."""
+
+from collections.abc import Iterable, Sequence
+
+from cosim.analysis.replay import Replay, replay
+from cosim.analysis.replay.replay_result import MessagesReplay, ProcessReplay
+from cosim.analysis.summary_model import ReplayDifference
+from cosim.record.run_record import RecordedRun
+from noack.protocol.topology import LOOP_ROLES
+
+
+def replay_run(run: RecordedRun, loop: str | None = None) -> Replay:
+    """Replay a run, or one of its loops; each process's and link's results are added up.
+
+    Raises:
+        CallerError: there is no such loop.
+    """
+    if loop is not None or len(run.loops) == 1:
+        return replay(run.loop(loop))
+    found = [replay(run.network), *map(replay, run.loops)]
+    processes = [one for each in found for one in each.processes]
+    messages = [one for each in found for one in each.messages]
+    legs = dict.fromkeys(one.leg for one in messages)
+    return Replay(
+        processes=tuple(
+            _process([one for one in processes if one.process == role]) for role in LOOP_ROLES
+        ),
+        messages=tuple(_leg([one for one in messages if one.leg == leg]) for leg in legs),
+    )
+
+
+def _process(found: Sequence[ProcessReplay]) -> ProcessReplay:
+    missing = (one.missing_from for one in found if one.missing_from is not None)
+    return ProcessReplay(
+        process=found[0].process,
+        inputs=sum(one.inputs for one in found),
+        compared=sum(one.compared for one in found),
+        missing_from=next(missing, None),
+        end_known=all(one.end_known for one in found),
+        difference=_first(one.difference for one in found),
+    )
+
+
+def _leg(found: Sequence[MessagesReplay]) -> MessagesReplay:
+    return MessagesReplay(
+        leg=found[0].leg,
+        received=sum(one.received for one in found),
+        compared=sum(one.compared for one in found),
+        difference=_first(one.difference for one in found),
+    )
+
+
+def _first(differences: Iterable[ReplayDifference | None]) -> ReplayDifference | None:
+    return min(filter(None, differences), key=lambda one: one.now_ns, default=None)

@@ -1,0 +1,33 @@
+"""Summaries of runs for tests: of a record of one loop, and with other values."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from cosim.analysis.network_summary import summarise_run
+from cosim.analysis.run_summary import summarise
+from cosim.analysis.summary_model import ExitPart, LoopSummary, RunSummary
+from cosim.record.run_record import RunRecord, alone
+
+
+def summary_of(record: RunRecord, **more: Any) -> RunSummary:
+    """The summary of a completed run whose only loop has this record, with other values."""
+    end = ExitPart(status=0, reason="horizon")
+    run = summarise_run(alone(record).network, [summarise(record, 0, "horizon")], end)
+    return with_values(run, **more)
+
+
+def with_values(run: RunSummary, **more: Any) -> RunSummary:
+    """The summary of one loop with other values of the run or of its loop, given as JSON."""
+    document: dict[str, Any] = run.to_json()
+    (loop,) = document["loops"]
+    unknown = more.keys() - RunSummary.model_fields.keys() - LoopSummary.model_fields.keys()
+    assert not unknown, unknown
+    for part, model in ((loop, LoopSummary), (document, RunSummary)):
+        part |= {key: value for key, value in more.items() if key in model.model_fields}
+    return RunSummary.model_validate(document)
+
+
+def loop_of(summary: Mapping[str, Any], name: str | None = None) -> dict[str, Any]:
+    """The entry of a loop in ``summary.json``; of the only one without a name."""
+    (found,) = [one for one in summary["loops"] if name in (None, one["name"])]
+    return dict(found)
