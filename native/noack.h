@@ -742,7 +742,7 @@ void noack_driver_open(noack_driver *driver);
    until_ns it goes on for a while if a tick is near. INT64_MIN: do what is due, and do not wait. */
 int64_t noack_drive(noack_driver *driver, int64_t until_ns);
 
-/* Add a datagram as if it had just been received. The driver must have driven all others. */
+/* Add a datagram as if it had just been received; then noack_drive must be called. */
 void noack_driver_add_datagram(
     noack_driver *driver, const uint8_t name[32], const uint8_t *data, int64_t size_bytes);
 
