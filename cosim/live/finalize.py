@@ -84,7 +84,9 @@ def finalize(
         _write_summary(run_dir, summary)
         status, reason = ExitStatus(summary.exit.status), summary.exit.reason
         if view and (again or not is_shown):
-            with _is_optional(run_dir / RECORDING_FILE):
+            # That of an earlier attempt may be complete: it stays if there is no space for another.
+            quiet = (MachineError,) if is_shown else ()
+            with _is_optional(run_dir / RECORDING_FILE), suppress(*quiet):
                 _write_recording(run, summary, run_dir, None)
         if report:
             names = run.names if 1 < len(run.names) <= _FEW_LOOPS else []

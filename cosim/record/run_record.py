@@ -252,15 +252,6 @@ def no_such_loop(name: str | None, names: Sequence[str]) -> CallerError:
     return CallerError(f"--loop {name}: the run has no such loop; it has {few}")
 
 
-def alone(record: RunRecord) -> RecordedRun:
-    """Return the record of a run whose only loop has the network for itself."""
-    network = RunRecord(
-        record.scenario, record.source, [], record.reports, record.kind, record.earlier,
-        is_network=True,
-    )  # fmt: skip
-    return RecordedRun(network, [record])
-
-
 class _StoredLoops(Sequence[RunRecord]):
     """The loops of a run directory, each read when it is used."""
 

@@ -7,7 +7,7 @@ The queues of the network couple the loops. A run with one loop computes what th
 from typing import Any
 
 from controller_node.controller import controller_of
-from cosim.record.loop_rows import network_rows_by_loop
+from cosim.record.loop_rows import NetworkRows
 from cosim.record.run_record import RecordedRun, RunRecord
 from cosim.simulation.virtual_time import Gathered, Progress, Shuttle, drive, reports_of
 from netem.duplex_link import network_of
@@ -73,8 +73,9 @@ def simulate_loops(scenario: Scenario, progress: Progress | None = None) -> Reco
     drive(shuttle, scenario, gathered.take, progress)
     network_rows = gathered.network.rows()
     records = []
-    for number, network_of_loop in enumerate(network_rows_by_loop(network_rows, phases)):
-        rows = gathered.loops[number].rows() | network_of_loop
+    of_network = NetworkRows(network_rows, phases)
+    for number in range(len(loops)):
+        rows = gathered.loops[number].rows() | of_network.of_loop(number)
         reports = reports_of(rows, shuttle, scenario, number)
         notices = gathered.loops[number].sorted_notices()
         rows = {table: rows[table] for table in tables_of(loops[number])}
