@@ -164,8 +164,9 @@ class RunRecord:
         """
         rows = DerivedRows(self.source, derive)
         derived = RunRecord(
-            scenario, rows, self.notices, self.reports, self.kind, self.earlier, self.number
-        )
+            scenario, rows, self.notices, self.reports, self.kind, self.earlier, self.number,
+            is_network=self.is_network,
+        )  # fmt: skip
         derived.tables = self.tables  # they are those of the run that was recorded
         return derived
 
