@@ -77,7 +77,8 @@ def finalize(
             raise MachineError(f"{scenario_file}: no such file")  # the run directory was replaced
         unfinished = (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir()
         # A recorder that completed its recording writes the reports afterwards.
-        is_shown = all((run_dir / name).is_file() for name in (REPORTS_FILE, RECORDING_FILE))
+        is_shown = not unfinished or (run_dir / REPORTS_FILE).is_file()
+        is_shown = is_shown and (run_dir / RECORDING_FILE).is_file()
         with work_bar("the record of the run") as show:
             run = finish_record(run_dir, show) if unfinished else load_run(run_dir)
         summary = _judged(run, ending)
