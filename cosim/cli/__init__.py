@@ -50,10 +50,12 @@ def _fork_server(words: list[str]) -> "ForkServer | None":
     """Start the fork server of a live run, which imports while this process does."""
     if sys.platform != "linux" or "--help" in words or not words or words[0] not in _LIVE:
         return None
+    import os
     from contextlib import suppress
 
-    from cosim.live.fork_server import ForkServer
+    from cosim.live.fork_server import QUICK_IMPORTS, ForkServer
 
+    os.environ.update(QUICK_IMPORTS)
     with suppress(OSError):  # the command reports it
         return ForkServer()
     return None

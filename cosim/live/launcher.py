@@ -14,13 +14,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cosim.live.child_processes import ChildProcesses, Failure
 from cosim.live.coordinator import Coordinator
 from cosim.live.disk_space import require_disk_space
 from cosim.live.fork_server import ForkServer, fork_server
-from cosim.live.remote_access import Listening, open_to_hosts, with_clocks
 from cosim.live.remote_hosts import RemoteStart
 from cosim.live.restart_policy import RestartPolicy
 from cosim.live.wait_limit import DEFAULT_S, WaitLimit
@@ -46,6 +45,9 @@ from noack.runtime.join_ticket import Ticket, new_ticket, published
 from noack.runtime.life_cycle import HORIZON
 from noack.runtime.signals import Signals, stop_reason
 
+if TYPE_CHECKING:
+    from cosim.live.remote_access import Listening
+
 _POLL_S = 0.01
 _STOP_TIMEOUT_S = 15.0
 _OVERTIME_S, _OVERTIME_SHARE = 20.0, 0.2
@@ -57,7 +59,7 @@ class Watcher:
     """Callbacks of a launched run; each must return at once."""
 
     waiting: Callable[[Sequence[str]], None] = lambda roles: None
-    listening: Callable[[str, Listening], None] = lambda address, how: None
+    listening: "Callable[[str, Listening], None]" = lambda address, how: None
     started: Callable[[Path], None] = lambda run_dir: None
     failed: Callable[[str, float, str | None], None] = lambda why, t_s, by_hand: None
     restarted: Callable[[str, float], None] = lambda role, t_s: None
@@ -92,7 +94,7 @@ def launch(
     live: bool = False,
     watcher: Watcher | None = None,
     server: ForkServer | None = None,
-    listening: Listening | None = None,
+    listening: "Listening | None" = None,
 ) -> RunEnding:
     """Run a scenario; :func:`cosim.live.finalize.finalize` completes its record.
 
@@ -112,6 +114,8 @@ def launch(
     """
     began_ns = time.monotonic_ns()
     if listening is not None:
+        from cosim.live.remote_access import open_to_hosts, with_clocks  # asyncio and TLS
+
         scenario = with_clocks(scenario)
     with contextlib.ExitStack() as stack:
         server = server or stack.enter_context(fork_server())

@@ -19,7 +19,6 @@ from zenoh.handlers import FifoChannel
 
 from noack.core.errors import CallerError, NoAnswerError
 from noack.runtime.address import text_of
-from noack.runtime.coordinator_link import Destination, coordinator_link
 from noack.runtime.join_ticket import RemoteAccess
 from noack.runtime.private_folder import open_private
 
@@ -51,6 +50,9 @@ def open_remote_session(remote: RemoteAccess, key: bytes) -> Iterator[zenoh.Sess
         MachineError: the link to the coordinator cannot be started.
         CallerError: other users have access to the user's runtime directory.
     """
+    # Processes on the coordinator's host need neither TLS nor asyncio.
+    from noack.runtime.coordinator_link import Destination, coordinator_link
+
     destination = Destination(
         remote.host, remote.port, remote.authority, remote.certificate, remote.private_key,
         key.hex(),
