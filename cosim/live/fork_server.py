@@ -25,7 +25,7 @@ from noack.runtime.command_line import TICKET_ON_STDIN
 
 _IMPORTS = (
     "plant_server.__main__", "sensor_node.__main__", "controller_node.__main__", "netem.__main__",
-    "cosim.live.recorder", "zenoh",
+    "cosim.live.recorder", "numpy.random", "zenoh",
 )  # fmt: skip
 QUICK_IMPORTS = {
     "OPENBLAS_NUM_THREADS": "1",  # numpy starts no threads
@@ -216,9 +216,12 @@ def _fork_twice() -> int:
 def _build_validators() -> None:
     """Build what would otherwise be built in each process."""
     from noack.config.scenario_changes import prepare_changes
+    from noack.impairments.kinds.loss import LossOf
+    from noack.impairments.link_settings import LinkSettings
     from noack.runtime.join_ticket import Ticket
 
-    Ticket.model_rebuild()
+    for section in (Ticket, LinkSettings, LossOf):
+        section.model_rebuild()
     prepare_changes()
 
 
@@ -226,11 +229,13 @@ def main() -> None:
     """Run the server."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # a parent's "ignore" is inherited
     connection = socket.socket(fileno=int(sys.argv[1]))
+    gc.disable()
     for module in _IMPORTS:
         import_module(module)
     _build_validators()
-    gc.collect()
+    # What was collected now would leave holes, which each process would fill on pages of its own.
     gc.freeze()
+    gc.enable()
     request = _serve(connection)
     if request is not None:
         module, arguments = request

@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
+from functools import cache
 from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
@@ -48,7 +49,7 @@ from noack.runtime.signals import Signals, stop_reason
 if TYPE_CHECKING:
     from cosim.live.remote_access import Listening
 
-_POLL_S = 0.01
+_POLL_S, _STARTING_POLL_S = 0.01, 0.002
 _STOP_TIMEOUT_S = 15.0
 _OVERTIME_S, _OVERTIME_SHARE = 20.0, 0.2
 """After the horizon: the recorder writes the record, and a long run has many rows."""
@@ -81,6 +82,16 @@ def joint_watcher(watchers: Sequence[Watcher]) -> Watcher:
                     left.remove(one)
 
         return each
+
+    return Watcher(*(call(field.name) for field in fields(Watcher)))
+
+
+def later_watcher(open_watcher: Callable[[], Watcher]) -> Watcher:
+    """Return a watcher that is opened at its first callback, after the start of the processes."""
+    opened = cache(open_watcher)
+
+    def call(name: str) -> Callable[..., None]:
+        return lambda *arguments: getattr(opened(), name)(*arguments)
 
     return Watcher(*(call(field.name) for field in fields(Watcher)))
 
@@ -133,7 +144,6 @@ def launch(
         run_dir = new_run_dir(runs, resolved.name)
         resolved = write_scenario(resolved, run_dir)
         ticket = new_ticket(resolved, run_dir.resolve(), launched=True)
-        write_environment(run_dir, "live", run_name(ticket.run_id))
         stack.enter_context(active_run(run_dir))
         ending = stack.enter_context(EndingFile(run_dir))
         _publish_run(stack, ticket, session)  # first: its file leads to a killed run's socket
@@ -156,6 +166,8 @@ def launch(
                 watcher.listening(text_of(opened.address), listening)
         children = ChildProcesses(ticket, run_dir, spawn, server, remote)
         stack.enter_context(children.started(live=live))
+        # While the processes get ready: the versions of all packages take 0.02 s.
+        write_environment(run_dir, "live", run_name(ticket.run_id))
         run = _Run(ticket, run_dir, coordinator, children, watcher, notices)
         status, reason = run.watch(signals, ending.store)
         if coordinator.epoch_ns is None:
@@ -250,7 +262,7 @@ class _Run:
                     self._limit = WaitLimit(_STOP_TIMEOUT_S)
             elif self._limit.is_reached:
                 break
-            time.sleep(_POLL_S)
+            time.sleep(_POLL_S if started else _STARTING_POLL_S)
         self._notify_progress()  # the last report may have arrived with the end
         return (
             result
