@@ -888,10 +888,12 @@ void noack_exact_runs(
 
 /* Follow a plant from each of count states, just after an event, to its next event or the horizon.
    In: times t_s, states (count, 3, n), auxiliary variables eta. Out: the same at the end, and events
-   (1: an event, before its reset), values (of the measure), statuses. */
+   (1: an event, before its reset), values (of the measure; NAN if it fails), at_s (the time of a
+   supremum), statuses. */
 void noack_exact_segments(
     const noack_exact *exact, const double *A, const double *B, int64_t count, double *t_s,
-    double *states, double *auxiliaries, int64_t *events, double *values, int64_t *statuses);
+    double *states, double *auxiliaries, int64_t *events, double *values, double *at_s,
+    int64_t *statuses);
 
 /* The states (count, 3, n) of a plant at ascending times t_s, from the first start on. A start is a state
    just after an event, (starts, 3, n), at an ascending time; the last one up to a time applies. NAN

@@ -189,8 +189,10 @@ void noack_exact_runs(
         for (int64_t i = 0; i < n; i++) {
             if (exact->known_start)
                 state[i] = x0[number * n + i];
-            else
+            else { /* e_s = 0 */
                 state[code->stride + i] = 0.0 - x0[number * n + i];
+                state[2 * code->stride + i] = x0[number * n + i];
+            }
         }
         run.event = !exact->known_start;
         run.auxiliary = memory.dynamic ? exact->rule.initial : 0.0;
@@ -200,7 +202,8 @@ void noack_exact_runs(
 
 void noack_exact_segments(
     const noack_exact *exact, const double *A, const double *B, int64_t count, double *t_s,
-    double *states, double *auxiliaries, int64_t *events, double *values, int64_t *statuses) {
+    double *states, double *auxiliaries, int64_t *events, double *values, double *at_s,
+    int64_t *statuses) {
     const exact_code *code = code_for(max_of(exact->n, exact->m));
     int64_t n = exact->n, stride = code->stride;
     double state[3 * NOACK_EXACT_ENTRIES];
@@ -209,7 +212,7 @@ void noack_exact_segments(
     code->prepare(&memory, A, B);
     for (int64_t i = 0; i < count; i++, states += 3 * n) {
         noack_exact_row row = {.inter_event_min_s = INFINITY};
-        exact_run run = {.row = &row, .stops = 1, .t_s = t_s[i], .state = state};
+        exact_run run = {.row = &row, .stops = 1, .t_s = t_s[i], .at_s = t_s[i], .state = state};
         run.auxiliary = auxiliaries[i];
         memset(state, 0, sizeof state);
         for (int64_t j = 0; j < 3 * n; j++)
@@ -221,6 +224,7 @@ void noack_exact_segments(
         auxiliaries[i] = run.auxiliary;
         events[i] = run.event;
         values[i] = exact->measure == NOACK_EXACT_COST ? row.cost : row.sup_e_c_scaled;
+        at_s[i] = run.at_s;
         statuses[i] = row.status;
     }
 }

@@ -76,6 +76,7 @@ typedef struct { /* a run, or a part of one */
     double auxiliary;     /* likewise */
     int64_t event;        /* likewise: 1: an event at t_s */
     int64_t losses;       /* consecutive ones so far */
+    double at_s;          /* time at which the supremum is attained */
 } exact_run;
 
 /* The code for a number of states; see simulator.h. */

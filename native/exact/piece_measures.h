@@ -55,13 +55,15 @@ static double square_integrals(exact_memory *memory, int p, double s) {
            * (double_sum(xs, p, memory->Q, inverse) + double_sum(us, u_terms, memory->R, inverse));
 }
 
-/* |y(s)| e^(rate s) at or near a maximum to the right of low_s. */
-static double climb(const double *curve, int p, double low_s, double high_s, double rate) {
+/* |y(s)| e^(rate s) at or near a maximum to the right of low_s; *at_s is the time. */
+static double climb(
+    const double *curve, int p, double low_s, double high_s, double rate, double *at_s) {
     const int climbs = 12;
     lanes y, dy;
     value_and_slope(curve, p, low_s, &y, &dy);
     double low = dot(y, dy) + rate * dot(y, y);
     double best = sqrt(dot(y, y)) * exp(rate * low_s);
+    *at_s = low_s;
     value_and_slope(curve, p, high_s, &y, &dy);
     double high = dot(y, dy) + rate * dot(y, y);
     for (int i = 0; i < climbs; i++) {
@@ -72,6 +74,7 @@ static double climb(const double *curve, int p, double low_s, double high_s, dou
         value_and_slope(curve, p, s, &y, &dy);
         double slope = dot(y, dy) + rate * dot(y, y), size = sqrt(dot(y, y)) * exp(rate * s);
         int rises = slope > 0.0 && size >= best;
+        *at_s = size > best ? s : *at_s;
         best = largest_of(best, size);
         if (rises) {
             low_s = s;
@@ -92,7 +95,7 @@ static double climb(const double *curve, int p, double low_s, double high_s, dou
    oscillation, is searched again as the scalar |y|^2, in which cancelling terms vanish. */
 static double raise_supremum(
     exact_memory *memory, double best, const double *curve, int p, double end_s, double rate,
-    double growth) {
+    double growth, double *at_s) {
     const double smallest = 1e-150, too_large = 1e150;
     const int few_steps = 50, most_rises = 10000; /* each passes a maximum or rises by CERTAINTY */
     for (int rise = 0; rise < most_rises; rise++) {
@@ -111,7 +114,7 @@ static double raise_supremum(
             return best;
         if (s == UNRESOLVED)
             return UNRESOLVED;
-        double found = climb(curve, p, s, end_s, rate);
+        double found = climb(curve, p, s, end_s, rate, at_s);
         best = largest_of(best * (1.0 + CERTAINTY), found * growth);
     }
     return UNRESOLVED;

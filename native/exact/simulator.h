@@ -117,7 +117,7 @@ static double find_event(
 
 /* Raise a row's supremum by that of a piece; return 0 if it is UNRESOLVED. */
 static int measure_supremum(
-    exact_memory *memory, noack_exact_row *row, models end, int q, double t_s, double length_s,
+    exact_memory *memory, exact_run *run, models end, int q, double t_s, double length_s,
     double ceiling) {
     const noack_exact *exact = memory->exact;
     int of_state = exact->measure == NOACK_EXACT_STATE;
@@ -125,28 +125,30 @@ static int measure_supremum(
     lanes last = of_state ? subtract(end.x_c, end.e_c) : weigh(memory->weight, end.e_c);
     double rate = t_s < exact->fading_until_s ? exact->fading_per_s : 0.0;
     double growth = exp(exact->fading_per_s * least(t_s, exact->fading_until_s));
-    double best = row->sup_e_c_scaled;
-    best = largest_of(best, size_of(last) * growth * exp(rate * length_s));
+    double before = run->row->sup_e_c_scaled, at_s = length_s;
+    double best = largest_of(before, size_of(last) * growth * exp(rate * length_s));
     if (!(ceiling <= best * (1.0 + CERTAINTY)))
-        best = raise_supremum(memory, best, curve, q, length_s, rate, growth);
+        best = raise_supremum(memory, best, curve, q, length_s, rate, growth, &at_s);
     if (best == UNRESOLVED)
         return 0;
-    row->sup_e_c_scaled = best;
+    run->at_s = best > before ? t_s + at_s : run->at_s;
+    run->row->sup_e_c_scaled = best;
     return 1;
 }
 
 /* Add a piece's contribution to a row; settled is a level of |x|, and ceiling a bound on the
    measured norm. Return the last time on the piece at which |x| > settled; NONE; or UNRESOLVED. */
 static double measure_piece(
-    exact_memory *memory, noack_exact_row *row, models end, double t_s, double length_s,
-    double settled, double ceiling) {
+    exact_memory *memory, exact_run *run, models end, double t_s, double length_s, double settled,
+    double ceiling) {
+    noack_exact_row *row = run->row;
     int64_t measure = memory->exact->measure;
     int q = degree_for(memory->measured_s, length_s);
     if (measure == NOACK_EXACT_ROW || measure == NOACK_EXACT_COST)
         row->cost += square_integrals(memory, q, length_s);
     if (measure == NOACK_EXACT_TIMES || measure == NOACK_EXACT_COST)
         return NONE;
-    if (!measure_supremum(memory, row, end, q, t_s, length_s, ceiling))
+    if (!measure_supremum(memory, run, end, q, t_s, length_s, ceiling))
         return UNRESOLVED;
     if (measure != NOACK_EXACT_ROW)
         return NONE;
@@ -285,7 +287,7 @@ static void follow(exact_memory *memory, exact_run *run) {
             ceiling = phase.threshold
                       * exp(exact->fading_per_s
                             * (t_s + (phase.rate_per_s == 0.0 ? spent_s : 0.0)));
-        double within_s = measure_piece(memory, row, state, t_s, spent_s, settled, ceiling);
+        double within_s = measure_piece(memory, run, state, t_s, spent_s, settled, ceiling);
         if (within_s == UNRESOLVED)
             break;
         above = within_s == spent_s;

@@ -159,7 +159,7 @@ def _run(
     before = tuple(map(LoopState, times_s, *signals(states)))
     x_c, e_c, _ = np.moveaxis(states, 1, 0)
     lost = ~delivered[:, None]
-    first = [x0, zero, zero] if known_start else [zero, zero - x0, zero]
+    first = [x0, zero, zero] if known_start else [zero, zero - x0, x0]
     after = np.stack([np.where(lost, x_c, x_c - e_c), lost * e_c, 0.0 - lost * e_c], axis=1)
     return ContinuousRun(
         system, horizon_s, LoopState(0.0, x0, zero, zero if known_start else -x0), before,
